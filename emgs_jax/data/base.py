@@ -1,0 +1,52 @@
+"""What a data set gives: frames in order, their calibration and, where it is known, the truth."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+
+class BadFrameError(ValueError):
+    """A frame that is there but cannot be used: unreadable, truncated or of the wrong size. Names the file."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image and what is known about it; every array has the data set's `size`.
+
+    Args:
+        index: position among the images in use, from 0 (after `start`, `stop`, `stride`).
+        timestamp: seconds of the data set, or the number in the file name where it has none.
+        name: path of the image file, for messages.
+        image: RGB, uint8 (h, w, 3).
+        depth: camera-space z in metres, float32 (h, w), 0 = no value; None without ground truth.
+        T_world_camera: true pose of the colour camera, OpenCV axes, float64 (4, 4); None without ground truth.
+        labels: semantic class per pixel, int32 (h, w), -1 = none; None without labels.
+    """
+
+    index: int
+    timestamp: float
+    name: str
+    image: np.ndarray
+    depth: np.ndarray | None = None
+    T_world_camera: np.ndarray | None = None
+    labels: np.ndarray | None = None
+
+
+class Dataset(Protocol):
+    """A sequence of frames. Construction checks the layout; `dataset[i]` reads frame i and may raise BadFrameError."""
+
+    name: str  # e.g. "seven_scenes"
+    sequence: str  # e.g. "redkitchen/seq-01"
+    size: tuple[int, int]  # (width, height) of every frame
+    intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels at `size`, pixel centres at integers
+    classes: tuple[str, ...]  # names of the labels; empty without semantics
+    has_ground_truth: bool  # depth and poses are there
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Frame: ...
+
+    def fingerprint(self) -> str:
+        """Hex digest over what defines the frames (files' names and sizes, options), for provenance."""
+        ...

@@ -1,0 +1,83 @@
+"""What a prior gives: for a window of images, the pose of every view and dense geometry of some of them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from emgs_jax.data.base import Frame
+
+
+@dataclass(frozen=True)
+class Window:
+    """One call of the prior (Method A): the anchor, the FIFO from oldest to newest, the current and the newest image.
+
+    Args:
+        inference: number of the call, from 0.
+        views: frame indices in the order that the model sees them; `views[0]` is the anchor (frame 0).
+        dense: frame indices whose dense geometry the mapping needs: all views of the first window, then
+            (previous, current).
+        current: the frame that this call integrates; in the first window the last of `dense`.
+    """
+
+    inference: int
+    views: tuple[int, ...]
+    dense: tuple[int, ...]
+    current: int
+
+
+@dataclass(frozen=True)
+class PriorPrediction:
+    """The answer of a prior to one window. Poses are in the frame of view 0, geometry in each view's own camera.
+
+    Args:
+        window: the question.
+        T_anchor_view: camera -> camera of view 0, OpenCV axes, metres, float64 (v, 4, 4); the first is the identity.
+        points: camera-frame points, metres, float32 (d, h, w, 3), rows as in `window.dense`; 0 where the mask is off.
+        confidence: float32 (d, h, w), at least 1; higher is better.
+        mask: bool (d, h, w), True where the point can be used.
+        features: text-aligned unit features (d, h, w, f), float16; f = 0 without features.
+    """
+
+    window: Window
+    T_anchor_view: np.ndarray
+    points: np.ndarray
+    confidence: np.ndarray
+    mask: np.ndarray
+    features: np.ndarray
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where predictions come from; goes into every result and every recorded file."""
+
+    name: str
+    settings: dict = field(default_factory=dict)
+    is_simulated: bool = False
+
+
+class Prior(Protocol):
+    """Anything that predicts geometry from a window of frames. `predict` is deterministic."""
+
+    provenance: Provenance
+    feature_names: tuple[str, ...]  # classes that `text_features` describes; empty without features
+    text_features: np.ndarray  # (classes, f) unit embeddings comparable with `PriorPrediction.features`
+
+    def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
+        """Predict for `frames`, which are in the order of `window.views`."""
+        ...
+
+
+def windows(num_frames: int, window_size: int) -> Iterator[Window]:
+    """Yield the calls of a sequence: one that fills the FIFO, then one for each further frame.
+
+    A step sees the anchor, the `window_size` images before the current one, the current one and, except at the end
+    of the sequence, the next; an image is never listed twice.
+    """
+    first = tuple(range(min(window_size, num_frames)))
+    if first:
+        yield Window(0, first, first, first[-1])
+    for inference, current in enumerate(range(len(first), num_frames), start=1):
+        recent = range(max(current - window_size, 0), min(current + 2, num_frames))
+        yield Window(inference, tuple(dict.fromkeys((0, *recent))), (current - 1, current), current)
