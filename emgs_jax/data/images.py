@@ -1,0 +1,158 @@
+"""A folder of images or a video file with known intrinsics; no ground truth, so no metrics."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from emgs_jax.data import reading
+from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.reading import Size
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv")
+LAYOUT = "root[/sequence] = a folder of png, jpg, bmp or tiff images, or a video file (mp4, mov, avi, mkv)"
+
+
+class Images:
+    """Your own images.
+
+    Args:
+        root: folder of images or video file.
+        sequence: folder or file below root; None = root itself.
+        start, stop, stride: which of the images that are there, in natural order of their names.
+        size: (width, height) of the frames given out; another aspect than the images' is allowed (fx and fy follow).
+        intrinsics: fx, fy, cx, cy of the images on disk, required.
+    """
+
+    name = "images"
+    classes: tuple[str, ...] = ()
+    has_ground_truth = False
+
+    def __init__(
+        self,
+        root: str | None = None,
+        sequence: str | None = None,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        size: Sequence[int] = (320, 240),
+        intrinsics: Sequence[float] | None = None,
+    ) -> None:
+        path = reading.find_sequence(root, "." if sequence is None else sequence, LAYOUT, "your own recording")
+        if intrinsics is None:
+            raise ValueError(
+                f"dataset.intrinsics is not set: give dataset.intrinsics=[fx,fy,cx,cy] in pixels of the images in "
+                f"{path}; for an unknown camera, fx = fy = .8 times the width and the centre of the image are a start"
+            )
+        self._source = Video(path) if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() else Folder(path)
+        self._chosen = reading.select(self._source.count, start, stop, stride, f"{path} ({LAYOUT})")
+        raw_size = self._source.find_size(self._chosen)
+        self._raw_size = raw_size
+        self.sequence = path.name if sequence is None else str(sequence)
+        self.size = reading.check_size(size)
+        raw = reading.check_intrinsics(intrinsics, raw_size)
+        self.intrinsics = reading.resize_intrinsics(raw, raw_size, self.size)
+
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    def __getitem__(self, index: int) -> Frame:
+        reading.check_index(index, len(self))
+        row = self._chosen[index]
+        image = self._source.read(row)
+        reading.check_raw_size(image, self._raw_size, self._source.label(row))
+        image = reading.resize_color(image, self.size)
+        return Frame(index, self._source.timestamp(row), self._source.label(row), image)
+
+    def fingerprint(self) -> str:
+        options = {
+            "dataset": self.name,
+            "size": self.size,
+            "intrinsics": self.intrinsics,
+            "frames": (self._chosen.start, self._chosen.stop, self._chosen.step),
+        }
+        files = {self._source.file(row) for row in self._chosen}
+        return reading.fingerprint(self._source.folder, files, options)
+
+
+class Folder:
+    """Images of a folder in natural order; time is the number in the name where that ascends, else the position."""
+
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise ValueError(f"{folder} is neither a folder nor a video file; expected {LAYOUT}")
+        found = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+        self.folder = folder
+        self._paths = sorted(found, key=lambda p: (reading.natural_key(p), p.name))
+        self.count = len(self._paths)
+        numbers = [reading.last_number(p.stem) for p in self._paths]
+        is_time = all(n is not None and math.isfinite(n) for n in numbers)
+        is_time = is_time and all(b > a for a, b in zip(numbers, numbers[1:], strict=False))
+        self._times = numbers if is_time else [float(i) for i in range(self.count)]
+
+    def find_size(self, rows: range) -> Size:
+        return reading.first_size((self._paths[row] for row in rows), self.folder)
+
+    def read(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        return reading.read_color(self._paths[row])
+
+    def timestamp(self, row: int) -> float:
+        return self._times[row]
+
+    def file(self, row: int) -> Path:
+        return self._paths[row]
+
+    def label(self, row: int) -> str:
+        return str(self._paths[row])
+
+
+class Video:
+    """A video, read from its beginning: seeking lands on a key frame nearby with many codecs, counting never does."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self.folder = path, path.parent
+        self._capture = self._open()
+        self._next = 0  # number of the frame that the capture gives next
+        self.count = max(int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+        if self.count == 0:  # some containers do not say
+            while self._capture.grab():
+                self.count += 1
+            self._next = self.count
+        rate = self._capture.get(cv2.CAP_PROP_FPS)
+        self._seconds_per_frame = 1 / rate if math.isfinite(rate) and rate > 0 else 1.0
+
+    def _open(self) -> cv2.VideoCapture:
+        capture = cv2.VideoCapture(str(self._path))
+        if not capture.isOpened():
+            raise ValueError(f"{self._path} is no video that OpenCV can open: convert it to mp4 (h264) or to images")
+        return capture
+
+    def find_size(self, rows: range) -> Size:
+        return self.read(rows[0]).shape[1::-1]
+
+    def read(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        if row < self._next:
+            self._capture, self._next = self._open(), 0
+        while self._next < row and self._capture.grab():
+            self._next += 1
+        is_read, image = self._capture.read() if self._next == row else (False, None)
+        if not is_read or image is None:
+            raise BadFrameError(
+                f"{self.label(row)} cannot be read, the video ends or is damaged after frame {self._next - 1} although "
+                f"its header says {self.count} frames: set dataset.stop={self._next}"
+            )
+        self._next += 1
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+    def timestamp(self, row: int) -> float:
+        return row * self._seconds_per_frame
+
+    def file(self, row: int) -> Path:
+        return self._path
+
+    def label(self, row: int) -> str:
+        return f"{self._path}, frame {row}"

@@ -1,0 +1,262 @@
+"""What the data sets on disk share: finding, choosing, reading, checking and resizing; every failure names its file."""
+
+import hashlib
+import math
+import re
+import struct
+import zlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from emgs_jax.data.base import BadFrameError
+
+Size = tuple[int, int]  # (width, height)
+Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy; pixel centres at integers
+
+RIGID_TOLERANCE = 1e-2  # text files round; a flipped digit moves R^T R by more
+REMEDY = "fetch the file again or set on_bad_frame=skip"
+
+
+def find_sequence(root: str | None, sequence: str | None, layout: str, source: str) -> Path:
+    """The folder (or file) root/sequence, or an error that names the path, the expected layout and where data is."""
+    if root is None:
+        raise ValueError(f"dataset.root is not set: give dataset.root=FOLDER with the layout {layout} ({source})")
+    if sequence is None:
+        raise ValueError(f"dataset.sequence is not set: give dataset.sequence=NAME of the layout {layout} under {root}")
+    path = Path(root).expanduser() / sequence
+    if not Path(root).expanduser().exists():
+        raise FileNotFoundError(f"dataset.root={root} does not exist; expected the layout {layout} ({source})")
+    if not path.exists():
+        near = next(p for p in path.parents if p.is_dir())
+        names = ", ".join(sorted(p.name for p in near.iterdir() if not p.name.startswith("."))[:8])
+        raise FileNotFoundError(f"{path} does not exist; expected the layout {layout} ({source}); {near} has: {names}")
+    return path
+
+
+def natural_key(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key under which frame2 comes before frame10."""
+    parts = re.split(r"([0-9]+)", path.name.casefold())
+    return [(1, int(p), p) if p and p[0] in "0123456789" else (0, 0, p) for p in parts]
+
+
+def last_number(name: str) -> float | None:
+    """The last number in a file name without suffix: 'frame-000012.color' gives 12, '1341841.25' gives 1341841.25."""
+    found = re.findall(r"[0-9]+(?:\.[0-9]+)?", name)
+    return float(found[-1]) if found else None
+
+
+def select(count: int, start: int, stop: int | None, stride: int, where: object) -> range:
+    """The images in use out of the `count` that are there, in order."""
+    if count == 0:
+        raise ValueError(f"{where} has no images")
+    if stride < 1:
+        raise ValueError(f"dataset.stride must be at least 1, got {stride}")
+    if not 0 <= start < count:
+        raise ValueError(f"dataset.start must be in 0..{count - 1}, {where} has {count} images; got {start}")
+    if stop is not None and not start < stop <= count:
+        raise ValueError(
+            f"dataset.stop must be null (all) or in {start + 1}..{count}, {where} has {count} images; got {stop}"
+        )
+    return range(start, count if stop is None else stop, stride)
+
+
+def check_index(index: int, count: int) -> None:
+    """IndexError outside of 0..count-1, so that a plain for loop over the data set ends."""
+    if not 0 <= index < count:
+        raise IndexError(f"frame {index} of a sequence with {count} frames")
+
+
+def check_size(size: Sequence[int]) -> Size:
+    """`size` as two positive integers."""
+    values = tuple(int(v) for v in size)
+    if len(values) != 2 or min(values) < 1:
+        raise ValueError(f"dataset.size must be [width, height] in pixels, got {list(size)}")
+    return values
+
+
+def check_depth_scale(depth_scale: float) -> float:
+    """`depth_scale` as a positive finite number."""
+    if not (math.isfinite(depth_scale) and depth_scale > 0):
+        raise ValueError(f"dataset.depth_scale must be raw units per metre (5000 for TUM), got {depth_scale}")
+    return float(depth_scale)
+
+
+def check_intrinsics(intrinsics: Sequence[float], raw_size: Size) -> Intrinsics:
+    """`intrinsics` as four numbers that fit an image of raw_size."""
+    values = tuple(float(v) for v in intrinsics)
+    if len(values) != 4 or not np.isfinite(values).all() or min(values[:2]) <= 0:
+        raise ValueError(f"dataset.intrinsics must be [fx, fy, cx, cy] in pixels, got {list(intrinsics)}")
+    if not (0 <= values[2] < raw_size[0] and 0 <= values[3] < raw_size[1]):
+        raise ValueError(
+            f"dataset.intrinsics {list(values)} has its principal point outside of the {raw_size[0]}x{raw_size[1]} "
+            "images: give [fx, fy, cx, cy] at the size of the images on disk, not at dataset.size"
+        )
+    return values
+
+
+def resize_intrinsics(intrinsics: Intrinsics, raw_size: Size, size: Size) -> Intrinsics:
+    """Intrinsics after resizing; image borders stay borders, so c' = (c + .5) s - .5 with pixel centres at integers."""
+    fx, fy, cx, cy = intrinsics
+    sx, sy = size[0] / raw_size[0], size[1] / raw_size[1]
+    return fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5
+
+
+def resize_color(image: UInt8[np.ndarray, "_ _ 3"], size: Size) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Average of the pixels that fall into each new pixel."""
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def resize_nearest(values: np.ndarray, size: Size) -> np.ndarray:
+    """Value of the pixel whose area holds each new pixel's centre: depths and labels must not be mixed."""
+    h, w = values.shape[:2]
+    rows = np.minimum(((np.arange(size[1]) + 0.5) * h / size[1]).astype(int), h - 1)
+    columns = np.minimum(((np.arange(size[0]) + 0.5) * w / size[0]).astype(int), w - 1)
+    return values[rows[:, None], columns[None, :]]
+
+
+def read_bytes(path: Path) -> bytes:
+    """A file's bytes; a missing file is a bad frame."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise BadFrameError(f"{path} is missing: {REMEDY}") from error
+    except OSError as error:
+        raise BadFrameError(f"{path} cannot be read ({error}): {REMEDY}") from error
+    except ValueError as error:  # a zero byte in a name from a damaged list
+        raise BadFrameError(f"{path!r} is no file name: {REMEDY}") from error
+
+
+def read_text(path: Path) -> str:
+    """A file's text; bytes that are no text become a sign that no number parses."""
+    return read_bytes(path).decode("utf-8", "replace")
+
+
+def damage(data: bytes) -> str | None:
+    """What is wrong with an encoded image, where its format can tell; decoders fill what is missing with grey."""
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return _png_damage(data)
+    if data.startswith(b"\xff\xd8"):
+        # Thumbnails before the scan have end markers of their own; inside the scan an 0xff is always escaped.
+        scan = _jpeg_scan(data)
+        return None if scan >= 0 and data.find(b"\xff\xd9", scan) >= 0 else "truncated: no end-of-image marker"
+    if data.startswith(b"BM") and len(data) >= 6 and len(data) < struct.unpack("<I", data[2:6])[0]:
+        return "truncated: shorter than its header says"
+    return None if data else "empty"
+
+
+def _png_damage(data: bytes) -> str | None:
+    position = 8
+    while position + 12 <= len(data):
+        (length,) = struct.unpack(">I", data[position : position + 4])
+        end = position + 8 + length
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(data[position + 4 : end]) != struct.unpack(">I", data[end : end + 4])[0]:
+            return "damaged: a PNG checksum is wrong"
+        if data[position + 4 : position + 8] == b"IEND":
+            return None
+        position = end + 4
+    return "truncated: no PNG end chunk"
+
+
+def _jpeg_scan(data: bytes) -> int:
+    """Offset of the first scan, -1 if the header segments do not lead to one."""
+    position = 2
+    while position + 4 <= len(data) and data[position] == 0xFF:
+        if data[position + 1] == 0xFF:  # fill byte
+            position += 1
+            continue
+        if data[position + 1] == 0xDA:
+            return position
+        position += 2 + struct.unpack(">H", data[position + 2 : position + 4])[0]
+    return -1
+
+
+def decode(path: Path, flags: int) -> np.ndarray:
+    """The image in a file as cv2 gives it (BGR), or a BadFrameError."""
+    data = read_bytes(path)
+    reason = damage(data)
+    image = None
+    if reason is None:
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        except cv2.error as error:
+            reason = f"cannot be decoded ({error.err})"
+    if image is None:
+        raise BadFrameError(f"{path} is {reason or 'not a readable image'}: {REMEDY}")
+    return image
+
+
+def read_color(path: Path, raw_size: Size | None = None) -> UInt8[np.ndarray, "_ _ 3"]:
+    """RGB image; BadFrameError where its size is not raw_size."""
+    image = decode(path, cv2.IMREAD_COLOR)
+    check_raw_size(image, raw_size, path)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def read_depth(path: Path, depth_scale: float, raw_size: Size) -> Float32[np.ndarray, "_ _"]:
+    """Depth in metres from a 16-bit image, 0 where it has no value (raw 0 and 65535, the sensors' two marks)."""
+    raw = decode(path, cv2.IMREAD_UNCHANGED)
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise BadFrameError(f"{path} must be a 16-bit depth image with one channel, got {raw.dtype} {raw.shape}")
+    check_raw_size(raw, raw_size, path)
+    return np.where(raw == 65535, 0, raw).astype(np.float32) / np.float32(depth_scale)
+
+
+def check_raw_size(image: np.ndarray, raw_size: Size | None, path: object) -> None:
+    """BadFrameError where an image is not of the size that the calibration is for."""
+    if raw_size is not None and image.shape[1::-1] != tuple(raw_size):
+        (w, h), (width, height) = image.shape[1::-1], raw_size
+        raise BadFrameError(
+            f"{path} is {w}x{h}, but colour, depth and intrinsics of this sequence are {width}x{height}: "
+            "resize the file, or give dataset.intrinsics for the images that are there, or set on_bad_frame=skip"
+        )
+
+
+def first_size(paths: Iterable[Path], where: object) -> Size:
+    """(width, height) of the first image that can be read."""
+    for path in paths:
+        try:
+            return decode(path, cv2.IMREAD_COLOR).shape[1::-1]
+        except BadFrameError:
+            continue
+    raise ValueError(f"{where}: none of its images can be read; fetch them again")
+
+
+def as_pose(text: str, where: object) -> Float[np.ndarray, "4 4"]:
+    """A rigid 4x4 transform from 16 numbers, row by row; BadFrameError where it is none (lost tracking: inf or nan)."""
+    try:
+        pose = np.array([float(token) for token in text.split()], np.float64).reshape(4, 4)
+    except ValueError as error:
+        raise BadFrameError(f"{where} must hold 16 numbers (a 4x4 pose): {REMEDY}") from error
+    if not np.isfinite(pose).all():
+        raise BadFrameError(f"{where} has a pose that is not finite, tracking was lost: set on_bad_frame=skip")
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()
+    is_rigid = off < RIGID_TOLERANCE and np.linalg.det(pose[:3, :3]) > 0 and np.allclose(pose[3], (0, 0, 0, 1))
+    if not is_rigid:
+        raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
+    left, _, right = np.linalg.svd(pose[:3, :3])
+    pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded
+    return pose
+
+
+def fingerprint(root: Path, files: Iterable[Path], options: dict[str, object]) -> str:
+    """sha256 over names and sizes of the files and the options; the same on every machine."""
+    digest = hashlib.sha256()
+    names = {p.relative_to(root).as_posix() if p.is_relative_to(root) else p.name: file_size(p) for p in files}
+    for item in [*sorted(options.items()), *sorted(names.items())]:
+        digest.update(repr(item).encode())
+    return digest.hexdigest()
+
+
+def file_size(path: Path) -> int:
+    """Bytes of a file, -1 where there is none."""
+    try:
+        return path.stat().st_size
+    except (OSError, ValueError):
+        return -1

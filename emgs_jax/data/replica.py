@@ -1,0 +1,118 @@
+"""Replica in the NICE-SLAM layout: cam_params.json, SCENE/traj.txt, SCENE/results/{frame%06d.jpg, depth%06d.png}."""
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from emgs_jax.data import reading
+from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.reading import Intrinsics, Size
+
+LAYOUT = "root/{cam_params.json, SCENE/{traj.txt, results/{frame000000.jpg, depth000000.png}}}"
+SOURCE = "Replica as rendered for iMAP and NICE-SLAM, see the NICE-SLAM project page"
+
+
+class Replica:
+    """One rendered sequence of Replica.
+
+    Args:
+        root: folder that holds cam_params.json and the scenes.
+        sequence: "office0".
+        start, stop, stride: which of the images that are there, in order.
+        size: (width, height) of the frames given out.
+        intrinsics: fx, fy, cx, cy of the images on disk; None = those of cam_params.json.
+        depth_scale: raw units per metre; None = that of cam_params.json.
+    """
+
+    name = "replica"
+    classes: tuple[str, ...] = ()
+    has_ground_truth = True
+
+    def __init__(
+        self,
+        root: str | None = None,
+        sequence: str | None = None,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 10,
+        size: Sequence[int] = (320, 180),
+        intrinsics: Sequence[float] | None = None,
+        depth_scale: float | None = None,
+    ) -> None:
+        self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
+        images = find_images(self._folder / "results")
+        chosen = reading.select(len(images), start, stop, stride, f"{self._folder / 'results'} (layout {LAYOUT})")
+        self._images = [images[i] for i in chosen]
+        self._poses = read_rows(self._folder / "traj.txt", self._images)
+        self._raw_size, calibration, scale = read_calibration(Path(str(root)).expanduser() / "cam_params.json")
+        raw = reading.check_intrinsics(calibration if intrinsics is None else intrinsics, self._raw_size)
+        self.sequence = str(sequence)
+        self.size = reading.check_size(size)
+        self.intrinsics = reading.resize_intrinsics(raw, self._raw_size, self.size)
+        self._depth_scale = reading.check_depth_scale(scale if depth_scale is None else depth_scale)
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __getitem__(self, index: int) -> Frame:
+        reading.check_index(index, len(self))
+        path = self._images[index]
+        image = reading.read_color(path, self._raw_size)
+        depth = reading.read_depth(depth_path(path), self._depth_scale, self._raw_size)
+        pose = reading.as_pose(self._poses[index], f"{self._folder / 'traj.txt'}, row {number_of(path)} (from 0),")
+        image, depth = reading.resize_color(image, self.size), reading.resize_nearest(depth, self.size)
+        return Frame(index, float(number_of(path)), str(path), image, depth, pose)
+
+    def fingerprint(self) -> str:
+        files = [self._folder / "traj.txt", *self._images, *map(depth_path, self._images)]
+        options = {
+            "dataset": self.name,
+            "size": self.size,
+            "intrinsics": self.intrinsics,
+            "depth_scale": self._depth_scale,
+        }
+        return reading.fingerprint(self._folder, files, options)
+
+
+def find_images(folder: Path) -> list[Path]:
+    """frame%06d.jpg (or .png) in the order of their numbers."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder} does not exist; expected the layout {LAYOUT} ({SOURCE})")
+    found = [p for p in folder.iterdir() if re.fullmatch(r"frame[0-9]+\.(jpe?g|png)", p.name, re.IGNORECASE)]
+    return sorted(found, key=reading.natural_key)
+
+
+def number_of(path: Path) -> int:
+    """12 for frame000012.jpg."""
+    return int(path.stem[len("frame") :])
+
+
+def depth_path(path: Path) -> Path:
+    """depth000012.png for frame000012.jpg."""
+    return path.with_name(f"depth{path.stem[len('frame') :]}.png")
+
+
+def read_rows(path: Path, images: list[Path]) -> list[str]:
+    """The row of traj.txt for every image, still as text: image frame000012 belongs to row 12, from 0."""
+    try:
+        rows = [row for row in reading.read_text(path).splitlines() if row.strip()]
+    except BadFrameError as error:
+        raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
+    last = max(number_of(p) for p in images)
+    if last >= len(rows):
+        raise ValueError(f"{path} has {len(rows)} poses, but there is an image number {last}: fetch traj.txt again")
+    return [rows[number_of(p)] for p in images]
+
+
+def read_calibration(path: Path) -> tuple[Size, Intrinsics, float]:
+    """Image size, intrinsics and depth scale from cam_params.json."""
+    try:
+        camera = json.loads(reading.read_text(path))["camera"]
+        size = int(camera["w"]), int(camera["h"])
+        fx, fy, cx, cy, scale = (float(camera[key]) for key in ("fx", "fy", "cx", "cy", "scale"))
+    except BadFrameError as error:
+        raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise ValueError(f'{path} must hold {{"camera": {{w, h, fx, fy, cx, cy, scale}}}}: {error!r}') from error
+    return size, (fx, fy, cx, cy), scale

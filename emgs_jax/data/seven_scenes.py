@@ -1,0 +1,147 @@
+"""7-Scenes: hand-held Kinect, SCENE/seq-XX/frame-%06d.{color.png|jpg, depth.png, pose.txt}."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from emgs_jax.data import reading
+from emgs_jax.data.base import Frame
+from emgs_jax.data.reading import Intrinsics, Size
+
+LAYOUT = "root/SCENE/seq-XX/frame-000000.{color.png or color.jpg, depth.png, pose.txt}"
+SOURCE = "7-Scenes, project page of Microsoft Research; unpack the inner seq-XX.zip as well"
+RAW_SIZE = (640, 480)
+# The release has no calibration: the depth camera is KinectFusion's, the colour camera and the transform are kapture's.
+DEPTH_INTRINSICS = (585.0, 585.0, 320.0, 240.0)
+COLOR_INTRINSICS = (525.0, 525.0, 320.0, 240.0)
+T_COLOR_DEPTH = np.array(
+    [
+        [0.99996518, 0.0026765127, -0.0079041012, -0.025558943],
+        [-0.0027409311, 0.99996303, -0.0081504521, 0.00010109636],
+        [0.0078819942, 0.0081718329, 0.99993555, 0.0020318322],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+FOOTPRINT_MARGIN = 1.2  # slanted surfaces spread: a little overlap leaves no holes between neighbouring pixels
+NEAR = 0.05  # metres; nothing the sensor measures is nearer
+
+
+class SevenScenes:
+    """One sequence of 7-Scenes.
+
+    Args:
+        root: folder that holds the scenes.
+        sequence: "SCENE/seq-XX".
+        start, stop, stride: which of the images that are there, in order.
+        size: (width, height) of the frames given out.
+        intrinsics: fx, fy, cx, cy of the 640x480 colour images; None = 525 when registered, else 585.
+        depth_scale: raw units per metre.
+        register_depth: warp depth into the colour camera and give its pose; else depth and pose are the depth camera's.
+    """
+
+    name = "seven_scenes"
+    classes: tuple[str, ...] = ()
+    has_ground_truth = True
+
+    def __init__(
+        self,
+        root: str | None = None,
+        sequence: str | None = None,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 10,
+        size: Sequence[int] = (320, 240),
+        intrinsics: Sequence[float] | None = None,
+        depth_scale: float = 1000.0,
+        register_depth: bool = True,
+    ) -> None:
+        self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
+        images = find_images(self._folder)
+        chosen = reading.select(len(images), start, stop, stride, f"{self._folder} (layout {LAYOUT})")
+        self._images = [images[i] for i in chosen]
+        self.sequence = str(sequence)
+        self.size = reading.check_size(size)
+        self._depth_scale = reading.check_depth_scale(depth_scale)
+        self._register = bool(register_depth)
+        default = COLOR_INTRINSICS if register_depth else DEPTH_INTRINSICS
+        raw = reading.check_intrinsics(default if intrinsics is None else intrinsics, RAW_SIZE)
+        self.intrinsics = reading.resize_intrinsics(raw, RAW_SIZE, self.size)
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __getitem__(self, index: int) -> Frame:
+        reading.check_index(index, len(self))
+        path = self._images[index]
+        image = reading.resize_color(reading.read_color(path, RAW_SIZE), self.size)
+        pose_path = sibling(path, "pose.txt")
+        pose = reading.as_pose(reading.read_text(pose_path), pose_path)  # T_world_depth
+        depth = reading.read_depth(sibling(path, "depth.png"), self._depth_scale, RAW_SIZE)
+        if self._register:
+            depth = register(depth, self.intrinsics, self.size)
+            pose = pose @ np.linalg.inv(T_COLOR_DEPTH)
+        else:
+            depth = reading.resize_nearest(depth, self.size)
+        return Frame(index, frame_number(path), str(path), image, depth, pose)
+
+    def fingerprint(self) -> str:
+        files = [f for p in self._images for f in (p, sibling(p, "depth.png"), sibling(p, "pose.txt"))]
+        options = {
+            "dataset": self.name,
+            "size": self.size,
+            "intrinsics": self.intrinsics,
+            "depth_scale": self._depth_scale,
+            "register_depth": self._register,
+        }
+        return reading.fingerprint(self._folder, files, options)
+
+
+def find_images(folder: Path) -> list[Path]:
+    """Colour images in the order of their numbers; where a frame is there as png and as jpg, the png."""
+    found: dict[float, Path] = {}
+    for path in sorted(folder.iterdir(), key=lambda p: p.suffix.lower() == ".png"):
+        if re.fullmatch(r"frame-[0-9]+\.color\.(png|jpe?g)", path.name, re.IGNORECASE):
+            found[frame_number(path)] = path
+    return [found[number] for number in sorted(found)]
+
+
+def frame_number(path: Path) -> float:
+    """12 for frame-000012.color.png."""
+    return float(path.name.split(".")[0][len("frame-") :])
+
+
+def sibling(path: Path, ending: str) -> Path:
+    """frame-000012.depth.png for frame-000012.color.png."""
+    return path.with_name(f"{path.name.split('.')[0]}.{ending}")
+
+
+def register(depth: Float32[np.ndarray, "_ _"], intrinsics: Intrinsics, size: Size) -> Float32[np.ndarray, "_ _"]:
+    """Depth of the colour camera at `size` from the depth camera's 640x480 image; metres, 0 where nothing falls.
+
+    Every source pixel is a square that covers the target pixels whose centres lie in it; the nearest one wins.
+    """
+    points = color_camera_points(depth)
+    (fx, fy, cx, cy), (w, h) = intrinsics, size
+    u, v, z = fx * points[:, 0] / points[:, 2] + cx, fy * points[:, 1] / points[:, 2] + cy, points[:, 2]
+    half_u, half_v = (0.5 * FOOTPRINT_MARGIN * f / g for f, g in zip((fx, fy), DEPTH_INTRINSICS[:2], strict=True))
+    nearest = np.full(h * w, np.inf, np.float32)
+    for du in range(-int(half_u + 0.5), int(half_u + 0.5) + 1):
+        for dv in range(-int(half_v + 0.5), int(half_v + 0.5) + 1):
+            x, y = np.rint(u) + du, np.rint(v) + dv
+            covered = (np.abs(x - u) <= half_u) & (np.abs(y - v) <= half_v)
+            covered &= (x >= 0) & (x < w) & (y >= 0) & (y < h)
+            np.minimum.at(nearest, (y[covered] * w + x[covered]).astype(np.intp), z[covered])
+    return np.where(np.isfinite(nearest), nearest, 0).reshape(h, w)
+
+
+def color_camera_points(depth: Float32[np.ndarray, "h w"]) -> Float[np.ndarray, "p 3"]:
+    """Points of the valid pixels of the depth camera in the colour camera's axes, metres."""
+    fx, fy, cx, cy = DEPTH_INTRINSICS
+    v, u = np.nonzero(depth > NEAR)
+    z = depth[v, u]
+    points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=-1)
+    points = points @ T_COLOR_DEPTH[:3, :3].T + T_COLOR_DEPTH[:3, 3]
+    return points[points[:, 2] > NEAR]

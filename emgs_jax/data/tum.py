@@ -1,0 +1,212 @@
+"""TUM RGB-D and every folder of its layout: rgb.txt, depth.txt, groundtruth.txt, associated by timestamp."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.data import reading
+from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.reading import Intrinsics, Size
+
+LAYOUT = "root/SEQUENCE/{rgb.txt, depth.txt, groundtruth.txt, rgb/, depth/}"
+SOURCE = "TUM RGB-D benchmark, project page of the Computer Vision Group of TU Munich"
+RAW_SIZE = (640, 480)
+# Calibration by the benchmark (digits of ORB-SLAM2); fr3 comes undistorted. Distortion is k1, k2, p1, p2, k3.
+CALIBRATIONS: dict[str, tuple[Intrinsics, tuple[float, ...] | None]] = {
+    "freiburg1": (
+        (517.306408, 516.469215, 318.643040, 255.313989),
+        (0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
+    ),
+    "freiburg2": (
+        (520.908620, 521.007327, 325.141442, 249.701764),
+        (0.231222, -0.784899, -0.003257, -0.000105, 0.917205),
+    ),
+    "freiburg3": ((535.4, 539.2, 320.1, 247.6), None),
+}
+
+
+class Tum:
+    """One sequence in the TUM layout; without depth.txt or groundtruth.txt there is no ground truth.
+
+    A colour image without depth near in time stays in use with depth 0 everywhere; one without a pose has none.
+
+    Args:
+        root: folder that holds the sequences.
+        sequence: "rgbd_dataset_freiburg1_desk"; freiburg1, 2 and 3 in the name choose the calibration.
+        start, stop, stride: which of the images in rgb.txt, in order of time.
+        size: (width, height) of the frames given out.
+        intrinsics: fx, fy, cx, cy of the images on disk; None = the benchmark's calibration.
+        distortion: k1, k2, p1, p2, k3 that goes with `intrinsics`; None = the images are undistorted.
+        depth_scale: raw units per metre.
+        max_time_difference: seconds between a colour image and its depth image or pose.
+    """
+
+    name = "tum"
+    classes: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        root: str | None = None,
+        sequence: str | None = None,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 10,
+        size: Sequence[int] = (320, 240),
+        intrinsics: Sequence[float] | None = None,
+        distortion: Sequence[float] | None = None,
+        depth_scale: float = 5000.0,
+        max_time_difference: float = 0.02,
+    ) -> None:
+        self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
+        times, names = read_list(self._folder / "rgb.txt", 2)
+        chosen = reading.select(len(times), start, stop, stride, f"{self._folder / 'rgb.txt'} (layout {LAYOUT})")
+        self._times, self._images = times[chosen], [self._folder / names[i][0] for i in chosen]
+        self.sequence = str(sequence)
+        self.size = reading.check_size(size)
+        self._depth_scale = reading.check_depth_scale(depth_scale)
+        if not (math.isfinite(max_time_difference) and max_time_difference >= 0):
+            raise ValueError(f"dataset.max_time_difference must be seconds, 0 or more, got {max_time_difference}")
+        self._depths, self._poses = self._associate(float(max_time_difference))
+        self.has_ground_truth = self._depths is not None and self._poses is not None
+        raw, bent = find_calibration(self.sequence, intrinsics, distortion)
+        self._raw_size = RAW_SIZE if intrinsics is None else reading.first_size(self._images, self._folder)
+        raw = reading.check_intrinsics(raw, self._raw_size)
+        self._maps = None
+        if bent is not None:
+            raw, self._maps = undistortion(raw, bent, self._raw_size)
+        self.intrinsics = reading.resize_intrinsics(raw, self._raw_size, self.size)
+
+    def _associate(self, tolerance: float) -> tuple[list[Path | None] | None, list[list[str] | None] | None]:
+        """Per image in use the depth file and the words of the pose nearest in time; None where there is no list."""
+        depths = poses = None
+        if (self._folder / "depth.txt").exists():
+            times, names = read_list(self._folder / "depth.txt", 2)
+            rows = nearest_rows(self._times, times, tolerance)
+            depths = [None if row < 0 else self._folder / names[row][0] for row in rows]
+        if (self._folder / "groundtruth.txt").exists():
+            times, words = read_list(self._folder / "groundtruth.txt", 8)
+            rows = nearest_rows(self._times, times, tolerance)
+            poses = [None if row < 0 else words[row] for row in rows]
+        return depths, poses
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __getitem__(self, index: int) -> Frame:
+        reading.check_index(index, len(self))
+        path, (w, h) = self._images[index], self.size
+        image = reading.read_color(path, self._raw_size)
+        depth = pose = None
+        if self._depths is not None:
+            depth = np.zeros((h, w), np.float32)
+            if self._depths[index] is not None:
+                raw = reading.read_depth(self._depths[index], self._depth_scale, self._raw_size)
+                raw = raw if self._maps is None else cv2.remap(raw, *self._maps, cv2.INTER_NEAREST)
+                depth = reading.resize_nearest(raw, self.size)
+        if self._poses is not None and self._poses[index] is not None:
+            pose = as_transform(self._poses[index], self._folder / "groundtruth.txt")
+        if self._maps is not None:
+            image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR)
+        return Frame(index, float(self._times[index]), str(path), reading.resize_color(image, self.size), depth, pose)
+
+    def fingerprint(self) -> str:
+        lists = [self._folder / name for name in ("rgb.txt", "depth.txt", "groundtruth.txt")]
+        files = [*lists, *self._images, *(p for p in self._depths or () if p is not None)]
+        options = {
+            "dataset": self.name,
+            "size": self.size,
+            "intrinsics": self.intrinsics,
+            "undistorted": self._maps is not None,
+            "depth_scale": self._depth_scale,
+            "depths": [p and p.name for p in self._depths or ()],
+            "poses": self._poses,
+        }
+        return reading.fingerprint(self._folder, files, options)
+
+
+def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[list[str]]]:
+    """Timestamps in ascending order and the words after them; lines of a '#' comment and empty lines do not count."""
+    try:
+        lines = reading.read_text(path).splitlines()
+    except BadFrameError as error:
+        raise FileNotFoundError(f"{error}; expected the layout {LAYOUT} ({SOURCE})") from error
+    times, words = [], []
+    for number, line in enumerate(lines, 1):
+        row = line.replace(",", " ").split()
+        if not row or row[0].startswith("#"):
+            continue
+        try:
+            time = float(row[0])
+        except ValueError:
+            time = math.nan
+        if len(row) < columns or not math.isfinite(time):
+            raise ValueError(f"{path}, line {number}: expected a timestamp and {columns - 1} more, got {line[:80]!r}")
+        times.append(time)
+        words.append(row[1:columns])
+    order = np.argsort(times, kind="stable")
+    return np.array(times, np.float64)[order], [words[i] for i in order]
+
+
+def nearest_rows(times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, " m"], tolerance: float) -> list[int]:
+    """Row of `candidates` (ascending) nearest to each time, -1 where none is within the tolerance in seconds."""
+    if len(candidates) == 0:
+        return [-1] * len(times)
+    after = np.clip(np.searchsorted(candidates, times), 1, max(len(candidates) - 1, 1))
+    pair = np.stack([after - 1, np.minimum(after, len(candidates) - 1)])
+    gaps = np.abs(candidates[pair] - times)
+    best = gaps.argmin(axis=0)
+    rows = np.take_along_axis(pair, best[None], 0)[0]
+    return np.where(gaps.min(axis=0) <= tolerance, rows, -1).tolist()
+
+
+def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"]:
+    """T_world_camera from tx ty tz qx qy qz qw; BadFrameError where they are none."""
+    try:
+        values = np.array([float(word) for word in words], np.float64)
+    except ValueError as error:
+        raise BadFrameError(f"{where}: {' '.join(words)!r} must be tx ty tz qx qy qz qw: {reading.REMEDY}") from error
+    norm = np.linalg.norm(values[3:])
+    if not np.isfinite(values).all() or abs(norm - 1) > reading.RIGID_TOLERANCE:
+        raise BadFrameError(f"{where}: {' '.join(words)!r} is no pose (finite, unit quaternion): {reading.REMEDY}")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
+    return pose
+
+
+def find_calibration(
+    sequence: str, intrinsics: Sequence[float] | None, distortion: Sequence[float] | None
+) -> tuple[Sequence[float], tuple[float, ...] | None]:
+    """Intrinsics and distortion of the images on disk: as given, else the benchmark's by the sequence's name."""
+    if intrinsics is None:
+        if distortion is not None:
+            raise ValueError("dataset.distortion needs the dataset.intrinsics that it was calibrated with")
+        for key, calibration in CALIBRATIONS.items():
+            if key in sequence.lower():
+                return calibration
+        raise ValueError(
+            f"{sequence} names no calibration (freiburg1, freiburg2 or freiburg3): give "
+            "dataset.intrinsics=[fx,fy,cx,cy] at the size of the images on disk and, where they are distorted, "
+            "dataset.distortion=[k1,k2,p1,p2,k3]"
+        )
+    if distortion is None:
+        return intrinsics, None
+    bent = tuple(float(v) for v in distortion)
+    if len(bent) != 5 or not np.isfinite(bent).all():
+        raise ValueError(f"dataset.distortion must be [k1, k2, p1, p2, k3], got {list(distortion)}")
+    return intrinsics, bent
+
+
+def undistortion(
+    intrinsics: Intrinsics, distortion: tuple[float, ...], size: Size
+) -> tuple[Intrinsics, tuple[np.ndarray, np.ndarray]]:
+    """New intrinsics whose view lies wholly inside of the distorted image, and the cv2.remap tables that lead there."""
+    fx, fy, cx, cy = intrinsics
+    old, bent = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(distortion)
+    new, _ = cv2.getOptimalNewCameraMatrix(old, bent, size, alpha=0, newImgSize=size, centerPrincipalPoint=True)
+    maps = cv2.initUndistortRectifyMap(old, bent, None, new, size, cv2.CV_32FC1)
+    return (float(new[0, 0]), float(new[1, 1]), float(new[0, 2]), float(new[1, 2])), maps
