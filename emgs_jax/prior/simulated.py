@@ -20,7 +20,7 @@ the same bits as a whole run.
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -76,7 +76,7 @@ class Simulated:
         self.feature_names = tuple(classes)
         self.text_features = text_embeddings(self.feature_names, feature_size)
         settings = {"version": 1, "level": self.level, "seed": self.seed, "feature_size": self.text_features.shape[1]}
-        self.provenance = Provenance("simulated", settings | {"standard": asdict(self.standard)}, is_simulated=True)
+        self.provenance = Provenance("simulated", settings, is_simulated=True)
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Raise ValueError, before any work is done, where the data set has no truth to disturb."""
@@ -160,9 +160,9 @@ class Simulated:
     def _confidence(self, inference: int, index: int, error: np.ndarray, near_edge: np.ndarray) -> np.ndarray:
         """Return the confidence (h, w) ≥ 1 for the absolute log-depth `error` without the common scale."""
         noise = self.standard
-        jitter = (
-            self.level * noise.confidence_noise * normals(error.shape, (self.seed, Stream.CONFIDENCE, inference, index))
-        )
+        # It hides part of the error; above level 1 more of it would hide everything.
+        jitter = normals(error.shape, (self.seed, Stream.CONFIDENCE, inference, index))
+        jitter *= min(1.0, self.level) * noise.confidence_noise
         doubt = np.minimum(error / noise.confidence_error, noise.confidence_cap) + noise.confidence_edge * near_edge
         return (1 + (noise.max_confidence - 1) * np.exp(jitter - doubt)).astype(np.float32)
 

@@ -1,0 +1,247 @@
+"""Predictions written to disk once and replayed bit for bit.
+
+The format `emgs_jax.predictions`, version 1, is a folder; nothing in it is ever unpickled:
+
+- `manifest.json`: UTF-8 JSON object with `format`, `version`, `dataset` (name, sequence, fingerprint, num_frames, size,
+  intrinsics), `window_size`, `provenance` (name, settings, is_simulated), `feature_names`, `num_inferences`,
+  `complete` (all inferences are there), `files` (file name -> SHA-256 of its content) and `sha256` (of all the other
+  keys, as JSON with sorted keys and without spaces), so that no changed bit goes unnoticed.
+- `text_features.npz`: the array `text_features` (classes, f).
+- `000000.npz`, …, one file per inference: `inference` (), `views` (v,), `dense` (d,), `current` () and the arrays of
+  `PriorPrediction` in the dtypes stated there: about d·h·w·(17 + 2f) bytes.
+
+Each file is written under a temporary name and then renamed, data before the manifest: a full disk or an interrupted
+run leaves a valid folder, which `record` completes.
+"""
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.files import atomic_write
+from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows
+
+FORMAT, VERSION = "emgs_jax.predictions", 1
+REMEDY = "record it again with `python -m experiments.predict`"
+FIELDS = {  # array -> dtype and the axes that it has; axes of one name have one length
+    "T_anchor_view": (np.float64, "vij"),
+    "points": (np.float32, "dhwc"),
+    "confidence": (np.float32, "dhw"),
+    "mask": (np.bool_, "dhw"),
+    "features": (np.float16, "dhwf"),
+}
+
+
+def record(
+    prior: Prior,
+    dataset: Dataset,
+    window_size: int,
+    folder: Path | str,
+    progress: Callable[[Sequence[Window]], Iterable[Window]] = iter,
+) -> None:
+    """Write what `prior` predicts for every window of `dataset`; inferences that are there already are kept.
+
+    Args:
+        progress: wraps the list of windows, e.g. tqdm.
+    """
+    folder = Path(folder)
+    calls = list(windows(len(dataset), window_size))
+    header = _header(prior, dataset, window_size, len(calls))
+    files = _resume(folder, header)
+    folder.mkdir(parents=True, exist_ok=True)
+    text_features = _npz({"text_features": prior.text_features})
+    files["text_features.npz"] = _write(folder / "text_features.npz", text_features)
+    frames: dict[int, Frame] = {}
+    for window in progress(calls):
+        name = f"{window.inference:06d}.npz"
+        if name in files and _digest_of(folder / name) == files[name]:
+            continue
+        frames = {index: frames[index] if index in frames else dataset[index] for index in window.views}
+        prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
+        files[name] = _write(folder / name, _npz(_arrays(prediction)))
+        _write_manifest(folder, header, files)
+    _write_manifest(folder, header | {"complete": True}, files)
+
+
+class Recorded:
+    """A prior that replays a folder written by `record` (implements `Prior`).
+
+    Args:
+        folder: the recording; it must be complete.
+    """
+
+    def __init__(self, folder: Path | str) -> None:
+        self.folder = Path(folder)
+        self._manifest = _read_manifest(self.folder)
+        if not self._manifest["complete"]:
+            done, total = len(self._manifest["files"]) - 1, self._manifest["num_inferences"]
+            raise ValueError(f"{self.folder} holds {done} of {total} inferences: finish it, {REMEDY}")
+        self.provenance = Provenance(**self._manifest["provenance"])
+        self.feature_names = tuple(self._manifest["feature_names"])
+        self.text_features = self._load("text_features.npz", ("text_features",))["text_features"]
+
+    def check(self, dataset: Dataset, window_size: int) -> None:
+        """Raise ValueError where the recording is not of this data set, calibration and window size."""
+        expected = _described(dataset) | {"window_size": window_size}
+        recorded = self._manifest["dataset"] | {"window_size": self._manifest["window_size"]}
+        for key, value in expected.items():
+            if recorded.get(key) != value:
+                raise ValueError(
+                    f"{self.folder} was recorded with {key} {recorded.get(key)}, but this run has {value}: "
+                    f"choose the recording of this sequence or {REMEDY}"
+                )
+
+    def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
+        """Return the recorded prediction of `window`; of `frames` only the number and size are looked at."""
+        data, name = self._manifest["dataset"], f"{window.inference:06d}.npz"
+        shape, size = frames[0].image.shape[:2], tuple(data["size"])
+        if [*intrinsics] != data["intrinsics"] or shape != size[::-1] or len(frames) != len(window.views):
+            raise ValueError(
+                f"{self.folder} was recorded at size {size} with intrinsics {data['intrinsics']}; asked for are "
+                f"{len(frames)} frames of {shape[::-1]} with {[*intrinsics]} as {len(window.views)} views: {REMEDY}"
+            )
+        arrays = self._load(name, ("inference", "views", "dense", "current", *FIELDS))
+        recorded = [arrays[key].tolist() for key in ("inference", "views", "dense", "current")]
+        if recorded != [window.inference, list(window.views), list(window.dense), window.current]:
+            raise ValueError(
+                f"{self.folder / name} answers another window (views {recorded[1]}) than {window}: {REMEDY}"
+            )
+        _check_arrays(
+            self.folder / name, arrays, {"v": len(window.views), "d": len(window.dense), "h": shape[0], "w": shape[1]}
+        )
+        return PriorPrediction(window, *(arrays[key] for key in FIELDS))
+
+    def _load(self, name: str, keys: Sequence[str]) -> dict[str, np.ndarray]:
+        """Read and verify one file of the recording."""
+        path = self.folder / name
+        if not path.is_file():
+            raise ValueError(f"{path} is missing: {REMEDY}")
+        content = path.read_bytes()
+        if hashlib.sha256(content).hexdigest() != self._manifest["files"].get(name):
+            raise ValueError(f"{path} is damaged (its SHA-256 is not the manifest's): delete it and {REMEDY}")
+        try:
+            with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+                return {key: arrays[key] for key in keys}
+        except (KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path} is no file of this format ({error}): {REMEDY}") from error
+
+
+def _check_arrays(path: Path, arrays: dict[str, np.ndarray], sizes: dict[str, int]) -> None:
+    """Raise ValueError where an array has not the dtype and shape of the format."""
+    sizes = sizes | {"i": 4, "j": 4, "c": 3}
+    for key, (dtype, axes) in FIELDS.items():
+        got = arrays[key]
+        expected = tuple(sizes.get(axis, got.shape[-1] if got.ndim else 0) for axis in axes)
+        if got.dtype != dtype or got.shape != expected:
+            raise ValueError(
+                f"{path}: {key} must be {np.dtype(dtype)} {expected}, got {got.dtype} {got.shape}: {REMEDY}"
+            )
+
+
+def _described(dataset: Dataset) -> dict:
+    """Return what identifies the frames that were predicted, as JSON gives it back."""
+    return {
+        "name": dataset.name,
+        "sequence": dataset.sequence,
+        "num_frames": len(dataset),
+        "size": [int(value) for value in dataset.size],
+        "intrinsics": [float(value) for value in dataset.intrinsics],
+        "fingerprint": dataset.fingerprint(),
+    }
+
+
+def _header(prior: Prior, dataset: Dataset, window_size: int, num_inferences: int) -> dict:
+    """Return the manifest without the files, as JSON gives it back."""
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "dataset": _described(dataset),
+        "window_size": window_size,
+        "provenance": asdict(prior.provenance),
+        "feature_names": list(prior.feature_names),
+        "num_inferences": num_inferences,
+        "complete": False,
+    }
+    return json.loads(json.dumps(header))
+
+
+def _resume(folder: Path, header: dict) -> dict[str, str]:
+    """Return the files (name -> SHA-256) of an earlier, perhaps interrupted `record` with the same header."""
+    if not (folder / "manifest.json").exists():
+        return {}
+    old = _read_manifest(folder)
+    for key in header.keys() - {"complete"}:
+        if old[key] != header[key]:
+            raise ValueError(
+                f"{folder} holds a recording with {key} {old[key]}, not {header[key]}: choose another folder"
+            )
+    return old["files"]
+
+
+def _read_manifest(folder: Path) -> dict:
+    """Read and verify the manifest."""
+    path = folder / "manifest.json"
+    if not path.is_file():
+        raise ValueError(f"{path} is missing: expected the folder of a recording (manifest.json, 000000.npz, …)")
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged ({error}): {REMEDY}") from error
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise ValueError(f"{path} is not of the format {FORMAT}: {REMEDY}")
+    if manifest.get("version") != VERSION:
+        raise ValueError(f"{path} has version {manifest.get('version')}, this program reads {VERSION}: {REMEDY}")
+    if manifest.pop("sha256", None) != _digest(manifest):
+        raise ValueError(f"{path} is damaged (its SHA-256 does not fit): delete the folder and {REMEDY}")
+    return manifest
+
+
+def _digest(manifest: dict) -> str:
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _digest_of(path: Path) -> str | None:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+
+
+def _write_manifest(folder: Path, header: dict, files: dict[str, str]) -> None:
+    manifest = header | {"files": files}
+    text = json.dumps(manifest | {"sha256": _digest(manifest)}, indent=1)
+    _write(folder / "manifest.json", text.encode())
+
+
+def _write(path: Path, content: bytes) -> str:
+    """Write `path` whole or not at all; return the SHA-256 of the content."""
+    with atomic_write(path) as handle:
+        handle.write(content)
+    return hashlib.sha256(content).hexdigest()
+
+
+def _npz(arrays: dict[str, np.ndarray]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def _arrays(prediction: PriorPrediction) -> dict[str, np.ndarray]:
+    """Return the arrays of one inference's file; ValueError where a dtype is not the format's."""
+    window = prediction.window
+    arrays = {
+        "inference": np.asarray(window.inference),
+        "views": np.asarray(window.views),
+        "dense": np.asarray(window.dense),
+        "current": np.asarray(window.current),
+    }
+    for key, (dtype, _) in FIELDS.items():
+        arrays[key] = getattr(prediction, key)
+        if arrays[key].dtype != dtype:
+            # A conversion would make the replay differ from the live run.
+            raise ValueError(f"the prior's {key} must be {np.dtype(dtype)}, got {arrays[key].dtype}")
+    return arrays

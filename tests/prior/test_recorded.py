@@ -1,0 +1,207 @@
+"""The recorded format: replay is the live run, and nothing damaged or foreign passes for it."""
+
+import json
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from emgs_jax.prior.base import windows
+from emgs_jax.prior.recorded import Recorded, record
+from emgs_jax.prior.simulated import Simulated
+
+WINDOW_SIZE = 3
+
+
+@pytest.fixture
+def prior(room):
+    return Simulated(seed=5, feature_size=4, classes=room.classes)
+
+
+@pytest.fixture
+def folder(tmp_path, prior, room):
+    record(prior, room, WINDOW_SIZE, tmp_path / "recording")
+    return tmp_path / "recording"
+
+
+def calls(dataset):
+    return [(window, [dataset[i] for i in window.views]) for window in windows(len(dataset), WINDOW_SIZE)]
+
+
+def assert_same_bits(a, b):
+    assert a.window == b.window
+    for name in [field.name for field in fields(a) if field.name != "window"]:
+        x, y = getattr(a, name), getattr(b, name)
+        assert (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes()), name
+
+
+def test_replay_is_the_live_prior_bit_for_bit(folder, prior, room):
+    replay = Recorded(folder)
+    replay.check(room, WINDOW_SIZE)
+    assert replay.provenance == prior.provenance
+    assert replay.feature_names == prior.feature_names
+    assert replay.text_features.tobytes() == prior.text_features.tobytes()
+    for window, frames in calls(room):
+        live = prior.predict(window, frames, room.intrinsics)
+        assert_same_bits(replay.predict(window, frames, room.intrinsics), live)
+
+
+def test_replay_without_features_has_width_0(tmp_path, room):
+    record(Simulated(), room, WINDOW_SIZE, tmp_path)
+    window, frames = calls(room)[0]
+    assert Recorded(tmp_path).predict(window, frames, room.intrinsics).features.shape == (3, 30, 40, 0)
+
+
+def test_nothing_but_the_documented_files_is_left(folder):
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["000000.npz", "000001.npz", "000002.npz", "000003.npz", "manifest.json", "text_features.npz"]
+
+
+class Interrupted(Simulated):
+    """Stops at a given inference, as a user would; counts its calls."""
+
+    stop_at, num_calls = 99, 0
+
+    def predict(self, window, frames, intrinsics):
+        if window.inference == self.stop_at:
+            raise KeyboardInterrupt
+        self.num_calls += 1
+        return super().predict(window, frames, intrinsics)
+
+
+def test_an_interrupted_recording_says_so_and_is_completed_without_repeating_work(tmp_path, folder, room):
+    prior = Interrupted(seed=5, feature_size=4, classes=room.classes)
+    prior.stop_at = 2
+    with pytest.raises(KeyboardInterrupt):
+        record(prior, room, WINDOW_SIZE, tmp_path / "part")
+    with pytest.raises(ValueError, match="2 of 4 inferences.*experiments.predict"):
+        Recorded(tmp_path / "part")
+    prior.stop_at = 99
+    record(prior, room, WINDOW_SIZE, tmp_path / "part")
+    assert prior.num_calls == 4
+    for path in folder.iterdir():
+        assert path.read_bytes() == (tmp_path / "part" / path.name).read_bytes()
+
+
+def test_recording_again_repairs_a_damaged_file_only(folder, room):
+    whole = (folder / "000001.npz").read_bytes()
+    (folder / "000001.npz").write_bytes(whole[:-7])
+    prior = Interrupted(seed=5, feature_size=4, classes=room.classes)
+    record(prior, room, WINDOW_SIZE, folder)
+    assert prior.num_calls == 1
+    assert (folder / "000001.npz").read_bytes() == whole
+
+
+def test_a_folder_of_another_prior_is_not_overwritten(folder, room):
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(ValueError, match="choose another folder"):
+        record(Simulated(seed=6, feature_size=4, classes=room.classes), room, WINDOW_SIZE, folder)
+    assert before == {path: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_prior_of_another_precision_is_refused(tmp_path, room):
+    class Double(Simulated):
+        def predict(self, window, frames, intrinsics):
+            prediction = super().predict(window, frames, intrinsics)
+            return replace(prediction, points=prediction.points.astype(np.float64))
+
+    with pytest.raises(ValueError, match="points must be float32"):
+        record(Double(), room, WINDOW_SIZE, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"sequence": "two"}, "sequence"),
+        ({"name": "tum"}, "name"),
+        ({"size": (32, 24)}, "size"),
+        ({"intrinsics": (50.0, 48.0, 19.25, 15.0)}, "intrinsics"),
+        ({"num_frames": 7}, "num_frames"),
+        ({"fingerprint": lambda: "other"}, "fingerprint"),
+    ],
+)
+def test_a_recording_of_another_sequence_names_what_differs(folder, room, change, key):
+    for name, value in change.items():
+        setattr(room, name, value)
+    with pytest.raises(ValueError, match=f"recorded with {key} .*but this run has"):
+        Recorded(folder).check(room, WINDOW_SIZE)
+
+
+def test_a_recording_with_another_window_size_is_refused(folder, room):
+    with pytest.raises(ValueError, match="window_size 3, but this run has 4"):
+        Recorded(folder).check(room, 4)
+
+
+def test_predict_refuses_another_window_size_or_calibration(folder, room, make_room):
+    replay, (window, frames) = Recorded(folder), calls(room)[1]
+    with pytest.raises(ValueError, match="another window"):
+        replay.predict(replace(window, dense=(0, 1)), frames, room.intrinsics)
+    with pytest.raises(ValueError, match="intrinsics"):
+        replay.predict(window, frames, (1.0, 2.0, 3.0, 4.0))
+    with pytest.raises(ValueError, match="size"):
+        replay.predict(window, [make_room(size=(20, 30))[i] for i in window.views], room.intrinsics)
+    with pytest.raises(ValueError, match="000007.npz is missing"):
+        replay.predict(replace(window, inference=7), frames, room.intrinsics)
+
+
+def test_missing_and_foreign_folders_name_the_path(tmp_path, folder):
+    with pytest.raises(ValueError, match="nowhere.*manifest.json is missing"):
+        Recorded(tmp_path / "nowhere")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps(manifest | {"version": 2}))
+    with pytest.raises(ValueError, match="version 2, this program reads 1"):
+        Recorded(folder)
+    (folder / "manifest.json").write_text(json.dumps(manifest | {"format": "other"}))
+    with pytest.raises(ValueError, match="not of the format"):
+        Recorded(folder)
+    (folder / "manifest.json").write_text("[1, 2]")
+    with pytest.raises(ValueError, match="not of the format"):
+        Recorded(folder)
+
+
+def damaged(content, rng):
+    """Yield 60 versions of `content`: cut short, with one flipped bit, with a run of random bytes."""
+    for _ in range(20):
+        yield content[: rng.integers(len(content))]
+        at, length = int(rng.integers(len(content))), int(rng.integers(1, 40))
+        yield content[:at] + bytes([content[at] ^ (1 << int(rng.integers(8)))]) + content[at + 1 :]
+        yield content[:at] + rng.bytes(length) + content[at + length :]
+
+
+def test_a_damaged_manifest_gives_a_value_error_or_says_the_same(folder):
+    """A flipped bit in the white space between the keys may leave the same content; anything else must be noticed."""
+    path = folder / "manifest.json"
+    whole = path.read_bytes()
+    content = json.loads(whole)
+    noticed = 0
+    for version in damaged(whole, np.random.default_rng(0)):
+        path.write_bytes(version)
+        try:
+            Recorded(folder)
+        except ValueError as error:
+            assert str(path) in str(error)
+            noticed += 1
+        else:
+            assert json.loads(version) == content
+    assert noticed > 50
+
+
+def test_a_damaged_inference_gives_a_value_error_with_the_remedy(folder, room):
+    path, replay, (window, frames) = folder / "000001.npz", Recorded(folder), calls(room)[1]
+    whole = path.read_bytes()
+    for version in damaged(whole, np.random.default_rng(1)):
+        path.write_bytes(version)
+        with pytest.raises(ValueError, match="000001.npz is damaged.*experiments.predict"):
+            replay.predict(window, frames, room.intrinsics)
+
+
+def test_an_array_of_the_wrong_shape_is_refused_even_with_a_fitting_hash(tmp_path, room):
+    class Narrow(Simulated):
+        def predict(self, window, frames, intrinsics):
+            prediction = super().predict(window, frames, intrinsics)
+            return replace(prediction, confidence=prediction.confidence[:, :, 1:])
+
+    record(Narrow(), room, WINDOW_SIZE, tmp_path)
+    window, frames = calls(room)[0]
+    with pytest.raises(ValueError, match=r"confidence must be float32 \(3, 30, 40\), got float32 \(3, 30, 39\)"):
+        Recorded(tmp_path).predict(window, frames, room.intrinsics)

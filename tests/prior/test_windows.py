@@ -1,0 +1,56 @@
+"""The calls that a sequence makes to its prior."""
+
+import pytest
+
+from emgs_jax.prior.base import Window, windows
+
+
+def test_no_frames_give_no_window():
+    assert list(windows(0, 4)) == []
+
+
+def test_one_frame_gives_the_first_window_only():
+    assert list(windows(1, 4)) == [Window(0, (0,), (0,), 0)]
+
+
+def test_five_frames_with_a_window_of_four():
+    assert list(windows(5, 4)) == [
+        Window(0, (0, 1, 2, 3), (0, 1, 2, 3), 3),
+        Window(1, (0, 1, 2, 3, 4), (3, 4), 4),
+    ]
+
+
+def test_twelve_frames_with_a_window_of_four():
+    assert list(windows(12, 4)) == [
+        Window(0, (0, 1, 2, 3), (0, 1, 2, 3), 3),
+        Window(1, (0, 1, 2, 3, 4, 5), (3, 4), 4),
+        Window(2, (0, 1, 2, 3, 4, 5, 6), (4, 5), 5),
+        Window(3, (0, 2, 3, 4, 5, 6, 7), (5, 6), 6),
+        Window(4, (0, 3, 4, 5, 6, 7, 8), (6, 7), 7),
+        Window(5, (0, 4, 5, 6, 7, 8, 9), (7, 8), 8),
+        Window(6, (0, 5, 6, 7, 8, 9, 10), (8, 9), 9),
+        Window(7, (0, 6, 7, 8, 9, 10, 11), (9, 10), 10),
+        Window(8, (0, 7, 8, 9, 10, 11), (10, 11), 11),
+    ]
+
+
+@pytest.mark.parametrize("num_frames", [1, 2, 3, 4, 5, 9, 30])
+@pytest.mark.parametrize("window_size", [1, 2, 4, 10])
+def test_every_frame_is_integrated_once_in_order_and_no_view_is_listed_twice(num_frames, window_size):
+    calls = list(windows(num_frames, window_size))
+    first, steps = calls[0], calls[1:]
+    assert [*first.dense, *(call.current for call in steps)] == list(range(num_frames))
+    assert [call.inference for call in calls] == list(range(len(calls)))
+    for call in calls:
+        assert len(set(call.views)) == len(call.views)
+        assert call.views[0] == 0
+        assert list(call.views) == sorted(call.views)
+        assert set(call.dense) <= set(call.views)
+        assert call.dense[-1] == call.current
+    for call in steps:
+        assert call.dense == (call.current - 1, call.current)
+
+
+def test_a_window_without_images_is_refused():
+    with pytest.raises(ValueError, match="at least 1"):
+        list(windows(5, 0))
