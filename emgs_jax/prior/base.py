@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -57,6 +57,7 @@ class Provenance:
     is_simulated: bool = False
 
 
+@runtime_checkable
 class Prior(Protocol):
     """Anything that predicts geometry from a window of frames. `predict` is deterministic."""
 
