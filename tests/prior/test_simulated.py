@@ -83,15 +83,13 @@ def test_the_geometry_of_a_view_does_not_depend_on_the_other_dense_views(room):
     np.testing.assert_array_equal(one.points[0], two.points[1])
 
 
-def test_one_scale_multiplies_points_and_translations_of_an_inference(room, monkeypatch):
+def test_one_scale_multiplies_points_and_translations_of_an_inference(room):
     """With every other disturbance at zero, what is left is exp N(0, .03²), common to the inference."""
     log_scales = []
     for seed in range(300):
         prior = Simulated(seed=seed)
-        prior.standard = replace(
-            prior.standard, window_translation=0.0, window_rotation=0.0, pair_translation=0.0, pair_rotation=0.0, warp=(0.0, 0.0),
-            pixel=0.0, flying_share=0.0,
-        )  # fmt: skip
+        rigid = dict.fromkeys(["window_translation", "window_rotation", "pair_translation", "pair_rotation"], 0.0)
+        prior.standard = replace(prior.standard, **rigid, warp=(0.0, 0.0), pixel=0.0, flying_share=0.0)
         prediction = ask(prior, room, Window(4, (0, 2, 3), (2, 3), 3))
         scale = prediction.points[0, 10, 10, 2] / room[2].depth[10, 10]
         exact = true_poses(room, prediction.window)
