@@ -1,0 +1,253 @@
+"""How far a reconstructed cloud is from the true one: building both clouds, accuracy, completion, F1, normals."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from emgs_jax.data.base import Frame
+from emgs_jax.evaluation.trajectory import Alignment
+
+_MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """The protocol of a comparison; it is written into every result."""
+
+    protocol: str = "paper: Sim(3) of the trajectory, mean unclipped distances"
+    alignment: str = "sim3"  # or "se3": without the scale
+    voxel_m: float = 0.01  # both clouds are averaged per voxel, so that dense regions do not count more
+    f1_thresholds_m: tuple[float, ...] = (0.20, 0.05)
+    max_normal_angle_deg: float = 30.0
+    normal_radius_px: int = 4
+    normal_step_px: int = 2
+    max_normal_gap: float = 0.10  # relative inverse-depth step to a tap of the normal's window
+    max_normal_residual: float = 0.02  # relative inverse-depth distance of a tap from the fitted plane
+    min_normal_taps: int = 8
+
+    def __post_init__(self):
+        if self.alignment not in ("sim3", "se3"):
+            raise ValueError(f"evaluation.alignment must be sim3 or se3, got {self.alignment!r}")
+        if self.voxel_m <= 0:
+            raise ValueError(f"evaluation.voxel_m must be positive, got {self.voxel_m}")
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points with attributes; float64 rows. A normal of zero is unknown and left out of the normal metrics.
+
+    Args:
+        points: (n, 3), metres.
+        normals: (n, 3), unit length and towards the camera that saw them, or zero.
+        colors: (n, 3), RGB in [0, 1].
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    colors: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def transform_cloud(cloud: PointCloud, alignment: Alignment) -> PointCloud:
+    """Bring a cloud into the reference's frame."""
+    return PointCloud(alignment.apply(cloud.points), cloud.normals @ alignment.rotation.T, cloud.colors)
+
+
+def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
+    """Average all points that share a voxel [m] of the world grid, however they are spread over the clouds.
+
+    Rows come out ordered by cell, so the result is deterministic; points that are not finite are dropped.
+    """
+    keys, sums = np.empty(0, np.int64), np.empty((10, 0))
+    pending: list[tuple[np.ndarray, np.ndarray]] = []
+    for cloud in clouds:
+        pending.append(_cells(cloud, voxel))
+        if sum(len(rows) for rows, _ in pending) > max(_MERGE_ROWS, len(keys)):
+            keys, sums = _merge([(keys, sums), *pending])
+            pending = []
+    _, sums = _merge([(keys, sums), *pending])
+    means = np.ascontiguousarray((sums[:9] / sums[9]).T)
+    length = np.linalg.norm(means[:, 3:6], axis=1, keepdims=True)
+    # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
+    normals = np.where(length > 0.1, means[:, 3:6] / np.maximum(length, 0.1), 0.0)
+    return PointCloud(means[:, :3], normals, means[:, 6:9])
+
+
+def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
+    """Average the points of each voxel [m]; doing it twice changes nothing."""
+    return fuse_clouds([cloud], voxel)
+
+
+def window_normals(points: np.ndarray, valid: np.ndarray, config: EvaluationConfig) -> np.ndarray:
+    """Fit a plane to the window around each pixel of a camera-frame point map (h, w, 3), in camera frame.
+
+    On a plane the inverse depth is affine in the ray's (x/z, y/z), so two weighted least-squares passes over shifted
+    images do: the first takes taps without a depth step to the centre, the second those near the first plane.
+    Returns unit normals towards the camera, float32 (h, w, 3); zero where no plane was found.
+    """
+    valid = valid & np.isfinite(points).all(-1) & (points[..., 2] > 1e-6)
+    z = np.where(valid, points[..., 2], 1.0).astype(np.float32)
+    samples = np.stack([points[..., 0] / z, points[..., 1] / z, 1.0 / z]).astype(np.float32)
+    samples = np.where(valid, samples, 0.0)
+    gaps = config.max_normal_gap * samples[2]
+    slopes, offset, _ = _fit_planes(samples, valid, (np.zeros_like(samples[:2]), np.zeros_like(z), gaps), config)
+    gaps = config.max_normal_residual * samples[2]
+    slopes, offset, good = _fit_planes(samples, valid, (slopes, offset, gaps), config)
+    # samples[2] + offset is the plane's inverse depth at the centre: (slopes, c) · p = 1 for every p on the plane.
+    c = samples[2] + offset - slopes[0] * samples[0] - slopes[1] * samples[1]
+    normals = -np.stack([slopes[0], slopes[1], c], -1)
+    length = np.linalg.norm(normals, axis=-1)
+    good &= valid & (samples[2] + offset > 0) & (length > 1e-12)
+    return np.where(good[..., None], normals / np.where(good, length, 1.0)[..., None], 0.0)
+
+
+def posed_cloud(
+    points: np.ndarray, mask: np.ndarray, image: np.ndarray, T_world_camera: np.ndarray, config: EvaluationConfig
+) -> PointCloud:
+    """Turn a camera-frame point map (h, w, 3) with its image, uint8 (h, w, 3), into a cloud in the world."""
+    mask = mask & np.isfinite(points).all(-1)
+    normals = window_normals(points, mask, config)[mask].astype(np.float64)
+    rotation, translation = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    world = points[mask].astype(np.float64) @ rotation.T + translation
+    return PointCloud(world, normals @ rotation.T, image[mask] / 255.0)
+
+
+def raw_prior_cloud(
+    views: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]], config: EvaluationConfig
+) -> PointCloud:
+    """Accumulate what a prior says, without any mapping: (points, mask, image, T_world_camera) of one view each."""
+    return fuse_clouds((posed_cloud(*view, config) for view in views), config.voxel_m)
+
+
+def ground_truth_cloud(
+    frames: Iterable[Frame], intrinsics: tuple[float, float, float, float], config: EvaluationConfig
+) -> PointCloud:
+    """Back-project true depth with true poses; frames without them contribute nothing."""
+
+    def clouds():
+        for frame in frames:
+            if frame.depth is not None and frame.T_world_camera is not None:
+                points = backproject(frame.depth, intrinsics)
+                yield posed_cloud(points, frame.depth > 0, frame.image, frame.T_world_camera, config)
+
+    return fuse_clouds(clouds(), config.voxel_m)
+
+
+def backproject(depth: np.ndarray, intrinsics: tuple[float, float, float, float]) -> np.ndarray:
+    """Camera-frame points (h, w, 3) of a depth image (h, w); pixel centres at integers."""
+    fx, fy, cx, cy = intrinsics
+    v, u = np.indices(depth.shape)
+    return np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], -1)
+
+
+def reconstruction_metrics(
+    estimate: PointCloud, truth: PointCloud, config: EvaluationConfig
+) -> dict[str, float | int | str | None]:
+    """Compare two clouds in one frame; flat keys, metres and percent.
+
+    Both clouds are averaged per voxel first. Accuracy (estimate → truth) and completion (truth → estimate) are means
+    of the distances to the nearest point, never clipped: one far outlier counts in full. The normal metrics take the
+    nearest neighbours' |cos| and average both directions. Without points the values are None, with a reason.
+    """
+    estimate, truth = voxel_downsample(estimate, config.voxel_m), voxel_downsample(truth, config.voxel_m)
+    names = _metric_names(config)
+    metrics: dict[str, float | int | str | None] = dict.fromkeys(names)
+    metrics["reconstruction/num_points"] = len(estimate)
+    if not len(estimate) or not len(truth):
+        which = "estimate" if not len(estimate) else "ground truth"
+        metrics["reconstruction/reason"] = f"the {which} has no points"
+        return metrics
+    to_truth, partner = _nearest(estimate.points, truth.points)
+    to_estimate, back = _nearest(truth.points, estimate.points)
+    values = [float(to_truth.mean()), float(to_estimate.mean())]
+    for threshold in config.f1_thresholds_m:
+        precision, recall = 100.0 * np.mean(to_truth <= threshold), 100.0 * np.mean(to_estimate <= threshold)
+        f1 = 2.0 * precision * recall / max(precision + recall, 1e-12)
+        values += [float(f1), float(precision), float(recall)]
+    both = [_abs_cosines(estimate.normals, truth.normals[partner]), _abs_cosines(truth.normals, estimate.normals[back])]
+    if all(len(cosines) for cosines in both):
+        limit = np.cos(np.radians(config.max_normal_angle_deg))
+        values.append(100.0 * float(np.mean([cosines.mean() for cosines in both])))
+        values.append(100.0 * float(np.mean([(cosines >= limit).mean() for cosines in both])))
+    else:
+        metrics["reconstruction/reason"] = "no normals to compare"
+    return metrics | dict(zip(names, values, strict=False))
+
+
+def _metric_names(config: EvaluationConfig) -> list[str]:
+    names = ["accuracy_m", "completion_m"]
+    for threshold in config.f1_thresholds_m:
+        names += [f"{kind}_{100 * threshold:g}cm_percent" for kind in ("f1", "precision", "recall")]
+    names += ["normals_abs_cos_percent", f"normals_within_{config.max_normal_angle_deg:g}deg_percent"]
+    return [f"reconstruction/{name}" for name in names]
+
+
+def _nearest(queries: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    # Without balancing and compacting the tree is built, and here even searched, in half the time.
+    return cKDTree(points, balanced_tree=False, compact_nodes=False).query(queries, workers=-1)
+
+
+def _abs_cosines(normals: np.ndarray, others: np.ndarray) -> np.ndarray:
+    known = normals.any(axis=1) & others.any(axis=1)
+    return np.abs(np.einsum("ni,ni->n", normals[known], others[known]))
+
+
+def _fit_planes(
+    samples: np.ndarray,
+    valid: np.ndarray,
+    previous: tuple[np.ndarray, np.ndarray, np.ndarray],
+    config: EvaluationConfig,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit inverse depth = centre's + offset + slopes · (ray − centre's ray) around every pixel of samples (3, h, w).
+
+    Takes the taps within `previous`' gap of its plane (slopes, offset, gap). Returns slopes (2, h, w), offset (h, w)
+    and whether there were enough taps in both directions.
+    """
+    _, h, w = samples.shape
+    slopes, offset, gap = previous
+    radius, step = config.normal_radius_px, config.normal_step_px
+    padded = np.pad(samples, ((0, 0), (radius, radius), (radius, radius)))
+    is_valid = np.pad(valid, radius)
+    shifts = range(0, 2 * radius + 1, step)
+    sums = np.zeros((9, h, w), np.float32)
+    for row, column in ((row, column) for row in shifts for column in shifts):
+        window = (slice(row, row + h), slice(column, column + w))
+        x, y, d = padded[(slice(None), *window)] - samples
+        keep = is_valid[window] & (np.abs(d - offset - slopes[0] * x - slopes[1] * y) <= gap)
+        x, y, d = x * keep, y * keep, d * keep
+        for total, term in zip(sums, (keep, x, y, d, x * x, x * y, y * y, x * d, y * d), strict=True):
+            total += term
+    count = np.maximum(sums[0], 1.0)
+    x, y, d, xx, xy, yy, xd, yd = sums[1:] / count
+    xx, xy, yy, xd, yd = xx - x * x, xy - x * y, yy - y * y, xd - x * d, yd - y * d
+    determinant = xx * yy - xy * xy
+    good = (sums[0] >= config.min_normal_taps) & (determinant > 1e-3 * (xx + yy) ** 2)
+    scale = np.where(good, 1.0 / np.where(good, determinant, 1.0), 0.0)
+    a, b = (yy * xd - xy * yd) * scale, (xx * yd - xy * xd) * scale
+    return np.stack([a, b]), d - a * x - b * y, good
+
+
+def _cells(cloud: PointCloud, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Reduce one cloud to its occupied cells: packed cell numbers (n,), sorted, and sums (10, n), the last a count."""
+    finite = np.isfinite(cloud.points).all(axis=1)
+    points = np.asarray(cloud.points[finite], np.float64)
+    # 21 bits an axis; what is farther than a million voxels shares the border cells.
+    index = np.floor(np.clip(points / voxel, -(2.0**20), 2.0**20 - 1)).astype(np.int64) + 2**20
+    keys = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+    columns = (*points.T, *cloud.normals[finite].T, *cloud.colors[finite].T, np.ones(len(points)))
+    return _merge([(keys, np.stack(columns))])
+
+
+def _merge(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    keys = np.concatenate([keys for keys, _ in tables])
+    sums = np.concatenate([sums for _, sums in tables], axis=1)
+    order = np.argsort(keys, kind="stable")
+    is_first = np.diff(keys[order], prepend=-1) != 0
+    cell = np.empty(len(keys), np.int64)
+    cell[order] = np.cumsum(is_first) - 1
+    unique = keys[order][is_first]
+    return unique, np.stack([np.bincount(cell, column, minlength=len(unique)) for column in sums])

@@ -1,0 +1,176 @@
+"""How far an estimated trajectory is from the true one: association, alignment, absolute and relative errors.
+
+All errors are root mean squares. Poses are `T_world_camera`, float (n, 4, 4), in metres.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+_MIN_SPREAD_M = 1e-6  # below this RMS distance from its centroid a path gives no direction and no scale
+
+
+class DegenerateTrajectoryError(ValueError):
+    """The positions do not determine the alignment that was asked for."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Similarity that maps the estimate's frame to the reference's: y = scale · rotation @ x + translation."""
+
+    scale: float
+    rotation: np.ndarray  # (3, 3), determinant +1
+    translation: np.ndarray  # (3,), metres of the reference
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Map points (..., 3) into the reference's frame."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def apply_to_poses(self, poses: np.ndarray) -> np.ndarray:
+        """Map camera poses (n, 4, 4); the result stays rigid, the scale acts on the positions only."""
+        moved = np.array(poses, np.float64)
+        moved[:, :3, :3] = self.rotation @ moved[:, :3, :3]
+        moved[:, :3, 3] = self.apply(moved[:, :3, 3])
+        return moved
+
+
+def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pair timestamps (n,) and (m,), in seconds, that are each other's nearest within `max_difference`.
+
+    Returns indices into a and into b, int (k,), in the order of a; no index occurs twice.
+    """
+    times_a, times_b = np.asarray(times_a, np.float64), np.asarray(times_b, np.float64)
+    if not len(times_a) or not len(times_b):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    to_b, to_a = _nearest(times_a, times_b), _nearest(times_b, times_a)
+    rows = np.arange(len(times_a))
+    keep = (to_a[to_b] == rows) & (np.abs(times_a - times_b[to_b]) <= max_difference)
+    return rows[keep], to_b[keep]
+
+
+def align(estimate: np.ndarray, reference: np.ndarray, with_scale: bool) -> Alignment:
+    """Find the least-squares similarity (Umeyama 1991) from points (n, 3) to their partners (n, 3).
+
+    Without scale it is the best rigid motion. Of a straight path the roll about the line is arbitrary (the residual
+    is not); `align_poses` takes it from the orientations. Raises DegenerateTrajectoryError.
+    """
+    estimate, reference = _checked(estimate, reference, 3)
+    if with_scale:
+        _require_motion(estimate, "estimate")
+        _require_motion(reference, "reference")
+    centered, target = estimate - estimate.mean(0), reference - reference.mean(0)
+    return _solve(estimate, reference, target.T @ centered / len(estimate), with_scale)
+
+
+def align_poses(estimate: np.ndarray, truth: np.ndarray, with_scale: bool) -> tuple[Alignment, str | None]:
+    """Align poses (n, 4, 4) by their positions, and by their orientations where positions leave something open.
+
+    Unlike `align` this answers for every sequence of at least one pose: on a straight path the orientations decide
+    the roll; without motion, or with fewer than 3 poses, they decide the rotation and the scale stays 1. The second
+    value says so, None in the regular case.
+    """
+    x, y = _checked(np.asarray(estimate)[:, :3, 3], np.asarray(truth)[:, :3, 3], 1)
+    orientations = np.einsum("nij,nkj->ik", np.asarray(truth)[:, :3, :3], np.asarray(estimate)[:, :3, :3]) / len(x)
+    covariance = (y - y.mean(0)).T @ (x - x.mean(0)) / len(x)
+    if len(x) < 3 or min(_spread(x), _spread(y)) < _MIN_SPREAD_M:
+        return _solve(x, y, orientations, False), f"{len(x)} poses without enough motion: aligned by orientation"
+    singular = np.linalg.svd(covariance, compute_uv=False)
+    if singular[1] > 1e-6 * singular[0]:
+        return _solve(x, y, covariance, with_scale), None
+    # A straight path: a term too small to turn the line itself, but the only one that sees the roll about it.
+    rotation = _solve(x, y, covariance + 1e-5 * singular[0] * orientations, False).rotation
+    return _solve(x, y, covariance, with_scale, rotation), "straight path: roll about it aligned by orientation"
+
+
+def ate(estimate: np.ndarray, reference: np.ndarray, alignment: Alignment) -> float:
+    """Root mean square distance [m] of the aligned positions (n, 3) from the reference (n, 3)."""
+    return _rms(np.linalg.norm(alignment.apply(estimate) - reference, axis=-1))
+
+
+def rpe(estimate: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+    """Error of the motion from each pose to the next: RMS translation [m] and RMS rotation [deg].
+
+    The estimate's own scale is kept: this is what an odometry user gets.
+    """
+    moved_estimate = np.linalg.inv(estimate[:-1]) @ estimate[1:]
+    moved_truth = np.linalg.inv(truth[:-1]) @ truth[1:]
+    error = np.linalg.inv(moved_truth) @ moved_estimate
+    return _rms(np.linalg.norm(error[:, :3, 3], axis=-1)), _rms(np.degrees(_angles(error[:, :3, :3])))
+
+
+def trajectory_metrics(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float | int | str | None]:
+    """Compare poses (n, 4, 4) row by row; flat keys. What is not defined is None and `trajectory/reason` says why."""
+    estimate, truth = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
+    if estimate.shape != truth.shape or estimate.shape[1:] != (4, 4):
+        raise ValueError(f"poses must be two equal (n, 4, 4), got {estimate.shape} and {truth.shape}: associate first")
+    names = ("ate_sim3_m", "ate_se3_m", "scale", "scale_percent", "rpe_translation_m", "rpe_rotation_deg")
+    metrics: dict[str, float | int | str | None] = dict.fromkeys(f"trajectory/{name}" for name in names)
+    metrics["trajectory/num_frames"] = len(estimate)
+    try:
+        _checked(estimate.reshape(-1, 16), truth.reshape(-1, 16), 2)
+        metrics["trajectory/rpe_translation_m"], metrics["trajectory/rpe_rotation_deg"] = rpe(estimate, truth)
+        x, y = estimate[:, :3, 3], truth[:, :3, 3]
+        metrics["trajectory/ate_se3_m"] = ate(x, y, align(x, y, with_scale=False))
+        similarity = align(x, y, with_scale=True)
+    except DegenerateTrajectoryError as error:
+        metrics["trajectory/reason"] = str(error)
+        return metrics
+    metrics["trajectory/ate_sim3_m"] = ate(x, y, similarity)
+    scale = similarity.scale
+    metrics["trajectory/scale"] = scale
+    metrics["trajectory/scale_percent"] = 100.0 * min(scale, 1.0 / scale) if scale > 0 else 0.0
+    return metrics
+
+
+def _solve(
+    x: np.ndarray, y: np.ndarray, covariance: np.ndarray, with_scale: bool, rotation: np.ndarray | None = None
+) -> Alignment:
+    """Solve for the rotation (unless given) that maximises trace(Rᵀ · covariance), then scale, then translation."""
+    if rotation is None:
+        u, _, vt = np.linalg.svd(covariance)
+        signs = np.array([1.0, 1.0, 1.0 if np.linalg.det(u @ vt) > 0 else -1.0])  # never a reflection
+        rotation = (u * signs) @ vt
+    scale = 1.0
+    if with_scale:
+        scale = float(np.trace(rotation.T @ covariance)) / _spread(x) ** 2
+    return Alignment(scale, rotation, y.mean(0) - scale * rotation @ x.mean(0))
+
+
+def _checked(estimate: np.ndarray, reference: np.ndarray, minimum: int) -> tuple[np.ndarray, np.ndarray]:
+    estimate, reference = np.asarray(estimate, np.float64), np.asarray(reference, np.float64)
+    if estimate.shape != reference.shape:
+        raise ValueError(f"estimate {estimate.shape} and reference {reference.shape} must match: associate first")
+    if len(estimate) < minimum:
+        raise DegenerateTrajectoryError(f"{len(estimate)} poses, at least {minimum} are needed")
+    if not (np.isfinite(estimate).all() and np.isfinite(reference).all()):
+        raise DegenerateTrajectoryError("a pose is not finite")
+    return estimate, reference
+
+
+def _require_motion(points: np.ndarray, name: str) -> None:
+    if _spread(points) < _MIN_SPREAD_M:
+        raise DegenerateTrajectoryError(f"the {name} does not move: no scale can be estimated")
+
+
+def _nearest(queries: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Index of the value nearest to each query; the earlier in time wins a tie."""
+    order = np.argsort(values, kind="stable")
+    after = np.searchsorted(values[order], queries).clip(1, max(len(values) - 1, 1))
+    before = order[after - 1]
+    after = order[after.clip(max=len(values) - 1)]
+    return np.where(queries - values[before] <= values[after] - queries, before, after)
+
+
+def _spread(points: np.ndarray) -> float:
+    return _rms(np.linalg.norm(points - points.mean(0), axis=-1))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _angles(rotations: np.ndarray) -> np.ndarray:
+    """Rotation angles [rad] of (n, 3, 3); atan2 keeps the digits of small angles that arccos loses."""
+    skew = rotations - np.swapaxes(rotations, -1, -2)
+    sine = 0.5 * np.linalg.norm(np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1), axis=-1)
+    return np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=-2, axis2=-1) - 1.0))
