@@ -1,6 +1,7 @@
 """A folder of images or a video file with known intrinsics; no ground truth, so no metrics."""
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -89,7 +90,7 @@ class Folder:
         self.folder = folder
         self._paths = sorted(found, key=lambda p: (reading.natural_key(p), p.name))
         self.count = len(self._paths)
-        numbers = [reading.last_number(p.stem) for p in self._paths]
+        numbers = [last_number(p.stem) for p in self._paths]
         is_time = all(n is not None and math.isfinite(n) for n in numbers)
         is_time = is_time and all(b > a for a, b in zip(numbers, numbers[1:], strict=False))
         self._times = numbers if is_time else [float(i) for i in range(self.count)]
@@ -156,3 +157,9 @@ class Video:
 
     def label(self, row: int) -> str:
         return f"{self._path}, frame {row}"
+
+
+def last_number(name: str) -> float | None:
+    """The last number in a file name without suffix: 'frame-000012.color' gives 12, '1341841.25' gives 1341841.25."""
+    found = re.findall(r"[0-9]+(?:\.[0-9]+)?", name)
+    return float(found[-1]) if found else None

@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+import os
 import re
 import struct
 import zlib
@@ -27,8 +28,9 @@ def find_sequence(root: str | None, sequence: str | None, layout: str, source: s
         raise ValueError(f"dataset.root is not set: give dataset.root=FOLDER with the layout {layout} ({source})")
     if sequence is None:
         raise ValueError(f"dataset.sequence is not set: give dataset.sequence=NAME of the layout {layout} under {root}")
-    path = Path(root).expanduser() / sequence
-    if not Path(root).expanduser().exists():
+    folder = Path(root).expanduser()
+    path = folder / sequence
+    if not folder.exists():
         raise FileNotFoundError(f"dataset.root={root} does not exist; expected the layout {layout} ({source})")
     if not path.exists():
         near = next(p for p in path.parents if p.is_dir())
@@ -41,12 +43,6 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
     """Sort key under which frame2 comes before frame10."""
     parts = re.split(r"([0-9]+)", path.name.casefold())
     return [(1, int(p), p) if p and p[0] in "0123456789" else (0, 0, p) for p in parts]
-
-
-def last_number(name: str) -> float | None:
-    """The last number in a file name without suffix: 'frame-000012.color' gives 12, '1341841.25' gives 1341841.25."""
-    found = re.findall(r"[0-9]+(?:\.[0-9]+)?", name)
-    return float(found[-1]) if found else None
 
 
 def select(count: int, start: int, stop: int | None, stride: int, where: object) -> range:
@@ -124,10 +120,8 @@ def read_bytes(path: Path) -> bytes:
         return path.read_bytes()
     except FileNotFoundError as error:
         raise BadFrameError(f"{path} is missing: {REMEDY}") from error
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in a name from a damaged list
         raise BadFrameError(f"{path} cannot be read ({error}): {REMEDY}") from error
-    except ValueError as error:  # a zero byte in a name from a damaged list
-        raise BadFrameError(f"{path!r} is no file name: {REMEDY}") from error
 
 
 def read_text(path: Path) -> str:
@@ -237,8 +231,7 @@ def as_pose(text: str, where: object) -> Float[np.ndarray, "4 4"]:
         raise BadFrameError(f"{where} has a pose that is not finite, tracking was lost: set on_bad_frame=skip")
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()
-    is_rigid = off < RIGID_TOLERANCE and np.linalg.det(pose[:3, :3]) > 0 and np.allclose(pose[3], (0, 0, 0, 1))
-    if not is_rigid:
+    if not (off < RIGID_TOLERANCE and np.linalg.det(pose[:3, :3]) > 0 and np.allclose(pose[3], (0, 0, 0, 1))):
         raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded
@@ -248,15 +241,9 @@ def as_pose(text: str, where: object) -> Float[np.ndarray, "4 4"]:
 def fingerprint(root: Path, files: Iterable[Path], options: dict[str, object]) -> str:
     """sha256 over names and sizes of the files and the options; the same on every machine."""
     digest = hashlib.sha256()
-    names = {p.relative_to(root).as_posix() if p.is_relative_to(root) else p.name: file_size(p) for p in files}
-    for item in [*sorted(options.items()), *sorted(names.items())]:
+    files = set(files)
+    names = {p: p.relative_to(root).as_posix() if p.is_relative_to(root) else p.name for p in files}
+    sizes = {names[p]: os.path.getsize(p) if os.path.isfile(p) else -1 for p in files}
+    for item in [*sorted(options.items()), *sorted(sizes.items())]:
         digest.update(repr(item).encode())
     return digest.hexdigest()
-
-
-def file_size(path: Path) -> int:
-    """Bytes of a file, -1 where there is none."""
-    try:
-        return path.stat().st_size
-    except (OSError, ValueError):
-        return -1

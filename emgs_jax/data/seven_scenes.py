@@ -101,6 +101,8 @@ class SevenScenes:
 
 def find_images(folder: Path) -> list[Path]:
     """Colour images in the order of their numbers; where a frame is there as png and as jpg, the png."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder} is no folder; expected the layout {LAYOUT} ({SOURCE})")
     found: dict[float, Path] = {}
     for path in sorted(folder.iterdir(), key=lambda p: p.suffix.lower() == ".png"):
         if re.fullmatch(r"frame-[0-9]+\.color\.(png|jpe?g)", path.name, re.IGNORECASE):
