@@ -1,0 +1,1 @@
+"""Gaussian splatting in pure JAX: project (EWA), tiles (who is where), composite (front to back), one verb `render`."""

@@ -1,0 +1,177 @@
+"""Expectation-maximisation map update (Method D, eq. 2 to 4): aligned points move the Gaussians that explain them."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.linalg import inverse_and_logdet, mahalanobis_sq, outer, principal_axes_2x2, safe_normalize, tangent_basis
+from emgs_jax.neighbours import knn
+from emgs_jax.observation import Observation
+from emgs_jax.pytree import choice, static, traced, where_rows
+
+
+class EmConfig(eqx.Module):
+    """Gates, weights and readings of the update.
+
+    Args:
+        num_neighbours: K, nearest Gaussians per point.
+        min_normal_cos: τ_n, on the mean over the neighbours of n_k · n_i.
+        max_mahalanobis_sq: τ_Σ, on the smallest squared Mahalanobis distance (R1).
+        max_log_gap: τ_π, on the gap between the best explanation and the best possible one; `inf` as printed (R3).
+        determinant_weight: of -log|Σ|; 1 printed, 0.5 a Gaussian's (R2).
+        normal_weight: κ1.
+        feature_weight: κ2.
+        support: δ as `printed`, clipped to 1, or `normalized` by the total responsibility (R5).
+        average: gain and blend (R4, R13).
+        min_responsibility: a Gaussian that receives less in total from a frame is left as it is.
+        min_std: m; floor of the new covariances.
+    """
+
+    num_neighbours: int = static()
+    min_normal_cos: Float[Array, "*b"] = traced()
+    max_mahalanobis_sq: Float[Array, "*b"] = traced()
+    max_log_gap: Float[Array, "*b"] = traced()
+    determinant_weight: Float[Array, "*b"] = traced()
+    normal_weight: Float[Array, "*b"] = traced()
+    feature_weight: Float[Array, "*b"] = traced()
+    support: Float[Array, "*b"] = choice("printed", "normalized")
+    average: AverageConfig
+    min_responsibility: Float[Array, "*b"] = traced()
+    min_std: Float[Array, "*b"] = traced()
+
+
+class EStep(eqx.Module):
+    """Which Gaussians explain which points.
+
+    Args:
+        rows: the K nearest Gaussians of each point.
+        responsibilities: r^ik; a row sums to 1, or is 0 where the point takes no part.
+        is_fused: the points that pass every gate.
+    """
+
+    rows: Int[Array, "m k"]
+    responsibilities: Float[Array, "m k"]
+    is_fused: Bool[Array, "m"]
+
+
+class EmInfo(eqx.Module):
+    """Counts of one update, and the mean log-joint of the fused points."""
+
+    num_points: Int[Array, ""]
+    num_fused: Int[Array, ""]
+    num_updated: Int[Array, ""]
+    mean_log_joint: Float[Array, ""]
+
+
+def e_step(gaussians: Gaussians, points: Observation, config: EmConfig) -> tuple[EStep, Float[Array, "m"]]:
+    """Responsibilities of the K nearest Gaussians for every point (eq. 2 and 3), and each point's best log-joint.
+
+    Args:
+        gaussians: n of them, world frame.
+        points: m observed points, world frame.
+        config: gates and weights.
+    """
+    rows, found = knn(points.points, gaussians.means, gaussians.valid, config.num_neighbours)
+    precisions, logdets = inverse_and_logdet(gaussians.covs)
+    distance_sq = mahalanobis_sq(points.points[:, None] - gaussians.means[rows], precisions[rows])
+    normal_cos = jnp.einsum("mkd,md->mk", gaussians.normals[rows], points.normals)
+    # Features are unit vectors, so their product is the cosine; with width 0 the term must vanish.
+    feature_gap = 0.0
+    if gaussians.features.shape[-1]:
+        feature_gap = jnp.einsum("mkf,mf->mk", gaussians.features[rows], points.features) - 1.0
+    log_det_term = -config.determinant_weight * logdets[rows]
+    log_joint = -0.5 * distance_sq + log_det_term
+    log_joint += config.normal_weight * (normal_cos - 1.0) + config.feature_weight * feature_gap
+
+    has_neighbour = jnp.any(found, axis=-1)
+    some = found | ~has_neighbour[:, None]  # a reduction over nothing has no value; such points are left out below
+    best = jnp.max(jnp.where(some, log_joint, -jnp.inf), axis=-1)
+    log_gap = jnp.max(jnp.where(some, log_det_term, -jnp.inf), axis=-1) - best
+    mean_cos = jnp.sum(jnp.where(found, normal_cos, 0.0), axis=-1) / jnp.maximum(jnp.sum(found, axis=-1), 1)
+    nearest_sq = jnp.min(jnp.where(some, distance_sq, jnp.inf), axis=-1)
+    is_fused = points.valid & has_neighbour & (mean_cos >= config.min_normal_cos)
+    is_fused &= (nearest_sq <= config.max_mahalanobis_sq) & (log_gap <= config.max_log_gap)
+    responsibilities = jax.nn.softmax(log_joint, axis=-1, where=some) * is_fused[:, None]
+    return EStep(rows, responsibilities, is_fused), best
+
+
+def support(
+    gaussians: Gaussians, points: Observation, step: EStep, config: EmConfig
+) -> Float[Array, "n"]:
+    """δ_k in [0, 1]: how evenly the points lie on both sides of the Gaussian along its tangential principal axes.
+
+    For each axis 2 min(Σ₊ r, Σ₋ r), over the total or clipped (R5); the smaller of the two axes.
+    """
+    basis = tangent_basis(gaussians.normals)
+    plane_covs = jnp.einsum("nda,ndc,ncb->nab", basis, gaussians.covs, basis)
+    axes = jnp.einsum("nda,nab->ndb", basis, principal_axes_2x2(plane_covs))
+    offsets = points.points[:, None] - gaussians.means[step.rows]
+    is_positive = jnp.einsum("mkd,mkda->mka", offsets, axes[step.rows]) > 0
+    r = step.responsibilities[..., None]
+    sides = jnp.concatenate([jnp.where(is_positive, r, 0.0), jnp.where(is_positive, 0.0, r)], axis=-1)
+    sums = jnp.zeros((gaussians.valid.shape[0], 4)).at[step.rows].add(sides)
+    smaller = 2.0 * jnp.minimum(sums[:, :2], sums[:, 2:])
+    total = sums[:, :2] + sums[:, 2:]
+    normalized = smaller / jnp.where(total > 0, total, 1.0)
+    both = jnp.where(config.support > 0, normalized, jnp.minimum(smaller, 1.0))
+    return jnp.min(both, axis=-1)
+
+
+def m_step(gaussians: Gaussians, points: Observation, step: EStep, config: EmConfig) -> tuple[Gaussians, Float[Array, "n"]]:
+    """Responsibility-weighted mean, covariance about it, normal and colour of the points of every Gaussian.
+
+    Returns:
+        The new parameters (the old ones where no point is), and the total responsibility Σ_i r_ik.
+    """
+    r = step.responsibilities
+    # Sums of offsets from the old means: second moments of world coordinates would cancel in float32.
+    offsets = points.points[:, None] - gaussians.means[step.rows]
+    rows, columns = jnp.triu_indices(3)
+    products = offsets[..., rows] * offsets[..., columns]
+    others = jnp.broadcast_to(
+        jnp.concatenate([points.normals, points.colors], axis=-1)[:, None], (*r.shape, 6)
+    )
+    statistics = jnp.concatenate([jnp.ones_like(r)[..., None], offsets, products, others], axis=-1)
+    sums = jnp.zeros((gaussians.valid.shape[0], 16)).at[step.rows].add(r[..., None] * statistics)
+    total = sums[:, 0]
+    has_points = total > config.min_responsibility
+    mean = sums[:, 1:] / jnp.where(has_points, total, 1.0)[:, None]
+    second = jnp.zeros((total.shape[0], 3, 3)).at[:, rows, columns].set(mean[:, 3:9])
+    second = second.at[:, columns, rows].set(mean[:, 3:9])
+    new = eqx.tree_at(
+        lambda g: (g.means, g.covs, g.normals, g.colors),
+        gaussians,
+        (
+            gaussians.means + mean[:, :3],
+            second - outer(mean[:, :3]) + config.min_std**2 * jnp.eye(3),
+            safe_normalize(mean[:, 9:12]),
+            mean[:, 12:],
+        ),
+    )
+    return where_rows(has_points, new, gaussians), jnp.where(has_points, total, 0.0)
+
+
+def em_update(
+    submap: GaussianMap, aligned: Observation, config: EmConfig
+) -> tuple[GaussianMap, Bool[Array, "m"], EmInfo]:
+    """One incremental EM step: fuse the points of `aligned` (world frame) that the submap explains.
+
+    Returns:
+        The updated submap, which points were fused, and counts. Without any fused point the submap is unchanged.
+    """
+    gaussians = submap.gaussians
+    step, best = e_step(gaussians, aligned, config)
+    new, total = m_step(gaussians, aligned, step, config)
+    evidence = jnp.where(total > 0, support(gaussians, aligned, step, config), 0.0)
+    updated, gain = update_average(submap, new, evidence, config.average)
+    num_fused = jnp.sum(step.is_fused)
+    info = EmInfo(
+        num_points=jnp.sum(aligned.valid),
+        num_fused=num_fused,
+        num_updated=jnp.sum(gain > 0),
+        mean_log_joint=jnp.sum(jnp.where(step.is_fused, best, 0.0)) / jnp.maximum(num_fused, 1),
+    )
+    return updated, step.is_fused, info

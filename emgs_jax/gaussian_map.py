@@ -1,0 +1,136 @@
+"""The map M: Gaussians of fixed capacity with the weight of their running average, and its submaps."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from emgs_jax.gaussians import Gaussians, blend, empty_gaussians
+from emgs_jax.neighbours import compact_rows
+from emgs_jax.observation import Observation
+from emgs_jax.pytree import choice, put_rows, static, take_rows, traced, where_rows
+
+
+class GaussianMap(eqx.Module):
+    """Gaussians and, for each, the state of its running average.
+
+    Args:
+        gaussians: world frame.
+        weight: what eq. 4 keeps per Gaussian: α_{t-1} for the printed gain, the accumulated support for `count` (R4).
+        num_updates: in how many frames points were fused into it.
+    """
+
+    gaussians: Gaussians
+    weight: Float[Array, "*b n"]
+    num_updates: Int[Array, "*b n"]
+
+
+class AverageConfig(eqx.Module):
+    """How a Gaussian takes up what a frame says of it (eq. 4 and 6).
+
+    Args:
+        gain: `ema_printed`, α_t = δ / (α_{t-1} + δ), an exponential average; or `count`, W += δ, α = δ / W, which
+            tends to the mean of all frames (R4; West 1979).
+        forgetting: factor on the kept α or W before each update; 1 = the printed form.
+        blend: of covariances: `linear` (printed) or `moment_matched` (R13).
+    """
+
+    gain: Float[Array, "*b"] = choice("ema_printed", "count")
+    forgetting: Float[Array, "*b"] = traced()
+    blend: Float[Array, "*b"] = choice("linear", "moment_matched")
+
+
+class SubmapConfig(eqx.Module):
+    """Which part of the map a step works on, and how much room there is.
+
+    Args:
+        voxel_size: m; Gaussians are looked up by the voxel of their mean.
+        margin: m; by which the box round the previous cloud is grown.
+        map_capacity: rows of the map at the start; `slam.run` doubles it when it is full.
+        submap_capacity: rows of a submap at the start; likewise.
+    """
+
+    voxel_size: Float[Array, "*b"] = traced()
+    margin: Float[Array, "*b"] = traced()
+    map_capacity: int = static()
+    submap_capacity: int = static()
+
+
+def empty_map(capacity: int, num_features: int) -> GaussianMap:
+    """A map without a Gaussian."""
+    return GaussianMap(
+        empty_gaussians(capacity, num_features), jnp.zeros(capacity), jnp.zeros(capacity, jnp.int32)
+    )
+
+
+def update_average(
+    map: GaussianMap, new: Gaussians, evidence: Float[Array, "n"], config: AverageConfig
+) -> tuple[GaussianMap, Float[Array, "n"]]:
+    """(1 - α) M + α M_new with the gain α = δ / (forgetting · w + δ) of every Gaussian (eq. 4).
+
+    Args:
+        new: parameters that this frame suggests, row by row.
+        evidence: δ >= 0; a Gaussian without any is left as it is, bit for bit.
+
+    Returns:
+        The map and the gain.
+    """
+    kept = config.forgetting * map.weight + evidence
+    has_evidence = (evidence > 0) & map.gaussians.valid
+    gain = jnp.where(has_evidence, evidence / jnp.where(has_evidence, kept, 1.0), 0.0)
+    weight = jnp.where(has_evidence, jnp.where(config.gain > 0, kept, gain), map.weight)
+    blended = where_rows(has_evidence, blend(map.gaussians, new, gain, config.blend), map.gaussians)
+    return GaussianMap(blended, weight, map.num_updates + has_evidence), gain
+
+
+def select_submap(
+    map: GaussianMap, clouds: tuple[Observation, ...], config: SubmapConfig
+) -> tuple[GaussianMap, Int[Array, "s"], Int[Array, ""]]:
+    """The Gaussians whose voxel lies in the bounding box of the valid points of `clouds`, world-frame observations.
+
+    The paper takes the box of the previous frame's cloud. With wide baselines that misses what only the current frame
+    sees, so the step gives both, the current one at its coarse pose.
+
+    Returns:
+        The submap, its rows in the map (map capacity where there is none), and how many Gaussians did not fit.
+    """
+    points = jnp.concatenate([cloud.points for cloud in clouds])
+    valid = jnp.concatenate([cloud.valid for cloud in clouds])[:, None]
+    low = jnp.min(jnp.where(valid, points, jnp.inf), axis=0) - config.margin
+    high = jnp.max(jnp.where(valid, points, -jnp.inf), axis=0) + config.margin
+    voxels, low, high = (jnp.floor(x / config.voxel_size) for x in (map.gaussians.means, low, high))
+    is_inside = jnp.all((voxels >= low) & (voxels <= high), axis=-1) & map.gaussians.valid
+    rows, exists, overflow = compact_rows(is_inside, config.submap_capacity)
+    submap = take_rows(map, rows)
+    return eqx.tree_at(lambda m: m.gaussians.valid, submap, exists), rows, overflow
+
+
+def write_back(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> GaussianMap:
+    """Put the rows of a submap back into the map that it was taken from."""
+    return put_rows(map, rows, submap)
+
+
+def insert(
+    map: GaussianMap, fresh: Gaussians, weight: Float[Array, "g"]
+) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""]]:
+    """Write the valid rows of `fresh` into free rows of the map.
+
+    Returns:
+        The map, how many were inserted, and how many found no free row.
+    """
+    num_fresh = fresh.valid.shape[0]
+    sources, exists, _ = compact_rows(fresh.valid, num_fresh)
+    free, is_free, _ = compact_rows(~map.gaussians.valid, min(num_fresh, map.weight.shape[0]))
+    free = jnp.pad(free, (0, num_fresh - free.shape[0]), constant_values=map.weight.shape[0])
+    is_free = jnp.pad(is_free, (0, num_fresh - is_free.shape[0]))
+    targets = jnp.where(exists & is_free, free, map.weight.shape[0])
+    new = GaussianMap(fresh, weight, jnp.ones(num_fresh, jnp.int32))
+    overflow = jnp.sum(exists & ~is_free)
+    return put_rows(map, targets, take_rows(new, sources)), jnp.sum(exists & is_free), overflow
+
+
+def grow(map: GaussianMap, capacity: int) -> GaussianMap:
+    """The same map with room for `capacity` Gaussians (host side: the shape changes)."""
+    old = map.weight.shape[0]
+    return put_rows(empty_map(capacity, map.gaussians.features.shape[-1]), jnp.arange(old), map)
+
+

@@ -1,0 +1,140 @@
+"""Gaussians with colour, normal and feature, and how points become them (eq. 1)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.clustering import kmeans, strided_seeds
+from emgs_jax.linalg import inverse_and_logdet, mahalanobis_sq, outer, safe_normalize
+from emgs_jax.neighbours import knn
+from emgs_jax.observation import Observation
+from emgs_jax.pytree import static, take_rows, traced, where_rows
+
+
+class Gaussians(eqx.Module):
+    """A set of Gaussians in the world frame. Invalid rows are neutral: origin, unit covariance, zero normal."""
+
+    means: Float[Array, "*b n 3"]  # μ, m
+    covs: Float[Array, "*b n 3 3"]  # Σ, m²; every eigenvalue is at least min_std²
+    colors: Float[Array, "*b n 3"]  # c, RGB in [0, 1]
+    normals: Float[Array, "*b n 3"]  # n̄, unit
+    features: Float[Array, "*b n f"]  # f, unit; fixed at creation
+    valid: Bool[Array, "*b n"]
+
+
+def empty_gaussians(capacity: int, num_features: int) -> Gaussians:
+    """`capacity` invalid rows."""
+    return Gaussians(
+        means=jnp.zeros((capacity, 3)),
+        covs=jnp.broadcast_to(jnp.eye(3), (capacity, 3, 3)),
+        colors=jnp.zeros((capacity, 3)),
+        normals=jnp.zeros((capacity, 3)),
+        features=jnp.zeros((capacity, num_features)),
+        valid=jnp.zeros(capacity, bool),
+    )
+
+
+class FitConfig(eqx.Module):
+    """How points become Gaussians.
+
+    Args:
+        points_per_gaussian: λ, in pixels of the full image; a new Gaussian stands for so many.
+        num_fit_neighbours: M of eq. 1 (R10).
+        num_kmeans_iterations: of Lloyd's algorithm.
+        min_std: m; floor of a Gaussian's standard deviation in every direction.
+    """
+
+    points_per_gaussian: int = static()
+    num_fit_neighbours: int = static()
+    num_kmeans_iterations: int = static()
+    min_std: Float[Array, "*b"] = traced()
+
+
+def spacing(thin: int, config: FitConfig) -> int:
+    """Rows of a thinned observation that make one Gaussian: λ pixels of the full image."""
+    return max(config.points_per_gaussian // thin**2, 1)
+
+
+def fit_to_points(
+    centers: Float[Array, "k 3"], exists: Bool[Array, "k"], observation: Observation, config: FitConfig
+) -> Gaussians:
+    """Eq. 1: covariance, normal, feature and colour of each centre from its M nearest points.
+
+    The covariance has min_std² added on the diagonal, which keeps every eigenvalue at or above the floor. A centre
+    with fewer than four points becomes invalid.
+    """
+    rows, found = knn(centers, observation.points, observation.valid, config.num_fit_neighbours)
+    valid = exists & (jnp.sum(found, axis=-1) >= 4)
+    found |= ~valid[:, None]  # a softmax over nothing would be NaN; these rows are replaced below
+    near = jax.tree.map(lambda leaf: leaf[rows], observation)
+    count = jnp.maximum(jnp.sum(found, axis=-1), 1)[:, None]
+    offsets = jnp.where(found[..., None], near.points - centers[:, None], 0.0)
+    centered = jnp.where(found[..., None], offsets - (jnp.sum(offsets, axis=1) / count)[:, None], 0.0)
+    covs = jnp.sum(outer(centered), axis=1) / count[..., None] + config.min_std**2 * jnp.eye(3)
+    precisions, _ = inverse_and_logdet(covs)
+
+    log_weights = -0.5 * mahalanobis_sq(offsets, precisions[:, None])
+    weights = jax.nn.softmax(log_weights, axis=-1, where=found)
+    mean_feature = jnp.einsum("km,kmf->kf", weights, near.features)
+    # The medoid: features are never averaged, since a mean of two meanings has none.
+    closeness = jnp.where(found, jnp.einsum("kmf,kf->km", near.features, mean_feature), -jnp.inf)
+    medoid = jnp.argmax(closeness, axis=-1)
+    fitted = Gaussians(
+        means=centers,
+        covs=covs,
+        colors=jnp.einsum("km,kmc->kc", weights, near.colors),
+        normals=safe_normalize(jnp.einsum("km,kmd->kd", weights, near.normals)),
+        features=jnp.take_along_axis(near.features, medoid[:, None, None], axis=1)[:, 0],
+        valid=valid,
+    )
+    return where_rows(valid, fitted, empty_gaussians(centers.shape[0], observation.features.shape[-1]))
+
+
+def cluster(
+    observation: Observation, order: Int[Array, "p"], spacing: int, config: FitConfig
+) -> tuple[Gaussians, Float[Array, "g"]]:
+    """Gaussians of the valid points: k-means from every `spacing`-th point along `order`, then eq. 1.
+
+    The M neighbours of eq. 1 are taken from an even choice of the points in which a cluster has about M of them, so
+    that a Gaussian is as large as its cluster whatever the number of merged images is.
+
+    Returns:
+        ceil(p / spacing) Gaussians, and the number of points of each in units of `spacing`; 0 where invalid.
+    """
+    num_points, num_neighbours = order.shape[0], config.num_fit_neighbours
+    num_seeds = -(-num_points // spacing)
+    seeds, seed_exists = strided_seeds(observation.valid, order, spacing, num_seeds)
+    centers, exists, count = kmeans(
+        observation.points, observation.valid, observation.points[seeds], seed_exists, config.num_kmeans_iterations
+    )
+    stride = max(spacing // num_neighbours, 1)
+    rows, row_exists = strided_seeds(observation.valid, order, stride, -(-num_points // stride))
+    even = take_rows(observation, rows)
+    even = eqx.tree_at(lambda o: o.valid, even, even.valid & row_exists)
+    fitted = fit_to_points(centers, exists, even, config)
+    return fitted, jnp.where(fitted.valid, count / spacing, 0.0)
+
+
+def blend(
+    old: Gaussians, new: Gaussians, gain: Float[Array, "n"], moment_matched: Float[Array, ""]
+) -> Gaussians:
+    """(1 - gain) old + gain new on means, covariances, colours and normals (eq. 4 and 6); features stay (R13).
+
+    Args:
+        moment_matched: 0 = the printed linear blend of covariances; 1 adds gain (1 - gain) Δ Δ' for the means'
+            difference Δ, which makes it the covariance of the moment-matched mixture.
+    """
+    weight = gain[:, None]
+    difference = new.means - old.means
+    spread = moment_matched * (gain * (1.0 - gain))[:, None, None] * outer(difference)
+    return eqx.tree_at(
+        lambda g: (g.means, g.covs, g.colors, g.normals),
+        old,
+        (
+            old.means + weight * difference,
+            old.covs + weight[..., None] * (new.covs - old.covs) + spread,
+            old.colors + weight * (new.colors - old.colors),
+            safe_normalize(old.normals + weight * (new.normals - old.normals)),
+        ),
+    )

@@ -1,0 +1,232 @@
+"""Registration: rigid fits of paired points, and ICP against Gaussians as one Levenberg–Marquardt solve."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.linalg import inverse_and_logdet, mahalanobis_sq, outer, tangent_basis
+from emgs_jax.neighbours import knn
+from emgs_jax.observation import Observation
+from emgs_jax.pytree import choice, static, take_rows, traced
+
+LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
+
+
+class IcpConfig(eqx.Module):
+    """Terms, gates and limits of the solve (R9).
+
+    Args:
+        residual: `colored` (printed): distance to the Gaussian's plane and intensity difference (Park et al.,
+            "Colored point cloud registration revisited", ICCV 2017); `distribution`: offset from the mean, whitened by
+            the Gaussian's covariance; or `colored+distribution`: offset and intensity difference.
+        color_std: standard deviation of intensity.
+        noise_std: m; standard deviation of a predicted point, added to every Gaussian.
+        max_mahalanobis_sq: a point farther from all its neighbours than this is no inlier.
+        min_normal_cos: nor one whose normal differs more from its Gaussian's.
+        num_effective: how many independent measurements the points are worth: their errors are correlated.
+        prior_information: of the coarse pose, in units of one effective point as noisy as the coarse step shows;
+            0 = no prior, the printed form.
+        num_points: how many points take part.
+        num_neighbours: Gaussians that are compared for each point.
+        num_color_neighbours: Gaussians from which a Gaussian's intensity gradient is fitted.
+        max_steps: of the solver.
+        tolerance: relative and absolute, of the solver.
+    """
+
+    residual: Float[Array, "*b"] = choice("colored", "distribution", "colored+distribution")
+    color_std: Float[Array, "*b"] = traced()
+    noise_std: Float[Array, "*b"] = traced()
+    max_mahalanobis_sq: Float[Array, "*b"] = traced()
+    min_normal_cos: Float[Array, "*b"] = traced()
+    num_effective: Float[Array, "*b"] = traced()
+    prior_information: Float[Array, "*b"] = traced()
+    num_points: int = static()
+    num_neighbours: int = static()
+    num_color_neighbours: int = static()
+    max_steps: int = static()
+    tolerance: float = static()
+
+
+class IcpInfo(eqx.Module):
+    """What the solve found.
+
+    Args:
+        num_inliers: points with a Gaussian that passes the gates.
+        inlier_fraction: of the points that take part.
+        residual: m; root mean square distance of the inliers to their Gaussians' planes.
+        min_eigenvalue: smallest eigenvalue of the Hessian, prior included, per effective point (1/m² and 1/rad²).
+        num_steps: of the solver.
+        is_converged: False where the solver reached `max_steps` or failed.
+    """
+
+    num_inliers: Int[Array, ""]
+    inlier_fraction: Float[Array, ""]
+    residual: Float[Array, ""]
+    min_eigenvalue: Float[Array, ""]
+    num_steps: Int[Array, ""]
+    is_converged: Bool[Array, ""]
+
+
+def fit_rigid(
+    source: Float[Array, "p 3"], target: Float[Array, "p 3"], weights: Float[Array, "p"]
+) -> tuple[jaxlie.SE3, Float[Array, ""]]:
+    """Weighted least-squares T_target_source of paired points, and the scale of the similarity that would fit best.
+
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
+    Without weights the identity and 1.
+    """
+    total = jnp.sum(weights)
+    share = weights / jnp.where(total > 0, total, 1.0)
+    source_mean, target_mean = share @ source, share @ target
+    a, b = source - source_mean, target - target_mean
+    u, s, vt = jnp.linalg.svd((share[:, None] * b).T @ a)
+    handed = jnp.array([1.0, 1.0, 1.0]).at[2].set(jnp.sign(jnp.linalg.det(u @ vt)))
+    rotation = jnp.where(total > 0, (u * handed) @ vt, jnp.eye(3))
+    spread = share @ jnp.sum(a * a, axis=-1)
+    scale = jnp.where(spread > 0, (s @ handed) / jnp.where(spread > 0, spread, 1.0), 1.0)
+    T = jaxlie.SE3.from_rotation_and_translation(
+        jaxlie.SO3.from_matrix(rotation), target_mean - rotation @ source_mean
+    )
+    return T, scale
+
+
+def intensity(colors: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
+    """Luminance of RGB."""
+    return colors @ jnp.array(LUMINANCE, colors.dtype)
+
+
+def color_gradients(gaussians: Gaussians, num_neighbours: int) -> Float[Array, "n 3"]:
+    """Intensity gradient (1/m) of every Gaussian in its tangent plane, fitted to its neighbours; orthogonal to n."""
+    rows, found = knn(gaussians.means, gaussians.means, gaussians.valid, num_neighbours)
+    basis = tangent_basis(gaussians.normals)
+    offsets = jnp.einsum("nkd,nda->nka", gaussians.means[rows] - gaussians.means[:, None], basis)
+    offsets = jnp.where(found[..., None], offsets, 0.0)
+    light = intensity(gaussians.colors)
+    moments = jnp.einsum("nka,nkb->nab", offsets, offsets)
+    cross = jnp.einsum("nka,nk->na", offsets, light[rows] - light[:, None])
+    # A hundredth of the spread keeps the fit of collinear neighbours finite.
+    ridge = 0.01 * jnp.trace(moments, axis1=-2, axis2=-1) + 1e-8
+    slopes = jnp.linalg.solve(moments + ridge[:, None, None] * jnp.eye(2), cross[..., None])[..., 0]
+    return jnp.einsum("nda,na->nd", basis, slopes)
+
+
+class _Matches(eqx.Module):
+    """The Gaussian of every point, held fixed while a step is linearised."""
+
+    means: Float[Array, "p 3"]
+    normals: Float[Array, "p 3"]
+    whitening: Float[Array, "p 3 3"]
+    plane_std: Float[Array, "p"]
+    light: Float[Array, "p"]
+    gradients: Float[Array, "p 3"]
+    is_inlier: Bool[Array, "p"]
+
+
+def _match(
+    points: Float[Array, "p 3"], source: Observation, target: Gaussians, gradients: Array, config: IcpConfig
+) -> _Matches:
+    """For each world point the nearest of its neighbouring Gaussians in Mahalanobis distance."""
+    rows, found = knn(points, target.means, target.valid, config.num_neighbours)
+    covs = target.covs[rows] + config.noise_std**2 * jnp.eye(3)
+    precisions, _ = inverse_and_logdet(covs)
+    distance_sq = jnp.where(found, mahalanobis_sq(points[:, None] - target.means[rows], precisions), jnp.inf)
+    best = jnp.argmin(distance_sq, axis=-1)[:, None]
+    row = jnp.take_along_axis(rows, best, axis=1)[:, 0]
+    near = take_rows(target, row)
+    precision = jnp.take_along_axis(precisions, best[..., None, None], axis=1)[:, 0]
+    cov = jnp.take_along_axis(covs, best[..., None, None], axis=1)[:, 0]
+    cos = jnp.sum(near.normals * source.normals, axis=-1)
+    is_near = jnp.take_along_axis(distance_sq, best, axis=1)[:, 0] <= config.max_mahalanobis_sq
+    return _Matches(
+        means=near.means,
+        normals=near.normals,
+        whitening=jnp.swapaxes(jnp.linalg.cholesky(precision), -1, -2),
+        plane_std=jnp.sqrt(jnp.einsum("pi,pij,pj->p", near.normals, cov, near.normals) + 1e-12),
+        light=intensity(near.colors),
+        gradients=gradients[row],
+        is_inlier=source.valid & is_near & (cos >= config.min_normal_cos),
+    )
+
+
+def icp(
+    source: Observation,
+    target: Gaussians,
+    T_world_coarse: jaxlie.SE3,
+    noise: tuple[Float[Array, ""], Float[Array, ""]],
+    config: IcpConfig,
+) -> tuple[jaxlie.SE3, IcpInfo]:
+    """Place camera-frame `source` on the Gaussians `target`: argmin over xi of data + prior, T = T_world_coarse exp(xi).
+
+    The data term is a truncated least-squares sum over the points, scaled so that all of them together weigh as much
+    as `num_effective` independent ones. The prior holds xi at 0 with `prior_information`.
+
+    Args:
+        source: points to align, camera frame.
+        target: Gaussians of the submap, world frame.
+        T_world_coarse: where to start, and the mean of the prior.
+        noise: standard deviation of the coarse pose in metres and radians.
+        config: terms and gates.
+    """
+    stride = max(source.valid.shape[0] // config.num_points, 1)
+    source = jax.tree.map(lambda leaf: leaf[::stride], source)
+    light = intensity(source.colors)
+    # Only where colour counts: the gradients cost a neighbour search over the submap.
+    uses_plane, uses_color, uses_distribution = config.residual == 0, config.residual != 1, config.residual >= 1
+    gradients = jax.lax.cond(
+        uses_color,
+        lambda: color_gradients(target, config.num_color_neighbours),
+        lambda: jnp.zeros_like(target.means),
+    )
+    share = jnp.sqrt(config.num_effective / jnp.maximum(jnp.sum(source.valid), 1))
+    prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack(noise), 3)
+
+    def place(xi: Float[Array, "6"]) -> tuple[jaxlie.SE3, Float[Array, "p 3"], Float[Array, "p 3"]]:
+        T = T_world_coarse @ jaxlie.SE3.exp(xi)
+        rotation = T.rotation().as_matrix()
+        return T, source.points @ rotation.T + T.translation(), source.normals @ rotation.T
+
+    def matches(points: Float[Array, "p 3"], normals: Float[Array, "p 3"]) -> _Matches:
+        world = eqx.tree_at(lambda o: o.normals, source, normals)
+        return jax.lax.stop_gradient(_match(points, world, target, gradients, config))
+
+    def residuals(xi: Float[Array, "6"], _: None) -> tuple[Float[Array, "p 5"], Float[Array, "6"]]:
+        _, points, normals = place(xi)
+        match = matches(jax.lax.stop_gradient(points), jax.lax.stop_gradient(normals))
+        offset = points - match.means
+        plane = jnp.sum(offset * match.normals, axis=-1) / match.plane_std
+        shade = (match.light + jnp.sum(match.gradients * offset, axis=-1) - light) / config.color_std
+        white = jnp.einsum("pij,pj->pi", match.whitening, offset)
+        # A point beyond the gate costs what it would at the gate and pulls nowhere.
+        edge = jnp.sqrt(config.max_mahalanobis_sq)
+        rows = jnp.concatenate(
+            [
+                uses_plane * jnp.where(match.is_inlier, plane, edge)[:, None],
+                uses_color * jnp.where(match.is_inlier, jnp.clip(shade, -edge, edge), edge)[:, None],
+                uses_distribution * jnp.where(match.is_inlier[:, None], white, edge / jnp.sqrt(3.0)),
+            ],
+            axis=-1,
+        )
+        return share * jnp.where(source.valid[:, None], rows, 0.0), prior * xi
+
+    solver = optx.LevenbergMarquardt(rtol=config.tolerance, atol=config.tolerance)
+    solution = optx.least_squares(residuals, solver, jnp.zeros(6), max_steps=config.max_steps, throw=False)
+    xi = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, 0.0)
+    T, points, normals = place(xi)
+    match = matches(points, normals)
+    num_inliers = jnp.sum(match.is_inlier)
+    distance = jnp.where(match.is_inlier, jnp.sum((points - match.means) * match.normals, axis=-1), 0.0)
+    jacobian = jnp.concatenate([x.reshape(-1, 6) for x in jax.jacfwd(residuals)(xi, None)])
+    hessian = jacobian.T @ jacobian / jnp.maximum(config.num_effective, 1.0)
+    info = IcpInfo(
+        num_inliers=num_inliers,
+        inlier_fraction=num_inliers / jnp.maximum(jnp.sum(source.valid), 1),
+        residual=jnp.sqrt(jnp.sum(distance**2) / jnp.maximum(num_inliers, 1)),
+        min_eigenvalue=jnp.linalg.eigvalsh(hessian)[0],
+        num_steps=solution.stats["num_steps"],
+        is_converged=solution.result == optx.RESULTS.successful,
+    )
+    return T, info

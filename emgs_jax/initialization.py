@@ -1,0 +1,35 @@
+"""Initialisation (Method B): the map from the merged predictions of the first window."""
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from emgs_jax.camera import Camera
+from emgs_jax.clustering import morton_order
+from emgs_jax.gaussians import FitConfig, Gaussians, cluster, spacing
+from emgs_jax.observation import Observation, transform
+
+
+def initialize(
+    views: Observation, T_world_views: jaxlie.SE3, camera: Camera, thin: int, config: FitConfig
+) -> tuple[Gaussians, Float[Array, "g"], Observation]:
+    """Cluster the merged points of all views: K = num_points / (λ · num_views) Gaussians.
+
+    Args:
+        views: camera frames, v views of p points each.
+        T_world_views: the prior's poses, which are the map's by construction.
+        camera: of the thinned rows.
+        thin: the observations' thinning.
+        config: λ and how points become Gaussians.
+
+    Returns:
+        The Gaussians, their number of points in units of λ, and the views in the world frame.
+    """
+    world = jax.vmap(lambda T, view: transform(T, view, jnp.ones(())))(T_world_views, views)
+    num_views, num_points = views.valid.shape
+    order = morton_order(camera.height, camera.width)
+    order = (jnp.arange(num_views)[:, None] * num_points + order).reshape(-1)
+    merged = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), world)
+    gaussians, weight = cluster(merged, order, spacing(thin, config) * num_views, config)
+    return gaussians, weight * num_views, world

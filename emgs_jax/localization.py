@@ -1,0 +1,258 @@
+"""Localization (Method C): where the current frame is, first through the previous frame, then against the map."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.camera import Camera, project
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.icp import IcpConfig, IcpInfo, fit_rigid, icp
+from emgs_jax.observation import Observation, Prediction, transform
+from emgs_jax.pytree import choice, stack, traced
+
+# Bits of LocalizationInfo.reason; the words are for people.
+REASONS = (
+    "the prediction has no valid point or pose",
+    "too few points agree with the map",
+    "the residual against the map is too large",
+    "the fine pose is too far from the coarse one",
+    "the geometry does not determine the pose",
+)
+MIN_PAIRS = 16  # points predicted twice, under which the previous pose is taken as it is
+
+
+class LocalizationConfig(eqx.Module):
+    """The coarse step's reading (R7, R8), the fine step (R9) and what a pose must pass.
+
+    Args:
+        coarse: `via_previous` (printed): closest points in the previous image carry over to its earlier prediction;
+            `same_image`: the two predictions of the previous image directly; `anchored`: the prior's own pose;
+            `fused`: `same_image` and `anchored` by their uncertainties.
+        coarse_scale: `none` (printed), `ratio` (median ratio of the depths that were predicted twice) or
+            `estimated` (similarity fit).
+        scale_memory: power on the estimated scale; below 1 it is pulled towards the prior's own.
+        max_pair_distance: m; farther points are no pair.
+        anchor_noise: of `fused`: variance of the prior's own pose near the anchor, over that of the chain.
+        anchor_range: m; of `fused`: distance from the anchor at which its standard deviation has doubled.
+        icp: the fine step.
+        min_inlier_fraction: of the points, below which the fine pose is not accepted.
+        max_residual: m; root mean square distance to the map's planes.
+        max_step_m: between the coarse and the fine pose.
+        max_step_rad: likewise.
+        min_eigenvalue: of the Hessian, see `IcpInfo`.
+    """
+
+    coarse: Float[Array, "*b"] = choice("via_previous", "same_image", "anchored", "fused")
+    coarse_scale: Float[Array, "*b"] = choice("none", "ratio", "estimated")
+    scale_memory: Float[Array, "*b"] = traced()
+    max_pair_distance: Float[Array, "*b"] = traced()
+    anchor_noise: Float[Array, "*b"] = traced()
+    anchor_range: Float[Array, "*b"] = traced()
+    icp: IcpConfig
+    min_inlier_fraction: Float[Array, "*b"] = traced()
+    max_residual: Float[Array, "*b"] = traced()
+    max_step_m: Float[Array, "*b"] = traced()
+    max_step_rad: Float[Array, "*b"] = traced()
+    min_eigenvalue: Float[Array, "*b"] = traced()
+
+
+class CoarsePose(eqx.Module):
+    """Result of the coarse step.
+
+    Args:
+        T_world_camera: of the current frame.
+        T_world_newest: temporary pose of the newest image (the current one's where there is none).
+        scale: by which this prediction is multiplied about its cameras' origins.
+        repeat_rms: m; disagreement of the two predictions of the previous image, after alignment.
+        mean_depth: m; of the previous image.
+        is_usable: False where the prediction has no valid point or pose.
+    """
+
+    T_world_camera: jaxlie.SE3
+    T_world_newest: jaxlie.SE3
+    scale: Float[Array, ""]
+    repeat_rms: Float[Array, ""]
+    mean_depth: Float[Array, ""]
+    is_usable: Bool[Array, ""]
+
+
+class LocalizationInfo(eqx.Module):
+    """Outcome of one frame.
+
+    Args:
+        is_tracked: the fine pose passed every check.
+        is_lost: not even the coarse pose is known.
+        reason: bits into `REASONS`; 0 for a tracked frame.
+        scale: of this prediction.
+        repeat_rms: see `CoarsePose`.
+        step_m: between the coarse and the fine pose.
+        step_rad: likewise.
+        icp: of the fine step.
+    """
+
+    is_tracked: Bool[Array, ""]
+    is_lost: Bool[Array, ""]
+    reason: Int[Array, ""]
+    scale: Float[Array, ""]
+    repeat_rms: Float[Array, ""]
+    step_m: Float[Array, ""]
+    step_rad: Float[Array, ""]
+    icp: IcpInfo
+
+
+def median(values: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
+    """Lower median of the valid values; 1 without any."""
+    count = jnp.sum(valid)
+    ordered = jnp.sort(jnp.where(valid, values, jnp.inf))
+    return jnp.where(count > 0, ordered[jnp.maximum(count - 1, 0) // 2], 1.0)
+
+
+def pose_row(poses: jaxlie.SE3, row: int | Int[Array, ""]) -> jaxlie.SE3:
+    """One pose of a batch."""
+    return jaxlie.SE3(poses.wxyz_xyz[row])
+
+
+def scale_translation(T: jaxlie.SE3, scale: Float[Array, ""]) -> jaxlie.SE3:
+    """The pose with its translation multiplied."""
+    return jaxlie.SE3.from_rotation_and_translation(T.rotation(), scale * T.translation())
+
+
+def _repeat_scale(
+    now: Observation, before: Observation, T_world_previous: jaxlie.SE3, paired: Array, config: LocalizationConfig
+) -> Float[Array, ""]:
+    """Scale of this prediction relative to the map, from the image that was predicted twice (R8)."""
+    depth_now = now.points[:, 2]
+    depth_before = ((before.points - T_world_previous.translation()) @ T_world_previous.rotation().as_matrix())[:, 2]
+    ratio = median(depth_before / jnp.where(paired, depth_now, 1.0), paired)
+    _, similarity = fit_rigid(now.points, before.points, paired.astype(jnp.float32))
+    scale = jnp.stack([jnp.ones(()), ratio, similarity])[config.coarse_scale.astype(jnp.int32)]
+    return jnp.where(jnp.isfinite(scale) & (scale > 0.1), scale, 1.0) ** config.scale_memory
+
+
+def _align_pairs(
+    source: Float[Array, "p 3"], target: Float[Array, "p 3"], paired: Bool[Array, "p"], start: jaxlie.SE3
+) -> jaxlie.SE3:
+    """Rigid fit of pairs, robust by three reweightings around the median distance; `start` with too few pairs."""
+    T = start
+    for _ in range(3):
+        distance = jnp.linalg.norm(source @ T.rotation().as_matrix().T + T.translation() - target, axis=-1)
+        spread = jnp.maximum(median(distance, paired), 1e-6)
+        weights = jnp.where(paired, 1.0 / (1.0 + (distance / (2.0 * spread)) ** 2), 0.0)
+        T, _ = fit_rigid(source, target, weights)
+    keep = jnp.sum(paired) >= MIN_PAIRS
+    return jaxlie.SE3(jnp.where(keep, T.wxyz_xyz, start.wxyz_xyz))
+
+
+def _via_previous(
+    prediction: Prediction,
+    previous: Observation,
+    paired: Bool[Array, "p"],
+    scale: Float[Array, ""],
+    motion: tuple[jaxlie.SE3, jaxlie.SE3],
+    camera: Camera,
+    config: LocalizationConfig,
+) -> jaxlie.SE3:
+    """The printed chain (R7): current point -> closest point of the previous image now -> the same pixel before.
+
+    The closest point is looked up by projection, which needs no tree. `motion` is T_world_previous and
+    T_previous_current of the prior, where the search starts.
+    """
+    now, current = prediction.previous, prediction.current
+    seen = transform(motion[1], current, scale)
+    pixels, depth = project(camera, seen.points)
+    columns, rows = jnp.round(pixels[:, 0]).astype(jnp.int32), jnp.round(pixels[:, 1]).astype(jnp.int32)
+    inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height) & (depth > 0)
+    match = jnp.where(inside, rows * camera.width + columns, 0)
+    is_close = jnp.linalg.norm(seen.points - scale * now.points[match], axis=-1) <= config.max_pair_distance
+    via = inside & is_close & paired[match] & current.valid
+    return _align_pairs(scale * current.points, previous.points[match], via, motion[0] @ motion[1])
+
+
+def _interpolate(start: jaxlie.SE3, end: jaxlie.SE3, share: Float[Array, ""]) -> jaxlie.SE3:
+    return start @ jaxlie.SE3.exp(share * (start.inverse() @ end).log())
+
+
+def localize_coarse(
+    prediction: Prediction,
+    previous: Observation,
+    T_world_previous: jaxlie.SE3,
+    camera: Camera,
+    config: LocalizationConfig,
+) -> CoarsePose:
+    """Coarse registration through the previous frame, which was predicted twice, fused with the prior's own pose.
+
+    Args:
+        prediction: of this call.
+        previous: the previous frame as it was aligned with the map, world frame.
+        T_world_previous: its pose.
+        camera: of the (thinned) rows.
+        config: readings.
+    """
+    now = prediction.previous
+    paired = now.valid & previous.valid
+    scale = _repeat_scale(now, previous, T_world_previous, paired, config)
+    views = prediction.T_world_views
+    raw_previous, raw_current = pose_row(views, 0), pose_row(views, 1)
+    T_previous_current = scale_translation(raw_previous.inverse() @ raw_current, scale)
+    T_current_newest = scale_translation(raw_current.inverse() @ pose_row(views, 2), scale)
+
+    same_image = _align_pairs(scale * now.points, previous.points, paired, T_world_previous) @ T_previous_current
+    via_previous = _via_previous(prediction, previous, paired, scale, (T_world_previous, T_previous_current), camera, config)
+    anchor = prediction.T_world_anchor
+    anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, scale)
+    reach = 1.0 + jnp.linalg.norm(anchored.translation() - anchor.translation()) / config.anchor_range
+    fused = _interpolate(same_image, anchored, 1.0 / (1.0 + config.anchor_noise * reach**2))
+    forms = stack([via_previous, same_image, anchored, fused])
+    coarse = pose_row(forms, config.coarse.astype(jnp.int32))
+
+    rotation, origin = T_world_previous.rotation().as_matrix(), T_world_previous.translation()
+    repeat_sq = jnp.sum((scale * now.points @ rotation.T + origin - previous.points) ** 2, axis=-1)
+    # 1.4826 makes the median absolute deviation a standard deviation (Gaussian errors).
+    # Without a pair nothing is known, and the pairing distance stands in.
+    repeat_rms = 1.4826 * jnp.sqrt(jnp.where(jnp.any(paired), median(repeat_sq, paired), config.max_pair_distance**2))
+    is_finite = jnp.all(jnp.isfinite(coarse.wxyz_xyz))
+    coarse = jaxlie.SE3(jnp.where(is_finite, coarse.wxyz_xyz, T_world_previous.wxyz_xyz))
+    newest = coarse @ T_current_newest
+    newest = jaxlie.SE3(jnp.where(prediction.has_newest & is_finite, newest.wxyz_xyz, coarse.wxyz_xyz))
+    is_usable = is_finite & (jnp.sum(prediction.current.valid) >= MIN_PAIRS)
+    return CoarsePose(coarse, newest, scale, repeat_rms, median(now.points[:, 2], now.valid), is_usable)
+
+
+def localize_fine(
+    current: Observation, submap: Gaussians, coarse: CoarsePose, config: LocalizationConfig
+) -> tuple[jaxlie.SE3, Observation, LocalizationInfo]:
+    """Fine registration against the submap without scale; the coarse pose stays where a check fails.
+
+    Args:
+        current: camera frame, unscaled.
+        submap: Gaussians, world frame.
+        coarse: result of `localize_coarse`.
+        config: terms, gates and checks.
+
+    Returns:
+        T_world_camera, the observation in the world frame, and the outcome.
+    """
+    scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
+    # The coarse pose is as good as two predictions of one image agree; a millimetre keeps the solve well scaled.
+    noise_m = jnp.maximum(coarse.repeat_rms, 1e-3)
+    fine, info = icp(scaled, submap, coarse.T_world_camera, (noise_m, noise_m / coarse.mean_depth), config.icp)
+    step = (coarse.T_world_camera.inverse() @ fine).log()
+    step_m, step_rad = jnp.linalg.norm(step[:3]), jnp.linalg.norm(step[3:])
+    failed = jnp.stack(
+        [
+            ~coarse.is_usable,
+            ~(info.inlier_fraction >= config.min_inlier_fraction),
+            ~(info.residual <= config.max_residual),
+            ~((step_m <= config.max_step_m) & (step_rad <= config.max_step_rad)),
+            ~(info.min_eigenvalue >= config.min_eigenvalue),
+        ]
+    )
+    is_tracked = ~jnp.any(failed)
+    T = jaxlie.SE3(jnp.where(is_tracked, fine.wxyz_xyz, coarse.T_world_camera.wxyz_xyz))
+    aligned = transform(T, current, coarse.scale)
+    aligned = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & coarse.is_usable)
+    bits = jnp.sum(failed * 2 ** jnp.arange(failed.shape[0]))
+    return T, aligned, LocalizationInfo(
+        is_tracked, ~coarse.is_usable, bits, coarse.scale, coarse.repeat_rms, step_m, step_rad, info
+    )

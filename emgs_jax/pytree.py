@@ -1,0 +1,64 @@
+"""Config fields and row operations that every other file uses."""
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+Tree = TypeVar("Tree")
+Scalar = Float[Array, "*batch"]  # a traced number of a config; `*batch` when configs are stacked for a sweep
+
+
+def _as_float32(value: Any) -> Any:
+    # Without the conversion, YAML's `1` and `1.0` would be two dtypes and hence two compilations.
+    return value if isinstance(value, jax.ShapeDtypeStruct) else jnp.asarray(value, jnp.float32)
+
+
+def traced() -> Any:
+    """A config field that is a number of the computation: changing it compiles nothing."""
+    return eqx.field(converter=_as_float32)
+
+
+def choice(*names: str) -> Any:
+    """A traced config field that is written as one of `names` and held as its position, so that readings can be swept."""
+
+    def convert(value: Any) -> Any:
+        if isinstance(value, str):
+            if value not in names:
+                raise ValueError(f"must be one of {', '.join(names)}; got {value!r}")
+            value = names.index(value)
+        return _as_float32(value)
+
+    return eqx.field(converter=convert, metadata={"choices": names})
+
+
+def static() -> Any:
+    """A config field that is a shape, a loop bound or a choice of code: each value compiles once."""
+    return eqx.field(static=True)
+
+
+def take_rows(tree: Tree, rows: Int[Array, "r"]) -> Tree:
+    """Rows of every leaf; a row number past the end gives the last row, to be masked by the caller."""
+    return jax.tree.map(lambda leaf: jnp.take(leaf, rows, axis=0, mode="clip"), tree)
+
+
+def put_rows(tree: Tree, rows: Int[Array, "r"], values: Tree) -> Tree:
+    """Write `values` into `rows` of every leaf; a row number past the end is dropped."""
+    return jax.tree.map(lambda leaf, value: leaf.at[rows].set(value, mode="drop"), tree, values)
+
+
+def where_rows(mask: Bool[Array, "n"], yes: Tree, no: Tree) -> Tree:
+    """Choose whole rows by `mask`."""
+
+    def choose(a: Array, b: Array) -> Array:
+        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(choose, yes, no)
+
+
+def stack(trees: Sequence[Tree]) -> PyTree:
+    """Stack the leaves of equal trees along a new first axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)

@@ -1,0 +1,148 @@
+"""Rasterisation-based refinement (Method D, eq. 5 and 6): what EM left over is merged on the image plane or is new."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.camera import Camera
+from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.linalg import inverse_2x2, mahalanobis_sq, outer, safe_normalize
+from emgs_jax.neighbours import knn
+from emgs_jax.pytree import static, traced, where_rows
+from emgs_jax.render.composite import RenderConfig, Rendering, render
+from emgs_jax.render.project import Splats, project_gaussians
+
+
+class RefinementConfig(eqx.Module):
+    """Association on the image plane.
+
+    Args:
+        num_candidates: K_2D, map Gaussians per candidate.
+        max_mahalanobis_sq_2d: τ_Σ2D, on the squared distance under both covariances (R1).
+        front_margin: fraction of the depth by which a candidate may lie in front of the map and still be merged; 0 as
+            printed (R6).
+        back_margin: likewise behind it; `inf` as printed.
+        render: how both sets are drawn.
+        average: gain and blend, those of the EM step.
+    """
+
+    num_candidates: int = static()
+    max_mahalanobis_sq_2d: Float[Array, "*b"] = traced()
+    front_margin: Float[Array, "*b"] = traced()
+    back_margin: Float[Array, "*b"] = traced()
+    render: RenderConfig
+    average: AverageConfig
+
+
+class RefinementInfo(eqx.Module):
+    """Counts of one refinement; `overflow` is the number of splats that found their tile full."""
+
+    num_candidates: Int[Array, ""]
+    num_merged: Int[Array, ""]
+    num_fresh: Int[Array, ""]
+    overflow: Int[Array, ""]
+
+
+def depth_at(rendering: Rendering, splats: Splats, camera: Camera) -> Float[Array, "g"]:
+    """Rendered depth at the pixel of every splat's mean; 0 where the map has none or the mean is outside the image."""
+    pixels = jnp.round(splats.means).astype(jnp.int32)
+    inside = splats.valid & jnp.all((pixels >= 0) & (pixels < jnp.array([camera.width, camera.height])), axis=-1)
+    column, row = jnp.where(inside[:, None], pixels, 0).T
+    return jnp.where(inside, rendering.depth[row, column], 0.0)
+
+
+def match_on_image(
+    map_splats: Splats, candidate_splats: Splats, visible: Bool[Array, "n"], config: RefinementConfig
+) -> tuple[Int[Array, "g k"], Float[Array, "g k"], Bool[Array, "g k"]]:
+    """The K_2D nearest visible map splats of every candidate, and the squared distance under Σ_map + Σ_candidate."""
+    rows, found = knn(candidate_splats.means, map_splats.means, visible, config.num_candidates)
+    covs = map_splats.covs[rows] + candidate_splats.covs[:, None]
+    offsets = map_splats.means[rows] - candidate_splats.means[:, None]
+    return rows, mahalanobis_sq(offsets, inverse_2x2(covs)), found
+
+
+def average_candidates(
+    candidates: Gaussians, rows: Int[Array, "g k"], weights: Float[Array, "g k"], old: Gaussians
+) -> Gaussians:
+    """ω-weighted average of the candidates that merge into each map Gaussian; the old values where none does.
+
+    The covariance is that of the mixture: mean covariance plus the spread of the candidates' means.
+    """
+    size = old.valid.shape[0]
+
+    def total(values: Float[Array, "g k *d"]) -> Float[Array, "n *d"]:
+        return jnp.zeros((size, *values.shape[2:])).at[rows].add(values)
+
+    sums = total(weights)
+    share = weights / jnp.where(sums > 0, sums, 1.0)[rows]
+    offsets = candidates.means[:, None] - old.means[rows]
+    mean_offset = total(share[..., None] * offsets)
+    around = offsets - mean_offset[rows]
+    covs = total(share[..., None, None] * (candidates.covs[:, None] + outer(around)))
+    averaged = eqx.tree_at(
+        lambda g: (g.means, g.covs, g.colors, g.normals),
+        old,
+        (
+            old.means + mean_offset,
+            covs,
+            total(share[..., None] * candidates.colors[:, None]),
+            safe_normalize(total(share[..., None] * candidates.normals[:, None])),
+        ),
+    )
+    return where_rows(sums > 0, averaged, old)
+
+
+def refine(
+    submap: GaussianMap, candidates: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, config: RefinementConfig
+) -> tuple[GaussianMap, Gaussians, RefinementInfo]:
+    """Merge candidates with the map where both show the same surface; the rest is fresh.
+
+    A candidate on a pixel without map depth is fresh. Otherwise it merges with those of its K_2D closest map Gaussians
+    that pass the distance gate, unless it lies in front of the map (or behind it) by more than the margin.
+
+    Args:
+        submap: what is seen, world frame.
+        candidates: Gaussians of the points that EM did not fuse.
+        T_world_camera: refined pose.
+        camera: of the images that are rendered.
+        config: gates and margins.
+
+    Returns:
+        The submap with merged candidates, the candidates with only the fresh ones valid, and counts.
+    """
+    old = submap.gaussians
+    scale, blur = config.render.covariance_scale, config.render.blur
+    rendering = render(old, jnp.zeros((old.valid.shape[0], 0)), T_world_camera, camera, config.render)
+    map_splats = project_gaussians(old, T_world_camera, camera, scale, blur)
+    candidate_splats = project_gaussians(candidates, T_world_camera, camera, scale, blur)
+
+    map_depth = depth_at(rendering, candidate_splats, camera)
+    # Only what the image shows can be matched: a Gaussian behind the rendered surface is occluded.
+    own_depth = depth_at(rendering, map_splats, camera)
+    reach = config.render.radius * map_splats.depth_std
+    visible = map_splats.valid & (own_depth > 0) & (map_splats.depth <= own_depth + reach)
+    rows, distance_sq, found = match_on_image(map_splats, candidate_splats, visible, config)
+
+    relative = candidate_splats.depth / jnp.where(map_depth > 0, map_depth, 1.0) - 1.0
+    on_surface = (map_depth > 0) & (relative >= -config.front_margin) & (relative <= config.back_margin)
+    is_match = found & candidates.valid[:, None] & on_surface[:, None]
+    is_match &= distance_sq < config.max_mahalanobis_sq_2d
+    similarity = jnp.ones_like(distance_sq)
+    if old.features.shape[-1]:
+        cosine = jnp.einsum("gkf,gf->gk", old.features[rows], candidates.features)
+        similarity = jnp.maximum(cosine, 0.0)  # opposite meanings do not merge
+    omega = jax.nn.softmax(-0.5 * distance_sq, axis=-1, where=found | ~jnp.any(found, -1, keepdims=True)) * similarity
+    omega = jnp.where(is_match, omega, 0.0)
+
+    averaged = average_candidates(candidates, rows, omega, old)
+    evidence = jnp.zeros(old.valid.shape[0]).at[rows].max(omega)
+    merged, _ = update_average(submap, averaged, evidence, config.average)
+    is_merged = jnp.any(omega > 0, axis=-1)
+    fresh = eqx.tree_at(lambda g: g.valid, candidates, candidates.valid & ~is_merged)
+    info = RefinementInfo(
+        jnp.sum(candidates.valid), jnp.sum(is_merged), jnp.sum(fresh.valid), rendering.overflow
+    )
+    return merged, fresh, info

@@ -1,0 +1,130 @@
+"""Front-to-back compositing of one tile, and the image from all of them."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float, Int
+
+from emgs_jax.camera import Camera
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.pytree import static, take_rows, traced
+from emgs_jax.render.project import Splats, project_gaussians
+from emgs_jax.render.tiles import assign_tiles, tile_corners
+
+
+class RenderConfig(eqx.Module):
+    """How the map is drawn.
+
+    Args:
+        tile_size: pixels along a tile's side.
+        tile_capacity: splats that one tile can hold; more are counted in `Rendering.overflow`.
+        tile_batch: tiles that are drawn at once, which bounds the memory.
+        opacity: of every Gaussian at its centre (the paper's constant opacity).
+        covariance_scale: factor on the covariances, so that neighbouring Gaussians close the surface.
+        blur: pixels²; low-pass filter.
+        radius: standard deviations beyond which a splat is not drawn.
+        min_alpha: a pixel with less coverage has no depth.
+    """
+
+    tile_size: int = static()
+    tile_capacity: int = static()
+    tile_batch: int = static()
+    opacity: Float[Array, "*b"] = traced()
+    covariance_scale: Float[Array, "*b"] = traced()
+    blur: Float[Array, "*b"] = traced()
+    radius: Float[Array, "*b"] = traced()
+    min_alpha: Float[Array, "*b"] = traced()
+
+
+class Rendering(eqx.Module):
+    """Images of the map.
+
+    Args:
+        values: composited values (not divided by alpha; 0 where nothing is).
+        alpha: coverage in [0, 1].
+        depth: expected camera-space z in metres; 0 where alpha is below `min_alpha`.
+        depth_std: standard deviation in metres of the depth over the splats of a pixel: large where two surfaces mix.
+        overflow: splats that were not drawn because their tile was full, summed over the tiles.
+    """
+
+    values: Float[Array, "h w c"]
+    alpha: Float[Array, "h w"]
+    depth: Float[Array, "h w"]
+    depth_std: Float[Array, "h w"]
+    overflow: Int[Array, ""]
+
+
+def splat_alpha(splats: Splats, pixels: Float[Array, "q 2"], config: RenderConfig) -> Float[Array, "c q"]:
+    """Opacity of every splat at every pixel: opacity · exp(-½ d²); 0 beyond `radius` standard deviations."""
+    offset = pixels[None] - splats.means[:, None]
+    precision = splats.precisions
+    distance_sq = (
+        precision[:, None, 0, 0] * offset[..., 0] ** 2
+        + 2.0 * precision[:, None, 0, 1] * offset[..., 0] * offset[..., 1]
+        + precision[:, None, 1, 1] * offset[..., 1] ** 2
+    )
+    alpha = config.opacity * jnp.exp(-0.5 * distance_sq)
+    return jnp.where((distance_sq <= config.radius**2) & splats.valid[:, None], alpha, 0.0)
+
+
+def splat_depth(splats: Splats, pixels: Float[Array, "q 2"], config: RenderConfig) -> Float[Array, "c q"]:
+    """Camera-space z of every splat's plane at every pixel, kept within the splat's own extent in depth."""
+    offset = pixels[None] - splats.means[:, None]
+    inverse = splats.inverse_depth[:, None] + jnp.sum(splats.depth_slope[:, None] * offset, axis=-1)
+    reach = config.radius * splats.depth_std
+    nearest, farthest = splats.depth - reach, splats.depth + reach
+    highest = 1.0 / jnp.maximum(nearest, 0.1 * splats.depth)
+    return 1.0 / jnp.clip(inverse, (1.0 / farthest)[:, None], highest[:, None])
+
+
+def composite(
+    splats: Splats, values: Float[Array, "c v"], pixels: Float[Array, "q 2"], config: RenderConfig
+) -> tuple[Float[Array, "q v"], Float[Array, "q"], Float[Array, "q"], Float[Array, "q"]]:
+    """Blend the splats of one tile, which come nearest first: values, alpha, Σ w z, Σ w z²."""
+    alpha = splat_alpha(splats, pixels, config)
+    log_light = jnp.cumsum(jnp.log1p(-jnp.minimum(alpha, 0.999)), axis=0)
+    light_before = jnp.exp(jnp.concatenate([jnp.zeros_like(log_light[:1]), log_light[:-1]]))
+    weights = alpha * light_before
+    # An invalid row may hold any depth; its weight is 0, and 0 · inf would be NaN.
+    depth = jnp.where(weights > 0, splat_depth(splats, pixels, config), 0.0)
+    return weights.T @ values, weights.sum(0), (weights * depth).sum(0), (weights * depth**2).sum(0)
+
+
+def render(
+    gaussians: Gaussians,
+    values: Float[Array, "n v"],
+    T_world_camera: jaxlie.SE3,
+    camera: Camera,
+    config: RenderConfig,
+) -> Rendering:
+    """Draw `values` (colours, normals, features or one-hot labels) of the Gaussians with depth and coverage."""
+    splats = project_gaussians(gaussians, T_world_camera, camera, config.covariance_scale, config.blur)
+    corners = tile_corners(camera, config.tile_size)
+    rows, exists, overflow = assign_tiles(splats, corners, config.tile_size, config.tile_capacity, config.radius)
+    step = jnp.arange(config.tile_size, dtype=jnp.float32)
+    inside = jnp.stack(jnp.meshgrid(step, step, indexing="xy"), axis=-1).reshape(-1, 2)
+
+    def draw(tile: tuple[Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        corner, tile_rows, tile_exists = tile
+        near, near_values = take_rows((splats, values), tile_rows)
+        near = eqx.tree_at(lambda s: s.valid, near, near.valid & tile_exists)
+        near_values = jnp.where(near.valid[:, None], near_values, 0.0)
+        return composite(near, near_values, corner + inside, config)
+
+    tiles = jax.lax.map(draw, (corners, rows, exists), batch_size=min(config.tile_batch, corners.shape[0]))
+    values_sum, alpha, depth_sum, depth_sq_sum = jax.tree.map(lambda x: _assemble(x, camera, config.tile_size), tiles)
+    is_covered = alpha >= jnp.maximum(config.min_alpha, 1e-6)
+    total = jnp.where(is_covered, alpha, 1.0)
+    depth = jnp.where(is_covered, depth_sum / total, 0.0)
+    variance = jnp.maximum(depth_sq_sum / total - depth**2, 1e-12)
+    depth_std = jnp.where(is_covered, jnp.sqrt(variance), 0.0)
+    return Rendering(values_sum, alpha, depth, depth_std, jnp.sum(overflow))
+
+
+def _assemble(tiles: Float[Array, "t q *c"], camera: Camera, tile_size: int) -> Float[Array, "h w *c"]:
+    """Tiles in row-major order -> image, cut at the border."""
+    columns, rows = -(-camera.width // tile_size), -(-camera.height // tile_size)
+    channels = tiles.shape[2:]
+    grid = tiles.reshape(rows, columns, tile_size, tile_size, *channels).swapaxes(1, 2)
+    return grid.reshape(rows * tile_size, columns * tile_size, *channels)[: camera.height, : camera.width]

@@ -1,0 +1,80 @@
+"""EWA projection: a Gaussian in space becomes a Gaussian on the image plane and an inverse depth that varies over it."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from emgs_jax.camera import NEAREST_DEPTH, Camera, project
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.linalg import inverse_2x2
+
+# A splat that is seen at a grazing angle has no depth slope that its linearisation could hold.
+SMALLEST_COSINE = 0.1
+# Pixels; points far outside the image project with unbounded Jacobians, so the Jacobian is taken at most this far out.
+FRUSTUM_MARGIN = 0.3  # of the image's size
+
+
+class Splats(eqx.Module):
+    """Gaussians on the image plane, row by row those of the map.
+
+    The inverse depth at pixel p is `inverse_depth + depth_slope · (p - mean)`, which is exact for the plane through
+    the Gaussian's mean with its normal.
+    """
+
+    means: Float[Array, "n 2"]  # pixels
+    covs: Float[Array, "n 2 2"]  # pixels²
+    precisions: Float[Array, "n 2 2"]  # 1/pixels²
+    depth: Float[Array, "n"]  # camera-space z of the mean, m
+    depth_std: Float[Array, "n"]  # standard deviation of z over the Gaussian, m
+    inverse_depth: Float[Array, "n"]  # 1/m
+    depth_slope: Float[Array, "n 2"]  # 1/m per pixel
+    valid: Bool[Array, "n"]  # in front of the camera
+
+
+def project_gaussians(
+    gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, scale: Float[Array, ""], blur: Float[Array, ""]
+) -> Splats:
+    """Project with the local affine approximation (Zwicker et al., "EWA splatting", 2002).
+
+    Args:
+        scale: by which the covariances are multiplied, so that neighbouring Gaussians close the surface.
+        blur: pixels²; added to the image-plane covariance, the low-pass filter of EWA.
+    """
+    rotation = T_world_camera.rotation().as_matrix()
+    points = (gaussians.means - T_world_camera.translation()) @ rotation
+    covs = scale * jnp.einsum("ji,njk,kl->nil", rotation, gaussians.covs, rotation)
+    normals = gaussians.normals @ rotation
+    means, depth = project(camera, points)
+    valid = gaussians.valid & (depth > NEAREST_DEPTH)
+    z = jnp.where(valid, depth, 1.0)
+
+    size = jnp.array([camera.width, camera.height], means.dtype)
+    low, high = -FRUSTUM_MARGIN * size, (1.0 + FRUSTUM_MARGIN) * size
+    tangent = (jnp.clip(means, low, high) - camera.center) / camera.focal
+    focal_over_z = camera.focal / z[:, None]
+    zero = jnp.zeros_like(z)
+    jacobian = jnp.stack(
+        [
+            jnp.stack([focal_over_z[:, 0], zero, -focal_over_z[:, 0] * tangent[:, 0]], -1),
+            jnp.stack([zero, focal_over_z[:, 1], -focal_over_z[:, 1] * tangent[:, 1]], -1),
+        ],
+        -2,
+    )
+    covs_2d = jnp.einsum("nai,nij,nbj->nab", jacobian, covs, jacobian) + blur * jnp.eye(2)
+
+    # The plane n·X = n·μ meets the ray d = (x, y, 1) at 1/z = n·d / n·μ, which is linear in the pixel.
+    facing = jnp.einsum("ni,ni->n", normals, points)
+    limit = SMALLEST_COSINE * jnp.linalg.norm(jnp.where(valid[:, None], points, 1.0), axis=-1)
+    is_flat = jnp.abs(facing) > limit
+    slope = normals[:, :2] / (camera.focal * jnp.where(is_flat, facing, 1.0)[:, None])
+    return Splats(
+        means=means,
+        covs=covs_2d,
+        precisions=inverse_2x2(covs_2d),
+        depth=depth,
+        depth_std=jnp.sqrt(jnp.maximum(covs[:, 2, 2], 1e-12)),
+        inverse_depth=1.0 / z,
+        depth_slope=jnp.where((is_flat & valid)[:, None], slope, 0.0),
+        valid=valid,
+    )

@@ -1,0 +1,214 @@
+"""The pipeline: `init_state` and `step` are pure and jitted; `run` replays a sequence and grows what is full."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float, Int
+
+from emgs_jax.camera import Camera, downscale
+from emgs_jax.clustering import morton_order
+from emgs_jax.em import EmConfig, EmInfo, em_update
+from emgs_jax.gaussian_map import GaussianMap, SubmapConfig, empty_map, grow, insert, select_submap, write_back
+from emgs_jax.gaussians import FitConfig, cluster, spacing
+from emgs_jax.initialization import initialize
+from emgs_jax.localization import LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine, pose_row
+from emgs_jax.observation import Observation, ObservationConfig, Prediction, transform
+from emgs_jax.pytree import static
+from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
+
+
+class SlamConfig(eqx.Module):
+    """All stages.
+
+    Args:
+        window_size: |S|, images in the FIFO that the prior sees before the current one.
+        observation: point maps to observations.
+        fit: points to Gaussians (eq. 1).
+        submap: what a step works on, and capacities.
+        localization: coarse and fine.
+        em: E- and M-step.
+        refinement: on the image plane.
+    """
+
+    window_size: int = static()
+    observation: ObservationConfig
+    fit: FitConfig
+    submap: SubmapConfig
+    localization: LocalizationConfig
+    em: EmConfig
+    refinement: RefinementConfig
+
+
+class SlamState(eqx.Module):
+    """What the next step needs.
+
+    Args:
+        map: all Gaussians.
+        previous: the last frame as it was aligned, world frame.
+        T_world_previous: its pose.
+    """
+
+    map: GaussianMap
+    previous: Observation
+    T_world_previous: jaxlie.SE3
+
+
+class Overflow(eqx.Module):
+    """How many rows did not fit: a step with any of the first two is to be repeated with more room."""
+
+    map: Int[Array, ""]
+    submap: Int[Array, ""]
+    tiles: Int[Array, ""]
+
+
+class StepInfo(eqx.Module):
+    """What one step did."""
+
+    T_world_camera: jaxlie.SE3
+    T_world_newest: jaxlie.SE3
+    localization: LocalizationInfo
+    em: EmInfo
+    refinement: RefinementInfo
+    num_gaussians: Int[Array, ""]
+    overflow: Overflow
+
+
+def _first_weight(weight: Float[Array, "g"], config: SlamConfig) -> Float[Array, "g"]:
+    """Weight of a new Gaussian: α_0 = 1 as printed, or the number of images that its points amount to."""
+    return jnp.where(config.em.average.gain > 0, weight, 1.0)
+
+
+def init_state(
+    views: Observation, T_world_views: jaxlie.SE3, camera: Camera, config: SlamConfig
+) -> tuple[SlamState, Int[Array, ""]]:
+    """The map of the first window, whose last view becomes the previous frame.
+
+    Args:
+        views: the window's observations, camera frames, oldest first.
+        T_world_views: their poses.
+        camera: of the full images.
+        config: all stages.
+
+    Returns:
+        The state, and how many Gaussians did not fit into the map's capacity.
+    """
+    thin = config.observation.thin
+    gaussians, weight, world = initialize(views, T_world_views, downscale(camera, thin), thin, config.fit)
+    empty = empty_map(config.submap.map_capacity, views.features.shape[-1])
+    map, _, overflow = insert(empty, gaussians, _first_weight(weight, config))
+    previous = jax.tree.map(lambda leaf: leaf[-1], world)
+    return SlamState(map, previous, pose_row(T_world_views, -1)), overflow
+
+
+def step(
+    state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig
+) -> tuple[SlamState, StepInfo]:
+    """Integrate one frame: localise, select, E-step, M-step, refine, insert (the paper's pipeline figure).
+
+    Args:
+        state: of the last step.
+        prediction: of this one.
+        camera: of the full images.
+        config: all stages.
+    """
+    thin = config.observation.thin
+    view = downscale(camera, thin)
+    coarse = localize_coarse(prediction, state.previous, state.T_world_previous, view, config.localization)
+    guess = transform(coarse.T_world_camera, prediction.current, coarse.scale)
+    submap, rows, submap_overflow = select_submap(state.map, (state.previous, guess), config.submap)
+    T, aligned, localization = localize_fine(prediction.current, submap.gaussians, coarse, config.localization)
+
+    trusted = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & localization.is_tracked)
+    submap, is_fused, em = em_update(submap, trusted, config.em)
+    rest = eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~is_fused)
+    order = morton_order(view.height, view.width)
+    candidates, weight = cluster(rest, order, spacing(thin, config.fit), config.fit)
+    submap, fresh, refinement = refine(submap, candidates, T, view, config.refinement)
+    map, _, map_overflow = insert(write_back(state.map, submap, rows), fresh, _first_weight(weight, config))
+
+    overflow = Overflow(map_overflow, submap_overflow, refinement.overflow)
+    count = jnp.sum(map.gaussians.valid)
+    info = StepInfo(T, coarse.T_world_newest, localization, em, refinement, count, overflow)
+    return SlamState(map, aligned, T), info
+
+
+@dataclass(frozen=True)
+class FirstWindow:
+    """The first prediction of a sequence: all views, with the prior's poses."""
+
+    views: Observation
+    T_world_views: jaxlie.SE3
+
+
+jitted_init_state = eqx.filter_jit(init_state)
+jitted_step = eqx.filter_jit(step)
+
+
+def with_room(config: SlamConfig, overflow: Overflow) -> SlamConfig:
+    """The config with doubled capacities where rows did not fit (host side: each new size compiles once)."""
+    submap = config.submap
+    return replace(
+        config,
+        submap=replace(
+            submap,
+            map_capacity=submap.map_capacity * (2 if overflow.map > 0 else 1),
+            submap_capacity=submap.submap_capacity * (2 if overflow.submap > 0 else 1),
+        ),
+    )
+
+
+def start(first: FirstWindow, camera: Camera, config: SlamConfig) -> tuple[SlamState, SlamConfig]:
+    """State of the first window, with the capacity that it needs (host side)."""
+    state, overflow = jitted_init_state(first.views, first.T_world_views, camera, config)
+    while overflow > 0:
+        config = with_room(config, Overflow(overflow, jnp.zeros((), int), jnp.zeros((), int)))
+        state, overflow = jitted_init_state(first.views, first.T_world_views, camera, config)
+    return state, config
+
+
+def advance(
+    state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig
+) -> tuple[SlamState, StepInfo, SlamConfig]:
+    """One step; a map or submap that is full is doubled and the frame repeated (host side).
+
+    That gives the same map as starting with the larger capacity. Splats that find their tile full are only counted:
+    they change what is drawn, not what is kept.
+    """
+    new, info = jitted_step(state, prediction, camera, config)
+    while info.overflow.map > 0 or info.overflow.submap > 0:
+        config = with_room(config, info.overflow)
+        state = eqx.tree_at(lambda s: s.map, state, grow(state.map, config.submap.map_capacity))
+        new, info = jitted_step(state, prediction, camera, config)
+    return new, info, config
+
+
+def run(
+    predictions: Iterable[FirstWindow | Prediction],
+    camera: Camera,
+    config: SlamConfig,
+    on_step: Callable[[SlamState, StepInfo], None] = lambda state, info: None,
+) -> SlamState:
+    """Map a sequence (host side): the first window, then one step for each further prediction.
+
+    Args:
+        predictions: one `FirstWindow`, then `Prediction`s in order.
+        camera: of the full images.
+        config: all stages; capacities are where to start.
+        on_step: called after each step, not for the first window.
+
+    Raises:
+        ValueError: there is no prediction.
+    """
+    remaining = iter(predictions)
+    first = next(remaining, None)
+    if first is None:
+        raise ValueError("there is no prediction to map: the sequence is empty")
+    state, config = start(first, camera, config)
+    for prediction in remaining:
+        state, info, config = advance(state, prediction, camera, config)
+        on_step(state, info)
+    return state
