@@ -28,6 +28,7 @@ class EvaluationConfig:
     min_normal_taps: int = 8
 
     def __post_init__(self):
+        object.__setattr__(self, "f1_thresholds_m", tuple(float(value) for value in self.f1_thresholds_m))
         if self.alignment not in ("sim3", "se3"):
             raise ValueError(f"evaluation.alignment must be sim3 or se3, got {self.alignment!r}")
         if self.voxel_m <= 0:
@@ -111,15 +112,14 @@ def posed_cloud(
     """Turn a camera-frame point map (h, w, 3) with its image, uint8 (h, w, 3), into a cloud in the world."""
     mask = mask & np.isfinite(points).all(-1)
     normals = window_normals(points, mask, config)[mask].astype(np.float64)
-    rotation, translation = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    world = points[mask].astype(np.float64) @ rotation.T + translation
-    return PointCloud(world, normals @ rotation.T, image[mask] / 255.0)
+    world = points[mask].astype(np.float64) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    return PointCloud(world, normals @ T_world_camera[:3, :3].T, image[mask] / 255.0)
 
 
 def raw_prior_cloud(
     views: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]], config: EvaluationConfig
 ) -> PointCloud:
-    """Accumulate what a prior says, without any mapping: (points, mask, image, T_world_camera) of one view each."""
+    """Accumulate what a prior says, without any mapping; of each view (points, mask, image, T_world_camera)."""
     return fuse_clouds((posed_cloud(*view, config) for view in views), config.voxel_m)
 
 
@@ -154,8 +154,7 @@ def reconstruction_metrics(
     nearest neighbours' |cos| and average both directions. Without points the values are None, with a reason.
     """
     estimate, truth = voxel_downsample(estimate, config.voxel_m), voxel_downsample(truth, config.voxel_m)
-    names = _metric_names(config)
-    metrics: dict[str, float | int | str | None] = dict.fromkeys(names)
+    metrics: dict[str, float | int | str | None] = dict.fromkeys(_metric_names(config))
     metrics["reconstruction/num_points"] = len(estimate)
     if not len(estimate) or not len(truth):
         which = "estimate" if not len(estimate) else "ground truth"
@@ -175,7 +174,7 @@ def reconstruction_metrics(
         values.append(100.0 * float(np.mean([(cosines >= limit).mean() for cosines in both])))
     else:
         metrics["reconstruction/reason"] = "no normals to compare"
-    return metrics | dict(zip(names, values, strict=False))
+    return metrics | dict(zip(_metric_names(config), values, strict=False))
 
 
 def _metric_names(config: EvaluationConfig) -> list[str]:
@@ -207,8 +206,7 @@ def _fit_planes(
     Takes the taps within `previous`' gap of its plane (slopes, offset, gap). Returns slopes (2, h, w), offset (h, w)
     and whether there were enough taps in both directions.
     """
-    _, h, w = samples.shape
-    slopes, offset, gap = previous
+    (_, h, w), (slopes, offset, gap) = samples.shape, previous
     radius, step = config.normal_radius_px, config.normal_step_px
     padded = np.pad(samples, ((0, 0), (radius, radius), (radius, radius)))
     is_valid = np.pad(valid, radius)

@@ -1,0 +1,212 @@
+"""Oracles: errors published with the trajectories, closed forms, invariances, evo where it is installed."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.evaluation.trajectory import (
+    Alignment,
+    DegenerateTrajectoryError,
+    align,
+    align_poses,
+    associate,
+    ate,
+    rpe,
+    trajectory_metrics,
+)
+from emgs_jax.export import load_trajectory_tum
+
+SHARED = Path(__file__).resolve().parents[2].parent / "shared"
+TRAJECTORIES = SHARED / "data" / "trajectories"
+needs_trajectories = pytest.mark.skipif(not TRAJECTORIES.exists(), reason="the shared trajectories are not here")
+KNOWN = [  # estimate, reference, with scale, scale, pairs, RMSE: table in shared/data/README.md
+    ("fr2_desk_ORB_kf_mono", "fr2_desk_groundtruth", True, 2.2280, 118, 0.00773),
+    ("freiburg1_xyz-ORB_kf_mono", "freiburg1_xyz-groundtruth", True, 1.1056, 32, 0.00975),
+    ("freiburg1_xyz-rgbdslam", "freiburg1_xyz-groundtruth", False, 1.0, 785, 0.01347),
+]
+
+
+def random_poses(rng, n):
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, :3, :3] = Rotation.random(n, rng).as_matrix()
+    poses[:, :3, 3] = rng.normal(size=(n, 3))
+    return poses
+
+
+def noisy(rng, poses, sigma):
+    out = poses.copy()
+    out[:, :3, 3] += sigma * rng.normal(size=(len(poses), 3))
+    out[:, :3, :3] = out[:, :3, :3] @ Rotation.from_rotvec(sigma * rng.normal(size=(len(poses), 3))).as_matrix()
+    return out
+
+
+def associated(estimate, reference):
+    times, poses = load_trajectory_tum(TRAJECTORIES / f"{estimate}.txt")
+    true_times, truth = load_trajectory_tum(TRAJECTORIES / f"{reference}.txt")
+    rows, true_rows = associate(times, true_times, 0.01)
+    return poses[rows], truth[true_rows]
+
+
+@needs_trajectories
+@pytest.mark.parametrize(("estimate", "reference", "with_scale", "scale", "pairs", "rmse"), KNOWN)
+def test_known_errors_of_public_trajectories_come_out_to_the_printed_digits(
+    estimate, reference, with_scale, scale, pairs, rmse
+):
+    poses, truth = associated(estimate, reference)
+    alignment = align(poses[:, :3, 3], truth[:, :3, 3], with_scale)
+    assert len(poses) == pairs
+    assert round(alignment.scale, 4) == scale
+    assert round(ate(poses[:, :3, 3], truth[:, :3, 3], alignment), 5) == rmse
+
+
+@needs_trajectories
+@pytest.mark.parametrize(("estimate", "reference"), [row[:2] for row in KNOWN])
+def test_all_errors_agree_with_evo(estimate, reference):
+    pytest.importorskip("evo")
+    from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
+    from evo.core.trajectory import PosePath3D
+
+    poses, truth = associated(estimate, reference)
+    metrics = trajectory_metrics(poses, truth)
+    for name, with_scale in (("ate_sim3_m", True), ("ate_se3_m", False)):
+        path, true_path = PosePath3D(poses_se3=list(poses)), PosePath3D(poses_se3=list(truth))
+        path.align(true_path, correct_scale=with_scale)
+        error = APE(PoseRelation.translation_part)
+        error.process_data((true_path, path))
+        np.testing.assert_allclose(metrics[f"trajectory/{name}"], error.get_statistic(StatisticsType.rmse), rtol=1e-6)
+    relations = {"rpe_translation_m": "translation_part", "rpe_rotation_deg": "rotation_angle_deg"}
+    for name, relation in relations.items():
+        error = RPE(PoseRelation[relation], delta=1, delta_unit=Unit.frames)
+        error.process_data((PosePath3D(poses_se3=list(truth)), PosePath3D(poses_se3=list(poses))))
+        np.testing.assert_allclose(metrics[f"trajectory/{name}"], error.get_statistic(StatisticsType.rmse), rtol=1e-5)
+
+
+def test_align_finds_the_similarity_that_made_the_points():
+    rng = np.random.default_rng(0)
+    made = Alignment(2.5, Rotation.random(rng=rng).as_matrix(), np.array([3.0, -1.0, 7.0]))
+    points = rng.normal(size=(20, 3))
+    found = align(points, made.apply(points), with_scale=True)
+    np.testing.assert_allclose(found.scale, made.scale, rtol=1e-12)
+    np.testing.assert_allclose(found.rotation, made.rotation, atol=1e-12)
+    np.testing.assert_allclose(found.translation, made.translation, atol=1e-12)
+
+
+def test_a_mirrored_path_is_aligned_by_a_rotation_and_keeps_its_error():
+    """The best orthogonal map would be a reflection with no error at all."""
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(50, 3))
+    mirrored = points * np.array([1.0, 1.0, -1.0])
+    found = align(points, mirrored, with_scale=False)
+    np.testing.assert_allclose(np.linalg.det(found.rotation), 1.0, rtol=1e-12)
+    assert ate(points, mirrored, found) > 0.5
+
+
+def test_the_alignment_is_a_minimum_of_the_error():
+    rng = np.random.default_rng(2)
+    x, y = rng.normal(size=(30, 3)), rng.normal(size=(30, 3))
+    best = align(x, y, with_scale=True)
+    for change in 1e-3 * rng.normal(size=(30, 7)):
+        rotation = best.rotation @ Rotation.from_rotvec(change[:3]).as_matrix()
+        other = Alignment(best.scale + change[6], rotation, best.translation + change[3:6])
+        assert ate(x, y, other) >= ate(x, y, best)
+
+
+def test_metrics_do_not_depend_on_the_frame_of_the_estimate_and_sim3_not_on_its_scale():
+    rng = np.random.default_rng(3)
+    truth = random_poses(rng, 25)
+    estimate = noisy(rng, truth, 0.05)
+    moved = random_poses(rng, 1)[0] @ estimate
+    before, after = trajectory_metrics(estimate, truth), trajectory_metrics(moved, truth)
+    for key, value in before.items():
+        np.testing.assert_allclose(after[key], value, rtol=1e-9, err_msg=key)
+    scaled = estimate.copy()
+    scaled[:, :3, 3] *= 4.0
+    after = trajectory_metrics(scaled, truth)
+    np.testing.assert_allclose(after["trajectory/ate_sim3_m"], before["trajectory/ate_sim3_m"], rtol=1e-9)
+    np.testing.assert_allclose(after["trajectory/scale"], before["trajectory/scale"] / 4.0, rtol=1e-9)
+
+
+def test_the_scale_percentage_is_the_same_for_twice_and_half_the_size():
+    truth = random_poses(np.random.default_rng(4), 10)
+    for factor in (2.0, 0.5):
+        estimate = truth.copy()
+        estimate[:, :3, 3] *= factor
+        metrics = trajectory_metrics(estimate, truth)
+        np.testing.assert_allclose(metrics["trajectory/scale"], 1.0 / factor, rtol=1e-12)
+        np.testing.assert_allclose(metrics["trajectory/scale_percent"], 50.0, rtol=1e-12)
+
+
+def test_a_constant_drift_per_frame_is_the_relative_error():
+    """Each step of the estimate is 2 cm longer and turns 1 degree more about the same axis."""
+    step, drift = np.eye(4), np.eye(4)
+    step[:3, 3] = [0.1, 0.0, 0.0]
+    drift[:3, :3] = Rotation.from_euler("z", 1.0, degrees=True).as_matrix()
+    drift[:3, 3] = [0.02, 0.0, 0.0]
+    truth = np.stack([np.linalg.matrix_power(step, i) for i in range(8)])
+    estimate = np.stack([np.linalg.matrix_power(step @ drift, i) for i in range(8)])
+    np.testing.assert_allclose(rpe(estimate, truth), (0.02, 1.0), rtol=1e-9)
+
+
+def test_association_is_mutual_ordered_and_symmetric():
+    times_a = np.array([0.0, 1.0, 1.004, 2.0, 5.0])
+    times_b = np.array([1.003, 0.009, 2.02, 4.995])
+    rows_a, rows_b = associate(times_a, times_b, 0.01)
+    np.testing.assert_array_equal(rows_a, [0, 2, 4])
+    np.testing.assert_array_equal(rows_b, [1, 0, 3])
+    back_b, back_a = associate(times_b, times_a, 0.01)
+    assert sorted(zip(back_a, back_b, strict=True)) == sorted(zip(rows_a, rows_b, strict=True))
+    assert len(associate(times_a, np.empty(0), 1.0)[0]) == 0
+    assert len(associate(np.array([3.0]), np.array([3.0]), 0.0)[0]) == 1
+
+
+def test_too_few_poses_or_no_motion_give_null_with_a_reason():
+    rng = np.random.default_rng(5)
+    truth = random_poses(rng, 6)
+    standing = truth.copy()
+    standing[:, :3, 3] = 1.0
+    for estimate, reference in ((truth[:2], truth[:2]), (truth[:0], truth[:0]), (standing, truth), (truth, standing)):
+        metrics = trajectory_metrics(estimate, reference)
+        assert metrics["trajectory/ate_sim3_m"] is None
+        assert metrics["trajectory/scale"] is None
+        assert metrics["trajectory/reason"]
+    # A stuck estimate still pays: without scale its error is the spread of the truth.
+    spread = np.sqrt(np.mean(np.sum((truth[:, :3, 3] - truth[:, :3, 3].mean(0)) ** 2, axis=1)))
+    np.testing.assert_allclose(trajectory_metrics(standing, truth)["trajectory/ate_se3_m"], spread, rtol=1e-9)
+    broken = truth.copy()
+    broken[3, 0, 3] = np.nan
+    assert trajectory_metrics(broken, truth)["trajectory/reason"] == "a pose is not finite"
+    with pytest.raises(DegenerateTrajectoryError):
+        align(standing[:, :3, 3], truth[:, :3, 3], with_scale=True)
+    with pytest.raises(ValueError, match="associate first"):
+        trajectory_metrics(truth[:3], truth)
+
+
+def test_orientations_decide_what_positions_leave_open():
+    """A straight path leaves the roll open, a single pose everything but its own position."""
+    rng = np.random.default_rng(6)
+    truth = random_poses(rng, 12)
+    truth[:, :3, 3] = np.outer(np.linspace(0.0, 2.0, 12), [0.6, 0.8, 0.0]) + 1.0
+    made = Alignment(1.0, Rotation.random(rng=rng).as_matrix(), np.array([1.0, 2.0, 3.0]))
+    inverse = Alignment(1.0, made.rotation.T, -made.rotation.T @ made.translation)
+    for rows in (slice(None), slice(0, 1)):
+        found, note = align_poses(inverse.apply_to_poses(truth[rows]), truth[rows], with_scale=True)
+        assert note is not None
+        np.testing.assert_allclose(found.rotation, made.rotation, atol=1e-6)
+        np.testing.assert_allclose(found.translation, made.translation, atol=1e-6)
+
+
+def test_pose_alignment_is_point_alignment_where_positions_suffice():
+    rng = np.random.default_rng(7)
+    truth = random_poses(rng, 12)
+    estimate = noisy(rng, truth, 0.1)
+    found, note = align_poses(estimate, truth, with_scale=True)
+    expected = align(estimate[:, :3, 3], truth[:, :3, 3], with_scale=True)
+    assert note is None
+    np.testing.assert_array_equal(found.rotation, expected.rotation)
+    assert found.scale == expected.scale
+    np.testing.assert_allclose(
+        ate(found.apply_to_poses(estimate)[:, :3, 3], truth[:, :3, 3], Alignment(1, np.eye(3), 0)),
+        ate(estimate[:, :3, 3], truth[:, :3, 3], expected),
+    )
