@@ -109,7 +109,8 @@ def _draw_map(axes: Axes, cloud: tuple[np.ndarray, np.ndarray], estimate: np.nda
         image, extent = paint_from_above(points[seen], colors[seen], cell)
         axes.imshow(fill_holes(image), extent=extent, origin="lower", interpolation="nearest", zorder=1)
     if truth is not None:
-        _draw_path(axes, truth[:, :3, 3] @ rotation.T, _TRUTH, "true path", 3.2)
+        _draw_path(axes, truth[:, :3, 3] @ rotation.T, _TRUTH, "true path", 5.0)
+    # Thinner with its outline than the true path, so that one on top of the other shows both.
     _draw_path(axes, path, _ESTIMATE, "estimated path", 1.6)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_facecolor("#e3e6ea")
