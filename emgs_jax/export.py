@@ -119,7 +119,7 @@ def save_mesh_ply(
     if len(points) < min_points:
         reason = f"{len(points)} points with a normal, at least {min_points} are needed for a mesh"
     else:
-        vertices, faces = _poisson(points, normals, depth)
+        vertices, faces = _poisson(*_crop(points, normals), depth)
         vertices, faces = _trim(vertices, faces, points)
         reason = None if len(faces) else "the surface reconstruction is empty"
     if reason is not None:
@@ -162,6 +162,14 @@ def load_trajectory_tum(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray
     if len(rows):
         poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     return rows[:, 0], poses
+
+
+def _crop(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Leave out far flying points: the solver's grid spans all points, so they would make the cells coarse."""
+    low, high = np.percentile(points, [1, 99], axis=0)
+    margin = 0.25 * np.max(high - low)
+    keep = ((points >= low - margin) & (points <= high + margin)).all(1)
+    return points[keep], normals[keep]
 
 
 def _poisson(points: np.ndarray, normals: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:

@@ -7,9 +7,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from emgs_jax.data.base import Frame
-from emgs_jax.evaluation.trajectory import Alignment
-
-_MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
+from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, transform_cloud, voxel_downsample
+from emgs_jax.evaluation.trajectory import align_poses
 
 
 @dataclass(frozen=True)
@@ -33,54 +32,6 @@ class EvaluationConfig:
             raise ValueError(f"evaluation.alignment must be sim3 or se3, got {self.alignment!r}")
         if self.voxel_m <= 0:
             raise ValueError(f"evaluation.voxel_m must be positive, got {self.voxel_m}")
-
-
-@dataclass(frozen=True)
-class PointCloud:
-    """Points with attributes; float64 rows. A normal of zero is unknown and left out of the normal metrics.
-
-    Args:
-        points: (n, 3), metres.
-        normals: (n, 3), unit length and towards the camera that saw them, or zero.
-        colors: (n, 3), RGB in [0, 1].
-    """
-
-    points: np.ndarray
-    normals: np.ndarray
-    colors: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-
-def transform_cloud(cloud: PointCloud, alignment: Alignment) -> PointCloud:
-    """Bring a cloud into the reference's frame."""
-    return PointCloud(alignment.apply(cloud.points), cloud.normals @ alignment.rotation.T, cloud.colors)
-
-
-def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
-    """Average all points that share a voxel [m] of the world grid, however they are spread over the clouds.
-
-    Rows come out ordered by cell, so the result is deterministic; points that are not finite are dropped.
-    """
-    keys, sums = np.empty(0, np.int64), np.empty((10, 0))
-    pending: list[tuple[np.ndarray, np.ndarray]] = []
-    for cloud in clouds:
-        pending.append(_cells(cloud, voxel))
-        if sum(len(rows) for rows, _ in pending) > max(_MERGE_ROWS, len(keys)):
-            keys, sums = _merge([(keys, sums), *pending])
-            pending = []
-    _, sums = _merge([(keys, sums), *pending])
-    means = np.ascontiguousarray((sums[:9] / sums[9]).T)
-    length = np.linalg.norm(means[:, 3:6], axis=1, keepdims=True)
-    # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
-    normals = np.where(length > 0.1, means[:, 3:6] / np.maximum(length, 0.1), 0.0)
-    return PointCloud(means[:, :3], normals, means[:, 6:9])
-
-
-def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
-    """Average the points of each voxel [m]; doing it twice changes nothing."""
-    return fuse_clouds([cloud], voxel)
 
 
 def window_normals(points: np.ndarray, valid: np.ndarray, config: EvaluationConfig) -> np.ndarray:
@@ -142,6 +93,17 @@ def backproject(depth: np.ndarray, intrinsics: tuple[float, float, float, float]
     fx, fy, cx, cy = intrinsics
     v, u = np.indices(depth.shape)
     return np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], -1)
+
+
+def align_cloud(
+    cloud: PointCloud, estimate: np.ndarray, truth: np.ndarray, config: EvaluationConfig
+) -> tuple[PointCloud, str | None]:
+    """Bring the estimate's cloud into the frame of the truth by the alignment of the poses (n, 4, 4).
+
+    The second value says what the poses left open, see `align_poses`; None in the regular case.
+    """
+    alignment, note = align_poses(estimate, truth, with_scale=config.alignment == "sim3")
+    return transform_cloud(cloud, alignment), note
 
 
 def reconstruction_metrics(
@@ -227,25 +189,3 @@ def _fit_planes(
     scale = np.where(good, 1.0 / np.where(good, determinant, 1.0), 0.0)
     a, b = (yy * xd - xy * yd) * scale, (xx * yd - xy * xd) * scale
     return np.stack([a, b]), d - a * x - b * y, good
-
-
-def _cells(cloud: PointCloud, voxel: float) -> tuple[np.ndarray, np.ndarray]:
-    """Reduce one cloud to its occupied cells: packed cell numbers (n,), sorted, and sums (10, n), the last a count."""
-    finite = np.isfinite(cloud.points).all(axis=1)
-    points = np.asarray(cloud.points[finite], np.float64)
-    # 21 bits an axis; what is farther than a million voxels shares the border cells.
-    index = np.floor(np.clip(points / voxel, -(2.0**20), 2.0**20 - 1)).astype(np.int64) + 2**20
-    keys = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
-    columns = (*points.T, *cloud.normals[finite].T, *cloud.colors[finite].T, np.ones(len(points)))
-    return _merge([(keys, np.stack(columns))])
-
-
-def _merge(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    keys = np.concatenate([keys for keys, _ in tables])
-    sums = np.concatenate([sums for _, sums in tables], axis=1)
-    order = np.argsort(keys, kind="stable")
-    is_first = np.diff(keys[order], prepend=-1) != 0
-    cell = np.empty(len(keys), np.int64)
-    cell[order] = np.cumsum(is_first) - 1
-    unique = keys[order][is_first]
-    return unique, np.stack([np.bincount(cell, column, minlength=len(unique)) for column in sums])

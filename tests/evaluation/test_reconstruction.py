@@ -9,17 +9,14 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import Frame
+from emgs_jax.evaluation.clouds import PointCloud, transform_cloud
 from emgs_jax.evaluation.reconstruction import (
     EvaluationConfig,
-    PointCloud,
+    align_cloud,
     backproject,
-    fuse_clouds,
     ground_truth_cloud,
     raw_prior_cloud,
     reconstruction_metrics,
-    transform_cloud,
-    voxel_downsample,
-    window_normals,
 )
 from emgs_jax.evaluation.trajectory import Alignment
 
@@ -157,79 +154,6 @@ def test_empty_clouds_and_unknown_normals_give_null_with_a_reason():
     assert metrics["reconstruction/reason"] == "no normals to compare"
 
 
-def test_points_of_a_voxel_become_their_mean_and_twice_is_once():
-    rng = np.random.default_rng(3)
-    cloud = random_cloud(rng, 5000)
-    small = voxel_downsample(cloud, 0.2)
-    cells, inverse = np.unique(np.floor(cloud.points / 0.2), axis=0, return_inverse=True)
-    means = np.stack([cloud.points[inverse.ravel() == cell].mean(0) for cell in range(len(cells))])
-    np.testing.assert_allclose(small.points, means, rtol=0, atol=1e-12)
-    again = voxel_downsample(small, 0.2)
-    for name in ("points", "normals", "colors"):
-        np.testing.assert_allclose(getattr(again, name), getattr(small, name), atol=1e-12)
-
-
-def test_fusing_pieces_is_reducing_the_whole(monkeypatch):
-    monkeypatch.setattr("emgs_jax.evaluation.reconstruction._MERGE_ROWS", 50)
-    cloud = random_cloud(np.random.default_rng(4), 900)
-    pieces = [PointCloud(cloud.points[i::7], cloud.normals[i::7], cloud.colors[i::7]) for i in range(7)]
-    whole, fused = voxel_downsample(cloud, 0.1), fuse_clouds(iter(pieces), 0.1)
-    for name in ("points", "normals", "colors"):
-        np.testing.assert_allclose(getattr(fused, name), getattr(whole, name), atol=1e-12)
-    poisoned = PointCloud(cloud.points.copy(), cloud.normals, cloud.colors)
-    poisoned.points[::2] = np.nan
-    assert np.isfinite(voxel_downsample(poisoned, 0.1).points).all()
-    assert len(voxel_downsample(poisoned, 1e-6)) == 450
-
-
-@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.5, -0.3, 0.8), (-0.6, 0.5, 0.62)])
-def test_normals_of_a_plane_are_exact_and_face_the_camera(normal):
-    normal = np.asarray(normal) / np.linalg.norm(normal)
-    depth = plane_depth(normal, 2.0)
-    valid = (depth > 0.3) & (depth < 8.0)
-    normals = window_normals(backproject(np.where(valid, depth, 0.0), INTRINSICS), valid, CONFIG)
-    known = normals.any(-1)
-    assert known[valid].mean() > 0.9
-    np.testing.assert_allclose(normals[known], np.broadcast_to(-normal, normals[known].shape), atol=2e-3)
-
-
-def test_normals_of_a_noisy_sphere_point_from_its_centre():
-    rays = backproject(np.ones(SHAPE), INTRINSICS)
-    center = np.array([0.1, -0.05, 2.5])
-    a, b, c = (rays**2).sum(-1), rays @ center, center @ center - 1.0
-    hit = b * b - a * c > 0
-    depth = np.where(hit, (b - np.sqrt(np.maximum(b * b - a * c, 0.0))) / a, 0.0)
-    noise = 1.0 + 0.002 * np.random.default_rng(5).normal(size=SHAPE)
-    normals = window_normals(backproject(depth * noise, INTRINSICS), hit, CONFIG)
-    truth = backproject(depth, INTRINSICS) - center
-    known = normals.any(-1)
-    assert not known[~hit].any()
-    assert known[hit].mean() > 0.9
-    angles = np.degrees(np.arccos(np.einsum("nk,nk->n", normals[known], truth[known]).clip(-1, 1)))
-    assert np.median(angles) < 4.0
-
-
-def test_a_depth_step_does_not_bend_the_normals_beside_it():
-    depth = np.full(SHAPE, 2.0)
-    depth[:, 60:] = 3.0
-    normals = window_normals(backproject(depth, INTRINSICS), depth > 0, CONFIG)
-    known = normals.any(-1)
-    assert known.mean() > 0.95
-    np.testing.assert_allclose(normals[known], np.broadcast_to([0.0, 0.0, -1.0], normals[known].shape), atol=1e-3)
-
-
-def test_invalid_pixels_have_no_normal_and_change_no_other():
-    depth = plane_depth((0.3, 0.2, 0.9), 2.0)
-    points, valid = backproject(depth, INTRINSICS), np.ones(SHAPE, bool)
-    valid[20:30, 40:55] = False
-    poisoned = points.copy()
-    poisoned[~valid] = np.nan
-    normals = window_normals(poisoned, valid, CONFIG)
-    assert not normals[~valid].any()
-    points[~valid] = 0.0
-    np.testing.assert_array_equal(normals, window_normals(points, valid, CONFIG))
-
-
 def test_the_prior_of_true_points_is_the_ground_truth_and_moves_with_the_poses():
     rng = np.random.default_rng(6)
     move = np.eye(4)
@@ -248,6 +172,21 @@ def test_the_prior_of_true_points_is_the_ground_truth_and_moves_with_the_poses()
     np.testing.assert_allclose(camera[on_plane] @ normal, 2.0, atol=1e-5)
     cosines = truth.normals @ move[:3, :3] @ normal / np.linalg.norm(normal)
     assert (cosines[on_plane] < -0.99).mean() > 0.95
+
+
+def test_a_cloud_is_aligned_by_the_poses_with_scale_or_without():
+    """The estimate is half the size; without scale it keeps its size about the poses' centre."""
+    rng = np.random.default_rng(7)
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, 3] = rng.normal(size=(6, 3))
+    cloud, half = random_cloud(rng), poses.copy()
+    half[:, :3, 3] *= 0.5
+    estimate = dataclasses.replace(cloud, points=0.5 * cloud.points)
+    found, note = align_cloud(estimate, half, poses, CONFIG)
+    assert note is None
+    np.testing.assert_allclose(found.points, cloud.points, atol=1e-12)
+    found, _ = align_cloud(estimate, half, poses, EvaluationConfig(alignment="se3"))
+    np.testing.assert_allclose(found.points, estimate.points + 0.5 * poses[:, :3, 3].mean(0), atol=1e-12)
 
 
 @pytest.mark.skipif(not REPLICA.exists(), reason="the shared Replica sequence is not here")

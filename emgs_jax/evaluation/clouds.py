@@ -1,0 +1,80 @@
+"""Point clouds: moving them, and averaging them per voxel without holding all points at once."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from emgs_jax.evaluation.trajectory import Alignment
+
+_MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points with attributes; float64 rows. A normal of zero is unknown and left out of the normal metrics.
+
+    Args:
+        points: (n, 3), metres.
+        normals: (n, 3), unit length and towards the camera that saw them, or zero.
+        colors: (n, 3), RGB in [0, 1].
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    colors: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def transform_cloud(cloud: PointCloud, alignment: Alignment) -> PointCloud:
+    """Bring a cloud into the reference's frame."""
+    return PointCloud(alignment.apply(cloud.points), cloud.normals @ alignment.rotation.T, cloud.colors)
+
+
+def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
+    """Average all points that share a voxel [m] of the world grid, however they are spread over the clouds.
+
+    Rows come out ordered by cell, so the result is deterministic; points that are not finite are dropped.
+    """
+    keys, sums = np.empty(0, np.int64), np.empty((10, 0))
+    pending: list[tuple[np.ndarray, np.ndarray]] = []
+    for cloud in clouds:
+        pending.append(_cells(cloud, voxel))
+        if sum(len(rows) for rows, _ in pending) > max(_MERGE_ROWS, len(keys)):
+            keys, sums = _merge([(keys, sums), *pending])
+            pending = []
+    _, sums = _merge([(keys, sums), *pending])
+    means = np.ascontiguousarray((sums[:9] / sums[9]).T)
+    length = np.linalg.norm(means[:, 3:6], axis=1, keepdims=True)
+    # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
+    normals = np.where(length > 0.1, means[:, 3:6] / np.maximum(length, 0.1), 0.0)
+    return PointCloud(means[:, :3], normals, means[:, 6:9])
+
+
+def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
+    """Average the points of each voxel [m]; doing it twice changes nothing."""
+    return fuse_clouds([cloud], voxel)
+
+
+def _cells(cloud: PointCloud, voxel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Reduce one cloud to its occupied cells: packed cell numbers (n,), sorted, and sums (10, n), the last a count."""
+    finite = np.isfinite(cloud.points).all(axis=1)
+    points = np.asarray(cloud.points[finite], np.float64)
+    # 21 bits an axis; what is farther than a million voxels shares the border cells.
+    index = np.floor(np.clip(points / voxel, -(2.0**20), 2.0**20 - 1)).astype(np.int64) + 2**20
+    keys = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+    columns = (*points.T, *cloud.normals[finite].T, *cloud.colors[finite].T, np.ones(len(points)))
+    return _merge([(keys, np.stack(columns))])
+
+
+def _merge(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    keys = np.concatenate([keys for keys, _ in tables])
+    sums = np.concatenate([sums for _, sums in tables], axis=1)
+    order = np.argsort(keys, kind="stable")
+    is_first = np.diff(keys[order], prepend=-1) != 0
+    cell = np.empty(len(keys), np.int64)
+    cell[order] = np.cumsum(is_first) - 1
+    unique = keys[order][is_first]
+    return unique, np.stack([np.bincount(cell, column, minlength=len(unique)) for column in sums])

@@ -1,0 +1,64 @@
+"""Oracles: normals of planes, spheres and steps in closed form, poison."""
+
+import numpy as np
+import pytest
+
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, backproject, window_normals
+
+CONFIG = EvaluationConfig()
+INTRINSICS = (110.0, 95.0, 61.0, 47.0)  # fx ≠ fy, centre not in the middle
+SHAPE = (90, 120)
+
+
+def plane_depth(normal, distance):
+    """Depth image of the plane normal · p = distance."""
+    rays = backproject(np.ones(SHAPE), INTRINSICS)
+    return distance / (rays @ np.asarray(normal))
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.5, -0.3, 0.8), (-0.6, 0.5, 0.62)])
+def test_normals_of_a_plane_are_exact_and_face_the_camera(normal):
+    normal = np.asarray(normal) / np.linalg.norm(normal)
+    depth = plane_depth(normal, 2.0)
+    valid = (depth > 0.3) & (depth < 8.0)
+    normals = window_normals(backproject(np.where(valid, depth, 0.0), INTRINSICS), valid, CONFIG)
+    known = normals.any(-1)
+    assert known[valid].mean() > 0.9
+    np.testing.assert_allclose(normals[known], np.broadcast_to(-normal, normals[known].shape), atol=2e-3)
+
+
+def test_normals_of_a_noisy_sphere_point_from_its_centre():
+    rays = backproject(np.ones(SHAPE), INTRINSICS)
+    center = np.array([0.1, -0.05, 2.5])
+    a, b, c = (rays**2).sum(-1), rays @ center, center @ center - 1.0
+    hit = b * b - a * c > 0
+    depth = np.where(hit, (b - np.sqrt(np.maximum(b * b - a * c, 0.0))) / a, 0.0)
+    noise = 1.0 + 0.002 * np.random.default_rng(5).normal(size=SHAPE)
+    normals = window_normals(backproject(depth * noise, INTRINSICS), hit, CONFIG)
+    truth = backproject(depth, INTRINSICS) - center
+    known = normals.any(-1)
+    assert not known[~hit].any()
+    assert known[hit].mean() > 0.9
+    angles = np.degrees(np.arccos(np.einsum("nk,nk->n", normals[known], truth[known]).clip(-1, 1)))
+    assert np.median(angles) < 4.0
+
+
+def test_a_depth_step_does_not_bend_the_normals_beside_it():
+    depth = np.full(SHAPE, 2.0)
+    depth[:, 60:] = 3.0
+    normals = window_normals(backproject(depth, INTRINSICS), depth > 0, CONFIG)
+    known = normals.any(-1)
+    assert known.mean() > 0.95
+    np.testing.assert_allclose(normals[known], np.broadcast_to([0.0, 0.0, -1.0], normals[known].shape), atol=1e-3)
+
+
+def test_invalid_pixels_have_no_normal_and_change_no_other():
+    depth = plane_depth((0.3, 0.2, 0.9), 2.0)
+    points, valid = backproject(depth, INTRINSICS), np.ones(SHAPE, bool)
+    valid[20:30, 40:55] = False
+    poisoned = points.copy()
+    poisoned[~valid] = np.nan
+    normals = window_normals(poisoned, valid, CONFIG)
+    assert not normals[~valid].any()
+    points[~valid] = 0.0
+    np.testing.assert_array_equal(normals, window_normals(points, valid, CONFIG))
