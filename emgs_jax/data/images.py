@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
-from emgs_jax.data.reading import Size
+from emgs_jax.data.reading import Number, Size
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv")
@@ -41,7 +41,7 @@ class Images:
         stop: int | None = None,
         stride: int = 1,
         size: Sequence[int] = (320, 240),
-        intrinsics: Sequence[float] | None = None,
+        intrinsics: Sequence[Number] | None = None,
     ) -> None:
         path = reading.find_sequence(root, "." if sequence is None else sequence, LAYOUT, "your own recording")
         if intrinsics is None:

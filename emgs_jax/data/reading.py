@@ -15,6 +15,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from emgs_jax.data.base import BadFrameError
 
+Number = int | float  # a YAML value may be written 585 or 585.0
 Size = tuple[int, int]  # (width, height)
 Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy; pixel centres at integers
 
@@ -74,14 +75,14 @@ def check_size(size: Sequence[int]) -> Size:
     return values
 
 
-def check_depth_scale(depth_scale: float) -> float:
+def check_depth_scale(depth_scale: Number) -> float:
     """`depth_scale` as a positive finite number."""
     if not (math.isfinite(depth_scale) and depth_scale > 0):
         raise ValueError(f"dataset.depth_scale must be raw units per metre (5000 for TUM), got {depth_scale}")
     return float(depth_scale)
 
 
-def check_intrinsics(intrinsics: Sequence[float], raw_size: Size) -> Intrinsics:
+def check_intrinsics(intrinsics: Sequence[Number], raw_size: Size) -> Intrinsics:
     """`intrinsics` as four numbers that fit an image of raw_size."""
     values = tuple(float(v) for v in intrinsics)
     if len(values) != 4 or not np.isfinite(values).all() or min(values[:2]) <= 0:

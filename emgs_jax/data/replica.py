@@ -7,7 +7,7 @@ from pathlib import Path
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
-from emgs_jax.data.reading import Intrinsics, Size
+from emgs_jax.data.reading import Intrinsics, Number, Size
 
 LAYOUT = "root/{cam_params.json, SCENE/{traj.txt, results/{frame000000.jpg, depth000000.png}}}"
 SOURCE = "Replica as rendered for iMAP and NICE-SLAM, see the NICE-SLAM project page"
@@ -37,8 +37,8 @@ class Replica:
         stop: int | None = None,
         stride: int = 10,
         size: Sequence[int] = (320, 180),
-        intrinsics: Sequence[float] | None = None,
-        depth_scale: float | None = None,
+        intrinsics: Sequence[Number] | None = None,
+        depth_scale: Number | None = None,
     ) -> None:
         self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
         images = find_images(self._folder / "results")

@@ -1,12 +1,15 @@
 """A furnished room for the synthetic data set: boxes, cylinders and a ball with procedural solid textures. z is up."""
 
 import colorsys
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
 from scipy.ndimage import map_coordinates
+
+from emgs_jax.data.reading import Number
 
 # A label is the position in here.
 CLASSES = ("wall", "floor", "ceiling", "table", "chair", "sofa", "shelf", "cabinet", "lamp", "picture", "box", "ball")
@@ -40,14 +43,14 @@ def build_room(rng: np.random.Generator) -> tuple[list[Part], Float[np.ndarray, 
     """Objects of a random room as (class, mesh) and its size x, y, z in metres; the origin is the floor's centre."""
     size = np.array([5.0, 4.0, 2.6]) * rng.uniform(0.95, 1.05, 3)
     parts = _shell(size) + _center(rng)
-    walls = rng.permutation(4)
+    walls = rng.permutation(4).tolist()
     for wall, build in zip(walls, (_sofa, _shelf, _cabinet, _desk), strict=True):
         parts += _against(build(rng), wall, size, rng.uniform(-0.3, 0.3))
     for wall in range(4):
         for along in (-0.75, 0.75):
             if rng.uniform() < 0.8 and not (wall == walls[1] and along < 0):
                 parts += _against(_picture(rng), wall, size, along + rng.uniform(-0.2, 0.2))
-    corners = rng.permutation(4)
+    corners = rng.permutation(4).tolist()
     for corner, build in zip(corners, (_lamp, _boxes, _ball), strict=False):
         sign = np.array([1 - 2 * (corner & 1), 1 - (corner & 2)])
         parts += _moved(build(rng), np.array([*(sign * (size[:2] / 2 - 0.38)), 0.0]))
@@ -95,13 +98,13 @@ def _noise(cells: Float[np.ndarray, "p 3"], looks: Looks) -> Float[np.ndarray, "
     return map_coordinates(looks.noise, cells.T, order=1, mode="grid-wrap", prefilter=False)
 
 
-def _box(size: tuple[float, float, float], low_center: tuple[float, float, float]) -> trimesh.Trimesh:
+def _box(size: Sequence[Number], low_center: Sequence[Number]) -> trimesh.Trimesh:
     """Box of (x, y, z) size whose bottom face is centred at low_center."""
     x, y, z = low_center
     return trimesh.creation.box(size, trimesh.transformations.translation_matrix((x, y, z + size[2] / 2)))
 
 
-def _cylinder(radius: float, height: float, bottom: float) -> trimesh.Trimesh:
+def _cylinder(radius: float, height: float, bottom: Number) -> trimesh.Trimesh:
     center = trimesh.transformations.translation_matrix((0, 0, bottom + height / 2))
     return trimesh.creation.cylinder(radius, height, sections=32, transform=center)
 

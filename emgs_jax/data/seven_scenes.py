@@ -9,7 +9,7 @@ from jaxtyping import Float, Float32
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import Frame
-from emgs_jax.data.reading import Intrinsics, Size
+from emgs_jax.data.reading import Intrinsics, Number, Size
 
 LAYOUT = "root/SCENE/seq-XX/frame-000000.{color.png or color.jpg, depth.png, pose.txt}"
 SOURCE = "7-Scenes, project page of Microsoft Research; unpack the inner seq-XX.zip as well"
@@ -54,8 +54,8 @@ class SevenScenes:
         stop: int | None = None,
         stride: int = 10,
         size: Sequence[int] = (320, 240),
-        intrinsics: Sequence[float] | None = None,
-        depth_scale: float = 1000.0,
+        intrinsics: Sequence[Number] | None = None,
+        depth_scale: Number = 1000.0,
         register_depth: bool = True,
     ) -> None:
         self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
@@ -145,5 +145,6 @@ def color_camera_points(depth: Float32[np.ndarray, "h w"]) -> Float[np.ndarray, 
     v, u = np.nonzero(depth > NEAR)
     z = depth[v, u]
     points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=-1)
-    points = points @ T_COLOR_DEPTH[:3, :3].T + T_COLOR_DEPTH[:3, 3]
+    # einsum, as a threaded matmul of this shape waits for its threads when the machine is busy
+    points = np.einsum("pj,ij->pi", points, T_COLOR_DEPTH[:3, :3]) + T_COLOR_DEPTH[:3, 3]
     return points[points[:, 2] > NEAR]

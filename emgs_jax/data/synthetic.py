@@ -9,6 +9,7 @@ from jaxtyping import Float, Float32
 
 from emgs_jax.data import reading, room
 from emgs_jax.data.base import Frame
+from emgs_jax.data.reading import Number
 
 VERSION = 1  # goes up with every change of geometry, texture or path: recorded predictions then no longer fit
 FOCAL_PER_WIDTH = 0.82  # 63 degrees across, as a Kinect
@@ -38,7 +39,7 @@ class Synthetic:
         stop: int | None = None,
         stride: int = 1,
         size: Sequence[int] = (320, 240),
-        intrinsics: Sequence[float] | None = None,
+        intrinsics: Sequence[Number] | None = None,
     ) -> None:
         if seed < 0 or num_frames < 1:
             raise ValueError(
@@ -78,7 +79,7 @@ class Synthetic:
         """Unit normals of the surfaces in the camera's axes, facing the camera."""
         _, _, normals, rays = self._cast(index)
         normals = np.where((normals * rays[..., 3:]).sum(-1, keepdims=True) > 0, -normals, normals)
-        return normals @ self._poses[self._numbers[index]][:3, :3].astype(np.float32)
+        return np.einsum("hwj,ji->hwi", normals, self._poses[self._numbers[index]][:3, :3].astype(np.float32))
 
     def _cast(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Depth (h, w), object (h, w), normal in the world (h, w, 3) and ray (origin, direction) (h, w, 6)."""
@@ -86,9 +87,8 @@ class Synthetic:
         (w, h), (fx, fy, cx, cy) = self.size, self.intrinsics
         pose = self._poses[self._numbers[index]]
         u, v = np.meshgrid((np.arange(w) - cx) / fx, (np.arange(h) - cy) / fy)
-        directions = (
-            np.stack([u, v, np.ones_like(u)], axis=-1) @ pose[:3, :3].T
-        )  # z = 1: the hit's parameter is the depth
+        # In the camera a direction's z is 1, so the hit's parameter is the depth.
+        directions = np.einsum("hwj,ij->hwi", np.stack([u, v, np.ones_like(u)], axis=-1), pose[:3, :3])
         rays = np.concatenate([np.broadcast_to(pose[:3, 3], directions.shape), directions], axis=-1).astype(np.float32)
         hit = self._scene.cast_rays(o3d.core.Tensor(rays))
         objects = hit["geometry_ids"].numpy().astype(np.int64)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
-from emgs_jax.data.reading import Intrinsics, Size
+from emgs_jax.data.reading import Intrinsics, Number, Size
 
 LAYOUT = "root/SEQUENCE/{rgb.txt, depth.txt, groundtruth.txt, rgb/, depth/}"
 SOURCE = "TUM RGB-D benchmark, project page of the Computer Vision Group of TU Munich"
@@ -57,10 +57,10 @@ class Tum:
         stop: int | None = None,
         stride: int = 10,
         size: Sequence[int] = (320, 240),
-        intrinsics: Sequence[float] | None = None,
-        distortion: Sequence[float] | None = None,
-        depth_scale: float = 5000.0,
-        max_time_difference: float = 0.02,
+        intrinsics: Sequence[Number] | None = None,
+        distortion: Sequence[Number] | None = None,
+        depth_scale: Number = 5000.0,
+        max_time_difference: Number = 0.02,
     ) -> None:
         self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
         times, names = read_list(self._folder / "rgb.txt", 2)
@@ -179,8 +179,8 @@ def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"]:
 
 
 def find_calibration(
-    sequence: str, intrinsics: Sequence[float] | None, distortion: Sequence[float] | None
-) -> tuple[Sequence[float], tuple[float, ...] | None]:
+    sequence: str, intrinsics: Sequence[Number] | None, distortion: Sequence[Number] | None
+) -> tuple[Sequence[Number], tuple[float, ...] | None]:
     """Intrinsics and distortion of the images on disk: as given, else the benchmark's by the sequence's name."""
     if intrinsics is None:
         if distortion is not None:

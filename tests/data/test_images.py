@@ -1,0 +1,105 @@
+"""Folders of images and videos."""
+
+import cv2
+import numpy as np
+import pytest
+from written_scene import color_image
+
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.images import Images
+
+INTRINSICS = (128.0, 128.0, 79.5, 59.5)
+SIZE = (160, 120)
+
+
+def load(path, **options):
+    return Images(str(path), **{"size": SIZE, "intrinsics": INTRINSICS, **options})
+
+
+def number_of(frame) -> int:
+    """Which color_image a frame is, by its red."""
+    return round((frame.image[..., 0].mean() - 20) / 40)
+
+
+def write_video(path, num_frames: int = 6) -> None:
+    code = {".avi": "MJPG", ".mp4": "mp4v"}[path.suffix]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), 25.0, SIZE)
+    if not writer.isOpened():
+        pytest.skip(f"this OpenCV cannot write {path.suffix}")
+    for i in range(num_frames):
+        writer.write(color_image(i, SIZE))
+    writer.release()
+
+
+def test_images_come_in_the_order_of_their_numbers_in_any_case(images_root):
+    dataset = load(images_root)
+    assert [number_of(frame) for frame in dataset] == [0, 1, 2]
+    assert [frame.timestamp for frame in dataset] == [2, 10, 33]
+    assert not dataset.has_ground_truth
+    assert dataset[0].depth is None and dataset[0].T_world_camera is None
+    np.testing.assert_allclose(dataset.intrinsics, INTRINSICS)
+
+
+def test_names_without_ascending_numbers_get_their_position_as_time(images_root):
+    (images_root / "img10.JPG").rename(images_root / "imgx.JPG")
+    assert [frame.timestamp for frame in load(images_root)] == [0, 1, 2]
+
+
+def test_another_aspect_bends_the_intrinsics_with_the_image(images_root):
+    np.testing.assert_allclose(load(images_root, size=(80, 30)).intrinsics, (64, 32, 39.5, 14.5))
+
+
+def test_missing_intrinsics_say_what_to_give(images_root):
+    with pytest.raises(ValueError, match=r"dataset.intrinsics=\[fx,fy,cx,cy\]"):
+        load(images_root, intrinsics=None)
+
+
+def test_one_image_is_a_sequence_and_none_is_an_error(images_root):
+    assert len(load(images_root, stop=1)) == 1
+    for path in images_root.iterdir():
+        path.unlink()
+    with pytest.raises(ValueError, match="has no images"):
+        load(images_root)
+
+
+def test_a_first_image_that_is_broken_does_not_hide_the_size_of_the_others(images_root):
+    (images_root / "img2.png").write_bytes(b"")
+    dataset = load(images_root)
+    with pytest.raises(BadFrameError, match="img2.png is empty"):
+        dataset[0]
+    assert number_of(dataset[1]) == 1
+
+
+def test_an_image_of_another_size_is_a_bad_frame(images_root):
+    cv2.imwrite(str(images_root / "img44.png"), color_image(0, (80, 60)))
+    with pytest.raises(BadFrameError, match="img44.png is 80x60"):
+        load(images_root)[3]
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mp4"])
+def test_a_video_gives_the_right_frame_in_any_order(suffix, tmp_path):
+    path = tmp_path / f"clip{suffix}"
+    write_video(path)
+    dataset = load(path, stride=2)
+    assert len(dataset) == 3
+    for i in (0, 1, 2, 1, 0, 2, 2):
+        frame = dataset[i]
+        assert number_of(frame) == 2 * i
+        assert frame.timestamp == pytest.approx(2 * i / 25)
+
+
+def test_a_video_that_ends_early_says_where(tmp_path, monkeypatch):
+    path = tmp_path / "clip.avi"
+    write_video(path)
+    dataset = load(path)
+    monkeypatch.setattr(dataset._source, "count", 9)  # what a header may claim
+    with pytest.raises(BadFrameError, match="dataset.stop=6"):
+        dataset._source.read(8)
+    assert number_of(dataset[1]) == 1
+
+
+def test_a_file_that_is_no_video_is_an_error(tmp_path):
+    path = tmp_path / "clip.mp4"
+    path.write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="clip.mp4 is no video"):
+        load(path)

@@ -1,0 +1,74 @@
+"""Replica in the NICE-SLAM layout."""
+
+import numpy as np
+import pytest
+from written_scene import plane_depth, scene_pose
+
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.replica import Replica
+
+
+def load(root, **options):
+    return Replica(str(root), "office9", **{"stride": 1, "size": (60, 34), **options})
+
+
+def test_frames_have_the_scenes_depth_and_poses(replica_root):
+    dataset = load(replica_root)
+    np.testing.assert_allclose(dataset.intrinsics, (30, 30, 29.5, 16.5))
+    for i, frame in enumerate(dataset):
+        assert frame.timestamp == i
+        np.testing.assert_allclose(frame.T_world_camera, scene_pose(i), atol=1e-8)
+        truth = plane_depth(scene_pose(i), dataset.intrinsics, (60, 34))
+        assert np.abs(frame.depth - truth).max() < 0.05  # half of a coarse raw pixel, 1/120 wide, on a slant of 3 m
+        assert abs(frame.image[..., 0].mean() - (40 * i + 20)) < 2
+
+
+def test_a_frame_belongs_to_the_row_of_its_number(replica_root):
+    for path in list((replica_root / "office9" / "results").glob("*000001*")):
+        path.unlink()
+    dataset = load(replica_root)
+    assert [frame.timestamp for frame in dataset] == [0, 2]
+    np.testing.assert_allclose(dataset[1].T_world_camera, scene_pose(2), atol=1e-8)
+
+
+def test_fewer_poses_than_images_is_an_error_that_names_the_file(replica_root):
+    path = replica_root / "office9" / "traj.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[:2]))
+    with pytest.raises(ValueError, match="traj.txt has 2 poses, but there is an image number 2"):
+        load(replica_root)
+    assert len(load(replica_root, stop=2)) == 2
+
+
+def test_a_row_that_is_no_pose_is_a_bad_frame(replica_root):
+    path = replica_root / "office9" / "traj.txt"
+    rows = path.read_text().splitlines()
+    path.write_text("\n".join([rows[0], rows[1][:40], rows[2].replace("e", "x", 1)]))
+    dataset = load(replica_root)
+    assert dataset[0].index == 0
+    for i in (1, 2):
+        with pytest.raises(BadFrameError, match=f"traj.txt, row {i}"):
+            dataset[i]
+
+
+def test_missing_or_broken_calibration_names_the_file(replica_root):
+    path = replica_root / "cam_params.json"
+    path.write_text(path.read_text()[:-9])
+    with pytest.raises(ValueError, match="cam_params.json must hold"):
+        load(replica_root)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match="cam_params.json is missing"):
+        load(replica_root)
+
+
+def test_calibration_of_another_size_is_found_at_the_image(replica_root):
+    path = replica_root / "cam_params.json"
+    path.write_text(path.read_text().replace('"w": 120', '"w": 1200'))
+    with pytest.raises(BadFrameError, match="frame000000.jpg is 120x68, but .* are 1200x68"):
+        load(replica_root)[0]
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (60, 62), (150, 145)])
+def test_points_of_one_frame_lie_on_the_surfaces_of_another(pair, shared_data, depth_gaps):
+    dataset = Replica(shared_data("replica"), "office0_from_mesh", stride=1)
+    assert len(dataset) == 200
+    assert np.median(np.abs(depth_gaps(dataset, *pair))) < 0.006  # exact depth; half a pixel of rounding on slants

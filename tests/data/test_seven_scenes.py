@@ -1,0 +1,137 @@
+"""7-Scenes: registration, poses of the colour camera, layout."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
+from written_scene import color_image, plane_depth, scene_pose
+
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.seven_scenes import T_COLOR_DEPTH, SevenScenes, register
+
+REAL = "redkitchen/seq-01"
+
+
+def load(root, **options):
+    return SevenScenes(str(root), "kitchen/seq-01", **{"stride": 1, **options})
+
+
+@pytest.mark.parametrize("size", [(320, 240), (640, 480), (800, 600), (256, 144)])
+def test_registered_depth_is_what_the_colour_camera_would_have_measured(size, seven_scenes_root):
+    frame = load(seven_scenes_root, size=size)[2]
+    T_world_color = scene_pose(2) @ np.linalg.inv(T_COLOR_DEPTH)
+    sx, sy = size[0] / 640, size[1] / 480
+    intrinsics = (525 * sx, 525 * sy, 320.5 * sx - 0.5, 240.5 * sy - 0.5)
+    truth = plane_depth(T_world_color, intrinsics, size)
+    seen = frame.depth > 0
+    rows, columns = np.nonzero(seen)
+    assert seen[rows.min() + 6 : rows.max() - 5, columns.min() + 6 : columns.max() - 5].all(), (
+        "holes"
+    )  # within a ragged rim
+    assert 0.75 < seen.mean() < 0.85  # (525 / 585)^2 = .805 of the image
+    # A source pixel is 1/585 wide and the plane's depth changes by 1.6 m a unit at most: 1.4 mm, and .5 mm of rounding.
+    assert np.abs(frame.depth - truth)[seen].max() < 0.003
+    np.testing.assert_allclose(frame.T_world_camera, T_world_color, atol=1e-6)
+
+
+def test_a_nearer_surface_hides_a_farther_one():
+    depth = np.full((480, 640), 2.0, np.float32)
+    depth[:, :300] = 1.0
+    registered = register(depth, (262.5, 262.5, 159.75, 119.75), (320, 240))
+    # Both surfaces shift by t_x f / z, -13.4 and -6.7 pixels of 525: a gap opens, and nothing of 2 m shows left of it.
+    row = registered[120]
+    assert set(np.round(row[row > 0]).astype(int)) == {1, 2}
+    assert np.nonzero(np.round(row) == 2)[0].min() > np.nonzero(np.round(row) == 1)[0].max()
+
+
+def test_unregistered_depth_keeps_the_files_pose_and_585(seven_scenes_root):
+    dataset = load(seven_scenes_root, register_depth=False)
+    np.testing.assert_allclose(dataset.intrinsics, (292.5, 292.5, 159.75, 119.75))
+    np.testing.assert_allclose(dataset[1].T_world_camera, scene_pose(1), atol=1e-9)
+    truth = plane_depth(scene_pose(1), dataset.intrinsics, (320, 240))
+    assert np.abs(dataset[1].depth - truth).max() < 0.003
+
+
+def test_given_intrinsics_are_those_of_the_640_by_480_colour_images(seven_scenes_root):
+    dataset = load(seven_scenes_root, intrinsics=[500, 510, 300, 200])
+    np.testing.assert_allclose(dataset.intrinsics, (250, 255, 149.75, 99.75))
+    frame = dataset[0]
+    truth = plane_depth(np.linalg.inv(T_COLOR_DEPTH), dataset.intrinsics, (320, 240))
+    assert np.abs(frame.depth - truth)[frame.depth > 0].max() < 0.003
+
+
+def test_png_and_jpg_are_read_and_the_png_wins(seven_scenes_root):
+    folder = seven_scenes_root / "kitchen" / "seq-01"
+    cv2.imwrite(str(folder / "frame-000000.color.jpg"), color_image(5, (640, 480)))
+    dataset = load(seven_scenes_root)
+    assert [frame.name[-3:] for frame in dataset] == ["png", "jpg", "jpg"]
+    assert [frame.timestamp for frame in dataset] == [0, 1, 2]
+    np.testing.assert_allclose([f.image[..., 0].mean() for f in dataset], [20, 60, 100], atol=1)  # red names the frame
+
+
+def test_lost_tracking_names_the_pose_file(seven_scenes_root):
+    path = seven_scenes_root / "kitchen" / "seq-01" / "frame-000001.pose.txt"
+    path.write_text("inf " * 16)
+    with pytest.raises(BadFrameError, match="frame-000001.pose.txt"):
+        load(seven_scenes_root)[1]
+
+
+def test_missing_depth_and_images_of_another_size_name_the_file(seven_scenes_root):
+    folder = seven_scenes_root / "kitchen" / "seq-01"
+    (folder / "frame-000001.depth.png").unlink()
+    cv2.imwrite(str(folder / "frame-000002.color.jpg"), color_image(2, (320, 240)))
+    dataset = load(seven_scenes_root)
+    with pytest.raises(BadFrameError, match="frame-000001.depth.png is missing"):
+        dataset[1]
+    with pytest.raises(BadFrameError, match="frame-000002.color.jpg is 320x240"):
+        dataset[2]
+
+
+def test_poses_are_the_published_poses_of_the_colour_camera(shared_data):
+    root = shared_data("7scenes")
+    published = {}
+    for line in Path(root, "redkitchen/seq-01_color_camera_poses_dslam.txt").read_text().splitlines():
+        if not line.startswith("#"):
+            name, *numbers = line.split()
+            w, x, y, z, *t = (float(n) for n in numbers[:7])
+            world_to_camera = Rotation.from_quat([x, y, z, w])
+            published[int(name[-16:-10])] = -world_to_camera.inv().apply(t), world_to_camera.inv()
+    dataset = SevenScenes(root, REAL, stride=50)
+    assert len(dataset) == 5
+    for frame in dataset:
+        center, rotation = published[int(frame.timestamp)]
+        assert np.linalg.norm(frame.T_world_camera[:3, 3] - center) < 2e-4  # six digits; the depth camera is 2.5 cm off
+        assert (Rotation.from_matrix(frame.T_world_camera[:3, :3]).inv() * rotation).magnitude() < 2e-4
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (20, 21)])
+def test_points_of_one_real_frame_lie_on_the_surfaces_of_the_next(pair, shared_data, depth_gaps):
+    dataset = SevenScenes(shared_data("7scenes"), REAL, stride=5)
+    assert np.median(np.abs(depth_gaps(dataset, *pair))) < 0.015
+
+
+def test_registration_brings_real_colours_together(shared_data):
+    """The README's check of the calibration: .98 with registration, .94 with 585 for the colour camera."""
+    scores = {}
+    for registered in (True, False):
+        dataset = SevenScenes(shared_data("7scenes"), REAL, stride=10, register_depth=registered)
+        scores[registered] = np.median([photometric_correlation(dataset, i, i + 1) for i in (0, 5, 10, 15)])
+    assert scores[True] > 0.96
+    assert scores[True] > scores[False] + 0.02
+
+
+def photometric_correlation(dataset, i: int, j: int) -> float:
+    a, b = dataset[i], dataset[j]
+    fx, fy, cx, cy = dataset.intrinsics
+    v, u = np.nonzero(a.depth > 0)
+    z = a.depth[v, u]
+    points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z, np.ones_like(z)])
+    x, y, z = (np.linalg.inv(b.T_world_camera) @ a.T_world_camera @ points)[:3]
+    place = np.stack([fy * y / z + cy, fx * x / z + cx])
+    depth = map_coordinates(b.depth, place, order=0)
+    visible = (z > 0.1) & (np.abs(depth - z) < 0.1)
+    there = map_coordinates(b.image.mean(-1), place[:, visible], order=1)
+    return float(np.corrcoef(a.image.mean(-1)[v, u][visible], there)[0, 1])

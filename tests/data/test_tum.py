@@ -1,0 +1,125 @@
+"""TUM layout: association by time, calibration, undistortion."""
+
+import cv2
+import numpy as np
+import pytest
+from written_scene import plane_depth, scene_pose
+
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.tum import CALIBRATIONS, Tum, nearest_rows, undistortion
+
+SEQUENCE = "rgbd_dataset_freiburg3_plane"
+
+
+def load(root, sequence=SEQUENCE, **options):
+    return Tum(str(root), sequence, **{"stride": 1, **options})
+
+
+def test_frames_have_the_scenes_depth_and_poses(tum_root):
+    dataset = load(tum_root)
+    assert dataset.has_ground_truth
+    np.testing.assert_allclose(dataset.intrinsics, (267.7, 269.6, 159.8, 123.55))
+    for i, frame in enumerate(dataset):
+        assert frame.timestamp == 100.0 + i
+        np.testing.assert_allclose(frame.T_world_camera, scene_pose(i), atol=1e-6)
+        truth = plane_depth(scene_pose(i), dataset.intrinsics, (320, 240))
+        assert np.abs(frame.depth - truth).max() < 0.005  # nearest: half a pixel of a slanted plane
+        assert abs(frame.image[..., 0].mean() - (40 * i + 20)) < 1
+
+
+def test_the_nearest_row_in_time_is_taken_within_the_tolerance():
+    rng = np.random.default_rng(0)
+    times, candidates = rng.uniform(0, 10, 50), np.sort(rng.uniform(0, 10, 70))
+    gaps = np.abs(times[:, None] - candidates)
+    truth = np.where(gaps.min(1) <= 0.03, gaps.argmin(1), -1)
+    assert nearest_rows(times, candidates, 0.03) == truth.tolist()
+    assert nearest_rows(times, candidates[:0], 0.03) == [-1] * 50
+    assert nearest_rows(np.array([1.0, 5.0]), np.array([1.01]), 0.02) == [0, -1]
+
+
+def test_an_image_without_depth_or_pose_near_in_time_stays_in_use(tum_root):
+    for name in ("depth", "groundtruth"):
+        path = tum_root / SEQUENCE / f"{name}.txt"
+        lines = path.read_text().splitlines()
+        path.write_text("\n".join([lines[0], lines[1], lines[3]]))  # the second frame's row is gone
+    frames = list(load(tum_root))
+    assert [frame.T_world_camera is None for frame in frames] == [False, True, False]
+    assert [bool((frame.depth > 0).any()) for frame in frames] == [True, False, True]
+
+
+def test_without_lists_of_depth_and_poses_there_is_no_ground_truth(tum_root):
+    for name in ("depth", "groundtruth"):
+        (tum_root / SEQUENCE / f"{name}.txt").unlink()
+    dataset = load(tum_root)
+    assert not dataset.has_ground_truth
+    assert dataset[0].depth is None
+    assert dataset[0].T_world_camera is None
+
+
+def test_rows_out_of_order_and_comments_do_not_matter(tum_root):
+    expected = load(tum_root)[1]
+    for name in ("rgb", "depth", "groundtruth"):
+        path = tum_root / SEQUENCE / f"{name}.txt"
+        path.write_text("\n\n# again\n".join(reversed(path.read_text().splitlines())))
+    np.testing.assert_array_equal(load(tum_root)[1].depth, expected.depth)
+    np.testing.assert_array_equal(load(tum_root)[1].T_world_camera, expected.T_world_camera)
+
+
+def test_an_unknown_folder_needs_intrinsics_and_takes_them(tum_root):
+    (tum_root / SEQUENCE).rename(tum_root / "my_desk")
+    with pytest.raises(ValueError, match=r"dataset.intrinsics=\[fx,fy,cx,cy\]"):
+        load(tum_root, "my_desk")
+    with pytest.raises(ValueError, match="dataset.distortion needs"):
+        load(tum_root, "my_desk", distortion=[0, 0, 0, 0, 0])
+    dataset = load(tum_root, "my_desk", intrinsics=[500, 500, 320, 240], depth_scale=1000)
+    np.testing.assert_allclose(dataset.intrinsics, (250, 250, 159.75, 119.75))
+    np.testing.assert_allclose(dataset[0].depth, 5 * load_scaled(tum_root).depth, rtol=1e-5)
+
+
+def load_scaled(root):
+    return load(root, "my_desk", intrinsics=[500, 500, 320, 240], depth_scale=5000)[0]
+
+
+@pytest.mark.parametrize("key", ["freiburg1", "freiburg2"])
+def test_undistorted_pixels_see_what_the_distorted_camera_saw(key):
+    intrinsics, distortion = CALIBRATIONS[key]
+    (fx, fy, cx, cy), maps = undistortion(intrinsics, distortion, (640, 480))
+    pixels = np.array([[10, 20], [320, 240], [600, 450]])
+    rays = np.column_stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(3)])
+    old = np.array([[intrinsics[0], 0, intrinsics[2]], [0, intrinsics[1], intrinsics[3]], [0, 0, 1]])
+    seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), old, np.array(distortion))
+    np.testing.assert_allclose([m[pixels[:, 1], pixels[:, 0]] for m in maps], seen[:, 0].T, atol=1e-2)
+    assert maps[0].min() >= -1 and maps[0].max() <= 640 and maps[1].min() >= -1 and maps[1].max() <= 480
+
+
+def test_freiburg1_images_are_undistorted_and_freiburg3_images_are_not(tum_root):
+    straight = load(tum_root)[0].image
+    (tum_root / SEQUENCE).rename(tum_root / "rgbd_dataset_freiburg1_plane")
+    bent = load(tum_root, "rgbd_dataset_freiburg1_plane")
+    assert np.abs(bent[0].image.astype(int) - straight).max() > 3
+    fx, _, cx, cy = bent.intrinsics
+    assert 258 < fx < 300  # cropped to what the distorted image covers, so longer than the 258.7 of the lens
+    np.testing.assert_allclose((cx, cy), (159.5, 119.5), atol=1e-6)  # the new centre is the image's
+
+
+def test_a_broken_row_names_the_file_and_the_line(tum_root):
+    path = tum_root / SEQUENCE / "rgb.txt"
+    path.write_text(path.read_text().replace("101.0", "x01.0", 1))
+    with pytest.raises(ValueError, match=r"rgb.txt, line 3"):
+        load(tum_root)
+
+
+def test_a_pose_that_is_not_finite_or_no_rotation_is_a_bad_frame(tum_root):
+    path = tum_root / SEQUENCE / "groundtruth.txt"
+    path.write_text("99.995 0 0 0 0 0 0 0\n100.995 nan 0 0 0 0 0 1\n101.995 0 0 0 0 0 0 1\n")
+    dataset = load(tum_root)
+    for i in (0, 1):
+        with pytest.raises(BadFrameError, match="groundtruth.txt"):
+            dataset[i]
+    np.testing.assert_array_equal(dataset[2].T_world_camera, np.eye(4))
+
+
+def test_points_of_one_real_frame_lie_on_the_surfaces_of_the_next(shared_data, depth_gaps):
+    dataset = Tum(shared_data("tum"), "rgbd_dataset_freiburg3_cabinet", stride=1)
+    assert len(dataset) == 48
+    assert np.median(np.abs(np.concatenate([depth_gaps(dataset, i, i + 1) for i in (3, 20, 40)]))) < 0.025
