@@ -38,14 +38,13 @@ def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
 
     Rows come out ordered by cell, so the result is deterministic; points that are not finite are dropped.
     """
-    keys, sums = np.empty(0, np.int64), np.empty((10, 0))
-    pending: list[tuple[np.ndarray, np.ndarray]] = []
+    tables: list[tuple[np.ndarray, np.ndarray]] = []  # cells of the clouds; the first may hold many of them
     for cloud in clouds:
-        pending.append(_cells(cloud, voxel))
-        if sum(len(rows) for rows, _ in pending) > max(_MERGE_ROWS, len(keys)):
-            keys, sums = _merge([(keys, sums), *pending])
-            pending = []
-    _, sums = _merge([(keys, sums), *pending])
+        tables.append(_cells(cloud, voxel))
+        if sum(len(keys) for keys, _ in tables[1:]) > max(_MERGE_ROWS, len(tables[0][0])):
+            tables = [_merge(tables)]
+    empty = (np.empty(0, np.int64), np.empty((10, 0)))
+    _, sums = tables[0] if len(tables) == 1 else _merge([empty, *tables])
     means = np.ascontiguousarray((sums[:9] / sums[9]).T)
     length = np.linalg.norm(means[:, 3:6], axis=1, keepdims=True)
     # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
@@ -66,15 +65,20 @@ def _cells(cloud: PointCloud, voxel: float) -> tuple[np.ndarray, np.ndarray]:
     index = np.floor(np.clip(points / voxel, -(2.0**20), 2.0**20 - 1)).astype(np.int64) + 2**20
     keys = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
     columns = (*points.T, *cloud.normals[finite].T, *cloud.colors[finite].T, np.ones(len(points)))
-    return _merge([(keys, np.stack(columns))])
+    return _sum_cells(keys, columns)
 
 
 def _merge(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    keys = np.concatenate([keys for keys, _ in tables])
-    sums = np.concatenate([sums for _, sums in tables], axis=1)
+    return _sum_cells(
+        np.concatenate([keys for keys, _ in tables]), np.concatenate([sums for _, sums in tables], axis=1)
+    )
+
+
+def _sum_cells(keys: np.ndarray, columns: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Sum the rows of equal keys (n,), column by column."""
     order = np.argsort(keys, kind="stable")
     is_first = np.diff(keys[order], prepend=-1) != 0
     cell = np.empty(len(keys), np.int64)
     cell[order] = np.cumsum(is_first) - 1
     unique = keys[order][is_first]
-    return unique, np.stack([np.bincount(cell, column, minlength=len(unique)) for column in sums])
+    return unique, np.stack([np.bincount(cell, column, minlength=len(unique)) for column in columns])
