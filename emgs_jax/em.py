@@ -26,6 +26,8 @@ class EmConfig(eqx.Module):
         feature_weight: κ2.
         support: δ as `printed`, clipped to 1, or `normalized` by the total responsibility (R5).
         average: gain and blend (R4, R13).
+        noise: factor on the points' noise along their viewing rays, which widens every Gaussian when a point is compared
+            with it; 0 as printed.
         min_responsibility: a Gaussian that receives less in total from a frame is left as it is.
         min_std: m; floor of the new covariances.
     """
@@ -39,6 +41,7 @@ class EmConfig(eqx.Module):
     feature_weight: Float[Array, "*b"] = traced()
     support: Float[Array, "*b"] = choice("printed", "normalized")
     average: AverageConfig
+    noise: Float[Array, "*b"] = traced()
     min_responsibility: Float[Array, "*b"] = traced()
     min_std: Float[Array, "*b"] = traced()
 
@@ -66,23 +69,43 @@ class EmInfo(eqx.Module):
     mean_log_joint: Float[Array, ""]
 
 
-def e_step(gaussians: Gaussians, points: Observation, config: EmConfig) -> tuple[EStep, Float[Array, "m"]]:
+def widened_distance_sq(
+    offsets: Float[Array, "m k 3"],
+    precisions: Float[Array, "m k 3 3"],
+    noise: Float[Array, "m 3"],
+) -> tuple[Float[Array, "m k"], Float[Array, "m k"]]:
+    """Squared Mahalanobis distance under Σ_k + ν ν' and log|Σ_k + ν ν'| - log|Σ_k| (Sherman–Morrison).
+
+    ν is a point's noise: a standard deviation along its viewing ray.
+    """
+    pulled = jnp.einsum("mkij,mj->mki", precisions, noise)
+    growth = 1.0 + jnp.einsum("mki,mi->mk", pulled, noise)
+    along = jnp.einsum("mki,mki->mk", offsets, pulled)
+    distance_sq = mahalanobis_sq(offsets, precisions) - along**2 / growth
+    return jnp.maximum(distance_sq, 0.0), jnp.log(growth)
+
+
+def e_step(
+    gaussians: Gaussians, points: Observation, noise: Float[Array, "m 3"], config: EmConfig
+) -> tuple[EStep, Float[Array, "m"]]:
     """Responsibilities of the K nearest Gaussians for every point (eq. 2 and 3), and each point's best log-joint.
 
     Args:
         gaussians: n of them, world frame.
         points: m observed points, world frame.
+        noise: m; standard deviation of every point along its viewing ray, as a vector.
         config: gates and weights.
     """
     rows, found = knn(points.points, gaussians.means, gaussians.valid, config.num_neighbours)
     precisions, logdets = inverse_and_logdet(gaussians.covs)
-    distance_sq = mahalanobis_sq(points.points[:, None] - gaussians.means[rows], precisions[rows])
+    offsets = points.points[:, None] - gaussians.means[rows]
+    distance_sq, log_growth = widened_distance_sq(offsets, precisions[rows], config.noise * noise)
     normal_cos = jnp.einsum("mkd,md->mk", gaussians.normals[rows], points.normals)
     # Features are unit vectors, so their product is the cosine; with width 0 the term must vanish.
     feature_gap = 0.0
     if gaussians.features.shape[-1]:
         feature_gap = jnp.einsum("mkf,mf->mk", gaussians.features[rows], points.features) - 1.0
-    log_det_term = -config.determinant_weight * logdets[rows]
+    log_det_term = -config.determinant_weight * (logdets[rows] + log_growth)
     log_joint = -0.5 * distance_sq + log_det_term
     log_joint += config.normal_weight * (normal_cos - 1.0) + config.feature_weight * feature_gap
 
@@ -98,9 +121,7 @@ def e_step(gaussians: Gaussians, points: Observation, config: EmConfig) -> tuple
     return EStep(rows, responsibilities, is_fused), best
 
 
-def support(
-    gaussians: Gaussians, points: Observation, step: EStep, config: EmConfig
-) -> Float[Array, "n"]:
+def support(gaussians: Gaussians, points: Observation, step: EStep, config: EmConfig) -> Float[Array, "n"]:
     """δ_k in [0, 1]: how evenly the points lie on both sides of the Gaussian along its tangential principal axes.
 
     For each axis 2 min(Σ₊ r, Σ₋ r), over the total or clipped (R5); the smaller of the two axes.
@@ -120,7 +141,9 @@ def support(
     return jnp.min(both, axis=-1)
 
 
-def m_step(gaussians: Gaussians, points: Observation, step: EStep, config: EmConfig) -> tuple[Gaussians, Float[Array, "n"]]:
+def m_step(
+    gaussians: Gaussians, points: Observation, step: EStep, config: EmConfig
+) -> tuple[Gaussians, Float[Array, "n"]]:
     """Responsibility-weighted mean, covariance about it, normal and colour of the points of every Gaussian.
 
     Returns:
@@ -131,9 +154,7 @@ def m_step(gaussians: Gaussians, points: Observation, step: EStep, config: EmCon
     offsets = points.points[:, None] - gaussians.means[step.rows]
     rows, columns = jnp.triu_indices(3)
     products = offsets[..., rows] * offsets[..., columns]
-    others = jnp.broadcast_to(
-        jnp.concatenate([points.normals, points.colors], axis=-1)[:, None], (*r.shape, 6)
-    )
+    others = jnp.broadcast_to(jnp.concatenate([points.normals, points.colors], axis=-1)[:, None], (*r.shape, 6))
     statistics = jnp.concatenate([jnp.ones_like(r)[..., None], offsets, products, others], axis=-1)
     sums = jnp.zeros((gaussians.valid.shape[0], 16)).at[step.rows].add(r[..., None] * statistics)
     total = sums[:, 0]
@@ -155,15 +176,17 @@ def m_step(gaussians: Gaussians, points: Observation, step: EStep, config: EmCon
 
 
 def em_update(
-    submap: GaussianMap, aligned: Observation, config: EmConfig
+    submap: GaussianMap, aligned: Observation, noise: Float[Array, "m 3"], config: EmConfig
 ) -> tuple[GaussianMap, Bool[Array, "m"], EmInfo]:
     """One incremental EM step: fuse the points of `aligned` (world frame) that the submap explains.
+
+    `noise` is the standard deviation of each point along its viewing ray, a vector in metres.
 
     Returns:
         The updated submap, which points were fused, and counts. Without any fused point the submap is unchanged.
     """
     gaussians = submap.gaussians
-    step, best = e_step(gaussians, aligned, config)
+    step, best = e_step(gaussians, aligned, noise, config)
     new, total = m_step(gaussians, aligned, step, config)
     evidence = jnp.where(total > 0, support(gaussians, aligned, step, config), 0.0)
     updated, gain = update_average(submap, new, evidence, config.average)

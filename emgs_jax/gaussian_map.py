@@ -57,9 +57,7 @@ class SubmapConfig(eqx.Module):
 
 def empty_map(capacity: int, num_features: int) -> GaussianMap:
     """A map without a Gaussian."""
-    return GaussianMap(
-        empty_gaussians(capacity, num_features), jnp.zeros(capacity), jnp.zeros(capacity, jnp.int32)
-    )
+    return GaussianMap(empty_gaussians(capacity, num_features), jnp.zeros(capacity), jnp.zeros(capacity, jnp.int32))
 
 
 def update_average(
@@ -132,5 +130,3 @@ def grow(map: GaussianMap, capacity: int) -> GaussianMap:
     """The same map with room for `capacity` Gaussians (host side: the shape changes)."""
     old = map.weight.shape[0]
     return put_rows(empty_map(capacity, map.gaussians.features.shape[-1]), jnp.arange(old), map)
-
-

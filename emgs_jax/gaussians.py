@@ -116,9 +116,7 @@ def cluster(
     return fitted, jnp.where(fitted.valid, count / spacing, 0.0)
 
 
-def blend(
-    old: Gaussians, new: Gaussians, gain: Float[Array, "n"], moment_matched: Float[Array, ""]
-) -> Gaussians:
+def blend(old: Gaussians, new: Gaussians, gain: Float[Array, "n"], moment_matched: Float[Array, ""]) -> Gaussians:
     """(1 - gain) old + gain new on means, covariances, colours and normals (eq. 4 and 6); features stay (R13).
 
     Args:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.linalg import inverse_and_logdet, mahalanobis_sq, outer, tangent_basis
 from emgs_jax.neighbours import knn
-from emgs_jax.observation import Observation
+from emgs_jax.observation import Observation, transform
 from emgs_jax.pytree import choice, static, take_rows, traced
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
@@ -24,7 +24,7 @@ class IcpConfig(eqx.Module):
             "Colored point cloud registration revisited", ICCV 2017); `distribution`: offset from the mean, whitened by
             the Gaussian's covariance; or `colored+distribution`: offset and intensity difference.
         color_std: standard deviation of intensity.
-        noise_std: m; standard deviation of a predicted point, added to every Gaussian.
+        noise: factor on the points' noise along their viewing rays, which widens every Gaussian for them.
         max_mahalanobis_sq: a point farther from all its neighbours than this is no inlier.
         min_normal_cos: nor one whose normal differs more from its Gaussian's.
         num_effective: how many independent measurements the points are worth: their errors are correlated.
@@ -39,7 +39,7 @@ class IcpConfig(eqx.Module):
 
     residual: Float[Array, "*b"] = choice("colored", "distribution", "colored+distribution")
     color_std: Float[Array, "*b"] = traced()
-    noise_std: Float[Array, "*b"] = traced()
+    noise: Float[Array, "*b"] = traced()
     max_mahalanobis_sq: Float[Array, "*b"] = traced()
     min_normal_cos: Float[Array, "*b"] = traced()
     num_effective: Float[Array, "*b"] = traced()
@@ -58,6 +58,7 @@ class IcpInfo(eqx.Module):
         num_inliers: points with a Gaussian that passes the gates.
         inlier_fraction: of the points that take part.
         residual: m; root mean square distance of the inliers to their Gaussians' planes.
+        misfit: m; the same distance of all points, as a median (times 1.4826, a standard deviation for Gaussian errors).
         min_eigenvalue: smallest eigenvalue of the Hessian, prior included, per effective point (1/m² and 1/rad²).
         num_steps: of the solver.
         is_converged: False where the solver reached `max_steps` or failed.
@@ -66,9 +67,17 @@ class IcpInfo(eqx.Module):
     num_inliers: Int[Array, ""]
     inlier_fraction: Float[Array, ""]
     residual: Float[Array, ""]
+    misfit: Float[Array, ""]
     min_eigenvalue: Float[Array, ""]
     num_steps: Int[Array, ""]
     is_converged: Bool[Array, ""]
+
+
+def median(values: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
+    """Lower median of the valid values; 1 without any."""
+    count = jnp.sum(valid)
+    ordered = jnp.sort(jnp.where(valid, values, jnp.inf))
+    return jnp.where(count > 0, ordered[jnp.maximum(count - 1, 0) // 2], 1.0)
 
 
 def fit_rigid(
@@ -88,9 +97,7 @@ def fit_rigid(
     rotation = jnp.where(total > 0, (u * handed) @ vt, jnp.eye(3))
     spread = share @ jnp.sum(a * a, axis=-1)
     scale = jnp.where(spread > 0, (s @ handed) / jnp.where(spread > 0, spread, 1.0), 1.0)
-    T = jaxlie.SE3.from_rotation_and_translation(
-        jaxlie.SO3.from_matrix(rotation), target_mean - rotation @ source_mean
-    )
+    T = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.from_matrix(rotation), target_mean - rotation @ source_mean)
     return T, scale
 
 
@@ -127,11 +134,12 @@ class _Matches(eqx.Module):
 
 
 def _match(
-    points: Float[Array, "p 3"], source: Observation, target: Gaussians, gradients: Array, config: IcpConfig
+    source: Observation, noise: Float[Array, "p 3"], target: Gaussians, gradients: Array, config: IcpConfig
 ) -> _Matches:
     """For each world point the nearest of its neighbouring Gaussians in Mahalanobis distance."""
+    points = source.points
     rows, found = knn(points, target.means, target.valid, config.num_neighbours)
-    covs = target.covs[rows] + config.noise_std**2 * jnp.eye(3)
+    covs = target.covs[rows] + outer(noise)[:, None]
     precisions, _ = inverse_and_logdet(covs)
     distance_sq = jnp.where(found, mahalanobis_sq(points[:, None] - target.means[rows], precisions), jnp.inf)
     best = jnp.argmin(distance_sq, axis=-1)[:, None]
@@ -168,7 +176,7 @@ def icp(
         source: points to align, camera frame.
         target: Gaussians of the submap, world frame.
         T_world_coarse: where to start, and the mean of the prior.
-        noise: standard deviation of the coarse pose in metres and radians.
+        noise: standard deviation of the coarse pose in metres, and of the points' depth as a fraction of it.
         config: terms and gates.
     """
     stride = max(source.valid.shape[0] // config.num_points, 1)
@@ -182,20 +190,22 @@ def icp(
         lambda: jnp.zeros_like(target.means),
     )
     share = jnp.sqrt(config.num_effective / jnp.maximum(jnp.sum(source.valid), 1))
-    prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack(noise), 3)
+    pose_noise, depth_noise = noise
+    prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack([pose_noise, depth_noise]), 3)
+    rays = config.noise * depth_noise * source.points
 
-    def place(xi: Float[Array, "6"]) -> tuple[jaxlie.SE3, Float[Array, "p 3"], Float[Array, "p 3"]]:
+    def place(xi: Float[Array, "6"]) -> tuple[jaxlie.SE3, Float[Array, "p 3"]]:
         T = T_world_coarse @ jaxlie.SE3.exp(xi)
-        rotation = T.rotation().as_matrix()
-        return T, source.points @ rotation.T + T.translation(), source.normals @ rotation.T
+        return T, source.points @ T.rotation().as_matrix().T + T.translation()
 
-    def matches(points: Float[Array, "p 3"], normals: Float[Array, "p 3"]) -> _Matches:
-        world = eqx.tree_at(lambda o: o.normals, source, normals)
-        return jax.lax.stop_gradient(_match(points, world, target, gradients, config))
+    def matches(T: jaxlie.SE3) -> _Matches:
+        T = jax.lax.stop_gradient(T)
+        noise_rays = rays @ T.rotation().as_matrix().T
+        return jax.lax.stop_gradient(_match(transform(T, source, jnp.ones(())), noise_rays, target, gradients, config))
 
     def residuals(xi: Float[Array, "6"], _: None) -> tuple[Float[Array, "p 5"], Float[Array, "6"]]:
-        _, points, normals = place(xi)
-        match = matches(jax.lax.stop_gradient(points), jax.lax.stop_gradient(normals))
+        T, points = place(xi)
+        match = matches(T)
         offset = points - match.means
         plane = jnp.sum(offset * match.normals, axis=-1) / match.plane_std
         shade = (match.light + jnp.sum(match.gradients * offset, axis=-1) - light) / config.color_std
@@ -215,16 +225,17 @@ def icp(
     solver = optx.LevenbergMarquardt(rtol=config.tolerance, atol=config.tolerance)
     solution = optx.least_squares(residuals, solver, jnp.zeros(6), max_steps=config.max_steps, throw=False)
     xi = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, 0.0)
-    T, points, normals = place(xi)
-    match = matches(points, normals)
+    T, points = place(xi)
+    match = matches(T)
     num_inliers = jnp.sum(match.is_inlier)
-    distance = jnp.where(match.is_inlier, jnp.sum((points - match.means) * match.normals, axis=-1), 0.0)
+    distance = jnp.sum((points - match.means) * match.normals, axis=-1)
     jacobian = jnp.concatenate([x.reshape(-1, 6) for x in jax.jacfwd(residuals)(xi, None)])
     hessian = jacobian.T @ jacobian / jnp.maximum(config.num_effective, 1.0)
     info = IcpInfo(
         num_inliers=num_inliers,
         inlier_fraction=num_inliers / jnp.maximum(jnp.sum(source.valid), 1),
-        residual=jnp.sqrt(jnp.sum(distance**2) / jnp.maximum(num_inliers, 1)),
+        residual=jnp.sqrt(jnp.sum(jnp.where(match.is_inlier, distance, 0.0) ** 2) / jnp.maximum(num_inliers, 1)),
+        misfit=1.4826 * median(jnp.abs(distance), source.valid),
         min_eigenvalue=jnp.linalg.eigvalsh(hessian)[0],
         num_steps=solution.stats["num_steps"],
         is_converged=solution.result == optx.RESULTS.successful,

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.camera import Camera, project
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.icp import IcpConfig, IcpInfo, fit_rigid, icp
+from emgs_jax.icp import IcpConfig, IcpInfo, fit_rigid, icp, median
 from emgs_jax.observation import Observation, Prediction, transform
 from emgs_jax.pytree import choice, stack, traced
 
@@ -86,6 +86,7 @@ class LocalizationInfo(eqx.Module):
         reason: bits into `REASONS`; 0 for a tracked frame.
         scale: of this prediction.
         repeat_rms: see `CoarsePose`.
+        depth_noise: of the points, as a fraction of their depth: how much they differ from the map.
         step_m: between the coarse and the fine pose.
         step_rad: likewise.
         icp: of the fine step.
@@ -96,16 +97,10 @@ class LocalizationInfo(eqx.Module):
     reason: Int[Array, ""]
     scale: Float[Array, ""]
     repeat_rms: Float[Array, ""]
+    depth_noise: Float[Array, ""]
     step_m: Float[Array, ""]
     step_rad: Float[Array, ""]
     icp: IcpInfo
-
-
-def median(values: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
-    """Lower median of the valid values; 1 without any."""
-    count = jnp.sum(valid)
-    ordered = jnp.sort(jnp.where(valid, values, jnp.inf))
-    return jnp.where(count > 0, ordered[jnp.maximum(count - 1, 0) // 2], 1.0)
 
 
 def pose_row(poses: jaxlie.SE3, row: int | Int[Array, ""]) -> jaxlie.SE3:
@@ -198,7 +193,9 @@ def localize_coarse(
     T_current_newest = scale_translation(raw_current.inverse() @ pose_row(views, 2), scale)
 
     same_image = _align_pairs(scale * now.points, previous.points, paired, T_world_previous) @ T_previous_current
-    via_previous = _via_previous(prediction, previous, paired, scale, (T_world_previous, T_previous_current), camera, config)
+    via_previous = _via_previous(
+        prediction, previous, paired, scale, (T_world_previous, T_previous_current), camera, config
+    )
     anchor = prediction.T_world_anchor
     anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, scale)
     reach = 1.0 + jnp.linalg.norm(anchored.translation() - anchor.translation()) / config.anchor_range
@@ -253,6 +250,18 @@ def localize_fine(
     aligned = transform(T, current, coarse.scale)
     aligned = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & coarse.is_usable)
     bits = jnp.sum(failed * 2 ** jnp.arange(failed.shape[0]))
-    return T, aligned, LocalizationInfo(
-        is_tracked, ~coarse.is_usable, bits, coarse.scale, coarse.repeat_rms, step_m, step_rad, info
+    return (
+        T,
+        aligned,
+        LocalizationInfo(
+            is_tracked,
+            ~coarse.is_usable,
+            bits,
+            coarse.scale,
+            coarse.repeat_rms,
+            info.misfit / coarse.mean_depth,
+            step_m,
+            step_rad,
+            info,
+        ),
     )

@@ -25,6 +25,8 @@ class RefinementConfig(eqx.Module):
         front_margin: fraction of the depth by which a candidate may lie in front of the map and still be merged; 0 as
             printed (R6).
         back_margin: likewise behind it; `inf` as printed.
+        max_splat_std: pixels of the rendered image; a wider candidate is scattered points, not a surface, and is dropped;
+            `inf` as printed.
         render: how both sets are drawn.
         average: gain and blend, those of the EM step.
     """
@@ -33,6 +35,7 @@ class RefinementConfig(eqx.Module):
     max_mahalanobis_sq_2d: Float[Array, "*b"] = traced()
     front_margin: Float[Array, "*b"] = traced()
     back_margin: Float[Array, "*b"] = traced()
+    max_splat_std: Float[Array, "*b"] = traced()
     render: RenderConfig
     average: AverageConfig
 
@@ -115,10 +118,13 @@ def refine(
     """
     old = submap.gaussians
     scale, blur = config.render.covariance_scale, config.render.blur
-    rendering = render(old, jnp.zeros((old.valid.shape[0], 0)), T_world_camera, camera, config.render)
+    rendering = render(old, old.colors, T_world_camera, camera, config.render)
     map_splats = project_gaussians(old, T_world_camera, camera, scale, blur)
     candidate_splats = project_gaussians(candidates, T_world_camera, camera, scale, blur)
 
+    widest = jnp.sqrt(jnp.trace(candidate_splats.covs, axis1=-2, axis2=-1) / scale)
+    is_surface = candidates.valid & (widest <= config.max_splat_std)
+    candidates = eqx.tree_at(lambda g: g.valid, candidates, is_surface)
     map_depth = depth_at(rendering, candidate_splats, camera)
     # Only what the image shows can be matched: a Gaussian behind the rendered surface is occluded.
     own_depth = depth_at(rendering, map_splats, camera)
@@ -142,7 +148,5 @@ def refine(
     merged, _ = update_average(submap, averaged, evidence, config.average)
     is_merged = jnp.any(omega > 0, axis=-1)
     fresh = eqx.tree_at(lambda g: g.valid, candidates, candidates.valid & ~is_merged)
-    info = RefinementInfo(
-        jnp.sum(candidates.valid), jnp.sum(is_merged), jnp.sum(fresh.valid), rendering.overflow
-    )
+    info = RefinementInfo(jnp.sum(candidates.valid), jnp.sum(is_merged), jnp.sum(fresh.valid), rendering.overflow)
     return merged, fresh, info

@@ -1,7 +1,8 @@
 """The pipeline: `init_state` and `step` are pure and jitted; `run` replays a sequence and grows what is full."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import chain
 
 import equinox as eqx
 import jax
@@ -26,6 +27,8 @@ class SlamConfig(eqx.Module):
 
     Args:
         window_size: |S|, images in the FIFO that the prior sees before the current one.
+        initialization: `merged` (printed): all views of the first window are clustered together; `incremental`: the
+            first view is, and the others are integrated one by one.
         observation: point maps to observations.
         fit: points to Gaussians (eq. 1).
         submap: what a step works on, and capacities.
@@ -35,12 +38,17 @@ class SlamConfig(eqx.Module):
     """
 
     window_size: int = static()
+    initialization: str = static()
     observation: ObservationConfig
     fit: FitConfig
     submap: SubmapConfig
     localization: LocalizationConfig
     em: EmConfig
     refinement: RefinementConfig
+
+    def __check_init__(self) -> None:
+        if self.initialization not in ("merged", "incremental"):
+            raise ValueError(f"slam.initialization must be merged or incremental; got {self.initialization!r}")
 
 
 class SlamState(eqx.Module):
@@ -104,9 +112,7 @@ def init_state(
     return SlamState(map, previous, pose_row(T_world_views, -1)), overflow
 
 
-def step(
-    state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig
-) -> tuple[SlamState, StepInfo]:
+def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig) -> tuple[SlamState, StepInfo]:
     """Integrate one frame: localise, select, E-step, M-step, refine, insert (the paper's pipeline figure).
 
     Args:
@@ -123,7 +129,8 @@ def step(
     T, aligned, localization = localize_fine(prediction.current, submap.gaussians, coarse, config.localization)
 
     trusted = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & localization.is_tracked)
-    submap, is_fused, em = em_update(submap, trusted, config.em)
+    noise = localization.depth_noise * (trusted.points - T.translation())
+    submap, is_fused, em = em_update(submap, trusted, noise, config.em)
     rest = eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~is_fused)
     order = morton_order(view.height, view.width)
     candidates, weight = cluster(rest, order, spacing(thin, config.fit), config.fit)
@@ -136,12 +143,33 @@ def step(
     return SlamState(map, aligned, T), info
 
 
-@dataclass(frozen=True)
-class FirstWindow:
-    """The first prediction of a sequence: all views, with the prior's poses."""
+class FirstWindow(eqx.Module):
+    """The first prediction of a sequence: all views, camera frames, oldest first, with the prior's poses."""
 
     views: Observation
     T_world_views: jaxlie.SE3
+
+
+def as_predictions(window: FirstWindow) -> tuple[FirstWindow, list[Prediction]]:
+    """The first view alone, and each further view as if it were a step's current frame (incremental initialisation).
+
+    Consecutive views come from one inference, so the previous image's two predictions agree exactly and the coarse
+    pose of a step is the prior's own.
+    """
+    num_views = window.views.valid.shape[0]
+    view = lambda i: jax.tree.map(lambda leaf: leaf[i], window.views)  # noqa: E731
+    poses = window.T_world_views.wxyz_xyz
+    following = [
+        Prediction(
+            current=view(i),
+            previous=view(i - 1),
+            T_world_views=jaxlie.SE3(poses[jnp.array([i - 1, i, min(i + 1, num_views - 1)])]),
+            T_world_anchor=jaxlie.SE3(poses[0]),
+            has_newest=jnp.asarray(i + 1 < num_views),
+        )
+        for i in range(1, num_views)
+    ]
+    return jax.tree.map(lambda leaf: leaf[:1], window), following
 
 
 jitted_init_state = eqx.filter_jit(init_state)
@@ -198,7 +226,7 @@ def run(
         predictions: one `FirstWindow`, then `Prediction`s in order.
         camera: of the full images.
         config: all stages; capacities are where to start.
-        on_step: called after each step, not for the first window.
+        on_step: called after each step; the views that the map is initialised from have none.
 
     Raises:
         ValueError: there is no prediction.
@@ -207,8 +235,11 @@ def run(
     first = next(remaining, None)
     if first is None:
         raise ValueError("there is no prediction to map: the sequence is empty")
+    following: list[Prediction] = []
+    if config.initialization == "incremental":
+        first, following = as_predictions(first)
     state, config = start(first, camera, config)
-    for prediction in remaining:
+    for prediction in chain(following, remaining):
         state, info, config = advance(state, prediction, camera, config)
         on_step(state, info)
     return state
