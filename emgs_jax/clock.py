@@ -1,0 +1,73 @@
+"""Where the time of a run goes: phases, and what of them was tracing, lowering and compiling."""
+
+import contextlib
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+
+import jax.monitoring
+
+_COMPILING = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration", "backend_compile_duration")
+
+
+class Clock:
+    """Wall-clock seconds by phase; while `watching`, also the seconds in which JAX made executables.
+
+    Args:
+        phases: name -> seconds, compilation included; phases do not overlap.
+        compile_seconds: union of all spans in which a function was traced, lowered or compiled.
+    """
+
+    def __init__(self) -> None:
+        self.phases: dict[str, float] = defaultdict(float)
+        self.compile_seconds = 0.0
+        self._begin = time.perf_counter()
+        self._spans: list[tuple[float, float]] = []  # disjoint and ascending
+
+    @property
+    def total_seconds(self) -> float:
+        """Seconds since this clock was made."""
+        return time.perf_counter() - self._begin
+
+    @contextlib.contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        """Count what happens inside as `name`."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.phases[name] += time.perf_counter() - begin
+
+    @contextlib.contextmanager
+    def watching(self) -> Iterator["Clock"]:
+        """Listen to what JAX says of its compilations."""
+        jax.monitoring.register_event_duration_secs_listener(self._hear)
+        try:
+            yield self
+        finally:
+            jax.monitoring.unregister_event_duration_listener(self._hear)
+
+    def _hear(self, event: str, duration: float, **_: object) -> None:
+        if event.rsplit("/", 1)[-1] in _COMPILING:
+            end = time.perf_counter()
+            self.add_span(end - duration, end)
+
+    def add_span(self, begin: float, end: float) -> None:
+        """Count a span that has just ended; functions trace each other, so a span may contain the ones before it."""
+        while self._spans and self._spans[-1][0] >= begin:
+            inner = self._spans.pop()
+            self.compile_seconds -= inner[1] - inner[0]
+        begin = max(begin, self._spans[-1][1]) if self._spans else begin
+        self._spans.append((begin, end))
+        self.compile_seconds += end - begin
+
+
+def peak_memory_mb() -> float | None:
+    """Largest resident size of this process so far in MiB; None where the system does not say."""
+    try:
+        import resource  # not on Windows
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2.0**20 if sys.platform == "darwin" else 2.0**10)

@@ -1,0 +1,64 @@
+"""A data set without the frames that cannot be read."""
+
+import hashlib
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+from emgs_jax.data.base import BadFrameError, Dataset, Frame
+
+
+class ReadableFrames:
+    """The frames of a data set that a run uses (a `Dataset` itself); windows are made over these.
+
+    Args:
+        dataset: all frames.
+        on_bad_frame: `error`: a frame that cannot be read ends the run when it is its turn; `skip`: all frames are
+            read once here, and those that cannot be read are left out.
+        progress: wraps the frame numbers of that first pass, e.g. tqdm.
+
+    Attributes:
+        kept: for each frame in use its index in `dataset`.
+        skipped: index in `dataset` and reason of the others.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        on_bad_frame: str = "error",
+        progress: Callable[[Iterable[int]], Iterable[int]] = iter,
+    ) -> None:
+        if on_bad_frame not in ("error", "skip"):
+            raise ValueError(f"on_bad_frame must be error or skip, got {on_bad_frame!r}")
+        self._dataset = dataset
+        self.name, self.sequence, self.size = dataset.name, dataset.sequence, dataset.size
+        self.intrinsics, self.classes = dataset.intrinsics, dataset.classes
+        self.has_ground_truth = dataset.has_ground_truth
+        indices = range(len(dataset))
+        self.skipped = _unreadable(dataset, progress(indices)) if on_bad_frame == "skip" else {}
+        self.kept = tuple(index for index in indices if index not in self.skipped)
+        if not self.kept:
+            what = f"{dataset.name} {dataset.sequence}"
+            first = next(iter(self.skipped.values()), "there are none")
+            raise ValueError(f"{what} has no frame that can be read: {first}")
+
+    def __len__(self) -> int:
+        return len(self.kept)
+
+    def __getitem__(self, index: int) -> Frame:
+        return replace(self._dataset[self.kept[index]], index=index)
+
+    def fingerprint(self) -> str:
+        """That of the data set, unless frames are left out."""
+        whole = self._dataset.fingerprint()
+        return hashlib.sha256(repr((whole, self.kept)).encode()).hexdigest() if self.skipped else whole
+
+
+def _unreadable(dataset: Dataset, indices: Iterable[int]) -> dict[int, str]:
+    """Index and reason of the frames that raise BadFrameError."""
+    reasons = {}
+    for index in indices:
+        try:
+            dataset[index]
+        except BadFrameError as error:
+            reasons[index] = str(error)
+    return reasons

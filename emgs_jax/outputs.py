@@ -1,0 +1,106 @@
+"""The files of a run: trajectory, map, Gaussians, densified points, mesh and the overview."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from emgs_jax import export
+from emgs_jax.data.base import Dataset
+from emgs_jax.data.convert import to_se3
+from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
+from emgs_jax.evaluation.overview import draw_overview
+from emgs_jax.pipeline import MappingRun
+from emgs_jax.render.densify import DensifyConfig, densify
+
+_densify = eqx.filter_jit(densify)
+
+
+@dataclass(frozen=True)
+class DenseMap:
+    """The map as points.
+
+    Args:
+        cloud: a point per pixel of every frame whose pose is known, averaged per voxel.
+        pictures: what the overview shows of some frames.
+    """
+
+    cloud: PointCloud
+    pictures: list[dict[str, Any]] = field(default_factory=list)
+
+
+def save_progress(folder: Path, run: MappingRun) -> None:
+    """Write trajectory.txt and map.npz of the frames so far; nothing before there is a map."""
+    if run.state is not None:
+        export.save_trajectory_tum(
+            folder / "trajectory.txt", [record.timestamp for record in run.records], np.stack(run.poses)
+        )
+        export.save_map_npz(folder / "map.npz", run.state.map)
+
+
+def dense_map(
+    run: MappingRun, dataset: Dataset, config: DensifyConfig, voxel: float, num_pictures: int = 4
+) -> DenseMap:
+    """Render the map from the pose of every frame that is not lost.
+
+    Args:
+        run: finished.
+        dataset: for the images in the pictures.
+        config: what becomes a point.
+        voxel: m; points of one voxel are averaged.
+        num_pictures: frames that are shown, evenly spread.
+    """
+    known = [row for row, record in enumerate(run.records) if record.status != "lost"]
+    shown = {known[int(i)] for i in np.linspace(0, len(known) - 1, num_pictures)} if known else set()
+    pictures: list[dict[str, Any]] = []
+
+    def clouds() -> Iterator[PointCloud]:
+        for row in known:
+            view = jax.device_get(_densify(run.state.map.gaussians, to_se3(run.poses[row]), run.camera, config))
+            if row in shown:
+                pictures.append(_picture(run, dataset, row, view))
+            yield PointCloud(
+                *(rows[view.valid].astype(np.float64) for rows in (view.points, view.normals, view.colors))
+            )
+
+    return DenseMap(fuse_clouds(clouds(), voxel), pictures)
+
+
+def center_cloud(run: MappingRun) -> PointCloud:
+    """The Gaussians' means with their normals and colours."""
+    gaussians = jax.device_get(run.state.map.gaussians)
+    rows = (gaussians.means, gaussians.normals, gaussians.colors)
+    return PointCloud(*(values[gaussians.valid].astype(np.float64) for values in rows))
+
+
+def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: DensifyConfig, title: str) -> list[str]:
+    """Write every file that shows the map, besides `save_progress`; returns what could not be made, and why."""
+    save_progress(folder, run)
+    gaussians = jax.device_get(run.state.map.gaussians)
+    valid = gaussians.valid
+    # As drawn: the covariances are those that close the surface.
+    covs = gaussians.covs[valid] * float(config.render.covariance_scale)
+    rest = gaussians.colors[valid], float(config.render.opacity), gaussians.normals[valid]
+    export.save_gaussians_ply(folder / "map.ply", gaussians.means[valid], covs, *rest)
+    export.save_points_ply(folder / "points.ply", dense.cloud.points, dense.cloud.normals, dense.cloud.colors)
+    centers = center_cloud(run)
+    no_mesh = export.save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, centers.colors)
+    is_known = all(pose is not None for pose in run.true_poses)
+    truth = np.stack(run.true_poses) if is_known else None
+    paths = np.stack(run.poses), truth
+    draw_overview(folder / "overview.png", dense.cloud.points, dense.cloud.colors, paths, dense.pictures, title)
+    return [] if no_mesh is None else [f"no mesh.ply: {no_mesh}"]
+
+
+def _picture(run: MappingRun, dataset: Dataset, row: int, view: Any) -> dict[str, Any]:
+    return {
+        "image": dataset[row].image,
+        "rendered_color": view.colors,
+        "rendered_depth": view.rendering.depth,
+        "alpha": view.rendering.alpha,
+        "title": f"frame {run.records[row].index}",
+    }

@@ -1,0 +1,237 @@
+"""A sequence through the whole pipeline, frame by frame: what the prior says, what the map takes, what is recorded."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from time import perf_counter
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.camera import Camera
+from emgs_jax.clock import Clock
+from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.data.convert import to_camera, to_first_window, to_prediction
+from emgs_jax.localization import REASONS
+from emgs_jax.observation import Prediction
+from emgs_jax.prior.base import Prior, PriorPrediction, windows
+from emgs_jax.slam import FirstWindow, SlamConfig, SlamState, StepInfo, advance, as_predictions, start
+
+RawView = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # points, mask, image, T_world_camera
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """What became of one frame: a line of frames.jsonl. None where a frame was not a step.
+
+    Args:
+        index: position in the data set.
+        name: of the image.
+        timestamp: of the data set.
+        status: tracked, degraded (the coarse pose stays, nothing is fused), lost (not even that is known),
+            initialization (the map was made from it) or skipped (it cannot be read).
+        reason: why it is not tracked.
+        pose: T_world_camera as tx, ty, tz (m), qx, qy, qz, qw.
+        newest_pose: temporary pose of the next frame, likewise.
+        inliers: points that agree with the map.
+        residual: of these to the map's planes, m.
+        scale: by which the prediction was multiplied.
+        fused: points that moved Gaussians.
+        refined: candidates that were merged on the image plane.
+        new: candidates that became Gaussians.
+        num_gaussians: in the map after this frame.
+        overflow: splats that found their tile full.
+        seconds: of mapping (conversion and step), compilation included.
+        compile_seconds: of these.
+    """
+
+    index: int
+    name: str | None
+    timestamp: float | None
+    status: str
+    reason: str | None = None
+    pose: tuple[float, ...] | None = None
+    newest_pose: tuple[float, ...] | None = None
+    inliers: int | None = None
+    residual: float | None = None
+    scale: float | None = None
+    fused: int | None = None
+    refined: int | None = None
+    new: int | None = None
+    num_gaussians: int | None = None
+    overflow: int | None = None
+    seconds: float = 0.0
+    compile_seconds: float = 0.0
+
+
+@dataclass
+class MappingRun:
+    """A run as far as it is. It grows with each frame, so an interrupted one still holds what it has.
+
+    Args:
+        camera: of the frames.
+        config: all stages; capacities grow where they must.
+        clock: counts load, predict and map.
+        on_record: hears of each frame at once.
+        state: None before the first window.
+        records: of the frames in use, in order.
+        poses: T_world_camera (4, 4) of each record.
+        raw_poses: what the prior alone says, likewise; the pose before where it says none.
+        true_poses: None where unknown.
+    """
+
+    camera: Camera
+    config: SlamConfig
+    clock: Clock = field(default_factory=Clock)
+    on_record: Callable[[dict[str, Any]], None] = lambda record: None
+    state: SlamState | None = None
+    records: list[FrameRecord] = field(default_factory=list)
+    poses: list[np.ndarray] = field(default_factory=list)
+    raw_poses: list[np.ndarray] = field(default_factory=list)
+    true_poses: list[np.ndarray | None] = field(default_factory=list)
+
+
+def new_run(
+    dataset: Dataset,
+    config: SlamConfig,
+    clock: Clock | None = None,
+    on_record: Callable[[dict[str, Any]], None] = lambda record: None,
+) -> MappingRun:
+    """A run of `dataset` before its first frame."""
+    return MappingRun(to_camera(dataset), config, Clock() if clock is None else clock, on_record)
+
+
+def predictions(
+    dataset: Dataset, prior: Prior, window_size: int, clock: Clock
+) -> Iterator[tuple[PriorPrediction, dict[int, Frame]]]:
+    """Ask the prior window by window; frames are read when a window needs them and dropped when none does."""
+    frames: dict[int, Frame] = {}
+    for window in windows(len(dataset), window_size):
+        with clock.phase("load"):
+            frames = {index: frames[index] if index in frames else dataset[index] for index in window.views}
+        with clock.phase("predict"):
+            prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
+        yield prediction, frames
+
+
+def map_frames(run: MappingRun, dataset: Dataset, prior: Prior) -> Iterator[RawView]:
+    """Map a sequence; yields on the way what the prior alone says of each frame, for comparison.
+
+    The pose of the first frame is the true one where it is known, else the identity.
+    """
+    anchor = None
+    for prediction, frames in predictions(dataset, prior, run.config.window_size, run.clock):
+        if anchor is None:
+            truth = frames[0].T_world_camera
+            anchor = np.eye(4) if truth is None else np.asarray(truth, np.float64)
+        with run.clock.phase("map"):
+            if run.state is None:
+                _map_first_window(run, prediction, frames, anchor)
+            else:
+                _map_step(run, prediction, frames, anchor)
+        yield from _raw_views(run, prediction, frames, anchor)
+
+
+def _map_first_window(
+    run: MappingRun, prediction: PriorPrediction, frames: Mapping[int, Frame], anchor: np.ndarray
+) -> None:
+    timer = _Timer(run.clock)
+    window = to_first_window(prediction, frames, anchor, run.config.observation)
+    following: list[Prediction] = []
+    if run.config.initialization == "incremental":
+        window, following = as_predictions(window)
+    run.state, run.config = start(window, run.camera, run.config)
+    dense = [frames[index] for index in prediction.window.dense]
+    _record_initialization(run, window, dense, timer)
+    for frame, step in zip(dense[1:], following, strict=False):
+        _advance(run, step, frame, _Timer(run.clock))
+
+
+def _map_step(run: MappingRun, prediction: PriorPrediction, frames: Mapping[int, Frame], anchor: np.ndarray) -> None:
+    timer = _Timer(run.clock)
+    step = to_prediction(prediction, frames, anchor, run.config.observation)
+    _advance(run, step, frames[prediction.window.current], timer)
+
+
+def _advance(run: MappingRun, step: Prediction, frame: Frame, timer: "_Timer") -> None:
+    run.state, info, run.config = advance(run.state, step, run.camera, run.config)
+    info = jax.device_get(info)
+    _add(run, frame, _matrix(info.T_world_camera.wxyz_xyz), _described(info) | timer.read())
+
+
+def _record_initialization(run: MappingRun, window: FirstWindow, frames: list[Frame], timer: "_Timer") -> None:
+    poses = np.asarray(window.T_world_views.wxyz_xyz)
+    count = int(np.asarray(run.state.map.gaussians.valid).sum())
+    spent = timer.read()
+    for frame, pose in zip(frames, poses, strict=False):
+        described = {"status": "initialization", "pose": _tum(pose), "num_gaussians": count}
+        _add(run, frame, _matrix(pose), described | {key: value / len(poses) for key, value in spent.items()})
+
+
+def _add(run: MappingRun, frame: Frame, pose: np.ndarray, described: dict[str, Any]) -> None:
+    record = FrameRecord(frame.index, frame.name, frame.timestamp, **described)
+    run.records.append(record)
+    run.poses.append(pose)
+    run.true_poses.append(frame.T_world_camera)
+    run.on_record(asdict(record))
+
+
+def _described(info: StepInfo) -> dict[str, Any]:
+    """The fields of a record that a step fills; `info` is on the host."""
+    localization = info.localization
+    reasons = [words for bit, words in enumerate(REASONS) if int(localization.reason) >> bit & 1]
+    return {
+        "status": "tracked" if localization.is_tracked else "lost" if localization.is_lost else "degraded",
+        "reason": "; ".join(reasons) or None,
+        "pose": _tum(info.T_world_camera.wxyz_xyz),
+        "newest_pose": _tum(info.T_world_newest.wxyz_xyz),
+        "inliers": int(localization.icp.num_inliers),
+        "residual": float(localization.icp.residual),
+        "scale": float(localization.scale),
+        "fused": int(info.em.num_fused),
+        "refined": int(info.refinement.num_merged),
+        "new": int(info.refinement.num_fresh),
+        "num_gaussians": int(info.num_gaussians),
+        "overflow": int(info.overflow.tiles),
+    }
+
+
+def _raw_views(
+    run: MappingRun, prediction: PriorPrediction, frames: Mapping[int, Frame], anchor: np.ndarray
+) -> Iterator[RawView]:
+    """Pose and points of each new frame as predicted, under the same mask that the mapping uses."""
+    window, min_confidence = prediction.window, float(run.config.observation.min_confidence)
+    is_first = not run.raw_poses
+    for row, index in enumerate(window.dense):
+        if not is_first and index != window.current:
+            continue
+        pose = anchor @ prediction.T_anchor_view[window.views.index(index)]
+        mask = prediction.mask[row] & (prediction.confidence[row] >= min_confidence)
+        if not np.isfinite(pose).all():
+            pose, mask = (run.raw_poses[-1] if run.raw_poses else anchor), np.zeros_like(mask)
+        run.raw_poses.append(pose)
+        yield prediction.points[row], mask, frames[index].image, pose
+
+
+class _Timer:
+    """Seconds since it was made, and what of them was compilation."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock, self._begin, self._compiled = clock, perf_counter(), clock.compile_seconds
+
+    def read(self) -> dict[str, float]:
+        compiled = self._clock.compile_seconds - self._compiled
+        return {"seconds": perf_counter() - self._begin, "compile_seconds": compiled}
+
+
+def _matrix(wxyz_xyz: np.ndarray) -> np.ndarray:
+    """(4, 4) float64 of a pose as jaxlie holds it."""
+    pose, (w, x, y, z, *translation) = np.eye(4), np.asarray(wxyz_xyz, np.float64)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), translation
+    return pose
+
+
+def _tum(wxyz_xyz: np.ndarray) -> tuple[float, ...]:
+    w, x, y, z, *translation = (float(value) for value in np.asarray(wxyz_xyz))
+    return (*translation, x, y, z, w)

@@ -1,0 +1,49 @@
+"""What the scripts share: a config becomes a data set and a prior, an error becomes one clear line."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from functools import partial
+
+import jax
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+from tqdm import tqdm
+
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.prior.base import Prior
+
+
+def build_dataset(config: DictConfig) -> ReadableFrames:
+    """The data set of a config, without unreadable frames where it says so."""
+    dataset = instantiate(config.dataset)
+    return ReadableFrames(dataset, config.on_bad_frame, partial(tqdm, desc="checking", unit="frame"))
+
+
+def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
+    """The prior of a config; raises ValueError where it cannot answer for the data set."""
+    known = {"classes": list(dataset.classes)} if "classes" in config.prior else {}
+    prior = instantiate(config.prior, **known)
+    prior.check(dataset, config.slam.window_size)
+    return prior
+
+
+def use_compilation_cache(config: DictConfig) -> None:
+    """Keep executables in the folder that the config names, for the next process; null keeps none."""
+    if config.compilation_cache is not None:
+        jax.config.update("jax_compilation_cache_dir", os.path.expanduser(config.compilation_cache))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+@contextlib.contextmanager
+def clear_errors() -> Iterator[None]:
+    """End the program with the message of what is wrong with the input; HYDRA_FULL_ERROR=1 shows the traceback."""
+    try:
+        yield
+    except (ValueError, OSError, InstantiationException, OmegaConfBaseException) as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
+        raise SystemExit(f"error: {cause}\n(HYDRA_FULL_ERROR=1 shows where it was raised)") from None

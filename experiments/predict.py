@@ -1,0 +1,43 @@
+"""Record what a prior says of a sequence: `python -m experiments.predict dataset=… prior=… out=DIR`.
+
+`prior=recorded prior.folder=DIR` replays it in `experiments.run`. An interrupted recording is completed by the same
+command.
+"""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from emgs_jax.prior.base import Window
+from emgs_jax.prior.recorded import record
+from experiments.building import build_dataset, build_prior, clear_errors
+
+
+def predict(config: DictConfig) -> Path:
+    """Record the predictions of `config` into `config.out`."""
+    dataset = build_dataset(config)
+    prior = build_prior(config, dataset)
+
+    def progress(windows: Sequence[Window]) -> Iterable[Window]:
+        return tqdm(windows, unit="inference", desc=prior.provenance.name)
+
+    folder = Path(config.out)
+    record(prior, dataset, config.slam.window_size, folder, progress)
+    size = sum(path.stat().st_size for path in folder.iterdir())
+    print(f"{folder}: {size / 2**20:.1f} MiB, {dataset.name} {dataset.sequence}, {len(dataset)} frames")
+    print(f"prior {prior.provenance.name} {prior.provenance.settings}")
+    return folder
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="predict")
+def main(config: DictConfig) -> None:
+    """Record, and say what was recorded."""
+    with clear_errors():
+        predict(config)
+
+
+if __name__ == "__main__":
+    main()

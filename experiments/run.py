@@ -1,0 +1,89 @@
+"""Map one sequence: `python -m experiments.run dataset=… prior=…`; everything that it writes is in Hydra's folder."""
+
+import contextlib
+import math
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from emgs_jax import outputs, scoring
+from emgs_jax.clock import Clock
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, raw_prior_cloud
+from emgs_jax.evaluation.report import print_metrics_table, provenance, write_metrics
+from emgs_jax.files import FrameLog
+from emgs_jax.pipeline import FrameRecord, MappingRun, map_frames, new_run
+from emgs_jax.prior.base import Prior
+from experiments.building import build_dataset, build_prior, clear_errors, use_compilation_cache
+
+
+def run(config: DictConfig, folder: Path) -> dict[str, Any]:
+    """Map the sequence of `config`, write every output into `folder` and return the metrics."""
+    with Clock().watching() as clock:
+        with clock.phase("setup"):
+            dataset = build_dataset(config)
+            prior = build_prior(config, dataset)
+            slam, evaluation, densify = (instantiate(config[name]) for name in ("slam", "evaluation", "densify"))
+        session = new_run(dataset, slam, clock)
+        raw_cloud = _map(session, dataset, prior, evaluation, folder)
+        with clock.phase("densify"):
+            dense = outputs.dense_map(session, dataset, densify, evaluation.voxel_m)
+        with clock.phase("export"):
+            title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
+            notes = outputs.save_outputs(folder, session, dense, densify, title)
+        with clock.phase("evaluate"):
+            clouds = scoring.Clouds(dense.cloud, outputs.center_cloud(session), raw_cloud)
+            metrics = scoring.score(session, clouds, dataset, evaluation)
+        metrics |= scoring.describe(session, len(dataset.skipped)) | scoring.spent(clock)
+    settings = OmegaConf.to_container(config, resolve=True)
+    seed = prior.provenance.settings.get("seed", 0)
+    metrics["provenance"] = provenance(settings, dataset, prior.provenance, seed)
+    write_metrics(folder / "metrics.json", metrics)
+    for note in notes:
+        tqdm.write(note)
+    return metrics
+
+
+def _map(
+    session: MappingRun, dataset: ReadableFrames, prior: Prior, evaluation: EvaluationConfig, folder: Path
+) -> PointCloud:
+    """Map all frames and log each; returns the raw prior's cloud. What an interrupted run has is written."""
+    with FrameLog(folder / "frames.jsonl") as log, tqdm(total=len(dataset), unit="frame", desc="mapping") as bar:
+
+        def on_record(record: dict[str, Any]) -> None:
+            log.append(record | {"index": dataset.kept[record["index"]]})
+            bar.set_postfix_str(f"{record['status']}, {record['num_gaussians']} Gaussians", refresh=False)
+            bar.update()
+
+        session.on_record = on_record
+        for index, reason in dataset.skipped.items():
+            log.append(vars(FrameRecord(index, None, None, "skipped", reason)))
+        try:
+            return raw_prior_cloud(map_frames(session, dataset, prior), evaluation)
+        except BaseException:
+            with contextlib.suppress(OSError, ValueError):  # the first error is the one to show
+                outputs.save_progress(folder, session)
+            raise
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="config")
+def main(config: DictConfig) -> float:
+    """Run, print the table and the folder; returns the trajectory error for Hydra's sweepers, inf without one."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    with clear_errors():
+        use_compilation_cache(config)
+        metrics = run(config, folder)
+    print(print_metrics_table(metrics))
+    print(f"{metrics['time/seconds_per_frame']:.2f} s a frame; everything is in {folder}")
+    error = metrics.get("trajectory/ate_sim3_m")
+    return math.inf if error is None else error
+
+
+if __name__ == "__main__":
+    main()
