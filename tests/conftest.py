@@ -3,9 +3,9 @@
 import pytest
 from jaxtyping import install_import_hook
 
-# Before anything imports the package: every call in the tests checks its jaxtyping signature. Left out are modules whose
-# annotations do not hold: `clustering` ("h*w" of morton_order names no bound size; the counter of kmeans's loop is traced,
-# not an int) and `linalg` (mahalanobis_sq is called with batches that broadcast, which "*b" forbids and "*#b" allows).
+# Before anything imports the package: every call in the tests checks its jaxtyping signature. Two modules are left out
+# because their annotations do not hold: `clustering` ("h*w" of morton_order names no bound size; the counter of kmeans's
+# loop is traced, not an int) and `linalg` (mahalanobis_sq gets batches that broadcast: "*b" forbids it, "*#b" would not).
 CHECKED = (
     *("pytree", "camera", "observation", "neighbours", "gaussians", "gaussian_map", "icp"),
     *("render", "initialization", "localization", "em", "refinement", "slam"),

@@ -1,0 +1,269 @@
+"""E-step, M-step and support against NumPy and closed limits: sums, textbook mixtures, one-hot assignments, gates."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from scene import as_numpy, assert_same, at, move_gaussians, pose, random_gaussians, random_observation
+
+from emgs_jax.em import EStep, e_step, em_update, m_step, support, widened_distance_sq
+from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.observation import transform
+
+M, N, F = 60, 40, 3
+POINTS, GAUSSIANS = random_observation(M, num_features=F), random_gaussians(N, num_features=F)
+QUIET = jnp.zeros((M, 3))
+NOISE = jnp.asarray(np.random.default_rng(5).normal(size=(M, 3)) * 0.1, jnp.float32)
+estep, mstep, supported, em = (eqx.filter_jit(f) for f in (e_step, m_step, support, em_update))
+MAP = GaussianMap(GAUSSIANS, jnp.ones(N), jnp.ones(N, jnp.int32))
+
+PAPER = ("slam/em=paper",)
+OPEN = {"min_normal_cos": -1.0, "max_mahalanobis_sq": np.inf, "max_log_gap": np.inf, "noise": 0.0}
+
+
+def changed(config, **values):
+    for path, value in values.items():
+        config = at(config, path, value)
+    return config
+
+
+@pytest.fixture(scope="module")
+def paper(config):
+    return config(*PAPER).em
+
+
+@pytest.fixture(scope="module")
+def opened(paper):
+    """All gates open, no noise, every sum counts."""
+    return changed(paper, **OPEN, min_responsibility=0.0)
+
+
+def dense(step):
+    """Responsibilities as an (m, n) matrix."""
+    matrix = np.zeros((step.rows.shape[0], N))
+    np.add.at(matrix, (np.arange(len(matrix))[:, None], np.asarray(step.rows)), np.asarray(step.responsibilities))
+    return matrix
+
+
+def arrays(points):
+    return tuple(np.asarray(x, float) for x in (points.points, points.normals, points.features))
+
+
+@pytest.mark.parametrize("gates", [{}, {"max_mahalanobis_sq": 50.0}, {"max_log_gap": 30.0, "max_mahalanobis_sq": 1e9}])
+def test_responsibilities_equal_equation_3_and_gates_equation_2(paper, gates):
+    config = changed(paper, min_normal_cos=0.85, **gates)
+    step, _ = estep(GAUSSIANS, POINTS, QUIET, config)
+    expected, is_fused = reference.e_step(*arrays(POINTS), as_numpy(GAUSSIANS), config)
+    np.testing.assert_array_equal(step.is_fused, is_fused)
+    assert 0 < is_fused.sum() < M
+    np.testing.assert_allclose(dense(step), expected, atol=1e-3)  # exponents near 100 lose 1e-5 each in float32
+
+
+def test_responsibilities_sum_to_one_for_fused_points_and_to_zero_otherwise(paper):
+    step, _ = estep(GAUSSIANS, POINTS, NOISE, changed(paper, noise=1.0))
+    assert 0 < step.is_fused.sum() < M
+    np.testing.assert_allclose(step.responsibilities.sum(1), step.is_fused, atol=1e-6)  # a softmax's roundings
+    assert (step.responsibilities >= 0).all()
+
+
+def test_without_terms_and_gates_they_are_the_posterior_of_a_textbook_mixture(opened):
+    config = changed(opened, determinant_weight=0.5, normal_weight=0.0, feature_weight=0.0)
+    step, _ = estep(GAUSSIANS, POINTS, QUIET, config)
+    for i in range(0, M, 7):
+        rows = np.asarray(step.rows[i])
+        density = []
+        for k in rows:
+            cov, offset = np.asarray(GAUSSIANS.covs[k], float), np.asarray(POINTS.points[i] - GAUSSIANS.means[k], float)
+            density.append(
+                np.exp(-0.5 * offset @ np.linalg.inv(cov) @ offset) / np.sqrt(np.linalg.det(2 * np.pi * cov))
+            )
+        posterior = np.array(density) / np.sum(density)
+        np.testing.assert_allclose(step.responsibilities[i], posterior, atol=1e-3)  # exponents near 100, as above
+
+
+@pytest.mark.parametrize(
+    ("field", "shut"), [("min_normal_cos", 1.01), ("max_mahalanobis_sq", 0.0), ("max_log_gap", -1.0)]
+)
+def test_each_gate_alone_shuts_everything_out_and_leaves_the_map_bit_for_bit(opened, field, shut):
+    updated, is_fused, info = em(MAP, POINTS, QUIET, changed(opened, **{field: shut}))
+    assert not is_fused.any() and info.num_fused == 0 and info.num_updated == 0 and info.num_points == M
+    assert info.mean_log_joint == 0
+    assert_same(updated, MAP)
+
+
+def test_the_gap_of_a_point_at_the_best_gaussians_mean_is_zero_and_grows_by_half_the_distance(opened):
+    """π: one Gaussian of unit covariance; a point 4 σ away with the same normal has a gap of 8."""
+    one = eqx.tree_at(lambda g: g.covs, random_gaussians(N), jnp.tile(jnp.eye(3), (N, 1, 1)))
+    one = eqx.tree_at(lambda g: g.valid, one, jnp.arange(N) == 0)
+    point = random_observation(2)
+    positions = one.means[0] + jnp.array([[4.0, 0, 0], [0, 0, 0]])
+    point = eqx.tree_at(lambda o: (o.points, o.normals), point, (positions, jnp.tile(one.normals[0], (2, 1))))
+    for limit, expected in ((7.99, [False, True]), (8.01, [True, True])):
+        step, _ = estep(one, point, jnp.zeros((2, 3)), changed(opened, max_log_gap=limit))
+        np.testing.assert_array_equal(step.is_fused, expected)
+
+
+def test_features_of_width_zero_are_as_good_as_a_zero_weight(opened):
+    bare = lambda x: eqx.tree_at(lambda g: g.features, x, jnp.zeros((x.valid.shape[0], 0)))  # noqa: E731
+    without, _ = estep(bare(GAUSSIANS), bare(POINTS), QUIET, opened)
+    unweighted, _ = estep(GAUSSIANS, POINTS, QUIET, changed(opened, feature_weight=0.0))
+    np.testing.assert_allclose(without.responsibilities, unweighted.responsibilities, atol=1e-6)
+
+
+def test_noise_along_the_ray_widens_the_gaussian_by_its_outer_product():
+    offsets = jnp.asarray(np.random.default_rng(0).normal(size=(M, 5, 3)) * 0.2, jnp.float32)
+    covs = np.asarray(random_gaussians(M * 5).covs, float).reshape(M, 5, 3, 3)
+    precisions = jnp.asarray(np.linalg.inv(covs), jnp.float32)
+    distance_sq, log_growth = widened_distance_sq(offsets, precisions, NOISE)
+    noise = np.asarray(NOISE, float)
+    widened = covs + (noise[:, :, None] * noise[:, None])[:, None]
+    expected = np.einsum("mki,mkij,mkj->mk", offsets, np.linalg.inv(widened), offsets)
+    np.testing.assert_allclose(distance_sq, expected, rtol=1e-3, atol=1e-3)  # a difference of values up to 500
+    np.testing.assert_allclose(log_growth, np.linalg.slogdet(widened)[1] - np.linalg.slogdet(covs)[1], atol=1e-4)
+
+
+def test_the_m_step_equals_weighted_statistics(opened):
+    step, _ = estep(GAUSSIANS, POINTS, QUIET, opened)
+    new, total = mstep(GAUSSIANS, POINTS, step, opened)
+    r = dense(step)
+    np.testing.assert_allclose(total, r.sum(0), atol=1e-5)  # sums of up to 60 shares
+    points, normals, _ = arrays(POINTS)
+    for k in np.flatnonzero(r.sum(0) > 1e-3):
+        expected = reference.m_step(r, points, normals, np.asarray(POINTS.colors, float), k, float(opened.min_std))
+        actual = new.means[k], new.covs[k], new.normals[k], new.colors[k]
+        for a, b in zip(actual, expected, strict=True):
+            np.testing.assert_allclose(a, b, atol=2e-4)  # float32 shares divided by totals down to 1e-3
+
+
+def test_one_hot_responsibilities_give_the_clusters_mean_and_covariance(opened):
+    assignment = np.random.default_rng(3).integers(0, 4, M)
+    rows = jnp.stack([jnp.asarray(assignment), jnp.full(M, 7)], axis=1)
+    step = EStep(rows, jnp.tile(jnp.array([1.0, 0.0]), (M, 1)), jnp.ones(M, bool))
+    new, total = mstep(GAUSSIANS, POINTS, step, opened)
+    points = np.asarray(POINTS.points, float)
+    for k in range(4):
+        own = points[assignment == k]
+        assert total[k] == len(own)
+        np.testing.assert_allclose(new.means[k], own.mean(0), atol=1e-5)  # float32 sums of some 15 offsets
+        expected = np.cov(own.T, bias=True) + float(opened.min_std) ** 2 * np.eye(3)
+        np.testing.assert_allclose(new.covs[k], expected, atol=1e-5)
+    others = jax.tree.map(lambda x: x[4:], (new, GAUSSIANS))
+    assert_same(*others)
+    assert (total[4:] == 0).all()
+
+
+def test_a_gaussian_with_too_little_responsibility_stays_as_it_is(paper):
+    config = changed(paper, **OPEN, min_responsibility=1.5)
+    step, _ = estep(GAUSSIANS, POINTS, QUIET, config)
+    little = dense(step).sum(0) < 1.49
+    assert 0 < little.sum() < N
+    updated, _, info = em(MAP, POINTS, QUIET, config)
+    assert_same(*jax.tree.map(lambda x: x[little], (updated, MAP)))
+    assert info.num_updated <= (~little).sum()
+
+
+FLAT = jnp.diag(jnp.array([0.04, 0.01, 0.0001]))  # principal axes x, y; normal z
+
+
+def support_of(positions, weights, config, kind):
+    """δ of one flat Gaussian at the origin under points with given responsibilities."""
+    g = random_gaussians(1)
+    g = eqx.tree_at(
+        lambda g: (g.means, g.covs, g.normals), g, (jnp.zeros((1, 3)), FLAT[None], jnp.array([[0.0, 0, 1]]))
+    )
+    points = eqx.tree_at(lambda o: o.points, random_observation(len(positions)), jnp.array(positions, jnp.float32))
+    step = EStep(
+        jnp.zeros((len(weights), 1), int), jnp.array(weights, jnp.float32)[:, None], jnp.ones(len(weights), bool)
+    )
+    return float(support(g, points, step, changed(config, support={"printed": 0, "normalized": 1}[kind]))[0])
+
+
+CORNERS = [(1, 1, 0), (1, -1, 0), (-1, 1, 0), (-1, -1, 0)]
+
+
+@pytest.mark.parametrize(
+    ("weights", "printed", "normalized"),
+    [
+        ([0.1, 0.1, 0.1, 0.1], 0.4, 1.0),  # even support: 2 min(.2, .2)
+        ([0.3, 0.3, 0.1, 0.1], 0.4, 0.5),  # one-sided in x: 2 min(.6, .2), of .8
+        ([0.3, 0.1, 0.3, 0.1], 0.4, 0.5),  # one-sided in y
+        ([0.5, 0.5, 0.0, 0.0], 0.0, 0.0),  # nothing on one side
+        ([1.0, 1.0, 1.0, 1.0], 1.0, 1.0),  # 4 is clipped to 1
+        ([0.0, 0.0, 0.0, 0.0], 0.0, 0.0),  # no support at all
+    ],
+)
+def test_support_has_its_literal_values(opened, weights, printed, normalized):
+    assert support_of(CORNERS, weights, opened, "printed") == pytest.approx(printed, abs=1e-6)
+    assert support_of(CORNERS, weights, opened, "normalized") == pytest.approx(normalized, abs=1e-6)
+
+
+def test_points_along_the_normal_do_not_count_as_sides(opened):
+    above_and_below = [(1, 1, 5), (1, 1, -5)]
+    assert support_of(above_and_below, [1.0, 1.0], opened, "normalized") == 0
+
+
+@pytest.mark.parametrize("kind", ["printed", "normalized"])
+def test_support_equals_the_reference_for_tilted_gaussians(opened, kind):
+    config = changed(opened, support={"printed": 0, "normalized": 1}[kind])
+    step, _ = estep(GAUSSIANS, POINTS, QUIET, config)
+    actual, r, g = supported(GAUSSIANS, POINTS, step, config), dense(step), as_numpy(GAUSSIANS)
+    for k in np.flatnonzero(r.sum(0) > 1e-3):
+        expected = reference.support(r, arrays(POINTS)[0], g["means"][k], g["covs"][k], g["normals"][k], k, kind)
+        # The sign of a projection near 0 may differ; none is that near here. Shares over totals of 1e-3.
+        np.testing.assert_allclose(actual[k], expected, atol=1e-3)
+
+
+def test_the_update_is_estep_mstep_support_and_average_in_a_row(opened):
+    """Eq. 4 with α_0 = 1: α = δ / (1 + δ), applied to mean, covariance (linear), colour and normal."""
+    step, _ = estep(GAUSSIANS, POINTS, QUIET, opened)
+    new, total = mstep(GAUSSIANS, POINTS, step, opened)
+    delta = np.where(np.asarray(total) > 0, supported(GAUSSIANS, POINTS, step, opened), 0)
+    alpha = delta / (1 + delta)
+    updated, is_fused, info = em(MAP, POINTS, QUIET, opened)
+    for name in ("means", "covs", "colors"):
+        old, fresh = (np.asarray(getattr(g, name), float) for g in (GAUSSIANS, new))
+        a = alpha.reshape(-1, *[1] * (old.ndim - 1))
+        np.testing.assert_allclose(getattr(updated.gaussians, name), (1 - a) * old + a * fresh, atol=1e-5)  # roundings
+    assert_same(updated.gaussians.features, GAUSSIANS.features)  # features are fixed at creation
+    np.testing.assert_allclose(updated.weight, np.where(alpha > 0, alpha, 1), atol=1e-6)
+    assert info.num_fused == M == is_fused.sum() and info.num_updated == (alpha > 0).sum()
+
+
+def test_the_update_moves_with_a_rigid_motion(opened):
+    T, one = pose((0.4, -0.9, 0.3), (0.5, 1.0, -0.7)), jnp.ones(())
+    config = changed(opened, max_mahalanobis_sq=9.0, noise=1.0)
+    updated, is_fused, _ = em(MAP, POINTS, NOISE, config)
+    moved_map = eqx.tree_at(lambda m: m.gaussians, MAP, move_gaussians(T, GAUSSIANS))
+    turned_noise = NOISE @ T.rotation().as_matrix().T
+    moved, moved_fused, _ = em(moved_map, transform(T, POINTS, one), turned_noise, config)
+    np.testing.assert_array_equal(moved_fused, is_fused)
+    expected = move_gaussians(T, updated.gaussians)
+    for name in ("means", "covs", "normals", "colors"):
+        # float32 exponents of d² up to some hundred, through shares into means of some decimetres
+        np.testing.assert_allclose(getattr(moved.gaussians, name), getattr(expected, name), atol=5e-4)
+
+
+@pytest.mark.parametrize("poison", [1e6, -1e6])
+def test_invalid_rows_of_map_and_observation_change_no_valid_output(paper, poison):
+    map_valid, valid = jnp.arange(N) % 4 > 0, jnp.arange(M) % 5 > 0
+    put = lambda tree, mask: jax.tree.map(  # noqa: E731
+        lambda x: x if x.dtype != jnp.float32 else jnp.where(mask.reshape(-1, *[1] * (x.ndim - 1)), x, poison), tree
+    )
+    clean_map = eqx.tree_at(lambda m: m.gaussians.valid, MAP, map_valid)
+    clean_points = eqx.tree_at(lambda o: o.valid, POINTS, valid)
+    config = changed(paper, **OPEN)
+    clean, clean_fused, clean_info = em(clean_map, clean_points, NOISE, config)
+    bad_points = put(clean_points, valid)
+    bad, bad_fused, bad_info = em(put(clean_map, map_valid), bad_points, NOISE, config)
+    assert_same((bad_fused, bad_info), (clean_fused, clean_info))
+    assert_same(*jax.tree.map(lambda x: x[map_valid], (bad, clean)))
+    assert not clean_fused[~valid].any() and clean_info.num_points == valid.sum()
+
+
+def test_an_empty_submap_fuses_nothing_and_stays_finite(paper):
+    empty = eqx.tree_at(lambda m: m.gaussians.valid, MAP, jnp.zeros(N, bool))
+    updated, is_fused, info = em(empty, POINTS, QUIET, paper)
+    assert not is_fused.any() and info.mean_log_joint == 0
+    assert_same(updated, empty)

@@ -1,0 +1,198 @@
+"""The running average against the recursion's literal values, submaps against NumPy, rows that are kept or counted."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from scene import assert_same, at, random_gaussians, random_observation
+
+from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert, select_submap, update_average, write_back
+from emgs_jax.gaussians import empty_gaussians
+
+update = eqx.filter_jit(update_average)
+select = eqx.filter_jit(select_submap)
+
+
+def map_of(count: int, capacity: int, seed: int = 0) -> GaussianMap:
+    return grow(GaussianMap(random_gaussians(count, seed), jnp.ones(count), jnp.ones(count, jnp.int32)), capacity)
+
+
+@pytest.fixture(scope="module")
+def average(config):
+    return {kind: config(f"em.average.gain={kind}").em.average for kind in ("ema_printed", "count")}
+
+
+def averaged(values, evidence, config):
+    """Mean's x of one Gaussian after each value, its gains, and its map."""
+    map, means, gains = map_of(1, 1), [], []
+    map = eqx.tree_at(lambda m: m.gaussians.means, map, jnp.zeros((1, 3)))
+    for value, delta in zip(values, evidence, strict=True):
+        new = eqx.tree_at(lambda g: g.means, map.gaussians, jnp.full((1, 3), value))
+        map, gain = update(map, new, jnp.array([delta]), config)
+        means.append(float(map.gaussians.means[0, 0]))
+        gains.append(float(gain[0]))
+    return means, gains, map
+
+
+def test_the_printed_gain_follows_its_recursion(average):
+    _, gains, map = averaged([1.0] * 4, [0.5] * 4, average["ema_printed"])
+    # α = .5 / (α + .5) from α_0 = 1; float32 roundings
+    np.testing.assert_allclose(gains, [1 / 3, 3 / 5, 5 / 11, 11 / 21], rtol=1e-6)
+    np.testing.assert_allclose(map.weight, gains[-1])
+    assert map.num_updates == 5
+
+
+def test_the_counting_gain_gives_the_mean_of_all_frames(average):
+    values = [3.0, -1.0, 4.0, 1.0, -5.0, 9.0]
+    means, gains, _ = averaged(values, [1.0] * 6, average["count"])
+    expected = [np.mean([0.0, *values[: n + 1]]) for n in range(6)]  # the first frame's value was 0
+    np.testing.assert_allclose(means, expected, atol=1e-6)  # six roundings near 1
+    np.testing.assert_allclose(gains, 1 / np.arange(2, 8), rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["ema_printed", "count"])
+def test_uneven_evidence_gives_the_reference_average(average, kind):
+    values, evidence = [3.0, -1.0, 4.0, 1.0], [0.2, 1.0, 0.05, 0.7]
+    means, _, _ = averaged(values, evidence, average[kind])
+    np.testing.assert_allclose(means, reference.running_average(values, 0.0, evidence, kind), atol=1e-6)
+
+
+def test_forgetting_shrinks_the_kept_weight_before_each_update(average):
+    _, gains, map = averaged([1.0] * 2, [1.0] * 2, at(average["count"], "forgetting", 0.5))
+    np.testing.assert_allclose(gains, [1 / 1.5, 1 / 1.75], rtol=1e-6)  # W: 1, .5 + 1, .75 + 1
+    np.testing.assert_allclose(map.weight, 1.75, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["ema_printed", "count"])
+def test_a_gaussian_without_evidence_or_that_is_invalid_stays_bit_for_bit(average, kind):
+    map = map_of(6, 8)
+    evidence = jnp.array([0.0, 0.5, 0.0, 1.0, 0.0, 0.2, 0.7, 0.7])  # the last two rows are free
+    poison = jax.tree.map(
+        lambda x: jnp.where(evidence.reshape(-1, *[1] * (x.ndim - 1)) > 0, x, jnp.nan), random_gaussians(8, 5)
+    )
+    poison = eqx.tree_at(lambda g: g.valid, poison, jnp.ones(8, bool))
+    updated, gain = update(map, poison, evidence, average[kind])
+    still = np.array([0, 2, 4, 6, 7])
+    assert_same(jax.tree.map(lambda x: x[still], updated), jax.tree.map(lambda x: x[still], map))
+    np.testing.assert_array_equal(np.asarray(gain)[still], 0)
+    np.testing.assert_array_equal(updated.num_updates, [1, 2, 1, 2, 1, 2, 0, 0])
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(updated))
+
+
+def in_box(map, clouds, config):
+    """Rows of the valid Gaussians whose voxel meets the voxels of the clouds' box."""
+    points = np.concatenate([np.asarray(c.points)[np.asarray(c.valid)] for c in clouds])
+    size, margin = float(config.voxel_size), float(config.margin)
+    low, high = (np.floor(x / size) for x in (points.min(0) - margin, points.max(0) + margin))
+    voxels = np.floor(np.asarray(map.gaussians.means) / size)
+    return np.flatnonzero(((voxels >= low) & (voxels <= high)).all(1) & np.asarray(map.gaussians.valid))
+
+
+def box_cloud(low, high):
+    cloud = random_observation(40)
+    points = jnp.linspace(jnp.array(low), jnp.array(high), 40)
+    return eqx.tree_at(lambda o: o.points, cloud, points)
+
+
+CLOUDS = box_cloud([-0.5, -0.4, 1.2], [0.0, 0.3, 1.9]), box_cloud([-0.2, 0.0, 1.5], [0.33, 0.41, 2.5])
+
+
+def test_a_submap_holds_the_gaussians_in_the_box_of_the_clouds(config):
+    config = config("submap.voxel_size=0.13", "submap.margin=0.07").submap
+    map = map_of(200, 256)
+    submap, rows, overflow = select(map, CLOUDS, config)
+    expected = in_box(map, CLOUDS, config)
+    assert 20 < len(expected) < 100 and overflow == 0
+    exists = np.asarray(submap.gaussians.valid)
+    np.testing.assert_array_equal(np.asarray(rows)[exists], expected)
+    np.testing.assert_array_equal(np.asarray(rows)[~exists], 256)
+    assert_same(jax.tree.map(lambda x: x[exists], submap), jax.tree.map(lambda x: x[expected], map))
+
+
+def test_invalid_points_do_not_widen_the_box(config):
+    poisoned = eqx.tree_at(lambda o: (o.points, o.valid), CLOUDS[1], (jnp.full((40, 3), 1e6), jnp.zeros(40, bool)))
+    map = map_of(200, 256)
+    # Rows past the end are no rows of the map, so only the valid part is compared.
+    one, other = (select(map, clouds, config().submap) for clouds in ((CLOUDS[0], poisoned), (CLOUDS[0], CLOUDS[0])))
+    np.testing.assert_array_equal(one[1], other[1])
+
+
+def test_clouds_without_a_valid_point_select_nothing(config):
+    empty = eqx.tree_at(lambda o: o.valid, CLOUDS[0], jnp.zeros(40, bool))
+    submap, rows, overflow = select(map_of(20, 32), (empty, empty), config().submap)
+    assert not submap.gaussians.valid.any() and overflow == 0
+    np.testing.assert_array_equal(rows, 32)
+
+
+def test_a_submap_that_is_too_small_by_one_counts_one(config):
+    map = map_of(200, 256)
+    count = len(in_box(map, CLOUDS, config().submap))
+    for capacity, expected in ((count, 0), (count - 1, 1)):
+        submap, _, overflow = select(map, CLOUDS, config(f"submap.submap_capacity={capacity}").submap)
+        assert overflow == expected and submap.gaussians.valid.all()
+
+
+@pytest.mark.parametrize("capacity", [192, 10])
+def test_writing_an_unchanged_submap_back_changes_no_bit(config, capacity):
+    map = map_of(200, 256)
+    submap, rows, _ = select(map, CLOUDS, config(f"submap.submap_capacity={capacity}").submap)
+    assert_same(write_back(map, submap, rows), map)
+
+
+def test_a_changed_submap_changes_its_rows_only(config):
+    map = map_of(200, 256)
+    submap, rows, _ = select(map, CLOUDS, config().submap)
+    changed = eqx.tree_at(lambda m: m.weight, submap, submap.weight + 5)
+    expected = np.array(map.weight)
+    expected[in_box(map, CLOUDS, config().submap)] += 5
+    np.testing.assert_array_equal(write_back(map, changed, rows).weight, expected)
+
+
+def with_holes(count, holes):
+    map = map_of(count, count)
+    free = jnp.isin(jnp.arange(count), jnp.array(holes))
+    return eqx.tree_at(lambda m: m.gaussians.valid, map, ~free)
+
+
+def test_fresh_gaussians_fill_the_free_rows_in_order():
+    map, fresh = with_holes(10, [2, 3, 7, 9]), random_gaussians(5, 9)
+    fresh = eqx.tree_at(lambda g: g.valid, fresh, jnp.array([False, True, True, False, True]))
+    inserted, count, overflow = insert(map, fresh, jnp.arange(5.0))
+    assert (count, overflow) == (3, 0)
+    for row, source in ((2, 1), (3, 2), (7, 4)):
+        np.testing.assert_array_equal(inserted.gaussians.means[row], fresh.means[source])
+        assert inserted.weight[row] == source and inserted.num_updates[row] == 1
+    np.testing.assert_array_equal(inserted.gaussians.valid, [True] * 9 + [False])
+    others = np.array([0, 1, 4, 5, 6, 8])
+    assert_same(jax.tree.map(lambda x: x[others], inserted), jax.tree.map(lambda x: x[others], map))
+
+
+@pytest.mark.parametrize(("holes", "expected"), [([2], 2), ([], 3), ([1, 4], 1), ([0, 1, 4], 0)])
+def test_what_finds_no_free_row_is_counted_and_the_rest_is_kept(holes, expected):
+    map, fresh = with_holes(6, holes or [99]), random_gaussians(3, 9)
+    inserted, count, overflow = insert(map, fresh, jnp.ones(3))
+    assert (count, overflow) == (3 - expected, expected)
+    assert inserted.gaussians.valid.sum() == min(6, 6 - len(holes) + 3)
+    kept = np.setdiff1d(np.arange(6), holes)
+    assert_same(jax.tree.map(lambda x: x[kept], inserted), jax.tree.map(lambda x: x[kept], map))
+
+
+def test_more_fresh_gaussians_than_rows_are_counted():
+    _, count, overflow = insert(empty_map(4, 0), random_gaussians(7), jnp.ones(7))
+    assert (count, overflow) == (4, 3)
+
+
+def test_inserting_nothing_changes_no_bit():
+    map = with_holes(6, [1, 3])
+    inserted, count, overflow = insert(map, empty_gaussians(4, 0), jnp.full(4, 7.0))
+    assert_same(inserted, map)
+    assert (count, overflow) == (0, 0)
+
+
+def test_growing_keeps_every_row_and_adds_free_neutral_ones():
+    map = map_of(5, 8)
+    grown = grow(map, 16)
+    assert_same(jax.tree.map(lambda x: x[:8], grown), map)
+    assert_same(jax.tree.map(lambda x: x[8:], grown), empty_map(8, 0))
