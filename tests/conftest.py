@@ -4,8 +4,8 @@ import pytest
 from jaxtyping import install_import_hook
 
 # Before anything imports the package: every call in the tests checks its jaxtyping signature. Two modules are left out
-# because their annotations do not hold: `clustering` ("h*w" of morton_order names no bound size; the counter of kmeans's
-# loop is traced, not an int) and `linalg` (mahalanobis_sq gets batches that broadcast: "*b" forbids it, "*#b" would not).
+# because their annotations do not hold: `clustering` ("h*w" of morton_order names no bound size, and the counter of
+# kmeans's loop is traced, not an int) and `linalg` (mahalanobis_sq gets batches that broadcast, which needs "*#b").
 CHECKED = (
     *("pytree", "camera", "observation", "neighbours", "gaussians", "gaussian_map", "icp"),
     *("render", "initialization", "localization", "em", "refinement", "slam"),

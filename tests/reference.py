@@ -147,7 +147,9 @@ def render(g, values, pose, camera, config):
                     continue
                 weight = light[row, column] * float(config.opacity) * np.exp(-0.5 * distance_sq)
                 ray = np.array([(column - center[0]) / focal[0], (row - center[1]) / focal[1], 1.0])
-                z = np.clip((normal @ point) / (normal @ ray), point[2] - reach, point[2] + reach)
+                # In inverse depth: beyond its horizon a plane is infinitely far, not behind the camera.
+                inverse = (normal @ ray) / (normal @ point)
+                z = 1 / np.clip(inverse, 1 / (point[2] + reach), 1 / max(point[2] - reach, 0.1 * point[2]))
                 image[row, column] += weight * values[k]
                 depth[row, column] += weight * z
                 alpha[row, column] += weight

@@ -1,0 +1,141 @@
+"""The rasteriser against a tile-free NumPy renderer, and identities that any renderer must satisfy."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from scene import as_numpy, at, move_gaussians, pose, random_gaussians
+
+from emgs_jax.camera import pixel_grid, rays
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.render.composite import render
+
+draw = eqx.filter_jit(render)
+T = pose((0.05, -0.1, 0.05), (0.05, -0.05, 0.1))
+GAUSSIANS = random_gaussians(24, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
+
+
+@pytest.fixture(scope="module")
+def render_config(config):
+    return config().refinement.render
+
+
+def single(mean, normal, std=0.15) -> Gaussians:
+    """One disc with a given normal, a millimetre thick."""
+    normal = np.asarray(normal) / np.linalg.norm(normal)
+    cov = std**2 * (np.eye(3) - np.outer(normal, normal)) + 1e-6 * np.outer(normal, normal)
+    rows = [jnp.asarray(x, jnp.float32)[None] for x in (mean, cov, (0.2, 0.5, 0.8), normal)]
+    return Gaussians(*rows, jnp.zeros((1, 0)), jnp.ones(1, bool))
+
+
+def assert_images_equal(actual, expected, atol):
+    for name in ("values", "alpha", "depth"):
+        np.testing.assert_allclose(getattr(actual, name), getattr(expected, name), atol=atol, err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def image(camera, render_config):
+    return draw(GAUSSIANS, GAUSSIANS.colors, T, camera, render_config)
+
+
+def test_the_image_equals_the_tile_free_reference(camera, render_config, image):
+    values, alpha, depth = reference.render(
+        as_numpy(GAUSSIANS),
+        np.asarray(GAUSSIANS.colors, float),
+        np.asarray(T.as_matrix(), float),
+        camera,
+        render_config,
+    )
+    assert image.overflow == 0 and (alpha > 0.3).mean() > 0.2
+    # A splat's edge (3 σ) has weight .9 exp(-4.5) = .01, and float32 may put a pixel on either side of it.
+    wrong = np.abs(image.alpha - alpha) > 1e-4
+    assert wrong.mean() < 0.005 and np.abs(image.alpha - alpha).max() < 0.011
+    np.testing.assert_allclose(np.asarray(image.values)[~wrong], values[~wrong], atol=1e-4)
+    both = ~wrong & (np.abs(alpha - float(render_config.min_alpha)) > 1e-3)
+    np.testing.assert_allclose(np.asarray(image.depth)[both], depth[both], atol=2e-3)  # m; slopes in float32
+
+
+def test_white_gaussians_over_black_are_alpha(camera, render_config):
+    rendering = draw(GAUSSIANS, jnp.ones((24, 1)), T, camera, render_config)
+    np.testing.assert_allclose(rendering.values[..., 0], rendering.alpha, atol=1e-6)
+    assert rendering.alpha.min() >= 0 and rendering.alpha.max() <= 1 + 1e-6
+
+
+def test_depth_exists_exactly_where_alpha_suffices(image, render_config):
+    np.testing.assert_array_equal(image.depth > 0, image.alpha >= render_config.min_alpha)
+    np.testing.assert_array_equal(image.depth_std > 0, image.alpha >= render_config.min_alpha)
+
+
+def test_a_fronto_parallel_gaussian_has_its_own_depth_where_it_covers(camera, render_config):
+    rendering = draw(single((0.1, 0.05, 2.0), (0, 0, -1)), jnp.ones((1, 1)), pose(), camera, render_config)
+    covered = np.asarray(rendering.depth) > 0
+    assert covered.sum() >= 8
+    np.testing.assert_allclose(np.asarray(rendering.depth)[covered], 2.0, atol=1e-5)  # roundings
+    # Its peak is the opacity at the projected mean, (15.5, 12.825), off the nearest pixel by a fraction of one.
+    assert 0.9 * float(render_config.opacity) < rendering.alpha.max() <= render_config.opacity
+
+
+def test_the_depth_of_a_slanted_gaussian_is_that_of_its_plane(camera, render_config):
+    normal, mean = np.array([0.5, 0.3, -1.0]), np.array([0.1, 0.05, 2.0])
+    rendering = draw(single(mean, normal), jnp.ones((1, 1)), pose(), camera, render_config)
+    directions = np.asarray(rays(camera, pixel_grid(camera)), float)
+    plane = (normal @ mean) / (directions @ normal)
+    covered = np.asarray(rendering.depth) > 0
+    assert covered.sum() >= 8 and np.ptp(plane[covered]) > 0.1
+    np.testing.assert_allclose(np.asarray(rendering.depth)[covered], plane[covered], atol=1e-4)  # m; roundings
+
+
+@pytest.mark.parametrize("size", [4, 5, 16, 32])
+def test_the_image_does_not_depend_on_the_tile_size(camera, config, image, size):
+    other = config(f"render.tile_size={size}").refinement.render
+    assert_images_equal(draw(GAUSSIANS, GAUSSIANS.colors, T, camera, other), image, 2e-5)  # order of sums
+
+
+def test_the_image_does_not_depend_on_the_order_of_rows(camera, render_config, image):
+    order = np.random.default_rng(0).permutation(24)
+    shuffled = jax.tree.map(lambda x: x[order], GAUSSIANS)
+    assert_images_equal(draw(shuffled, shuffled.colors, T, camera, render_config), image, 2e-5)  # order of sums
+
+
+def test_moving_map_and_camera_together_does_not_change_the_image(camera, render_config, image):
+    motion = pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
+    moved = draw(move_gaussians(motion, GAUSSIANS), GAUSSIANS.colors, motion @ T, camera, render_config)
+    # Coordinates of 3 m in float32; a pixel at a splat's edge may lose its weight of .01.
+    assert np.quantile(np.abs(moved.alpha - image.alpha), 0.99) < 1e-3
+    assert np.abs(moved.alpha - image.alpha).max() < 0.011
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf, 1e6])
+def test_invalid_rows_change_no_pixel(camera, render_config, image, poison):
+    rows = jax.tree.map(
+        lambda x: jnp.full_like(x[:8], poison) if x.dtype == jnp.float32 else jnp.zeros(8, bool), GAUSSIANS
+    )
+    padded = jax.tree.map(lambda a, b: jnp.concatenate([b, a]), GAUSSIANS, rows)
+    assert_images_equal(draw(padded, padded.colors, T, camera, render_config), image, 2e-5)  # order of sums
+
+
+def test_a_nearer_gaussian_hides_what_is_behind_it(camera, render_config):
+    config = at(render_config, "opacity", 1.0)
+    near, far = single((0.0, 0.0, 1.0), (0, 0, -1), 0.3), single((0.0, 0.0, 2.0), (0, 0, -1), 0.6)
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), far, near)
+    rendering = draw(both, jnp.array([[0.0, 1.0], [1.0, 0.0]]), pose(), camera, config)
+    row, column = 12, 14  # the pixel of the mean, to within half a pixel of splats with 6 and more
+    np.testing.assert_allclose(rendering.values[row, column], [1, 0], atol=0.02)  # exp of a quarter pixel
+    np.testing.assert_allclose(rendering.depth[row, column], 1.0, atol=0.02)
+
+
+def test_a_full_tile_is_counted(camera, config):
+    def overflow(capacity):
+        small = config(f"render.tile_capacity={capacity}", "render.tile_size=32").refinement.render
+        return int(draw(GAUSSIANS, GAUSSIANS.colors, T, camera, small).overflow)
+
+    seen = next(c for c in range(24, 0, -1) if overflow(c - 1) > 0)
+    assert overflow(seen) == 0 and overflow(seen - 1) == 1
+
+
+def test_an_empty_map_is_a_black_image_without_depth(camera, render_config):
+    nothing = eqx.tree_at(lambda g: g.valid, GAUSSIANS, jnp.zeros(24, bool))
+    rendering = draw(nothing, GAUSSIANS.colors, T, camera, render_config)
+    assert all((np.asarray(x) == 0).all() for x in jax.tree.leaves(rendering))

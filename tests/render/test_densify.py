@@ -1,0 +1,71 @@
+"""One point per pixel: exact on a plane of Gaussians, moved by rigid motions, silent where surfaces mix."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scene import at, move_gaussians, pose
+
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.render.densify import DensifyConfig, densify
+
+dense = eqx.filter_jit(densify)
+
+
+def wall(depth: float, normal=(0.0, 0.0, -1.0), step: float = 0.15) -> Gaussians:
+    """Discs on a grid on the plane through (0, 0, depth) with a normal."""
+    normal = np.asarray(normal) / np.linalg.norm(normal)
+    x, y = (a.reshape(-1) for a in np.meshgrid(np.arange(-2, 2, step), np.arange(-1.5, 1.5, step)))
+    z = depth - (normal[0] * x + normal[1] * y) / normal[2]
+    cov = (step / 2) ** 2 * (np.eye(3) - np.outer(normal, normal)) + 1e-4 * np.outer(normal, normal)
+    count = len(x)
+    rows = np.stack([x, y, z], -1), np.tile(cov, (count, 1, 1)), np.tile([0.2, 0.5, 0.8], (count, 1))
+    arrays = [jnp.asarray(a, jnp.float32) for a in (*rows, np.tile(normal, (count, 1)))]
+    return Gaussians(*arrays, jnp.zeros((count, 0)), jnp.ones(count, bool))
+
+
+@pytest.fixture(scope="module")
+def densify_config(config):
+    return DensifyConfig(0.05, config("render.tile_capacity=600").refinement.render)
+
+
+def test_the_points_of_a_slanted_wall_lie_on_it_with_its_normal_and_colour(camera, densify_config):
+    normal = np.array([0.3, 0.2, -1.0]) / np.linalg.norm([0.3, 0.2, -1.0])
+    # Without the blur: a splat's depth is kept within its own extent, which blur widens on the image only.
+    view = dense(wall(2.0, normal), pose(), camera, at(densify_config, "render.blur", 0.0))
+    valid = np.asarray(view.valid)
+    assert view.rendering.overflow == 0 and valid.mean() > 0.95
+    distance = (np.asarray(view.points)[valid] - [0, 0, 2]) @ normal
+    assert np.abs(distance).max() < 1e-3  # m; every splat's depth is exact for its plane
+    np.testing.assert_allclose(np.asarray(view.normals)[valid], np.tile(normal, (valid.sum(), 1)), atol=1e-4)
+    np.testing.assert_allclose(np.asarray(view.colors)[valid], np.tile([0.2, 0.5, 0.8], (valid.sum(), 1)), atol=1e-4)
+
+
+def test_points_move_with_map_and_camera(camera, densify_config):
+    T, motion = pose((0.05, 0.1, 0)), pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
+    view = dense(wall(2.0), T, camera, densify_config)
+    moved = dense(move_gaussians(motion, wall(2.0)), motion @ T, camera, densify_config)
+    both = np.asarray(view.valid & moved.valid)
+    assert both.mean() > 0.9
+    expected = np.asarray(view.points) @ np.asarray(motion.rotation().as_matrix()).T + np.asarray(motion.translation())
+    np.testing.assert_allclose(
+        np.asarray(moved.points)[both], expected[both], atol=2e-3
+    )  # a splat more or less at its edge
+
+
+def test_a_pixel_that_mixes_two_surfaces_is_no_point(camera, densify_config):
+    half_open = at(densify_config, "render.opacity", 0.5)  # so that the wall behind shines through
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), wall(1.5), wall(3.0, step=0.3))
+    view = dense(both, pose(), camera, half_open)
+    assert (view.rendering.depth > 0).mean() > 0.9
+    mixed = np.asarray(view.rendering.depth_std) > 0.05 * np.asarray(view.rendering.depth)
+    assert mixed.mean() > 0.5
+    np.testing.assert_array_equal(np.asarray(view.valid), ~mixed & (np.asarray(view.rendering.depth) > 0))
+
+
+def test_pixels_without_depth_are_invalid_and_finite(camera, densify_config):
+    nothing = eqx.tree_at(lambda g: g.valid, wall(2.0), jnp.zeros(wall(2.0).valid.shape, bool))
+    view = dense(nothing, pose(), camera, densify_config)
+    assert not view.valid.any()
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(view))

@@ -1,0 +1,79 @@
+"""EWA projection against NumPy, sampled Gaussians, and the exact depth of planes."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from scene import as_numpy, move_gaussians, pose, random_gaussians
+
+from emgs_jax.camera import pixel_grid, rays
+from emgs_jax.render.project import project_gaussians
+
+project = eqx.filter_jit(project_gaussians)
+T = pose((0.1, -0.2, 0.05), (0.1, -0.05, 0.2))
+SCALE, BLUR = jnp.asarray(2.0), jnp.asarray(0.3)
+GAUSSIANS = random_gaussians(30, 1, low=(-0.7, -0.5, 1.5), high=(0.7, 0.5, 3))
+
+
+def test_splats_equal_the_local_affine_approximation(camera):
+    splats, g = project(GAUSSIANS, T, camera, SCALE, BLUR), as_numpy(GAUSSIANS)
+    matrix, focal, center = (np.asarray(x, float) for x in (T.as_matrix(), camera.focal, camera.center))
+    for k in range(30):
+        pixel, cov_2d, point, cov = reference.splat(g["means"][k], g["covs"][k], matrix, focal, center, 2.0, 0.3)
+        np.testing.assert_allclose(splats.means[k], pixel, atol=1e-4)  # pixels; coordinates of about 30
+        np.testing.assert_allclose(splats.covs[k], cov_2d, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(splats.precisions[k], np.linalg.inv(cov_2d), rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose([splats.depth[k], splats.inverse_depth[k]], [point[2], 1 / point[2]], rtol=1e-5)
+        np.testing.assert_allclose(splats.depth_std[k], np.sqrt(cov[2, 2]), rtol=1e-4)
+    assert splats.valid.all()
+
+
+def test_a_small_gaussians_splat_has_the_covariance_of_its_projected_samples(camera):
+    """The approximation is exact in the limit of small Gaussians."""
+    small = eqx.tree_at(lambda g: g.covs, GAUSSIANS, GAUSSIANS.covs * 1e-3)
+    splats = project(small, T, camera, jnp.ones(()), jnp.zeros(()))
+    rng, matrix = np.random.default_rng(0), np.linalg.inv(np.asarray(T.as_matrix(), float))
+    for k in range(0, 30, 10):
+        x = rng.multivariate_normal(np.asarray(small.means[k], float), np.asarray(small.covs[k], float), 100_000)
+        x = x @ matrix[:3, :3].T + matrix[:3, 3]
+        pixels = x[:, :2] / x[:, 2:] * np.asarray(camera.focal) + np.asarray(camera.center)
+        cov = np.cov(pixels.T)
+        np.testing.assert_allclose(splats.covs[k], cov, atol=0.02 * np.trace(cov))  # 4 standard errors of 1e5 samples
+
+
+def test_the_inverse_depth_of_a_slanted_plane_is_exact_at_every_pixel(camera):
+    splats, g = project(GAUSSIANS, T, camera, SCALE, BLUR), as_numpy(GAUSSIANS)
+    matrix, directions = np.asarray(T.as_matrix(), float), np.asarray(rays(camera, pixel_grid(camera)), float)
+    for k in range(30):
+        normal, point = matrix[:3, :3].T @ g["normals"][k], matrix[:3, :3].T @ (g["means"][k] - matrix[:3, 3])
+        expected = directions @ normal / (normal @ point)
+        offset = np.asarray(pixel_grid(camera) - splats.means[k])
+        actual = float(splats.inverse_depth[k]) + offset @ np.asarray(splats.depth_slope[k])
+        np.testing.assert_allclose(actual, expected, atol=2e-5)  # 1/m; slopes of .1 over 30 pixels in float32
+
+
+def test_a_gaussian_seen_edge_on_has_no_depth_slope(camera):
+    edge = eqx.tree_at(
+        lambda g: (g.means, g.normals), random_gaussians(1), (jnp.array([[0.0, 0, 2]]), jnp.array([[1.0, 0, 0]]))
+    )
+    splats = project(edge, pose(), camera, SCALE, BLUR)
+    np.testing.assert_array_equal(splats.depth_slope, [[0, 0]])
+    np.testing.assert_allclose(splats.inverse_depth, 0.5)
+
+
+@pytest.mark.parametrize("z", [-1.0, 0.0, 5e-4])
+def test_a_gaussian_that_is_not_in_front_is_invalid_and_finite(camera, z):
+    behind = eqx.tree_at(lambda g: g.means, random_gaussians(1), jnp.array([[0.3, -0.2, z]]))
+    splats = project(behind, pose(), camera, SCALE, BLUR)
+    assert not splats.valid.any()
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(splats))
+
+
+def test_moving_gaussians_and_camera_together_changes_no_splat(camera):
+    motion = pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
+    still = project(GAUSSIANS, T, camera, SCALE, BLUR)
+    moved = project(move_gaussians(motion, GAUSSIANS), motion @ T, camera, SCALE, BLUR)
+    for name in ("means", "covs", "depth", "depth_slope"):
+        np.testing.assert_allclose(getattr(moved, name), getattr(still, name), rtol=1e-3, atol=1e-3)  # 2 m in float32
