@@ -15,7 +15,7 @@ class Clock:
     """Wall-clock seconds by phase; while `watching`, also the seconds in which JAX made executables.
 
     Args:
-        phases: name -> seconds, compilation included; phases do not overlap.
+        phases: name -> seconds, compilation included; a phase inside another counts for itself only.
         compile_seconds: union of all spans in which a function was traced, lowered or compiled.
     """
 
@@ -23,6 +23,7 @@ class Clock:
         self.phases: dict[str, float] = defaultdict(float)
         self.compile_seconds = 0.0
         self._begin = time.perf_counter()
+        self._inner = 0.0  # seconds of the phases inside the current one
         self._spans: list[tuple[float, float]] = []  # disjoint and ascending
 
     @property
@@ -33,11 +34,13 @@ class Clock:
     @contextlib.contextmanager
     def phase(self, name: str) -> Iterator[None]:
         """Count what happens inside as `name`."""
-        begin = time.perf_counter()
+        begin, around, self._inner = time.perf_counter(), self._inner, 0.0
         try:
             yield
         finally:
-            self.phases[name] += time.perf_counter() - begin
+            seconds = time.perf_counter() - begin
+            self.phases[name] += seconds - self._inner
+            self._inner = around + seconds
 
     @contextlib.contextmanager
     def watching(self) -> Iterator["Clock"]:

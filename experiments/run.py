@@ -65,7 +65,8 @@ def _map(
         for index, reason in dataset.skipped.items():
             log.append(vars(FrameRecord(index, None, None, "skipped", reason)))
         try:
-            return raw_prior_cloud(map_frames(session, dataset, prior), evaluation)
+            with session.clock.phase("raw_prior"):
+                return raw_prior_cloud(map_frames(session, dataset, prior), evaluation)
         except BaseException:
             with contextlib.suppress(OSError, ValueError):  # the first error is the one to show
                 outputs.save_progress(folder, session)

@@ -1,0 +1,58 @@
+"""Frames that cannot be read, left out or not."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.readable import ReadableFrames
+
+
+class Damaged:
+    """Five frames of which some cannot be read."""
+
+    name, sequence, size, classes, has_ground_truth = "damaged", "one", (4, 3), (), False
+    intrinsics = (4.0, 4.0, 1.5, 1.0)
+
+    def __init__(self, *bad: int) -> None:
+        self.bad, self.reads = bad, []
+
+    def __len__(self) -> int:
+        return 5
+
+    def __getitem__(self, index: int) -> Frame:
+        self.reads.append(index)
+        if index in self.bad:
+            raise BadFrameError(f"{index}.png is truncated")
+        return Frame(index, 10.0 * index, f"{index}.png", np.zeros((3, 4, 3), np.uint8))
+
+    def fingerprint(self) -> str:
+        return "whole"
+
+
+def test_skipping_leaves_out_exactly_the_unreadable_frames_and_renumbers_the_rest():
+    frames = ReadableFrames(Damaged(1, 4), "skip")
+    assert frames.skipped == {1: "1.png is truncated", 4: "4.png is truncated"}
+    assert [(frame.index, frame.timestamp) for frame in frames] == [(0, 0.0), (1, 20.0), (2, 30.0)]
+    assert frames.kept == (0, 2, 3) and len(frames) == 3
+
+
+def test_without_skipping_nothing_is_read_before_its_turn_and_the_error_names_the_file():
+    damaged = Damaged(2)
+    frames = ReadableFrames(damaged, "error")
+    assert damaged.reads == [] and len(frames) == 5
+    with pytest.raises(BadFrameError, match="2.png"):
+        frames[2]
+
+
+def test_the_fingerprint_changes_only_where_frames_are_left_out():
+    whole, without_1, without_2 = (ReadableFrames(Damaged(*bad), "skip").fingerprint() for bad in ((), (1,), (2,)))
+    assert whole == "whole" and len({whole, without_1, without_2}) == 3
+
+
+def test_a_sequence_without_any_readable_frame_says_why():
+    with pytest.raises(ValueError, match="no frame that can be read: 0.png is truncated"):
+        ReadableFrames(Damaged(*range(5)), "skip")
+    with pytest.raises(ValueError, match="on_bad_frame must be error or skip, got 'maybe'"):
+        ReadableFrames(SimpleNamespace(), "maybe")

@@ -1,0 +1,62 @@
+"""Recording and replay; oracle: the live run's bytes."""
+
+import json
+from pathlib import Path
+
+import hydra
+import numpy as np
+import pytest
+from tiny_run import NUM_FRAMES, WINDOW_SIZE, compose, dataset
+
+from emgs_jax.prior.base import windows
+from experiments.predict import predict
+from experiments.run import run
+
+
+def record(folder: Path, *overrides: str) -> Path:
+    return predict(compose(f"out={folder}", *overrides, name="predict"))
+
+
+def test_the_recording_holds_what_the_prior_says_of_every_window(tmp_path, capsys):
+    record(tmp_path / "out")
+    said = capsys.readouterr().out
+    assert "simulated" in said and "MiB" in said and "'level': 1.0" in said
+    prior = hydra.utils.instantiate(compose().prior, classes=list(dataset().classes))
+    calls = list(windows(NUM_FRAMES, WINDOW_SIZE))
+    for window in calls:
+        frames = [dataset()[index] for index in window.views]
+        expected = prior.predict(window, frames, dataset().intrinsics)
+        with np.load(tmp_path / "out" / f"{window.inference:06d}.npz") as arrays:
+            np.testing.assert_array_equal(arrays["points"], expected.points)
+            np.testing.assert_array_equal(arrays["T_anchor_view"], expected.T_anchor_view)
+    assert len(list((tmp_path / "out").glob("0*.npz"))) == len(calls)
+
+
+def test_recording_again_asks_only_for_what_is_missing(tmp_path):
+    folder = record(tmp_path / "out")
+    kept = (folder / "000000.npz").stat().st_mtime_ns
+    content = (folder / "000002.npz").read_bytes()
+    (folder / "000002.npz").unlink()
+    record(folder)
+    assert (folder / "000002.npz").read_bytes() == content
+    assert (folder / "000000.npz").stat().st_mtime_ns == kept
+
+
+@pytest.mark.slow
+def test_a_run_from_the_recording_writes_the_same_bytes_as_the_live_run(tmp_path):
+    folder = record(tmp_path / "out")
+    for name, overrides in (("live", ()), ("replay", ("prior=recorded", f"prior.folder={folder}"))):
+        (tmp_path / name).mkdir()
+        run(compose(*overrides), tmp_path / name)
+    for name in ("map.npz", "trajectory.txt", "map.ply", "points.ply", "mesh.ply"):
+        assert (tmp_path / "live" / name).read_bytes() == (tmp_path / "replay" / name).read_bytes(), name
+    live, replay = (json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("live", "replay"))
+    same = [key for key in live if not key.startswith(("time/", "memory/", "provenance"))]
+    assert {key: live[key] for key in same} == {key: replay[key] for key in same}
+    assert replay["provenance"]["prior"] == live["provenance"]["prior"] and replay["provenance"]["simulated"] is True
+
+
+def test_a_recording_of_another_sequence_is_refused(tmp_path):
+    folder = record(tmp_path / "out")
+    with pytest.raises(ValueError, match="was recorded with"):
+        run(compose("prior=recorded", f"prior.folder={folder}", "dataset.seed=1"), tmp_path)

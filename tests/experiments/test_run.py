@@ -1,0 +1,183 @@
+"""The script: files, metrics, interruption, bad input; oracle: the truth, reloading, and a second process."""
+
+import json
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+
+import hydra
+import numpy as np
+import pytest
+from tiny_run import CONF, NUM_FRAMES, TINY, WINDOW_SIZE, EditedPrior, compose, dataset
+
+import experiments.run
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.synthetic import Synthetic
+from emgs_jax.export import load_map_npz, load_trajectory_tum
+from emgs_jax.gaussian_map import GaussianMap
+from experiments.building import clear_errors
+
+FILES = {"trajectory.txt", "map.npz", "map.ply", "points.ply", "mesh.ply", "frames.jsonl", "overview.png"}
+ERRORS = [f"{kind}_{size}cm_percent" for size in (20, 5) for kind in ("f1", "precision", "recall")]
+NORMALS = ["normals_abs_cos_percent", "normals_within_30deg_percent"]
+TRAJECTORY = [
+    "ate_sim3_m",
+    "ate_se3_m",
+    "scale",
+    "scale_percent",
+    "rpe_translation_m",
+    "rpe_rotation_deg",
+    "num_frames",
+]
+RECONSTRUCTION = ["accuracy_m", "completion_m", *ERRORS, *NORMALS, "num_points", "alignment_note"]
+COMPARED = [f"trajectory/{name}" for name in TRAJECTORY] + [f"reconstruction/{name}" for name in RECONSTRUCTION]
+PHASES = ("setup", "load", "predict", "map", "raw_prior", "densify", "export", "evaluate", "compile", "total")
+KEYS = {
+    *COMPARED,
+    *(f"raw_prior/{name}" for name in COMPARED),
+    *(f"reconstruction_{kind}/{name}" for kind in ("se3", "centers") for name in RECONSTRUCTION),
+    *(f"frames/{name}" for name in ("tracked", "degraded", "lost", "initialization", "skipped", "overflow")),
+    *(f"time/{name}_seconds" for name in PHASES),
+    *("time/seconds_per_frame", "map/num_gaussians", "map/capacity", "memory/peak_mb", "provenance"),
+}
+
+
+@cache
+def exact_run() -> tuple[Path, dict]:
+    """Folder and metrics of a run with the exact prior."""
+    folder = Path(mkdtemp())
+    return folder, experiments.run.run(compose("prior.level=0"), folder)
+
+
+def read_log(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "frames.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.slow
+def test_an_exact_prior_is_not_harmed():
+    metrics = exact_run()[1]
+    assert metrics["trajectory/ate_se3_m"] <= 0.01
+    assert metrics["raw_prior/trajectory/ate_se3_m"] <= 1e-9
+    assert metrics["frames/tracked"] == NUM_FRAMES - 1 and metrics["frames/initialization"] == 1
+
+
+@pytest.mark.slow
+def test_metrics_json_has_exactly_the_promised_keys():
+    folder, metrics = exact_run()
+    assert set(metrics) == KEYS
+    written = json.loads((folder / "metrics.json").read_text())
+    assert set(written) == KEYS
+    assert written["provenance"]["simulated"] is True and written["provenance"]["config"]["prior"]["level"] == 0
+
+
+@pytest.mark.slow
+def test_the_phases_account_for_the_time():
+    metrics = exact_run()[1]
+    parts = sum(metrics[f"time/{name}_seconds"] for name in PHASES if name not in ("compile", "total"))
+    assert parts <= metrics["time/total_seconds"] <= 1.1 * parts + 0.5
+    assert 0 < metrics["time/seconds_per_frame"] < metrics["time/map_seconds"]
+
+
+@pytest.mark.slow
+def test_every_file_is_there_and_the_trajectory_has_every_frame_at_its_time():
+    folder, metrics = exact_run()
+    assert {path.name for path in folder.iterdir()} == FILES | {"metrics.json"}
+    times, poses = load_trajectory_tum(folder / "trajectory.txt")
+    assert times.tolist() == [dataset()[i].timestamp for i in range(NUM_FRAMES)]
+    truth = np.stack([dataset()[i].T_world_camera for i in range(NUM_FRAMES)])
+    np.testing.assert_allclose(poses, truth, atol=1e-3)
+    map = load_map_npz(folder / "map.npz", GaussianMap)
+    assert int(map.gaussians.valid.sum()) == metrics["map/num_gaussians"] == read_log(folder)[-1]["num_gaussians"]
+
+
+@pytest.mark.slow
+def test_a_second_process_writes_the_same_bytes(tmp_path):
+    command = [sys.executable, "-m", "experiments.run", *TINY, "prior.level=0", f"hydra.run.dir={tmp_path}"]
+    done = subprocess.run(command, cwd=CONF.parent, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "ours" in done.stdout and "raw prior" in done.stdout and str(tmp_path) in done.stdout
+    for name in ("map.npz", "trajectory.txt"):
+        assert (tmp_path / name).read_bytes() == (exact_run()[0] / name).read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_an_interrupted_run_leaves_what_it_has(tmp_path, monkeypatch, error):
+    def interrupt(prediction):
+        if prediction.window.inference == 2:
+            raise error
+        return prediction
+
+    monkeypatch.setattr(experiments.run, "build_prior", lambda config, dataset: EditedPrior(interrupt))
+    with pytest.raises(error):
+        experiments.run.run(compose(), tmp_path)
+    num_done = WINDOW_SIZE + 1
+    records = read_log(tmp_path)
+    assert [record["index"] for record in records] == list(range(num_done))
+    whole = load_trajectory_tum(exact_run()[0] / "trajectory.txt")
+    times, poses = load_trajectory_tum(tmp_path / "trajectory.txt")
+    np.testing.assert_array_equal(times, whole[0][:num_done])
+    np.testing.assert_array_equal(poses, whole[1][:num_done])
+    map = load_map_npz(tmp_path / "map.npz", GaussianMap)
+    assert int(map.gaussians.valid.sum()) == records[-1]["num_gaussians"]
+
+
+@pytest.mark.slow
+def test_a_bad_frame_is_left_out_and_listed_or_ends_the_run(tmp_path, monkeypatch):
+    read = Synthetic.__getitem__
+
+    def damaged(self, index):
+        if index == 2:
+            raise BadFrameError("frame-000002.png is truncated")
+        return read(self, index)
+
+    monkeypatch.setattr(Synthetic, "__getitem__", damaged)
+    metrics = experiments.run.run(compose("prior.level=0", "on_bad_frame=skip"), tmp_path)
+    records = read_log(tmp_path)
+    assert [(r["index"], r["reason"]) for r in records if r["status"] == "skipped"] == [
+        (2, "frame-000002.png is truncated")
+    ]
+    assert sorted(record["index"] for record in records) == list(range(NUM_FRAMES))
+    assert load_trajectory_tum(tmp_path / "trajectory.txt")[0].tolist() == [0.0, 1.0, 3.0, 4.0, 5.0]
+    assert metrics["frames/skipped"] == 1 and metrics["trajectory/ate_se3_m"] <= 0.01
+    with pytest.raises(BadFrameError, match="frame-000002.png is truncated"):
+        experiments.run.run(compose("prior.level=0"), tmp_path)
+
+
+@pytest.mark.slow
+def test_one_single_frame_is_mapped_and_says_why_it_has_no_trajectory_error(tmp_path):
+    metrics = experiments.run.run(compose("prior.level=0", "dataset.stop=1"), tmp_path)
+    assert metrics["trajectory/ate_sim3_m"] is None and "poses" in metrics["trajectory/reason"]
+    assert metrics["map/num_gaussians"] > 100 and metrics["reconstruction/accuracy_m"] < 0.05
+    assert metrics["time/seconds_per_frame"] > 0 and {path.name for path in tmp_path.iterdir()} >= FILES
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
+def test_every_experiment_composes_and_builds_its_config(name):
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        config = hydra.compose("config", overrides=[f"experiment={name}"])
+    for part in ("slam", "evaluation", "densify"):
+        hydra.utils.instantiate(config[part])
+
+
+def test_the_paper_experiment_takes_the_printed_readings():
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        config = hydra.compose("config", overrides=["experiment=paper", "em.num_neighbours=7"])
+    assert config.slam.initialization == "merged" and config.em.determinant_weight == 1.0
+    assert config.em.average.gain == "ema_printed" and config.localization.coarse == "via_previous"
+    assert config.fit.points_per_gaussian == 128 and config.observation.thin == 1
+    assert config.refinement.front_margin == 0.0 and config.slam.em.num_neighbours == 7
+
+
+def test_an_error_of_a_constructor_is_one_clear_line(monkeypatch):
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    with pytest.raises(SystemExit, match=r"^error: prior.level must be finite.*got -1") as caught, clear_errors():
+        hydra.utils.instantiate(compose("prior.level=-1").prior)
+    assert caught.value.code not in (0, None)
+    with pytest.raises(SystemExit, match="unexpected keyword argument 'foo'"), clear_errors():
+        hydra.utils.instantiate(compose("+em.foo=1").em)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(hydra.errors.InstantiationException), clear_errors():
+        hydra.utils.instantiate(compose("prior.level=-1").prior)

@@ -1,0 +1,72 @@
+"""One small setting for every test that needs a whole run; all have the same shapes, so a process compiles once."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import hydra
+
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.pipeline import MappingRun, map_frames, new_run
+from emgs_jax.prior.base import PriorPrediction
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+NUM_FRAMES, WINDOW_SIZE = 6, 3
+TINY = (
+    *("dataset.size=[64,48]", "dataset.num_frames=40", f"dataset.stop={NUM_FRAMES}"),
+    *("observation.thin=1", "observation.normal_radius=1", "observation.normal_spacing=1"),
+    *("fit.points_per_gaussian=8", "fit.num_fit_neighbours=8", "fit.num_kmeans_iterations=2"),
+    *("submap.map_capacity=1024", "submap.submap_capacity=1024", "em.num_neighbours=6"),
+    *("render.tile_size=16", "render.tile_capacity=192", "localization.icp.num_points=512"),
+    f"slam.window_size={WINDOW_SIZE}",
+)
+
+
+def compose(*overrides: str, name: str = "config"):
+    """conf/ as Hydra composes it for a script, with the small setting."""
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        return hydra.compose(name, overrides=[*TINY, *overrides])
+
+
+@cache
+def dataset() -> ReadableFrames:
+    return ReadableFrames(hydra.utils.instantiate(compose().dataset))
+
+
+class EditedPrior:
+    """The exact prior, with each prediction passed through `edit`, which may raise."""
+
+    def __init__(self, edit: Callable[[PriorPrediction], PriorPrediction] = lambda prediction: prediction) -> None:
+        self._prior = hydra.utils.instantiate(compose("prior.level=0").prior, classes=list(dataset().classes))
+        self._edit, self.provenance = edit, self._prior.provenance
+
+    def check(self, dataset, window_size) -> None:
+        pass
+
+    def predict(self, window, frames, intrinsics) -> PriorPrediction:
+        return self._edit(self._prior.predict(window, frames, intrinsics))
+
+
+def at_inference(number: int, **arrays) -> Callable[[PriorPrediction], PriorPrediction]:
+    """An edit: at one inference, arrays are filled with these values."""
+
+    def edit(prediction: PriorPrediction) -> PriorPrediction:
+        if prediction.window.inference != number:
+            return prediction
+        filled = {name: getattr(prediction, name).copy() for name in arrays}
+        for name, value in arrays.items():
+            filled[name][...] = value
+        return dataclasses.replace(prediction, **filled)
+
+    return edit
+
+
+def map_tiny(frames, prior, *overrides: str) -> tuple[MappingRun, list]:
+    """A finished run, and the map after each record."""
+    maps = []
+    session = new_run(frames, hydra.utils.instantiate(compose(*overrides).slam))
+    session.on_record = lambda record: maps.append(session.state.map)
+    for _ in map_frames(session, frames, prior):
+        pass
+    return session, maps
