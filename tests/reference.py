@@ -148,7 +148,9 @@ def render(g, values, pose, camera, config):
                 weight = light[row, column] * float(config.opacity) * np.exp(-0.5 * distance_sq)
                 ray = np.array([(column - center[0]) / focal[0], (row - center[1]) / focal[1], 1.0])
                 # In inverse depth: beyond its horizon a plane is infinitely far, not behind the camera.
-                inverse = (normal @ ray) / (normal @ point)
+                # A plane that is seen at a grazing angle (cosine below .1) has its mean's depth everywhere.
+                is_grazing = abs(normal @ point) <= 0.1 * np.linalg.norm(point)
+                inverse = 1 / point[2] if is_grazing else (normal @ ray) / (normal @ point)
                 z = 1 / np.clip(inverse, 1 / (point[2] + reach), 1 / max(point[2] - reach, 0.1 * point[2]))
                 image[row, column] += weight * values[k]
                 depth[row, column] += weight * z

@@ -20,7 +20,7 @@ SMALL = (
     *("fit.points_per_gaussian=8", "fit.num_fit_neighbours=8", "fit.num_kmeans_iterations=2"),
     *("submap.map_capacity=256", "submap.submap_capacity=192", "em.num_neighbours=6"),
     *("render.tile_size=8", "render.tile_capacity=192", "render.covariance_scale=2.0", "render.radius=3.0"),
-    *("localization.icp.num_points=256"),
+    "localization.icp.num_points=256",
 )
 
 
