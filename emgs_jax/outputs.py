@@ -78,8 +78,7 @@ def center_cloud(run: MappingRun) -> PointCloud:
 
 
 def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: DensifyConfig, title: str) -> list[str]:
-    """Write every file that shows the map, besides `save_progress`; returns what could not be made, and why."""
-    save_progress(folder, run)
+    """Write the files that show the map; returns what could not be made, and why."""
     gaussians = jax.device_get(run.state.map.gaussians)
     valid = gaussians.valid
     # As drawn: the covariances are those that close the surface.

@@ -32,6 +32,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             slam, evaluation, densify = (instantiate(config[name]) for name in ("slam", "evaluation", "densify"))
         session = new_run(dataset, slam, clock)
         raw_cloud = _map(session, dataset, prior, evaluation, folder)
+        outputs.save_progress(folder, session)
         with clock.phase("densify"):
             dense = outputs.dense_map(session, dataset, densify, evaluation.voxel_m)
         with clock.phase("export"):
@@ -80,7 +81,7 @@ def main(config: DictConfig) -> float:
     with clear_errors():
         use_compilation_cache(config)
         metrics = run(config, folder)
-    print(print_metrics_table(metrics))
+    print(print_metrics_table(metrics) if "trajectory/num_frames" in metrics else "no ground truth, so no errors")
     print(f"{metrics['time/seconds_per_frame']:.2f} s a frame; everything is in {folder}")
     error = metrics.get("trajectory/ate_sim3_m")
     return math.inf if error is None else error

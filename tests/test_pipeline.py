@@ -135,7 +135,7 @@ def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
     dense = dense_map(blind, dataset(), config, voxel=0.02)
     assert len(dense.cloud) > 1000 and len(dense.pictures) == 4
     assert save_outputs(tmp_path, blind, dense, config, "blind") == []
-    names = {"trajectory.txt", "map.npz", "map.ply", "points.ply", "mesh.ply", "overview.png"}
+    names = {"map.ply", "points.ply", "mesh.ply", "overview.png"}
     assert {path.name for path in tmp_path.iterdir()} == names
     assert score(blind, Clouds(dense.cloud, dense.cloud, dense.cloud), dataset(), None) == {}
 
