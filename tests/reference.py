@@ -159,7 +159,7 @@ def render(g, values, pose, camera, config):
     return image, alpha, np.where(alpha >= config.min_alpha, depth / np.maximum(alpha, 1e-9), 0.0)
 
 
-ROOM_LOW, ROOM_HIGH = np.array([-1.4, -1.0, -0.8]), np.array([1.6, 1.1, 2.2])  # m; a box, seen from inside
+ROOM_LOW, ROOM_HIGH = np.array([-0.9, -0.7, -0.8]), np.array([1.0, 0.75, 2.2])  # m; a box, seen from inside
 
 
 def texture(points):

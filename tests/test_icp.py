@@ -123,10 +123,11 @@ def errors(target, source, config, starts):
 @pytest.mark.parametrize("residual", RESIDUALS)
 def test_every_residual_recovers_the_pose_in_a_closed_room(source, target, settings, residual):
     found = errors(target, source, at(settings, "residual", RESIDUALS[residual]), STARTS)
-    # From 5 cm and 2 degrees. Gaussians across the room's edges are no planes and leave some millimetres; offsets from
-    # the means also pull points beyond the mapped region into it (R9), which leaves up to a third of the start.
-    assert found[:, 0].max() < (0.01 if residual == "colored" else 0.02), found
-    assert found[:, 1].max() < 0.006, found
+    # From 5 cm and 2 degrees; pixels and Gaussians are 10 cm apart here. Gaussians across the room's edges are no planes
+    # and leave some millimetres; the offsets from such sparse means (R9) leave up to a quarter of the spacing.
+    limit = 0.01 if residual == "colored" else 0.025
+    assert found[:, 0].max() < limit, found
+    assert found[:, 1].max() < limit, found
 
 
 def cloud(points, normals, colors):

@@ -1,0 +1,260 @@
+"""Coarse readings recover an exact chain, scales are found, every guard keeps the coarse pose and says why."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from scene import assert_same, at, observe_room, path_pose, pose, pose_error, predict_room
+
+from emgs_jax.camera import Camera
+from emgs_jax.gaussians import fit_to_points
+from emgs_jax.localization import REASONS, localize_coarse, localize_fine
+from emgs_jax.observation import transform
+
+coarse_step, fine_step = eqx.filter_jit(localize_coarse), eqx.filter_jit(localize_fine)
+COARSE = {"via_previous": 0, "same_image": 1, "anchored": 2, "fused": 3}
+SCALES = {"none": 0, "ratio": 1, "estimated": 2}
+FRAME = 3
+
+
+@pytest.fixture(scope="module")
+def wide():
+    """Twice the resolution: closest points of the previous image are then a few centimetres apart."""
+    return Camera([60.0, 66.0], [39.5, 30.25], 80, 64)
+
+
+def world(i, camera):
+    return transform(path_pose(i), observe_room(path_pose(i), camera), jnp.ones(()))
+
+
+def coarse_of(prediction, camera, config, previous=None):
+    previous = world(FRAME - 1, camera) if previous is None else previous
+    return coarse_step(prediction, previous, path_pose(FRAME - 1), camera, config)
+
+
+@pytest.fixture(scope="module")
+def printed(config):
+    """Scale `none` and memory 1, whatever the presets say."""
+    return at(config("localization.coarse_scale=none").localization, "scale_memory", 1.0)
+
+
+@pytest.mark.parametrize("reading", ["same_image", "anchored", "fused"])
+def test_an_exact_chain_is_recovered_exactly(wide, printed, reading):
+    result = coarse_of(predict_room(FRAME, wide), wide, at(printed, "coarse", COARSE[reading]))
+    # Quaternions from float32 matrices: 5e-4 rad at worst, and as much per metre.
+    assert max(pose_error(result.T_world_camera, path_pose(FRAME))) < 1e-3
+    assert max(pose_error(result.T_world_newest, path_pose(FRAME + 1))) < 1e-3
+    assert result.scale == 1 and result.repeat_rms < 1e-5 and result.is_usable
+    depths = np.asarray(observe_room(path_pose(FRAME - 1), wide).points[:, 2])
+    assert result.mean_depth == pytest.approx(np.median(depths), rel=0.01)
+
+
+def test_closest_points_in_the_previous_image_recover_an_exact_chain(wide, printed):
+    result = coarse_of(predict_room(FRAME, wide), wide, at(printed, "coarse", COARSE["via_previous"]))
+    # Closest points are up to half a pixel apart (1.5 cm on the walls), on average to all sides.
+    distance, angle = pose_error(result.T_world_camera, path_pose(FRAME))
+    assert distance < 0.012 and angle < 0.01
+
+
+@pytest.mark.parametrize("reading", COARSE)
+@pytest.mark.parametrize("kind", ["ratio", "estimated"])
+def test_a_known_scale_is_found_and_the_chain_with_it(wide, printed, kind, reading):
+    config = at(at(printed, "coarse_scale", SCALES[kind]), "coarse", COARSE[reading])
+    result = coarse_of(predict_room(FRAME, wide, scale=0.9), wide, config)
+    np.testing.assert_allclose(result.scale, 1 / 0.9, rtol=1e-4)  # float32 sums
+    distance, angle = pose_error(result.T_world_camera, path_pose(FRAME))
+    limit = 0.012 if reading == "via_previous" else 2e-3  # as above
+    assert distance < limit and angle < limit
+
+
+def test_the_printed_form_estimates_no_scale_and_memory_dampens_it(wide, printed):
+    prediction = predict_room(FRAME, wide, scale=0.9)
+    assert coarse_of(prediction, wide, printed).scale == 1
+    half = at(at(printed, "coarse_scale", SCALES["ratio"]), "scale_memory", 0.5)
+    np.testing.assert_allclose(coarse_of(prediction, wide, half).scale, 0.9**-0.5, rtol=1e-4)
+
+
+def test_the_printed_coarse_pose_does_not_use_the_priors_absolute_pose(wide, printed):
+    """What the chain throws away: the same prediction placed elsewhere gives the same chain."""
+    prediction, shift = predict_room(FRAME, wide), pose((0.05, 0.02, -0.03), (0.2, -0.1, 0.3))
+    shifted = eqx.tree_at(
+        lambda p: p.T_world_views, prediction, jaxlie.SE3((shift @ prediction.T_world_views).wxyz_xyz)
+    )
+    for reading in ("same_image", "via_previous"):
+        config = at(printed, "coarse", COARSE[reading])
+        one, other = (coarse_of(p, wide, config).T_world_camera for p in (prediction, shifted))
+        assert max(pose_error(other, one)) < 2e-3  # as for the exact chain
+    anchored = coarse_of(shifted, wide, at(printed, "coarse", COARSE["anchored"])).T_world_camera
+    assert max(pose_error(anchored, shift @ path_pose(FRAME))) < 1e-3
+
+
+def test_the_fused_pose_lies_between_chain_and_anchor_and_far_from_the_anchor_at_the_chain(wide, printed):
+    prediction, shift = predict_room(FRAME, wide), pose(translation=(0.1, 0, 0))
+    shifted = eqx.tree_at(
+        lambda p: p.T_world_views, prediction, jaxlie.SE3((shift @ prediction.T_world_views).wxyz_xyz)
+    )
+    fused = at(printed, "coarse", COARSE["fused"])
+
+    def distance(noise, reach):
+        config = at(at(fused, "anchor_noise", noise), "anchor_range", reach)
+        return pose_error(coarse_of(shifted, wide, config).T_world_camera, path_pose(FRAME))[0]
+
+    assert distance(0.0, 1.0) == pytest.approx(0.1, abs=1e-3)
+    # Equal variances near the anchor meet in the middle.
+    assert distance(1.0, 1e6) == pytest.approx(0.05, abs=1e-3)
+    assert distance(1e9, 1.0) == pytest.approx(0.0, abs=1e-3)
+    assert distance(1.0, 1e-3) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_repeat_rms_is_the_standard_deviation_between_the_two_predictions(wide, printed):
+    noise = np.random.default_rng(0).normal(size=(80 * 64, 3)) * [0.03, 0, 0]
+    previous = world(FRAME - 1, wide)
+    noisy = eqx.tree_at(lambda o: o.points, previous, previous.points + jnp.asarray(noise, jnp.float32))
+    result = coarse_of(predict_room(FRAME, wide), wide, printed, noisy)
+    assert result.repeat_rms == pytest.approx(0.03, rel=0.05)  # the median of 5,000 samples
+
+
+@pytest.mark.parametrize("reading", COARSE)
+def test_the_newest_image_has_the_current_pose_where_there_is_none(wide, printed, reading):
+    result = coarse_of(predict_room(FRAME, wide, has_newest=False), wide, at(printed, "coarse", COARSE[reading]))
+    assert_same(result.T_world_newest, result.T_world_camera)
+
+
+@pytest.mark.parametrize("reading", COARSE)
+def test_outliers_among_the_pairs_do_not_move_the_pose(wide, printed, reading):
+    previous = world(FRAME - 1, wide)
+    is_bad = jnp.arange(80 * 64)[:, None] % 7 == 0
+    bad = eqx.tree_at(lambda o: o.points, previous, previous.points + jnp.where(is_bad, 0.5, 0.0))
+    result = coarse_of(predict_room(FRAME, wide), wide, at(printed, "coarse", COARSE[reading]), bad)
+    assert pose_error(result.T_world_camera, path_pose(FRAME))[0] < 0.02
+
+
+@pytest.mark.parametrize("reading", COARSE)
+@pytest.mark.parametrize("poison", [1e6, -1e6])
+def test_invalid_rows_change_nothing(wide, printed, reading, poison):
+    def mark(o, step, value):
+        valid = jnp.arange(80 * 64) % step > 0
+        put = lambda x: jnp.where(valid.reshape(-1, *[1] * (x.ndim - 1)), x, x if value is None else value)  # noqa: E731
+        return eqx.tree_at(lambda o: o.valid, jax.tree.map(lambda x: x if x.dtype == bool else put(x), o), valid)
+
+    prediction, config = predict_room(FRAME, wide), at(printed, "coarse", COARSE[reading])
+    results = []
+    for value in (None, poison):
+        pair = mark(prediction.current, 3, value), mark(prediction.previous, 4, value)
+        marked = eqx.tree_at(lambda p: (p.current, p.previous), prediction, pair)
+        results.append(coarse_of(marked, wide, config, mark(world(FRAME - 1, wide), 5, value)))
+    assert_same(*results)
+
+
+def test_without_a_pair_the_previous_pose_and_the_priors_motion_remain(wide, printed):
+    blind = eqx.tree_at(lambda p: p.previous.valid, predict_room(FRAME, wide), jnp.zeros(80 * 64, bool))
+    result = coarse_of(blind, wide, at(printed, "coarse", COARSE["same_image"]))
+    assert max(pose_error(result.T_world_camera, path_pose(FRAME))) < 1e-3
+    assert result.repeat_rms > 0.01 and np.isfinite(result.mean_depth)
+
+
+# The fine step, at the small size.
+
+
+@pytest.fixture(scope="module")
+def submap(camera, config):
+    """Gaussians of the room from two views, so that all of the frame is mapped."""
+    points = jax.tree.map(lambda *x: jnp.concatenate(x), world(1, camera), world(FRAME + 1, camera))
+    return eqx.filter_jit(fit_to_points)(points.points[::8], jnp.ones(192, bool), points, config().fit)
+
+
+@pytest.fixture(scope="module")
+def lenient(config):
+    """Coarse as the prior says, fine as printed but with wide gates; every check passes."""
+    readings = "localization.coarse=anchored", "localization.coarse_scale=none", "localization.icp.residual=colored"
+    settings = config(*readings).localization
+    for name, value in {
+        "min_inlier_fraction": 0.0,
+        "max_residual": np.inf,
+        "max_step_m": np.inf,
+        "max_step_rad": np.inf,
+        "min_eigenvalue": -np.inf,
+        "icp.prior_information": 0.0,
+        "icp.max_mahalanobis_sq": 25.0,
+    }.items():
+        settings = at(settings, name, value)
+    return settings
+
+
+def fine_of(prediction, submap, camera, config):
+    coarse = coarse_of(prediction, camera, config)
+    return coarse, *fine_step(prediction.current, submap, coarse, config)
+
+
+def nudged(camera):
+    """A prediction whose own poses are 3 cm and 1 degree off."""
+    prediction = predict_room(FRAME, camera)
+    wrong = prediction.T_world_views @ pose((0.01, -0.015, 0.0), (0.02, 0.01, -0.02))
+    return eqx.tree_at(lambda p: p.T_world_views, prediction, jaxlie.SE3(wrong.wxyz_xyz))
+
+
+def test_a_tracked_frame_is_nearer_to_the_truth_and_its_points_are_in_the_world(camera, submap, lenient):
+    coarse, T, aligned, info = fine_of(nudged(camera), submap, camera, lenient)
+    before, after = (pose_error(x, path_pose(FRAME)) for x in (coarse.T_world_camera, T))
+    assert info.is_tracked and not info.is_lost and info.reason == 0
+    assert after[0] < 0.6 * before[0], (before, after)
+    moved = transform(T, predict_room(FRAME, camera).current, jnp.ones(()))
+    np.testing.assert_allclose(aligned.points, moved.points, atol=1e-5)  # roundings
+    step = pose_error(T, coarse.T_world_camera)
+    np.testing.assert_allclose([info.step_m, info.step_rad], step, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("bit", "field", "value"),
+    [
+        (1, "min_inlier_fraction", 1.01),
+        (2, "max_residual", 0.0),
+        (3, "max_step_m", 1e-6),
+        (3, "max_step_rad", 1e-6),
+        (4, "min_eigenvalue", 1e12),
+    ],
+)
+def test_each_check_alone_keeps_the_coarse_pose_and_says_why(camera, submap, lenient, bit, field, value):
+    coarse, T, aligned, info = fine_of(nudged(camera), submap, camera, at(lenient, field, value))
+    assert not info.is_tracked and not info.is_lost
+    assert int(info.reason) == 2**bit and bit < len(REASONS)
+    assert_same(T, coarse.T_world_camera)
+    assert aligned.valid.all()  # the next frame's coarse step still needs them
+
+
+def test_an_empty_submap_is_too_few_points_that_agree(camera, submap, lenient):
+    empty = eqx.tree_at(lambda g: g.valid, submap, jnp.zeros(192, bool))
+    coarse, T, _, info = fine_of(predict_room(FRAME, camera), empty, camera, at(lenient, "min_inlier_fraction", 0.1))
+    assert int(info.reason) & 2 and not info.is_tracked
+    assert_same(T, coarse.T_world_camera)
+
+
+def test_a_single_untextured_wall_does_not_determine_the_pose(camera, submap, lenient, config):
+    """With the configured limit; the room's other walls and all colour are taken away."""
+    wall = submap.normals[:, 2] < -0.99
+    flat = wall, jnp.full((192, 3), 0.5), jnp.tile(jnp.array([0.0, 0, -1]), (192, 1))
+    plain = eqx.tree_at(lambda g: (g.valid, g.colors, g.normals), submap, flat)
+    prediction = predict_room(FRAME, camera)
+    grey = eqx.tree_at(lambda p: p.current.colors, prediction, jnp.full((768, 3), 0.5))
+    settings = at(at(lenient, "min_eigenvalue", config().localization.min_eigenvalue), "icp.residual", 0)
+    coarse, T, _, info = fine_of(grey, plain, camera, settings)
+    assert int(info.reason) & 16 and not info.is_tracked
+    assert_same(T, coarse.T_world_camera)
+
+
+@pytest.mark.parametrize("loss", ["no point", "nan pose"])
+def test_a_prediction_without_points_or_pose_is_lost_and_nothing_of_it_is_valid(camera, submap, lenient, loss):
+    prediction = predict_room(FRAME, camera)
+    if loss == "no point":
+        prediction = eqx.tree_at(lambda p: p.current.valid, prediction, jnp.zeros(768, bool))
+    else:
+        prediction = eqx.tree_at(lambda p: p.T_world_views, prediction, jaxlie.SE3(jnp.full((3, 7), jnp.nan)))
+    coarse, T, aligned, info = fine_of(prediction, submap, camera, lenient)
+    assert info.is_lost and not info.is_tracked and int(info.reason) & 1
+    assert not aligned.valid.any()
+    for x in jax.tree.leaves((T, aligned, coarse.T_world_newest)):
+        assert np.isfinite(x).all()
+    if loss == "nan pose":
+        assert_same(T, path_pose(FRAME - 1))
