@@ -123,7 +123,7 @@ def errors(target, source, config, starts):
 @pytest.mark.parametrize("residual", RESIDUALS)
 def test_every_residual_recovers_the_pose_in_a_closed_room(source, target, settings, residual):
     found = errors(target, source, at(settings, "residual", RESIDUALS[residual]), STARTS)
-    # From 5 cm and 2 degrees; pixels and Gaussians are 10 cm apart here. Gaussians across the room's edges are no planes
+    # From 5 cm and 2 degrees; pixels and Gaussians are 10 cm apart. Gaussians across the edges are no planes
     # and leave some millimetres; the offsets from such sparse means (R9) leave up to a quarter of the spacing.
     limit = 0.01 if residual == "colored" else 0.025
     assert found[:, 0].max() < limit, found

@@ -1,0 +1,74 @@
+"""The first map: its number of Gaussians, its weights, its place in the world, and independence of the world frame."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from scene import move_gaussians, observe_room, path_pose, pose, stack_poses
+
+from emgs_jax.initialization import initialize
+from emgs_jax.observation import transform
+from emgs_jax.pytree import stack
+
+first_map = eqx.filter_jit(initialize)
+POSES = [path_pose(i) for i in range(3)]
+
+
+@pytest.fixture(scope="module")
+def views(camera):
+    return stack([observe_room(T, camera, num_features=2) for T in POSES])
+
+
+@pytest.fixture(scope="module")
+def result(views, camera, config):
+    return first_map(views, stack_poses(POSES), camera, 1, config().fit)
+
+
+def test_there_are_num_points_over_lambda_and_views_gaussians(result):
+    gaussians, weight, _ = result
+    assert gaussians.valid.shape == (3 * 768 // (8 * 3),) == weight.shape
+    assert gaussians.valid.all()
+
+
+def test_the_weights_count_every_point_in_units_of_lambda(result):
+    np.testing.assert_allclose(result[1].sum(), 3 * 768 / 8, rtol=1e-5)  # float32 sums
+
+
+def test_the_views_are_moved_to_the_world_by_the_priors_poses(result, views):
+    for i, T in enumerate(POSES):
+        expected = transform(T, jax.tree.map(lambda x, i=i: x[i], views), jnp.ones(()))
+        np.testing.assert_allclose(result[2].points[i], expected.points, atol=1e-6)  # roundings
+
+
+def test_the_gaussians_lie_on_the_rooms_walls_with_their_normals_and_colours(result):
+    g = result[0]
+    means = np.asarray(g.means, float)
+    distance = np.concatenate([np.abs(means - reference.ROOM_LOW), np.abs(means - reference.ROOM_HIGH)], axis=1)
+    on_wall = distance.min(1) < 1e-3  # the others are clusters across an edge
+    assert on_wall.mean() > 0.5
+    inward = np.concatenate([np.eye(3), -np.eye(3)])[distance.argmin(1)]
+    cos = np.sum(np.asarray(g.normals) * inward, axis=1)
+    assert np.median(cos[on_wall]) > 0.999
+    # A mean over some 20 cm of a texture that changes by .9 a metre at most
+    assert np.abs(np.asarray(g.colors) - reference.texture(means))[on_wall].max() < 0.1
+
+
+def test_invalid_points_are_not_clustered(views, camera, config):
+    blind = eqx.tree_at(lambda o: o.valid, views, views.valid.at[1:].set(False))
+    gaussians, weight, _ = first_map(blind, stack_poses(POSES), camera, 1, config().fit)
+    np.testing.assert_allclose(weight.sum(), 768 / 8, rtol=1e-5)
+    nothing = eqx.tree_at(lambda o: o.valid, views, jnp.zeros((3, 768), bool))
+    gaussians, weight, _ = first_map(nothing, stack_poses(POSES), camera, 1, config().fit)
+    assert not gaussians.valid.any() and weight.sum() == 0
+
+
+def test_the_map_moves_with_the_anchor(result, views, camera, config):
+    motion = pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
+    moved, weight, _ = first_map(views, stack_poses([motion @ T for T in POSES]), camera, 1, config().fit)
+    expected = move_gaussians(motion, result[0])
+    # A point half-way between two centroids may go to either, which moves both: most are equal to roundings.
+    error = np.abs(moved.means - expected.means).max(1)
+    assert np.median(error) < 1e-5 and error.max() < 0.05
+    np.testing.assert_allclose(weight.sum(), result[1].sum(), rtol=1e-5)

@@ -1,0 +1,187 @@
+"""Merging on the image plane: the formulas of eq. 5 and 6 for one Gaussian, each reason to be fresh, nothing lost."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scene import assert_same, at, move_gaussians, pose
+
+from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.refinement import average_candidates, refine
+
+refined = eqx.filter_jit(refine)
+CAMERA_POSE = pose()
+
+
+def discs(means, std=0.15, feature=(1.0, 0.0), color=0.5) -> Gaussians:
+    """Discs that face the camera."""
+    means = jnp.atleast_2d(jnp.asarray(means, jnp.float32))
+    count = len(means)
+    cov = jnp.diag(jnp.array([std**2, std**2, 1e-4]))
+    return Gaussians(
+        means=means,
+        covs=jnp.tile(cov, (count, 1, 1)),
+        colors=jnp.full((count, 3), color),
+        normals=jnp.tile(jnp.array([0.0, 0, -1]), (count, 1)),
+        features=jnp.tile(jnp.asarray(feature, jnp.float32), (count, 1)),
+        valid=jnp.ones(count, bool),
+    )
+
+
+GRID = [(x, y, 2.0) for x in np.arange(-0.6, 0.61, 0.3) for y in np.arange(-0.6, 0.61, 0.3)]
+
+
+def map_of(gaussians) -> GaussianMap:
+    count = gaussians.valid.shape[0]
+    return GaussianMap(gaussians, jnp.ones(count), jnp.ones(count, jnp.int32))
+
+
+@pytest.fixture(scope="module")
+def settings(config):
+    """As printed (margins 0 and infinite, linear blend, α/(α+…)), but 1 cm of margin for rounding."""
+    return at(config("slam/em=paper", "slam/refinement=paper").refinement, "front_margin", 0.005)
+
+
+def run(settings, camera, candidates, gaussians=None):
+    return refined(map_of(discs(GRID) if gaussians is None else gaussians), candidates, CAMERA_POSE, camera, settings)
+
+
+def test_a_candidate_on_the_mapped_surface_merges_by_equations_5_and_6(settings, camera):
+    """One map Gaussian, one candidate: ω = cos, γ = ω / (1 + ω) from α = 1."""
+    old, new = discs((0, 0, 2.0), std=0.3), discs((0.02, 0.01, 2.01), std=0.3, feature=(0.8, 0.6), color=0.9)
+    merged, fresh, info = run(settings, camera, new, old)
+    assert (info.num_candidates, info.num_merged, info.num_fresh) == (1, 1, 0) and not fresh.valid.any()
+    gamma = 0.8 / 1.8
+    g = merged.gaussians
+    np.testing.assert_allclose(g.means[0], np.array([0.02, 0.01, 0]) * gamma + [0, 0, 2 + 0.01 * gamma], atol=1e-6)
+    np.testing.assert_allclose(g.colors[0], 0.5 + 0.4 * gamma, atol=1e-6)
+    np.testing.assert_allclose(g.covs[0], (1 - gamma) * old.covs[0] + gamma * new.covs[0], atol=1e-6)
+    np.testing.assert_array_equal(g.features, old.features)
+    np.testing.assert_allclose(merged.weight, gamma, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("mean", "why"),
+    [
+        ((0.02, 0.0, 1.5), "in front of the surface"),
+        ((0.02, 0.0, 1.97), "in front by more than the margin"),
+        ((1.15, 0.9, 2.0), "on pixels without map depth"),
+        ((0.0, 0.0, -1.0), "behind the camera"),
+        ((30.0, 0.0, 2.0), "outside the image"),
+    ],
+)
+def test_a_candidate_that_is_not_on_the_surface_is_fresh_and_the_map_unchanged(settings, camera, mean, why):
+    merged, fresh, info = run(settings, camera, discs(mean, std=0.05))
+    assert (info.num_merged, info.num_fresh) == (0, 1) and fresh.valid.all(), why
+    assert_same(merged, map_of(discs(GRID)))
+
+
+def test_the_margins_say_how_far_in_front_and_behind_may_still_merge(settings, camera):
+    for z, front, back, expected in [
+        (1.9, 0.1, np.inf, 1),  # 5 % in front
+        (1.9, 0.04, np.inf, 0),
+        (2.1, 0.0, np.inf, 1),  # as printed: anything behind
+        (2.1, 0.0, 0.06, 1),
+        (2.1, 0.0, 0.04, 0),
+    ]:
+        config = at(at(settings, "front_margin", front), "back_margin", back)
+        _, fresh, info = run(config, camera, discs((0.02, 0.0, z)))
+        assert info.num_merged == expected and fresh.valid.sum() == 1 - expected, (z, front, back)
+
+
+def test_the_distance_gate_is_on_the_squared_distance_under_both_covariances(settings, camera):
+    """0.4 m apart at 2 m: 4 pixels in x; each splat's variance is 2 · (20 · .15 / 2)² + .3 pixels²."""
+    old, new = discs((0, 0, 2.0), std=0.15), discs((0.4, 0, 2.0), std=0.15)
+    wide = at(at(settings, "render.min_alpha", 1e-3), "render.radius", 10.0)  # so that the map has depth there
+    distance_sq = 4**2 / (2 * (2 * 1.5**2 + 0.3))
+    for factor, expected in ((1.01, 1), (0.99, 0)):
+        _, _, info = run(at(wide, "max_mahalanobis_sq_2d", factor * distance_sq), camera, new, old)
+        assert info.num_merged == expected
+
+
+def test_opposite_features_never_merge(settings, camera):
+    merged, fresh, info = run(settings, camera, discs((0.02, 0, 2.0), feature=(-1.0, 0.0)))
+    assert info.num_merged == 0 and fresh.valid.all()
+    assert_same(merged, map_of(discs(GRID)))
+
+
+def test_an_occluded_map_gaussian_is_not_matched(settings, camera):
+    behind = discs(GRID + [(0.02, 0.02, 3.0)])
+    merged, _, info = run(settings, camera, discs((0.02, 0.02, 2.0)), behind)
+    assert info.num_merged == 1
+    assert_same(*jax.tree.map(lambda x: x[-1], (merged, map_of(behind))))
+
+
+def test_a_candidate_that_is_too_wide_is_dropped(settings, camera):
+    config = at(settings, "max_splat_std", 3.0)
+    merged, fresh, info = run(config, camera, discs([(0.02, 0, 1.0), (0.5, 0.3, 1.0)], std=0.5))  # 10 pixels
+    assert info.num_merged == 0 and not fresh.valid.any()
+    assert_same(merged, map_of(discs(GRID)))
+
+
+def random_candidates(count=40, seed=0):
+    rng = np.random.default_rng(seed)
+    means = rng.uniform([-1.2, -0.9, 1.8], [1.2, 0.9, 2.3], (count, 3))
+    return eqx.tree_at(lambda g: g.valid, discs(means, std=0.1), jnp.arange(count) % 5 > 0)
+
+
+def test_every_valid_candidate_is_merged_or_fresh(settings, camera):
+    candidates = random_candidates()
+    _, fresh, info = run(settings, camera, candidates)
+    assert info.num_candidates == 32 == info.num_merged + info.num_fresh
+    assert info.num_merged > 0 and info.num_fresh > 0 and fresh.valid.sum() == info.num_fresh
+    assert not fresh.valid[::5].any()
+    assert_same(eqx.tree_at(lambda g: g.valid, fresh, candidates.valid), candidates)
+
+
+def test_without_candidates_the_map_stays_bit_for_bit(settings, camera):
+    nothing = eqx.tree_at(lambda g: g.valid, random_candidates(), jnp.zeros(40, bool))
+    merged, fresh, info = run(settings, camera, nothing)
+    assert_same(merged, map_of(discs(GRID)))
+    assert not fresh.valid.any() and info.num_candidates == 0
+
+
+def test_an_empty_map_makes_every_candidate_fresh(settings, camera):
+    empty = eqx.tree_at(lambda g: g.valid, discs(GRID), jnp.zeros(25, bool))
+    merged, _, info = run(settings, camera, random_candidates(), empty)
+    assert info.num_fresh == 32
+    assert_same(merged, map_of(empty))
+
+
+def test_merging_moves_with_a_rigid_motion(settings, camera):
+    motion, candidates = pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5)), random_candidates()
+    merged, fresh, _ = run(settings, camera, candidates)
+    arguments = map_of(move_gaussians(motion, discs(GRID))), move_gaussians(motion, candidates), motion @ CAMERA_POSE
+    moved, moved_fresh, _ = refined(*arguments, camera, settings)
+    np.testing.assert_array_equal(moved_fresh.valid, fresh.valid)
+    expected = move_gaussians(motion, merged.gaussians)
+    for name in ("means", "covs", "normals", "colors"):
+        # float32 coordinates of 3 m, through 2D distances in pixels into weights
+        np.testing.assert_allclose(getattr(moved.gaussians, name), getattr(expected, name), atol=2e-4)
+
+
+@pytest.mark.parametrize("poison", [1e6, np.nan])
+def test_invalid_candidates_and_map_rows_change_nothing(settings, camera, poison):
+    put = lambda g: jax.tree.map(  # noqa: E731
+        lambda x: x if x.dtype == bool else jnp.where(g.valid.reshape(-1, *[1] * (x.ndim - 1)), x, poison), g
+    )
+    seen = eqx.tree_at(lambda g: g.valid, discs(GRID), jnp.arange(25) % 6 > 0)
+    clean = run(settings, camera, random_candidates(), seen)
+    poisoned = run(settings, camera, put(random_candidates()), put(seen))
+    assert_same(poisoned[2], clean[2])
+    assert_same(*jax.tree.map(lambda x: x[seen.valid], (poisoned[0], clean[0])))
+    assert_same(*jax.tree.map(lambda x: x[clean[1].valid], (poisoned[1], clean[1])))
+
+
+def test_the_average_of_candidates_has_the_moments_of_their_mixture():
+    old = discs([(0, 0, 2.0), (5, 5, 5.0)])
+    candidates = discs([(0.1, 0, 2.0), (0.3, 0, 2.2), (1.0, 1, 1)])
+    weights = jnp.array([[0.3], [0.1], [0.0]])
+    averaged = average_candidates(candidates, jnp.zeros((3, 1), int), weights, old)
+    np.testing.assert_allclose(averaged.means[0], [0.15, 0, 2.05], atol=1e-6)
+    offset = np.array([0.2, 0, 0.2])
+    expected = np.asarray(candidates.covs[0], float) + 0.75 * 0.25 * np.outer(offset, offset)
+    np.testing.assert_allclose(averaged.covs[0], expected, atol=1e-6)
+    assert_same(*jax.tree.map(lambda x: x[1], (averaged, old)))
