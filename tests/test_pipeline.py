@@ -100,6 +100,18 @@ def test_a_bad_view_in_the_first_window_is_lost_and_the_others_are_not():
 
 
 @pytest.mark.slow
+def test_a_first_view_without_a_point_is_an_error_and_not_a_run_that_never_maps():
+    """All later frames were degraded, the map stayed empty and nothing said so."""
+
+    def edit(prediction):
+        prediction.points[0] = np.nan
+        return prediction
+
+    with pytest.raises(ValueError, match="the map is empty after 1 view.*begin elsewhere"):
+        map_tiny(dataset(), EditedPrior(edit))
+
+
+@pytest.mark.slow
 def test_the_merged_initialization_makes_the_map_from_the_whole_window():
     """Only the first window: `initialization` is static, so a step would be compiled anew."""
     frames = ReadableFrames(hydra.utils.instantiate(compose(f"dataset.stop={WINDOW_SIZE}").dataset))
