@@ -144,8 +144,8 @@ def _map_first_window(
     state, run.config = start(window, run.camera, run.config)
     if not bool(state.map.gaussians.valid.any()):  # no later frame could be localised in it
         raise ValueError(
-            f"the map is empty after {window.views.valid.shape[0]} view(s) from {frames[0].name}: the prior has no valid "
-            "point there; begin elsewhere (dataset.start=...) or use slam.initialization=merged"
+            f"the map is empty after {window.views.valid.shape[0]} view(s) from {frames[0].name}: the prior has no "
+            "valid point there; begin elsewhere (dataset.start=...) or use slam.initialization=merged"
         )
     run.state = state
     dense = [frames[index] for index in prediction.window.dense]
