@@ -30,6 +30,6 @@ def initialize(
     num_views, num_points = views.valid.shape
     order = morton_order(camera.height, camera.width)
     order = (jnp.arange(num_views)[:, None] * num_points + order).reshape(-1)
-    merged = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), world)
+    merged = jax.tree.map(lambda leaf: leaf.reshape(num_views * num_points, *leaf.shape[2:]), world)
     gaussians, weight = cluster(merged, order, spacing(thin, config) * num_views, config)
     return gaussians, weight * num_views, world

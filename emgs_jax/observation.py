@@ -132,7 +132,7 @@ def observe(
     valid &= jnp.any(normals != 0, axis=-1)
     image = Observation(points, colors, normals, jnp.where(valid[..., None], features, 0.0), confidence, valid)
     thinned = jax.tree.map(lambda leaf: leaf[:: config.thin, :: config.thin], image)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), thinned)
+    return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), thinned)
 
 
 def transform(T_target_source: jaxlie.SE3, observation: Observation, scale: Float[Array, ""]) -> Observation:

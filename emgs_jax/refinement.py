@@ -99,7 +99,11 @@ def average_candidates(
 
 
 def refine(
-    submap: GaussianMap, candidates: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, config: RefinementConfig
+    submap: GaussianMap,
+    candidates: Gaussians,
+    T_world_camera: jaxlie.SE3,
+    camera: Camera,
+    config: RefinementConfig,
 ) -> tuple[GaussianMap, Gaussians, RefinementInfo]:
     """Merge candidates with the map where both show the same surface; the rest is fresh.
 
