@@ -85,7 +85,9 @@ def stack_poses(poses: list[jaxlie.SE3]) -> jaxlie.SE3:
     return jaxlie.SE3(jnp.stack([T.wxyz_xyz for T in poses]))
 
 
-def predict_room(i: int, camera: Camera, scale: float = 1.0, has_newest: bool = True) -> Prediction:
+def predict_room(
+    i: int, camera: Camera, scale: float = 1.0, has_newest: bool = True, num_features: int = 0
+) -> Prediction:
     """An exact prediction of frame i of the path, but for a scale about each camera and about the anchor."""
     anchor = path_pose(0)
     poses = []
@@ -94,8 +96,8 @@ def predict_room(i: int, camera: Camera, scale: float = 1.0, has_newest: bool = 
         local = jaxlie.SE3.from_rotation_and_translation(local.rotation(), scale * local.translation())
         poses.append(anchor @ local)
     return Prediction(
-        current=observe_room(path_pose(i), camera, scale=scale),
-        previous=observe_room(path_pose(i - 1), camera, scale=scale),
+        current=observe_room(path_pose(i), camera, num_features, scale),
+        previous=observe_room(path_pose(i - 1), camera, num_features, scale),
         T_world_views=stack_poses(poses),
         T_world_anchor=anchor,
         has_newest=jnp.asarray(has_newest),

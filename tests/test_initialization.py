@@ -72,3 +72,9 @@ def test_the_map_moves_with_the_anchor(result, views, camera, config):
     error = np.abs(moved.means - expected.means).max(1)
     assert np.median(error) < 1e-5 and error.max() < 0.05
     np.testing.assert_allclose(weight.sum(), result[1].sum(), rtol=1e-5)
+
+
+def test_features_of_width_zero_are_possible(camera, config, result):
+    views = stack([observe_room(T, camera) for T in POSES])
+    gaussians, _, _ = first_map(views, stack_poses(POSES), camera, 1, config().fit)
+    np.testing.assert_array_equal(gaussians.means, result[0].means)

@@ -250,7 +250,9 @@ def test_a_prediction_without_points_or_pose_is_lost_and_nothing_of_it_is_valid(
     if loss == "no point":
         prediction = eqx.tree_at(lambda p: p.current.valid, prediction, jnp.zeros(768, bool))
     else:
-        prediction = eqx.tree_at(lambda p: p.T_world_views, prediction, jaxlie.SE3(jnp.full((3, 7), jnp.nan)))
+        prediction = eqx.tree_at(
+            lambda p: p.T_world_views, prediction, jaxlie.SE3(jnp.full((3, 7), jnp.nan, jnp.float32))
+        )
     coarse, T, aligned, info = fine_of(prediction, submap, camera, lenient)
     assert info.is_lost and not info.is_tracked and int(info.reason) & 1
     assert not aligned.valid.any()

@@ -106,6 +106,11 @@ def test_a_row_is_a_pixel_of_the_thinned_image_row_major(camera, config, thin):
     np.testing.assert_array_equal(o.normals, full)  # normals come from the full point map
 
 
+def test_features_of_width_zero_are_possible(camera, config):
+    o = observe(*example(camera, num_features=0), config().observation)
+    assert o.features.shape == (768, 0) and o.valid.all()
+
+
 @pytest.mark.parametrize("name", ["nan", "inf", "behind", "mask", "confidence"])
 def test_a_pixel_that_is_no_measurement_is_invalid_finite_and_changes_no_other(camera, config, name):
     points, colors, features, confidence, mask = example(camera)

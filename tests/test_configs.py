@@ -1,0 +1,113 @@
+"""Every YAML composes, every key is a parameter of its class, and every field of a config class is read somewhere."""
+
+import ast
+import inspect
+from pathlib import Path
+
+import equinox as eqx
+import hydra
+import pytest
+from omegaconf import OmegaConf
+from scene import CONF, compose, slam_config
+
+from emgs_jax.slam import SlamConfig
+
+ROOT = CONF.parent
+GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent != CONF and "experiment" not in path.parts)
+
+
+def group_and_option(path: Path) -> tuple[str, str]:
+    return str(path.parent.relative_to(CONF)), path.stem
+
+
+def targets(node):
+    """All nodes of a composed config that name a class."""
+    if isinstance(node, dict):
+        if "_target_" in node:
+            yield node
+        for value in node.values():
+            yield from targets(value)
+
+
+@pytest.mark.parametrize("path", GROUPED, ids=lambda path: "/".join(group_and_option(path)))
+def test_every_option_composes_and_its_keys_are_parameters(path):
+    group, option = group_and_option(path)
+    config = OmegaConf.to_container(compose(f"{group}={option}"), resolve=False)
+    nodes = list(targets(config))
+    assert nodes
+    for node in nodes:
+        parameters = inspect.signature(hydra.utils.get_class(node["_target_"])).parameters
+        keys = {key for key in node if not key.startswith("_")}
+        assert keys <= set(parameters), f"{node['_target_']}: {keys - set(parameters)}"
+        required = {
+            n for n, p in parameters.items() if p.default is p.empty and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+        }
+        assert required <= keys, f"{node['_target_']}: {required - keys} have no value"
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in GROUPED if "slam" in p.parts], ids=lambda path: "/".join(group_and_option(path))
+)
+def test_every_option_of_slam_instantiates(path):
+    group, option = group_and_option(path)
+    assert isinstance(slam_config(f"{group}={option}"), SlamConfig)
+
+
+def test_an_unknown_key_is_refused():
+    with pytest.raises(hydra.errors.ConfigCompositionException):
+        compose("em.max_mahalanobis=3")
+    with pytest.raises(hydra.errors.InstantiationException, match="max_mahalanobis"):
+        slam_config("+em.max_mahalanobis=3")
+
+
+def test_table_i_is_the_paper_preset():
+    groups = ("observation", "fit", "localization", "em", "refinement")
+    config = hydra.utils.instantiate(compose(*(f"slam/{g}=paper" for g in groups)).slam, _convert_="all")
+    em, refinement = config.em, config.refinement
+    assert (config.window_size, config.fit.points_per_gaussian, config.observation.thin) == (10, 128, 1)
+    assert (em.num_neighbours, refinement.num_candidates) == (16, 3)
+    assert (em.min_normal_cos, em.normal_weight, em.feature_weight) == (0.5, 5, 5)
+    assert float(em.max_mahalanobis_sq) == pytest.approx(4.6)
+    assert float(refinement.max_mahalanobis_sq_2d) == pytest.approx(4.6)
+
+
+def test_the_paper_preset_takes_every_printed_reading():
+    """design/method.md, section 4."""
+    paper = compose(*(f"slam/{g}=paper" for g in ("observation", "fit", "localization", "em", "refinement")))
+    printed = {
+        "em.determinant_weight": 1.0,  # R2
+        "em.max_log_gap": float("inf"),  # R3
+        "em.average.gain": "ema_printed",  # R4
+        "em.average.forgetting": 1.0,
+        "em.support": "printed",  # R5
+        "refinement.front_margin": 0.0,  # R6
+        "localization.coarse": "via_previous",  # R7
+        "localization.coarse_scale": "none",  # R8
+        "localization.icp.residual": "colored",  # R9
+        "localization.icp.prior_information": 0.0,
+        "em.average.blend": "linear",  # R13
+        "em.noise": 0.0,
+    }
+    assert {key: OmegaConf.select(paper.slam, key) for key in printed} == printed
+
+
+def config_fields(module: type, seen: set):
+    """All fields of a config class and of those it holds."""
+    if module in seen:
+        return
+    seen.add(module)
+    for name, field in module.__dataclass_fields__.items():
+        yield module.__name__, name
+        if inspect.isclass(field.type) and issubclass(field.type, eqx.Module):
+            yield from config_fields(field.type, seen)
+
+
+def test_every_field_of_a_config_class_is_read():
+    read = set()
+    for folder in ("emgs_jax", "experiments"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
+                    read.add(node.attr)
+    unread = [f"{owner}.{name}" for owner, name in config_fields(SlamConfig, set()) if name not in read]
+    assert not unread
