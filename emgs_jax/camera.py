@@ -26,7 +26,7 @@ class Camera(eqx.Module):
 
 
 def downscale(camera: Camera, stride: int) -> Camera:
-    """The camera whose pixel (i, j) is pixel (stride·i, stride·j) of `camera`: that of every `stride`-th row and column."""
+    """The camera of every `stride`-th row and column: its pixel (i, j) is pixel (stride·i, stride·j) of `camera`."""
     size = -(-camera.width // stride), -(-camera.height // stride)
     return Camera(camera.focal / stride, camera.center / stride, *size)
 

@@ -26,8 +26,8 @@ class EmConfig(eqx.Module):
         feature_weight: κ2.
         support: δ as `printed`, clipped to 1, or `normalized` by the total responsibility (R5).
         average: gain and blend (R4, R13).
-        noise: factor on the points' noise along their viewing rays, which widens every Gaussian when a point is compared
-            with it; 0 as printed.
+        noise: factor on the points' noise along their viewing rays, which widens every Gaussian when a point is
+            compared with it; 0 as printed.
         min_responsibility: a Gaussian that receives less in total from a frame is left as it is.
         min_std: m; floor of the new covariances.
     """

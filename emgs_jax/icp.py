@@ -1,4 +1,4 @@
-"""Registration: rigid fits of paired points, and ICP against Gaussians as one Levenberg–Marquardt solve."""
+"""ICP against Gaussians as one Levenberg–Marquardt solve."""
 
 import equinox as eqx
 import jax
@@ -12,8 +12,11 @@ from emgs_jax.linalg import inverse_and_logdet, mahalanobis_sq, outer, tangent_b
 from emgs_jax.neighbours import knn
 from emgs_jax.observation import Observation, transform
 from emgs_jax.pytree import choice, static, take_rows, traced
+from emgs_jax.rigid import median
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
+RESIDUALS = ("colored", "distribution", "colored+distribution")
+COLORED, DISTRIBUTION = 0, 1
 
 
 class IcpConfig(eqx.Module):
@@ -37,7 +40,7 @@ class IcpConfig(eqx.Module):
         tolerance: relative and absolute, of the solver.
     """
 
-    residual: Float[Array, "*b"] = choice("colored", "distribution", "colored+distribution")
+    residual: Float[Array, "*b"] = choice(*RESIDUALS)
     color_std: Float[Array, "*b"] = traced()
     noise: Float[Array, "*b"] = traced()
     max_mahalanobis_sq: Float[Array, "*b"] = traced()
@@ -58,7 +61,7 @@ class IcpInfo(eqx.Module):
         num_inliers: points with a Gaussian that passes the gates.
         inlier_fraction: of the points that take part.
         residual: m; root mean square distance of the inliers to their Gaussians' planes.
-        misfit: m; the same distance of all points, as a median (times 1.4826, a standard deviation for Gaussian errors).
+        misfit: m; the same distance of all points, as 1.4826 times the median, a robust standard deviation.
         min_eigenvalue: smallest eigenvalue of the Hessian, prior included, per effective point (1/m² and 1/rad²).
         num_steps: of the solver.
         is_converged: False where the solver reached `max_steps` or failed.
@@ -71,34 +74,6 @@ class IcpInfo(eqx.Module):
     min_eigenvalue: Float[Array, ""]
     num_steps: Int[Array, ""]
     is_converged: Bool[Array, ""]
-
-
-def median(values: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
-    """Lower median of the valid values; 1 without any."""
-    count = jnp.sum(valid)
-    ordered = jnp.sort(jnp.where(valid, values, jnp.inf))
-    return jnp.where(count > 0, ordered[jnp.maximum(count - 1, 0) // 2], 1.0)
-
-
-def fit_rigid(
-    source: Float[Array, "p 3"], target: Float[Array, "p 3"], weights: Float[Array, "p"]
-) -> tuple[jaxlie.SE3, Float[Array, ""]]:
-    """Weighted least-squares T_target_source of paired points, and the scale of the similarity that would fit best.
-
-    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
-    Without weights the identity and 1.
-    """
-    total = jnp.sum(weights)
-    share = weights / jnp.where(total > 0, total, 1.0)
-    source_mean, target_mean = share @ source, share @ target
-    a, b = source - source_mean, target - target_mean
-    u, s, vt = jnp.linalg.svd((share[:, None] * b).T @ a)
-    handed = jnp.array([1.0, 1.0, 1.0]).at[2].set(jnp.sign(jnp.linalg.det(u @ vt)))
-    rotation = jnp.where(total > 0, (u * handed) @ vt, jnp.eye(3))
-    spread = share @ jnp.sum(a * a, axis=-1)
-    scale = jnp.where(spread > 0, (s @ handed) / jnp.where(spread > 0, spread, 1.0), 1.0)
-    T = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.from_matrix(rotation), target_mean - rotation @ source_mean)
-    return T, scale
 
 
 def intensity(colors: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
@@ -160,6 +135,74 @@ def _match(
     )
 
 
+class _Problem(eqx.Module):
+    """What stays the same while the pose moves; lengths in metres."""
+
+    source: Observation  # camera frame
+    rays: Float[Array, "p 3"]  # noise of every point along its viewing ray, camera frame
+    target: Gaussians
+    gradients: Float[Array, "n 3"]
+    T_world_coarse: jaxlie.SE3
+    prior: Float[Array, "6"]  # 1 / standard deviation of xi
+
+
+def _pose_problem(
+    source: Observation,
+    target: Gaussians,
+    T_world_coarse: jaxlie.SE3,
+    noise: tuple[Float[Array, ""], Float[Array, ""]],
+    config: IcpConfig,
+) -> _Problem:
+    pose_noise, depth_noise = noise
+    stride = max(source.valid.shape[0] // config.num_points, 1)
+    source = jax.tree.map(lambda leaf: leaf[::stride], source)
+    # Only where colour counts: the gradients cost a neighbour search over the submap.
+    gradients = jax.lax.cond(
+        config.residual != DISTRIBUTION,
+        lambda: color_gradients(target, config.num_color_neighbours),
+        lambda: jnp.zeros_like(target.means),
+    )
+    prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack([pose_noise, depth_noise]), 3)
+    rays = config.noise * depth_noise * source.points
+    return _Problem(source, rays, target, gradients, T_world_coarse, prior)
+
+
+def _place(xi: Float[Array, "6"], problem: _Problem, config: IcpConfig) -> tuple[Observation, _Matches]:
+    """The source in the world frame at T_world_coarse exp(xi), and its matches, which carry no gradient."""
+    T = problem.T_world_coarse @ jaxlie.SE3.exp(xi)
+    placed = transform(T, problem.source, jnp.ones(()))
+    noise = problem.rays @ T.rotation().as_matrix().T
+    fixed, noise = jax.lax.stop_gradient((placed, noise))
+    return placed, jax.lax.stop_gradient(_match(fixed, noise, problem.target, problem.gradients, config))
+
+
+def _residuals(
+    xi: Float[Array, "6"], args: tuple[_Problem, IcpConfig]
+) -> tuple[Float[Array, "p 5"], Float[Array, "6"]]:
+    """Rows of every point (plane, colour, whitened offset) and of the prior, in standard deviations."""
+    problem, config = args
+    placed, match = _place(xi, problem, config)
+    offset = placed.points - match.means
+    plane = jnp.sum(offset * match.normals, axis=-1) / match.plane_std
+    light = match.light + jnp.sum(match.gradients * offset, axis=-1)
+    shade = (light - intensity(placed.colors)) / config.color_std
+    white = jnp.einsum("pij,pj->pi", match.whitening, offset)
+    # A point beyond the gate costs what it would at the gate and pulls nowhere.
+    edge = jnp.sqrt(config.max_mahalanobis_sq)
+    is_inlier = match.is_inlier[:, None]
+    rows = jnp.concatenate(
+        [
+            (config.residual == COLORED) * jnp.where(is_inlier, plane[:, None], edge),
+            (config.residual != DISTRIBUTION) * jnp.where(is_inlier, jnp.clip(shade, -edge, edge)[:, None], edge),
+            (config.residual != COLORED) * jnp.where(is_inlier, white, edge / jnp.sqrt(3.0)),
+        ],
+        axis=-1,
+    )
+    valid = placed.valid
+    share = jnp.sqrt(config.num_effective / jnp.maximum(jnp.sum(valid), 1))
+    return share * jnp.where(valid[:, None], rows, 0.0), problem.prior * xi
+
+
 def icp(
     source: Observation,
     target: Gaussians,
@@ -167,7 +210,7 @@ def icp(
     noise: tuple[Float[Array, ""], Float[Array, ""]],
     config: IcpConfig,
 ) -> tuple[jaxlie.SE3, IcpInfo]:
-    """Place camera-frame `source` on the Gaussians `target`: argmin over xi of data + prior, T = T_world_coarse exp(xi).
+    """Place camera-frame `source` on `target`: argmin over xi of data + prior, T = T_world_coarse exp(xi).
 
     The data term is a truncated least-squares sum over the points, scaled so that all of them together weigh as much
     as `num_effective` independent ones. The prior holds xi at 0 with `prior_information`.
@@ -179,65 +222,24 @@ def icp(
         noise: standard deviation of the coarse pose in metres, and of the points' depth as a fraction of it.
         config: terms and gates.
     """
-    stride = max(source.valid.shape[0] // config.num_points, 1)
-    source = jax.tree.map(lambda leaf: leaf[::stride], source)
-    light = intensity(source.colors)
-    # Only where colour counts: the gradients cost a neighbour search over the submap.
-    uses_plane, uses_color, uses_distribution = config.residual == 0, config.residual != 1, config.residual >= 1
-    gradients = jax.lax.cond(
-        uses_color,
-        lambda: color_gradients(target, config.num_color_neighbours),
-        lambda: jnp.zeros_like(target.means),
-    )
-    share = jnp.sqrt(config.num_effective / jnp.maximum(jnp.sum(source.valid), 1))
-    pose_noise, depth_noise = noise
-    prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack([pose_noise, depth_noise]), 3)
-    rays = config.noise * depth_noise * source.points
-
-    def place(xi: Float[Array, "6"]) -> tuple[jaxlie.SE3, Float[Array, "p 3"]]:
-        T = T_world_coarse @ jaxlie.SE3.exp(xi)
-        return T, source.points @ T.rotation().as_matrix().T + T.translation()
-
-    def matches(T: jaxlie.SE3) -> _Matches:
-        T = jax.lax.stop_gradient(T)
-        noise_rays = rays @ T.rotation().as_matrix().T
-        return jax.lax.stop_gradient(_match(transform(T, source, jnp.ones(())), noise_rays, target, gradients, config))
-
-    def residuals(xi: Float[Array, "6"], _: None) -> tuple[Float[Array, "p 5"], Float[Array, "6"]]:
-        T, points = place(xi)
-        match = matches(T)
-        offset = points - match.means
-        plane = jnp.sum(offset * match.normals, axis=-1) / match.plane_std
-        shade = (match.light + jnp.sum(match.gradients * offset, axis=-1) - light) / config.color_std
-        white = jnp.einsum("pij,pj->pi", match.whitening, offset)
-        # A point beyond the gate costs what it would at the gate and pulls nowhere.
-        edge = jnp.sqrt(config.max_mahalanobis_sq)
-        rows = jnp.concatenate(
-            [
-                uses_plane * jnp.where(match.is_inlier, plane, edge)[:, None],
-                uses_color * jnp.where(match.is_inlier, jnp.clip(shade, -edge, edge), edge)[:, None],
-                uses_distribution * jnp.where(match.is_inlier[:, None], white, edge / jnp.sqrt(3.0)),
-            ],
-            axis=-1,
-        )
-        return share * jnp.where(source.valid[:, None], rows, 0.0), prior * xi
-
+    problem = _pose_problem(source, target, T_world_coarse, noise, config)
     solver = optx.LevenbergMarquardt(rtol=config.tolerance, atol=config.tolerance)
-    solution = optx.least_squares(residuals, solver, jnp.zeros(6), max_steps=config.max_steps, throw=False)
-    xi = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, 0.0)
-    T, points = place(xi)
-    match = matches(T)
+    start, args = jnp.zeros(6), (problem, config)
+    solution = optx.least_squares(_residuals, solver, start, args, max_steps=config.max_steps, throw=False)
+    xi = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, start)
+
+    placed, match = _place(xi, problem, config)
     num_inliers = jnp.sum(match.is_inlier)
-    distance = jnp.sum((points - match.means) * match.normals, axis=-1)
-    jacobian = jnp.concatenate([x.reshape(-1, 6) for x in jax.jacfwd(residuals)(xi, None)])
+    distance = jnp.sum((placed.points - match.means) * match.normals, axis=-1)
+    jacobian = jnp.concatenate([rows.reshape(-1, 6) for rows in jax.jacfwd(_residuals)(xi, args)])
     hessian = jacobian.T @ jacobian / jnp.maximum(config.num_effective, 1.0)
     info = IcpInfo(
         num_inliers=num_inliers,
-        inlier_fraction=num_inliers / jnp.maximum(jnp.sum(source.valid), 1),
+        inlier_fraction=num_inliers / jnp.maximum(jnp.sum(placed.valid), 1),
         residual=jnp.sqrt(jnp.sum(jnp.where(match.is_inlier, distance, 0.0) ** 2) / jnp.maximum(num_inliers, 1)),
-        misfit=1.4826 * median(jnp.abs(distance), source.valid),
+        misfit=1.4826 * median(jnp.abs(distance), placed.valid),
         min_eigenvalue=jnp.linalg.eigvalsh(hessian)[0],
         num_steps=solution.stats["num_steps"],
         is_converged=solution.result == optx.RESULTS.successful,
     )
-    return T, info
+    return T_world_coarse @ jaxlie.SE3.exp(xi), info

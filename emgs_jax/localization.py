@@ -7,9 +7,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.camera import Camera, project
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.icp import IcpConfig, IcpInfo, fit_rigid, icp, median
+from emgs_jax.icp import IcpConfig, IcpInfo, icp
 from emgs_jax.observation import Observation, Prediction, transform
 from emgs_jax.pytree import choice, stack, traced
+from emgs_jax.rigid import MIN_PAIRS, fit_rigid, fit_rigid_robust, interpolate, median, pose_row, scale_translation
 
 # Bits of LocalizationInfo.reason; the words are for people.
 REASONS = (
@@ -19,7 +20,6 @@ REASONS = (
     "the fine pose is too far from the coarse one",
     "the geometry does not determine the pose",
 )
-MIN_PAIRS = 16  # points predicted twice, under which the previous pose is taken as it is
 
 
 class LocalizationConfig(eqx.Module):
@@ -103,16 +103,6 @@ class LocalizationInfo(eqx.Module):
     icp: IcpInfo
 
 
-def pose_row(poses: jaxlie.SE3, row: int | Int[Array, ""]) -> jaxlie.SE3:
-    """One pose of a batch."""
-    return jaxlie.SE3(poses.wxyz_xyz[row])
-
-
-def scale_translation(T: jaxlie.SE3, scale: Float[Array, ""]) -> jaxlie.SE3:
-    """The pose with its translation multiplied."""
-    return jaxlie.SE3.from_rotation_and_translation(T.rotation(), scale * T.translation())
-
-
 def _repeat_scale(
     now: Observation, before: Observation, T_world_previous: jaxlie.SE3, paired: Array, config: LocalizationConfig
 ) -> Float[Array, ""]:
@@ -125,24 +115,9 @@ def _repeat_scale(
     return jnp.where(jnp.isfinite(scale) & (scale > 0.1), scale, 1.0) ** config.scale_memory
 
 
-def _align_pairs(
-    source: Float[Array, "p 3"], target: Float[Array, "p 3"], paired: Bool[Array, "p"], start: jaxlie.SE3
-) -> jaxlie.SE3:
-    """Rigid fit of pairs, robust by three reweightings around the median distance; `start` with too few pairs."""
-    T = start
-    for _ in range(3):
-        distance = jnp.linalg.norm(source @ T.rotation().as_matrix().T + T.translation() - target, axis=-1)
-        spread = jnp.maximum(median(distance, paired), 1e-6)
-        weights = jnp.where(paired, 1.0 / (1.0 + (distance / (2.0 * spread)) ** 2), 0.0)
-        T, _ = fit_rigid(source, target, weights)
-    keep = jnp.sum(paired) >= MIN_PAIRS
-    return jaxlie.SE3(jnp.where(keep, T.wxyz_xyz, start.wxyz_xyz))
-
-
 def _via_previous(
     prediction: Prediction,
     previous: Observation,
-    paired: Bool[Array, "p"],
     scale: Float[Array, ""],
     motion: tuple[jaxlie.SE3, jaxlie.SE3],
     camera: Camera,
@@ -160,12 +135,8 @@ def _via_previous(
     inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height) & (depth > 0)
     match = jnp.where(inside, rows * camera.width + columns, 0)
     is_close = jnp.linalg.norm(seen.points - scale * now.points[match], axis=-1) <= config.max_pair_distance
-    via = inside & is_close & paired[match] & current.valid
-    return _align_pairs(scale * current.points, previous.points[match], via, motion[0] @ motion[1])
-
-
-def _interpolate(start: jaxlie.SE3, end: jaxlie.SE3, share: Float[Array, ""]) -> jaxlie.SE3:
-    return start @ jaxlie.SE3.exp(share * (start.inverse() @ end).log())
+    via = inside & is_close & (now.valid & previous.valid)[match] & current.valid
+    return fit_rigid_robust(scale * current.points, previous.points[match], via, motion[0] @ motion[1])
 
 
 def localize_coarse(
@@ -192,14 +163,12 @@ def localize_coarse(
     T_previous_current = scale_translation(raw_previous.inverse() @ raw_current, scale)
     T_current_newest = scale_translation(raw_current.inverse() @ pose_row(views, 2), scale)
 
-    same_image = _align_pairs(scale * now.points, previous.points, paired, T_world_previous) @ T_previous_current
-    via_previous = _via_previous(
-        prediction, previous, paired, scale, (T_world_previous, T_previous_current), camera, config
-    )
+    same_image = fit_rigid_robust(scale * now.points, previous.points, paired, T_world_previous) @ T_previous_current
+    via_previous = _via_previous(prediction, previous, scale, (T_world_previous, T_previous_current), camera, config)
     anchor = prediction.T_world_anchor
     anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, scale)
     reach = 1.0 + jnp.linalg.norm(anchored.translation() - anchor.translation()) / config.anchor_range
-    fused = _interpolate(same_image, anchored, 1.0 / (1.0 + config.anchor_noise * reach**2))
+    fused = interpolate(same_image, anchored, 1.0 / (1.0 + config.anchor_noise * reach**2))
     forms = stack([via_previous, same_image, anchored, fused])
     coarse = pose_row(forms, config.coarse.astype(jnp.int32))
 

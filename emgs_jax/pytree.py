@@ -23,7 +23,7 @@ def traced() -> Any:
 
 
 def choice(*names: str) -> Any:
-    """A traced config field that is written as one of `names` and held as its position, so that readings can be swept."""
+    """A traced config field, written as one of `names` and held as its position, so that readings can be swept."""
 
     def convert(value: Any) -> Any:
         if isinstance(value, str):

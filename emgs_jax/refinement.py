@@ -25,8 +25,8 @@ class RefinementConfig(eqx.Module):
         front_margin: fraction of the depth by which a candidate may lie in front of the map and still be merged; 0 as
             printed (R6).
         back_margin: likewise behind it; `inf` as printed.
-        max_splat_std: pixels of the rendered image; a wider candidate is scattered points, not a surface, and is dropped;
-            `inf` as printed.
+        max_splat_std: pixels of the rendered image; a wider candidate is scattered points, not a surface, and is
+            dropped; `inf` as printed.
         render: how both sets are drawn.
         average: gain and blend, those of the EM step.
     """
@@ -65,6 +65,24 @@ def match_on_image(
     covs = map_splats.covs[rows] + candidate_splats.covs[:, None]
     offsets = map_splats.means[rows] - candidate_splats.means[:, None]
     return rows, mahalanobis_sq(offsets, inverse_2x2(covs)), found
+
+
+def merge_weights(
+    old: Gaussians,
+    candidates: Gaussians,
+    match: tuple[Int[Array, "g k"], Float[Array, "g k"], Bool[Array, "g k"]],
+    on_surface: Bool[Array, "g"],
+    config: RefinementConfig,
+) -> Float[Array, "g k"]:
+    """ω of eq. 5: softmax of -½ d² over the K_2D matches times the features' cosine; 0 where a pair does not merge."""
+    rows, distance_sq, found = match
+    some = found | ~jnp.any(found, axis=-1, keepdims=True)  # a softmax over nothing would be NaN
+    omega = jax.nn.softmax(-0.5 * distance_sq, axis=-1, where=some)
+    if old.features.shape[-1]:
+        cosine = jnp.einsum("gkf,gf->gk", old.features[rows], candidates.features)
+        omega = omega * jnp.maximum(cosine, 0.0)  # opposite meanings do not merge
+    is_match = found & (candidates.valid & on_surface)[:, None] & (distance_sq < config.max_mahalanobis_sq_2d)
+    return jnp.where(is_match, omega, 0.0)
 
 
 def average_candidates(
@@ -134,18 +152,10 @@ def refine(
     own_depth = depth_at(rendering, map_splats, camera)
     reach = config.render.radius * map_splats.depth_std
     visible = map_splats.valid & (own_depth > 0) & (map_splats.depth <= own_depth + reach)
-    rows, distance_sq, found = match_on_image(map_splats, candidate_splats, visible, config)
-
+    match = match_on_image(map_splats, candidate_splats, visible, config)
     relative = candidate_splats.depth / jnp.where(map_depth > 0, map_depth, 1.0) - 1.0
     on_surface = (map_depth > 0) & (relative >= -config.front_margin) & (relative <= config.back_margin)
-    is_match = found & candidates.valid[:, None] & on_surface[:, None]
-    is_match &= distance_sq < config.max_mahalanobis_sq_2d
-    similarity = jnp.ones_like(distance_sq)
-    if old.features.shape[-1]:
-        cosine = jnp.einsum("gkf,gf->gk", old.features[rows], candidates.features)
-        similarity = jnp.maximum(cosine, 0.0)  # opposite meanings do not merge
-    omega = jax.nn.softmax(-0.5 * distance_sq, axis=-1, where=found | ~jnp.any(found, -1, keepdims=True)) * similarity
-    omega = jnp.where(is_match, omega, 0.0)
+    omega, rows = merge_weights(old, candidates, match, on_surface, config), match[0]
 
     averaged = average_candidates(candidates, rows, omega, old)
     evidence = jnp.zeros(old.valid.shape[0]).at[rows].max(omega)

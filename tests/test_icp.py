@@ -21,8 +21,9 @@ from scene import (
 )
 
 from emgs_jax.gaussians import fit_to_points
-from emgs_jax.icp import color_gradients, fit_rigid, icp, median
+from emgs_jax.icp import color_gradients, icp
 from emgs_jax.observation import transform
+from emgs_jax.rigid import fit_rigid, median
 
 RNG = np.random.default_rng(0)
 RESIDUALS = {"colored": 0, "distribution": 1, "colored+distribution": 2}

@@ -1,4 +1,4 @@
-"""EWA projection: a Gaussian in space becomes a Gaussian on the image plane and an inverse depth that varies over it."""
+"""EWA projection: a Gaussian in space becomes one on the image plane, with an inverse depth that varies over it."""
 
 import equinox as eqx
 import jax.numpy as jnp
