@@ -13,6 +13,7 @@ from emgs_jax.gaussians import empty_gaussians
 
 update = eqx.filter_jit(update_average)
 select = eqx.filter_jit(select_submap)
+insert = eqx.filter_jit(insert)
 
 
 def map_of(count: int, capacity: int, seed: int = 0) -> GaussianMap:

@@ -17,7 +17,18 @@ from scene import (
 )
 
 from emgs_jax import camera as cam
-from emgs_jax import clustering, em, gaussian_map, gaussians, icp, initialization, linalg, localization, neighbours
+from emgs_jax import (
+    clustering,
+    em,
+    gaussian_map,
+    gaussians,
+    icp,
+    initialization,
+    linalg,
+    localization,
+    neighbours,
+    rigid,
+)
 from emgs_jax import observation as obs
 from emgs_jax.pytree import stack
 from emgs_jax.refinement import refine
@@ -106,7 +117,7 @@ VERBS = {
         lambda s: (map_of(s), points(s)),
     ),
     "insert": (gaussian_map.insert, lambda s: (map_of(s), random_gaussians(9, s, 2), jnp.ones(9))),
-    "fit_rigid": (icp.fit_rigid, lambda s: (points(s).points, points(s + 5).points, jnp.ones(40))),
+    "fit_rigid": (rigid.fit_rigid, lambda s: (points(s).points, points(s + 5).points, jnp.ones(40))),
     "icp": (
         lambda o, g, T: icp.icp(o, g, T, (ONE * 0.02, ONE * 0.01), CONFIG.localization.icp),
         lambda s: (obs.transform(path_pose(s).inverse(), close(s), ONE), random_gaussians(32, s, 2), path_pose(s)),
@@ -148,10 +159,9 @@ VERBS = {
         lambda s: (map_of(s), random_gaussians(9, s + 5, 2), pose(translation=(0.1 * s, 0, 0))),
     ),
 }
-# Their compilation alone is 5 to 15 s each.
-HEAVY = {"cluster", "em_update", "icp", "localize_coarse", "localize_fine", "refine", "densify", "initialize"}
-LOOSE = HEAVY - {"cluster", "em_update"} | {"render"}
-EVERY = [pytest.param(name, marks=pytest.mark.slow if name in HEAVY else ()) for name in VERBS]
+# These end where a solver or a gate decides, or sum many terms.
+LOOSE = {"render", "icp", "localize_coarse", "localize_fine", "refine", "densify", "initialize"}
+pytestmark = pytest.mark.slow  # every verb is compiled four times: minutes
 # The solver has a while loop, which has no reverse mode; forward mode must be finite.
 FORWARD = {"icp", "localize_fine"}
 
@@ -171,7 +181,7 @@ def assert_close(actual, expected, name):
             np.testing.assert_array_equal(a, b, err_msg=name)
 
 
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("name", VERBS)
 def test_jit_equals_eager_and_vmap_equals_a_loop(name):
     verb, arguments = VERBS[name]
     eager = [verb(*arguments(seed)) for seed in (0, 1)]
@@ -179,7 +189,7 @@ def test_jit_equals_eager_and_vmap_equals_a_loop(name):
     assert_close(eqx.filter_jit(eqx.filter_vmap(verb))(*stack([arguments(0), arguments(1)])), stack(eager), name)
 
 
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("name", VERBS)
 def test_gradients_are_finite(name):
     verb, arguments = VERBS[name]
     inputs = arguments(0)
