@@ -26,6 +26,7 @@ from emgs_jax.observation import transform
 from emgs_jax.rigid import fit_rigid, median
 
 RNG = np.random.default_rng(0)
+pytestmark = pytest.mark.slow  # the solver compiles for 10 s; the quick subset has test_localization
 RESIDUALS = {"colored": 0, "distribution": 1, "colored+distribution": 2}
 NOISE = jnp.asarray(0.02), jnp.asarray(0.01)
 STARTS = [
