@@ -6,10 +6,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.clustering import kmeans, strided_seeds
-from emgs_jax.linalg import inverse_and_logdet, mahalanobis_sq, outer, safe_normalize
+from emgs_jax.linalg import inverse_and_logdet, mahalanobis_sq, outer, safe_normalize, tangent_basis
 from emgs_jax.neighbours import knn
 from emgs_jax.observation import Observation
 from emgs_jax.pytree import static, take_rows, traced, where_rows
+
+LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 
 class Gaussians(eqx.Module):
@@ -136,3 +138,23 @@ def blend(old: Gaussians, new: Gaussians, gain: Float[Array, "n"], moment_matche
             safe_normalize(old.normals + weight * (new.normals - old.normals)),
         ),
     )
+
+
+def intensity(colors: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
+    """Luminance of RGB."""
+    return colors @ jnp.array(LUMINANCE, colors.dtype)
+
+
+def color_gradients(gaussians: Gaussians, num_neighbours: int) -> Float[Array, "n 3"]:
+    """Intensity gradient (1/m) of every Gaussian in its tangent plane, fitted to its neighbours; orthogonal to n."""
+    rows, found = knn(gaussians.means, gaussians.means, gaussians.valid, num_neighbours)
+    basis = tangent_basis(gaussians.normals)
+    offsets = jnp.einsum("nkd,nda->nka", gaussians.means[rows] - gaussians.means[:, None], basis)
+    offsets = jnp.where(found[..., None], offsets, 0.0)
+    light = intensity(gaussians.colors)
+    moments = jnp.einsum("nka,nkb->nab", offsets, offsets)
+    cross = jnp.einsum("nka,nk->na", offsets, light[rows] - light[:, None])
+    # A hundredth of the spread keeps the fit of collinear neighbours finite.
+    ridge = 0.01 * jnp.trace(moments, axis1=-2, axis2=-1) + 1e-8
+    slopes = jnp.linalg.solve(moments + ridge[:, None, None] * jnp.eye(2), cross[..., None])[..., 0]
+    return jnp.einsum("nda,na->nd", basis, slopes)

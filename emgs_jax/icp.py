@@ -7,14 +7,13 @@ import jaxlie
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.gaussians import Gaussians
-from emgs_jax.linalg import inverse_and_logdet, mahalanobis_sq, outer, tangent_basis
+from emgs_jax.gaussians import Gaussians, color_gradients, intensity
+from emgs_jax.linalg import inverse_and_logdet, mahalanobis_sq, outer
 from emgs_jax.neighbours import knn
 from emgs_jax.observation import Observation, transform
 from emgs_jax.pytree import choice, static, take_rows, traced
 from emgs_jax.rigid import median
 
-LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
 RESIDUALS = ("colored", "distribution", "colored+distribution")
 COLORED, DISTRIBUTION = 0, 1
 
@@ -33,6 +32,8 @@ class IcpConfig(eqx.Module):
         num_effective: how many independent measurements the points are worth: their errors are correlated.
         prior_information: of the coarse pose, in units of one effective point as noisy as the coarse step shows;
             0 = no prior, the printed form.
+        scale_noise: standard deviation of the logarithm of the scale about the coarse step's, in units of the points'
+            depth noise; 0 = no scale (printed).
         num_points: how many points take part.
         num_neighbours: Gaussians that are compared for each point.
         num_color_neighbours: Gaussians from which a Gaussian's intensity gradient is fitted.
@@ -47,6 +48,7 @@ class IcpConfig(eqx.Module):
     min_normal_cos: Float[Array, "*b"] = traced()
     num_effective: Float[Array, "*b"] = traced()
     prior_information: Float[Array, "*b"] = traced()
+    scale_noise: Float[Array, "*b"] = traced()
     num_points: int = static()
     num_neighbours: int = static()
     num_color_neighbours: int = static()
@@ -74,26 +76,6 @@ class IcpInfo(eqx.Module):
     min_eigenvalue: Float[Array, ""]
     num_steps: Int[Array, ""]
     is_converged: Bool[Array, ""]
-
-
-def intensity(colors: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
-    """Luminance of RGB."""
-    return colors @ jnp.array(LUMINANCE, colors.dtype)
-
-
-def color_gradients(gaussians: Gaussians, num_neighbours: int) -> Float[Array, "n 3"]:
-    """Intensity gradient (1/m) of every Gaussian in its tangent plane, fitted to its neighbours; orthogonal to n."""
-    rows, found = knn(gaussians.means, gaussians.means, gaussians.valid, num_neighbours)
-    basis = tangent_basis(gaussians.normals)
-    offsets = jnp.einsum("nkd,nda->nka", gaussians.means[rows] - gaussians.means[:, None], basis)
-    offsets = jnp.where(found[..., None], offsets, 0.0)
-    light = intensity(gaussians.colors)
-    moments = jnp.einsum("nka,nkb->nab", offsets, offsets)
-    cross = jnp.einsum("nka,nk->na", offsets, light[rows] - light[:, None])
-    # A hundredth of the spread keeps the fit of collinear neighbours finite.
-    ridge = 0.01 * jnp.trace(moments, axis1=-2, axis2=-1) + 1e-8
-    slopes = jnp.linalg.solve(moments + ridge[:, None, None] * jnp.eye(2), cross[..., None])[..., 0]
-    return jnp.einsum("nda,na->nd", basis, slopes)
 
 
 class _Matches(eqx.Module):
@@ -143,7 +125,8 @@ class _Problem(eqx.Module):
     target: Gaussians
     gradients: Float[Array, "n 3"]
     T_world_coarse: jaxlie.SE3
-    prior: Float[Array, "6"]  # 1 / standard deviation of xi
+    scale_std: Float[Array, ""]
+    prior: Float[Array, "7"]  # 1 / standard deviation of xi and of the scale's parameter
 
 
 def _pose_problem(
@@ -163,25 +146,29 @@ def _pose_problem(
         lambda: jnp.zeros_like(target.means),
     )
     prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack([pose_noise, depth_noise]), 3)
+    prior = jnp.append(prior, 1.0)
     rays = config.noise * depth_noise * source.points
-    return _Problem(source, rays, target, gradients, T_world_coarse, prior)
+    return _Problem(source, rays, target, gradients, T_world_coarse, config.scale_noise * depth_noise, prior)
 
 
-def _place(xi: Float[Array, "6"], problem: _Problem, config: IcpConfig) -> tuple[Observation, _Matches]:
-    """The source in the world frame at T_world_coarse exp(xi), and its matches, which carry no gradient."""
-    T = problem.T_world_coarse @ jaxlie.SE3.exp(xi)
-    placed = transform(T, problem.source, jnp.ones(()))
+def _place(y: Float[Array, "7"], problem: _Problem, config: IcpConfig) -> tuple[Observation, _Matches]:
+    """The source in the world frame for the unknowns y, and its matches, which carry no gradient."""
+    T, scale = _pose(y, problem)
+    placed = transform(T, problem.source, scale)
     noise = problem.rays @ T.rotation().as_matrix().T
     fixed, noise = jax.lax.stop_gradient((placed, noise))
     return placed, jax.lax.stop_gradient(_match(fixed, noise, problem.target, problem.gradients, config))
 
 
-def _residuals(
-    xi: Float[Array, "6"], args: tuple[_Problem, IcpConfig]
-) -> tuple[Float[Array, "p 5"], Float[Array, "6"]]:
+def _pose(y: Float[Array, "7"], problem: _Problem) -> tuple[jaxlie.SE3, Float[Array, ""]]:
+    """T_world_coarse exp(xi), and the scale exp(scale_std · y_6)."""
+    return problem.T_world_coarse @ jaxlie.SE3.exp(y[:6]), jnp.exp(problem.scale_std * y[6])
+
+
+def _residuals(y: Float[Array, "7"], args: tuple[_Problem, IcpConfig]) -> tuple[Float[Array, "p 5"], Float[Array, "7"]]:
     """Rows of every point (plane, colour, whitened offset) and of the prior, in standard deviations."""
     problem, config = args
-    placed, match = _place(xi, problem, config)
+    placed, match = _place(y, problem, config)
     offset = placed.points - match.means
     plane = jnp.sum(offset * match.normals, axis=-1) / match.plane_std
     light = match.light + jnp.sum(match.gradients * offset, axis=-1)
@@ -200,7 +187,7 @@ def _residuals(
     )
     valid = placed.valid
     share = jnp.sqrt(config.num_effective / jnp.maximum(jnp.sum(valid), 1))
-    return share * jnp.where(valid[:, None], rows, 0.0), problem.prior * xi
+    return share * jnp.where(valid[:, None], rows, 0.0), problem.prior * y
 
 
 def icp(
@@ -209,11 +196,13 @@ def icp(
     T_world_coarse: jaxlie.SE3,
     noise: tuple[Float[Array, ""], Float[Array, ""]],
     config: IcpConfig,
-) -> tuple[jaxlie.SE3, IcpInfo]:
-    """Place camera-frame `source` on `target`: argmin over xi of data + prior, T = T_world_coarse exp(xi).
+) -> tuple[jaxlie.SE3, Float[Array, ""], IcpInfo]:
+    """Place camera-frame `source` on `target`: argmin over xi and s of data + prior, T = T_world_coarse exp(xi).
 
     The data term is a truncated least-squares sum over the points, scaled so that all of them together weigh as much
-    as `num_effective` independent ones. The prior holds xi at 0 with `prior_information`.
+    as `num_effective` independent ones. The prior holds xi at 0 with `prior_information`, and the scale s of the
+    points about the camera at 1 with `scale_noise`: the predictions of one call share an error of scale, and only the
+    map remembers the scale of the calls before.
 
     Args:
         source: points to align, camera frame.
@@ -221,17 +210,20 @@ def icp(
         T_world_coarse: where to start, and the mean of the prior.
         noise: standard deviation of the coarse pose in metres, and of the points' depth as a fraction of it.
         config: terms and gates.
+
+    Returns:
+        T_world_camera, the scale, and what the solve found.
     """
     problem = _pose_problem(source, target, T_world_coarse, noise, config)
     solver = optx.LevenbergMarquardt(rtol=config.tolerance, atol=config.tolerance)
-    start, args = jnp.zeros(6), (problem, config)
+    start, args = jnp.zeros(7), (problem, config)
     solution = optx.least_squares(_residuals, solver, start, args, max_steps=config.max_steps, throw=False)
-    xi = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, start)
+    y = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, start)
 
-    placed, match = _place(xi, problem, config)
+    placed, match = _place(y, problem, config)
     num_inliers = jnp.sum(match.is_inlier)
     distance = jnp.sum((placed.points - match.means) * match.normals, axis=-1)
-    jacobian = jnp.concatenate([rows.reshape(-1, 6) for rows in jax.jacfwd(_residuals)(xi, args)])
+    jacobian = jnp.concatenate([rows.reshape(-1, 7)[:, :6] for rows in jax.jacfwd(_residuals)(y, args)])
     hessian = jacobian.T @ jacobian / jnp.maximum(config.num_effective, 1.0)
     info = IcpInfo(
         num_inliers=num_inliers,
@@ -242,4 +234,4 @@ def icp(
         num_steps=solution.stats["num_steps"],
         is_converged=solution.result == optx.RESULTS.successful,
     )
-    return T_world_coarse @ jaxlie.SE3.exp(xi), info
+    return *_pose(y, problem), info

@@ -188,7 +188,7 @@ def localize_coarse(
 def localize_fine(
     current: Observation, submap: Gaussians, coarse: CoarsePose, config: LocalizationConfig
 ) -> tuple[jaxlie.SE3, Observation, LocalizationInfo]:
-    """Fine registration against the submap without scale; the coarse pose stays where a check fails.
+    """Fine registration against the submap; the coarse pose and scale stay where a check fails.
 
     Args:
         current: camera frame, unscaled.
@@ -202,7 +202,7 @@ def localize_fine(
     scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
     # The coarse pose is as good as two predictions of one image agree; a millimetre keeps the solve well scaled.
     noise_m = jnp.maximum(coarse.repeat_rms, 1e-3)
-    fine, info = icp(scaled, submap, coarse.T_world_camera, (noise_m, noise_m / coarse.mean_depth), config.icp)
+    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, (noise_m, noise_m / coarse.mean_depth), config.icp)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     step_m, step_rad = jnp.linalg.norm(step[:3]), jnp.linalg.norm(step[3:])
     failed = jnp.stack(
@@ -216,7 +216,8 @@ def localize_fine(
     )
     is_tracked = ~jnp.any(failed)
     T = jaxlie.SE3(jnp.where(is_tracked, fine.wxyz_xyz, coarse.T_world_camera.wxyz_xyz))
-    aligned = transform(T, current, coarse.scale)
+    scale = coarse.scale * jnp.where(is_tracked, scale, 1.0)
+    aligned = transform(T, current, scale)
     aligned = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & coarse.is_usable)
     bits = jnp.sum(failed * 2 ** jnp.arange(failed.shape[0]))
     return (
@@ -226,7 +227,7 @@ def localize_fine(
             is_tracked,
             ~coarse.is_usable,
             bits,
-            coarse.scale,
+            scale,
             coarse.repeat_rms,
             info.misfit / coarse.mean_depth,
             step_m,

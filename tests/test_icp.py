@@ -21,7 +21,8 @@ from scene import (
 )
 
 from emgs_jax.gaussians import fit_to_points
-from emgs_jax.icp import color_gradients, icp
+from emgs_jax.gaussians import color_gradients
+from emgs_jax.icp import icp
 from emgs_jax.observation import transform
 from emgs_jax.rigid import fit_rigid, median
 
@@ -160,18 +161,18 @@ def test_the_error_is_no_larger_than_open3ds_from_the_same_starts(source, target
 
 def test_an_overwhelming_prior_holds_the_coarse_pose(source, target, settings):
     start = TRUTH @ STARTS[0]
-    held, _ = solve(source, target, start, NOISE, at(settings, "prior_information", 1e9))
-    free, _ = solve(source, target, start, NOISE, settings)
+    held, _, _ = solve(source, target, start, NOISE, at(settings, "prior_information", 1e9))
+    free, _, _ = solve(source, target, start, NOISE, settings)
     assert max(pose_error(held, start)) < 1e-4 < 0.02 < pose_error(free, start)[0]
 
 
 def test_the_info_counts_inliers_and_measures_their_planes(source, target, settings):
-    T, info = solve(source, target, TRUTH @ STARTS[0], NOISE, settings)
+    T, _, info = solve(source, target, TRUTH @ STARTS[0], NOISE, settings)
     assert 0.5 * 768 < info.num_inliers <= 768
     assert info.inlier_fraction == pytest.approx(float(info.num_inliers) / 768)
     assert info.residual < 0.02 and info.misfit < 0.02  # exact points: only edges are off their planes
     assert info.min_eigenvalue > 0 and info.num_steps > 0
-    _, strict = solve(source, target, TRUTH, NOISE, at(settings, "min_normal_cos", 1.1))
+    _, _, strict = solve(source, target, TRUTH, NOISE, at(settings, "min_normal_cos", 1.1))
     assert strict.num_inliers == 0 and strict.inlier_fraction == 0 and strict.residual == 0
 
 
@@ -180,8 +181,8 @@ def test_a_single_plane_does_not_determine_the_pose(source, target, settings):
     plain = eqx.tree_at(lambda g: (g.valid, g.colors), target, (jnp.asarray(wall), jnp.full((384, 3), 0.5)))
     facing = eqx.tree_at(lambda o: o.colors, source, jnp.full((768, 3), 0.5))
     config = at(settings, "residual", RESIDUALS["colored"])
-    _, whole = solve(source, target, TRUTH, NOISE, config)
-    _, flat = solve(facing, plain, TRUTH, NOISE, config)
+    _, _, whole = solve(source, target, TRUTH, NOISE, config)
+    _, _, flat = solve(facing, plain, TRUTH, NOISE, config)
     assert wall.sum() > 30 and flat.num_inliers > 50
     assert flat.min_eigenvalue < 1e-3 * whole.min_eigenvalue
 
@@ -190,8 +191,8 @@ def test_a_single_plane_does_not_determine_the_pose(source, target, settings):
 def test_the_pose_moves_with_a_rigid_motion_of_the_world(source, target, settings, residual):
     config, motion = at(settings, "residual", RESIDUALS[residual]), pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
     start = TRUTH @ STARTS[0]
-    still, _ = solve(source, target, start, NOISE, config)
-    moved, _ = solve(source, move_gaussians(motion, target), motion @ start, NOISE, config)
+    still, _, _ = solve(source, target, start, NOISE, config)
+    moved, _, _ = solve(source, move_gaussians(motion, target), motion @ start, NOISE, config)
     # The solver stops where a step changes the cost by 1e-4 of it; both stop near the same minimum.
     assert max(pose_error(moved, motion @ still)) < 2e-3
 
@@ -200,7 +201,7 @@ def test_without_any_gaussian_or_point_the_coarse_pose_stays(source, target, set
     empty = eqx.tree_at(lambda g: g.valid, target, jnp.zeros(384, bool))
     blind = eqx.tree_at(lambda o: o.valid, source, jnp.zeros(768, bool))
     for points, gaussians in ((source, empty), (blind, target)):
-        T, info = solve(points, gaussians, TRUTH, NOISE, settings)
+        T, _, info = solve(points, gaussians, TRUTH, NOISE, settings)
         assert info.num_inliers == 0
         assert max(pose_error(T, TRUTH)) < 1e-6
 
@@ -216,3 +217,11 @@ def test_invalid_points_and_gaussians_change_nothing(source, target, settings, p
     clean = solve(points, gaussians, TRUTH @ STARTS[1], NOISE, settings)
     poisoned = solve(put(points, seen), put(gaussians, known), TRUTH @ STARTS[1], NOISE, settings)
     assert_same(poisoned, clean)
+
+
+def test_a_common_error_of_scale_is_found_only_where_it_may_be(source, target, settings):
+    small = eqx.tree_at(lambda o: o.points, source, source.points / 1.03)
+    _, none, _ = solve(small, target, TRUTH, NOISE, at(settings, "scale_noise", 0.0))
+    _, found, _ = solve(small, target, TRUTH, NOISE, at(settings, "scale_noise", 10.0))
+    assert none == 1.0
+    assert found == pytest.approx(1.03, abs=0.01)  # points are matched with the centres of sparse Gaussians
