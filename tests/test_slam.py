@@ -171,7 +171,7 @@ def test_a_run_follows_the_exact_path_reports_every_step_and_repeats_bit_for_bit
     window, camera, config, initialization
 ):
     chosen = config(
-        *WHOLE, f"slam.initialization={initialization}", "submap.map_capacity=512", "submap.submap_capacity=512"
+        *WHOLE, f"slam.initialization={initialization}", "submap.map_capacity=256", "submap.submap_capacity=128"
     )
     chosen = at(chosen, "localization.max_residual", 1.0)
     results = []
