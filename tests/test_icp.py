@@ -20,8 +20,7 @@ from scene import (
     random_gaussians,
 )
 
-from emgs_jax.gaussians import fit_to_points
-from emgs_jax.gaussians import color_gradients
+from emgs_jax.gaussians import color_gradients, fit_to_points
 from emgs_jax.icp import icp
 from emgs_jax.observation import transform
 from emgs_jax.rigid import fit_rigid, median
