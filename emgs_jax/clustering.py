@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.neighbours import knn
 
 
-def morton_order(height: int, width: int) -> Int[Array, "h*w"]:
+def morton_order(height: int, width: int) -> Int[Array, "{height}*{width}"]:
     """Row-major pixel numbers along the Z curve, so that an even choice of them is even over the image."""
     y, x = jnp.divmod(jnp.arange(height * width), width)
     code = jnp.zeros_like(x)
@@ -43,7 +43,7 @@ def kmeans(
         Centroids, which of them have points, and how many; an empty cluster stays where it was and becomes invalid.
     """
 
-    def iterate(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def iterate(_: Int[Array, ""], state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         centroids, exists, _ = state
         nearest, _ = knn(points, centroids, exists, 1)
         rows = jnp.where(valid, nearest[:, 0], seeds.shape[0])

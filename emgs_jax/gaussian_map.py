@@ -16,7 +16,7 @@ class GaussianMap(eqx.Module):
     Args:
         gaussians: world frame.
         weight: what eq. 4 keeps per Gaussian: α_{t-1} for the printed gain, the accumulated support for `count` (R4).
-        num_updates: in how many frames points were fused into it.
+        num_updates: how often EM or refinement fused something into it, at most twice a frame.
     """
 
     gaussians: Gaussians

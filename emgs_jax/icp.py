@@ -64,7 +64,7 @@ class IcpInfo(eqx.Module):
         inlier_fraction: of the points that take part.
         residual: m; root mean square distance of the inliers to their Gaussians' planes.
         misfit: m; the same distance of all points, as 1.4826 times the median, a robust standard deviation.
-        min_eigenvalue: smallest eigenvalue of the Hessian, prior included, per effective point (1/m² and 1/rad²).
+        min_eigenvalue: smallest eigenvalue of the data's Hessian per effective point (1/m² and 1/rad²).
         num_steps: of the solver.
         is_converged: False where the solver reached `max_steps` or failed.
     """
@@ -223,7 +223,7 @@ def icp(
     placed, match = _place(y, problem, config)
     num_inliers = jnp.sum(match.is_inlier)
     distance = jnp.sum((placed.points - match.means) * match.normals, axis=-1)
-    jacobian = jnp.concatenate([rows.reshape(-1, 7)[:, :6] for rows in jax.jacfwd(_residuals)(y, args)])
+    jacobian = jax.jacfwd(_residuals)(y, args)[0].reshape(-1, 7)[:, :6]
     hessian = jacobian.T @ jacobian / jnp.maximum(config.num_effective, 1.0)
     info = IcpInfo(
         num_inliers=num_inliers,

@@ -57,7 +57,7 @@ def inverse_2x2(matrices: Float[Array, "*b 2 2"]) -> Float[Array, "*b 2 2"]:
     return jnp.where(is_positive[..., None, None], adjugate / jnp.where(is_positive, det, 1.0)[..., None, None], 0.0)
 
 
-def mahalanobis_sq(offsets: Float[Array, "*b d"], precisions: Float[Array, "*b d d"]) -> Float[Array, "*b"]:
+def mahalanobis_sq(offsets: Float[Array, "*#b d"], precisions: Float[Array, "*#b d d"]) -> Float[Array, "*b"]:
     """Squared Mahalanobis distance d' P d, never negative."""
     return jnp.maximum(jnp.einsum("...i,...ij,...j->...", offsets, precisions, offsets), 0.0)
 

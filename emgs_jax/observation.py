@@ -78,6 +78,7 @@ def normals_from_pointmap(
     Returns:
         Camera frame; zero where the pixel is invalid or a fifth of the window or less lies on its surface.
     """
+    points = jnp.where(valid[..., None], points, 0.0)
     depth = points[..., 2]
     inverse_depth = jnp.where(valid, 1.0 / jnp.where(valid, depth, 1.0), 0.0)
     ray_xy = points[..., :2] * inverse_depth[..., None]
@@ -107,7 +108,8 @@ def normals_from_pointmap(
     xu = cross[..., 0] - count * mean[..., 0] * mean[..., 2]
     yu = cross[..., 1] - count * mean[..., 1] * mean[..., 2]
     det = xx * yy - xy * xy
-    is_fitted = valid & (count > len(taps) / 5) & (det > 0)
+    # Valid pixels in one line determine no plane; rounding must not decide.
+    is_fitted = valid & (count > len(taps) / 5) & (det > 1e-4 * (xx + yy) ** 2)
     safe_det = jnp.where(is_fitted, det, 1.0)
     slope = jnp.stack([yy * xu - xy * yu, xx * yu - xy * xu], axis=-1) / safe_det[..., None]
     level = inverse_depth + mean[..., 2] - jnp.sum(slope * (mean[..., :2] + ray_xy), axis=-1)
@@ -130,7 +132,9 @@ def observe(
     normals = normals_from_pointmap(points, valid, config)
     # A point without a normal lies on a sliver or in a hole's rim, where a prior guesses.
     valid &= jnp.any(normals != 0, axis=-1)
-    image = Observation(points, colors, normals, jnp.where(valid[..., None], features, 0.0), confidence, valid)
+    keep = valid[..., None]
+    colors, features = jnp.where(keep, colors, 0.0), jnp.where(keep, features, 0.0)
+    image = Observation(points, colors, normals, features, jnp.where(valid, confidence, 1.0), valid)
     thinned = jax.tree.map(lambda leaf: leaf[:: config.thin, :: config.thin], image)
     return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), thinned)
 

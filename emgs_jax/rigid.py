@@ -4,6 +4,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
+from emgs_jax.linalg import SMALLEST_LENGTH
+
 MIN_PAIRS = 16  # fewer pairs of noisy points do not make a pose
 
 
@@ -56,7 +58,9 @@ def fit_rigid_robust(
     """Rigid fit of pairs, robust by three reweightings around the median distance; `start` with too few pairs."""
     T = start
     for _ in range(3):
-        distance = jnp.linalg.norm(source @ T.rotation().as_matrix().T + T.translation() - target, axis=-1)
+        difference = source @ T.rotation().as_matrix().T + T.translation() - target
+        # Exact pairs: the square root has no gradient at 0.
+        distance = jnp.sqrt(jnp.sum(difference**2, axis=-1) + SMALLEST_LENGTH**2)
         spread = jnp.maximum(median(distance, paired), 1e-6)
         weights = jnp.where(paired, 1.0 / (1.0 + (distance / (2.0 * spread)) ** 2), 0.0)
         T, _ = fit_rigid(source, target, weights)

@@ -7,7 +7,8 @@ from jaxtyping import install_import_hook
 # because their annotations do not hold: `clustering` ("h*w" of morton_order names no bound size, and the counter of
 # kmeans's loop is traced, not an int) and `linalg` (mahalanobis_sq gets batches that broadcast, which needs "*#b").
 CHECKED = (
-    *("pytree", "rigid", "camera", "observation", "neighbours", "gaussians", "gaussian_map", "icp"),
+    *("pytree", "linalg", "rigid", "camera", "observation", "neighbours", "clustering", "gaussians"),
+    *("gaussian_map", "icp"),
     *("render", "initialization", "localization", "em", "refinement", "slam", "semantics"),
 )
 install_import_hook([f"emgs_jax.{name}" for name in CHECKED], "beartype.beartype")
