@@ -16,10 +16,15 @@ class DensifyConfig(eqx.Module):
     """Which pixels become points.
 
     Args:
+        opacity: of every Gaussian here. Low, so that a depth is the mean of the layers that noise left in a surface; with
+            the refinement's opacity the nearest layer alone would count, which is too near.
+        min_alpha: a pixel with less coverage has no depth.
         max_depth_spread: a pixel whose splats differ in depth by more than this fraction mixes two surfaces.
         render: how the map is drawn.
     """
 
+    opacity: Float[Array, "*b"] = traced()
+    min_alpha: Float[Array, "*b"] = traced()
     max_depth_spread: Float[Array, "*b"] = traced()
     render: RenderConfig
 
@@ -37,7 +42,8 @@ class DenseView(eqx.Module):
 def densify(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, config: DensifyConfig) -> DenseView:
     """Render depth, normals and colours of the map from one pose and back-project every pixel that has a depth."""
     values = jnp.concatenate([gaussians.colors, gaussians.normals], axis=-1)
-    rendering = render(gaussians, values, T_world_camera, camera, config.render)
+    soft = eqx.tree_at(lambda r: (r.opacity, r.min_alpha), config.render, (config.opacity, config.min_alpha))
+    rendering = render(gaussians, values, T_world_camera, camera, soft)
     rotation = T_world_camera.rotation().as_matrix()
     points = unproject(camera, rendering.depth) @ rotation.T + T_world_camera.translation()
     alpha = jnp.maximum(rendering.alpha, 1e-6)[..., None]
