@@ -16,8 +16,8 @@ class DensifyConfig(eqx.Module):
     """Which pixels become points.
 
     Args:
-        opacity: of every Gaussian here. Low, so that a depth is the mean of the layers that noise left in a surface; with
-            the refinement's opacity the nearest layer alone would count, which is too near.
+        opacity: of every Gaussian here. Low, so that a depth is the mean of the layers that noise left in a surface;
+            with the refinement's opacity the nearest layer alone would count, which is too near.
         min_alpha: a pixel with less coverage has no depth.
         max_depth_spread: a pixel whose splats differ in depth by more than this fraction mixes two surfaces.
         render: how the map is drawn.
