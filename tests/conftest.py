@@ -1,11 +1,10 @@
 """Shared by all tests of the core: shapes and types checked at every call, one small config, one small camera."""
 
+import jax
 import pytest
 from jaxtyping import install_import_hook
 
-# Before anything imports the package: every call in the tests checks its jaxtyping signature. Two modules are left out
-# because their annotations do not hold: `clustering` ("h*w" of morton_order names no bound size, and the counter of
-# kmeans's loop is traced, not an int) and `linalg` (mahalanobis_sq gets batches that broadcast, which needs "*#b").
+# Before anything imports the package: every call in the tests checks its jaxtyping signature.
 CHECKED = (
     *("pytree", "linalg", "rigid", "camera", "observation", "neighbours", "clustering", "gaussians"),
     *("gaussian_map", "icp"),
@@ -28,3 +27,10 @@ def camera():
     from emgs_jax.camera import Camera
 
     return Camera([20.0, 23.0], [14.5, 12.25], 32, 24)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def drop_executables():
+    """Every executable holds memory maps, of which Linux gives a process 65530: past that, compiling segfaults."""
+    yield
+    jax.clear_caches()
