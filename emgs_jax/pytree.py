@@ -6,10 +6,9 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Int, PyTree
 
 Tree = TypeVar("Tree")
-Scalar = Float[Array, "*batch"]  # a traced number of a config; `*batch` when configs are stacked for a sweep
 
 
 def _as_float32(value: Any) -> Any:
