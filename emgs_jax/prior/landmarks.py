@@ -1,0 +1,206 @@
+"""Points of the scene that several images show: detection, verified matches, tracks, poses from them (OpenCV)."""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+NONE = -1  # a keypoint without a landmark
+
+
+@dataclass(frozen=True)
+class MatchingConfig:
+    """Detection, matching and acceptance; errors in pixels.
+
+    Args:
+        num_features: at most, in one image.
+        min_contrast: of a keypoint (SIFT).
+        max_ratio: distance to the best descriptor over that to the second (Lowe, IJCV 2004).
+        max_epipolar_error: of a match that fits the essential matrix.
+        max_reprojection_error: of an observation that fits its landmark.
+        min_matches: that a pair of images, or an image and the landmarks, must have.
+        min_parallax_rad: between the rays of a landmark, as the root of the rays' smallest variance.
+    """
+
+    num_features: int
+    min_contrast: float
+    max_ratio: float
+    max_epipolar_error: float
+    max_reprojection_error: float
+    min_matches: int
+    min_parallax_rad: float
+
+
+@dataclass
+class View:
+    """What is known of one image.
+
+    Args:
+        pixels: (n, 2) float64 of the keypoints.
+        descriptors: (n, 128) float32, unit.
+        landmark: (n,) the landmark of each keypoint, or NONE.
+        T_ref_view: camera -> reference (4, 4); None while it is not placed.
+    """
+
+    pixels: np.ndarray
+    descriptors: np.ndarray
+    landmark: np.ndarray
+    T_ref_view: np.ndarray | None = None
+
+
+@dataclass
+class Structure:
+    """Views by frame index, and landmarks: `points` (l, 3) in the reference frame, NaN where not triangulated."""
+
+    K: np.ndarray
+    views: dict[int, View] = field(default_factory=dict)
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def placed(self) -> dict[int, View]:
+        """The views that have a pose, by frame."""
+        return {frame: view for frame, view in self.views.items() if view.T_ref_view is not None}
+
+    def known(self, view: View) -> np.ndarray:
+        """Which keypoints (n,) of a view have a landmark with a position."""
+        has = view.landmark >= 0
+        has[has] = np.isfinite(self.points[view.landmark[has], 0])
+        return has
+
+
+def detect(gray: np.ndarray, config: MatchingConfig) -> View:
+    """SIFT keypoints with the square roots of their normalised descriptors (Arandjelović and Zisserman, CVPR 2012)."""
+    detector = cv2.SIFT_create(nfeatures=config.num_features, contrastThreshold=config.min_contrast, enable_precise_upscale=True)
+    keypoints, descriptors = detector.detectAndCompute(gray, None)
+    if not keypoints:
+        return View(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros(0, int))
+    total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
+    pixels = np.array([point.pt for point in keypoints])
+    return View(pixels, np.sqrt(descriptors / total), np.full(len(pixels), NONE))
+
+
+def match(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of `a` and `b` that are each other's nearest, distinctly so, and fit one essential matrix (MAGSAC++)."""
+    none = np.zeros(0, int), np.zeros(0, int)
+    if min(len(a.pixels), len(b.pixels)) < max(config.min_matches, 2):
+        return none
+    similarity = a.descriptors @ b.descriptors.T
+    nearest = similarity.argmax(axis=1)
+    best, second = -np.partition(-similarity, 1, axis=1)[:, :2].T
+    # Of unit vectors |d|² = 2 - 2 cos.
+    is_distinct = 1 - best < config.max_ratio**2 * (1 - second)
+    is_mutual = similarity.argmax(axis=0)[nearest] == np.arange(len(nearest))
+    rows = np.flatnonzero(is_distinct & is_mutual)
+    if len(rows) < config.min_matches:
+        return none
+    _, mask = _essential(a.pixels[rows], b.pixels[nearest[rows]], K, config)
+    if mask is None or mask.sum() < config.min_matches:
+        return none
+    inliers = mask.ravel().astype(bool)
+    return rows[inliers], nearest[rows[inliers]]
+
+
+def _essential(a: np.ndarray, b: np.ndarray, K: np.ndarray, config: MatchingConfig):
+    return cv2.findEssentialMat(
+        a, b, K, method=cv2.USAC_MAGSAC, prob=0.9999, threshold=config.max_epipolar_error, maxIters=2000
+    )
+
+
+def link(structure: Structure, frame: int, config: MatchingConfig) -> None:
+    """Match a view with all others, nearest in time first, and extend or begin tracks."""
+    view = structure.views[frame]
+    for other_frame in sorted(structure.views, key=lambda index: abs(index - frame)):
+        if other_frame == frame:
+            continue
+        other = structure.views[other_frame]
+        for there, here in zip(*match(other, view, structure.K, config), strict=True):
+            known = other.landmark[there]
+            if view.landmark[here] != NONE or known in view.landmark and known != NONE:
+                continue
+            if known == NONE:
+                known = len(structure.points)
+                structure.points = np.concatenate([structure.points, np.full((1, 3), np.nan)])
+                other.landmark[there] = known
+            view.landmark[here] = known
+
+
+def relative_pose(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, float] | None:
+    """T_a_b with a unit baseline from the landmarks that two views share, and a score; None without enough of them.
+
+    The score is the number of matches in front of both cameras times the sine of their median parallax.
+    """
+    _, rows_a, rows_b = np.intersect1d(a.landmark, b.landmark, return_indices=True)
+    has = a.landmark[rows_a] != NONE
+    pixels_a, pixels_b = a.pixels[rows_a[has]], b.pixels[rows_b[has]]
+    if len(pixels_a) < config.min_matches:
+        return None
+    E, mask = _essential(pixels_a, pixels_b, K, config)
+    if E is None or E.shape != (3, 3):
+        return None
+    count, R, t, mask = cv2.recoverPose(E, pixels_a, pixels_b, K, mask=mask)
+    if count < config.min_matches:
+        return None
+    inliers = mask.ravel() > 0
+    rays_a, rays_b = unit_rays(pixels_a[inliers], K), unit_rays(pixels_b[inliers], K)
+    parallax = np.linalg.norm(np.cross(rays_a @ R.T, rays_b), axis=1)
+    T_b_a = np.eye(4)
+    T_b_a[:3, :3], T_b_a[:3, 3] = R, t.ravel()
+    return np.linalg.inv(T_b_a), float(count * np.median(parallax))
+
+
+def unit_rays(pixels: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Unit viewing directions (n, 3) of pixels (n, 2), camera frame."""
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def place(structure: Structure, view: View, config: MatchingConfig) -> bool:
+    """Give a view the pose that fits the landmarks which it sees (PnP with MAGSAC++); False without enough of them."""
+    known = structure.known(view)
+    if known.sum() < config.min_matches:
+        return False
+    points, pixels = structure.points[view.landmark[known]], view.pixels[known]
+    params = cv2.UsacParams()
+    params.threshold, params.confidence, params.maxIterations = config.max_reprojection_error, 0.9999, 2000
+    params.score, params.sampler = cv2.SCORE_METHOD_MAGSAC, cv2.SAMPLING_UNIFORM
+    params.loMethod, params.randomGeneratorState = cv2.LOCAL_OPTIM_SIGMA, 0
+    found, _, rotation, translation, inliers = cv2.solvePnPRansac(
+        points.reshape(-1, 1, 3), pixels.reshape(-1, 1, 2), structure.K.copy(), None, params=params
+    )
+    if not found or inliers is None or len(inliers) < config.min_matches:
+        return False
+    rows = inliers.ravel()
+    rotation, translation = cv2.solvePnPRefineLM(points[rows], pixels[rows], structure.K, None, rotation, translation)
+    T_view_ref = np.eye(4)
+    T_view_ref[:3, :3], T_view_ref[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
+    view.T_ref_view = np.linalg.inv(T_view_ref)
+    return True
+
+
+def triangulate(structure: Structure, config: MatchingConfig) -> None:
+    """Give every track without a position the point nearest to its rays, where they have parallax and agree."""
+    placed = list(structure.placed().values())
+    landmark = np.concatenate([view.landmark for view in placed])
+    views = np.repeat(np.arange(len(placed)), [len(view.landmark) for view in placed])
+    pixels = np.concatenate([view.pixels for view in placed])
+    wanted = landmark >= 0
+    wanted[wanted] = np.isnan(structure.points[landmark[wanted], 0])
+    landmark, views, pixels = landmark[wanted], views[wanted], pixels[wanted]
+    if not len(landmark):
+        return
+    ids, track = np.unique(landmark, return_inverse=True)
+    poses = np.stack([view.T_ref_view for view in placed])
+    rays = np.einsum("nij,nj->ni", poses[views, :3, :3], unit_rays(pixels, structure.K))
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    hessian, right, count = np.zeros((len(ids), 3, 3)), np.zeros((len(ids), 3)), np.bincount(track)
+    np.add.at(hessian, track, across)
+    np.add.at(right, track, np.einsum("nij,nj->ni", across, poses[views, :3, 3]))
+    parallax_sq = np.linalg.eigvalsh(hessian)[:, 0] / count
+    good = (count >= 2) & (parallax_sq > config.min_parallax_rad**2)
+    points = np.full((len(ids), 3), np.nan)
+    points[good] = np.linalg.solve(hessian[good], right[good][..., None])[..., 0]
+    local = np.einsum("nji,nj->ni", poses[views, :3, :3], points[track] - poses[views, :3, 3])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error = np.linalg.norm((local @ structure.K.T)[:, :2] / local[:, 2:] - pixels, axis=1)
+        fits = (local[:, 2] > 0) & (error < config.max_reprojection_error)
+    good &= np.bincount(track, ~fits) == 0
+    structure.points[ids[good]] = points[good]
