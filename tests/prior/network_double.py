@@ -70,15 +70,15 @@ class DrawnRoom:
     """The package's synthetic room, cast at whatever grid the network has."""
 
     def __init__(self, dataset, seed, num_frames):
-        self._dataset, self._seed, self._num_frames = dataset, seed, num_frames
+        self._frames, self._seed, self._num_frames = [dataset[i] for i in range(len(dataset))], seed, num_frames
 
     def pose(self, index):
-        return self._dataset[index].T_world_camera
+        return self._frames[index].T_world_camera
 
     def which(self, image):
-        resize = plan_resize(self._dataset.size, image.shape[1::-1])
-        frames = (self._dataset[index].image for index in range(len(self._dataset)))
-        return int(np.argmin([np.abs(resize_image(frame, resize) / 255 - image).sum() for frame in frames]))
+        resize = plan_resize(self._frames[0].image.shape[1::-1], image.shape[1::-1])
+        differences = [np.abs(resize_image(frame.image, resize) / 255 - image).sum() for frame in self._frames]
+        return int(np.argmin(differences))
 
     def depth(self, index, intrinsics, size):
         focal_and_center = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].astype(float)
@@ -93,6 +93,7 @@ class Double:
         scene: `which`, `pose` and `depth` as in `Sphere`.
         convert: from arrays to what it gives out.
         unit: by what it multiplies lengths in its n-th call.
+        patch: of its grid.
         spoil: changes the outputs of one view in place.
     """
 
@@ -102,8 +103,10 @@ class Double:
         convert: Callable = np.asarray,
         unit: Callable[[int], float] = lambda call: 1.0,
         spoil: Callable = lambda index, output: None,
+        patch: int = 14,
     ):
-        self._scene, self._convert, self._unit, self._spoil, self.num_calls = scene, convert, unit, spoil, 0
+        self._scene, self._convert, self._unit, self._spoil, self._patch = scene, convert, unit, spoil, patch
+        self.num_calls = 0
         self.seen = []  # keys of every view of the last call
 
     def infer(
@@ -121,7 +124,7 @@ class Double:
         return self.answer(views)
 
     def answer(self, views):
-        check_views(views)
+        check_views(views, self._patch)
         self.seen = [set(view) for view in views]
         images = [self._image(view) for view in views]
         numbers = [self._scene.which(image) for image in images]
@@ -170,7 +173,7 @@ class Double:
         return {key: self._convert(value) for key, value in output.items()}
 
 
-def check_views(views):
+def check_views(views, patch=14):
     """Raise what the real model raises for views that break its contract (part A.5 of the reference)."""
     for number, view in enumerate(views):
         if set(view) - KEYS:
@@ -179,7 +182,9 @@ def check_views(views):
             raise ValueError(f"View {number} missing required keys")
         assert view["data_norm_type"][0] in NORMALIZATIONS, view["data_norm_type"]
         height, width = view["img"].shape[2:]
-        assert height % 14 == 0 and width % 14 == 0, f"Input shape must be divisible by patch size: {height, width}"
+        assert height % patch == 0 and width % patch == 0, (
+            f"Input shape must be divisible by patch size: {height, width}"
+        )
         if tuple(view["img"].shape) != tuple(views[0]["img"].shape):
             raise RuntimeError("stack expects each tensor to be equal size")
         for key in ("img", "intrinsics"):
