@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from emgs_jax.prior.resize import Resize, resize_image, resize_intrinsics
+from emgs_jax.prior.resize import Resize, Size, resize_image, resize_intrinsics
 
 View = dict[str, Any]  # of the framework: `img`, `data_norm_type` and what else the network is told
 NORMALIZATIONS = {  # of RGB in [0, 1]: mean, standard deviation
@@ -18,7 +18,7 @@ NORMALIZATIONS = {  # of RGB in [0, 1]: mean, standard deviation
 }
 CHECKPOINT_FILES = ("config.json", "model.safetensors")
 DINOV2_CLONE = "facebookresearch_dinov2_main"  # the name that torch.hub gives to its copy of the repository
-DOWNLOAD = "huggingface-cli download facebook/map-anything-apache --local-dir FOLDER"
+DOWNLOAD = "hf download facebook/map-anything-apache --local-dir FOLDER"
 
 
 @dataclass(frozen=True)
@@ -151,13 +151,15 @@ def build_views(
     return views
 
 
-def read_output(output: Mapping[str, np.ndarray]) -> ViewOutput:
-    """Take what the prior uses, without the batch axis; ValueError where it is not there."""
+def read_output(output: Mapping[str, np.ndarray], grid: Size) -> ViewOutput:
+    """Take what the prior uses, without the batch axis; ValueError where it is not there or not of the grid's size."""
     missing = [key for key in ("pts3d_cam", "camera_poses", "intrinsics") if key not in output]
     if missing:
         raise ValueError(f"the network's output has no {', '.join(missing)}: this version of it is not supported")
     points = np.asarray(output["pts3d_cam"][0], np.float32)
     shape = points.shape[:2]
+    if shape != grid[::-1]:
+        raise ValueError(f"the network was given images of {grid} and answered with points of {shape[::-1]}")
     return ViewOutput(
         points,
         np.asarray(output["conf"][0] if "conf" in output else np.ones(shape), np.float32),

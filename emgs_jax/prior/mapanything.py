@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from time import perf_counter
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -82,21 +83,24 @@ class MapAnything:
         folder = None if checkpoint is None else Path(checkpoint).expanduser()
         self._network = load(NetworkSettings(model, folder, compute))
         self._seconds: list[float] = []
-        settings = {
+        self.provenance = Provenance("mapanything", self._settings(model, compute) | self._network.described)
+
+    def _settings(self, model: str, compute: ComputeConfig) -> dict[str, Any]:
+        """Return what decides the predictions, as it took effect."""
+        return {
             "version": 1,
             "model": model,
             "scale": self._model.scale,
             "anchor_depth_m": self._anchor_depth_m,
             "is_calibrated": self._model.is_conditioned,
-            "anchor_pose": has_pose,
+            "anchor_pose": self._anchor_is_metric is not None,
             "anchor_is_metric": self._anchor_is_metric,
             "resolution": self._resolution,
             "max_depth_step": self._max_depth_step,
-            "masks": {name: float(value) for name, value in vars(masks).items()},
+            "masks": {name: float(value) for name, value in vars(self._masks).items()},
             "memory_efficient": compute.memory_efficient,
             "minibatch_size": compute.minibatch_size,
         }
-        self.provenance = Provenance("mapanything", settings | self._network.described)
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Accept every data set: all have images of one size with intrinsics."""
@@ -121,7 +125,7 @@ class MapAnything:
         begin = perf_counter()
         answers = self._network.infer(views)
         self._seconds.append(perf_counter() - begin)
-        outputs = [read_output(answer) for answer in answers]
+        outputs = [read_output(answer, resize.grid) for answer in answers]
         dense = [window.views.index(index) for index in window.dense]
         outputs, valid = self._scaled(outputs, dense)
         T_anchor_view = relative_poses([output.T_reference_view for output in outputs])

@@ -38,7 +38,7 @@ class TorchNetwork:
             outputs = self._call([{key: self._tensor(torch, value) for key, value in v.items()} for v in views])
             arrays = [{key: _array(value) for key, value in output.items()} for output in outputs]
         if self._device.startswith("cuda"):
-            self.peak_bytes = torch.cuda.max_memory_allocated()
+            self.peak_bytes = torch.cuda.max_memory_allocated(self._device)
         return arrays
 
     def _tensor(self, torch: ModuleType, value: Any) -> Any:
@@ -131,10 +131,10 @@ def _import(name: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError as error:
         raise ValueError(
-            f"prior=mapanything needs torch and the package mapanything, but {error}: pip install "
-            '"emgs_jax[mapanything]" (in a clone of this repository: pip install -e ".[mapanything]"), then clone the '
-            "GitHub repository facebookresearch/map-anything and in it pip install --no-deps -e . (it is in no package "
-            "index); or record with experiments.predict where both are installed and use prior=recorded here"
+            f"prior=mapanything needs torch and the package mapanything, but {error}: in a clone of this repository, "
+            'pip install -e ".[mapanything]"; then clone the GitHub repository facebookresearch/map-anything and in '
+            "it, pip install --no-deps -e . (it is in no package index); or record with experiments.predict where both "
+            "are installed and use prior=recorded here"
         ) from error
 
 

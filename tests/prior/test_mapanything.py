@@ -233,6 +233,15 @@ def test_an_output_that_lacks_geometry_is_refused():
         ask(make(Double(data, spoil=lambda i, o: (o.pop("pts3d_cam"), o.pop("camera_poses")))), data, calls(data)[0])
 
 
+def test_an_output_of_another_size_is_refused():
+    def halved(index, output):
+        output["pts3d_cam"] = output["pts3d_cam"][:, ::2, ::2]
+
+    data = Sphere()
+    with pytest.raises(ValueError, match=r"images of \(56, 42\) and answered with points of \(28, 21\)"):
+        ask(make(Double(data, spoil=halved)), data, calls(data)[0])
+
+
 def test_images_of_two_sizes_in_one_window_are_refused_with_their_names():
     data, other = Sphere(), Sphere(size=(44, 30))
     window = calls(data)[0]

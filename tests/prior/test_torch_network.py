@@ -54,7 +54,7 @@ def test_without_torch_or_the_framework_the_prior_says_what_to_install(monkeypat
         hydra.utils.instantiate(config)
     said = str(raised.value.__cause__)
     assert isinstance(raised.value.__cause__, ValueError) and missing in said
-    for part in ('pip install "emgs_jax[mapanything]"', "facebookresearch/map-anything", "--no-deps", "prior=recorded"):
+    for part in ('-e ".[mapanything]"', "facebookresearch/map-anything", "--no-deps", "prior=recorded"):
         assert part in said
 
 
