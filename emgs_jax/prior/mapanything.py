@@ -80,6 +80,10 @@ class MapAnything:
         has_pose = self._model.is_conditioned and anchor_pose in (True, "on")
         self._anchor_is_metric = bool(anchor_is_metric) if has_pose else None
         self._anchor_depth_m = float(anchor_depth_m) if self._model.scale == "arbitrary" else None
+        if checkpoint is not None and not self._model.is_conditioned:
+            raise ValueError(
+                f"prior.checkpoint is for prior.model=mapanything; {model} reads its weights from the caches"
+            )
         folder = None if checkpoint is None else Path(checkpoint).expanduser()
         self._network = load(NetworkSettings(model, folder, compute))
         self._seconds: list[float] = []
@@ -97,7 +101,7 @@ class MapAnything:
             "anchor_is_metric": self._anchor_is_metric,
             "resolution": self._resolution,
             "max_depth_step": self._max_depth_step,
-            "masks": {name: float(value) for name, value in vars(self._masks).items()},
+            "masks": {name: float(str(value)) for name, value in vars(self._masks).items()},  # .03, not .029999999
             "memory_efficient": compute.memory_efficient,
             "minibatch_size": compute.minibatch_size,
         }

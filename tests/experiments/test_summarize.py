@@ -6,7 +6,6 @@ import pytest
 
 from experiments.summarize import read_runs, table
 
-
 SIMULATED = {"_target_": "emgs_jax.prior.simulated.Simulated", "level": 1.0}
 
 

@@ -110,6 +110,7 @@ def test_the_anchors_pose_and_its_flag_are_switches_that_reach_the_network(overr
     depth = data.depth(window.dense[0], frame_matrix(data), (56, 42))
     np.testing.assert_allclose(prediction.points[0][..., 2], scale * depth, rtol=1e-5)
     settings = prior.provenance.settings
+    assert settings["masks"]["max_edge_step"] == 0.03
     assert settings["anchor_pose"] is bool(anchor_keys)
     assert settings["anchor_is_metric"] == (("anchor_is_metric=true" in overrides) if anchor_keys else None)
 
@@ -250,6 +251,11 @@ def test_images_of_two_sizes_in_one_window_are_refused_with_their_names():
         make(Double(data)).predict(window, frames, data.intrinsics)
     with pytest.raises(ValueError, match="in that order"):
         make(Double(data)).predict(window, frames[::-1], data.intrinsics)
+
+
+def test_a_checkpoint_for_a_network_that_takes_none_is_refused():
+    with pytest.raises(hydra.errors.InstantiationException, match="vggt reads its weights from the caches"):
+        make(Double(Sphere()), "model=vggt", "checkpoint=somewhere")
 
 
 @pytest.mark.parametrize(
