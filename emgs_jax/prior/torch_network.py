@@ -58,6 +58,8 @@ def load_network(settings: NetworkSettings) -> Network:
     torch, model = _import("torch"), MODELS[settings.model]
     _import("torch.hub")
     device = settings.compute.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(f"prior.compute.device={device}, but torch {torch.__version__} finds no GPU: use cpu or null")
     if model.needs_gpu and not device.startswith("cuda"):
         raise ValueError(f"prior.model={settings.model} cannot be built without a GPU: use prior.model=mapanything")
     amp = settings.compute.amp if device.startswith("cuda") else "float32"

@@ -249,6 +249,12 @@ def test_a_network_that_needs_a_gpu_says_so(torch, model):
         load_network(settings(model))
 
 
+def test_a_gpu_that_is_not_there_is_named(torch, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match="device=cuda:1, but torch .* finds no GPU"):
+        load_network(settings(device="cuda:1"))
+
+
 def test_nothing_is_downloaded_while_a_network_is_loaded(torch, no_network, tmp_path):
     with torch_network._offline(torch):
         with pytest.raises(OSError, match="clone the GitHub repository owner/name"):
