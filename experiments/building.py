@@ -30,6 +30,11 @@ def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
     return prior
 
 
+def measured(prior: Prior) -> dict[str, float]:
+    """What a prior measured of itself while it predicted, under `prior/`; nothing for most."""
+    return prior.report() if hasattr(prior, "report") else {}
+
+
 def use_compilation_cache(config: DictConfig) -> None:
     """Keep executables in the folder that the config names, for the next process; null keeps none."""
     if config.compilation_cache is not None:

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from emgs_jax.prior.base import Window
 from emgs_jax.prior.recorded import record
-from experiments.building import build_dataset, build_prior, clear_errors
+from experiments.building import build_dataset, build_prior, clear_errors, measured
 
 
 def predict(config: DictConfig) -> Path:
@@ -29,6 +29,8 @@ def predict(config: DictConfig) -> Path:
     size = sum(path.stat().st_size for path in folder.iterdir())
     print(f"{folder}: {size / 2**20:.1f} MiB, {dataset.name} {dataset.sequence}, {len(dataset)} frames")
     print(f"prior {prior.provenance.name} {prior.provenance.settings}")
+    for key, value in measured(prior).items():
+        print(f"{key} {value:.4g}")
     return folder
 
 

@@ -20,7 +20,7 @@ from emgs_jax.evaluation.report import print_metrics_table, provenance, write_me
 from emgs_jax.files import FrameLog
 from emgs_jax.pipeline import FrameRecord, MappingRun, map_frames, new_run
 from emgs_jax.prior.base import Prior
-from experiments.building import build_dataset, build_prior, clear_errors, use_compilation_cache
+from experiments.building import build_dataset, build_prior, clear_errors, measured, use_compilation_cache
 
 
 def run(config: DictConfig, folder: Path) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         with clock.phase("evaluate"):
             clouds = scoring.Clouds(dense.cloud, outputs.center_cloud(session), raw_cloud)
             metrics = scoring.score(session, clouds, dataset, evaluation)
-        metrics |= scoring.describe(session, len(dataset.skipped)) | scoring.spent(clock)
+        metrics |= scoring.describe(session, len(dataset.skipped)) | scoring.spent(clock) | measured(prior)
     settings = OmegaConf.to_container(config, resolve=True)
     seed = prior.provenance.settings.get("seed", 0)
     metrics["provenance"] = provenance(settings, dataset, prior.provenance, seed)
@@ -82,6 +82,8 @@ def main(config: DictConfig) -> float:
         use_compilation_cache(config)
         metrics = run(config, folder)
     print(print_metrics_table(metrics) if "trajectory/num_frames" in metrics else "no ground truth, so no errors")
+    for key in (key for key in metrics if key.startswith("prior/")):
+        print(f"{key} {metrics[key]:.4g}")
     print(f"{metrics['time/seconds_per_frame']:.2f} s a frame; everything is in {folder}")
     error = metrics.get("trajectory/ate_sim3_m")
     return math.inf if error is None else error

@@ -32,7 +32,8 @@ def row_name(metrics: dict[str, Any]) -> str:
     preset = "paper" if config["slam"]["initialization"] == "merged" else "default"
     dataset = config["dataset"]["_target_"].split(".")[-2]
     level = config["prior"].get("level")
-    prior = config["prior"]["_target_"].split(".")[-2] + ("" if level is None else f" {level:g}")
+    name = config["prior"].get("model", config["prior"]["_target_"].split(".")[-2])
+    prior = name + ("" if level is None else f" {level:g}")
     return f"{dataset}, {prior}, {preset}"
 
 

@@ -9,6 +9,7 @@ import pytest
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, compose, dataset
 
 from emgs_jax.prior.base import windows
+from emgs_jax.prior.simulated import Simulated
 from experiments.predict import predict
 from experiments.run import run
 
@@ -40,6 +41,14 @@ def test_recording_again_asks_only_for_what_is_missing(tmp_path):
     record(folder)
     assert (folder / "000002.npz").read_bytes() == content
     assert (folder / "000000.npz").stat().st_mtime_ns == kept
+
+
+def test_what_a_prior_measures_of_itself_is_printed(tmp_path, capsys, monkeypatch):
+    record(tmp_path / "silent")
+    assert "prior/" not in capsys.readouterr().out
+    monkeypatch.setattr(Simulated, "report", lambda self: {"prior/seconds_per_inference": 1.25}, raising=False)
+    record(tmp_path / "measured")
+    assert "prior/seconds_per_inference 1.25" in capsys.readouterr().out
 
 
 @pytest.mark.slow

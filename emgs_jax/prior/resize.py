@@ -1,0 +1,173 @@
+"""From a data set's frames to a network's grid and back: MapAnything's resize-and-crop rule, in NumPy.
+
+Sizes are (width, height) and pixel centres are at integers. The frame is scaled until it covers the grid, rounded down
+to whole pixels and cropped about its centre. The network's intrinsics follow the scale, as upstream; the resampling
+follows the rounded size, so that at the sides of some grids a ray is up to a third of a pixel off.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+from PIL import Image
+
+Size = tuple[int, int]
+
+GRIDS: dict[int, dict[float, Size]] = {  # resolution set -> aspect -> grid, upstream's `fixed_mapping`
+    518: {
+        3.083: (518, 168),
+        2.056: (518, 252),
+        1.762: (518, 294),
+        1.542: (518, 336),
+        1.321: (518, 392),
+        1.000: (518, 518),
+        0.757: (392, 518),
+        0.649: (336, 518),
+        0.567: (294, 518),
+        0.486: (252, 518),
+    },
+    512: {
+        3.200: (512, 160),
+        2.000: (512, 256),
+        1.778: (512, 288),
+        1.524: (512, 336),
+        1.333: (512, 384),
+        1.000: (512, 512),
+        0.750: (384, 512),
+        0.656: (336, 512),
+        0.562: (288, 512),
+        0.500: (256, 512),
+    },
+    504: {
+        3.273: (504, 154),
+        2.118: (504, 238),
+        1.800: (504, 280),
+        1.565: (504, 322),
+        1.333: (504, 378),
+        1.000: (504, 504),
+        0.750: (378, 504),
+        0.639: (322, 504),
+        0.556: (280, 504),
+        0.472: (238, 504),
+    },
+}
+
+
+@dataclass(frozen=True)
+class Resize:
+    """How frames of one size come onto a grid.
+
+    Args:
+        frame: size of the frames.
+        grid: size of what the network sees.
+        scaled: size of the frame before the crop.
+        corner: (left, top) pixel of the crop in the scaled frame.
+        scale: of the intrinsics.
+    """
+
+    frame: Size
+    grid: Size
+    scaled: Size
+    corner: tuple[int, int]
+    scale: float
+
+
+def choose_grid(frame: Size, resolution_set: int) -> Size:
+    """The grid of a set whose aspect is nearest to that of the frames."""
+    grids = GRIDS[resolution_set]
+    return grids[min(grids, key=lambda aspect: abs(aspect - frame[0] / frame[1]))]
+
+
+def plan_resize(frame: Size, grid: Size) -> Resize:
+    """Scale and crop that bring `frame` onto `grid`; the identity where both are the same."""
+    scale = max(grid[0] / frame[0], grid[1] / frame[1]) + 1e-8  # upstream's guard against rounding below the grid
+    scaled = math.floor(frame[0] * scale), math.floor(frame[1] * scale)
+    corner = round((scaled[0] - grid[0]) / 2), round((scaled[1] - grid[1]) / 2)
+    return Resize((frame[0], frame[1]), (grid[0], grid[1]), scaled, corner, scale)
+
+
+def resize_intrinsics(intrinsics: Sequence[float], resize: Resize) -> Float32[np.ndarray, "3 3"]:
+    """Camera matrix on the grid of fx, fy, cx, cy on the frame; float32, because the network refuses float64."""
+    fx, fy, *center = intrinsics
+    cx, cy = (
+        (c + 0.5) * resize.scale - 0.5 * (size * resize.scale - scaled) - 0.5 - corner
+        for c, size, scaled, corner in zip(center, resize.frame, resize.scaled, resize.corner, strict=True)
+    )
+    return np.array([[fx * resize.scale, 0, cx], [0, fy * resize.scale, cy], [0, 0, 1]], np.float32)
+
+
+def resize_image(image: UInt8[np.ndarray, "h w 3"], resize: Resize) -> UInt8[np.ndarray, "_ _ 3"]:
+    """The frame on the grid: Lanczos where it gets smaller, bicubic where it gets larger, then the crop."""
+    method = Image.Resampling.LANCZOS if resize.scale < 1 else Image.Resampling.BICUBIC
+    (left, top), (width, height) = resize.corner, resize.grid
+    return np.asarray(Image.fromarray(image).resize(resize.scaled, method))[top : top + height, left : left + width]
+
+
+def frame_on_grid(resize: Resize) -> tuple[Float[np.ndarray, " w"], Float[np.ndarray, " h"]]:
+    """Grid column of every column of the frame, grid row of every row; not whole, and beyond the grid where cropped."""
+    columns, rows = (
+        (np.arange(size) + 0.5) * (scaled / size) - 0.5 - corner
+        for size, scaled, corner in zip(resize.frame, resize.scaled, resize.corner, strict=True)
+    )
+    return columns, rows
+
+
+def to_frame(
+    points: Float32[np.ndarray, "gh gw 3"],
+    confidence: Float32[np.ndarray, "gh gw"],
+    mask: Bool[np.ndarray, "gh gw"],
+    resize: Resize,
+    max_depth_step: float,
+) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Points, confidence and mask of a view at every pixel of its frame.
+
+    The nearest grid pixel decides the mask and the confidence, and beyond the crop the mask is off. The point is
+    interpolated where the four grid pixels around are all valid and of one surface, else it is the nearest one's.
+    Ray and inverse depth are what is interpolated: both are linear on a plane.
+
+    Args:
+        points: camera frame, metres, at the pixels of the grid.
+        confidence: at least 1.
+        mask: True where the point can be used.
+        resize: from the frame to the grid.
+        max_depth_step: relative depth difference above which pixels lie on different surfaces.
+
+    Returns:
+        Where the mask is off, the point is 0 and the confidence 1.
+    """
+    columns, rows = frame_on_grid(resize)
+    height, width = mask.shape
+    column, row = np.floor(columns + 0.5).astype(int), np.floor(rows + 0.5).astype(int)
+    is_inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))
+    nearest = np.ix_(row.clip(0, height - 1), column.clip(0, width - 1))
+    on = is_inside & mask[nearest]
+    between, is_between = _interpolate(points, mask, columns, rows, max_depth_step)
+    chosen = np.where((on & is_between)[..., None], between, points[nearest])
+    return (
+        np.where(on[..., None], chosen, 0).astype(np.float32),
+        np.where(on, confidence[nearest], 1).astype(np.float32),
+        on,
+    )
+
+
+def _interpolate(
+    points: np.ndarray, mask: np.ndarray, columns: np.ndarray, rows: np.ndarray, max_depth_step: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (h, w, 3) between the grid's pixels, and where they are defined (h, w); whole pixels need none."""
+    height, width = mask.shape
+    left, top = np.floor(columns).astype(int).clip(0, width - 2), np.floor(rows).astype(int).clip(0, height - 2)
+    x, y = (columns - left)[None, :], (rows - top)[:, None]
+    depth = np.where(mask, points[..., 2], 1)
+    coordinates = np.stack([points[..., 0] / depth, points[..., 1] / depth, 1 / depth], axis=-1)
+    mixed, low, high, is_whole = 0.0, np.inf, -np.inf, True
+    for down, right, weight in ((0, 0, (1 - y) * (1 - x)), (0, 1, (1 - y) * x), (1, 0, y * (1 - x)), (1, 1, y * x)):
+        corner = np.ix_(top + down, left + right)
+        mixed = mixed + weight[..., None] * coordinates[corner]
+        low, high = np.minimum(low, depth[corner]), np.maximum(high, depth[corner])
+        is_whole = is_whole & mask[corner]
+    is_within = (x >= 0) & (x <= 1) & (y >= 0) & (y <= 1) & ((x % 1 != 0) | (y % 1 != 0))
+    is_defined = is_whole & is_within & (high - low <= max_depth_step * low)
+    inverse = np.where(is_defined, mixed[..., 2], 1)
+    return np.stack([mixed[..., 0] / inverse, mixed[..., 1] / inverse, 1 / inverse], axis=-1), is_defined
