@@ -33,6 +33,8 @@ def row_name(metrics: dict[str, Any]) -> str:
     dataset = config["dataset"]["_target_"].split(".")[-2]
     level = config["prior"].get("level")
     prior = config["prior"]["_target_"].split(".")[-2] + ("" if level is None else f" {level:g}")
+    features = metrics["provenance"]["prior"]["settings"].get("features")
+    prior += "" if features is None else f" + {features['model']['name']}"
     return f"{dataset}, {prior}, {preset}"
 
 
