@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from tiny_run import TINY
 
 from emgs_jax.prior.recorded import Recorded
@@ -31,6 +32,7 @@ runpy.run_module(script, run_name="__main__")
 """
 
 
+@pytest.mark.slow
 def test_recording_and_embedding_need_no_jax(tmp_path):
     features = ("features=random", "features.classes=[wall,floor]")
     python(WITHOUT_JAX, "experiments.predict", *TINY, *features, f"out={tmp_path / 'live'}")
@@ -66,6 +68,7 @@ print([name for name in sys.modules if name.split(".")[0] in ("torch", "transfor
 """
 
 
+@pytest.mark.slow
 def test_mapping_a_recording_imports_no_pytorch(tmp_path):
     """Packages of these names that can be imported stand in the way, so that an import would be seen anywhere."""
     for name in ("torch", "transformers"):
