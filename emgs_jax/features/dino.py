@@ -85,8 +85,8 @@ class DinoText:
         """Encode the prompts of each name and average the half that is aligned with patches."""
         import torch
 
-        names_of_files = [self._files.text_encoder, self._files.vocabulary]
-        encoder, vocabulary = require(self._folder, names_of_files, self._files.source)
+        needed = [self._files.text_encoder, self._files.vocabulary, self._files.vision_head]
+        encoder, vocabulary, _ = require(self._folder, needed, self._files.source)
         weights = load_part(encoder, "text_model.", "backbone.token_embedding.weight")
         sizes = len(weights["backbone.token_embedding.weight"]), len(weights["backbone.positional_embedding"])
         tokenizer = Tokenizer(vocabulary, *sizes)
@@ -139,7 +139,7 @@ class DinoText:
                 f"{path} is for a backbone of width {len(head['ln_final.weight'])}, the one in {folder} has "
                 f"{backbone.config.hidden_size}: take the backbone that {self._files.source} names"
             )
-        return backbone.eval().to(self._device), {name: value.to(self._device) for name, value in head.items()}
+        return backbone.eval().float().to(self._device), {name: value.to(self._device) for name, value in head.items()}
 
 
 def patch_grid(tokens: "Tensor", grid: tuple[int, int]) -> "Tensor":
