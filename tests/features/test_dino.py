@@ -178,3 +178,18 @@ def test_weights_that_would_run_code_are_refused(tmp_path):
     with pytest.raises(ValueError, match="head.pth is no file of weights"):
         model.extract(images()[0])
     assert not (tmp_path / "ran").exists()
+
+
+def test_a_gpu_without_memory_says_what_to_lower(tmp_path):
+    class Full:
+        config = dinov3().config
+
+        def __call__(self, values):
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+
+    model = make(tmp_path, "dinov3_text")
+    model.__dict__["_vision"] = Full(), {}
+    with pytest.raises(
+        ValueError, match="no memory for 5x3 patches: lower features.image.long_side=80 or set features"
+    ):
+        model.extract(images()[0])
