@@ -117,26 +117,56 @@ def normals_from_pointmap(
     return jnp.where(is_fitted[..., None], normals, 0.0)
 
 
+def sample_features(grid: Float[Array, "y x f"], size: tuple[int, int], thin: int) -> Float[Array, "h w f"]:
+    """Features of every `thin`-th row and column of an image, from a grid of cells that together cover the image.
+
+    Pixel u of W lies at ((u + ½) x / W) - ½ among x columns, and rows likewise: bilinear between the cells' centres,
+    the border cell's beyond them, unit length again. One cell per pixel is taken as it is.
+
+    Args:
+        grid: unit features, zero where there is none.
+        size: (height, width) of the image.
+        thin: step between the pixels.
+    """
+    if grid.shape[:2] == size:
+        return grid[::thin, ::thin]
+    for axis, length in enumerate(size):
+        cells = grid.shape[axis]
+        at = jnp.clip((jnp.arange(0, length, thin) + 0.5) * (cells / length) - 0.5, 0.0, cells - 1.0)
+        low = jnp.floor(at).astype(jnp.int32)
+        share = jnp.expand_dims(at - low, [other for other in range(3) if other != axis])
+        before, after = (jnp.take(grid, index, axis=axis) for index in (low, jnp.minimum(low + 1, cells - 1)))
+        grid = (1.0 - share) * before + share * after
+    return safe_normalize(grid)
+
+
 def observe(
     points: Float[Array, "h w 3"],
     colors: Float[Array, "h w 3"],
-    features: Float[Array, "h w f"],
+    features: Float[Array, "y x f"],
     confidence: Float[Array, "h w"],
     mask: Bool[Array, "h w"],
     config: ObservationConfig,
 ) -> Observation:
-    """Normals from the full point map, then every `thin`-th row and column as rows of an `Observation`."""
+    """Normals from the full point map, then every `thin`-th row and column as rows of an `Observation`.
+
+    `features` is a grid of any resolution that covers the image, see `sample_features`.
+    """
     is_finite = jnp.all(jnp.isfinite(points), axis=-1) & (points[..., 2] > 0)
     valid = mask & is_finite & (confidence >= config.min_confidence)
     points = jnp.where(valid[..., None], points, 0.0)
     normals = normals_from_pointmap(points, valid, config)
     # A point without a normal lies on a sliver or in a hole's rim, where a prior guesses.
     valid &= jnp.any(normals != 0, axis=-1)
-    keep = valid[..., None]
-    colors, features = jnp.where(keep, colors, 0.0), jnp.where(keep, features, 0.0)
-    image = Observation(points, colors, normals, features, jnp.where(valid, confidence, 1.0), valid)
-    thinned = jax.tree.map(lambda leaf: leaf[:: config.thin, :: config.thin], image)
-    return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), thinned)
+    confidence = jnp.where(valid, confidence, 1.0)
+    thin = config.thin
+    points, colors, normals, confidence, valid = (
+        image[::thin, ::thin] for image in (points, colors, normals, confidence, valid)
+    )
+    features = sample_features(features, mask.shape, thin)
+    colors, features = (jnp.where(valid[..., None], image, 0.0) for image in (colors, features))
+    image = Observation(points, colors, normals, features, confidence, valid)
+    return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), image)
 
 
 def transform(T_target_source: jaxlie.SE3, observation: Observation, scale: Float[Array, ""]) -> Observation:

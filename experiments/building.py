@@ -5,7 +5,6 @@ import os
 from collections.abc import Iterator
 from functools import partial
 
-import jax
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
@@ -14,6 +13,7 @@ from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior
+from emgs_jax.prior.featured import Featured, Requeried
 
 
 def build_dataset(config: DictConfig) -> ReadableFrames:
@@ -25,7 +25,7 @@ def build_dataset(config: DictConfig) -> ReadableFrames:
 def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
     """The prior of a config; raises ValueError where it cannot answer for the data set."""
     known = {"classes": list(dataset.classes)} if "classes" in config.prior else {}
-    prior = instantiate(config.prior, **known)
+    prior = attach_features(config.features, dataset, instantiate(config.prior, **known))
     prior.check(dataset, config.slam.window_size)
     return prior
 
@@ -35,9 +35,21 @@ def measured(prior: Prior) -> dict[str, float]:
     return prior.report() if hasattr(prior, "report") else {}
 
 
+def attach_features(config: DictConfig, dataset: ReadableFrames, prior: Prior) -> Prior:
+    """The prior with the features of a config; without a feature model its own, compared with the text of a file."""
+    if "_target_" not in config:
+        return prior if config.text is None else Requeried(prior, config.text)
+    classes = config.classes
+    if classes is None:  # all names of the file, or the data set's
+        classes = dataset.classes if config.text is None else ()
+    return Featured(prior, instantiate(config, classes=list(classes)))
+
+
 def use_compilation_cache(config: DictConfig) -> None:
     """Keep executables in the folder that the config names, for the next process; null keeps none."""
     if config.compilation_cache is not None:
+        import jax  # here, because experiments.predict and experiments.embed run where there is no JAX
+
         jax.config.update("jax_compilation_cache_dir", os.path.expanduser(config.compilation_cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 

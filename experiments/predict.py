@@ -1,7 +1,8 @@
-"""Record what a prior says of a sequence: `python -m experiments.predict dataset=… prior=… out=DIR`.
+"""Record what a prior says of a sequence: `python -m experiments.predict dataset=… prior=… features=… out=DIR`.
 
 `prior=recorded prior.folder=DIR` replays it in `experiments.run`. An interrupted recording is completed by the same
-command.
+command. This script needs no JAX, unless the prior does, and mapping a recording needs no PyTorch: each may have its
+own environment.
 """
 
 from collections.abc import Iterable, Sequence
@@ -26,8 +27,9 @@ def predict(config: DictConfig) -> Path:
 
     folder = Path(config.out)
     record(prior, dataset, config.slam.window_size, folder, progress)
-    size = sum(path.stat().st_size for path in folder.iterdir())
-    print(f"{folder}: {size / 2**20:.1f} MiB, {dataset.name} {dataset.sequence}, {len(dataset)} frames")
+    size = sum(path.stat().st_size for path in folder.iterdir()) / 2**20
+    per_frame = f"{size / len(dataset):.2f} a frame"
+    print(f"{folder}: {size:.1f} MiB, {per_frame}, {dataset.name} {dataset.sequence}, {len(dataset)} frames")
     print(f"prior {prior.provenance.name} {prior.provenance.settings}")
     for key, value in measured(prior).items():
         print(f"{key} {value:.4g}")

@@ -32,8 +32,9 @@ def row_name(metrics: dict[str, Any]) -> str:
     preset = "paper" if config["slam"]["initialization"] == "merged" else "default"
     dataset = config["dataset"]["_target_"].split(".")[-2]
     level = config["prior"].get("level")
-    name = config["prior"].get("model", config["prior"]["_target_"].split(".")[-2])
-    prior = name + ("" if level is None else f" {level:g}")
+    prior = config["prior"]["_target_"].split(".")[-2] + ("" if level is None else f" {level:g}")
+    features = metrics["provenance"]["prior"]["settings"].get("features")
+    prior += "" if features is None else f" + {features['model']['name']}"
     return f"{dataset}, {prior}, {preset}"
 
 

@@ -78,6 +78,15 @@ def test_nothing_is_pickled():
         assert "allow_pickle=True" not in path.read_text(), path
 
 
+def test_pytorch_is_imported_inside_functions_only_so_that_the_rest_works_without_it():
+    for path in [*FILES, *sorted((PACKAGE.parent / "experiments").glob("*.py"))]:
+        tree = ast.parse(path.read_text())
+        for node in tree.body:  # what is inside `if TYPE_CHECKING` is for readers and type checkers
+            if isinstance(node, (ast.Import, ast.ImportFrom)):
+                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module]
+                assert not {name.split(".")[0] for name in names} & {"torch", "torchvision", "transformers"}, path
+
+
 def functions():
     for path in FILES:
         for node in ast.walk(ast.parse(path.read_text())):

@@ -8,7 +8,7 @@ import pytest
 from scene import assert_same, observe_room, path_pose, pose
 
 from emgs_jax.camera import pixel_grid, rays
-from emgs_jax.observation import normals_from_pointmap, observe, transform
+from emgs_jax.observation import normals_from_pointmap, observe, sample_features, transform
 
 normals_from_pointmap, observe = eqx.filter_jit(normals_from_pointmap), eqx.filter_jit(observe)
 
@@ -113,6 +113,39 @@ def test_a_row_is_a_pixel_of_the_thinned_image_row_major(camera, config, thin):
     assert o.valid.all()
     full = normals_from_pointmap(inputs[0], EVERY, config().observation)[::thin, ::thin].reshape(-1, 3)
     np.testing.assert_array_equal(o.normals, full)  # normals come from the full point map
+
+
+@pytest.mark.parametrize("thin", [1, 3])
+@pytest.mark.parametrize("cells", [(5, 7), (48, 40), (1, 1)])
+def test_a_grid_of_features_is_sampled_at_the_pixels_by_the_rule_of_its_centres(thin, cells):
+    """A feature that is linear in the position, before it is made a unit vector, is met exactly between the centres."""
+    (height, width), (rows, columns) = (24, 33), cells
+    at_row, at_column = (np.arange(n) + 0.5 for n in cells)  # of the centres, in cells
+    v, u = at_row * height / rows - 0.5, at_column * width / columns - 0.5  # in pixels
+
+    def feature(v, u):
+        return np.stack(np.broadcast_arrays(1.0, 0.1 * v[:, None], -0.2 * u[None, :]), axis=-1)
+
+    sampled = sample_features(jnp.asarray(feature(v, u), jnp.float32), (height, width), thin)
+    pixels = np.arange(0, height, thin).clip(v[0], v[-1]), np.arange(0, width, thin).clip(u[0], u[-1])
+    expected = feature(*pixels)
+    expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
+    np.testing.assert_allclose(sampled, expected, atol=2e-6)  # float32
+
+
+def test_a_grid_of_one_cell_per_pixel_is_taken_bit_for_bit():
+    grid = jnp.asarray(np.random.default_rng(0).normal(size=(6, 9, 4)), jnp.float32)
+    np.testing.assert_array_equal(sample_features(grid, (6, 9), 2), grid[::2, ::2])
+
+
+def test_an_observation_holds_the_sampled_features_where_it_is_valid(camera, config):
+    points, colors, _, confidence, mask = example(camera)
+    mask[6:9, 4:7] = False
+    grid = jnp.asarray(np.random.default_rng(1).normal(size=(3, 4, 5)), jnp.float32)
+    o = observe(points, colors, grid, confidence, mask, config("observation.thin=2").observation)
+    expected = np.asarray(sample_features(grid, (24, 32), 2)).reshape(-1, 5)
+    np.testing.assert_allclose(o.features, np.where(o.valid[:, None], expected, 0), atol=1e-6)
+    assert not o.valid.all()
 
 
 def test_features_of_width_zero_are_possible(camera, config):

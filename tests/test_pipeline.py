@@ -111,6 +111,14 @@ def test_a_first_view_without_a_point_is_an_error_and_not_a_run_that_never_maps(
         map_tiny(dataset(), EditedPrior(edit))
 
 
+def test_features_without_a_grid_for_each_dense_view_are_refused():
+    def edit(prediction):
+        return replace(prediction, features=prediction.features[0])
+
+    with pytest.raises(ValueError, match=r"features have shape \(48, 64, 16\) at frame 2, expected \(3, rows, columns"):
+        map_tiny(dataset(), EditedPrior(edit))
+
+
 @pytest.mark.slow
 def test_the_merged_initialization_makes_the_map_from_the_whole_window():
     """Only the first window: `initialization` is static, so a step would be compiled anew."""

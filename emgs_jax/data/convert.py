@@ -30,13 +30,17 @@ def _check(prediction: PriorPrediction, frames: Mapping[int, Frame]) -> None:
         ("points", prediction.points.shape[:-1]),
         ("confidence", prediction.confidence.shape),
         ("mask", prediction.mask.shape),
-        ("features", prediction.features.shape[:-1]),
     ):
         if got != expected:
             raise ValueError(
                 f"the prior's {name} have shape {got} at frame {prediction.window.current}, expected {expected} "
                 "(dense views, height, width): predict at the data set's size"
             )
+    if prediction.features.ndim != 4 or len(prediction.features) != expected[0]:
+        raise ValueError(
+            f"the prior's features have shape {prediction.features.shape} at frame {prediction.window.current}, "
+            f"expected ({expected[0]}, rows, columns, width): a grid that covers the image of each dense view"
+        )
 
 
 def _observation(prediction: PriorPrediction, view: int, frame: Frame, config: ObservationConfig) -> Observation:

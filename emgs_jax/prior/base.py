@@ -37,7 +37,8 @@ class PriorPrediction:
         points: camera-frame points, metres, float32 (d, h, w, 3), rows as in `window.dense`; 0 where the mask is off.
         confidence: float32 (d, h, w), at least 1; higher is better.
         mask: bool (d, h, w), True where the point can be used.
-        features: text-aligned unit features (d, h, w, f), float16; f = 0 without features.
+        features: text-aligned unit features (d, y, x, f), float16, on a grid of y by x cells that cover the image, from
+            one cell per patch of a network to one per pixel; 0 where there is none, f = 0 without features.
     """
 
     window: Window

@@ -1,6 +1,6 @@
 """Predictions written to disk once and replayed bit for bit.
 
-The format `emgs_jax.predictions`, version 1, is a folder; nothing in it is ever unpickled:
+The format `emgs_jax.predictions`, version 2, is a folder; nothing in it is ever unpickled:
 
 - `manifest.json`: UTF-8 JSON object with `format`, `version`, `dataset` (name, sequence, fingerprint, num_frames, size,
   intrinsics), `window_size`, `provenance` (name, settings, is_simulated), `feature_names`, `num_inferences`,
@@ -8,7 +8,8 @@ The format `emgs_jax.predictions`, version 1, is a folder; nothing in it is ever
   keys, as JSON with sorted keys and without spaces), so that no changed bit goes unnoticed.
 - `text_features.npz`: the array `text_features` (classes, f).
 - `000000.npz`, …, one file per inference: `inference` (), `views` (v,), `dense` (d,), `current` () and the arrays of
-  `PriorPrediction` in the dtypes stated there: about d·h·w·(17 + 2f) bytes.
+  `PriorPrediction` in the dtypes stated there: about d·(17·h·w + 2·y·x·f) bytes. Features are float16; points are
+  not, because a float16 step is 2 mm at 2 to 4 m. Version 1, whose features have one cell per pixel, is read as well.
 
 Each file is written under a temporary name and then renamed, data before the manifest: a full disk or an interrupted
 run leaves a valid folder, which `record` completes.
@@ -28,14 +29,15 @@ from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.files import atomic_write
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows
 
-FORMAT, VERSION = "emgs_jax.predictions", 1
+FORMAT, VERSION = "emgs_jax.predictions", 2
+READABLE = (1, 2)
 REMEDY = "record it again with `python -m experiments.predict`"
-FIELDS = {  # array -> dtype and the axes that it has; axes of one name have one length
+FIELDS = {  # array -> dtype and the axes that it has; d, v, h, w, i, j, c have one length each, y, x, f are free
     "T_anchor_view": (np.float64, "vij"),
     "points": (np.float32, "dhwc"),
     "confidence": (np.float32, "dhw"),
     "mask": (np.bool_, "dhw"),
-    "features": (np.float16, "dhwf"),
+    "features": (np.float16, "dyxf"),
 }
 
 
@@ -138,7 +140,7 @@ def _check_arrays(path: Path, arrays: dict[str, np.ndarray], sizes: dict[str, in
     sizes = sizes | {"i": 4, "j": 4, "c": 3}
     for key, (dtype, axes) in FIELDS.items():
         got = arrays[key]
-        expected = tuple(sizes.get(axis, got.shape[-1] if got.ndim else 0) for axis in axes)
+        expected = tuple(sizes.get(axis, got.shape[k] if k < got.ndim else 0) for k, axis in enumerate(axes))
         if got.dtype != dtype or got.shape != expected:
             raise ValueError(
                 f"{path}: {key} must be {np.dtype(dtype)} {expected}, got {got.dtype} {got.shape}: {REMEDY}"
@@ -196,8 +198,8 @@ def _read_manifest(folder: Path) -> dict:
         raise ValueError(f"{path} is damaged ({error}): {REMEDY}") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ValueError(f"{path} is not of the format {FORMAT}: {REMEDY}")
-    if manifest.get("version") != VERSION:
-        raise ValueError(f"{path} has version {manifest.get('version')}, this program reads {VERSION}: {REMEDY}")
+    if manifest.get("version") not in READABLE:
+        raise ValueError(f"{path} has version {manifest.get('version')}, this program reads {READABLE}: {REMEDY}")
     if manifest.pop("sha256", None) != _digest(manifest):
         raise ValueError(f"{path} is damaged (its SHA-256 does not fit): delete the folder and {REMEDY}")
     return manifest

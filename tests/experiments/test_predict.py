@@ -21,7 +21,9 @@ def record(folder: Path, *overrides: str) -> Path:
 def test_the_recording_holds_what_the_prior_says_of_every_window(tmp_path, capsys):
     record(tmp_path / "out")
     said = capsys.readouterr().out
-    assert "simulated" in said and "MiB" in said and "'level': 1.0" in said
+    assert "simulated" in said and "'level': 1.0" in said
+    size = sum(path.stat().st_size for path in (tmp_path / "out").iterdir()) / 2**20
+    assert f"{size:.1f} MiB, {size / NUM_FRAMES:.2f} a frame" in said
     prior = hydra.utils.instantiate(compose().prior, classes=list(dataset().classes))
     calls = list(windows(NUM_FRAMES, WINDOW_SIZE))
     for window in calls:
@@ -52,9 +54,11 @@ def test_what_a_prior_measures_of_itself_is_printed(tmp_path, capsys, monkeypatc
 
 
 @pytest.mark.slow
-def test_a_run_from_the_recording_writes_the_same_bytes_as_the_live_run(tmp_path):
-    folder = record(tmp_path / "out")
-    for name, overrides in (("live", ()), ("replay", ("prior=recorded", f"prior.folder={folder}"))):
+@pytest.mark.parametrize("features", ["none", "random"])
+def test_a_run_from_the_recording_writes_the_same_bytes_as_the_live_run(tmp_path, features):
+    live = (f"features={features}",)
+    folder = record(tmp_path / "out", *live)
+    for name, overrides in (("live", live), ("replay", ("prior=recorded", f"prior.folder={folder}"))):
         (tmp_path / name).mkdir()
         run(compose(*overrides), tmp_path / name)
     for name in ("map.npz", "trajectory.txt", "map.ply", "points.ply", "mesh.ply"):

@@ -1,0 +1,27 @@
+"""What a feature model gives: unit vectors of the cells of an image, in the space of its text embeddings."""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from emgs_jax.features.text import TextEmbeddings
+
+
+@runtime_checkable
+class FeatureModel(Protocol):
+    """Anything that describes the parts of an image by vectors that text can be compared with.
+
+    Construction checks what it can without reading weights; they are loaded when they are first needed.
+    """
+
+    identity: dict  # of the space: embeddings of another model must not be compared with its features
+    settings: dict  # what else the features depend on, for provenance; plain JSON values
+    text: TextEmbeddings  # of the classes, from the text encoder or from a file of `experiments.embed`
+
+    def embed(self, names: tuple[str, ...]) -> TextEmbeddings:
+        """Embed the names with the text encoder."""
+        ...
+
+    def extract(self, image: np.ndarray) -> np.ndarray:
+        """Return unit features (y, x, f), float16, of a grid of cells that cover the RGB `image` (h, w, 3), uint8."""
+        ...

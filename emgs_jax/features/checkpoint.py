@@ -1,0 +1,70 @@
+"""Folders of weights: what must be in them, and reading them without running any code that is in them."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+BACKBONE = ("config.json", "model.safetensors")  # as Hugging Face publishes them
+
+
+@dataclass(frozen=True)
+class DinoFiles:
+    """Names within the folder of the checkpoint, beside the backbone's config.json and model.safetensors.
+
+    Args:
+        vision_head: weights of dino.txt.
+        text_encoder: weights of dino.txt, perhaps the same file.
+        vocabulary: of CLIP.
+        source: where they are published, for messages.
+    """
+
+    vision_head: str
+    text_encoder: str
+    vocabulary: str
+    source: str
+
+
+def require(folder: str, names: Sequence[str], source: str) -> list[Path]:
+    """Return the paths of `names` in `folder`; raise ValueError that names those which are not there."""
+    path = Path(folder).expanduser()
+    missing = [name for name in dict.fromkeys(names) if not (path / name).is_file()]
+    if missing:
+        raise ValueError(
+            f"features.checkpoint={folder} lacks {', '.join(missing)}: put the files there (nothing is downloaded), "
+            f"from {source}"
+        )
+    return [path / name for name in names]
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with open(path, "rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()
+
+
+def load_part(path: Path, prefix: str, needed: str) -> dict[str, "Tensor"]:
+    """Return the float32 weights under `prefix` by the names after it; all of the file where it holds that part only.
+
+    Args:
+        path: a .pth file; only tensors are read from it, no code is run.
+        prefix: of the part in a file of the whole model.
+        needed: a name without which the file is another one.
+    """
+    import torch
+
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a broken archive raises a dozen types
+        raise ValueError(f"{path} is no file of weights, or damaged ({error}): fetch it again") from error
+    state = state if isinstance(state, dict) else {}
+    part = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)} or state
+    # DINOv2's file has another name for the blocks of its head than DINOv3's.
+    part = {name.replace("block_list.", "blocks.", 1): value for name, value in part.items()}
+    if needed not in part:
+        raise ValueError(f"{path} has no {prefix}{needed}: it is not this part of dino.txt, or of another version")
+    return {name: value.float() for name, value in part.items()}

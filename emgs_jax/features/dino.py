@@ -1,0 +1,164 @@
+"""dino.txt on a DINO backbone: patch features that text can be compared with. PyTorch is imported when one is made.
+
+The backbone is Hugging Face's model of the checkpoint. Its own patch tokens are not aligned with text; those of
+dino.txt's vision head are, and their counterpart is the second half of the text encoder's vector, the first half being
+that of the class token. Nothing is ever downloaded.
+"""
+
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from emgs_jax.features.checkpoint import BACKBONE, DinoFiles, digest, load_part, require
+from emgs_jax.features.dinotxt import text_tower, vision_head
+from emgs_jax.features.images import ImageConfig, grid_size, network_input
+from emgs_jax.features.text import TextEmbeddings, average_over_templates, check_templates, load_text
+from emgs_jax.features.tokens import Tokenizer
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+class DinoText:
+    """Text-aligned patch features of dino.txt (implements `FeatureModel`).
+
+    Args:
+        name: of the model, for provenance: embeddings of another name are refused.
+        checkpoint: folder of the weights.
+        files: names of the files in it.
+        image: how images are resized and normalised.
+        num_text_heads: of the text encoder's attention.
+        device: of PyTorch; None = a GPU if there is one.
+        classes: names to embed, or to choose from `text`.
+        templates: prompts over which an embedding is the mean.
+        text: file of `experiments.embed`; with it the text encoder and the vocabulary are not needed.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        checkpoint: str,
+        files: DinoFiles,
+        image: ImageConfig,
+        num_text_heads: int,
+        device: str | None,
+        classes: Sequence[str],
+        templates: Sequence[str],
+        text: str | None,
+    ) -> None:
+        absent = [package for package in ("torch", "transformers") if importlib.util.find_spec(package) is None]
+        if absent:
+            raise ValueError(f"features={name} needs {' and '.join(absent)}: pip install 'emgs_jax[features]'")
+        check_templates(templates)
+        self._name, self._folder, self._files, self._image = name, checkpoint, files, image
+        self._num_text_heads, self._device = num_text_heads, device or _best_device()
+        self._classes, self._templates, self._file = tuple(classes), tuple(templates), text
+
+    @cached_property
+    def identity(self) -> dict:
+        (head,) = require(self._folder, [self._files.vision_head], self._files.source)
+        return {"name": self._name, "version": 1, "vision_head": digest(head)}
+
+    @cached_property
+    def settings(self) -> dict:
+        needed = [*BACKBONE, self._files.vision_head]
+        if self._classes and self._file is None:
+            needed += self._files.text_encoder, self._files.vocabulary
+        weights = require(self._folder, needed, self._files.source)[1]
+        image = asdict(self._image)
+        return {"backbone": digest(weights), "image": {key: _plain(value) for key, value in image.items()}}
+
+    @cached_property
+    def text(self) -> TextEmbeddings:
+        if self._file is not None:
+            return load_text(self._file, self.identity, self._classes)
+        if not self._classes:
+            vectors = np.zeros((0, self._vision[0].config.hidden_size), np.float32)
+            return TextEmbeddings((), vectors, self._templates, self.identity)
+        return self.embed(self._classes)
+
+    def embed(self, names: tuple[str, ...]) -> TextEmbeddings:
+        """Encode the prompts of each name and average the half that is aligned with patches."""
+        import torch
+
+        needed = [self._files.text_encoder, self._files.vocabulary, self._files.vision_head]
+        encoder, vocabulary, _ = require(self._folder, needed, self._files.source)
+        weights = load_part(encoder, "text_model.", "backbone.token_embedding.weight")
+        sizes = len(weights["backbone.token_embedding.weight"]), len(weights["backbone.positional_embedding"])
+        tokenizer = Tokenizer(vocabulary, *sizes)
+        weights = {name: value.to(self._device) for name, value in weights.items()}
+
+        def encode(prompts: list[str]) -> np.ndarray:
+            with torch.inference_mode():
+                tokens = torch.from_numpy(tokenizer(prompts)).to(self._device)
+                vectors = text_tower(tokens, weights, self._num_text_heads)
+            return vectors[:, vectors.shape[1] // 2 :].cpu().numpy()
+
+        return TextEmbeddings(
+            tuple(names), average_over_templates(names, self._templates, encode), self._templates, self.identity
+        )
+
+    def extract(self, image: np.ndarray) -> np.ndarray:
+        """Return the unit tokens of the vision head, float16 (rows, columns, f): one cell per patch."""
+        import torch
+
+        backbone, head = self._vision
+        patch = int(backbone.config.patch_size)
+        columns, rows = grid_size(image.shape[1::-1], patch, self._image.long_side)
+        values = network_input(image, (columns, rows), patch, self._image)
+        try:
+            with torch.inference_mode():
+                tokens = backbone(torch.from_numpy(values)[None].to(self._device)).last_hidden_state
+                tokens = vision_head(tokens, head, backbone.config.num_attention_heads)
+        except torch.cuda.OutOfMemoryError as error:
+            raise ValueError(
+                f"the GPU has no memory for {columns}x{rows} patches: lower features.image.long_side="
+                f"{self._image.long_side} or set features.device=cpu; what is recorded stays valid"
+            ) from error
+        return patch_grid(tokens, (columns, rows)).cpu().numpy().astype(np.float16)
+
+    @cached_property
+    def _vision(self) -> tuple[Any, dict[str, "Tensor"]]:
+        """The backbone, and the weights of the head."""
+        import transformers
+
+        require(self._folder, BACKBONE, self._files.source)
+        (path,) = require(self._folder, [self._files.vision_head], self._files.source)
+        head = load_part(path, "visual_model.head.", "ln_final.weight")
+        folder = path.parent
+        try:
+            backbone = transformers.AutoModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
+        except Exception as error:  # each of its readers raises its own type
+            raise ValueError(f"{folder} holds no backbone that can be read ({error}): fetch it again") from error
+        if head["ln_final.weight"].shape != (backbone.config.hidden_size,):
+            raise ValueError(
+                f"{path} is for a backbone of width {len(head['ln_final.weight'])}, the one in {folder} has "
+                f"{backbone.config.hidden_size}: take the backbone that {self._files.source} names"
+            )
+        return backbone.eval().float().to(self._device), {name: value.to(self._device) for name, value in head.items()}
+
+
+def patch_grid(tokens: "Tensor", grid: tuple[int, int]) -> "Tensor":
+    """Return the unit patch tokens (rows, columns, d) of one image; those of class and registers stand before them.
+
+    Args:
+        tokens: (1, n, d), patches row by row.
+        grid: (columns, rows).
+    """
+    columns, rows = grid
+    patches = tokens[0, -rows * columns :].float()
+    return (patches / patches.norm(dim=-1, keepdim=True)).reshape(rows, columns, -1)
+
+
+def _best_device() -> str:
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, int) else [float(item) for item in value]

@@ -1,0 +1,50 @@
+"""From an image of any size to what a vision transformer sees: whole patches, normalised colours."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+
+@dataclass(frozen=True)
+class ImageConfig:
+    """How images are given to the network.
+
+    Args:
+        long_side: pixels to which the longer side is resized, a multiple of the patch.
+        mean: of RGB in [0, 1], subtracted.
+        std: of RGB, divided by.
+    """
+
+    long_side: int
+    mean: Sequence[float]
+    std: Sequence[float]
+
+
+def grid_size(size: tuple[int, int], patch: int, long_side: int) -> tuple[int, int]:
+    """Return (columns, rows) of patches for an image of `size` (width, height), nearest to its aspect ratio."""
+    if long_side < patch or long_side % patch:
+        raise ValueError(
+            f"features.image.long_side must be a multiple of the network's patch, {patch}; got {long_side}"
+        )
+    columns, rows = (max(round(side * long_side / max(size) / patch), 1) for side in size)
+    return columns, rows
+
+
+def network_input(image: np.ndarray, grid: tuple[int, int], patch: int, config: ImageConfig) -> np.ndarray:
+    """Return normalised colours, float32 (3, rows·patch, columns·patch), of the whole RGB `image` (h, w, 3), uint8.
+
+    Args:
+        image: RGB.
+        grid: (columns, rows) of patches.
+        patch: pixels a side.
+        config: mean and standard deviation.
+    """
+    size = (grid[0] * patch, grid[1] * patch)
+    is_smaller = size[0] < image.shape[1]
+    values = image.astype(np.float32) / np.float32(255)
+    # A cubic overshoots at edges, and no camera gives a colour outside of [0, 1].
+    resized = cv2.resize(values, size, interpolation=cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC).clip(0, 1)
+    normalised = (resized - np.asarray(config.mean, np.float32)) / np.asarray(config.std, np.float32)
+    return np.ascontiguousarray(normalised.transpose(2, 0, 1))

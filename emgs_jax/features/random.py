@@ -1,0 +1,59 @@
+"""Features without weights, for tests: a fixed random projection of local colours, and random text embeddings."""
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from emgs_jax.features.text import TextEmbeddings, average_over_templates, check_templates, load_text
+from emgs_jax.prior.simulated import text_embeddings
+
+
+class RandomFeatures:
+    """Project the mean colour of each cell (implements `FeatureModel`). The text embeddings say nothing of colours.
+
+    Args:
+        width: f.
+        cell: pixels a side.
+        seed: of the projection.
+        classes: names to embed.
+        templates: prompts over which an embedding is the mean.
+        text: file of `experiments.embed` to take the embeddings from; None makes them.
+    """
+
+    def __init__(
+        self, width: int, cell: int, seed: int, classes: Sequence[str], templates: Sequence[str], text: str | None
+    ) -> None:
+        if width < 1 or cell < 1 or seed < 0:
+            raise ValueError(f"features.width and cell must be ≥ 1 and seed ≥ 0, got {width}, {cell} and {seed}")
+        check_templates(templates)
+        self._width, self._cell, self._classes, self._file = width, cell, tuple(classes), text
+        self._templates = tuple(templates)
+        self._projection = np.random.default_rng(seed).standard_normal((width, 4)).astype(np.float32)
+        self.identity = {"name": "random", "version": 1, "width": width, "seed": seed}
+        self.settings = {"cell": cell}
+
+    @cached_property
+    def text(self) -> TextEmbeddings:
+        if self._file is not None:
+            return load_text(self._file, self.identity, self._classes)
+        return self.embed(self._classes)
+
+    def embed(self, names: tuple[str, ...]) -> TextEmbeddings:
+        """Return pseudo-random vectors that depend on the prompts only."""
+        vectors = np.zeros((0, self._width), np.float32)
+        if names:
+            vectors = average_over_templates(
+                names, self._templates, lambda prompts: text_embeddings(prompts, self._width)
+            )
+        return TextEmbeddings(tuple(names), vectors, self._templates, self.identity)
+
+    def extract(self, image: np.ndarray) -> np.ndarray:
+        """Return the unit projection of (r, g, b, 1) of each cell's mean colour in [0, 1], float16 (y, x, f)."""
+        height, width = image.shape[:2]
+        cells = max(round(width / self._cell), 1), max(round(height / self._cell), 1)
+        colors = cv2.resize(image.astype(np.float32) / np.float32(255), cells, interpolation=cv2.INTER_AREA)
+        # einsum and not @: its sums do not depend on the number of BLAS threads, and the bits must not either.
+        features = np.einsum("yxc,fc->yxf", colors, self._projection[:, :3]) + self._projection[:, 3]
+        return (features / np.linalg.norm(features, axis=-1, keepdims=True)).astype(np.float16)

@@ -1,0 +1,111 @@
+"""Text embeddings: averaged over prompt templates, and kept in a file so that no text model is needed later.
+
+The file, format `emgs_jax.text` version 1, is an npz without pickled objects: `embeddings`, float32 (classes, f), and
+`header`, a JSON string with `format`, `version`, `names`, `templates` and `model` (identity of the model whose
+features the embeddings can be compared with).
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from emgs_jax.files import atomic_write
+
+FORMAT, VERSION = "emgs_jax.text", 1
+REMEDY = "write it with `python -m experiments.embed`"
+
+
+@dataclass(frozen=True)
+class TextEmbeddings:
+    """Classes as vectors.
+
+    Args:
+        names: of the classes.
+        vectors: unit, float32 (classes, f).
+        templates: prompts over which each vector is the mean.
+        model: identity of the model.
+    """
+
+    names: tuple[str, ...]
+    vectors: np.ndarray
+    templates: tuple[str, ...]
+    model: dict
+
+
+def average_over_templates(
+    names: Sequence[str], templates: Sequence[str], encode: Callable[[list[str]], np.ndarray]
+) -> np.ndarray:
+    """Return one unit vector per name, float32 (classes, f): the mean of its prompts' unit vectors, unit again.
+
+    Args:
+        names: of the classes.
+        templates: each has one {} for the name.
+        encode: prompts -> vectors (prompts, f).
+    """
+    check_templates(templates)
+    vectors = [_unit(_unit(encode([template.format(name) for template in templates])).mean(axis=0)) for name in names]
+    return np.stack(vectors).astype(np.float32)
+
+
+def check_templates(templates: Sequence[str]) -> None:
+    """Raise ValueError where a template has no place for the name."""
+    bad = [template for template in templates if template.count("{}") != 1]
+    if bad or not templates:
+        raise ValueError(f"features.templates must each have one {{}} for the name of the class, got {bad or 'none'}")
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    vectors = np.asarray(vectors, np.float64)
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.finfo(np.float64).tiny)
+
+
+def save_text(path: Path | str, text: TextEmbeddings) -> None:
+    """Write the embeddings, whole or not at all."""
+    header = {"format": FORMAT, "version": VERSION, "names": text.names, "templates": text.templates}
+    header |= {"model": text.model}
+    with atomic_write(path) as handle:
+        np.savez(handle, header=np.array(json.dumps(header)), embeddings=np.asarray(text.vectors, np.float32))
+
+
+def load_text(path: Path | str, model: dict, names: Sequence[str] = ()) -> TextEmbeddings:
+    """Read embeddings, in the order of `names`; all that are there where no names are given.
+
+    Args:
+        path: a file of `experiments.embed`.
+        model: identity of the model whose features they will be compared with.
+        names: classes to choose.
+
+    Raises:
+        ValueError: the file is damaged, foreign, newer, of another model, or lacks a name.
+    """
+    header, vectors = _read(Path(path))
+    if header["model"] != model:
+        raise ValueError(f"{path} was embedded by {header['model']}, but the features are of {model}: {REMEDY}")
+    known = {name: row for row, name in enumerate(header["names"])}
+    missing = [name for name in names if name not in known]
+    if missing:
+        raise ValueError(f"{path} has no embedding of {missing}, only of {[*known]}: {REMEDY}")
+    chosen = tuple(names or known)
+    return TextEmbeddings(chosen, vectors[[known[name] for name in chosen]], tuple(header["templates"]), model)
+
+
+def _read(path: Path) -> tuple[dict, np.ndarray]:
+    """Return header and vectors of a file that is whole."""
+    if not path.is_file():
+        raise ValueError(f"{path} does not exist: {REMEDY}")
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            header, vectors = json.loads(str(arrays["header"])), arrays["embeddings"]
+    except Exception as error:  # a broken zip raises a dozen types
+        raise ValueError(f"{path} is no file of text embeddings, or damaged ({error}): {REMEDY}") from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise ValueError(f"{path} is not of the format {FORMAT}: {REMEDY}")
+    if header.get("version") != VERSION:
+        raise ValueError(f"{path} has version {header.get('version')}, this program reads {VERSION}: {REMEDY}")
+    is_whole = {"names", "templates", "model"} <= header.keys() and vectors.ndim == 2
+    if not is_whole or vectors.dtype != np.float32 or len(vectors) != len(header["names"]):
+        raise ValueError(f"{path} is damaged (its embeddings are not those of its header): {REMEDY}")
+    return header, vectors

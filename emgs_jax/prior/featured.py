@@ -1,0 +1,85 @@
+"""Features for any prior: geometry from one model, features of the same images from another, text from a file."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.features.base import FeatureModel
+from emgs_jax.features.text import load_text
+from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
+
+
+class Featured:
+    """A prior whose predictions have the features of a feature model in place of their own (implements `Prior`).
+
+    Args:
+        prior: for poses, points, confidence and mask, which are passed on unchanged.
+        model: for features and text embeddings.
+    """
+
+    def __init__(self, prior: Prior, model: FeatureModel) -> None:
+        self._prior, self._model = prior, model
+        self._known: list[tuple[np.ndarray, np.ndarray]] = []  # (image, features) of the window before
+        features = {**model.settings, "model": model.identity}  # before the text: names all missing files
+        self.feature_names, self.text_features = model.text.names, model.text.vectors
+        features |= {"templates": [*model.text.templates]}
+        geometry = prior.provenance
+        self.provenance = Provenance(
+            f"{geometry.name}+{model.identity['name']}",
+            geometry.settings | {"features": features},
+            geometry.is_simulated,
+        )
+
+    def check(self, dataset: Dataset, window_size: int) -> None:
+        """Raise ValueError where the prior cannot answer for the data set."""
+        self._prior.check(dataset, window_size)
+
+    def report(self) -> dict[str, float]:
+        """What the prior measured of itself, if it does."""
+        return getattr(self._prior, "report", dict)()
+
+    def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
+        """Predict geometry, and describe the dense images; an image of the window before is not described again."""
+        prediction = self._prior.predict(window, frames, intrinsics)
+        images = {frame.index: frame.image for frame in frames}
+        known = [(images[index], self._features(images[index])) for index in window.dense]
+        self._known = known
+        return replace(prediction, features=np.stack([features for _, features in known]))
+
+    def _features(self, image: np.ndarray) -> np.ndarray:
+        for known, features in self._known:
+            if known is image or np.array_equal(known, image):
+                return features
+        return self._model.extract(image)
+
+
+class Requeried:
+    """A prior with its own features and the text embeddings of a file (implements `Prior`).
+
+    Args:
+        prior: one whose features are a feature model's: live ones or recorded.
+        path: file of `experiments.embed` with the same model.
+    """
+
+    def __init__(self, prior: Prior, path: str) -> None:
+        features = prior.provenance.settings.get("features")
+        if features is None:
+            raise ValueError(
+                f"features.text={path} goes with features of a model, but prior {prior.provenance.name} has none: "
+                "choose features=… or a recording that was made with it"
+            )
+        text = load_text(path, features["model"])
+        self._prior, self.predict = prior, prior.predict
+        self.feature_names, self.text_features = text.names, text.vectors
+        settings = prior.provenance.settings | {"features": features | {"templates": [*text.templates]}}
+        self.provenance = replace(prior.provenance, settings=settings)
+
+    def check(self, dataset: Dataset, window_size: int) -> None:
+        """Raise ValueError where the prior cannot answer for the data set."""
+        self._prior.check(dataset, window_size)
+
+    def report(self) -> dict[str, float]:
+        """What the prior measured of itself, if it does."""
+        return getattr(self._prior, "report", dict)()
