@@ -1,7 +1,9 @@
-"""Point clouds: moving them, and averaging them per voxel without holding all points at once."""
+"""Point clouds: reading and moving them, and averaging them per voxel without holding all points at once."""
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -27,6 +29,26 @@ class PointCloud:
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+def read_cloud(path: str | os.PathLike, normal_neighbours: int) -> PointCloud:
+    """Read a PLY; a cloud without normals gets those of planes through so many nearest points, sign unknown."""
+    import open3d as o3d  # slow to import, and only clouds of other systems need it
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path} does not exist: give a PLY file with the points in the trajectory's frame")
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        cloud = o3d.io.read_point_cloud(os.fspath(path))
+    points = np.asarray(cloud.points)
+    if not len(points):
+        raise ValueError(f"{path} has no points: it is empty or no PLY file; write the points of the map as PLY")
+    num_broken = int((~np.isfinite(points).all(1)).sum())
+    if num_broken:
+        raise ValueError(f"{path}: {num_broken} of {len(points)} points are not finite: leave them out of the file")
+    if not cloud.has_normals():
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(normal_neighbours))
+    colors = np.asarray(cloud.colors) if cloud.has_colors() else np.zeros_like(points)
+    return PointCloud(points, np.asarray(cloud.normals), colors)
 
 
 def transform_cloud(cloud: PointCloud, alignment: Alignment) -> PointCloud:
