@@ -64,8 +64,9 @@ def evaluate(settings: Mapping[str, Any]) -> list[str]:
     baseline = read_gate(settings["gate"]) if settings["gate"] else {}
     jobs = list(plan(settings))
     read_estimates(out)  # results that cannot be read end the evaluation before it begins
-    open_jobs = [job for job in jobs if not _is_finished(job)][part - 1 :: whole]
-    print(f"{len(jobs)} jobs, {len(open_jobs)} to do" + (f" in shard {part}/{whole}" if whole > 1 else ""))
+    ours = jobs[(part - 1) * len(jobs) // whole : part * len(jobs) // whole]  # neighbours share their executables
+    open_jobs = [job for job in ours if not _is_finished(job)]
+    print(f"shard {part}/{whole}: {len(open_jobs)} of its {len(ours)} jobs to do, {len(jobs)} in all")
     failures: dict[str, str] = {}
     try:
         _run_all(open_jobs, failures)
