@@ -30,6 +30,12 @@ _COLUMNS = (  # title, key, factor
     ("Scale [%]", "trajectory/scale_percent", 1.0),
     ("s a frame", "time/seconds_per_frame", 1.0),
 )
+_NOTES = """
+Sequences × seeds: ours is the mean over sequences, ± the deviation over seeds. F1 at .2 m; Normals: mean |cos|; Scale:
+100 · min(s, 1/s); the paper defines neither of the last two. **simulated**: the prior is disturbed ground truth, which
+says nothing about a network and must not be compared with quoted rows. Quoted rows are not measured here and are means
+over seq-01 of seven scenes (7-Scenes) and nine sequences of freiburg1 (TUM).
+"""
 _DASH = "–"
 
 
@@ -104,7 +110,7 @@ def paper_table(rows: Sequence[Row], published: Sequence[Mapping[str, Any]]) -> 
     for row in published:
         cells = [_DASH if value is None else f"{value:g}" for key in _PAPER_DATASETS for value in row[key]]
         lines.append([row["method"], f"quoted: {row['source']}", row["protocol"], _DASH, *cells])
-    return _markdown(["method", "source", "protocol", "sequences × seeds", *titles], lines)
+    return _markdown(["method", "source", "protocol", "sequences × seeds", *titles], lines) + _NOTES
 
 
 def full_table(rows: Sequence[Row]) -> str:

@@ -92,6 +92,17 @@ def test_parallel_planes_differ_by_their_distance():
     assert metrics["reconstruction/num_points"] == 1600
 
 
+def test_normals_that_are_turned_by_known_angles_agree_by_their_cosines():
+    """Half of the points by 20 degrees, half by 40: only the first half is within 30."""
+    truth = grid_cloud()
+    angles = np.radians(np.where(np.arange(len(truth)) % 2, 40.0, 20.0))
+    turned = np.stack([np.sin(angles), np.zeros_like(angles), np.cos(angles)], 1)
+    metrics = reconstruction_metrics(dataclasses.replace(truth, normals=turned), truth, CONFIG)
+    expected = 50 * (np.cos(np.radians(20.0)) + np.cos(np.radians(40.0)))
+    np.testing.assert_allclose(metrics["reconstruction/normals_abs_cos_percent"], expected, rtol=1e-9)
+    assert metrics["reconstruction/normals_within_30deg_percent"] == 50.0
+
+
 def test_half_a_plane_has_full_precision_and_half_the_recall():
     truth = grid_cloud()
     left = truth.points[:, 0] < 1.0
