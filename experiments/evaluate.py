@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from emgs_jax.evaluation.gate import read_gate, regressions, write_gate
 from emgs_jax.evaluation.results import is_finished, read_estimates, result_folder
-from emgs_jax.evaluation.tables import average, full_table, paper_table, to_csv
+from emgs_jax.evaluation.tables import Row, average, full_table, paper_table, to_csv
 from emgs_jax.files import atomic_write, write_json
 from experiments.building import clear_errors, message_of, use_compilation_cache
 from experiments.run import run
@@ -71,8 +71,7 @@ def evaluate(settings: Mapping[str, Any]) -> list[str]:
     try:
         _run_all(open_jobs, failures)
     finally:
-        missing = [job.name for job in jobs if not _is_finished(job)]
-        rows = _write_tables(out, missing, failures, settings["published"])
+        rows = _write_tables(out, jobs, failures, settings["published"])
     if settings["write_gate"]:
         write_gate(settings["write_gate"], rows, settings["tolerances"])
     problems = [f"{name}: {message}" for name, message in failures.items()]
@@ -107,21 +106,26 @@ def _shard(text: str) -> tuple[int, int]:
 
 
 def _write_tables(
-    out: Path, missing: Sequence[str], failures: Mapping[str, str], published: Sequence[Mapping[str, Any]]
-) -> list:
-    """Write results.csv, results.json and results.md of all that is finished; returns the rows by sequence."""
-    estimates = read_estimates(out)
+    out: Path, jobs: Sequence[Job], failures: Mapping[str, str], published: Sequence[Mapping[str, Any]]
+) -> list[Row]:
+    """Write results.csv, results.json and results.md; returns the rows by sequence.
+
+    They show the jobs of this evaluation and other systems: older results in `out` may have other settings.
+    """
+    folders = {job.folder for job in jobs}
+    estimates = [item for item in read_estimates(out) if item.kind == "scored" or item.folder in folders]
     totals, rows = average(estimates, each_sequence=False), average(estimates, each_sequence=True)
+    done = {item.folder for item in estimates}
+    missing = {job.name: failures.get(job.name, "to do") for job in jobs if job.folder not in done}
     parts = [paper_table(totals, published)]
     parts.append(full_table([*rows, *(row for row in totals if len(row.sequences) > 1)]) if rows else "")
-    parts.append("".join(f"- not finished: {name}: {failures.get(name, 'to do')}\n" for name in missing))
+    parts.append("".join(f"- not finished: {name}: {reason}\n" for name, reason in missing.items()))
     text = "\n".join(part for part in parts if part)
     out.mkdir(parents=True, exist_ok=True)
     for name, content in (("results.csv", to_csv(estimates)), ("results.md", text)):
         with atomic_write(out / name, "w") as handle:
             handle.write(content)
-    summary = {"rows": rows, "totals": totals, "published": published, "missing": missing, "failures": failures}
-    write_json(out / "results.json", summary)
+    write_json(out / "results.json", {"rows": rows, "totals": totals, "published": published, "missing": missing})
     print(text)
     return rows
 
@@ -133,7 +137,7 @@ def main(config: DictConfig) -> None:
         use_compilation_cache(config)
         problems = evaluate(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
         if problems:
-            raise ValueError("\n       ".join([f"{len(problems)} problems", *problems]))
+            raise ValueError("\n       ".join([f"problems: {len(problems)}", *problems]))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ class Estimate:
     """What was compared with the truth in one run: the map, or what the prior alone says.
 
     Args:
+        folder: of the result.
         dataset: name of the data set.
         sequence: name of its sequence.
         variant: name of the overrides, or of another system.
@@ -30,6 +31,7 @@ class Estimate:
         values: the metrics that are numbers.
     """
 
+    folder: Path
     dataset: str
     sequence: str
     variant: str
@@ -88,22 +90,22 @@ def read_estimates(out: Path) -> list[Estimate]:
 def estimates_of(path: Path) -> list[Estimate]:
     """What one result holds: ours and the raw prior, or another system."""
     metrics = read_metrics(path)
-    variant, seed = path.parts[-3], int(path.parts[-2])
-    found = [_estimate(metrics, variant, "ours" if metrics["provenance"]["prior"] else "scored", seed, "")]
+    found = [_estimate(path.parent, metrics, "ours" if metrics["provenance"]["prior"] else "scored", "")]
     if any(key.startswith(RAW_PRIOR) for key in metrics):
-        found.append(_estimate(metrics, variant, "raw prior", seed, RAW_PRIOR))
+        found.append(_estimate(path.parent, metrics, "raw prior", RAW_PRIOR))
     return found
 
 
-def _estimate(metrics: dict[str, Any], variant: str, kind: str, seed: int, prefix: str) -> Estimate:
+def _estimate(folder: Path, metrics: dict[str, Any], kind: str, prefix: str) -> Estimate:
     block = metrics["provenance"]
     own = {key: value for key, value in metrics.items() if key.startswith(RAW_PRIOR) == (prefix == RAW_PRIOR)}
     return Estimate(
+        folder=folder,
         dataset=block["data"]["name"],
         sequence=block["data"]["sequence"],
-        variant=variant,
+        variant=folder.parent.name,
         kind=kind,
-        seed=seed,
+        seed=int(folder.name),
         prior=(block["prior"] or {}).get("name"),
         is_simulated=block["simulated"],
         protocol=block["protocol"],

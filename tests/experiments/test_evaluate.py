@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 from tiny_run import CONF, TINY
 
 import experiments.evaluate
+from emgs_jax.evaluation.gate import read_gate
 from emgs_jax.evaluation.report import RESULT_FORMAT
 from emgs_jax.evaluation.results import METRICS_FILE
 from emgs_jax.files import write_json
@@ -98,7 +99,7 @@ def test_an_interrupted_evaluation_has_the_tables_of_what_is_finished_and_resume
     lines = list(csv.DictReader((evaluate.out / "results.csv").open()))
     assert [(line["sequence"], line["seed"]) for line in lines] == [("room0", "0"), ("room0", "1")]
     summary = json.loads((evaluate.out / "results.json").read_text())
-    assert summary["missing"] == ["synthetic/1/default/0", "synthetic/1/default/1"]
+    assert summary["missing"] == {"synthetic/1/default/0": "to do", "synthetic/1/default/1": "to do"}
     evaluate.broken.clear()
     assert evaluate("seeds=[0,1]") == [] and evaluate.runs == [(1, 0), (1, 1)]
 
@@ -125,6 +126,15 @@ def test_other_settings_never_replace_a_finished_result_and_nothing_runs(evaluat
     with pytest.raises(ValueError, match=r"window_size was 4, now 7.*\+variants.NAME"):
         evaluate("seeds=[0,1]", 'overrides=["slam.window_size=7"]')
     assert evaluate.runs == []
+
+
+def test_results_that_the_command_does_not_name_stay_but_never_enter_its_tables(evaluate):
+    """They may have other settings: seed 5 has another window here."""
+    evaluate("seeds=[5]", 'overrides=["slam.window_size=7"]')
+    evaluate("seeds=[0]")
+    lines = list(csv.DictReader((evaluate.out / "results.csv").open()))
+    assert {line["seed"] for line in lines} == {"0"}
+    assert (evaluate.out / "synthetic/0/default/5" / METRICS_FILE).is_file()
 
 
 def test_a_result_of_another_version_ends_the_evaluation_before_it_begins(evaluate):
@@ -155,6 +165,16 @@ def test_a_prior_without_a_seed_is_evaluated_with_one(evaluate):
         config = hydra.compose("evaluate", ["suite=smoke", recorded])
         jobs = list(experiments.evaluate.plan(OmegaConf.to_container(config, resolve=True)))
     assert [job.config.prior.folder for job in jobs] == ["predictions/0"]
+
+
+def test_the_committed_baseline_is_of_the_suite_and_the_protocol_of_its_name():
+    baseline = read_gate(CONF / "baseline" / "smoke.yaml")
+    assert {name: entry["protocol"] for name, entry in baseline.items()} == {"synthetic/room0/default": "paper/sim3"}
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        tolerances = hydra.compose("evaluate", ["suite=smoke"]).tolerances
+    for entry in baseline.values():
+        rules = {key: {k: rule[k] for k in ("direction", "tolerance")} for key, rule in entry["metrics"].items()}
+        assert rules == OmegaConf.to_container(tolerances)
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "suite").glob("*.yaml")))
@@ -195,7 +215,7 @@ def tiny(*overrides):
 def test_the_exit_status_says_that_a_job_failed(tmp_path):
     done = run_script("suite=tum", f"suite.root={tmp_path}", f"out={tmp_path / 'out'}")
     assert done.returncode == 1
-    assert "9 problems" in done.stderr and "freiburg1_xyz does not exist" in done.stderr
+    assert "problems: 9" in done.stderr and "freiburg1_xyz does not exist" in done.stderr
     assert "Traceback" not in done.stderr
 
 
