@@ -11,9 +11,8 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.evaluation.reconstruction import (
     EvaluationConfig,
-    align_cloud,
+    compare_clouds,
     ground_truth_cloud,
-    reconstruction_metrics,
 )
 from emgs_jax.evaluation.report import RAW_PRIOR, prefixed
 from emgs_jax.evaluation.trajectory import trajectory_metrics
@@ -52,10 +51,11 @@ def score(run: MappingRun, clouds: Clouds, dataset: Dataset, config: EvaluationC
     true_cloud = ground_truth_cloud((dataset[row] for row in rows), dataset.intrinsics, config)
     other = replace(config, alignment="se3" if config.alignment == "sim3" else "sim3")
     metrics = trajectory_metrics(ours, truth)
-    metrics |= _compare(clouds.dense, true_cloud, (ours, truth), config)
-    metrics |= _renamed(_compare(clouds.dense, true_cloud, (ours, truth), other), f"reconstruction_{other.alignment}/")
-    metrics |= _renamed(_compare(clouds.centers, true_cloud, (ours, truth), config), "reconstruction_centers/")
-    raw_metrics = trajectory_metrics(raw, truth) | _compare(clouds.raw_prior, true_cloud, (raw, truth), config)
+    poses = ours, truth
+    metrics |= compare_clouds(clouds.dense, true_cloud, poses, config)
+    metrics |= _renamed(compare_clouds(clouds.dense, true_cloud, poses, other), f"reconstruction_{other.alignment}/")
+    metrics |= _renamed(compare_clouds(clouds.centers, true_cloud, poses, config), "reconstruction_centers/")
+    raw_metrics = trajectory_metrics(raw, truth) | compare_clouds(clouds.raw_prior, true_cloud, (raw, truth), config)
     return metrics | prefixed(raw_metrics, RAW_PRIOR)
 
 
@@ -83,13 +83,6 @@ def seconds_per_frame(records: list[FrameRecord]) -> float | None:
     steps = [record for record in records if record.status != "initialization"] or records
     steady = [record.seconds for record in steps if record.compile_seconds == 0]
     return float(np.mean(steady or [record.seconds - record.compile_seconds for record in steps])) if steps else None
-
-
-def _compare(
-    cloud: PointCloud, truth: PointCloud, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
-) -> Metrics:
-    aligned, note = align_cloud(cloud, *poses, config)
-    return reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
 
 
 def _renamed(metrics: Metrics, prefix: str) -> Metrics:

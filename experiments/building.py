@@ -5,7 +5,9 @@ import os
 from collections.abc import Iterator
 from functools import partial
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
+from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -54,13 +56,22 @@ def use_compilation_cache(config: DictConfig) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
+def message_of(error: Exception) -> str:
+    """What is wrong, without Hydra's wrapping."""
+    cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
+    return str(cause) or type(cause).__name__
+
+
 @contextlib.contextmanager
 def clear_errors() -> Iterator[None]:
-    """End the program with the message of what is wrong with the input; HYDRA_FULL_ERROR=1 shows the traceback."""
+    """End the program with the message of what is wrong with the input; HYDRA_FULL_ERROR=1 shows the traceback.
+
+    In a multirun the error goes on to Hydra, which reports it after the other jobs; an exit would end them too.
+    """
     try:
         yield
     except (ValueError, OSError, InstantiationException, OmegaConfBaseException) as error:
-        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+        is_multirun = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+        if is_multirun or os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
-        cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
-        raise SystemExit(f"error: {cause}\n(HYDRA_FULL_ERROR=1 shows where it was raised)") from None
+        raise SystemExit(f"error: {message_of(error)}\n(HYDRA_FULL_ERROR=1 shows where it was raised)") from None

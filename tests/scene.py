@@ -37,6 +37,12 @@ def slam_config(*overrides: str):
     return hydra.utils.instantiate(compose(*SMALL, *overrides).slam, _convert_="all")
 
 
+@cache
+def evaluation_config(*overrides: str):
+    """The protocol that the overrides choose, e.g. "evaluation=mast3r"."""
+    return hydra.utils.instantiate(compose(*overrides).evaluation)
+
+
 def at(tree, path: str, value):
     """The config with the field at a dotted path replaced by a number."""
 

@@ -13,7 +13,9 @@ from scene import CONF, compose, slam_config
 from emgs_jax.slam import SlamConfig
 
 ROOT = CONF.parent
-GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent != CONF and "experiment" not in path.parts)
+# Studies and suites hold no class; tests/experiments composes them.
+UNTYPED = {CONF, CONF / "experiment", CONF / "suite", CONF / "baseline"}
+GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent not in UNTYPED)
 
 
 def group_and_option(path: Path) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from tiny_run import NUM_FRAMES, WINDOW_SIZE, EditedPrior, at_inference, compose
 
 from emgs_jax.clock import Clock
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.evaluation.reconstruction import EvaluationConfig, ground_truth_cloud
+from emgs_jax.evaluation.reconstruction import ground_truth_cloud
 from emgs_jax.export import load_map_npz, load_trajectory_tum
 from emgs_jax.outputs import dense_map, save_outputs, save_progress
 from emgs_jax.pipeline import map_frames, new_run, predictions
@@ -165,7 +165,8 @@ def test_the_densified_cloud_of_an_exact_run_lies_on_the_true_surfaces():
     """Within the size of a Gaussian: 8 points of about 3 cm spacing."""
     session, _ = exact()
     dense = dense_map(session, dataset(), hydra.utils.instantiate(compose().densify), voxel=0.01)
-    truth = ground_truth_cloud(list(dataset()), dataset().intrinsics, EvaluationConfig())
+    protocol = hydra.utils.instantiate(compose().evaluation)
+    truth = ground_truth_cloud(list(dataset()), dataset().intrinsics, protocol)
     distance, _ = cKDTree(truth.points).query(dense.cloud.points)
     assert np.median(distance) < 0.03
 

@@ -1,11 +1,14 @@
-"""Point clouds: moving them, and averaging them per voxel without holding all points at once."""
+"""Point clouds: reading and moving them, and averaging them per voxel without holding all points at once."""
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from emgs_jax.evaluation.trajectory import Alignment
+from emgs_jax.evaluation.trajectory import Alignment, align
 
 _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
 
@@ -26,6 +29,26 @@ class PointCloud:
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+def read_cloud(path: str | os.PathLike, normal_neighbours: int) -> PointCloud:
+    """Read a PLY; a cloud without normals gets those of planes through so many nearest points, sign unknown."""
+    import open3d as o3d  # slow to import, and only clouds of other systems need it
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path} does not exist: give a PLY file with the points in the trajectory's frame")
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        cloud = o3d.io.read_point_cloud(os.fspath(path))
+    points = np.asarray(cloud.points)
+    if not len(points):
+        raise ValueError(f"{path} has no points: it is empty or no PLY file; write the points of the map as PLY")
+    num_broken = int((~np.isfinite(points).all(1)).sum())
+    if num_broken:
+        raise ValueError(f"{path}: {num_broken} of {len(points)} points are not finite: leave them out of the file")
+    if not cloud.has_normals():
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(normal_neighbours))
+    colors = np.asarray(cloud.colors) if cloud.has_colors() else np.zeros_like(points)
+    return PointCloud(points, np.asarray(cloud.normals), colors)
 
 
 def transform_cloud(cloud: PointCloud, alignment: Alignment) -> PointCloud:
@@ -55,6 +78,25 @@ def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
 def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     """Average the points of each voxel [m]; doing it twice changes nothing."""
     return fuse_clouds([cloud], voxel)
+
+
+def register(points: np.ndarray, target: np.ndarray, max_distance: float, max_steps: int) -> Alignment:
+    """Find the rigid motion of points (n, 3) onto a target (m, 3) by point-to-point ICP (Besl and McKay 1992).
+
+    Pairs are nearest points within `max_distance` [m]; ends when they stay the same. With fewer than 3 pairs nothing
+    holds the cloud: it stays where it is.
+    """
+    found, known = Alignment(1.0, np.eye(3), np.zeros(3)), np.empty(0)
+    if not len(target):
+        return found
+    tree = cKDTree(target)
+    for _ in range(max_steps):
+        distances, partners = tree.query(found.apply(points), distance_upper_bound=max_distance, workers=-1)
+        near = np.isfinite(distances)
+        if near.sum() < 3 or np.array_equal(partners, known):
+            return found
+        found, known = align(points[near], target[partners[near]], with_scale=False), partners
+    return found
 
 
 def _cells(cloud: PointCloud, voxel: float) -> tuple[np.ndarray, np.ndarray]:

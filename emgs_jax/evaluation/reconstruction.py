@@ -7,31 +7,40 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from emgs_jax.data.base import Frame
-from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, transform_cloud, voxel_downsample
+from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, register, transform_cloud, voxel_downsample
 from emgs_jax.evaluation.trajectory import align_poses
 
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """The protocol of a comparison; it is written into every result."""
+    """The protocol of a comparison; it is written into every result. Values: conf/evaluation and conf/alignment."""
 
-    protocol: str = "paper: Sim(3) of the trajectory, mean unclipped distances"
-    alignment: str = "sim3"  # or "se3": without the scale
-    voxel_m: float = 0.01  # both clouds are averaged per voxel, so that dense regions do not count more
-    f1_thresholds_m: tuple[float, ...] = (0.20, 0.05)
-    max_normal_angle_deg: float = 30.0
-    normal_radius_px: int = 4
-    normal_step_px: int = 2
-    max_normal_gap: float = 0.10  # relative inverse-depth step to a tap of the normal's window
-    max_normal_residual: float = 0.02  # relative inverse-depth distance of a tap from the fitted plane
-    min_normal_taps: int = 8
+    protocol: str
+    alignment: str  # "sim3", or "se3": without the scale
+    statistic: str  # "mean" or "rmse" of the distances
+    max_distance_m: float  # longer distances count as this long; F1 does not change
+    max_depth_m: float  # true depth farther away is left out
+    icp_distance_m: float  # ICP after the alignment takes pairs within this distance; 0 = no ICP
+    icp_voxel_m: float
+    icp_max_steps: int
+    voxel_m: float
+    max_points: int | None  # compare a random choice of so many points of each cloud
+    f1_thresholds_m: tuple[float, ...]
+    max_normal_angle_deg: float
+    normal_radius_px: int
+    normal_step_px: int
+    max_normal_gap: float  # relative inverse-depth step to a tap of the normal's window
+    max_normal_residual: float  # relative inverse-depth distance of a tap from the fitted plane
+    min_normal_taps: int
 
     def __post_init__(self):
         object.__setattr__(self, "f1_thresholds_m", tuple(float(value) for value in self.f1_thresholds_m))
-        if self.alignment not in ("sim3", "se3"):
-            raise ValueError(f"evaluation.alignment must be sim3 or se3, got {self.alignment!r}")
-        if self.voxel_m <= 0:
-            raise ValueError(f"evaluation.voxel_m must be positive, got {self.voxel_m}")
+        for name, choices in (("alignment", ("sim3", "se3")), ("statistic", ("mean", "rmse"))):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"evaluation.{name} must be {' or '.join(choices)}, got {getattr(self, name)!r}")
+        for name in ("voxel_m", "icp_voxel_m", "max_distance_m", "max_depth_m"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"evaluation.{name} must be positive, got {getattr(self, name)}")
 
 
 def window_normals(points: np.ndarray, valid: np.ndarray, config: EvaluationConfig) -> np.ndarray:
@@ -83,7 +92,8 @@ def ground_truth_cloud(
         for frame in frames:
             if frame.depth is not None and frame.T_world_camera is not None:
                 points = backproject(frame.depth, intrinsics)
-                yield posed_cloud(points, frame.depth > 0, frame.image, frame.T_world_camera, config)
+                known = (frame.depth > 0) & (frame.depth <= config.max_depth_m)
+                yield posed_cloud(points, known, frame.image, frame.T_world_camera, config)
 
     return fuse_clouds(clouds(), config.voxel_m)
 
@@ -95,15 +105,20 @@ def backproject(depth: np.ndarray, intrinsics: tuple[float, float, float, float]
     return np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], -1)
 
 
-def align_cloud(
-    cloud: PointCloud, estimate: np.ndarray, truth: np.ndarray, config: EvaluationConfig
-) -> tuple[PointCloud, str | None]:
-    """Bring the estimate's cloud into the frame of the truth by the alignment of the poses (n, 4, 4).
+def compare_clouds(
+    cloud: PointCloud, truth: PointCloud, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
+) -> dict[str, float | int | str | None]:
+    """Bring the estimate's cloud into the frame of the truth, then measure how far they are apart.
 
-    The second value says what the poses left open, see `align_poses`; None in the regular case.
+    The alignment is that of the poses, estimated and true (n, 4, 4); what they left open stands in
+    `reconstruction/alignment_note`, see `align_poses`. ICP, where the protocol has it, then moves the cloud rigidly.
     """
-    alignment, note = align_poses(estimate, truth, with_scale=config.alignment == "sim3")
-    return transform_cloud(cloud, alignment), note
+    alignment, note = align_poses(*poses, with_scale=config.alignment == "sim3")
+    aligned = transform_cloud(cloud, alignment)
+    if config.icp_distance_m > 0:
+        source, target = (voxel_downsample(rows, config.icp_voxel_m).points for rows in (aligned, truth))
+        aligned = transform_cloud(aligned, register(source, target, config.icp_distance_m, config.icp_max_steps))
+    return reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
 
 
 def reconstruction_metrics(
@@ -111,9 +126,10 @@ def reconstruction_metrics(
 ) -> dict[str, float | int | str | None]:
     """Compare two clouds in one frame; flat keys, metres and percent.
 
-    Both clouds are averaged per voxel first. Accuracy (estimate → truth) and completion (truth → estimate) are means
-    of the distances to the nearest point, never clipped: one far outlier counts in full. The normal metrics take the
-    nearest neighbours' |cos| and average both directions. Without points the values are None, with a reason.
+    Both clouds are averaged per voxel first. Accuracy (estimate → truth) and completion (truth → estimate) are the
+    protocol's statistic of the distances to the nearest point; unless it clips them, one far outlier counts in full.
+    The normal metrics take the nearest neighbours' |cos| and average both directions. Without points the values are
+    None, with a reason.
     """
     estimate, truth = voxel_downsample(estimate, config.voxel_m), voxel_downsample(truth, config.voxel_m)
     metrics: dict[str, float | int | str | None] = dict.fromkeys(_metric_names(config))
@@ -122,9 +138,11 @@ def reconstruction_metrics(
         which = "estimate" if not len(estimate) else "ground truth"
         metrics["reconstruction/reason"] = f"the {which} has no points"
         return metrics
+    rng = np.random.default_rng(0)  # one for both: equally long clouds must not keep the same rows
+    estimate, truth = _chosen(estimate, config.max_points, rng), _chosen(truth, config.max_points, rng)
     to_truth, partner = _nearest(estimate.points, truth.points)
     to_estimate, back = _nearest(truth.points, estimate.points)
-    values = [float(to_truth.mean()), float(to_estimate.mean())]
+    values = [_average(distances, config) for distances in (to_truth, to_estimate)]
     for threshold in config.f1_thresholds_m:
         precision, recall = 100.0 * np.mean(to_truth <= threshold), 100.0 * np.mean(to_estimate <= threshold)
         f1 = 2.0 * precision * recall / max(precision + recall, 1e-12)
@@ -137,6 +155,19 @@ def reconstruction_metrics(
     else:
         metrics["reconstruction/reason"] = "no normals to compare"
     return metrics | dict(zip(_metric_names(config), values, strict=False))
+
+
+def _average(distances: np.ndarray, config: EvaluationConfig) -> float:
+    clipped = np.minimum(distances, config.max_distance_m)
+    return float(clipped.mean() if config.statistic == "mean" else np.sqrt(np.mean(np.square(clipped))))
+
+
+def _chosen(cloud: PointCloud, max_points: int | None, rng: np.random.Generator) -> PointCloud:
+    """At most `max_points` rows at random."""
+    if max_points is None or len(cloud) <= max_points:
+        return cloud
+    rows = np.sort(rng.choice(len(cloud), max_points, replace=False))
+    return PointCloud(cloud.points[rows], cloud.normals[rows], cloud.colors[rows])
 
 
 def _metric_names(config: EvaluationConfig) -> list[str]:

@@ -14,6 +14,7 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.files import write_json
 from emgs_jax.prior.base import Provenance
 
+RESULT_FORMAT = 1  # of metrics.json; another one is refused where results are read
 RAW_PRIOR = "raw_prior/"  # prefix of the same metrics for the prior without any mapping
 _GROUPS = ("trajectory/", "reconstruction/", "map/", "time/")
 _ROWS = (("", "ours"), (RAW_PRIOR, "raw prior"))
@@ -41,6 +42,7 @@ def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance, s
     """Say where a result comes from: the block that stands in every result file."""
     device = jax.devices()[0]
     return {
+        "format": RESULT_FORMAT,
         "protocol": config.get("evaluation", {}).get("protocol"),
         "simulated": prior.is_simulated,
         "prior": {"name": prior.name, "settings": prior.settings},

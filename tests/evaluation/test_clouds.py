@@ -1,8 +1,10 @@
-"""Oracles: NumPy means per voxel, the whole against its pieces."""
+"""Oracles: NumPy means per voxel, the whole against its pieces, Open3D's ICP."""
 
 import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
 
-from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, voxel_downsample
+from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, register, voxel_downsample
 
 
 def random_cloud(rng, n=400):
@@ -34,3 +36,27 @@ def test_fusing_pieces_is_reducing_the_whole(monkeypatch):
     poisoned.points[::2] = np.nan
     assert np.isfinite(voxel_downsample(poisoned, 0.1).points).all()
     assert len(voxel_downsample(poisoned, 1e-6)) == 450
+
+
+@pytest.mark.parametrize("num_steps", [1, 4])
+def test_registration_takes_the_steps_of_open3ds_point_to_point_icp(num_steps):
+    registration = pytest.importorskip("open3d").pipelines.registration
+    import open3d as o3d
+
+    rng = np.random.default_rng(5)
+    target = rng.uniform(-1, 1, (800, 3))
+    motion = Rotation.from_rotvec([0.05, -0.02, 0.03]).as_matrix()
+    points = target[:500] @ motion.T + [0.02, -0.03, 0.01] + 0.01 * rng.normal(size=(500, 3))
+    found = register(points, target, 0.15, num_steps)
+    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(rows)) for rows in (points, target)]
+    criteria = registration.ICPConvergenceCriteria(0.0, 0.0, num_steps)
+    expected = registration.registration_icp(*clouds, 0.15, np.eye(4), criteria=criteria).transformation
+    np.testing.assert_allclose(found.rotation, expected[:3, :3], atol=1e-9)
+    np.testing.assert_allclose(found.translation, expected[:3, 3], atol=1e-9)
+
+
+def test_registration_without_pairs_moves_nothing():
+    points = np.random.default_rng(6).uniform(size=(20, 3))
+    for target in (points + 100.0, points[:0]):
+        found = register(points, target, 0.1, 10)
+        np.testing.assert_array_equal(found.apply(points), points)

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from scene import evaluation_config
 
-from emgs_jax.evaluation.reconstruction import EvaluationConfig, backproject, window_normals
+from emgs_jax.evaluation.reconstruction import backproject, window_normals
 
-CONFIG = EvaluationConfig()
+CONFIG = evaluation_config()
 INTRINSICS = (110.0, 95.0, 61.0, 47.0)  # fx ≠ fy, centre not in the middle
 SHAPE = (90, 120)
 

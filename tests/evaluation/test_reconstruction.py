@@ -1,28 +1,26 @@
-"""Oracles: closed forms on planes and spheres, brute force, equivariance, the real Replica mesh, config = YAML."""
+"""Oracles: closed forms on planes and spheres, brute force, Open3D, equivariance, the real Replica mesh."""
 
 import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
+from scene import evaluation_config
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import PointCloud, transform_cloud
 from emgs_jax.evaluation.reconstruction import (
-    EvaluationConfig,
-    align_cloud,
     backproject,
+    compare_clouds,
     ground_truth_cloud,
     raw_prior_cloud,
     reconstruction_metrics,
 )
 from emgs_jax.evaluation.trajectory import Alignment
 
-ROOT = Path(__file__).resolve().parents[2]
-REPLICA = ROOT.parent / "shared" / "data" / "replica"
-CONFIG = EvaluationConfig()
+REPLICA = Path(__file__).resolve().parents[3] / "shared" / "data" / "replica"
+CONFIG = evaluation_config()
 INTRINSICS = (110.0, 95.0, 61.0, 47.0)  # fx ≠ fy, centre not in the middle
 SHAPE = (90, 120)
 
@@ -50,18 +48,26 @@ def a_frame(depth, pose=None, index=0):
     return Frame(index, float(index), "f", image, depth.astype(np.float32), np.eye(4) if pose is None else pose)
 
 
-def test_every_yaml_key_is_a_config_field_and_its_value_the_default():
-    values = yaml.safe_load((ROOT / "conf" / "evaluation" / "default.yaml").read_text())
-    assert values.pop("_target_") == f"{EvaluationConfig.__module__}.{EvaluationConfig.__name__}"
-    assert set(values) == {field.name for field in dataclasses.fields(EvaluationConfig)}
-    assert EvaluationConfig(**values) == CONFIG
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("alignment", "sim2", "alignment must be sim3 or se3, got 'sim2'"),
+        ("statistic", "median", "statistic must be mean or rmse, got 'median'"),
+        ("voxel_m", 0.0, "voxel_m must be positive, got 0.0"),
+        ("max_distance_m", float("nan"), "max_distance_m must be positive, got nan"),
+    ],
+)
+def test_wrong_config_values_are_named(name, value, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(CONFIG, **{name: value})
 
 
-def test_wrong_config_values_are_named():
-    with pytest.raises(ValueError, match="alignment must be sim3 or se3, got 'sim2'"):
-        EvaluationConfig(alignment="sim2")
-    with pytest.raises(ValueError, match="voxel_m"):
-        EvaluationConfig(voxel_m=0.0)
+def test_protocols_and_alignments_are_options_and_each_names_itself():
+    assert evaluation_config().protocol == "paper/sim3"
+    for protocol in ("paper", "mast3r", "nice_slam"):
+        for alignment in ("sim3", "se3"):
+            config = evaluation_config(f"evaluation={protocol}", f"alignment={alignment}")
+            assert (config.protocol, config.alignment) == (f"{protocol}/{alignment}", alignment)
 
 
 def test_a_cloud_against_itself_is_perfect():
@@ -86,11 +92,22 @@ def test_parallel_planes_differ_by_their_distance():
     assert metrics["reconstruction/num_points"] == 1600
 
 
+def test_normals_that_are_turned_by_known_angles_agree_by_their_cosines():
+    """Half of the points by 20 degrees, half by 40: only the first half is within 30."""
+    truth = grid_cloud()
+    angles = np.radians(np.where(np.arange(len(truth)) % 2, 40.0, 20.0))
+    turned = np.stack([np.sin(angles), np.zeros_like(angles), np.cos(angles)], 1)
+    metrics = reconstruction_metrics(dataclasses.replace(truth, normals=turned), truth, CONFIG)
+    expected = 50 * (np.cos(np.radians(20.0)) + np.cos(np.radians(40.0)))
+    np.testing.assert_allclose(metrics["reconstruction/normals_abs_cos_percent"], expected, rtol=1e-9)
+    assert metrics["reconstruction/normals_within_30deg_percent"] == 50.0
+
+
 def test_half_a_plane_has_full_precision_and_half_the_recall():
     truth = grid_cloud()
     left = truth.points[:, 0] < 1.0
     half = PointCloud(truth.points[left], truth.normals[left], truth.colors[left])
-    metrics = reconstruction_metrics(half, truth, EvaluationConfig(f1_thresholds_m=(0.01,)))
+    metrics = reconstruction_metrics(half, truth, dataclasses.replace(CONFIG, f1_thresholds_m=(0.01,)))
     assert metrics["reconstruction/precision_1cm_percent"] == 100.0
     assert metrics["reconstruction/recall_1cm_percent"] == 50.0
     np.testing.assert_allclose(metrics["reconstruction/f1_1cm_percent"], 200.0 / 3.0)
@@ -110,7 +127,7 @@ def test_one_far_outlier_counts_in_full():
 def test_distances_and_normals_are_those_of_brute_force():
     rng = np.random.default_rng(1)
     estimate, truth = random_cloud(rng, 300), random_cloud(rng, 200)
-    config = EvaluationConfig(voxel_m=1e-4)
+    config = dataclasses.replace(CONFIG, voxel_m=1e-4)
     metrics = reconstruction_metrics(estimate, truth, config)
     distances = np.linalg.norm(estimate.points[:, None] - truth.points[None], axis=-1)
     cosines = np.abs(estimate.normals @ truth.normals.T)
@@ -132,8 +149,8 @@ def test_metrics_follow_a_similarity_of_both_clouds():
     rng = np.random.default_rng(2)
     estimate, truth = random_cloud(rng), random_cloud(rng)
     move = Alignment(2.0, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
-    small = EvaluationConfig(voxel_m=1e-4, f1_thresholds_m=(0.1,))
-    large = EvaluationConfig(voxel_m=1e-4, f1_thresholds_m=(0.2,))
+    small = dataclasses.replace(CONFIG, voxel_m=1e-4, f1_thresholds_m=(0.1,))
+    large = dataclasses.replace(CONFIG, voxel_m=1e-4, f1_thresholds_m=(0.2,))
     before = list(reconstruction_metrics(estimate, truth, small).values())
     after = list(reconstruction_metrics(transform_cloud(estimate, move), transform_cloud(truth, move), large).values())
     np.testing.assert_allclose(after[:2], 2.0 * np.array(before[:2]), rtol=1e-6)
@@ -182,11 +199,65 @@ def test_a_cloud_is_aligned_by_the_poses_with_scale_or_without():
     cloud, half = random_cloud(rng), poses.copy()
     half[:, :3, 3] *= 0.5
     estimate = dataclasses.replace(cloud, points=0.5 * cloud.points)
-    found, note = align_cloud(estimate, half, poses, CONFIG)
-    assert note is None
-    np.testing.assert_allclose(found.points, cloud.points, atol=1e-12)
-    found, _ = align_cloud(estimate, half, poses, EvaluationConfig(alignment="se3"))
-    np.testing.assert_allclose(found.points, estimate.points + 0.5 * poses[:, :3, 3].mean(0), atol=1e-12)
+    metrics = compare_clouds(estimate, cloud, (half, poses), CONFIG)
+    assert metrics["reconstruction/alignment_note"] is None
+    np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 0.0, atol=1e-12)
+    kept = dataclasses.replace(estimate, points=estimate.points + 0.5 * poses[:, :3, 3].mean(0))
+    rigid = evaluation_config("alignment=se3")
+    metrics = compare_clouds(estimate, kept, (half, poses), rigid)
+    np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 0.0, atol=1e-12)
+
+
+def test_distances_are_those_of_open3d_as_mean_and_as_clipped_rmse():
+    o3d = pytest.importorskip("open3d")
+    rng = np.random.default_rng(8)
+    estimate, truth = random_cloud(rng, 900), random_cloud(rng, 700)
+    there, back = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(c.points)) for c in (estimate, truth))
+    distances = [np.asarray(a.compute_point_cloud_distance(b)) for a, b in ((there, back), (back, there))]
+    exact = dataclasses.replace(CONFIG, voxel_m=1e-5)
+    clipped = dataclasses.replace(exact, statistic="rmse", max_distance_m=0.1)
+    for config, average in (
+        (exact, np.mean),
+        (clipped, lambda values: np.sqrt(np.mean(np.minimum(values, 0.1) ** 2))),
+    ):
+        metrics = reconstruction_metrics(estimate, truth, config)
+        for name, values in zip(("accuracy_m", "completion_m"), distances, strict=True):
+            np.testing.assert_allclose(metrics[f"reconstruction/{name}"], average(values), rtol=1e-6)
+        # what the distances are clipped to does not touch the F1
+        precision, recall = (100 * np.mean(values <= 0.2) for values in distances)
+        f1 = 2 * precision * recall / (precision + recall)
+        np.testing.assert_allclose(metrics["reconstruction/f1_20cm_percent"], f1)
+
+
+def test_icp_of_a_protocol_takes_back_a_small_motion_that_the_poses_do_not_show():
+    rng = np.random.default_rng(9)
+    truth = random_cloud(rng, 1500)
+    small = Alignment(1.0, Rotation.from_rotvec([0.01, -0.01, 0.005]).as_matrix(), np.array([0.01, 0.0, -0.01]))
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, 3] = rng.normal(size=(5, 3))
+    moved = transform_cloud(truth, small)
+    without = compare_clouds(moved, truth, (poses, poses), CONFIG)
+    refined = dataclasses.replace(CONFIG, icp_distance_m=0.1, icp_voxel_m=1e-4)
+    assert without["reconstruction/accuracy_m"] > 0.01
+    assert compare_clouds(moved, truth, (poses, poses), refined)["reconstruction/accuracy_m"] < 1e-9
+
+
+def test_true_depth_beyond_the_limit_of_a_protocol_is_left_out():
+    depth = np.full(SHAPE, 3.0)
+    depth[:, 60:] = 5.0
+    cloud = ground_truth_cloud([a_frame(depth)], INTRINSICS, evaluation_config("evaluation=mast3r"))
+    assert len(cloud) > 1000
+    np.testing.assert_allclose(cloud.points[:, 2], 3.0)
+
+
+def test_a_protocol_compares_a_random_choice_of_points_that_is_the_same_each_time():
+    """Of two parallel planes every choice has the precision of the whole; the distances grow with the gaps."""
+    few = dataclasses.replace(CONFIG, max_points=400)
+    first, second = (reconstruction_metrics(grid_cloud(0.1), grid_cloud(), few) for _ in range(2))
+    assert first == second
+    assert first["reconstruction/num_points"] == 1600
+    assert 0.1 < first["reconstruction/accuracy_m"] < 0.12
+    assert first["reconstruction/f1_20cm_percent"] == 100.0
 
 
 @pytest.mark.skipif(not REPLICA.exists(), reason="the shared Replica sequence is not here")

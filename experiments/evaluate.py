@@ -1,0 +1,144 @@
+"""Evaluate data sets × sequences × variants × seeds: `python -m experiments.evaluate suite=smoke seeds=[0,1,2]`.
+
+What is finished is skipped, so the same command resumes; a job that fails does not stop the others. The folder `out`
+gets one folder per job, results.csv, results.json and results.md.
+"""
+
+import contextlib
+import copy
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import hydra
+import jax
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from emgs_jax.evaluation.gate import read_gate, regressions, write_gate
+from emgs_jax.evaluation.results import is_finished, read_estimates, result_folder
+from emgs_jax.evaluation.tables import Row, average, full_table, paper_table, to_csv
+from emgs_jax.files import atomic_write, write_json
+from experiments.building import clear_errors, message_of, use_compilation_cache
+from experiments.run import run
+
+ERROR_FILE = "error.txt"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run: its name, its config and its folder."""
+
+    name: str
+    dataset: str
+    config: DictConfig
+    folder: Path
+
+
+def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
+    """All jobs, those of one data set one after the other; `settings` is a resolved conf/evaluate.yaml."""
+    for dataset, data in settings["suite"]["data"].items():
+        for variant, changes in settings["variants"].items():
+            overrides = [f"dataset={dataset}", *data["overrides"], *settings["overrides"], *changes]
+            common = hydra.compose("config", overrides=overrides)
+            has_seed = "seed" in common.prior
+            if not has_seed and len(settings["seeds"]) > 1:
+                raise ValueError(f"prior.seed is no key of {common.prior._target_}: give one seed, seeds=[0]")
+            for sequence in data["sequences"]:
+                for seed in settings["seeds"]:
+                    config = copy.deepcopy(common)
+                    OmegaConf.update(config, data["key"], sequence)
+                    if has_seed:
+                        config.prior.seed = seed
+                    folder = result_folder(Path(settings["out"]), dataset, sequence, variant, seed)
+                    yield Job(f"{dataset}/{sequence}/{variant}/{seed}", dataset, config, folder)
+
+
+def evaluate(settings: Mapping[str, Any]) -> list[str]:
+    """Run every job of this shard that is not finished and write the tables; returns what went wrong, line by line."""
+    out, part, whole = Path(settings["out"]), *_shard(settings["shard"])
+    if whole > 1 and (settings["gate"] or settings["write_gate"]):
+        raise ValueError("a gate needs the results of all jobs: run once more without shard")
+    baseline = read_gate(settings["gate"]) if settings["gate"] else {}
+    jobs = list(plan(settings))
+    read_estimates(out)  # results that cannot be read end the evaluation before it begins
+    ours = jobs[(part - 1) * len(jobs) // whole : part * len(jobs) // whole]  # neighbours share their executables
+    open_jobs = [job for job in ours if not _is_finished(job)]
+    print(f"shard {part}/{whole}: {len(open_jobs)} of its {len(ours)} jobs to do, {len(jobs)} in all")
+    failures: dict[str, str] = {}
+    try:
+        _run_all(open_jobs, failures)
+    finally:
+        rows = _write_tables(out, jobs, failures, settings["published"])
+    if settings["write_gate"]:
+        write_gate(settings["write_gate"], rows, settings["tolerances"])
+    problems = [f"{name}: {message}" for name, message in failures.items()]
+    return problems + [f"regression: {line}" for line in regressions(baseline, rows)]
+
+
+def _run_all(jobs: Sequence[Job], failures: dict[str, str]) -> None:
+    for number, job in enumerate(jobs):
+        tqdm.write(f"{number + 1}/{len(jobs)} {job.name}")
+        if number and job.dataset != jobs[number - 1].dataset:
+            jax.clear_caches()  # other shapes: the old executables would only hold memory
+        try:
+            job.folder.mkdir(parents=True, exist_ok=True)
+            run(job.config, job.folder)
+            (job.folder / ERROR_FILE).unlink(missing_ok=True)
+        except Exception as error:  # whatever it is, the other jobs go on
+            failures[job.name] = message_of(error)
+            tqdm.write(f"failed: {failures[job.name]}")
+            with contextlib.suppress(OSError), atomic_write(job.folder / ERROR_FILE, "w") as handle:
+                handle.write("".join(traceback.format_exception(error)))
+
+
+def _is_finished(job: Job) -> bool:
+    return is_finished(job.folder, OmegaConf.to_container(job.config, resolve=True))
+
+
+def _shard(text: str) -> tuple[int, int]:
+    part, _, whole = str(text).partition("/")
+    if not (part.isdigit() and whole.isdigit() and 1 <= int(part) <= int(whole)):
+        raise ValueError(f"shard must be n/m with n from 1 to m, such as 2/4, got {text!r}")
+    return int(part), int(whole)
+
+
+def _write_tables(
+    out: Path, jobs: Sequence[Job], failures: Mapping[str, str], published: Sequence[Mapping[str, Any]]
+) -> list[Row]:
+    """Write results.csv, results.json and results.md; returns the rows by sequence.
+
+    They show the jobs of this evaluation and other systems: older results in `out` may have other settings.
+    """
+    folders = {job.folder for job in jobs}
+    estimates = [item for item in read_estimates(out) if item.kind == "scored" or item.folder in folders]
+    totals, rows = average(estimates, each_sequence=False), average(estimates, each_sequence=True)
+    done = {item.folder for item in estimates}
+    missing = {job.name: failures.get(job.name, "to do") for job in jobs if job.folder not in done}
+    parts = [paper_table(totals, published)]
+    parts.append(full_table([*rows, *(row for row in totals if len(row.sequences) > 1)]) if rows else "")
+    parts.append("".join(f"- not finished: {name}: {reason}\n" for name, reason in missing.items()))
+    text = "\n".join(part for part in parts if part)
+    out.mkdir(parents=True, exist_ok=True)
+    for name, content in (("results.csv", to_csv(estimates)), ("results.md", text)):
+        with atomic_write(out / name, "w") as handle:
+            handle.write(content)
+    write_json(out / "results.json", {"rows": rows, "totals": totals, "published": published, "missing": missing})
+    print(text)
+    return rows
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")
+def main(config: DictConfig) -> None:
+    """Evaluate; the exit status is 1 if a job failed or a metric got worse."""
+    with clear_errors():
+        use_compilation_cache(config)
+        problems = evaluate(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+        if problems:
+            raise ValueError("\n       ".join([f"problems: {len(problems)}", *problems]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""Score any other system: `python -m experiments.score trajectory=FILE points=FILE method=NAME dataset=…`.
+
+The same data, protocol and code as for our own runs; the result lies beside them in `out`, and the next table of
+`python -m experiments.evaluate` shows it.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import hydra
+import numpy as np
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.evaluation.clouds import PointCloud, read_cloud
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, compare_clouds, ground_truth_cloud
+from emgs_jax.evaluation.report import provenance, write_metrics
+from emgs_jax.evaluation.results import METRICS_FILE, estimates_of, is_finished, result_folder
+from emgs_jax.evaluation.tables import average, full_table
+from emgs_jax.evaluation.trajectory import associate, trajectory_metrics
+from emgs_jax.export import load_trajectory_tum
+from emgs_jax.prior.base import Provenance
+from experiments.building import build_dataset, clear_errors
+
+Metrics = dict[str, Any]
+
+
+def score(config: DictConfig) -> tuple[Metrics, Path]:
+    """Compare the trajectory and the cloud of `config` with its data set; returns the metrics and their file."""
+    dataset, evaluation = build_dataset(config), instantiate(config.evaluation)
+    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    folder = result_folder(Path(config.out), dataset.name, dataset.sequence, config.method, 0)
+    is_finished(folder, settings)  # scoring again replaces its own result, never another one
+    cloud = None if config.points is None else read_cloud(config.points, config.normal_neighbours)
+    poses, truth, counts = matched_poses(config.trajectory, dataset, config.max_time_difference)
+    metrics = trajectory_metrics(poses, truth) | counts
+    if cloud is not None:
+        metrics |= compare(cloud, (poses, truth), dataset, evaluation)
+    block = provenance(settings, dataset, Provenance(config.method, {}, config.simulated), 0)
+    metrics["provenance"] = block | {"prior": None, "method": config.method}
+    folder.mkdir(parents=True, exist_ok=True)
+    write_metrics(folder / METRICS_FILE, metrics)
+    return metrics, folder / METRICS_FILE
+
+
+def matched_poses(
+    path: str, dataset: ReadableFrames, max_difference: float
+) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
+    """Poses of the file and true poses of the same times (n, 4, 4), and how many there are of which."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"trajectory={path} does not exist: give a file with `timestamp tx ty tz qx qy qz qw`")
+    times, poses = load_trajectory_tum(path)
+    what = f"{dataset.name} {dataset.sequence}"
+    frames = (dataset[row] for row in range(len(dataset)))
+    known = [(frame.timestamp, frame.T_world_camera) for frame in frames if frame.T_world_camera is not None]
+    if not known:
+        raise ValueError(f"{what} has no true poses to compare with: choose another data set")
+    true_times = np.array([time for time, _ in known])
+    rows, true_rows = associate(times, true_times, max_difference)
+    if not len(rows):
+        raise ValueError(
+            f"{path}: no pose is within {max_difference:g} s of a frame. Its timestamps are {_span(times)}, those of "
+            f"{what} {_span(true_times)}: write the data set's timestamps, choose the same frames (dataset.start, "
+            "stop, stride) or raise max_time_difference"
+        )
+    truth = np.stack([known[row][1] for row in true_rows]).astype(np.float64)
+    return poses[rows], truth, {"score/num_poses": len(times), "score/num_frames": len(known)}
+
+
+def compare(
+    cloud: PointCloud, poses: tuple[np.ndarray, np.ndarray], dataset: ReadableFrames, evaluation: EvaluationConfig
+) -> Metrics:
+    """Reconstruction metrics against the true cloud of all frames."""
+    frames = (dataset[row] for row in range(len(dataset)))
+    return compare_clouds(cloud, ground_truth_cloud(frames, dataset.intrinsics, evaluation), poses, evaluation)
+
+
+def _span(times: np.ndarray) -> str:
+    return f"{times.min():.3f} to {times.max():.3f}" if len(times) else "none"
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="score")
+def main(config: DictConfig) -> None:
+    """Score, print the table and where the result lies."""
+    with clear_errors():
+        metrics, path = score(config)
+    print(full_table(average(estimates_of(path), each_sequence=True)))
+    counts = [metrics[key] for key in ("trajectory/num_frames", "score/num_poses", "score/num_frames")]
+    print(f"{counts[0]} of {counts[1]} poses belong to one of the {counts[2]} frames; everything is in {path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,69 @@
+"""Oracles: confusion matrices and metrics worked out by hand, a loop over points, the limits."""
+
+import numpy as np
+import pytest
+
+from emgs_jax.evaluation.segmentation import confusion_matrix, segmentation_metrics, transfer_labels
+
+#                predicted: 0  1  2  none
+CONFUSION = np.array([[6, 2, 0, 2], [1, 3, 1, 0], [0, 0, 0, 0]])
+
+
+def test_pairs_are_counted_and_points_without_a_true_class_are_not():
+    truth = np.array([0, 0, 0, 1, 1, -1, 3, 2])
+    predicted = np.array([0, 1, -1, 1, 7, 0, 1, 0])
+    np.testing.assert_array_equal(confusion_matrix(truth, predicted, 3), [[1, 1, 0, 1], [0, 1, 0, 1], [1, 0, 0, 0]])
+    with pytest.raises(ValueError, match="transfer the labels first"):
+        confusion_matrix(truth, predicted[:3], 3)
+
+
+def test_metrics_of_a_matrix_are_those_worked_out_by_hand():
+    """Class 0: IoU 6 / (10 + 7 - 6), recall .6. Class 1: 3 / (5 + 5 - 3), .6. Class 2 is only predicted: 0 and 0."""
+    metrics = segmentation_metrics(CONFUSION)
+    expected = {
+        "miou_percent": 100 * (6 / 11 + 3 / 7 + 0) / 3,
+        "fmiou_percent": 100 * (10 * 6 / 11 + 5 * 3 / 7) / 15,
+        "mean_recall_percent": 100 * (0.6 + 0.6 + 0) / 3,
+        "accuracy_percent": 60.0,
+    }
+    for name, value in expected.items():
+        np.testing.assert_allclose(metrics[f"segmentation/{name}"], value, rtol=1e-12, err_msg=name)
+    assert metrics["segmentation/num_points"] == 15
+
+
+def test_true_points_of_an_ignored_class_do_not_count_but_points_lost_to_it_do():
+    """Without class 1: class 0 has IoU 6 / (10 + 6 - 6), class 2 is not predicted any more."""
+    metrics = segmentation_metrics(CONFUSION, ignored=[1])
+    np.testing.assert_allclose(metrics["segmentation/miou_percent"], 60.0)
+    np.testing.assert_allclose(metrics["segmentation/mean_recall_percent"], 60.0)
+    assert metrics["segmentation/num_points"] == 10
+
+
+def test_a_perfect_answer_is_100_percent_and_none_is_0():
+    truth = np.repeat(np.arange(4), [3, 1, 7, 2])
+    perfect = segmentation_metrics(confusion_matrix(truth, truth, 6))
+    silent = segmentation_metrics(confusion_matrix(truth, np.full_like(truth, -1), 6))
+    for name in ("miou", "fmiou", "mean_recall", "accuracy"):
+        assert perfect[f"segmentation/{name}_percent"] == 100.0
+        assert silent[f"segmentation/{name}_percent"] == 0.0
+    assert segmentation_metrics(np.zeros((3, 4), int))["segmentation/miou_percent"] is None
+
+
+def test_scenes_are_joined_by_adding_their_matrices():
+    rng = np.random.default_rng(0)
+    truth, predicted = rng.integers(-1, 5, 400), rng.integers(-1, 5, 400)
+    parts = [confusion_matrix(truth[i::3], predicted[i::3], 5) for i in range(3)]
+    np.testing.assert_array_equal(sum(parts), confusion_matrix(truth, predicted, 5))
+
+
+def test_a_target_takes_the_most_frequent_label_of_its_neighbours():
+    rng = np.random.default_rng(1)
+    points, targets = rng.uniform(size=(200, 3)), rng.uniform(size=(50, 3))
+    labels = rng.integers(-1, 4, 200)
+    found = transfer_labels(points, labels, targets, 5)
+    for target, label in zip(targets, found, strict=True):
+        distances = np.where(labels < 0, np.inf, np.linalg.norm(points - target, axis=1))
+        values, counts = np.unique(labels[np.argsort(distances)[:5]], return_counts=True)
+        assert label == values[counts.argmax()]  # values ascend: the smallest of the most frequent
+    assert (transfer_labels(points, np.full(200, -1), targets, 5) == -1).all()
+    np.testing.assert_array_equal(transfer_labels(targets[:1], np.array([3]), targets, 5), 3)

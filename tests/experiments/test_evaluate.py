@@ -1,0 +1,234 @@
+"""The batch: what runs, what is skipped, what failures and interruptions leave; oracle: a run that is made up."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import hydra
+import pytest
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import OmegaConf
+from tiny_run import CONF, TINY
+
+import experiments.evaluate
+from emgs_jax.evaluation.gate import read_gate
+from emgs_jax.evaluation.report import RESULT_FORMAT
+from emgs_jax.evaluation.results import METRICS_FILE
+from emgs_jax.files import write_json
+from experiments.building import clear_errors
+
+ENVIRONMENT = os.environ | {"JAX_PLATFORMS": "cpu"}
+
+
+@pytest.fixture
+def evaluate(tmp_path, monkeypatch):
+    """`evaluate("seeds=[0,1]", …)`: problems of an evaluation of two rooms whose runs only write what they are of.
+
+    `evaluate.runs` holds the room and seed of each run; `evaluate.broken` maps a room to the error that its runs raise.
+    """
+
+    def run(config, folder):
+        evaluation.runs.append((config.dataset.seed, config.prior.seed))
+        if config.dataset.seed in evaluation.broken:
+            raise evaluation.broken[config.dataset.seed]
+        block = {"format": RESULT_FORMAT, "protocol": config.evaluation.protocol, "simulated": True, "git": None}
+        block |= {"prior": {"name": "simulated"}, "config": OmegaConf.to_container(config, resolve=True)}
+        block["data"] = {"name": "synthetic", "sequence": f"room{config.dataset.seed}"}
+        ate = 0.01 * (1 + config.dataset.seed) + 0.001 * config.prior.seed
+        write_json(folder / METRICS_FILE, {"trajectory/ate_sim3_m": ate, "provenance": block})
+
+    def evaluation(*overrides):
+        evaluation.runs.clear()
+        rooms = "suite.data.synthetic.sequences=[0,1]"
+        with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+            config = hydra.compose("evaluate", ["suite=smoke", rooms, f"out={tmp_path / 'out'}", *overrides])
+            return experiments.evaluate.evaluate(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+
+    evaluation.runs, evaluation.broken, evaluation.out = [], {}, tmp_path / "out"
+    monkeypatch.setattr(experiments.evaluate, "run", run)
+    return evaluation
+
+
+def test_every_sequence_is_run_with_every_seed_and_variant(evaluate):
+    assert evaluate("seeds=[0,2]", '+variants.wide=["slam.window_size=7"]') == []
+    assert evaluate.runs == [(0, 0), (0, 2), (1, 0), (1, 2)] * 2
+    configs = {
+        path.relative_to(evaluate.out).parent.as_posix(): json.loads(path.read_text())["provenance"]["config"]
+        for path in evaluate.out.rglob(METRICS_FILE)
+    }
+    assert {name: config["slam"]["window_size"] for name, config in configs.items()} == {
+        f"synthetic/{room}/{variant}/{seed}": size
+        for room in (0, 1)
+        for variant, size in (("default", 4), ("wide", 7))
+        for seed in (0, 2)
+    }
+
+
+def test_what_is_finished_is_skipped_and_the_rest_is_run(evaluate):
+    evaluate("seeds=[0]")
+    kept = (evaluate.out / "synthetic/0/default/0" / METRICS_FILE).read_bytes()
+    assert evaluate("seeds=[0,1]") == []
+    assert evaluate.runs == [(0, 1), (1, 1)]
+    assert (evaluate.out / "synthetic/0/default/0" / METRICS_FILE).read_bytes() == kept
+    assert evaluate("seeds=[0,1]") == [] and evaluate.runs == []
+
+
+def test_a_job_that_fails_does_not_stop_the_others_and_is_named_at_the_end(evaluate, capsys):
+    evaluate.broken[0] = OSError("frame 3 is gone")
+    assert evaluate("seeds=[0]") == ["synthetic/0/default/0: frame 3 is gone"]
+    assert evaluate.runs == [(0, 0), (1, 0)]
+    assert "- not finished: synthetic/0/default/0: frame 3 is gone" in (evaluate.out / "results.md").read_text()
+    assert "room1" in capsys.readouterr().out
+    note = evaluate.out / "synthetic/0/default/0" / experiments.evaluate.ERROR_FILE
+    assert "OSError: frame 3 is gone" in note.read_text()
+    # the same command tries again
+    evaluate.broken.clear()
+    assert evaluate("seeds=[0]") == [] and evaluate.runs == [(0, 0)]
+    assert not note.exists() and "not finished" not in (evaluate.out / "results.md").read_text()
+
+
+def test_an_interrupted_evaluation_has_the_tables_of_what_is_finished_and_resumes(evaluate):
+    evaluate.broken[1] = KeyboardInterrupt()
+    with pytest.raises(KeyboardInterrupt):
+        evaluate("seeds=[0,1]")
+    lines = list(csv.DictReader((evaluate.out / "results.csv").open()))
+    assert [(line["sequence"], line["seed"]) for line in lines] == [("room0", "0"), ("room0", "1")]
+    summary = json.loads((evaluate.out / "results.json").read_text())
+    assert summary["missing"] == {"synthetic/1/default/0": "to do", "synthetic/1/default/1": "to do"}
+    evaluate.broken.clear()
+    assert evaluate("seeds=[0,1]") == [] and evaluate.runs == [(1, 0), (1, 1)]
+
+
+def test_the_shards_do_every_job_once(evaluate):
+    """One after the other, so that each sees other jobs finished: what is whose must not depend on it."""
+    done = []
+    for part in (1, 2, 3):
+        assert evaluate("seeds=[0,1]", f"shard={part}/3") == []
+        done += evaluate.runs
+    assert done == [(0, 0), (0, 1), (1, 0), (1, 1)]
+
+
+def test_a_shard_is_a_part_of_a_whole_and_no_gate(evaluate):
+    for wrong in ("0/2", "3/2", "half"):
+        with pytest.raises(ValueError, match="shard must be n/m"):
+            evaluate(f"shard={wrong}")
+    with pytest.raises(ValueError, match="run once more without shard"):
+        evaluate("shard=1/2", "gate=some.yaml")
+
+
+def test_other_settings_never_replace_a_finished_result_and_nothing_runs(evaluate):
+    evaluate("seeds=[0]")
+    with pytest.raises(ValueError, match=r"window_size was 4, now 7.*\+variants.NAME"):
+        evaluate("seeds=[0,1]", 'overrides=["slam.window_size=7"]')
+    assert evaluate.runs == []
+
+
+def test_results_that_the_command_does_not_name_stay_but_never_enter_its_tables(evaluate):
+    """They may have other settings: seed 5 has another window here."""
+    evaluate("seeds=[5]", 'overrides=["slam.window_size=7"]')
+    evaluate("seeds=[0]")
+    lines = list(csv.DictReader((evaluate.out / "results.csv").open()))
+    assert {line["seed"] for line in lines} == {"0"}
+    assert (evaluate.out / "synthetic/0/default/5" / METRICS_FILE).is_file()
+
+
+def test_a_result_of_another_version_ends_the_evaluation_before_it_begins(evaluate):
+    evaluate("seeds=[0]")
+    path = evaluate.out / "synthetic/1/default/0" / METRICS_FILE
+    path.write_text(path.read_text().replace(f'"format": {RESULT_FORMAT}', '"format": -1'))
+    with pytest.raises(ValueError, match="written by another version"):
+        evaluate("seeds=[0,1]")
+    assert evaluate.runs == []
+
+
+def test_the_gate_passes_with_the_same_results_and_names_what_is_worse(evaluate, tmp_path):
+    gate = tmp_path / "gate.yaml"
+    assert evaluate("seeds=[0,1]", f"write_gate={gate}") == []
+    assert evaluate("seeds=[0,1]", f"gate={gate}") == [] and evaluate.runs == []
+    baseline = yaml.safe_load(gate.read_text())
+    baseline["baseline"]["synthetic/room1/default"]["metrics"]["trajectory/ate_sim3_m"]["value"] = 0.01
+    gate.write_text(yaml.safe_dump(baseline))
+    (problem,) = evaluate("seeds=[0,1]", f"gate={gate}")
+    assert problem.startswith("regression: synthetic/room1/default: trajectory/ate_sim3_m is 0.0205, baseline 0.01")
+
+
+def test_a_prior_without_a_seed_is_evaluated_with_one(evaluate):
+    recorded = 'overrides=["prior=recorded","prior.folder=predictions/\\${dataset.seed}"]'
+    with pytest.raises(ValueError, match=r"prior.seed is no key of .*Recorded: give one seed, seeds=\[0\]"):
+        evaluate("seeds=[0,1]", recorded)
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        config = hydra.compose("evaluate", ["suite=smoke", recorded])
+        jobs = list(experiments.evaluate.plan(OmegaConf.to_container(config, resolve=True)))
+    assert [job.config.prior.folder for job in jobs] == ["predictions/0"]
+
+
+def test_the_committed_baseline_holds_every_metric_of_the_suite_and_the_protocol_of_its_name():
+    baseline = read_gate(CONF / "baseline" / "smoke.yaml")
+    assert {name: entry["protocol"] for name, entry in baseline.items()} == {"synthetic/room0/default": "paper/sim3"}
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        tolerances = hydra.compose("evaluate", ["suite=smoke"]).tolerances
+    for entry in baseline.values():
+        directions = {key: rule["direction"] for key, rule in entry["metrics"].items()}
+        assert directions == {key: rule.direction for key, rule in tolerances.items()}
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "suite").glob("*.yaml")))
+def test_every_suite_makes_jobs_that_know_their_sequence_and_name_no_path_of_a_machine(name):
+    assert "/" not in yaml.safe_load((CONF / "suite" / f"{name}.yaml").read_text()).get("root", "???")
+    root = [] if name == "smoke" else ["suite.root=some folder"]
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        config = hydra.compose("evaluate", [f"suite={name}", *root])
+        jobs = list(experiments.evaluate.plan(OmegaConf.to_container(config, resolve=True, throw_on_missing=True)))
+    sequences = [job.config.dataset.get("sequence", job.config.dataset.get("seed")) for job in jobs]
+    count = {"seven_scenes": 7, "tum": 9, "replica": 8, "slices": 4, "smoke": 1}[name]
+    assert len({job.folder for job in jobs}) == len(set(sequences)) == count
+    assert all(job.config.dataset.get("root", "some folder").startswith("some folder") for job in jobs)
+
+
+@pytest.mark.parametrize(("mode", "error"), [(RunMode.RUN, SystemExit), (RunMode.MULTIRUN, ValueError)])
+def test_an_error_in_a_multirun_goes_to_hydra_so_that_the_other_jobs_run(monkeypatch, mode, error):
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    running = OmegaConf.create({"hydra": {"mode": mode}})
+    monkeypatch.setattr(HydraConfig, "initialized", lambda: True)
+    monkeypatch.setattr(HydraConfig, "get", lambda: running.hydra)
+    with pytest.raises(error, match="what is wrong"), clear_errors():
+        raise ValueError("what is wrong")
+
+
+def run_script(*arguments):
+    command = [sys.executable, "-m", "experiments.evaluate", *arguments]
+    return subprocess.run(
+        command, cwd=CONF.parent, env=ENVIRONMENT, capture_output=True, text=True, timeout=500, check=False
+    )
+
+
+def tiny(*overrides):
+    return "overrides=[" + ",".join(f"'{override}'" for override in (*TINY, *overrides)) + "]"
+
+
+@pytest.mark.slow
+def test_the_exit_status_says_that_a_job_failed(tmp_path):
+    done = run_script("suite=tum", f"suite.root={tmp_path}", f"out={tmp_path / 'out'}")
+    assert done.returncode == 1
+    assert "problems: 9" in done.stderr and "freiburg1_xyz does not exist" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["basic", "joblib", "submitit_local"])
+def test_shards_run_on_the_launchers_of_hydra(tmp_path, launcher):
+    """One shard fails: the other one's result is there, and the command says what is wrong."""
+    if launcher != "basic":
+        pytest.importorskip(f"hydra_plugins.hydra_{launcher.removesuffix('_local')}_launcher")
+    out = tmp_path / "out"
+    shards = ("-m", f"hydra/launcher={launcher}", "shard=1/2,2/2", "suite=smoke")
+    done = run_script(*shards, "suite.data.synthetic.sequences=[-1,0]", f"out={out}", tiny())
+    assert done.returncode == 1, done.stderr
+    assert "dataset.seed must be 0 or more" in done.stderr + done.stdout
+    assert [path.parent.relative_to(out).as_posix() for path in out.rglob(METRICS_FILE)] == ["synthetic/0/default/0"]
+    assert (out / "results.md").is_file() and not Path(CONF.parent / "multirun.yaml").exists()

@@ -1,0 +1,130 @@
+"""A peer under our protocol; oracles: the truth itself, a known similarity of it, evo's association, bad files."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tiny_run import NUM_FRAMES, compose, dataset
+
+from emgs_jax.evaluation.reconstruction import ground_truth_cloud
+from emgs_jax.evaluation.results import read_estimates
+from emgs_jax.evaluation.tables import average, full_table
+from emgs_jax.evaluation.trajectory import Alignment
+from emgs_jax.export import save_points_ply, save_trajectory_tum
+from experiments.score import score
+
+SIMILARITY = Alignment(0.4, Rotation.from_rotvec([0.3, -1.2, 0.5]).as_matrix(), np.array([3.0, -1.0, 7.0]))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """True times, poses and cloud of the tiny room."""
+    from scene import evaluation_config
+
+    frames = list(dataset())
+    cloud = ground_truth_cloud(frames, dataset().intrinsics, evaluation_config())
+    return np.array([frame.timestamp for frame in frames]), np.stack([f.T_world_camera for f in frames]), cloud
+
+
+def write_system(folder, times, poses, cloud, move=SIMILARITY, normals=None):
+    """Files of another system whose world differs by `move`."""
+    save_trajectory_tum(folder / "path.txt", times, move.apply_to_poses(poses))
+    normals = cloud.normals @ move.rotation.T if normals is None else normals
+    save_points_ply(folder / "cloud.ply", move.apply(cloud.points), normals, cloud.colors)
+    return f"trajectory={folder / 'path.txt'}", f"points={folder / 'cloud.ply'}", f"out={folder / 'out'}"
+
+
+def scored(*overrides):
+    return score(compose("method=peer", *overrides, name="score"))
+
+
+def test_the_truth_in_another_frame_and_scale_is_perfect_under_sim3(tmp_path, truth):
+    metrics, path = scored(*write_system(tmp_path, *truth))
+    assert metrics["trajectory/ate_sim3_m"] < 1e-6
+    np.testing.assert_allclose(metrics["trajectory/scale"], 2.5, rtol=1e-6)
+    assert metrics["reconstruction/accuracy_m"] < 1e-3  # float32 may move a point across the border of its voxel
+    assert metrics["reconstruction/f1_5cm_percent"] > 99.9
+    assert metrics["reconstruction/normals_abs_cos_percent"] > 99.9
+    assert json.loads(path.read_text())["provenance"]["protocol"] == "paper/sim3"
+    assert path.parent.relative_to(tmp_path / "out").as_posix() == "synthetic/room0/peer/0"
+
+
+def test_without_scale_the_error_of_the_scale_is_seen(tmp_path, truth):
+    metrics, _ = scored(*write_system(tmp_path, *truth), "alignment=se3")
+    assert metrics["trajectory/ate_sim3_m"] < 1e-6 < 0.01 < metrics["trajectory/ate_se3_m"]
+    assert metrics["reconstruction/accuracy_m"] > 0.1
+
+
+def test_the_table_of_an_evaluation_shows_the_other_system_under_its_name(tmp_path, truth):
+    scored(*write_system(tmp_path, *truth), "simulated=true")
+    (row,) = average(read_estimates(tmp_path / "out"), each_sequence=True)
+    assert (row.dataset, row.sequences, row.kind, row.variant) == ("synthetic", ("room0",), "scored", "peer")
+    assert "| scored, peer | **simulated** |" in full_table([row])
+
+
+def test_keyframes_are_matched_by_time_and_a_trajectory_alone_is_enough(tmp_path, truth):
+    times, poses, cloud = truth
+    rows = [4, 0, 2, 3]
+    times = np.append(times[rows] + 0.009, 77.0)
+    poses = np.concatenate([poses[rows], poses[:1]])
+    trajectory, _, out = write_system(tmp_path, times, poses, cloud)
+    metrics, _ = scored(trajectory, out)
+    assert metrics["trajectory/num_frames"] == 4 and metrics["trajectory/ate_sim3_m"] < 1e-6
+    assert (metrics["score/num_poses"], metrics["score/num_frames"]) == (5, NUM_FRAMES)
+    assert not any(key.startswith("reconstruction") for key in metrics)
+
+
+def test_normals_of_a_cloud_without_any_are_fitted(tmp_path, truth):
+    """Open3D takes zero normals as normals, so the file must not have them: points alone, as text."""
+    trajectory, points, out = write_system(tmp_path, *truth)
+    moved = SIMILARITY.apply(truth[2].points)
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(moved)}\n"
+    header += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+    lines = "\n".join(" ".join(map(repr, map(float, row))) for row in moved)
+    (tmp_path / "cloud.ply").write_text(header + lines + "\n")
+    metrics, _ = scored(trajectory, points, out)
+    assert metrics["reconstruction/accuracy_m"] < 1e-3
+    assert metrics["reconstruction/normals_abs_cos_percent"] > 80.0
+
+
+def test_another_result_is_never_replaced_but_the_same_one_may_be_made_again(tmp_path, truth):
+    files = write_system(tmp_path, *truth)
+    first, path = scored(*files)
+    assert scored(*files)[0]["trajectory/ate_sim3_m"] == first["trajectory/ate_sim3_m"]
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="made with other settings .*method=NAME"):
+        scored(*files, "alignment=se3")
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        ("times", r"no pose is within 0.01 s .* are 1000.000 to 1005.000, .* 0.000 to 5.000: .*max_time_difference"),
+        ("no trajectory", "path.txt does not exist: give a file with"),
+        ("empty trajectory", "no pose is within 0.01 s .* timestamps are none"),
+        ("no cloud", "cloud.ply does not exist: give a PLY"),
+        ("empty cloud", "cloud.ply has no points"),
+        ("text", "cloud.ply has no points: it is empty or no PLY"),
+        ("nan", r"cloud.ply: 1 of [0-9]+ points are not finite"),
+    ],
+)
+def test_bad_files_are_named_with_a_remedy_and_leave_no_result(tmp_path, truth, damage, message):
+    times, poses, cloud = truth
+    files = write_system(tmp_path, times + (1000.0 if damage == "times" else 0.0), poses, cloud)
+    path, ply = tmp_path / "path.txt", tmp_path / "cloud.ply"
+    if damage in ("no trajectory", "no cloud"):
+        (path if damage == "no trajectory" else ply).unlink()
+    elif damage in ("empty trajectory", "text"):
+        (path if damage == "empty trajectory" else ply).write_text("# nothing\n")
+    elif damage == "empty cloud":
+        save_points_ply(ply, cloud.points[:0], cloud.normals[:0], cloud.colors[:0])
+    elif damage == "nan":
+        content = bytearray(ply.read_bytes())
+        begin = content.index(b"end_header\n") + len(b"end_header\n")
+        content[begin : begin + 4] = np.float32("nan").tobytes()
+        ply.write_bytes(content)
+    with pytest.raises((ValueError, OSError), match=message):
+        scored(*files)
+    assert not (tmp_path / "out").exists()
