@@ -6,14 +6,19 @@ The first window is built from its best pair of views (Schönberger and Frahm, "
 
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-import equinox as eqx
 
 from emgs_jax.camera import Camera
 from emgs_jax.prior.landmarks import (
-    NONE, MatchingConfig, Structure, link, place, relative_pose, triangulate,
+    NONE,
+    MatchingConfig,
+    Structure,
+    place,
+    relative_pose,
+    triangulate,
 )
 from emgs_jax.stereo.bundle_adjustment import BundleConfig, Tracks, adjust
 
@@ -66,9 +71,7 @@ def extend(structure: Structure, camera: Camera, num_views: int, config: Structu
         refine(structure, camera, num_views, frames[: config.num_fixed], config)
 
 
-def refine(
-    structure: Structure, camera: Camera, num_views: int, fixed: list[int], config: StructureConfig
-) -> None:
+def refine(structure: Structure, camera: Camera, num_views: int, fixed: list[int], config: StructureConfig) -> None:
     """Bundle adjustment of all placed views; drops what does not fit and triangulates what now does."""
     for _ in range(config.num_rounds):
         frames = sorted(structure.placed())
@@ -80,7 +83,11 @@ def refine(
         is_fixed = np.array([frame in fixed for frame in frames] + [True] * (num_views - len(frames)))
         T, points, error = jitted_adjust(
             jaxlie.SE3.from_matrix(jnp.asarray(poses, jnp.float32)),
-            jnp.asarray(points, jnp.float32), tracks, jnp.asarray(is_fixed), camera, config.bundle,
+            jnp.asarray(points, jnp.float32),
+            tracks,
+            jnp.asarray(is_fixed),
+            camera,
+            config.bundle,
         )
         poses, error = np.asarray(T.as_matrix(), np.float64), np.asarray(error)
         structure.points[ids] = np.asarray(points, np.float64)[: len(ids)]

@@ -1,5 +1,6 @@
 """Points of the scene that several images show: detection, verified matches, tracks, poses from them (OpenCV)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -69,7 +70,9 @@ class Structure:
 
 def detect(gray: np.ndarray, config: MatchingConfig) -> View:
     """SIFT keypoints with the square roots of their normalised descriptors (Arandjelović and Zisserman, CVPR 2012)."""
-    detector = cv2.SIFT_create(nfeatures=config.num_features, contrastThreshold=config.min_contrast, enable_precise_upscale=True)
+    detector = cv2.SIFT_create(
+        nfeatures=config.num_features, contrastThreshold=config.min_contrast, enable_precise_upscale=True
+    )
     keypoints, descriptors = detector.detectAndCompute(gray, None)
     if not keypoints:
         return View(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros(0, int))
@@ -145,6 +148,12 @@ def relative_pose(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tu
     T_b_a = np.eye(4)
     T_b_a[:3, :3], T_b_a[:3, 3] = R, t.ravel()
     return np.linalg.inv(T_b_a), float(count * np.median(parallax))
+
+
+def calibration(intrinsics: Sequence[float]) -> np.ndarray:
+    """The matrix K (3, 3) of fx, fy, cx, cy."""
+    fx, fy, cx, cy = intrinsics
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
 def unit_rays(pixels: np.ndarray, K: np.ndarray) -> np.ndarray:

@@ -126,7 +126,9 @@ def adjust(
         Poses, points, and the reprojection error (px) of every observation, inf where it is none or behind the view.
     """
     args = (T_ref_view, points, tracks, is_fixed, camera, config)
-    solver = optx.LevenbergMarquardt(rtol=config.tolerance, atol=config.tolerance, linear_solver=lx.Normal(lx.Cholesky()))
+    solver = optx.LevenbergMarquardt(
+        rtol=config.tolerance, atol=config.tolerance, linear_solver=lx.Normal(lx.Cholesky())
+    )
     start = jnp.zeros((is_fixed.shape[0], 6))
     solution = optx.least_squares(_residuals, solver, start, args, max_steps=config.max_steps, throw=False)
     xi = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, start)

@@ -106,7 +106,10 @@ def sweep(
             # Homogeneous: the point of a plane at infinity is a direction.
             points = directions @ T.rotation().as_matrix().T + plane * T.translation()
             pixels, depth = project(camera, points)
-            column, row = jnp.round(2.0 * pixels[..., 0]).astype(jnp.int32), jnp.round(2.0 * pixels[..., 1]).astype(jnp.int32)
+            column, row = (
+                jnp.round(2.0 * pixels[..., 0]).astype(jnp.int32),
+                jnp.round(2.0 * pixels[..., 1]).astype(jnp.int32),
+            )
             inside = (column >= 0) & (column < code.shape[1]) & (row >= 0) & (row < code.shape[0]) & (depth > 0) & used
             index = jnp.where(inside, row * code.shape[1] + column, 0)
             differing = jax.lax.population_count(code.reshape(-1)[index] ^ reference).astype(jnp.float32)
