@@ -100,6 +100,6 @@ def _picture(run: MappingRun, dataset: Dataset, row: int, view: Any) -> dict[str
         "image": dataset[row].image,
         "rendered_color": view.colors,
         "rendered_depth": view.rendering.depth,
-        "alpha": view.rendering.alpha,
+        "valid": view.valid,
         "title": f"frame {run.records[row].index}",
     }

@@ -30,7 +30,7 @@ def draw_overview(
         colors: (n, 3), RGB in [0, 1].
         trajectories: estimated T_world_camera (n, 4, 4), and the true ones in the same frame or None.
         frames: about four, each with `image` uint8 (h, w, 3), `rendered_color` float (h, w, 3), `rendered_depth`
-            float (h, w) in metres, `alpha` (h, w) and `title`.
+            float (h, w) in metres, `valid` bool (h, w), where it is known, and `title`.
         title: of the whole picture.
     """
     estimate, truth = (None if poses is None else np.asarray(poses, np.float64) for poses in trajectories)
@@ -145,13 +145,12 @@ def _draw_scale_bar(axes: Axes) -> None:
 
 
 def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]]) -> None:
-    depths = [np.asarray(frame["rendered_depth"])[np.asarray(frame["alpha"]) > 0.5] for frame in frames]
+    depths = [np.asarray(frame["rendered_depth"])[np.asarray(frame["valid"])] for frame in frames]
     depths = np.concatenate([depth[np.isfinite(depth) & (depth > 0)].ravel() for depth in depths])
     near, far = np.percentile(depths, [1, 99]) if len(depths) else (0.0, 1.0)
     mappable = None
     for row, frame in zip(grid, frames, strict=True):
-        alpha = np.asarray(frame["alpha"], np.float64)
-        covered = (alpha > 0.5) & np.isfinite(frame["rendered_depth"])
+        covered = np.asarray(frame["valid"]) & np.isfinite(frame["rendered_depth"])
         row[0].imshow(np.asarray(frame["image"]))
         row[1].imshow(np.nan_to_num(np.asarray(frame["rendered_color"], np.float64)).clip(0.0, 1.0))
         depth = np.ma.masked_where(~covered, np.asarray(frame["rendered_depth"], np.float64))

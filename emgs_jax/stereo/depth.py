@@ -7,7 +7,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from emgs_jax.camera import Camera, project, unproject
-from emgs_jax.pytree import traced
+from emgs_jax.pytree import static, traced
 from emgs_jax.stereo.plane_sweep import SweepConfig, inverse_depths, sweep
 from emgs_jax.stereo.semi_global import SemiGlobalConfig, aggregate
 
@@ -20,6 +20,7 @@ class DepthConfig(eqx.Module):
         semi_global: its aggregation.
         max_cost: of the best plane, before aggregation.
         min_margin: by which the aggregated cost of any plane that is not next to the best must exceed the best's.
+        median_radius: half the side of the window whose median replaces a depth: removes speckle, keeps edges.
         max_depth_step: two views agree where their depths differ by at most this fraction.
     """
 
@@ -27,6 +28,7 @@ class DepthConfig(eqx.Module):
     semi_global: SemiGlobalConfig
     max_cost: Float[Array, "*b"] = traced()
     min_margin: Float[Array, "*b"] = traced()
+    median_radius: int = static()
     max_depth_step: Float[Array, "*b"] = traced()
 
 
@@ -40,6 +42,15 @@ def _between_planes(total: Float[Array, "h w d"], best: Array) -> Float[Array, "
     is_bent = curvature > 0
     offset = 0.5 * (before - after) / jnp.where(is_bent, curvature, 1.0)
     return jnp.where(is_bent, jnp.clip(offset, -0.5, 0.5), 0.0)
+
+
+def _median(depth: Float[Array, "h w"], radius: int) -> Float[Array, "h w"]:
+    """Median of the surroundings; a hole (0) stays one unless most of its surroundings are surface."""
+    height, width = depth.shape
+    padded = jnp.pad(depth, radius, mode="edge")
+    steps = range(2 * radius + 1)
+    around = [jax.lax.dynamic_slice(padded, (dy, dx), (height, width)) for dy in steps for dx in steps]
+    return jnp.sort(jnp.stack(around), axis=0)[len(around) // 2]
 
 
 def estimate_depth(
@@ -72,7 +83,7 @@ def estimate_depth(
     valid = (runner_up - jnp.min(total, axis=-1) >= config.min_margin) & (matched <= config.max_cost)
     valid &= (best > 0) & (best < planes.shape[0] - 1)
     inverse = planes[0] + (best + _between_planes(total, best)) * (planes[1] - planes[0])
-    return jnp.where(valid, 1.0 / inverse, 0.0)
+    return _median(jnp.where(valid, 1.0 / inverse, 0.0), config.median_radius)
 
 
 def count_agreeing(

@@ -71,7 +71,7 @@ def test_the_picture_shows_floor_and_paths_and_is_the_same_twice(tmp_path, num_f
     depth = np.full((24, 32), np.nan)
     depth[4:, :] = 2.0
     frame = {"image": np.zeros((24, 32, 3), np.uint8), "rendered_color": np.full((24, 32, 3), np.nan)}
-    frame |= {"rendered_depth": depth, "alpha": np.ones((24, 32)), "title": "frame 0"}
+    frame |= {"rendered_depth": depth, "valid": np.ones((24, 32), bool), "title": "frame 0"}
     for name in ("a.png", "b.png"):
         paths = (poses, poses + 0.0 if has_truth else None)
         draw_overview(tmp_path / name, points, colors, paths, [frame] * num_frames, "a run")
