@@ -13,7 +13,9 @@ from scene import CONF, compose, slam_config
 from emgs_jax.slam import SlamConfig
 
 ROOT = CONF.parent
-GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent != CONF and "experiment" not in path.parts)
+GROUPED = sorted(
+    path for path in CONF.rglob("*.yaml") if path.parent != CONF and not {"experiment", "sweep"} & set(path.parts)
+)
 
 
 def group_and_option(path: Path) -> tuple[str, str]:
