@@ -43,6 +43,15 @@ def test_more_queries_than_a_block_equal_brute_force():
     check(rng.uniform(-1, 1, (300, 3)).astype(np.float32), points, np.ones(70, bool), 4)
 
 
+@pytest.mark.parametrize("k", [1, 5])
+def test_where_blocks_look_at_near_groups_only_and_where_they_must_look_at_all_neighbours_equal_brute_force(k):
+    """A surface, whose blocks are compact, and queries far from it and from each other, whose blocks are not."""
+    rng = np.random.default_rng(6)
+    plane = rng.uniform(-1, 1, (1600, 3)).astype(np.float32) * np.float32([1, 1, 0.01])
+    queries = np.concatenate([plane[::2], rng.uniform(-5, 5, (100, 3)).astype(np.float32)])
+    check(rng.permutation(queries), plane, rng.uniform(size=1600) < 0.9, k)
+
+
 def test_with_fewer_valid_points_than_k_the_rest_is_marked():
     points = np.arange(12, dtype=np.float32).reshape(4, 3)
     check(points, points, np.array([False, True, False, True]), 3)

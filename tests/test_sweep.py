@@ -26,7 +26,7 @@ def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_
     configs, roomy = (
         [at(at(base, "em.max_mahalanobis_sq", x), "refinement.max_mahalanobis_sq_2d", x) for x in (0.0, 4.6, 20.0)]
         for base in (
-            slam_config(*WHOLE, f"submap.map_capacity={size}", "submap.submap_capacity=256") for size in (128, 256)
+            slam_config(*WHOLE, f"submap.map_capacity={size}", "submap.submap_capacity=256") for size in (128, 512)
         )
     )
     infos, alone = [], []
@@ -38,7 +38,7 @@ def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_
         for a, b in zip(jax.tree.leaves(mine.map), jax.tree.leaves(state.map), strict=True):
             np.testing.assert_allclose(a[:count], b[:count], atol=1e-5)
         np.testing.assert_allclose(mine.T_world_previous.wxyz_xyz, state.T_world_previous.wxyz_xyz, atol=1e-5)
-    assert states.map.weight.shape == (3, 256)
+    assert states.map.weight.shape == (3, 512)
     for step in range(2):
         fused = [int(alone[2 * i + step].em.num_fused) for i in range(3)]
         assert infos[step].em.num_fused.tolist() == fused and len(set(fused)) == 3
