@@ -88,8 +88,7 @@ def _search_near(
     gap = jnp.maximum(jnp.maximum(low - jnp.max(queries, axis=0), jnp.min(queries, axis=0) - high), 0.0)
     bounds, chosen = jax.lax.top_k(-jnp.sum(gap**2, axis=-1), num_near + 1)
     near = groups[chosen[:num_near]].reshape(-1, groups.shape[2])
-    # One axis after the other: a sum over a last axis of three does not fill the processor's vectors.
-    distance_sq = sum((queries[:, axis, None] - near[:, axis]) ** 2 for axis in range(queries.shape[1]))
+    distance_sq = _distance_sq(queries[:, None], near)
     best, index = _smallest(distance_sq, k)
     rows = chosen[index // GROUP] * GROUP + index % GROUP
     is_exact = jnp.all(best[:, -1] <= -bounds[num_near])
@@ -106,15 +105,24 @@ def _search_all(
     """
     points = groups.reshape(-1, groups.shape[2])
     is_point, num_sets = jnp.isfinite(points[:, 0]), groups.shape[0]
-    # |q|² is the same for all points of one query. From the block's centre |p|² - 2 q·p cancels little.
-    center = jnp.mean(queries, axis=0)
+    # |q|² is the same for all points of one query. From the block's centre |p|² - 2 q·p cancels little; a query far
+    # from all points, or none at all, must not move it.
+    low = jnp.min(jnp.where(is_point[:, None], points, jnp.inf), axis=0)
+    high = jnp.max(jnp.where(is_point[:, None], points, -jnp.inf), axis=0)
+    center = jnp.nanmean(jnp.clip(queries, low, high), axis=0)
     offsets = jnp.where(is_point[:, None], points - center, 0.0)
     farness = jnp.where(is_point, jnp.sum(offsets**2, axis=-1), jnp.inf) - 2.0 * (queries - center) @ offsets.T
-    farness = farness.reshape(-1, GROUP, num_sets)
-    _, sets = _smallest(jnp.min(farness, axis=1), min(k, num_sets))
-    best, index = _smallest(jnp.take_along_axis(farness, sets[:, None], axis=2).reshape(queries.shape[0], -1), k)
+    _, sets = _smallest(jnp.min(farness.reshape(-1, GROUP, num_sets), axis=1), min(k, num_sets))
+    near = points.reshape(GROUP, num_sets, -1)[:, sets].swapaxes(0, 1)
+    distance_sq = _distance_sq(queries[:, None, None], near).reshape(queries.shape[0], -1)
+    best, index = _smallest(distance_sq, k)
     member, chosen = jnp.divmod(index, sets.shape[1])
     return member * num_sets + jnp.take_along_axis(sets, chosen, axis=1), jnp.isfinite(best)
+
+
+def _distance_sq(queries: Float[Array, "*#b d"], points: Float[Array, "*#b d"]) -> Float[Array, "*b"]:
+    # One axis after the other: a sum over a last axis of three does not fill the processor's vectors.
+    return sum((queries[..., axis] - points[..., axis]) ** 2 for axis in range(queries.shape[-1]))
 
 
 def _smallest(values: Float[Array, "q c"], k: int) -> tuple[Float[Array, "q k"], Int[Array, "q k"]]:

@@ -85,6 +85,18 @@ def test_invalid_points_change_nothing(poison):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.parametrize("poison", [np.nan, np.inf, 1e6])
+def test_a_wild_query_changes_no_other(poison):
+    rng = np.random.default_rng(7)
+    points = rng.uniform(-1, 1, (900, 3)).astype(np.float32)
+    queries = rng.uniform(-1, 1, (900, 3)).astype(np.float32)
+    is_wild = (np.arange(900) % 9 == 0)[:, None]
+    rows, found = search(np.where(is_wild, np.float32(poison), queries), points, np.ones(900, bool), 5)
+    clean, _ = search(queries, points, np.ones(900, bool), 5)
+    np.testing.assert_array_equal(np.asarray(rows)[~is_wild[:, 0]], np.asarray(clean)[~is_wild[:, 0]])
+    assert np.asarray(found)[~is_wild[:, 0]].all()
+
+
 def test_compaction_lists_the_true_rows_in_order_and_counts_what_did_not_fit():
     mask = jnp.array([False, True, True, False, True])
     rows, exists, overflow = compact_rows(mask, 4)
