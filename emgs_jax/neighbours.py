@@ -8,7 +8,7 @@ GROUP = 32  # points per group: near each other
 CURVE_BITS = 8  # per axis, of the cells of the Z curve
 # Queries at once. On a CPU they are near each other, and their distances stay in the cache.
 BLOCK, LARGE_BLOCK = 64, 256
-NUM_NEAR = 20  # groups that such a block looks at first, beside twice its share of all groups
+NUM_NEAR = 32  # groups that such a block looks at first, beside twice its share of all groups
 
 
 def knn(

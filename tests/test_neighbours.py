@@ -47,9 +47,9 @@ def test_more_queries_than_a_block_equal_brute_force():
 def test_where_blocks_look_at_near_groups_only_and_where_they_must_look_at_all_neighbours_equal_brute_force(k):
     """A surface, whose blocks are compact, and queries far from it and from each other, whose blocks are not."""
     rng = np.random.default_rng(6)
-    plane = rng.uniform(-1, 1, (1600, 3)).astype(np.float32) * np.float32([1, 1, 0.01])
+    plane = rng.uniform(-1, 1, (2400, 3)).astype(np.float32) * np.float32([1, 1, 0.01])
     queries = np.concatenate([plane[::2], rng.uniform(-5, 5, (100, 3)).astype(np.float32)])
-    check(rng.permutation(queries), plane, rng.uniform(size=1600) < 0.9, k)
+    check(rng.permutation(queries), plane, rng.uniform(size=2400) < 0.9, k)
 
 
 def test_with_fewer_valid_points_than_k_the_rest_is_marked():

@@ -125,7 +125,8 @@ def test_a_map_is_enlarged_by_copies_that_no_camera_sees():
     count = int(state.map.gaussians.valid.sum())
     large = enlarged(state.map, 3 * count, 50.0)
     means = np.asarray(large.gaussians.means)[: 3 * count].reshape(3, count, 3)
-    np.testing.assert_allclose(means - means[:1], np.arange(3)[:, None, None] * [[[50.0, 0, 0]]], atol=1e-4)
+    offsets = np.arange(3)[:, None, None] * np.broadcast_to([50.0, 0, 0], (1, count, 3))
+    np.testing.assert_allclose(means - means[:1], offsets, atol=1e-4)
     assert int(large.gaussians.valid.sum()) == 3 * count and large.weight.shape == (6 * count,)
 
 
