@@ -132,11 +132,13 @@ class Scorer:
         dataset: in use.
         evaluation: the protocol.
         truth: its true cloud; None without ground truth.
+        num_skipped: frames that cannot be read.
     """
 
     dataset: Dataset
     evaluation: EvaluationConfig
     truth: PointCloud | None
+    num_skipped: int
 
 
 def score_settings(
@@ -159,7 +161,7 @@ def score_settings(
     shared = {} if truth is None else scoring.score_prior(runs[0], raw_cloud, truth, evaluation)
 
     def score(run: MappingRun, config: DensifyConfig) -> scoring.Metrics:
-        counts = {k: v for k, v in scoring.describe(run, 0).items() if not k.startswith("time/")}
+        counts = {k: v for k, v in scoring.describe(run, scorer.num_skipped).items() if not k.startswith("time/")}
         if truth is None:
             return counts
         dense = outputs.dense_map(run, scorer.dataset, config, evaluation.voxel_m, num_pictures=0).cloud

@@ -109,7 +109,8 @@ def _side_by_side(config: DictConfig, size: int) -> tuple[int, int]:
 def _scorer(dataset: ReadableFrames, config: DictConfig) -> Scorer:
     evaluation = instantiate(config.evaluation)
     has_truth = any(dataset[row].T_world_camera is not None for row in range(len(dataset)))
-    return Scorer(dataset, evaluation, scoring.true_cloud(dataset, evaluation) if has_truth else None)
+    truth = scoring.true_cloud(dataset, evaluation) if has_truth else None
+    return Scorer(dataset, evaluation, truth, len(dataset.skipped))
 
 
 @contextmanager
