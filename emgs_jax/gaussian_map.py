@@ -1,6 +1,7 @@
 """The map M: Gaussians of fixed capacity with the weight of their running average, and its submaps."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -127,6 +128,11 @@ def insert(
 
 
 def grow(map: GaussianMap, capacity: int) -> GaussianMap:
-    """The same map with room for `capacity` Gaussians (host side: the shape changes)."""
-    old = map.weight.shape[0]
-    return put_rows(empty_map(capacity, map.gaussians.features.shape[-1]), jnp.arange(old), map)
+    """The same map, or stack of maps, with room for `capacity` Gaussians (host side: the shape changes)."""
+    stacked = map.weight.shape[:-1]
+    free = empty_map(capacity - map.weight.shape[-1], map.gaussians.features.shape[-1])
+
+    def append(rows: Array, more: Array) -> Array:
+        return jnp.concatenate([rows, jnp.broadcast_to(more, (*stacked, *more.shape))], axis=len(stacked))
+
+    return jax.tree.map(append, map, free)

@@ -16,7 +16,7 @@ from emgs_jax.data.convert import to_camera, to_first_window, to_prediction
 from emgs_jax.localization import REASONS
 from emgs_jax.observation import Prediction
 from emgs_jax.prior.base import Prior, PriorPrediction, windows
-from emgs_jax.slam import FirstWindow, SlamConfig, SlamState, StepInfo, advance, as_predictions, start
+from emgs_jax.slam import FirstWindow, SlamConfig, SlamState, StepInfo, advance, opening, start
 
 RawView = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # points, mask, image, T_world_camera
 
@@ -122,54 +122,58 @@ def map_frames(run: MappingRun, dataset: Dataset, prior: Prior) -> Iterator[RawV
     """
     anchor = None
     for prediction, frames in predictions(dataset, prior, run.config.window_size, run.clock):
-        if anchor is None:
-            truth = frames[0].T_world_camera
-            anchor = np.eye(4) if truth is None else np.asarray(truth, np.float64)
+        anchor = first_pose(frames) if anchor is None else anchor
         with run.clock.phase("map"):
             if run.state is None:
                 _map_first_window(run, prediction, frames, anchor)
             else:
                 _map_step(run, prediction, frames, anchor)
-        yield from _raw_views(run, prediction, frames, anchor)
+        yield from raw_views(run, prediction, frames, anchor)
+
+
+def first_pose(frames: Mapping[int, Frame]) -> np.ndarray:
+    """T_world_camera of the anchor, (4, 4) float64; the identity where the truth is unknown."""
+    truth = frames[0].T_world_camera
+    return np.eye(4) if truth is None else np.asarray(truth, np.float64)
 
 
 def _map_first_window(
     run: MappingRun, prediction: PriorPrediction, frames: Mapping[int, Frame], anchor: np.ndarray
 ) -> None:
-    timer = _Timer(run.clock)
-    window = to_first_window(prediction, frames, anchor, run.config.observation)
-    following: list[Prediction] = []
-    if run.config.initialization == "incremental":
-        window, following = as_predictions(window)
-    state, run.config = start(window, run.camera, run.config)
-    if not bool(state.map.gaussians.valid.any()):  # no later frame could be localised in it
-        raise ValueError(
-            f"the map is empty after {window.views.valid.shape[0]} view(s) from {frames[0].name}: the prior has no "
-            "valid point there; begin elsewhere (dataset.start=...) or use slam.initialization=merged"
-        )
-    run.state = state
+    timer = Timer(run.clock)
+    window, following = opening(to_first_window(prediction, frames, anchor, run.config.observation), run.config)
+    run.state, run.config = start(window, run.camera, run.config)
     dense = [frames[index] for index in prediction.window.dense]
-    _record_initialization(run, window, dense, timer)
+    record_initialization(run, window, dense, timer.read())
     for frame, step in zip(dense[1:], following, strict=False):
-        _advance(run, step, frame, _Timer(run.clock))
+        _advance(run, step, frame, Timer(run.clock))
 
 
 def _map_step(run: MappingRun, prediction: PriorPrediction, frames: Mapping[int, Frame], anchor: np.ndarray) -> None:
-    timer = _Timer(run.clock)
+    timer = Timer(run.clock)
     step = to_prediction(prediction, frames, anchor, run.config.observation)
     _advance(run, step, frames[prediction.window.current], timer)
 
 
-def _advance(run: MappingRun, step: Prediction, frame: Frame, timer: "_Timer") -> None:
+def _advance(run: MappingRun, step: Prediction, frame: Frame, timer: "Timer") -> None:
     run.state, info, run.config = advance(run.state, step, run.camera, run.config)
-    info = jax.device_get(info)
-    _add(run, frame, _matrix(info.T_world_camera.wxyz_xyz), _described(info) | timer.read())
+    record_step(run, frame, jax.device_get(info), timer.read())
 
 
-def _record_initialization(run: MappingRun, window: FirstWindow, frames: list[Frame], timer: "_Timer") -> None:
+def record_step(run: MappingRun, frame: Frame, info: StepInfo, spent: dict[str, float]) -> None:
+    """Add what a step did, `info` on the host, and the seconds that it took."""
+    _add(run, frame, _matrix(info.T_world_camera.wxyz_xyz), _described(info) | spent)
+
+
+def record_initialization(run: MappingRun, window: FirstWindow, frames: list[Frame], spent: dict[str, float]) -> None:
+    """Add the frames that the map of `run.state` was made from; raises ValueError where that map is empty."""
     poses = np.asarray(window.T_world_views.wxyz_xyz)
     count = int(np.asarray(run.state.map.gaussians.valid).sum())
-    spent = timer.read()
+    if count == 0:  # no later frame could be localised in it
+        raise ValueError(
+            f"the map is empty after {len(poses)} view(s) from {frames[0].name}: the prior has no valid point there; "
+            "begin elsewhere (dataset.start=...) or use slam.initialization=merged"
+        )
     for frame, pose in zip(frames, poses, strict=False):
         described = {"status": "initialization", "pose": _tum(pose), "num_gaussians": count}
         _add(run, frame, _matrix(pose), described | {key: value / len(poses) for key, value in spent.items()})
@@ -203,7 +207,7 @@ def _described(info: StepInfo) -> dict[str, Any]:
     }
 
 
-def _raw_views(
+def raw_views(
     run: MappingRun, prediction: PriorPrediction, frames: Mapping[int, Frame], anchor: np.ndarray
 ) -> Iterator[RawView]:
     """Pose and points of each new frame as predicted, under the same mask that the mapping uses."""
@@ -220,7 +224,7 @@ def _raw_views(
         yield prediction.points[row], mask, frames[index].image, pose
 
 
-class _Timer:
+class Timer:
     """Seconds since it was made, and what of them was compilation."""
 
     def __init__(self, clock: Clock) -> None:

@@ -43,20 +43,33 @@ def score(run: MappingRun, clouds: Clouds, dataset: Dataset, config: EvaluationC
     The dense map is compared as `config` says, under the other alignment as `reconstruction_<alignment>/…`, and its
     plain centres as `reconstruction_centers/…`.
     """
-    rows = [row for row, pose in enumerate(run.true_poses) if pose is not None]
-    if not rows:
+    if all(pose is None for pose in run.true_poses):
         return {}
-    truth = np.stack([run.true_poses[row] for row in rows]).astype(np.float64)
-    ours, raw = np.stack(run.poses)[rows], np.stack(run.raw_poses)[rows]
-    true_cloud = ground_truth_cloud((dataset[row] for row in rows), dataset.intrinsics, config)
+    truth = true_cloud(dataset, config)
+    metrics = score_map(run, clouds.dense, clouds.centers, truth, config)
+    return metrics | score_prior(run, clouds.raw_prior, truth, config)
+
+
+def true_cloud(dataset: Dataset, config: EvaluationConfig) -> PointCloud:
+    """The true points of the frames whose pose is known."""
+    return ground_truth_cloud((dataset[row] for row in range(len(dataset))), dataset.intrinsics, config)
+
+
+def score_map(
+    run: MappingRun, dense: PointCloud, centers: PointCloud, truth: PointCloud, config: EvaluationConfig
+) -> Metrics:
+    """What `score` says of the map; `truth` is the `true_cloud`."""
+    poses = _known(run, run.poses)
     other = replace(config, alignment="se3" if config.alignment == "sim3" else "sim3")
-    metrics = trajectory_metrics(ours, truth)
-    poses = ours, truth
-    metrics |= compare_clouds(clouds.dense, true_cloud, poses, config)
-    metrics |= _renamed(compare_clouds(clouds.dense, true_cloud, poses, other), f"reconstruction_{other.alignment}/")
-    metrics |= _renamed(compare_clouds(clouds.centers, true_cloud, poses, config), "reconstruction_centers/")
-    raw_metrics = trajectory_metrics(raw, truth) | compare_clouds(clouds.raw_prior, true_cloud, (raw, truth), config)
-    return metrics | prefixed(raw_metrics, RAW_PRIOR)
+    metrics = trajectory_metrics(*poses) | compare_clouds(dense, truth, poses, config)
+    metrics |= _renamed(compare_clouds(dense, truth, poses, other), f"reconstruction_{other.alignment}/")
+    return metrics | _renamed(compare_clouds(centers, truth, poses, config), "reconstruction_centers/")
+
+
+def score_prior(run: MappingRun, cloud: PointCloud, truth: PointCloud, config: EvaluationConfig) -> Metrics:
+    """What `score` says of the raw prior, whose points are `cloud`."""
+    poses = _known(run, run.raw_poses)
+    return prefixed(trajectory_metrics(*poses) | compare_clouds(cloud, truth, poses, config), RAW_PRIOR)
 
 
 def describe(run: MappingRun, num_skipped: int) -> Metrics:
@@ -83,6 +96,13 @@ def seconds_per_frame(records: list[FrameRecord]) -> float | None:
     steps = [record for record in records if record.status != "initialization"] or records
     steady = [record.seconds for record in steps if record.compile_seconds == 0]
     return float(np.mean(steady or [record.seconds - record.compile_seconds for record in steps])) if steps else None
+
+
+def _known(run: MappingRun, poses: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """`poses` and the true ones (n, 4, 4), of the frames whose true pose is known."""
+    pairs = [(pose, true) for pose, true in zip(poses, run.true_poses, strict=True) if true is not None]
+    ours, truth = zip(*pairs, strict=True)
+    return np.stack(ours), np.stack(truth).astype(np.float64)
 
 
 def _renamed(metrics: Metrics, prefix: str) -> Metrics:

@@ -151,12 +151,15 @@ class FirstWindow(eqx.Module):
     T_world_views: jaxlie.SE3
 
 
-def as_predictions(window: FirstWindow) -> tuple[FirstWindow, list[Prediction]]:
-    """The first view alone, and each further view as if it were a step's current frame (incremental initialisation).
+def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[Prediction]]:
+    """What the map is initialised from, and the steps that follow from the same window.
 
-    Consecutive views come from one inference, so the previous image's two predictions agree exactly and the coarse
-    pose of a step is the prior's own.
+    These are the whole window and none, or (incremental initialisation) the first view alone and each further view as
+    if it were a step's current frame. Consecutive views come from one inference, so the previous image's two
+    predictions agree exactly and the coarse pose of a step is the prior's own.
     """
+    if config.initialization == "merged":
+        return window, []
     num_views = window.views.valid.shape[0]
     view = lambda i: jax.tree.map(lambda leaf: leaf[i], window.views)  # noqa: E731
     poses = window.T_world_views.wxyz_xyz
@@ -180,38 +183,36 @@ jitted_step = eqx.filter_jit(step)
 def with_room(config: SlamConfig, overflow: Overflow) -> SlamConfig:
     """The config with doubled capacities where rows did not fit (host side: each new size compiles once)."""
     submap = config.submap
-    return replace(
-        config,
-        submap=replace(
-            submap,
-            map_capacity=submap.map_capacity * (2 if overflow.map > 0 else 1),
-            submap_capacity=submap.submap_capacity * (2 if overflow.submap > 0 else 1),
-        ),
-    )
+    map_factor, submap_factor = (2 if jnp.any(lost > 0) else 1 for lost in (overflow.map, overflow.submap))
+    capacities = submap.map_capacity * map_factor, submap.submap_capacity * submap_factor
+    return replace(config, submap=replace(submap, map_capacity=capacities[0], submap_capacity=capacities[1]))
 
 
-def start(first: FirstWindow, camera: Camera, config: SlamConfig) -> tuple[SlamState, SlamConfig]:
-    """State of the first window, with the capacity that it needs (host side)."""
-    state, overflow = jitted_init_state(first.views, first.T_world_views, camera, config)
-    while overflow > 0:
+def start(
+    first: FirstWindow, camera: Camera, config: SlamConfig, init: Callable = jitted_init_state
+) -> tuple[SlamState, SlamConfig]:
+    """State of the first window, with the capacity that it needs (host side); `init` is as in `run`."""
+    state, overflow = init(first.views, first.T_world_views, camera, config)
+    while jnp.any(overflow > 0):
         config = with_room(config, Overflow(overflow, jnp.zeros((), int), jnp.zeros((), int)))
-        state, overflow = jitted_init_state(first.views, first.T_world_views, camera, config)
+        state, overflow = init(first.views, first.T_world_views, camera, config)
     return state, config
 
 
 def advance(
-    state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig
+    state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig, step: Callable = jitted_step
 ) -> tuple[SlamState, StepInfo, SlamConfig]:
-    """One step; a map or submap that is full is doubled and the frame repeated (host side).
+    """One step; a map or submap that is full is doubled and the frame repeated (host side); `step` is as in `run`.
 
     That gives the same map as starting with the larger capacity. Splats that find their tile full are only counted:
     they change what is drawn, not what is kept.
     """
-    new, info = jitted_step(state, prediction, camera, config)
-    while info.overflow.map > 0 or info.overflow.submap > 0:
+    new, info = step(state, prediction, camera, config)
+    while jnp.any((info.overflow.map > 0) | (info.overflow.submap > 0)):
         config = with_room(config, info.overflow)
-        state = eqx.tree_at(lambda s: s.map, state, grow(state.map, config.submap.map_capacity))
-        new, info = jitted_step(state, prediction, camera, config)
+        if config.submap.map_capacity > state.map.weight.shape[-1]:
+            state = eqx.tree_at(lambda s: s.map, state, grow(state.map, config.submap.map_capacity))
+        new, info = step(state, prediction, camera, config)
     return new, info, config
 
 
@@ -220,6 +221,8 @@ def run(
     camera: Camera,
     config: SlamConfig,
     on_step: Callable[[SlamState, StepInfo], None] = lambda state, info: None,
+    init: Callable = jitted_init_state,
+    step: Callable = jitted_step,
 ) -> SlamState:
     """Map a sequence (host side): the first window, then one step for each further prediction.
 
@@ -228,6 +231,8 @@ def run(
         camera: of the full images.
         config: all stages; capacities are where to start.
         on_step: called after each step; the views that the map is initialised from have none.
+        init: `init_state`, or what does the same for stacked configs and states (sweep.py).
+        step: `step`, likewise.
 
     Raises:
         ValueError: there is no prediction.
@@ -236,11 +241,9 @@ def run(
     first = next(remaining, None)
     if first is None:
         raise ValueError("there is no prediction to map: the sequence is empty")
-    following: list[Prediction] = []
-    if config.initialization == "incremental":
-        first, following = as_predictions(first)
-    state, config = start(first, camera, config)
+    first, following = opening(first, config)
+    state, config = start(first, camera, config, init)
     for prediction in chain(following, remaining):
-        state, info, config = advance(state, prediction, camera, config)
+        state, info, config = advance(state, prediction, camera, config, step)
         on_step(state, info)
     return state

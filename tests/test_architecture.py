@@ -22,7 +22,7 @@ CORE = (
         "icp",
     ),
     *("render.project", "render.tiles", "render.composite", "render.densify"),
-    *("initialization", "localization", "em", "refinement", "slam", "semantics"),
+    *("initialization", "localization", "em", "refinement", "slam", "semantics", "sweep"),
 )
 STAGES = {"initialization", "localization", "em", "refinement"}
 HOST_PACKAGES = {"numpy", "cv2", "open3d", "trimesh", "matplotlib", "scipy", "torch", "tqdm", "hydra", "omegaconf"}

@@ -14,7 +14,7 @@ from emgs_jax.slam import SlamConfig
 
 ROOT = CONF.parent
 # Studies and suites hold no class; tests/experiments composes them.
-UNTYPED = {CONF, CONF / "experiment", CONF / "suite", CONF / "baseline"}
+UNTYPED = {CONF, CONF / "experiment", CONF / "suite", CONF / "baseline", CONF / "sweep"}
 GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent not in UNTYPED)
 
 

@@ -43,6 +43,15 @@ def test_more_queries_than_a_block_equal_brute_force():
     check(rng.uniform(-1, 1, (300, 3)).astype(np.float32), points, np.ones(70, bool), 4)
 
 
+@pytest.mark.parametrize("k", [1, 5])
+def test_where_blocks_look_at_near_groups_only_and_where_they_must_look_at_all_neighbours_equal_brute_force(k):
+    """A surface, whose blocks are compact, and queries far from it and from each other, whose blocks are not."""
+    rng = np.random.default_rng(6)
+    plane = rng.uniform(-1, 1, (2400, 3)).astype(np.float32) * np.float32([1, 1, 0.01])
+    queries = np.concatenate([plane[::2], rng.uniform(-5, 5, (100, 3)).astype(np.float32)])
+    check(rng.permutation(queries), plane, rng.uniform(size=2400) < 0.9, k)
+
+
 def test_with_fewer_valid_points_than_k_the_rest_is_marked():
     points = np.arange(12, dtype=np.float32).reshape(4, 3)
     check(points, points, np.array([False, True, False, True]), 3)
@@ -74,6 +83,18 @@ def test_invalid_points_change_nothing(poison):
     clean = search(points[:20], points, valid, 6)
     for a, b in zip(search(points[:20], poisoned, valid, 6), clean, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf, 1e6])
+def test_a_wild_query_changes_no_other(poison):
+    rng = np.random.default_rng(7)
+    points = rng.uniform(-1, 1, (900, 3)).astype(np.float32)
+    queries = rng.uniform(-1, 1, (900, 3)).astype(np.float32)
+    is_wild = (np.arange(900) % 9 == 0)[:, None]
+    rows, found = search(np.where(is_wild, np.float32(poison), queries), points, np.ones(900, bool), 5)
+    clean, _ = search(queries, points, np.ones(900, bool), 5)
+    np.testing.assert_array_equal(np.asarray(rows)[~is_wild[:, 0]], np.asarray(clean)[~is_wild[:, 0]])
+    assert np.asarray(found)[~is_wild[:, 0]].all()
 
 
 def test_compaction_lists_the_true_rows_in_order_and_counts_what_did_not_fit():

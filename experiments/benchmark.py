@@ -1,0 +1,100 @@
+"""How long the stages take, beside what one would pick instead: `python -m experiments.benchmark [parts=[em,icp]]`.
+
+Compilation and run time apart, everything in turns on the same data; the tables are printed and written to benchmark.md
+and benchmark.json in Hydra's folder. The parts: stages, em, icp, render, sweep, growth.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import hydra
+import jax
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from emgs_jax.evaluation.report import provenance
+from emgs_jax.files import atomic_write, write_json
+from experiments.benchmarks.comparisons import time_em, time_icp, time_render
+from experiments.benchmarks.data import load
+from experiments.benchmarks.scaling import time_growth, time_settings
+from experiments.benchmarks.stages import time_stages
+from experiments.benchmarks.timing import Timing, spread
+from experiments.building import build_dataset, build_prior, clear_errors, use_compilation_cache
+
+
+def parts(config: DictConfig) -> dict[str, Callable[[], Iterable[Timing]]]:
+    """What can be timed, by name."""
+    chosen = config.benchmark
+    count, turns = chosen.num_gaussians, chosen.repetitions
+    return {
+        "stages": lambda: time_stages(load(config), turns),
+        "em": lambda: time_em(load(config, thin=1), count, turns),
+        "icp": lambda: time_icp(load(config), tuple(chosen.icp_offset), turns),
+        "render": lambda: time_render(load(config, thin=1), config.observation.thin, count, turns),
+        "sweep": lambda: time_settings(load(config), chosen.num_settings, turns),
+        "growth": lambda: time_growth(config, chosen.image_sizes, chosen.map_sizes, turns),
+    }
+
+
+def benchmark(config: DictConfig, folder: Path) -> list[Timing]:
+    """Time the chosen parts and write the tables after each of them."""
+    known = parts(config)
+    unknown = set(config.parts) - set(known)
+    if unknown or not config.parts:
+        raise ValueError(f"parts must be some of {', '.join(known)}; got {', '.join(sorted(unknown)) or 'none'}")
+    dataset = build_dataset(config)
+    prior = build_prior(config, dataset)
+    about = provenance(OmegaConf.to_container(config, resolve=True), dataset, prior.provenance, 0)
+    timings: list[Timing] = []
+    for name in tqdm(config.parts, unit="part", desc="timing"):
+        timings += known[name]()
+        write_json(folder / "benchmark.json", {"provenance": about, "timings": timings})
+        with atomic_write(folder / "benchmark.md", "w") as handle:
+            handle.write(report(timings) + "\n")
+    return timings
+
+
+def report(timings: Sequence[Timing]) -> str:
+    """Markdown: a table for each part, with the device above; times are medians with their range."""
+    device = jax.devices()[0]
+    lines = [f"{device.device_kind} ({device.platform}), {os.cpu_count()} CPU cores, jax {jax.__version__}"]
+    for part, rows in groupby(timings, lambda timing: timing.part):
+        lines += ["", f"| {part} | compile [s] | run [ms] | faster by | |", "|---|---|---|---|---|"]
+        lines += [_line(timing) for timing in rows]
+    return "\n".join(lines)
+
+
+def _line(timing: Timing) -> str:
+    facts = dict(timing.facts)
+    ratios = facts.pop("times_faster_than", {})
+    compile_seconds = "–" if timing.compile_seconds is None else f"{timing.compile_seconds:.1f}"
+    run = _text(spread([1e3 * seconds for seconds in timing.seconds]))
+    faster = "; ".join(f"{_text(ratio)} × {name}" for name, ratio in ratios.items()) or "–"
+    rest = ", ".join(f"{name} {_text(value)}" for name, value in facts.items())
+    return f"| {timing.name} | {compile_seconds} | {run} | {faster} | {rest} |"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, tuple):
+        middle, low, high = value
+        return f"{middle:.3g} ({low:.3g}–{high:.3g})"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="benchmark")
+def main(config: DictConfig) -> None:
+    """Time, print the tables and the folder."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    with clear_errors():
+        use_compilation_cache(config)
+        timings = benchmark(config, folder)
+    print(report(timings))
+    print(f"everything is in {folder}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,177 @@
+"""Stages beside what a user would pick instead: the same data and work, and how far the results differ."""
+
+import importlib.util
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from emgs_jax.camera import downscale
+from emgs_jax.em import e_step, m_step
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.icp import icp
+from emgs_jax.observation import Observation, transform
+from emgs_jax.pytree import take_rows
+from emgs_jax.render.composite import render
+from emgs_jax.render.project import project_gaussians
+from experiments.benchmarks import baselines
+from experiments.benchmarks.data import Data, gaussians_of, view
+from experiments.benchmarks.timing import Candidate, Timing, compare, executable, interleaved, spread
+
+
+def _host(tree: eqx.Module, valid: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """The fields of a module as NumPy arrays; only the valid rows."""
+    arrays = {name: np.asarray(value) for name, value in vars(tree).items() if eqx.is_array(value)}
+    keep = arrays["valid"] if valid is None else valid
+    return {name: value[keep] for name, value in arrays.items()}
+
+
+def time_em(data: Data, num_gaussians: int, repetitions: int) -> list[Timing]:
+    """E-step and M-step against NumPy and SciPy, on all pixels of the second view."""
+    gaussians, config = gaussians_of(data, num_gaussians), data.config.em
+    T, observation = view(data, 1)
+    points = transform(T, observation, jnp.ones(()))
+    points = take_rows(points, jnp.flatnonzero(points.valid))
+    noise = 0.01 * (points.points - T.translation())  # one percent of the depth
+
+    def both(gaussians: Gaussians, points: Observation, noise: jax.Array, config: Any) -> Any:
+        found, _ = e_step(gaussians, points, noise, config)
+        return found, m_step(gaussians, points, found, config)
+
+    ours = executable(both, gaussians, points, noise, config)
+    theirs = (_host(gaussians), _host(points), np.asarray(noise), config)
+    ours.facts.update(_em_difference(ours.call(), baselines.em(*theirs)))
+    ours.facts.update(points=points.valid.shape[0], gaussians=num_gaussians)
+    candidates = {"emgs_jax": ours, "NumPy + SciPy": Candidate(lambda: baselines.em(*theirs))}
+    return compare(interleaved("em", candidates, repetitions), "NumPy + SciPy")
+
+
+def _em_difference(ours: Any, theirs: baselines.Update) -> dict[str, float]:
+    found, (new, _) = ours
+    rows, r = np.asarray(found.rows), np.asarray(found.responsibilities)
+    orders = np.argsort(rows, axis=1), np.argsort(theirs.rows, axis=1)
+    mine, other = np.take_along_axis(rows, orders[0], 1), np.take_along_axis(theirs.rows, orders[1], 1)
+    is_same = (mine == other).all(axis=1)
+    gap = np.take_along_axis(r, orders[0], 1) - np.take_along_axis(theirs.responsibilities, orders[1], 1)
+    means = np.abs(np.asarray(new.means) - theirs.parameters["means"]).max(axis=1)
+    return {
+        "same_neighbours_percent": 100.0 * float(is_same.mean()),
+        "responsibility_error": float(np.abs(gap[is_same]).max()),
+        "responsibility_error_999": float(np.quantile(np.abs(gap[is_same]).max(axis=1), 0.999)),
+        "mean_error_m_999": float(np.quantile(means, 0.999)),
+    }
+
+
+def time_icp(data: Data, offset: tuple[float, float], repetitions: int) -> list[Timing]:
+    """Coloured ICP against Open3D: every view but the first on the Gaussians of the first, from starts that are off."""
+    config = data.config.localization.icp
+    # Coloured residuals only, without a prior on the pose or a scale, and never done before the last step.
+    config = eqx.tree_at(lambda c: (c.residual, c.prior_information, c.scale_noise), config, (jnp.zeros(()),) * 3)
+    _, reference = view(data, 0)
+    count = reference.valid.shape[0] * data.config.observation.thin**2 // data.config.fit.points_per_gaussian
+    target = gaussians_of(data, 3 * count // 4)
+    stride = max(reference.valid.shape[0] // config.num_points, 1)
+    cases = [_icp_case(data, row, offset) for row in range(1, len(data.true_poses))]
+    arguments = [(points, target, start, (jnp.asarray(0.02), jnp.asarray(0.01)), config) for points, start, _ in cases]
+    ours = executable(icp, *arguments[0])
+    clouds = [
+        (_host(jax.tree.map(lambda leaf: leaf[::stride], points)), start.as_matrix()) for points, start, _ in cases
+    ]
+    surface = _host(target) | {"points": _host(target)["means"]}
+    reach = 0.1
+
+    def open3d_one() -> np.ndarray:
+        return baselines.colored_icp(clouds[0][0], surface, np.asarray(clouds[0][1], float), reach, config.max_steps)
+
+    truth = [case[2] for case in cases]
+    mine = [np.asarray(ours.verb(*each)[0].as_matrix(), float) for each in arguments]
+    theirs = [
+        baselines.colored_icp(cloud, surface, np.asarray(start, float), reach, config.max_steps)
+        for cloud, start in clouds
+    ]
+    ours.facts.update(points=len(clouds[0][0]["points"]), gaussians=len(surface["points"]), steps=config.max_steps)
+    ours.facts.update(_pose_errors(mine, truth))
+    candidates = {"emgs_jax": ours, "Open3D": Candidate(open3d_one, None, _pose_errors(theirs, truth))}
+    return compare(interleaved("icp", candidates, repetitions), "Open3D")
+
+
+def _icp_case(data: Data, row: int, offset: tuple[float, float]) -> tuple[Observation, jaxlie.SE3, np.ndarray]:
+    """Points of a view, a start that is `offset` (m, rad) away from the truth, and the truth."""
+    _, points = view(data, row)
+    # The frame of the first view as the prior has it, which is where the Gaussians are.
+    T_world_first = np.asarray(view(data, 0)[0].as_matrix(), float)
+    truth = T_world_first @ np.linalg.inv(data.true_poses[0]) @ data.true_poses[row]
+    random = np.random.default_rng(row)
+    directions = [axis / np.linalg.norm(axis) for axis in random.normal(size=(2, 3))]
+    xi = np.concatenate([size * axis for size, axis in zip(offset, directions, strict=True)])
+    start = jaxlie.SE3.from_matrix(jnp.asarray(truth, jnp.float32)) @ jaxlie.SE3.exp(jnp.asarray(xi, jnp.float32))
+    return points, start, truth
+
+
+def _pose_errors(found: list[np.ndarray], truth: list[np.ndarray]) -> dict[str, Any]:
+    errors = [np.linalg.inv(true) @ pose for pose, true in zip(found, truth, strict=True)]
+    angles = [np.degrees(np.linalg.norm(jaxlie.SE3.from_matrix(jnp.asarray(e)).log()[3:])) for e in errors]
+    return {
+        "translation_error_cm": spread([100.0 * float(np.linalg.norm(error[:3, 3])) for error in errors]),
+        "rotation_error_deg": spread([float(angle) for angle in angles]),
+    }
+
+
+def time_render(data: Data, thin: int, num_gaussians: int, repetitions: int) -> list[Timing]:
+    """Drawing colours on every `thin`-th pixel against compositing without tiles, and gsplat where it can run."""
+    gaussians = gaussians_of(data, num_gaussians)
+    T, camera = view(data, 0)[0], downscale(data.camera, thin)
+    config = data.config.refinement.render
+    ours = executable(render, gaussians, gaussians.colors, T, camera, config)
+    splats = project_gaussians(gaussians, T, camera, config.covariance_scale, config.blur)
+    arrays, size = _host(splats), (camera.width, camera.height)
+    colors = np.asarray(gaussians.colors)[np.asarray(splats.valid)]
+    image = baselines.render(arrays, colors, size, config)
+    drawn = ours.call()
+    ours.facts.update(gaussians=num_gaussians, pixels=size[0] * size[1], tile_overflow=int(drawn.overflow))
+    # A pixel at the rim of a splat may be in or out.
+    ours.facts["color_error_999"] = float(np.quantile(np.abs(np.asarray(drawn.values) - image), 0.999))
+    candidates = {"emgs_jax": ours}
+    candidates["NumPy"] = Candidate(lambda: baselines.render(arrays, colors, size, config))
+    candidates |= _torch_candidates(gaussians, T, camera, (arrays, colors, size, config))
+    return compare(interleaved("render", candidates, repetitions), "NumPy")
+
+
+def _torch_candidates(gaussians: Gaussians, T: jaxlie.SE3, camera: Any, dense: tuple) -> Mapping[str, Candidate]:
+    """The same in PyTorch, and gsplat on a CUDA GPU, where these packages are installed."""
+    if importlib.util.find_spec("torch") is None:
+        return {}
+    import torch
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    tensor = lambda value: torch.as_tensor(np.array(value), device=device)  # noqa: E731
+    synchronize = torch.cuda.synchronize if device.type == "cuda" else lambda: None
+    arrays, colors, size, config = dense
+    tensors = {name: tensor(value) for name, value in arrays.items()}
+
+    def dense_torch() -> None:
+        with torch.device(device):
+            baselines.render(tensors, tensor(colors), size, config, torch)
+        synchronize()
+
+    found = {f"PyTorch, {device.type}": Candidate(dense_torch)}
+    if device.type == "cuda" and importlib.util.find_spec("gsplat") is not None:
+        variances, axes = np.linalg.eigh(np.asarray(gaussians.covs) * float(config.covariance_scale))
+        axes *= np.sign(np.linalg.det(axes))[:, None, None]
+        quaternions = jax.vmap(jaxlie.SO3.from_matrix)(jnp.asarray(axes)).wxyz
+        opacities = np.full(len(variances), float(config.opacity), np.float32)
+        model = [tensor(x) for x in (gaussians.means, quaternions, np.sqrt(variances), opacities)]
+        intrinsics = np.eye(3, dtype=np.float32)
+        intrinsics[[0, 1], [0, 1]], intrinsics[:2, 2] = np.asarray(camera.focal), np.asarray(camera.center) + 0.5
+        pose, rgb = tensor(T.inverse().as_matrix()), tensor(gaussians.colors)
+
+        def splat() -> None:
+            baselines.render_gsplat(model, rgb, pose, tensor(intrinsics), size)
+            synchronize()
+
+        found["gsplat"] = Candidate(splat)
+    return found

@@ -1,0 +1,114 @@
+"""What the benchmark runs on: the first frames of a data set, as a prior predicts them."""
+
+import itertools
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+from emgs_jax.camera import Camera
+from emgs_jax.clock import Clock
+from emgs_jax.clustering import morton_order
+from emgs_jax.data.convert import to_camera, to_first_window, to_prediction
+from emgs_jax.gaussian_map import GaussianMap, grow
+from emgs_jax.gaussians import Gaussians, cluster
+from emgs_jax.observation import Observation, Prediction, transform
+from emgs_jax.pipeline import first_pose, predictions
+from emgs_jax.prior.base import PriorPrediction
+from emgs_jax.pytree import take_rows
+from emgs_jax.slam import FirstWindow, SlamConfig, SlamState, start
+from experiments.building import build_dataset, build_prior
+
+
+@dataclass(frozen=True)
+class Data:
+    """The first window and the step after it, with the arrays that they come from.
+
+    Args:
+        camera: of the full images.
+        config: all stages.
+        raw: the prior's answer to the first window.
+        images: (views, h, w, 3), of the first window.
+        first: the first window.
+        prediction: of the frame after it.
+        true_poses: T_world_camera (views, 4, 4) of the first window.
+    """
+
+    camera: Camera
+    config: SlamConfig
+    raw: PriorPrediction
+    images: np.ndarray
+    first: FirstWindow
+    prediction: Prediction
+    true_poses: np.ndarray
+
+
+def load(config: DictConfig, thin: int | None = None) -> Data:
+    """The data of a config; `thin` instead of its `observation.thin`. Raises ValueError where frames are missing."""
+    dataset = build_dataset(config)
+    prior = build_prior(config, dataset)
+    slam = instantiate(config.slam)
+    if thin is not None:
+        slam = replace(slam, observation=replace(slam.observation, thin=thin))
+    calls = list(itertools.islice(predictions(dataset, prior, slam.window_size, Clock()), 2))
+    frames = calls[0][1] if calls else {}
+    if len(calls) < 2 or any(frames[row].T_world_camera is None for row in range(slam.window_size)):
+        raise ValueError(
+            f"the benchmark needs {slam.window_size + 1} frames with true poses, {dataset.name} {dataset.sequence} has "
+            f"{len(dataset)} frames: use dataset=synthetic"
+        )
+    anchor = first_pose(frames)
+    shown = [frames[row] for row in calls[0][0].window.dense]
+    return Data(
+        camera=to_camera(dataset),
+        config=slam,
+        raw=calls[0][0],
+        images=np.stack([frame.image for frame in shown]),
+        first=to_first_window(*calls[0], anchor, slam.observation),
+        prediction=to_prediction(*calls[1], anchor, slam.observation),
+        true_poses=np.stack([frame.T_world_camera for frame in shown]),
+    )
+
+
+def first_state(data: Data) -> tuple[SlamState, SlamConfig]:
+    """The map of all views of the first window."""
+    return start(data.first, data.camera, data.config)
+
+
+def view(data: Data, row: int) -> tuple[jaxlie.SE3, Observation]:
+    """One view of the first window: the prior's pose, and the points in the camera's frame."""
+    return jax.tree.map(lambda leaf: leaf[row], (data.first.T_world_views, data.first.views))
+
+
+def gaussians_of(data: Data, count: int) -> Gaussians:
+    """`count` Gaussians that the first view is clustered into, world frame."""
+    T, observation = view(data, 0)
+    camera, thin = data.camera, data.config.observation.thin
+    order = morton_order(-(-camera.height // thin), -(-camera.width // thin))
+    spacing = max(int(observation.valid.sum()) // (count + count // 8), 1)  # some clusters stay empty
+    config = data.config.fit
+    fitted, _ = eqx.filter_jit(cluster)(transform(T, observation, jnp.ones(())), order, spacing, config)
+    rows = np.flatnonzero(np.asarray(fitted.valid))
+    if len(rows) < count:
+        raise ValueError(
+            f"the first view gives {len(rows)} Gaussians, fewer than benchmark.num_gaussians={count}: use fewer"
+        )
+    return take_rows(fitted, jnp.asarray(rows[np.linspace(0, len(rows) - 1, count).astype(int)]))
+
+
+def enlarged(map: GaussianMap, count: int, distance: float) -> GaussianMap:
+    """`count` Gaussians: the map's own, as often as needed, each copy `distance` metres farther away."""
+    valid = np.flatnonzero(np.asarray(map.gaussians.valid))
+    rows = np.arange(count)
+    copies = rows // len(valid)
+    chosen = (
+        valid[rows % len(valid)] if count >= len(valid) else valid[np.linspace(0, len(valid) - 1, count).astype(int)]
+    )
+    large = take_rows(map, jnp.asarray(chosen))
+    offsets = jnp.asarray(copies * distance, jnp.float32)[:, None] * jnp.array([1.0, 0.0, 0.0])
+    return grow(eqx.tree_at(lambda m: m.gaussians.means, large, large.gaussians.means + offsets), 2 * count)

@@ -1,0 +1,56 @@
+"""The stages of one step, each by itself, and the whole step."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from emgs_jax.camera import downscale
+from emgs_jax.clustering import morton_order
+from emgs_jax.em import e_step, m_step
+from emgs_jax.gaussian_map import insert, select_submap, write_back
+from emgs_jax.gaussians import cluster, spacing
+from emgs_jax.localization import localize_coarse, localize_fine
+from emgs_jax.observation import observe, transform
+from emgs_jax.refinement import refine
+from emgs_jax.render.composite import render
+from emgs_jax.slam import step
+from experiments.benchmarks.data import Data, first_state
+from experiments.benchmarks.timing import Candidate, Timing, executable, interleaved
+
+
+def time_stages(data: Data, repetitions: int) -> list[Timing]:
+    """Compile every stage for what the stages before it give, then time all in turns."""
+    candidates: dict[str, Candidate] = {}
+
+    def stage(name: str, verb: Any, *arguments: Any) -> Any:
+        candidates[name] = executable(verb, *arguments)
+        return candidates[name].call()
+
+    state, config = first_state(data)
+    prediction, thin = data.prediction, config.observation.thin
+    camera = downscale(data.camera, thin)
+    raw = data.raw
+    arrays = raw.points[0], data.images[0] / 255.0, raw.features[0], raw.confidence[0]
+    stage(
+        "observe", observe, *(jnp.asarray(x, jnp.float32) for x in arrays), jnp.asarray(raw.mask[0]), config.observation
+    )
+    before = state.previous, state.T_world_previous
+    coarse = stage("localize, coarse", localize_coarse, prediction, *before, camera, config.localization)
+    guess = transform(coarse.T_world_camera, prediction.current, coarse.scale)
+    clouds = state.previous, guess
+    submap, rows, _ = stage("submap", select_submap, state.map, clouds, config.submap)
+    fine = prediction.current, submap.gaussians, coarse, config.localization
+    T, aligned, localization = stage("localize, fine", localize_fine, *fine)
+    noise = localization.depth_noise * (aligned.points - T.translation())
+    steps, _ = stage("E-step", e_step, submap.gaussians, aligned, noise, config.em)
+    stage("M-step", m_step, submap.gaussians, aligned, steps, config.em)
+    rest = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & ~steps.is_fused)
+    order = morton_order(camera.height, camera.width)
+    candidates_new, weight = stage("new Gaussians", cluster, rest, order, spacing(thin, config.fit), config.fit)
+    submap, fresh, _ = stage("refine", refine, submap, candidates_new, T, camera, config.refinement)
+    drawn = submap.gaussians, submap.gaussians.colors, T, camera, config.refinement.render
+    stage("render", render, *drawn)
+    stage("insert", lambda m, s, r, f, w: insert(write_back(m, s, r), f, w), state.map, submap, rows, fresh, weight)
+    stage("whole step", step, state, prediction, data.camera, config)
+    return interleaved("stages", candidates, repetitions)

@@ -1,0 +1,105 @@
+"""The axes of a sweep: dotted keys of the config with their values, checked, and the configs of their grid."""
+
+import difflib
+import itertools
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from emgs_jax.render.densify import DensifyConfig
+from emgs_jax.slam import SlamConfig
+from emgs_jax.sweep import programs
+
+Value = float | int | str | bool
+Axes = Mapping[str, Sequence[Value]]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One point of the grid.
+
+    Args:
+        setting: key -> value; infinities as text, as JSON has none.
+        slam: the config with it.
+        densify: likewise; what is drawn is shared with the refinement.
+    """
+
+    setting: dict[str, Value]
+    slam: SlamConfig
+    densify: DensifyConfig
+
+
+def read_axes(config: DictConfig) -> dict[str, list[Value]]:
+    """The axes of a composed config; raises ValueError where one is no key of a stage or has no list of values."""
+    known = sorted(set(_leaf_keys(OmegaConf.to_container(config, resolve=False), "slam")))
+    axes = OmegaConf.to_container(config)["axes"]
+    if not axes:
+        raise ValueError("the sweep has no axis: choose one with sweep=gates or 'axes={em.normal_weight:[0,5]}'")
+    for key, values in axes.items():
+        if key not in known:
+            raise ValueError(f"axis {key} is no key of a stage; {_advice(key, known)}")
+        if not isinstance(values, list) or not values:
+            raise ValueError(f"axis {key} must be a list of values, got {values!r}: write {key}: [{values}, …]")
+        if any(not isinstance(value, Value) for value in values):
+            raise ValueError(f"axis {key} must have numbers or names as values, got {values!r}")
+    return {key: list(dict.fromkeys(values)) for key, values in axes.items()}
+
+
+def _leaf_keys(root: dict[str, Any], path: str) -> Iterator[str]:
+    """Dotted keys of the values below `path`; a whole node that is only referred to counts where it stands."""
+    node = _at(root, path)
+    for name, value in node.items():
+        reference = re.fullmatch(r"\$\{([\w.]+)\}", value) if isinstance(value, str) else None
+        if reference and isinstance(_at(root, reference[1]), dict):
+            yield from _leaf_keys(root, reference[1])
+        elif isinstance(value, dict):
+            yield from _leaf_keys(root, f"{path}.{name}")
+        elif not name.startswith("_"):
+            yield f"{path}.{name}"
+
+
+def _at(root: dict[str, Any], path: str) -> Any:
+    for name in path.split("."):
+        root = root[name]
+    return root
+
+
+def _advice(key: str, known: list[str]) -> str:
+    if key.split(".")[0] in ("dataset", "prior"):
+        return f"a sweep predicts once, so sweep it around: experiments.sweep -m {key}=…,… or experiments.run -m"
+    ends = {name.rsplit(".", 1)[-1]: name for name in known}
+    near = difflib.get_close_matches(key, known, 5) or [
+        ends[end] for end in difflib.get_close_matches(key.rsplit(".", 1)[-1], ends, 5)
+    ]
+    return f"near names: {', '.join(near)}" if near else f"the keys are {', '.join(known)}"
+
+
+def variants(config: DictConfig, axes: Axes) -> list[Variant]:
+    """Every combination of the axes' values, the last axis fastest; raises ValueError where a value is refused."""
+    return [_variant(config, dict(zip(axes, values, strict=True))) for values in itertools.product(*axes.values())]
+
+
+def _variant(config: DictConfig, setting: dict[str, Value]) -> Variant:
+    changed = config.copy()
+    for key, value in setting.items():
+        OmegaConf.update(changed, key, value)
+    plain = {key: str(v) if isinstance(v, float) and not math.isfinite(v) else v for key, v in setting.items()}
+    return Variant(plain, instantiate(changed.slam), instantiate(changed.densify))
+
+
+def notes(config: DictConfig, axes: Axes) -> list[str]:
+    """What to know of axes whose values do not share a program."""
+    found = []
+    for key, values in axes.items():
+        configs = [variant.slam for variant in variants(config, {key: values})]
+        if len(set(map(jax.tree.structure, configs))) > 1:
+            found.append(f"{key} is static: it compiles once for each of its {len(values)} values")
+        elif len(programs(configs)) > 1:
+            found.append(f"{key} decides what a prediction becomes: its {len(values)} values are mapped in turn")
+    return found

@@ -1,0 +1,156 @@
+"""A grid of settings on one sequence: `python -m experiments.sweep sweep=gates dataset=… prior=…`.
+
+The axes are keys of a stage, from conf/sweep/ or the command line: `'axes={em.normal_weight:[0,5],em.noise:[0,1]}'`.
+Frames, predictions and the truth are made once for the whole grid. An interrupted sweep goes on with the same command
+and `hydra.run.dir=` its folder.
+"""
+
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import hydra
+import jax
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from emgs_jax import scoring
+from emgs_jax.clock import Clock
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.evaluation.reconstruction import raw_prior_cloud
+from emgs_jax.evaluation.report import provenance
+from emgs_jax.pipeline import new_run
+from emgs_jax.prior.base import Prior
+from emgs_jax.prior.recorded import Recorded, record
+from emgs_jax.sweep import programs
+from emgs_jax.sweep_results import SweepResults, draw, table, write_csv
+from emgs_jax.sweep_run import Scorer, map_settings, score_settings
+from experiments.building import build_dataset, build_prior, clear_errors, use_compilation_cache
+from experiments.grid import Variant, notes, read_axes, variants
+
+NOT_OF_RESULTS = ("axes", "chunk", "at_once", "compilation_cache")  # keys that change no number
+
+
+@dataclass(frozen=True)
+class Work:
+    """What all settings share; `at_once` and `num_threads` as in `map_settings`."""
+
+    dataset: ReadableFrames
+    prior: Prior
+    scorer: Scorer
+    clock: Clock
+    at_once: int
+    num_threads: int
+
+
+def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
+    """Map and score every setting of `config.axes` that `folder` has not; returns a flat row for each."""
+    axes = read_axes(config)
+    grid = variants(config, axes)
+    for note in notes(config, axes):
+        print(note)
+    with Clock().watching() as clock:
+        dataset = build_dataset(config)
+        prior = build_prior(config, dataset)
+        results = SweepResults(folder, _provenance(config, dataset, prior))
+        left = [variant for variant in grid if variant.setting not in results]
+        chunks = _chunks(left, config.chunk)
+        scorer = _scorer(dataset, config) if chunks else None
+        with _replayed(prior, dataset, chunks, folder / "predictions") as priors, _bar(dataset, chunks) as bar:
+            for chunk in chunks:
+                window_size = chunk[0].slam.window_size
+                work = Work(dataset, priors[window_size], scorer, clock, *_side_by_side(config, len(chunk)))
+                results.add([variant.setting for variant in chunk], _map_and_score(work, chunk, bar))
+    rows = results.rows([variant.setting for variant in grid])
+    write_csv(folder / "sweep.csv", rows)
+    no_picture = draw(
+        folder / "heat_map.png", rows, axes, f"{dataset.name} {dataset.sequence}, {prior.provenance.name}"
+    )
+    if no_picture:
+        print(f"no heat_map.png: {no_picture}")
+    print(table(rows, list(axes)))
+    print(f"{len(left)} settings in {clock.total_seconds:.1f} s, {clock.compile_seconds:.1f} s of it compilation")
+    return rows
+
+
+def _provenance(config: DictConfig, dataset: ReadableFrames, prior: Prior) -> dict[str, Any]:
+    plain = OmegaConf.to_container(config, resolve=True)
+    shared = {key: value for key, value in plain.items() if key not in NOT_OF_RESULTS}
+    return provenance(shared, dataset, prior.provenance, prior.provenance.settings.get("seed", 0))
+
+
+def _chunks(left: Sequence[Variant], size: int) -> list[list[Variant]]:
+    """Settings that share a program and a pass over the sequence, in chunks of equal size up to one."""
+    if size < 1:
+        raise ValueError(f"chunk must be at least 1 setting, got {size}")
+    chunks = []
+    for positions in programs([variant.slam for variant in left]):
+        count = -(-len(positions) // size)
+        chunks += [[left[position] for position in positions[start::count]] for start in range(count)]
+    return chunks
+
+
+def _side_by_side(config: DictConfig, size: int) -> tuple[int, int]:
+    """`at_once` and `num_threads`: vmap fills an accelerator, threads that share one executable fill a CPU.
+
+    On a CPU vmap is slower than one setting after the other: the blocks of the neighbour search leave the cache, every
+    setting waits for the solver of the slowest, and both sides of a condition are computed.
+    """
+    is_cpu = jax.default_backend() == "cpu"
+    return config.at_once or (1 if is_cpu else size), os.cpu_count() if is_cpu else 1
+
+
+def _scorer(dataset: ReadableFrames, config: DictConfig) -> Scorer:
+    evaluation = instantiate(config.evaluation)
+    has_truth = any(dataset[row].T_world_camera is not None for row in range(len(dataset)))
+    truth = scoring.true_cloud(dataset, evaluation) if has_truth else None
+    return Scorer(dataset, evaluation, truth, len(dataset.skipped))
+
+
+@contextmanager
+def _replayed(
+    prior: Prior, dataset: ReadableFrames, chunks: Sequence[Sequence[Variant]], folder: Path
+) -> Iterator[dict[int, Prior]]:
+    """The prior of every window size; where it is asked more than once, a recording, which is removed at the end."""
+    sizes = [chunk[0].slam.window_size for chunk in chunks]
+    priors = {}
+    for size in dict.fromkeys(sizes):
+        prior.check(dataset, size)
+        priors[size] = prior
+        if sizes.count(size) > 1 and not isinstance(prior, Recorded):
+            path = folder / f"window_{size}"
+            record(prior, dataset, size, path, lambda calls: tqdm(calls, unit="inference", desc="predicting"))
+            priors[size] = Recorded(path)
+    yield priors
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _bar(dataset: ReadableFrames, chunks: Sequence[Sequence[Variant]]) -> tqdm:
+    return tqdm(total=len(dataset) * sum(map(len, chunks)), unit="frame", desc="mapping", disable=not chunks)
+
+
+def _map_and_score(work: Work, chunk: Sequence[Variant], bar: tqdm) -> list[scoring.Metrics]:
+    runs = [new_run(work.dataset, variant.slam, work.clock, lambda record: bar.update()) for variant in chunk]
+    views = map_settings(runs, work.dataset, work.prior, work.at_once, work.num_threads)
+    raw_cloud = raw_prior_cloud(views, work.scorer.evaluation)
+    return score_settings(runs, raw_cloud, [variant.densify for variant in chunk], work.scorer, work.num_threads)
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="sweep")
+def main(config: DictConfig) -> None:
+    """Sweep, and say where the results are."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    with clear_errors():
+        use_compilation_cache(config)
+        sweep(config, folder)
+    print(f"everything is in {folder}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""The benchmark; oracles: the slow reference for the baselines, the library for what both compute, the files."""
+
+import json
+import time
+from types import SimpleNamespace
+
+import hydra
+import numpy as np
+import pytest
+import reference
+from tiny_run import compose
+
+import experiments.benchmark
+from emgs_jax.render.composite import RenderConfig
+from experiments.benchmarks import baselines
+from experiments.benchmarks.comparisons import time_em, time_icp, time_render
+from experiments.benchmarks.data import enlarged, first_state, load
+from experiments.benchmarks.timing import Candidate, compare, interleaved, spread
+
+TINY = ("benchmark.repetitions=2", "benchmark.num_gaussians=200")
+
+
+def benchmark_config(*overrides: str):
+    return compose("prior.level=0.3", *TINY, *overrides, name="benchmark")
+
+
+def gaussian_arrays(count: int, seed: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    axes = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    unit = lambda v: v / np.linalg.norm(v, axis=-1, keepdims=True)  # noqa: E731
+    return {
+        "means": rng.uniform(-1, 1, (count, 3)),
+        "covs": np.einsum("nij,nj,nkj->nik", axes, rng.uniform(0.05, 0.3, (count, 3)) ** 2, axes),
+        "normals": unit(rng.normal(size=(count, 3)) * 0.3 + [0, 0, -1]),
+        "colors": rng.uniform(0, 1, (count, 3)),
+        "features": unit(rng.normal(size=(count, 4)) + 2.0),
+        "valid": np.ones(count, bool),
+    }
+
+
+def test_the_array_form_of_em_is_what_the_equations_say_point_by_point():
+    config = SimpleNamespace(num_neighbours=5, noise=0.0, determinant_weight=0.5, normal_weight=5.0, feature_weight=2.0)
+    config = SimpleNamespace(
+        **vars(config),
+        min_normal_cos=0.5,
+        max_mahalanobis_sq=4.0,
+        max_log_gap=8.0,
+        min_responsibility=1.0,
+        min_std=0.01,
+    )
+    g, points = gaussian_arrays(30, 0), gaussian_arrays(200, 1)
+    points["points"] = points.pop("means")
+    update = baselines.em(g, points, np.zeros((200, 3)), config)
+    expected, is_fused = reference.e_step(points["points"], points["normals"], points["features"], g, config)
+    dense = np.zeros_like(expected)
+    np.put_along_axis(dense, update.rows, update.responsibilities, axis=1)
+    np.testing.assert_allclose(dense, expected, atol=1e-10)
+    assert 20 < is_fused.sum() < 200
+    for k in range(30):
+        new = {name: value[k] for name, value in update.parameters.items()}
+        if expected[:, k].sum() > 1.0:
+            truth = reference.m_step(expected, points["points"], points["normals"], points["colors"], k, 0.01)
+            for a, b in zip((new["means"], new["covs"], new["normals"], new["colors"]), truth, strict=True):
+                np.testing.assert_allclose(a, b, atol=1e-9)
+        else:
+            np.testing.assert_array_equal(new["means"], g["means"][k])
+
+
+def test_compositing_without_tiles_is_the_reference_pixel_by_pixel():
+    g = gaussian_arrays(25, 2)
+    g["means"][:, 2] += 3.0
+    camera = SimpleNamespace(focal=[20.0, 23.0], center=[11.5, 8.25], width=24, height=18)
+    config = RenderConfig(8, 32, 4, opacity=0.8, covariance_scale=1.5, blur=0.3, radius=2.5, min_alpha=0.1)
+    expected, _, _ = reference.render(g, g["colors"], np.eye(4), camera, config)
+    drawn = [
+        reference.splat(m, c, np.eye(4), camera.focal, camera.center, 1.5, 0.3)[:2]
+        for m, c in zip(g["means"], g["covs"], strict=True)
+    ]
+    splats = {
+        "means": np.stack([mean for mean, _ in drawn]),
+        "precisions": np.linalg.inv(np.stack([cov for _, cov in drawn])),
+        "depth": g["means"][:, 2],
+    }
+    image = baselines.render(splats, g["colors"], (24, 18), config)
+    np.testing.assert_allclose(image, expected, atol=1e-5)  # the config holds float32
+    assert expected.max() > 0.3
+
+
+def test_candidates_take_turns_and_a_ratio_compares_the_same_turn():
+    order = []
+
+    def wait(name: str, seconds: float) -> Candidate:
+        return Candidate(lambda: (order.append(name), time.sleep(seconds)))
+
+    timings = compare(interleaved("part", {"a": wait("a", 0.02), "b": wait("b", 0.005)}, 3), "a")
+    assert order == ["a", "b"] * 4  # the first turn does not count
+    middle, low, high = timings[1].facts["times_faster_than"]["a"]
+    assert 1.5 < low <= middle <= high and len(timings[0].seconds) == 3
+    assert spread([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
+
+
+@pytest.mark.slow
+def test_em_agrees_with_numpy_and_scipy_on_the_same_points():
+    ours, theirs = time_em(load(benchmark_config(), thin=1), 200, 1)
+    assert ours.facts["same_neighbours_percent"] >= 99.9 and ours.facts["responsibility_error"] <= 1e-4
+    assert ours.facts["mean_error_m_999"] <= 1e-5 and ours.compile_seconds > 0 and theirs.compile_seconds is None
+
+
+@pytest.mark.slow
+def test_both_registrations_find_the_pose_of_exact_views():
+    config = benchmark_config("prior.level=0", "fit.points_per_gaussian=4", "dataset.num_frames=100")
+    for timing in time_icp(load(config), (0.02, 0.01), 1):
+        assert timing.facts["translation_error_cm"][0] < 2.0, timing.name  # pixels are 5 cm apart
+
+
+@pytest.mark.slow
+def test_drawing_agrees_with_compositing_without_tiles():
+    ours = time_render(load(benchmark_config("render.tile_capacity=256"), thin=1), 1, 200, 1)[0]
+    assert ours.facts["tile_overflow"] == 0 and ours.facts["color_error_999"] < 1e-3
+
+
+@pytest.mark.slow
+def test_a_map_is_enlarged_by_copies_that_no_camera_sees():
+    state, _ = first_state(load(benchmark_config()))
+    count = int(state.map.gaussians.valid.sum())
+    large = enlarged(state.map, 3 * count, 50.0)
+    means = np.asarray(large.gaussians.means)[: 3 * count].reshape(3, count, 3)
+    offsets = np.arange(3)[:, None, None] * np.broadcast_to([50.0, 0, 0], (1, count, 3))
+    np.testing.assert_allclose(means - means[:1], offsets, atol=1e-4)
+    assert int(large.gaussians.valid.sum()) == 3 * count and large.weight.shape == (6 * count,)
+
+
+@pytest.mark.slow
+def test_the_tables_hold_every_part_and_unknown_parts_are_refused(tmp_path):
+    sizes = ("benchmark.num_settings=[2]", "benchmark.map_sizes=[100,400]", "benchmark.image_sizes=[[64,48]]")
+    timings = experiments.benchmark.benchmark(benchmark_config(*sizes, "parts=[stages,sweep,growth]"), tmp_path)
+    written = json.loads((tmp_path / "benchmark.json").read_text())
+    assert [row["name"] for row in written["timings"]] == [timing.name for timing in timings]
+    text = (tmp_path / "benchmark.md").read_text()
+    assert all(f"| {timing.name} |" in text for timing in timings) and written["provenance"]["device"]["kind"] in text
+    names = {timing.name for timing in timings}
+    assert {"E-step", "whole step", "2 settings, vmap", "64x48, 400 Gaussians"} <= names
+    assert all(len(timing.seconds) == 2 and min(timing.seconds) > 0 for timing in timings)
+    with pytest.raises(ValueError, match="parts must be some of stages, em.*got speed"):
+        experiments.benchmark.benchmark(benchmark_config("parts=[speed]"), tmp_path)
+    with pytest.raises(ValueError, match="4 frames"):
+        load(benchmark_config("dataset.stop=3"))
+    with pytest.raises(hydra.errors.ConfigCompositionException):
+        benchmark_config("benchmark.turns=3")

@@ -1,0 +1,141 @@
+"""The sweep; oracle: `experiments.run` with the same values, whose metrics every row must repeat."""
+
+import csv
+import json
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+
+import hydra
+import numpy as np
+import pytest
+from tiny_run import CONF, compose
+
+import experiments.run
+import experiments.sweep
+from experiments.grid import notes, read_axes, variants
+
+AXES = "axes={em.max_mahalanobis_sq:[1.0,9.0],em.average.gain:[count,ema_printed]}"
+COMPARED = ("trajectory/", "reconstruction", "raw_prior/", "map/", "frames/")
+
+
+@cache
+def swept() -> tuple[Path, list[dict]]:
+    """Folder and rows of a sweep over two axes, two settings a chunk."""
+    folder = Path(mkdtemp())
+    return folder, experiments.sweep.sweep(compose(AXES, "chunk=2", name="sweep"), folder)
+
+
+def assert_same_metrics(row: dict, metrics: dict, rtol: float) -> None:
+    names = {name for name in metrics if name.startswith(COMPARED)}
+    assert names == {name for name in row if name.startswith(COMPARED)} and len(names) > 40
+    for name in names:
+        if isinstance(metrics[name], float):
+            np.testing.assert_allclose(row[name], metrics[name], rtol=rtol, atol=rtol, err_msg=name)
+        else:
+            assert row[name] == metrics[name], name
+
+
+@pytest.mark.slow
+def test_every_setting_has_the_metrics_of_a_run_with_its_values(tmp_path):
+    for row in swept()[1]:
+        values = [f"{name}={row[name]}" for name in ("em.max_mahalanobis_sq", "em.average.gain")]
+        metrics = experiments.run.run(compose(*values), tmp_path)
+        assert_same_metrics(row, metrics, 1e-5)
+    assert len({row["trajectory/ate_sim3_m"] for row in swept()[1]}) == 4  # the axes do something
+
+
+@pytest.mark.slow
+def test_the_files_hold_every_row_and_the_recorded_predictions_are_removed():
+    folder, rows = swept()
+    assert {path.name for path in folder.iterdir()} == {"sweep.json", "sweep.csv", "heat_map.png"}
+    with open(folder / "sweep.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [float(line["trajectory/ate_sim3_m"]) for line in lines] == [row["trajectory/ate_sim3_m"] for row in rows]
+    assert [line["em.average.gain"] for line in lines] == ["count", "ema_printed"] * 2
+    written = json.loads((folder / "sweep.json").read_text())
+    assert written["provenance"]["simulated"] is True and len(written["settings"]) == 4
+    assert (folder / "heat_map.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.slow
+def test_a_finished_setting_is_not_mapped_again_and_another_sweep_is_not_mixed_in(monkeypatch, tmp_path):
+    folder, rows = swept()
+    (tmp_path / "sweep.json").write_bytes((folder / "sweep.json").read_bytes())
+    monkeypatch.setattr(experiments.sweep, "_map_and_score", None)  # calling it would fail
+    subset = compose("axes={em.max_mahalanobis_sq:[9.0],em.average.gain:[count]}", name="sweep")
+    (row,) = experiments.sweep.sweep(subset, tmp_path)
+    assert row | {"setting": 2} == rows[2]
+    with pytest.raises(ValueError, match=r"em\.noise 1\.0, and this one has 0\.5: choose another folder"):
+        experiments.sweep.sweep(compose(AXES, "em.noise=0.5", name="sweep"), tmp_path)
+    (tmp_path / "sweep.json").write_text('{"format": "emgs_jax.sweep", "version": 99}')
+    with pytest.raises(ValueError, match="version 1.*another folder"):
+        experiments.sweep.sweep(subset, tmp_path)
+
+
+@pytest.mark.slow
+def test_an_interrupted_sweep_keeps_its_chunks(monkeypatch, tmp_path):
+    done = []
+
+    def interrupted(work, chunk, bar):
+        if done:
+            raise KeyboardInterrupt
+        done.extend(variant.setting for variant in chunk)
+        return [{"map/num_gaussians": 1}] * len(chunk)
+
+    monkeypatch.setattr(experiments.sweep, "_map_and_score", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        experiments.sweep.sweep(compose(AXES, "chunk=2", name="sweep"), tmp_path)
+    kept = json.loads((tmp_path / "sweep.json").read_text())["settings"]
+    assert [row["setting"] for row in kept] == done and len(done) == 2
+
+
+def test_the_grid_is_every_combination_and_shared_nodes_change_wherever_they_are_used():
+    config = compose("axes={em.normal_weight:[0,5],render.opacity:[0.5,0.7]}", name="sweep")
+    grid = variants(config, read_axes(config))
+    got = [
+        (float(v.slam.em.normal_weight), float(v.slam.refinement.render.opacity), float(v.densify.render.opacity))
+        for v in grid
+    ]
+    np.testing.assert_allclose(got, [(0, 0.5, 0.5), (0, 0.7, 0.7), (5, 0.5, 0.5), (5, 0.7, 0.7)])
+    assert [v.setting for v in grid][1] == {"em.normal_weight": 0, "render.opacity": 0.7}
+
+
+def test_an_infinite_value_is_text_in_the_results():
+    config = compose("axes={em.max_log_gap:[8.0,inf]}", name="sweep")
+    grid = variants(config, read_axes(config))
+    assert [v.setting["em.max_log_gap"] for v in grid] == [8.0, "inf"] and np.isinf(grid[1].slam.em.max_log_gap)
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"),
+    [
+        ("null", "no axis: choose one with sweep=gates"),
+        ("{em.max_mahalanobis:[3]}", r"no key of a stage; near names: em\.max_mahalanobis_sq"),
+        ("{max_mahalanobis_sq:[3]}", r"near names: .*em\.max_mahalanobis_sq|near names: .*max_mahalanobis_sq"),
+        ("{em.noise:3}", r"must be a list of values, got 3: write em\.noise: \[3"),
+        ("{em.noise:[]}", "must be a list of values"),
+        ("{em.noise:[[1,2]]}", "numbers or names"),
+        ("{prior.seed:[0,1]}", r"experiments\.sweep -m prior\.seed"),
+    ],
+)
+def test_an_axis_that_is_none_is_refused_with_the_remedy(axes, message):
+    with pytest.raises(ValueError, match=message):
+        read_axes(compose(f"axes={axes}", name="sweep"))
+
+
+def test_a_static_axis_says_that_it_compiles_for_each_value_and_a_traced_one_says_nothing():
+    config = compose("axes={em.num_neighbours:[4,6],em.noise:[0,1],observation.min_confidence:[1.0,2.0]}", name="sweep")
+    said = notes(config, read_axes(config))
+    assert said == [
+        "em.num_neighbours is static: it compiles once for each of its 2 values",
+        "observation.min_confidence decides what a prediction becomes: its 2 values are mapped in turn",
+    ]
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "sweep").glob("*.yaml")))
+def test_every_sweep_of_conf_has_axes_whose_values_build_configs(name):
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        config = hydra.compose("sweep", overrides=[f"sweep={name}"])
+    axes = read_axes(config)
+    assert len(variants(config, axes)) == np.prod([len(values) for values in axes.values()]) >= 4
