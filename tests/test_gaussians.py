@@ -21,6 +21,8 @@ from emgs_jax.clustering import morton_order
 from emgs_jax.gaussians import blend, cluster, empty_gaussians, fit_to_points, spacing
 from emgs_jax.observation import transform
 
+pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
+
 fit = eqx.filter_jit(fit_to_points)
 ONE = jnp.ones(())
 

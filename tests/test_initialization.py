@@ -12,6 +12,8 @@ from emgs_jax.initialization import initialize
 from emgs_jax.observation import transform
 from emgs_jax.pytree import stack
 
+pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
+
 first_map = eqx.filter_jit(initialize)
 POSES = [path_pose(i) for i in range(3)]
 

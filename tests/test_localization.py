@@ -13,6 +13,8 @@ from emgs_jax.gaussians import fit_to_points
 from emgs_jax.localization import REASONS, localize_coarse, localize_fine
 from emgs_jax.observation import transform
 
+pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
+
 coarse_step, fine_step = eqx.filter_jit(localize_coarse), eqx.filter_jit(localize_fine)
 COARSE = {"via_previous": 0, "same_image": 1, "anchored": 2, "fused": 3}
 SCALES = {"none": 0, "ratio": 1, "estimated": 2}

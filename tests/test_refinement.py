@@ -11,6 +11,8 @@ from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.refinement import average_candidates, refine
 
+pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
+
 refined = eqx.filter_jit(refine)
 CAMERA_POSE = pose()
 

@@ -17,6 +17,8 @@ from emgs_jax.prior.mapanything import relative_poses
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.resize import plan_resize
 
+pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
+
 WINDOW_SIZE, GRID = 3, "[56,42]"
 
 

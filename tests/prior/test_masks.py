@@ -9,6 +9,8 @@ from scene import compose
 
 from emgs_jax.prior import masks
 
+pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
+
 SHAPE = (14, 17)
 
 

@@ -12,6 +12,8 @@ from emgs_jax.camera import pixel_grid, rays
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.render.composite import render
 
+pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
+
 draw = eqx.filter_jit(render)
 T = pose((0.05, -0.1, 0.05), (0.05, -0.05, 0.1))
 GAUSSIANS = random_gaussians(24, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
