@@ -1,4 +1,4 @@
-"""Poses of a window from noisy points: right up to a similarity, fixed scale, and refused where they cannot be known."""
+"""Poses of a window from noisy points: right up to a similarity, of a given scale, refused where not known."""
 
 import numpy as np
 import pytest

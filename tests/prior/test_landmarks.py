@@ -60,7 +60,7 @@ def test_matches_that_leave_the_epipolar_line_are_left_out(views):
     rng = np.random.default_rng(0)
     views[1].pixels[:10, 1] += rng.uniform(4, 12, 10) * rng.choice([-1, 1], 10)  # the camera moves sideways
     _, rows_b = match(views[0], views[1], calibration(), config)
-    assert len(rows_b) > 0.75 * NUM_POINTS
+    assert len(rows_b) > 0.65 * NUM_POINTS
     assert np.sum(rows_b < 10) <= 2  # a line may pass by chance
 
 
