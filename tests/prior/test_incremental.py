@@ -7,6 +7,7 @@ from stereo_scene import arc, cloud, matrix, similarity_error, small_camera, str
 from emgs_jax.prior.incremental import extend, initialize
 from emgs_jax.prior.landmarks import NONE, forget, link
 
+pytestmark = pytest.mark.slow  # compiling the solver takes ten seconds
 NUM_POINTS, NUM_VIEWS, MOST_VIEWS = 90, 6, 10
 CONFIG = structure_config("prior.structure.num_fixed=3")
 

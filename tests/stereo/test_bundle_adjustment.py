@@ -11,6 +11,7 @@ from stereo_scene import arc, cloud, matrix, projected, small_camera, structure_
 
 from emgs_jax.stereo.bundle_adjustment import Tracks, adjust
 
+pytestmark = pytest.mark.slow  # compiling the solver takes ten seconds
 NUM_VIEWS, NUM_POINTS = 4, 24
 OVERRIDES = tuple(f"prior.structure.bundle.{key}" for key in ("max_steps=30", "tolerance=1e-6", "damping=1e-7"))
 jitted_adjust = eqx.filter_jit(adjust)
