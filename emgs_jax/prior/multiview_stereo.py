@@ -95,7 +95,7 @@ class MultiviewStereo:
             initialize(self._structure, self._camera, self._num_views, self._structure_config)
         else:
             extend(self._structure, self._camera, self._num_views, self._structure_config)
-        return self._answer(window, frames)
+        return self._answer(window)
 
     def _begin(self, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
         height, width = frames[0].image.shape[:2]
@@ -124,7 +124,7 @@ class MultiviewStereo:
         self._structure.views[frame.index] = detect(gray, self._structure_config.matching)
         link(self._structure, frame.index, self._structure_config.matching)
 
-    def _answer(self, window: Window, frames: Sequence[Frame]) -> PriorPrediction:
+    def _answer(self, window: Window) -> PriorPrediction:
         views = [self._structure.views[frame] for frame in window.views]
         for frame in window.dense:
             if frame not in self._depths or not self._depths[frame].any():  # it may have been placed since
