@@ -9,7 +9,7 @@ CHECKED = (
     *("pytree", "linalg", "rigid", "camera", "observation", "neighbours", "clustering", "gaussians"),
     *("gaussian_map", "icp"),
     *("render", "initialization", "localization", "em", "refinement", "slam", "semantics"),
-    "prior.masks",
+    *("prior.masks", "stereo.bundle_adjustment", "stereo.plane_sweep", "stereo.semi_global", "stereo.depth"),
 )
 install_import_hook([f"emgs_jax.{name}" for name in CHECKED], "beartype.beartype")
 

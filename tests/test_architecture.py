@@ -23,6 +23,7 @@ CORE = (
     ),
     *("render.project", "render.tiles", "render.composite", "render.densify"),
     *("initialization", "localization", "em", "refinement", "slam", "semantics", "sweep"),
+    *("stereo.bundle_adjustment", "stereo.plane_sweep", "stereo.semi_global", "stereo.depth"),
 )
 STAGES = {"initialization", "localization", "em", "refinement"}
 HOST_PACKAGES = {"numpy", "cv2", "open3d", "trimesh", "matplotlib", "scipy", "torch", "tqdm", "hydra", "omegaconf"}

@@ -21,6 +21,7 @@ class Featured:
 
     def __init__(self, prior: Prior, model: FeatureModel) -> None:
         self._prior, self._model = prior, model
+        self.is_sequential = getattr(prior, "is_sequential", False)
         self._known: list[tuple[np.ndarray, np.ndarray]] = []  # (image, features) of the window before
         features = {**model.settings, "model": model.identity}  # before the text: names all missing files
         self.feature_names, self.text_features = model.text.names, model.text.vectors
@@ -72,6 +73,7 @@ class Requeried:
             )
         text = load_text(path, features["model"])
         self._prior, self.predict = prior, prior.predict
+        self.is_sequential = getattr(prior, "is_sequential", False)
         self.feature_names, self.text_features = text.names, text.vectors
         settings = prior.provenance.settings | {"features": features | {"templates": [*text.templates]}}
         self.provenance = replace(prior.provenance, settings=settings)

@@ -12,14 +12,7 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.camera import Camera
-from emgs_jax.prior.landmarks import (
-    NONE,
-    MatchingConfig,
-    Structure,
-    place,
-    relative_pose,
-    triangulate,
-)
+from emgs_jax.prior.landmarks import NONE, MatchingConfig, Structure, place, relative_pose, triangulate
 from emgs_jax.stereo.bundle_adjustment import BundleConfig, Tracks, adjust
 
 jitted_adjust = eqx.filter_jit(adjust)
@@ -33,7 +26,7 @@ class StructureConfig:
         matching: detection, matching and acceptance.
         bundle: the refinement.
         max_landmarks: that take part in the refinement; those that most views see.
-        num_fixed: the oldest views of a window, which hold the frame and scale of the ones before.
+        num_fixed: at most, the oldest views of a window, which hold the frame and scale of the ones before.
         num_rounds: of refinement; observations that do not fit are dropped after each.
         median_depth: m; what the median landmark of the first view is taken for: images alone do not tell the scale.
     """
@@ -54,7 +47,8 @@ def initialize(structure: Structure, camera: Camera, num_views: int, config: Str
         structure.views[a].T_ref_view, structure.views[b].T_ref_view = np.eye(4), T_a_b
         triangulate(structure, config.matching)
         _grow(structure, camera, num_views, a, config)
-        if structure.views[min(structure.views)].T_ref_view is not None:
+        first = structure.views[min(structure.views)]
+        if first.T_ref_view is not None and structure.known(first).sum() >= config.matching.min_matches:
             _normalize(structure, config)
             return True
     _reset(structure)
@@ -67,8 +61,10 @@ def extend(structure: Structure, camera: Camera, num_views: int, config: Structu
         if view.T_ref_view is None and place(structure, view, config.matching):
             triangulate(structure, config.matching)
     frames = sorted(structure.placed())
-    if len(frames) > config.num_fixed:
-        refine(structure, camera, num_views, frames[: config.num_fixed], config)
+    # A short window refines its two newest views too; it takes two others to hold the scale.
+    num_fixed = min(config.num_fixed, len(frames) - 2)
+    if num_fixed >= 2:
+        refine(structure, camera, num_views, frames[:num_fixed], config)
 
 
 def refine(structure: Structure, camera: Camera, num_views: int, fixed: list[int], config: StructureConfig) -> None:

@@ -31,6 +31,10 @@ class MatchingConfig:
     min_matches: int
     min_parallax_rad: float
 
+    def __post_init__(self) -> None:
+        if self.min_matches < 6:
+            raise ValueError(f"min_matches must be at least 6, which a pose needs; got {self.min_matches}")
+
 
 @dataclass
 class View:
@@ -110,20 +114,35 @@ def _essential(a: np.ndarray, b: np.ndarray, K: np.ndarray, config: MatchingConf
 
 def link(structure: Structure, frame: int, config: MatchingConfig) -> None:
     """Match a view with all others, nearest in time first, and extend or begin tracks."""
-    view = structure.views[frame]
+    view, count = structure.views[frame], len(structure.points)
+    seen = set(view.landmark.tolist()) - {NONE}
     for other_frame in sorted(structure.views, key=lambda index: abs(index - frame)):
         if other_frame == frame:
             continue
         other = structure.views[other_frame]
         for there, here in zip(*match(other, view, structure.K, config), strict=True):
             known = other.landmark[there]
-            if view.landmark[here] != NONE or known in view.landmark and known != NONE:
+            if view.landmark[here] != NONE or known in seen:
                 continue
             if known == NONE:
-                known = len(structure.points)
-                structure.points = np.concatenate([structure.points, np.full((1, 3), np.nan)])
-                other.landmark[there] = known
+                known = other.landmark[there] = count
+                count += 1
             view.landmark[here] = known
+            seen.add(known)
+    structure.points = np.concatenate([structure.points, np.full((count - len(structure.points), 3), np.nan)])
+
+
+def forget(structure: Structure, frames: Sequence[int]) -> None:
+    """Drop the views of these frames, and the landmarks that no other view shows; the others are renumbered."""
+    for frame in frames:
+        del structure.views[frame]
+    used = np.zeros(len(structure.points), bool)
+    for view in structure.views.values():
+        used[view.landmark[view.landmark >= 0]] = True
+    number = np.append(np.where(used, np.cumsum(used) - 1, NONE), NONE)  # of NONE, the last: NONE
+    for view in structure.views.values():
+        view.landmark = number[view.landmark]
+    structure.points = structure.points[used]
 
 
 def relative_pose(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, float] | None:

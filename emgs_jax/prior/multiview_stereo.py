@@ -7,10 +7,11 @@ must be asked for in order. The frame is that of image 0 and the scale that of t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import cv2
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -19,7 +20,7 @@ from emgs_jax.camera import Camera
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.prior.base import PriorPrediction, Provenance, Window
 from emgs_jax.prior.incremental import StructureConfig, extend, initialize
-from emgs_jax.prior.landmarks import Structure, View, calibration, detect, link
+from emgs_jax.prior.landmarks import Structure, View, calibration, detect, forget, link
 from emgs_jax.stereo.depth import DepthConfig, count_agreeing, estimate_depth
 
 jitted_depth = eqx.filter_jit(estimate_depth)
@@ -47,26 +48,34 @@ class DenseConfig:
     depth_margin: float
 
 
+def _values(config: StructureConfig | DenseConfig) -> dict:
+    """What a config was given, as JSON holds it: a device's .1 is .1 again."""
+    return jax.tree.map(lambda v: float(str(np.float32(v))) if isinstance(v, jax.Array) else v, asdict(config))
+
+
 class MultiviewStereo:
     """Structure from motion and plane-sweep stereo of a sliding window (implements `Prior`).
 
     Args:
         structure: poses and landmarks.
         dense: depth.
-        settings: of both, for the provenance.
     """
 
     feature_names: tuple[str, ...] = ()
     text_features = np.zeros((0, 0), np.float32)
     is_sequential = True  # a window needs those before it
 
-    def __init__(self, structure: StructureConfig, dense: DenseConfig, settings: dict | None = None) -> None:
+    def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:
         self._structure_config, self._dense_config = structure, dense
-        self.provenance = Provenance("multiview_stereo", {"version": 1} | (settings or {}))
+        settings = {"structure": _values(structure), "dense": _values(dense)}
+        self.provenance = Provenance("multiview_stereo", {"version": 1} | settings)
         self._next = 0
 
     def check(self, dataset: Dataset, window_size: int) -> None:
-        """Any images will do; they must be calibrated, which every data set is."""
+        """Raise ValueError where a window has too few images to confirm a depth."""
+        least = 1 + max(self._dense_config.min_agreeing, 1)
+        if window_size < least:
+            raise ValueError(f"multiview_stereo compares at least {least} images, got slam.window_size={window_size}")
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Poses of all views and depth of `window.dense`; a view that cannot be placed has NaN and no valid point."""
@@ -86,7 +95,7 @@ class MultiviewStereo:
             initialize(self._structure, self._camera, self._num_views, self._structure_config)
         else:
             extend(self._structure, self._camera, self._num_views, self._structure_config)
-        return self._answer(window, frames)
+        return self._answer(window)
 
     def _begin(self, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
         height, width = frames[0].image.shape[:2]
@@ -99,7 +108,8 @@ class MultiviewStereo:
         self._num_views = len(frames) + 3
 
     def _forget(self, window: Window) -> None:
-        for known in (self._structure.views, self._grays, self._depths):
+        forget(self._structure, [frame for frame in self._structure.views if frame not in window.views])
+        for known in (self._grays, self._depths):
             for frame in [frame for frame in known if frame not in window.views]:
                 del known[frame]
 
@@ -114,31 +124,37 @@ class MultiviewStereo:
         self._structure.views[frame.index] = detect(gray, self._structure_config.matching)
         link(self._structure, frame.index, self._structure_config.matching)
 
-    def _answer(self, window: Window, frames: Sequence[Frame]) -> PriorPrediction:
-        views = self._structure.views
-        unknown = np.full((4, 4), np.nan)
-        poses = [views[frame].T_ref_view if views[frame].T_ref_view is not None else unknown for frame in window.views]
+    def _answer(self, window: Window) -> PriorPrediction:
+        views = [self._structure.views[frame] for frame in window.views]
         for frame in window.dense:
-            if frame not in self._depths:
+            if frame not in self._depths or not self._depths[frame].any():  # it may have been placed since
                 self._depths[frame] = self._depth(frame)
         confidence = np.stack([self._confidence(frame) for frame in window.dense])
-        mask = confidence >= 1.0 + self._dense_config.min_agreeing
-        depth = np.where(mask, np.stack([self._depths[frame] for frame in window.dense]), 0.0)
+        depth = np.stack([self._depths[frame] for frame in window.dense])
+        mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_agreeing)
+        depth = np.where(mask, depth, 0.0)
         rays = np.dstack([*np.meshgrid(np.arange(depth.shape[2]), np.arange(depth.shape[1])), np.ones(depth.shape[1:])])
         points = (rays @ np.linalg.inv(self._structure.K).T)[None] * depth[..., None]
         features = np.zeros((*depth.shape, 0), np.float16)
-        T = np.linalg.inv(poses[0]) @ np.stack(poses)
-        return PriorPrediction(window, T, points.astype(np.float32), confidence, mask, features)
+        T_anchor_view = np.full((len(views), 4, 4), np.nan)
+        T_anchor_view[0] = np.eye(4)  # also where nothing else is known
+        for row, view in enumerate(views[1:], start=1):
+            if views[0].T_ref_view is not None and view.T_ref_view is not None:
+                T_anchor_view[row] = np.linalg.inv(views[0].T_ref_view) @ view.T_ref_view
+        return PriorPrediction(window, T_anchor_view, points.astype(np.float32), confidence, mask, features)
 
     def _depth(self, frame: int) -> np.ndarray:
         """Depth (h, w) of a view, 0 where it is not known."""
         view, nothing = self._structure.views[frame], np.zeros_like(self._grays[frame])
         sources = self._sources(frame)
-        known = self._structure.known(view)
-        if not sources or not known.any():
+        if not sources:
             return nothing
+        known = self._structure.known(view)
         T_view_ref = np.linalg.inv(view.T_ref_view)
         z = self._structure.points[view.landmark[known]] @ T_view_ref[2, :3] + T_view_ref[2, 3]
+        z = z[z > 0]
+        if not len(z):
+            return nothing
         margin = self._dense_config.depth_margin
         depth_range = np.float32([np.percentile(z, 1) / margin, np.percentile(z, 99) * margin])
         count = self._dense_config.num_sources

@@ -50,25 +50,28 @@ def record(
 ) -> None:
     """Write what `prior` predicts for every window of `dataset`; inferences that are there already are kept.
 
-    Args:
-        progress: wraps the list of windows, e.g. tqdm.
+    A prior with `is_sequential = True` is asked for them again, because later ones depend on them. `progress` wraps
+    the list of windows, e.g. tqdm.
     """
     folder = Path(folder)
     calls = list(windows(len(dataset), window_size))
     header = _header(prior, dataset, window_size, len(calls))
     files = _resume(folder, header)
     folder.mkdir(parents=True, exist_ok=True)
-    text_features = _npz({"text_features": prior.text_features})
-    files["text_features.npz"] = _write(folder / "text_features.npz", text_features)
+    files["text_features.npz"] = _write(folder / "text_features.npz", _npz({"text_features": prior.text_features}))
+    names = [f"{window.inference:06d}.npz" for window in calls]
+    missing = {row for row, name in enumerate(names) if _digest_of(folder / name) != files.get(name, "")}
+    asked = range(max(missing, default=-1) + 1) if getattr(prior, "is_sequential", False) else missing
     frames: dict[int, Frame] = {}
     for window in progress(calls):
-        name = f"{window.inference:06d}.npz"
-        if name in files and _digest_of(folder / name) == files[name]:
+        if window.inference not in asked:
             continue
         frames = {index: frames[index] if index in frames else dataset[index] for index in window.views}
         prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
-        files[name] = _write(folder / name, _npz(_arrays(prediction)))
-        _write_manifest(folder, header, files)
+        if window.inference in missing:
+            name = names[window.inference]
+            files[name] = _write(folder / name, _npz(_arrays(prediction)))
+            _write_manifest(folder, header, files)
     _write_manifest(folder, header | {"complete": True}, files)
 
 
@@ -112,9 +115,7 @@ class Recorded:
         arrays = self._load(name, ("inference", "views", "dense", "current", *FIELDS))
         recorded = [arrays[key].tolist() for key in ("inference", "views", "dense", "current")]
         if recorded != [window.inference, list(window.views), list(window.dense), window.current]:
-            raise ValueError(
-                f"{self.folder / name} answers another window (views {recorded[1]}) than {window}: {REMEDY}"
-            )
+            raise ValueError(f"{self.folder / name} answers another window ({recorded[1]}) than {window}: {REMEDY}")
         _check_arrays(
             self.folder / name, arrays, {"v": len(window.views), "d": len(window.dense), "h": shape[0], "w": shape[1]}
         )

@@ -85,6 +85,13 @@ def test_provenance_tells_the_geometry_and_the_features():
     }
 
 
+def test_features_leave_a_sequential_prior_sequential():
+    prior = Simulated()
+    assert not Featured(prior, make_model()).is_sequential
+    prior.is_sequential = True
+    assert Featured(prior, make_model()).is_sequential
+
+
 def test_replay_of_features_text_and_provenance_is_the_live_prior_bit_for_bit(tmp_path, textured):
     prior = Featured(Simulated(seed=1), make_model())
     record(prior, textured, WINDOW_SIZE, tmp_path)

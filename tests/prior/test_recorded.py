@@ -104,6 +104,20 @@ def test_recording_again_repairs_a_damaged_file_only(folder, room):
     assert (folder / "000001.npz").read_bytes() == whole
 
 
+def test_a_sequential_prior_is_asked_again_up_to_what_is_missing_and_only_that_is_written(folder, room):
+    times = {path.name: path.stat().st_mtime_ns for path in folder.glob("0*.npz")}
+    whole = (folder / "000001.npz").read_bytes()
+    (folder / "000001.npz").unlink()
+    prior = Interrupted(seed=5, feature_size=4, classes=room.classes)
+    prior.is_sequential = True
+    record(prior, room, WINDOW_SIZE, folder)
+    assert prior.num_calls == 2  # windows 0 and 1
+    assert (folder / "000001.npz").read_bytes() == whole
+    assert [name for name in times if (folder / name).stat().st_mtime_ns != times[name]] == ["000001.npz"]
+    record(prior, room, WINDOW_SIZE, folder)
+    assert prior.num_calls == 2  # nothing is missing
+
+
 def test_a_folder_of_another_prior_is_not_overwritten(folder, room):
     before = {path: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(ValueError, match="choose another folder"):

@@ -1,0 +1,119 @@
+"""Scenes with known geometry for the classical prior: textured planes as images, random points as keypoints."""
+
+from functools import cache
+
+import hydra
+import numpy as np
+from scene import compose
+
+from emgs_jax.camera import Camera
+from emgs_jax.prior.incremental import StructureConfig
+from emgs_jax.prior.landmarks import NONE, Structure, View
+from emgs_jax.stereo.depth import DepthConfig
+
+FOCAL, CENTER, SIZE = (55.0, 53.0), (30.5, 24.25), (64, 48)
+SMALL = ("prior.dense.depth.sweep.num_planes=24",)
+
+
+@cache
+def depth_config(*overrides: str) -> DepthConfig:
+    """`prior.dense.depth` of conf/ with few planes."""
+    return hydra.utils.instantiate(compose("prior=multiview_stereo", *SMALL, *overrides).prior.dense.depth)
+
+
+@cache
+def structure_config(*overrides: str) -> StructureConfig:
+    """`prior.structure` of conf/ for a few landmarks."""
+    small = ("prior.structure.max_landmarks=128",)
+    return hydra.utils.instantiate(compose("prior=multiview_stereo", *small, *overrides).prior.structure)
+
+
+@cache
+def small_camera() -> Camera:
+    return Camera(FOCAL, CENTER, *SIZE)
+
+
+def matrix(rotation=(0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """(4, 4) from a rotation vector (rad) and a translation (m)."""
+    import cv2
+
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(np.array(rotation, float))[0], translation
+    return T
+
+
+def calibration() -> np.ndarray:
+    return np.array([[FOCAL[0], 0, CENTER[0]], [0, FOCAL[1], CENTER[1]], [0, 0, 1]])
+
+
+def plane_image(T_world_camera: np.ndarray, slope: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Grey image and depth of the plane z = 2 m + slope x, painted with waves of 8 to 25 cm, ray by ray."""
+    x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(calibration()).T @ T_world_camera[:3, :3].T
+    normal = np.array([-slope, 0.0, 1.0])
+    depth = (2.0 - normal @ T_world_camera[:3, 3]) / (rays @ normal)
+    points = T_world_camera[:3, 3] + depth[..., None] * rays
+    rng = np.random.default_rng(seed)
+    gray = np.full(depth.shape, 0.5)
+    for _ in range(24):
+        wave, angle, phase = rng.uniform(0.08, 0.25), rng.uniform(0, np.pi), rng.uniform(0, 2 * np.pi)
+        along = points[..., 0] * np.cos(angle) + points[..., 1] * np.sin(angle)
+        gray += 0.05 * np.cos(2 * np.pi * along / wave + phase)
+    return np.float32(np.clip(gray, 0, 1)), np.float32(depth)
+
+
+def cloud(count: int, seed: int = 0) -> np.ndarray:
+    """Points (count, 3) 1.5 to 3 m before the first camera of `arc`, inside the image."""
+    rng = np.random.default_rng(seed)
+    pixels = rng.uniform((4, 4), (SIZE[0] - 5, SIZE[1] - 5), (count, 2))
+    rays = np.column_stack([pixels, np.ones(count)]) @ np.linalg.inv(calibration()).T
+    return rays * rng.uniform(1.5, 3.0, (count, 1))
+
+
+def arc(count: int, step: float = 0.08) -> np.ndarray:
+    """T_world_camera (count, 4, 4): `step` metres a frame sideways, turning to keep the cloud in view."""
+    poses = [
+        matrix((0.01 * np.sin(i), -0.4 * step * i, 0.01 * i), (step * i, 0.02 * np.sin(i), 0.03 * i))
+        for i in range(count)
+    ]
+    return np.stack(poses)
+
+
+def projected(T_world_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Pixels (n, 2)."""
+    local = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    return (local @ calibration().T)[:, :2] / local[:, 2:]
+
+
+def views_of(points: np.ndarray, poses: np.ndarray, noise: float = 0.0, seed: int = 0) -> list[View]:
+    """Keypoints as `detect` would give them, in another order in every view; not linked and not placed.
+
+    Keypoint i of a view is point `order[i]`, which its descriptor encodes: `whose` reads it back.
+    """
+    rng = np.random.default_rng(seed)
+    descriptors = np.abs(np.random.default_rng(99).normal(size=(len(points), 128)))
+    descriptors = np.float32(descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
+    views = []
+    for T in poses:
+        order = rng.permutation(len(points))
+        pixels = projected(T, points[order]) + noise * rng.normal(size=(len(points), 2))
+        views.append(View(pixels, descriptors[order], np.full(len(points), NONE)))
+    return views
+
+
+def whose(view: View, reference: View) -> np.ndarray:
+    """For each keypoint the row of `reference` that shows the same point."""
+    return (view.descriptors @ reference.descriptors.T).argmax(axis=1)
+
+
+def structure_of(views: list[View]) -> Structure:
+    return Structure(calibration(), dict(enumerate(views)))
+
+
+def similarity_error(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """Root mean square distance (n, 3) after the best Sim(3) (Umeyama 1991)."""
+    a, b = estimate - estimate.mean(0), truth - truth.mean(0)
+    U, S, Vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1, 1, np.linalg.det(U @ Vt)])
+    scale = (S * sign).sum() / (a**2).sum()
+    return float(np.sqrt(((scale * a @ (U * sign @ Vt).T - b) ** 2).sum(1).mean()))
