@@ -167,6 +167,9 @@ def localize_coarse(
     via_previous = _via_previous(prediction, previous, scale, (T_world_previous, T_previous_current), camera, config)
     anchor = prediction.T_world_anchor
     anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, scale)
+    # After a frame that could not be placed the chain is broken, and the prior's own pose stands in for it.
+    is_linked = (jnp.sum(paired) >= MIN_PAIRS) & jnp.all(jnp.isfinite(same_image.wxyz_xyz))
+    same_image = jaxlie.SE3(jnp.where(is_linked, same_image.wxyz_xyz, anchored.wxyz_xyz))
     reach = 1.0 + jnp.linalg.norm(anchored.translation() - anchor.translation()) / config.anchor_range
     fused = interpolate(same_image, anchored, 1.0 / (1.0 + config.anchor_noise * reach**2))
     forms = stack([via_previous, same_image, anchored, fused])
@@ -180,7 +183,8 @@ def localize_coarse(
     is_finite = jnp.all(jnp.isfinite(coarse.wxyz_xyz))
     coarse = jaxlie.SE3(jnp.where(is_finite, coarse.wxyz_xyz, T_world_previous.wxyz_xyz))
     newest = coarse @ T_current_newest
-    newest = jaxlie.SE3(jnp.where(prediction.has_newest & is_finite, newest.wxyz_xyz, coarse.wxyz_xyz))
+    has_newest = prediction.has_newest & is_finite & jnp.all(jnp.isfinite(newest.wxyz_xyz))
+    newest = jaxlie.SE3(jnp.where(has_newest, newest.wxyz_xyz, coarse.wxyz_xyz))
     is_usable = is_finite & (jnp.sum(prediction.current.valid) >= MIN_PAIRS)
     return CoarsePose(coarse, newest, scale, repeat_rms, median(now.points[:, 2], now.valid), is_usable)
 

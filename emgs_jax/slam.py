@@ -157,8 +157,16 @@ def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[
     These are the whole window and none, or (incremental initialisation) the first view alone and each further view as
     if it were a step's current frame. Consecutive views come from one inference, so the previous image's two
     predictions agree exactly and the coarse pose of a step is the prior's own.
+
+    Raises:
+        ValueError: `merged`, and a view has no pose.
     """
     if config.initialization == "merged":
+        if not bool(jnp.all(jnp.isfinite(window.T_world_views.wxyz_xyz))):
+            raise ValueError(
+                "a view of the first window has no pose, so its points cannot be merged: use "
+                "slam.initialization=incremental, which leaves such a view out, or begin elsewhere (dataset.start=...)"
+            )
         return window, []
     num_views = window.views.valid.shape[0]
     view = lambda i: jax.tree.map(lambda leaf: leaf[i], window.views)  # noqa: E731

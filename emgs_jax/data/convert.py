@@ -74,17 +74,18 @@ def to_first_window(
         config: normals and thinning.
 
     Raises:
-        ValueError: a shape differs from the images', or no view has a valid point or pose.
+        ValueError: a shape differs from the images', no view has a valid point, or the first view no pose. Another
+            view's pose may be NaN: integrated on its own, that view is lost.
     """
     _check(prediction, frames)
     dense = prediction.window.dense
     views = [_observation(prediction, row, frames[index], config) for row, index in enumerate(dense)]
     rows = [prediction.window.views.index(index) for index in dense]
     poses = np.asarray(T_world_anchor) @ prediction.T_anchor_view[rows]
-    if not np.isfinite(poses).all() or not any(bool(view.valid.any()) for view in views):
+    if not np.isfinite(poses[0]).all() or not any(bool(view.valid.any()) for view in views):
         raise ValueError(
-            "the first window has no valid point or a pose that is not finite, so there is nothing to start a map "
-            "from: begin the sequence elsewhere (dataset.start=...)"
+            "the first window has no valid point or its first view no pose, so there is nothing to start a map from: "
+            "begin the sequence elsewhere (dataset.start=...) or take frames farther apart (dataset.stride=...)"
         )
     return FirstWindow(stack(views), to_se3(poses))
 
