@@ -55,6 +55,7 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
     grid = variants(config, axes)
     for note in notes(config, axes):
         print(note)
+    folder.mkdir(parents=True, exist_ok=True)
     with Clock().watching() as clock:
         dataset = build_dataset(config)
         prior = build_prior(config, dataset)
