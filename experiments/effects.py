@@ -91,12 +91,16 @@ def _differences(sweep: Mapping[str, Any], path: Path) -> Iterator[tuple[str | N
         raise ValueError(f"{path} lacks its own config's values {own}: add them to the axes, or grid=one_at_a_time")
     for row in settings:
         changed = [key for key, value in row["setting"].items() if value != own[key]]
-        shown = [name for name, *_ in SHOWN if None not in (row["metrics"].get(name), base.get(name))]
+        names = [name for name in base if _is_number(base[name]) and _is_number(row["metrics"].get(name))]
         if not changed:
-            yield None, None, None, {name: base[name] for name in shown}
+            yield None, None, None, {name: base[name] for name in names}
         elif len(changed) == 1:
-            difference = {name: row["metrics"][name] - base[name] for name in shown}
+            difference = {name: row["metrics"][name] - base[name] for name in names}
             yield changed[0], row["setting"][changed[0]], own[changed[0]], difference
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float)
 
 
 def _plain(value: Any) -> Any:
@@ -126,14 +130,25 @@ def cell(numbers: Sequence[float], factor: float, digits: int, is_difference: bo
     return f"**{text}**" if is_difference and agree else text
 
 
-def table(effects: Sequence[Effect]) -> str:
+def columns(alignment: str) -> list[tuple]:
+    """`SHOWN` as the sweep's protocol aligns, or with the metrics after an SE(3) alignment in their place."""
+    if alignment not in ("protocol", "se3"):
+        raise ValueError(f"align must be protocol or se3, got {alignment!r}")
+    if alignment == "protocol":
+        return list(SHOWN)
+    names = {"trajectory/ate_sim3_m": "trajectory/ate_se3_m"}
+    return [(names.get(key, key.replace("reconstruction/", "reconstruction_se3/")), *others) for key, *others in SHOWN]
+
+
+def table(effects: Sequence[Effect], alignment: str = "protocol") -> str:
     """Markdown: for each sequence the metrics of its config, then what each changed value adds to them."""
-    lines = [["data", "change", "runs", *(title for _, title, *_ in SHOWN)]]
+    shown = columns(alignment)
+    lines = [["data", "change", "runs", *(title for _, title, *_ in shown)]]
     lines.append(["---"] * len(lines[0]))
     for effect in effects:
         change = "unchanged" if effect.key is None else f"{effect.key}={effect.value} (from {effect.own})"
         runs = max(map(len, effect.metrics.values()), default=0)
-        numbers = [(effect.metrics.get(name, []), factor, digits) for name, _, factor, digits, _ in SHOWN]
+        numbers = [(effect.metrics.get(name, []), factor, digits) for name, _, factor, digits, _ in shown]
         lines.append([effect.data, change, str(runs), *(cell(*entry, effect.key is not None) for entry in numbers)])
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
@@ -142,7 +157,7 @@ def table(effects: Sequence[Effect]) -> str:
 def main(config: DictConfig) -> None:
     """Print the table."""
     with clear_errors():
-        print(table(read_effects(config.folder, config.repetitions)))
+        print(table(read_effects(config.folder, config.repetitions), config.align))
 
 
 if __name__ == "__main__":

@@ -47,6 +47,16 @@ def test_sweeps_with_another_config_are_not_averaged_with_these(tmp_path):
     assert effects[0].data != effects[2].data
 
 
+def test_the_se3_table_shows_the_metrics_of_that_alignment(tmp_path):
+    write_sweep(tmp_path, 0, {(8.0, "inf"): 0.10})
+    (effect,) = read_effects(tmp_path, REPETITIONS)
+    effect.metrics.update({"trajectory/ate_se3_m": [0.30], "reconstruction_se3/f1_5cm_percent": [40.0]})
+    assert table([effect]).splitlines()[2].split(" | ")[3:] == ["10.00", "–", "–", "–", "50.0", "– |"]
+    assert table([effect], "se3").splitlines()[2].split(" | ")[3:] == ["30.00", "–", "–", "–", "40.0", "– |"]
+    with pytest.raises(ValueError, match="align must be protocol or se3, got 'none'"):
+        table([effect], "none")
+
+
 @pytest.mark.parametrize(
     ("numbers", "text"),
     [
