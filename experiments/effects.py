@@ -104,9 +104,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    return (
-        "inf" if value is None else value
-    )  # as JSON has no infinity, results say it in words and configs leave it out
+    return "inf" if value is None else value  # JSON has no infinity: a setting says it in words, a config has null
 
 
 def _grouped(data: str, found: Iterable[tuple[str | None, Any, Any, dict[str, float]]]) -> Iterator[Effect]:
