@@ -18,6 +18,7 @@ from emgs_jax.sweep import programs
 
 Value = float | int | str | bool
 Axes = Mapping[str, Sequence[Value]]
+GRIDS = ("product", "one_at_a_time")
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ def read_axes(config: DictConfig) -> dict[str, list[Value]]:
     axes = OmegaConf.to_container(config)["axes"]
     if not axes:
         raise ValueError("the sweep has no axis: choose one with sweep=gates or 'axes={em.normal_weight:[0,5]}'")
+    if config.grid not in GRIDS:
+        raise ValueError(f"grid must be one of {', '.join(GRIDS)}, got {config.grid!r}")
     for key, values in axes.items():
         if key not in known:
             raise ValueError(f"axis {key} is no key of a stage; {_advice(key, known)}")
@@ -81,8 +84,17 @@ def _advice(key: str, known: list[str]) -> str:
 
 
 def variants(config: DictConfig, axes: Axes) -> list[Variant]:
-    """Every combination of the axes' values, the last axis fastest; raises ValueError where a value is refused."""
-    return [_variant(config, dict(zip(axes, values, strict=True))) for values in itertools.product(*axes.values())]
+    """The settings of `config.grid`, the last axis fastest; raises ValueError where a value is refused.
+
+    These are every combination of the axes' values, or the config's own values and then each other value by itself.
+    """
+    if config.grid == "product":
+        settings = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+    else:
+        own = {key: OmegaConf.select(config, key) for key in axes}
+        others = [(key, value) for key, values in axes.items() for value in values if value != own[key]]
+        settings = [own, *(own | {key: value} for key, value in others)]
+    return [_variant(config, setting) for setting in settings]
 
 
 def _variant(config: DictConfig, setting: dict[str, Value]) -> Variant:

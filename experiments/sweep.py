@@ -34,7 +34,7 @@ from emgs_jax.sweep_run import Scorer, map_settings, score_settings
 from experiments.building import build_dataset, build_prior, clear_errors, use_compilation_cache
 from experiments.grid import Variant, notes, read_axes, variants
 
-NOT_OF_RESULTS = ("axes", "chunk", "at_once", "compilation_cache")  # keys that change no number
+NOT_OF_RESULTS = ("axes", "grid", "chunk", "at_once", "compilation_cache")  # keys that change no number
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
     grid = variants(config, axes)
     for note in notes(config, axes):
         print(note)
+    folder.mkdir(parents=True, exist_ok=True)
     with Clock().watching() as clock:
         dataset = build_dataset(config)
         prior = build_prior(config, dataset)
@@ -69,11 +70,11 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
                 results.add([variant.setting for variant in chunk], _map_and_score(work, chunk, bar))
     rows = results.rows([variant.setting for variant in grid])
     write_csv(folder / "sweep.csv", rows)
-    no_picture = draw(
-        folder / "heat_map.png", rows, axes, f"{dataset.name} {dataset.sequence}, {prior.provenance.name}"
-    )
-    if no_picture:
-        print(f"no heat_map.png: {no_picture}")
+    if config.grid == "product":  # else most cells of a picture would be empty
+        title = f"{dataset.name} {dataset.sequence}, {prior.provenance.name}"
+        no_picture = draw(folder / "heat_map.png", rows, axes, title)
+        if no_picture:
+            print(f"no heat_map.png: {no_picture}")
     print(table(rows, list(axes)))
     print(f"{len(left)} settings in {clock.total_seconds:.1f} s, {clock.compile_seconds:.1f} s of it compilation")
     return rows

@@ -101,6 +101,18 @@ def test_the_grid_is_every_combination_and_shared_nodes_change_wherever_they_are
     assert [v.setting for v in grid][1] == {"em.normal_weight": 0, "render.opacity": 0.7}
 
 
+def test_one_at_a_time_keeps_the_other_keys_as_the_config_has_them():
+    axes = "axes={em.normal_weight:[0,5.0,9],em.average.gain:[ema_printed,count]}"
+    config = compose(axes, "grid=one_at_a_time", name="sweep")
+    settings = [tuple(v.setting.values()) for v in variants(config, read_axes(config))]
+    assert settings == [(5.0, "count"), (0, "count"), (9, "count"), (5.0, "ema_printed")]
+
+
+def test_a_grid_that_is_none_is_refused():
+    with pytest.raises(ValueError, match="grid must be one of product, one_at_a_time, got 'random'"):
+        read_axes(compose(AXES, "grid=random", name="sweep"))
+
+
 def test_an_infinite_value_is_text_in_the_results():
     config = compose("axes={em.max_log_gap:[8.0,inf]}", name="sweep")
     grid = variants(config, read_axes(config))
@@ -138,4 +150,5 @@ def test_every_sweep_of_conf_has_axes_whose_values_build_configs(name):
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         config = hydra.compose("sweep", overrides=[f"sweep={name}"])
     axes = read_axes(config)
-    assert len(variants(config, axes)) == np.prod([len(values) for values in axes.values()]) >= 4
+    sizes = [len(values) for values in axes.values()]
+    assert len(variants(config, axes)) == (np.prod(sizes) if config.grid == "product" else sum(sizes) - len(axes) + 1)

@@ -1,0 +1,162 @@
+"""What each value of a sweep changes: `python -m experiments.effects folder=multirun/sweep`.
+
+Every setting that differs in one key from the sweep's own config is compared with that config, on the same predictions.
+The differences are averaged over the repetitions (seeds) that are found below the folder.
+"""
+
+import copy
+import json
+import statistics
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig
+
+from emgs_jax.sweep_results import FORMAT, SHOWN, VERSION
+from experiments.building import clear_errors
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One changed value, or (key None) the unchanged config with the metrics themselves.
+
+    Args:
+        data: data set, sequence and prior.
+        key: that differs from the config; None for the config itself.
+        value: of it.
+        own: the config's value.
+        metrics: metric -> difference from the config, one for each repetition that has both.
+    """
+
+    data: str
+    key: str | None
+    value: Any
+    own: Any
+    metrics: dict[str, list[float]]
+
+
+def read_effects(folder: str | Path, repetitions: Sequence[str]) -> list[Effect]:
+    """Effects of all sweeps below a folder; raises ValueError where there is none, or a sweep lacks its own config."""
+    paths = sorted(Path(folder).rglob("sweep.json"))
+    if not paths:
+        raise ValueError(f"there is no sweep.json below {folder}: make some with experiments.sweep -m prior.seed=0,1,2")
+    groups: dict[tuple[str, str], list[tuple]] = defaultdict(list)
+    for path in paths:
+        sweep = _read(path)
+        groups[_described(sweep), _identity(sweep, repetitions)] += _differences(sweep, path)
+    titles = [title for title, _ in groups]
+    effects = []
+    for number, ((title, _), found) in enumerate(groups.items()):
+        is_twice = titles.count(title) > 1  # the same data with another config, which no table must mix
+        effects += _grouped(f"{title}, config {number}" if is_twice else title, found)
+    return effects
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        sweep = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}): make it again") from error
+    if not isinstance(sweep, dict) or (sweep.get("format"), sweep.get("version")) != (FORMAT, VERSION):
+        raise ValueError(f"{path} is not a sweep of version {VERSION}: make it again or move it elsewhere")
+    return sweep
+
+
+def _described(sweep: Mapping[str, Any]) -> str:
+    data, prior = sweep["provenance"]["data"], sweep["provenance"]["prior"]
+    level = f" {prior['settings']['level']:g}" if "level" in prior["settings"] else ""
+    return f"{data['name']} {data['sequence']}, prior {prior['name']}{level}"
+
+
+def _identity(sweep: Mapping[str, Any], repetitions: Sequence[str]) -> str:
+    """The config without what may differ between repetitions."""
+    config = copy.deepcopy(sweep["provenance"]["config"])
+    for key in repetitions:
+        *nodes, name = key.split(".")
+        reduce(lambda node, name: node.get(name, {}), nodes, config).pop(name, None)
+    return json.dumps(config, sort_keys=True)
+
+
+def _differences(sweep: Mapping[str, Any], path: Path) -> Iterator[tuple[str | None, Any, Any, dict[str, float]]]:
+    """(key, value, own value, differences) of every setting that has one changed value, and of the config itself."""
+    config, settings = sweep["provenance"]["config"], sweep["settings"]
+    own = {key: _plain(reduce(dict.get, key.split("."), config)) for key in settings[0]["setting"]}
+    base = next((row["metrics"] for row in settings if row["setting"] == own), None)
+    if base is None:
+        raise ValueError(f"{path} lacks its own config's values {own}: add them to the axes, or grid=one_at_a_time")
+    for row in settings:
+        changed = [key for key, value in row["setting"].items() if value != own[key]]
+        names = [name for name in base if _is_number(base[name]) and _is_number(row["metrics"].get(name))]
+        if not changed:
+            yield None, None, None, {name: base[name] for name in names}
+        elif len(changed) == 1:
+            difference = {name: row["metrics"][name] - base[name] for name in names}
+            yield changed[0], row["setting"][changed[0]], own[changed[0]], difference
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float)
+
+
+def _plain(value: Any) -> Any:
+    return "inf" if value is None else value  # JSON has no infinity: a setting says it in words, a config has null
+
+
+def _grouped(data: str, found: Iterable[tuple[str | None, Any, Any, dict[str, float]]]) -> Iterator[Effect]:
+    effects: dict[tuple, Effect] = {}
+    for key, value, own, metrics in found:
+        effect = effects.setdefault((key, value), Effect(data, key, value, own, defaultdict(list)))
+        for name, number in metrics.items():
+            effect.metrics[name].append(number)
+    yield from effects.values()
+
+
+def cell(numbers: Sequence[float], factor: float, digits: int, is_difference: bool) -> str:
+    """Mean ± standard deviation; a mean of differences is bold where all of at least three have its sign."""
+    if not numbers:
+        return "–"
+    sign = "+" if is_difference else ""
+    text = f"{factor * statistics.fmean(numbers):{sign}.{digits}f}"
+    if len(numbers) > 1:
+        text += f" ± {factor * statistics.stdev(numbers):.{digits}f}"
+    agree = len(numbers) > 2 and (min(numbers) > 0 or max(numbers) < 0)
+    return f"**{text}**" if is_difference and agree else text
+
+
+def columns(alignment: str) -> list[tuple]:
+    """`SHOWN` as the sweep's protocol aligns, or with the metrics after an SE(3) alignment in their place."""
+    if alignment not in ("protocol", "se3"):
+        raise ValueError(f"align must be protocol or se3, got {alignment!r}")
+    if alignment == "protocol":
+        return list(SHOWN)
+    names = {"trajectory/ate_sim3_m": "trajectory/ate_se3_m"}
+    return [(names.get(key, key.replace("reconstruction/", "reconstruction_se3/")), *others) for key, *others in SHOWN]
+
+
+def table(effects: Sequence[Effect], alignment: str = "protocol") -> str:
+    """Markdown: for each sequence the metrics of its config, then what each changed value adds to them."""
+    shown = columns(alignment)
+    lines = [["data", "change", "runs", *(title for _, title, *_ in shown)]]
+    lines.append(["---"] * len(lines[0]))
+    for effect in effects:
+        change = "unchanged" if effect.key is None else f"{effect.key}={effect.value} (from {effect.own})"
+        runs = max(map(len, effect.metrics.values()), default=0)
+        numbers = [(effect.metrics.get(name, []), factor, digits) for name, _, factor, digits, _ in shown]
+        lines.append([effect.data, change, str(runs), *(cell(*entry, effect.key is not None) for entry in numbers)])
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="effects")
+def main(config: DictConfig) -> None:
+    """Print the table."""
+    with clear_errors():
+        print(table(read_effects(config.folder, config.repetitions), config.align))
+
+
+if __name__ == "__main__":
+    main()

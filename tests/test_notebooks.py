@@ -1,0 +1,119 @@
+"""The notebooks: how they are kept, and that each runs from a new folder and finds what its stages promise."""
+
+import ast
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_run import TINY
+
+NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
+IDS = [path.stem for path in NOTEBOOKS]
+AXES = "grid=one_at_a_time axes={em.support:[printed,normalized],em.noise:[0.0,1.0]}"
+GRID = "axes={em.max_mahalanobis_sq:[1.0,9.0],em.max_log_gap:[8.0,inf]}"
+
+
+def cells(path: Path) -> list[dict]:
+    return json.loads(path.read_text(encoding="utf-8"))["cells"]
+
+
+def code(path: Path) -> list[str]:
+    return ["".join(cell["source"]) for cell in cells(path) if cell["cell_type"] == "code"]
+
+
+def execute(number: int, overrides: str, monkeypatch, folder: Path) -> dict:
+    """Run the code cells one after the other in a new folder; returns their variables."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("NOTEBOOK_OVERRIDES", overrides)
+    monkeypatch.delenv("NOTEBOOK_FOLDER", raising=False)
+    variables = {"__name__": "__main__"}
+    for row, text in enumerate(code(NOTEBOOKS[number - 1])):
+        exec(compile(text, f"{NOTEBOOKS[number - 1].name}, code cell {row}", "exec"), variables)
+        matplotlib.pyplot.close("all")
+    return variables
+
+
+def test_there_are_four_notebooks_in_the_order_of_reading():
+    assert IDS == ["01_one_step", "02_readings", "03_threshold_sweep", "04_own_images"]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=IDS)
+def test_a_notebook_is_kept_without_outputs_and_has_at_most_15_cells(path):
+    assert len(cells(path)) <= 15
+    for cell in cells(path):
+        assert not cell.get("outputs") and cell.get("execution_count") is None
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=IDS)
+def test_the_first_cell_asks_the_question(path):
+    first = cells(path)[0]
+    title = first["source"][0].strip()
+    assert first["cell_type"] == "markdown" and title.startswith("# ") and title.endswith("?")
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=IDS)
+def test_no_function_of_a_notebook_is_longer_than_five_lines(path):
+    for text in code(path):
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                assert node.end_lineno - node.lineno < 5, node.name
+
+
+@pytest.mark.slow
+def test_one_step_taken_apart_is_the_step(monkeypatch, tmp_path):
+    """Oracle: `slam.step` on the same state and prediction."""
+    found = execute(1, " ".join(TINY), monkeypatch, tmp_path)
+    whole, counts = found["info"], found["counts"]
+    np.testing.assert_allclose(whole.T_world_camera.as_matrix(), found["T"].as_matrix(), atol=1e-4)
+    assert int(counts.num_fused) > 100 and abs(int(whole.em.num_fused) - int(counts.num_fused)) <= 5
+    grown = int(whole.num_gaussians) - int(found["state"].map.gaussians.valid.sum())
+    assert abs(grown - int(found["refined"].num_fresh)) <= 5
+
+
+@pytest.mark.slow
+def test_the_readings_are_compared_seed_by_seed_and_loaded_when_run_again(monkeypatch, tmp_path):
+    found = execute(2, " ".join((*TINY, AXES)), monkeypatch, tmp_path)
+    changes = [(effect.key, effect.value) for effect in found["effects"]]
+    assert changes == [(None, None), ("em.support", "printed"), ("em.noise", 0.0)]
+    first, second = (rows[1]["trajectory/ate_sim3_m"] - rows[0]["trajectory/ate_sim3_m"] for rows in found["rows"])
+    assert found["effects"][1].metrics["trajectory/ate_sim3_m"] == [first, second] and first != second
+    monkeypatch.setattr("experiments.sweep._map_and_score", None)  # calling it would fail
+    assert table_of(execute(2, " ".join((*TINY, AXES)), monkeypatch, tmp_path)) == table_of(found)
+
+
+def table_of(variables: dict) -> str:
+    return variables["table"](variables["effects"])
+
+
+@pytest.mark.slow
+def test_the_heat_maps_show_the_metrics_of_each_setting_at_its_place(monkeypatch, tmp_path):
+    found = execute(3, " ".join((*TINY, GRID)), monkeypatch, tmp_path)
+    drawn = found["values"]("trajectory/ate_sim3_m")
+    for row in found["rows"]:
+        place = [1.0, 9.0].index(row["em.max_mahalanobis_sq"]), [8.0, "inf"].index(row["em.max_log_gap"])
+        assert drawn[place] == row["trajectory/ate_sim3_m"]
+    assert len(np.unique(drawn)) == 4
+
+
+@pytest.mark.slow
+def test_own_images_become_a_map_of_the_room_that_they_show(monkeypatch, tmp_path):
+    """Oracle: the true path of the camera, up to the scale that images do not tell."""
+    small = "slam.window_size=4 dataset.size=[160,120] submap.map_capacity=4096 submap.submap_capacity=2048"
+    found = execute(4, small, monkeypatch, tmp_path)
+    truth = np.array([found["room"][row].T_world_camera[:3, 3] for row in range(len(found["room"]))])
+    path = np.loadtxt(found["results"] / "trajectory.txt")[:, 1:4]
+    truth, path = truth - truth[0], path - path[0]
+    aligned = path @ _rotation(path, truth).T
+    scale = (aligned * truth).sum() / (path**2).sum()
+    np.testing.assert_allclose(scale * aligned, truth, atol=0.1 * np.linalg.norm(truth, axis=1).max())
+    assert found["metrics"]["frames/lost"] == 0 and found["valid"].sum() > 100
+
+
+def _rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Least squares (Kabsch)."""
+    u, _, vt = np.linalg.svd(target.T @ source)
+    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
