@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.pytree import static, traced
 
@@ -43,6 +43,17 @@ def project(camera: Camera, points: Float[Array, "*b 3"]) -> tuple[Float[Array, 
     depth = points[..., 2]
     safe_depth = jnp.where(depth > NEAREST_DEPTH, depth, 1.0)
     return camera.focal * points[..., :2] / safe_depth[..., None] + camera.center, depth
+
+
+def nearest_pixel(pixels: Float[Array, "*b 2"], size: tuple[int, int]) -> tuple[Int[Array, "*b"], Bool[Array, "*b"]]:
+    """Row number, in an image of (height, width) row by row, of the nearest pixel, and whether it is in the image.
+
+    The number is 0 where it is not.
+    """
+    height, width = size
+    column, row = jnp.moveaxis(jnp.round(pixels).astype(jnp.int32), -1, 0)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return jnp.where(inside, row * width + column, 0), inside
 
 
 def rays(camera: Camera, pixels: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.camera import Camera, project
+from emgs_jax.camera import Camera, nearest_pixel, project
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.icp import IcpConfig, IcpInfo, icp
 from emgs_jax.observation import Observation, Prediction, transform
@@ -131,11 +131,9 @@ def _via_previous(
     now, current = prediction.previous, prediction.current
     seen = transform(motion[1], current, scale)
     pixels, depth = project(camera, seen.points)
-    columns, rows = jnp.round(pixels[:, 0]).astype(jnp.int32), jnp.round(pixels[:, 1]).astype(jnp.int32)
-    inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height) & (depth > 0)
-    match = jnp.where(inside, rows * camera.width + columns, 0)
+    match, inside = nearest_pixel(pixels, (camera.height, camera.width))
     is_close = jnp.linalg.norm(seen.points - scale * now.points[match], axis=-1) <= config.max_pair_distance
-    via = inside & is_close & (now.valid & previous.valid)[match] & current.valid
+    via = inside & (depth > 0) & is_close & (now.valid & previous.valid)[match] & current.valid
     return fit_rigid_robust(scale * current.points, previous.points[match], via, motion[0] @ motion[1])
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.camera import Camera
+from emgs_jax.camera import Camera, nearest_pixel
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.linalg import inverse_2x2, mahalanobis_sq, outer, safe_normalize
@@ -51,10 +51,8 @@ class RefinementInfo(eqx.Module):
 
 def depth_at(rendering: Rendering, splats: Splats, camera: Camera) -> Float[Array, "g"]:
     """Rendered depth at the pixel of every splat's mean; 0 where the map has none or the mean is outside the image."""
-    pixels = jnp.round(splats.means).astype(jnp.int32)
-    inside = splats.valid & jnp.all((pixels >= 0) & (pixels < jnp.array([camera.width, camera.height])), axis=-1)
-    column, row = jnp.where(inside[:, None], pixels, 0).T
-    return jnp.where(inside, rendering.depth[row, column], 0.0)
+    index, inside = nearest_pixel(splats.means, (camera.height, camera.width))
+    return jnp.where(splats.valid & inside, rendering.depth.reshape(-1)[index], 0.0)
 
 
 def match_on_image(

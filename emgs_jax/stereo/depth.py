@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from emgs_jax.camera import Camera, project, unproject
+from emgs_jax.camera import Camera, nearest_pixel, project, unproject
 from emgs_jax.pytree import static, traced
 from emgs_jax.stereo.plane_sweep import SweepConfig, inverse_depths, sweep
 from emgs_jax.stereo.semi_global import SemiGlobalConfig, aggregate
@@ -107,9 +107,8 @@ def count_agreeing(
     def agrees(T: Array, other: Array) -> Array:
         T = jaxlie.SE3(T)
         pixels, seen_depth = project(camera, points @ T.rotation().as_matrix().T + T.translation())
-        column, row = jnp.round(pixels[..., 0]).astype(jnp.int32), jnp.round(pixels[..., 1]).astype(jnp.int32)
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (depth > 0)
-        there = other.reshape(-1)[jnp.where(inside, row * camera.width + column, 0)]
-        return inside & (there > 0) & (jnp.abs(seen_depth - there) <= config.max_depth_step * there)
+        index, inside = nearest_pixel(pixels, other.shape)
+        there = other.reshape(-1)[index]
+        return inside & (depth > 0) & (there > 0) & (jnp.abs(seen_depth - there) <= config.max_depth_step * there)
 
     return jnp.sum(jax.vmap(agrees)(T_other_reference.wxyz_xyz, others).astype(jnp.float32), axis=0)

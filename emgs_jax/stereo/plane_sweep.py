@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, UInt32
 
-from emgs_jax.camera import Camera, pixel_grid, project, rays
+from emgs_jax.camera import Camera, nearest_pixel, pixel_grid, project, rays
 from emgs_jax.pytree import static, traced
 
 
@@ -106,14 +106,9 @@ def sweep(
             # Homogeneous: the point of a plane at infinity is a direction.
             points = directions @ T.rotation().as_matrix().T + plane * T.translation()
             pixels, depth = project(camera, points)
-            column, row = (
-                jnp.round(2.0 * pixels[..., 0]).astype(jnp.int32),
-                jnp.round(2.0 * pixels[..., 1]).astype(jnp.int32),
-            )
-            inside = (column >= 0) & (column < code.shape[1]) & (row >= 0) & (row < code.shape[0]) & (depth > 0) & used
-            index = jnp.where(inside, row * code.shape[1] + column, 0)
+            index, inside = nearest_pixel(2.0 * pixels, code.shape)
             differing = jax.lax.population_count(code.reshape(-1)[index] ^ reference).astype(jnp.float32)
-            return jnp.where(inside, differing / num_taps, config.unseen_cost)
+            return jnp.where(inside & (depth > 0) & used, differing / num_taps, config.unseen_cost)
 
         costs = jax.vmap(source_cost)(T_source_reference.wxyz_xyz, codes, is_used)
         return jnp.mean(jnp.sort(costs, axis=0)[: config.num_best], axis=0)
