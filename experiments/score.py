@@ -14,13 +14,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.clouds import PointCloud, read_cloud
-from emgs_jax.evaluation.reconstruction import EvaluationConfig, compare_clouds, ground_truth_cloud
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, compare_clouds
 from emgs_jax.evaluation.report import provenance, write_metrics
 from emgs_jax.evaluation.results import METRICS_FILE, estimates_of, is_finished, result_folder
 from emgs_jax.evaluation.tables import average, full_table
 from emgs_jax.evaluation.trajectory import associate, trajectory_metrics
 from emgs_jax.export import load_trajectory_tum
 from emgs_jax.prior.base import Provenance
+from emgs_jax.scoring import true_cloud
 from experiments.building import build_dataset, clear_errors
 
 Metrics = dict[str, Any]
@@ -72,8 +73,7 @@ def compare(
     cloud: PointCloud, poses: tuple[np.ndarray, np.ndarray], dataset: ReadableFrames, evaluation: EvaluationConfig
 ) -> Metrics:
     """Reconstruction metrics against the true cloud of all frames."""
-    frames = (dataset[row] for row in range(len(dataset)))
-    return compare_clouds(cloud, ground_truth_cloud(frames, dataset.intrinsics, evaluation), poses, evaluation)
+    return compare_clouds(cloud, true_cloud(dataset, evaluation), poses, evaluation)
 
 
 def _span(times: np.ndarray) -> str:

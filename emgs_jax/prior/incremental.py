@@ -135,6 +135,13 @@ def _normalize(structure: Structure, config: StructureConfig) -> None:
         view.T_ref_view[:3, 3] *= scale
 
 
+def _columns(structure: Structure, ids: np.ndarray) -> np.ndarray:
+    """Position in `ids` of every landmark, or NONE; NONE itself looks up the last entry, which is NONE."""
+    column = np.full(len(structure.points) + 1, NONE)
+    column[ids] = np.arange(len(ids))
+    return column
+
+
 def _tracks(
     structure: Structure, frames: list[int], num_views: int, config: StructureConfig
 ) -> tuple[np.ndarray, Tracks]:
@@ -143,12 +150,11 @@ def _tracks(
     seen = np.concatenate([view.landmark[structure.known(view)] for view in views])
     ids, count = np.unique(seen, return_counts=True)
     ids = ids[count >= 2][np.argsort(-count[count >= 2], kind="stable")][: config.max_landmarks]
-    column = np.full(len(structure.points) + 1, NONE)
-    column[ids] = np.arange(len(ids))
+    column = _columns(structure, ids)
     pixels = np.zeros((num_views, config.max_landmarks, 2), np.float32)
     is_seen = np.zeros((num_views, config.max_landmarks), bool)
     for row, view in enumerate(views):
-        places = column[view.landmark]  # NONE looks up the last entry, which is NONE
+        places = column[view.landmark]
         pixels[row, places[places >= 0]] = view.pixels[places >= 0]
         is_seen[row, places[places >= 0]] = True
     return ids, Tracks(jnp.asarray(pixels), jnp.asarray(is_seen))
@@ -156,8 +162,7 @@ def _tracks(
 
 def _drop(structure: Structure, frames: list[int], ids: np.ndarray, error: np.ndarray, config: StructureConfig) -> None:
     """Take landmarks from the keypoints that do not fit them, and positions from those that too few views see."""
-    column = np.full(len(structure.points) + 1, NONE)
-    column[ids] = np.arange(len(ids))
+    column = _columns(structure, ids)
     count = np.zeros(len(ids), int)
     for row, frame in enumerate(frames):
         view = structure.views[frame]
