@@ -13,7 +13,7 @@ from scene import CONF, compose, slam_config
 from emgs_jax.slam import SlamConfig
 
 ROOT = CONF.parent
-# Studies and suites hold no class; tests/experiments composes them.
+# Studies and suites hold no class; tests/scripts composes them.
 UNTYPED = {CONF, CONF / "experiment", CONF / "suite", CONF / "baseline", CONF / "sweep"}
 GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent not in UNTYPED)
 
