@@ -7,7 +7,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.linalg import inverse_and_logdet, mahalanobis_sq, outer, principal_axes_2x2, safe_normalize, tangent_basis
+from emgs_jax.linalg import (
+    Entries,
+    dot,
+    gather_entries,
+    outer,
+    principal_axes_2x2,
+    safe_normalize,
+    tangent_basis,
+    whiten,
+    whitening,
+)
 from emgs_jax.neighbours import knn
 from emgs_jax.observation import Observation
 from emgs_jax.pytree import choice, static, traced, where_rows
@@ -70,18 +80,15 @@ class EmInfo(eqx.Module):
 
 
 def widened_distance_sq(
-    offsets: Float[Array, "m k 3"],
-    precisions: Float[Array, "m k 3 3"],
-    noise: Float[Array, "m 3"],
+    triangle: Entries, offsets: Entries, noise: Entries
 ) -> tuple[Float[Array, "m k"], Float[Array, "m k"]]:
     """Squared Mahalanobis distance under Σ_k + ν ν' and log|Σ_k + ν ν'| - log|Σ_k| (Sherman–Morrison).
 
-    ν is a point's noise: a standard deviation along its viewing ray.
+    ν is a point's noise: a standard deviation along its viewing ray. `triangle` is that of `whitening`.
     """
-    pulled = jnp.einsum("mkij,mj->mki", precisions, noise)
-    growth = 1.0 + jnp.einsum("mki,mi->mk", pulled, noise)
-    along = jnp.einsum("mki,mki->mk", offsets, pulled)
-    distance_sq = mahalanobis_sq(offsets, precisions) - along**2 / growth
+    white, noise = whiten(triangle, offsets), whiten(triangle, noise)
+    growth = 1.0 + dot(noise, noise)
+    distance_sq = dot(white, white) - dot(white, noise) ** 2 / growth
     return jnp.maximum(distance_sq, 0.0), jnp.log(growth)
 
 
@@ -97,10 +104,16 @@ def e_step(
         config: gates and weights.
     """
     rows, found = knn(points.points, gaussians.means, gaussians.valid, config.num_neighbours)
-    precisions, logdets = inverse_and_logdet(gaussians.covs)
-    offsets = points.points[:, None] - gaussians.means[rows]
-    distance_sq, log_growth = widened_distance_sq(offsets, precisions[rows], config.noise * noise)
-    normal_cos = jnp.einsum("mkd,md->mk", gaussians.normals[rows], points.normals)
+    triangles, logdets = whitening(gaussians.covs)
+    triangle, means, normals = (
+        gather_entries(table, rows) for table in (triangles, gaussians.means, gaussians.normals)
+    )
+    point, point_normal, nu = (
+        jnp.unstack(vectors[:, None], axis=-1) for vectors in (points.points, points.normals, config.noise * noise)
+    )
+    offsets = tuple(a - b for a, b in zip(point, means, strict=True))
+    distance_sq, log_growth = widened_distance_sq(triangle, offsets, nu)
+    normal_cos = dot(normals, point_normal)
     # Features are unit vectors, so their product is the cosine; with width 0 the term must vanish.
     feature_gap = 0.0
     if gaussians.features.shape[-1]:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.clustering import kmeans, strided_seeds
-from emgs_jax.linalg import inverse_and_logdet, mahalanobis_sq, outer, safe_normalize, tangent_basis
+from emgs_jax.linalg import dot, inverse_2x2, outer, safe_normalize, tangent_basis, whiten, whitening
 from emgs_jax.neighbours import knn
 from emgs_jax.observation import Observation
 from emgs_jax.pytree import static, take_rows, traced, where_rows
@@ -74,10 +74,9 @@ def fit_to_points(
     offsets = jnp.where(found[..., None], near.points - centers[:, None], 0.0)
     centered = jnp.where(found[..., None], offsets - (jnp.sum(offsets, axis=1) / count)[:, None], 0.0)
     covs = jnp.sum(outer(centered), axis=1) / count[..., None] + config.min_std**2 * jnp.eye(3)
-    precisions, _ = inverse_and_logdet(covs)
-
-    log_weights = -0.5 * mahalanobis_sq(offsets, precisions[:, None])
-    weights = jax.nn.softmax(log_weights, axis=-1, where=found)
+    triangle = jnp.unstack(whitening(covs)[0][:, None], axis=-1)
+    white = whiten(triangle, jnp.unstack(offsets, axis=-1))
+    weights = jax.nn.softmax(-0.5 * dot(white, white), axis=-1, where=found)
     mean_feature = jnp.einsum("km,kmf->kf", weights, near.features)
     # The medoid: features are never averaged, since a mean of two meanings has none.
     closeness = jnp.where(found, jnp.einsum("kmf,kf->km", near.features, mean_feature), -jnp.inf)
@@ -156,5 +155,5 @@ def color_gradients(gaussians: Gaussians, num_neighbours: int) -> Float[Array, "
     cross = jnp.einsum("nka,nk->na", offsets, light[rows] - light[:, None])
     # A hundredth of the spread keeps the fit of collinear neighbours finite.
     ridge = 0.01 * jnp.trace(moments, axis1=-2, axis2=-1) + 1e-8
-    slopes = jnp.linalg.solve(moments + ridge[:, None, None] * jnp.eye(2), cross[..., None])[..., 0]
+    slopes = (inverse_2x2(moments + ridge[:, None, None] * jnp.eye(2)) @ cross[..., None])[..., 0]
     return jnp.einsum("nda,na->nd", basis, slopes)

@@ -1,17 +1,20 @@
 """ICP against Gaussians as one Levenberg–Marquardt solve."""
 
+from typing import TypeAlias
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+import lineax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import Gaussians, color_gradients, intensity
-from emgs_jax.linalg import inverse_and_logdet, mahalanobis_sq, outer
+from emgs_jax.linalg import dot, gather_entries, mahalanobis_sq, whiten, whitening, widen
 from emgs_jax.neighbours import knn
 from emgs_jax.observation import Observation, transform
-from emgs_jax.pytree import choice, static, take_rows, traced
+from emgs_jax.pytree import choice, static, traced
 from emgs_jax.rigid import median
 
 RESIDUALS = ("colored", "distribution", "colored+distribution")
@@ -35,9 +38,10 @@ class IcpConfig(eqx.Module):
         scale_noise: standard deviation of the logarithm of the scale about the coarse step's, in units of the points'
             depth noise; 0 = no scale (printed).
         num_points: how many points take part.
-        num_neighbours: Gaussians that are compared for each point.
+        num_searches: how often the Gaussians near every point are looked up, each time with a solve after it.
+        num_neighbours: Gaussians near a point, which every step of a solve compares.
         num_color_neighbours: Gaussians from which a Gaussian's intensity gradient is fitted.
-        max_steps: of the solver.
+        max_steps: of every solve.
         tolerance: relative and absolute, of the solver.
     """
 
@@ -50,6 +54,7 @@ class IcpConfig(eqx.Module):
     prior_information: Float[Array, "*b"] = traced()
     scale_noise: Float[Array, "*b"] = traced()
     num_points: int = static()
+    num_searches: int = static()
     num_neighbours: int = static()
     num_color_neighbours: int = static()
     max_steps: int = static()
@@ -65,8 +70,8 @@ class IcpInfo(eqx.Module):
         residual: m; root mean square distance of the inliers to their Gaussians' planes.
         misfit: m; the same distance of all points, as 1.4826 times the median, a robust standard deviation.
         min_eigenvalue: smallest eigenvalue of the data's Hessian per effective point (1/m² and 1/rad²).
-        num_steps: of the solver.
-        is_converged: False where the solver reached `max_steps` or failed.
+        num_steps: of all solves.
+        is_converged: False where the last solve reached `max_steps` or failed.
     """
 
     num_inliers: Int[Array, ""]
@@ -78,55 +83,34 @@ class IcpInfo(eqx.Module):
     is_converged: Bool[Array, ""]
 
 
-class _Matches(eqx.Module):
-    """The Gaussian of every point, held fixed while a step is linearised."""
-
-    means: Float[Array, "p 3"]
-    normals: Float[Array, "p 3"]
-    whitening: Float[Array, "p 3 3"]
-    plane_std: Float[Array, "p"]
-    light: Float[Array, "p"]
-    gradients: Float[Array, "p 3"]
-    is_inlier: Bool[Array, "p"]
-
-
-def _match(
-    source: Observation, noise: Float[Array, "p 3"], target: Gaussians, gradients: Array, config: IcpConfig
-) -> _Matches:
-    """For each world point the nearest of its neighbouring Gaussians in Mahalanobis distance."""
-    points = source.points
-    rows, found = knn(points, target.means, target.valid, config.num_neighbours)
-    covs = target.covs[rows] + outer(noise)[:, None]
-    precisions, _ = inverse_and_logdet(covs)
-    distance_sq = jnp.where(found, mahalanobis_sq(points[:, None] - target.means[rows], precisions), jnp.inf)
-    best = jnp.argmin(distance_sq, axis=-1)[:, None]
-    row = jnp.take_along_axis(rows, best, axis=1)[:, 0]
-    near = take_rows(target, row)
-    precision = jnp.take_along_axis(precisions, best[..., None, None], axis=1)[:, 0]
-    cov = jnp.take_along_axis(covs, best[..., None, None], axis=1)[:, 0]
-    cos = jnp.sum(near.normals * source.normals, axis=-1)
-    is_near = jnp.take_along_axis(distance_sq, best, axis=1)[:, 0] <= config.max_mahalanobis_sq
-    return _Matches(
-        means=near.means,
-        normals=near.normals,
-        whitening=jnp.swapaxes(jnp.linalg.cholesky(precision), -1, -2),
-        plane_std=jnp.sqrt(jnp.einsum("pi,pij,pj->p", near.normals, cov, near.normals) + 1e-12),
-        light=intensity(near.colors),
-        gradients=gradients[row],
-        is_inlier=source.valid & is_near & (cos >= config.min_normal_cos),
-    )
-
-
 class _Problem(eqx.Module):
     """What stays the same while the pose moves; lengths in metres."""
 
     source: Observation  # camera frame
     rays: Float[Array, "p 3"]  # noise of every point along its viewing ray, camera frame
     target: Gaussians
+    triangles: Float[Array, "n 6"]  # see `whitening`
+    plane_vars: Float[Array, "n"]  # of the Gaussians along their normals
     gradients: Float[Array, "n 3"]
     T_world_coarse: jaxlie.SE3
     scale_std: Float[Array, ""]
     prior: Float[Array, "7"]  # 1 / standard deviation of xi and of the scale's parameter
+
+
+class _Matches(eqx.Module):
+    """The Gaussian of every point, held fixed while a step is linearised."""
+
+    means: Float[Array, "p 3"]
+    normals: Float[Array, "p 3"]
+    triangle: Float[Array, "p 6"]
+    noise: Float[Array, "p 3"]  # of the point, whitened
+    plane_std: Float[Array, "p"]
+    light: Float[Array, "p"]
+    gradients: Float[Array, "p 3"]
+    is_inlier: Bool[Array, "p"]
+
+
+Candidates: TypeAlias = tuple[Int[Array, "p k"], Bool[Array, "p k"]]
 
 
 def _pose_problem(
@@ -146,18 +130,18 @@ def _pose_problem(
         lambda: jnp.zeros_like(target.means),
     )
     prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack([pose_noise, depth_noise]), 3)
-    prior = jnp.append(prior, 1.0)
-    rays = config.noise * depth_noise * source.points
-    return _Problem(source, rays, target, gradients, T_world_coarse, config.scale_noise * depth_noise, prior)
-
-
-def _place(y: Float[Array, "7"], problem: _Problem, config: IcpConfig) -> tuple[Observation, _Matches]:
-    """The source in the world frame for the unknowns y, and its matches, which carry no gradient."""
-    T, scale = _pose(y, problem)
-    placed = transform(T, problem.source, scale)
-    noise = problem.rays @ T.rotation().as_matrix().T
-    fixed, noise = jax.lax.stop_gradient((placed, noise))
-    return placed, jax.lax.stop_gradient(_match(fixed, noise, problem.target, problem.gradients, config))
+    triangles, _ = whitening(target.covs)
+    return _Problem(
+        source=source,
+        rays=config.noise * depth_noise * source.points,
+        target=target,
+        triangles=triangles,
+        plane_vars=mahalanobis_sq(target.normals, target.covs),  # n' Σ n
+        gradients=gradients,
+        T_world_coarse=T_world_coarse,
+        scale_std=config.scale_noise * depth_noise,
+        prior=jnp.append(prior, 1.0),
+    )
 
 
 def _pose(y: Float[Array, "7"], problem: _Problem) -> tuple[jaxlie.SE3, Float[Array, ""]]:
@@ -165,15 +149,64 @@ def _pose(y: Float[Array, "7"], problem: _Problem) -> tuple[jaxlie.SE3, Float[Ar
     return problem.T_world_coarse @ jaxlie.SE3.exp(y[:6]), jnp.exp(problem.scale_std * y[6])
 
 
-def _residuals(y: Float[Array, "7"], args: tuple[_Problem, IcpConfig]) -> tuple[Float[Array, "p 5"], Float[Array, "7"]]:
+def _search(y: Float[Array, "7"], problem: _Problem, config: IcpConfig) -> Candidates:
+    """The Gaussians near every point, placed by the unknowns y."""
+    T, scale = _pose(y, problem)
+    placed = transform(T, problem.source, scale)
+    return knn(placed.points, problem.target.means, problem.target.valid, config.num_neighbours)
+
+
+def _match(
+    placed: Observation, noise: Float[Array, "p 3"], candidates: Candidates, problem: _Problem, config: IcpConfig
+) -> _Matches:
+    """For each world point the nearest of its candidates in Mahalanobis distance."""
+    (rows, found), target = candidates, problem.target
+    near = gather_entries(target.means, rows), gather_entries(problem.triangles, rows)
+    point, ray = (jnp.unstack(vectors[:, None], axis=-1) for vectors in (placed.points, noise))
+    offset = tuple(a - b for a, b in zip(point, near[0], strict=True))
+    white = widen(whiten(near[1], offset), whiten(near[1], ray))
+    distance_sq = jnp.where(found, dot(white, white), jnp.inf)
+    best = jnp.argmin(distance_sq, axis=-1)[:, None]
+    row = jnp.take_along_axis(rows, best, axis=1)[:, 0]
+    normals, triangle = target.normals[row], problem.triangles[row]
+    is_near = jnp.min(distance_sq, axis=-1) <= config.max_mahalanobis_sq
+    is_alike = jnp.sum(normals * placed.normals, axis=-1) >= config.min_normal_cos
+    whitened = whiten(jnp.unstack(triangle, axis=-1), jnp.unstack(noise, axis=-1))
+    return _Matches(
+        means=target.means[row],
+        normals=normals,
+        triangle=triangle,
+        noise=jnp.stack(whitened, axis=-1),
+        plane_std=jnp.sqrt(problem.plane_vars[row] + jnp.sum(normals * noise, axis=-1) ** 2 + 1e-12),
+        light=intensity(target.colors[row]),
+        gradients=problem.gradients[row],
+        is_inlier=placed.valid & is_near & is_alike,
+    )
+
+
+def _place(
+    y: Float[Array, "7"], candidates: Candidates, problem: _Problem, config: IcpConfig
+) -> tuple[Observation, _Matches]:
+    """The source in the world frame for the unknowns y, and its matches, which carry no gradient."""
+    T, scale = _pose(y, problem)
+    placed = transform(T, problem.source, scale)
+    noise = problem.rays @ T.rotation().as_matrix().T
+    fixed, noise = jax.lax.stop_gradient((placed, noise))
+    return placed, jax.lax.stop_gradient(_match(fixed, noise, candidates, problem, config))
+
+
+def _residuals(
+    y: Float[Array, "7"], args: tuple[Candidates, _Problem, IcpConfig]
+) -> tuple[Float[Array, "p 5"], Float[Array, "7"]]:
     """Rows of every point (plane, colour, whitened offset) and of the prior, in standard deviations."""
-    problem, config = args
-    placed, match = _place(y, problem, config)
+    candidates, problem, config = args
+    placed, match = _place(y, candidates, problem, config)
     offset = placed.points - match.means
     plane = jnp.sum(offset * match.normals, axis=-1) / match.plane_std
     light = match.light + jnp.sum(match.gradients * offset, axis=-1)
     shade = (light - intensity(placed.colors)) / config.color_std
-    white = jnp.einsum("pij,pj->pi", match.whitening, offset)
+    triangle, noise, entries = (jnp.unstack(rows, axis=-1) for rows in (match.triangle, match.noise, offset))
+    white = jnp.stack(widen(whiten(triangle, entries), noise), axis=-1)
     # A point beyond the gate costs what it would at the gate and pulls nowhere.
     edge = jnp.sqrt(config.max_mahalanobis_sq)
     is_inlier = match.is_inlier[:, None]
@@ -215,12 +248,22 @@ def icp(
         T_world_camera, the scale, and what the solve found.
     """
     problem = _pose_problem(source, target, T_world_coarse, noise, config)
-    solver = optx.LevenbergMarquardt(rtol=config.tolerance, atol=config.tolerance)
-    start, args = jnp.zeros(7), (problem, config)
-    solution = optx.least_squares(_residuals, solver, start, args, max_steps=config.max_steps, throw=False)
-    y = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, start)
+    # Seven unknowns: on a CPU the normal equations take a fraction of a QR of all rows.
+    solver = optx.LevenbergMarquardt(
+        rtol=config.tolerance, atol=config.tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
+    )
 
-    placed, match = _place(y, problem, config)
+    def search_and_solve(y: Float[Array, "7"], _: None) -> tuple[Float[Array, "7"], tuple]:
+        candidates = _search(y, problem, config)
+        args = candidates, problem, config
+        solution = optx.least_squares(_residuals, solver, y, args, max_steps=config.max_steps, throw=False)
+        y = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, y)
+        return y, (candidates, solution.stats["num_steps"], solution.result == optx.RESULTS.successful)
+
+    y, rounds = jax.lax.scan(search_and_solve, jnp.zeros(7), length=config.num_searches)
+    candidates, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
+    args = candidates, problem, config
+    placed, match = _place(y, *args)
     num_inliers = jnp.sum(match.is_inlier)
     distance = jnp.sum((placed.points - match.means) * match.normals, axis=-1)
     jacobian = jax.jacfwd(_residuals)(y, args)[0].reshape(-1, 7)[:, :6]
@@ -231,7 +274,7 @@ def icp(
         residual=jnp.sqrt(jnp.sum(jnp.where(match.is_inlier, distance, 0.0) ** 2) / jnp.maximum(num_inliers, 1)),
         misfit=1.4826 * median(jnp.abs(distance), placed.valid),
         min_eigenvalue=jnp.linalg.eigvalsh(hessian)[0],
-        num_steps=solution.stats["num_steps"],
-        is_converged=solution.result == optx.RESULTS.successful,
+        num_steps=jnp.sum(rounds[1]),
+        is_converged=is_converged,
     )
     return *_pose(y, problem), info

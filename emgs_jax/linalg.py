@@ -4,8 +4,12 @@ Every guard replaces the argument before the operation that would fail, never th
 stay finite too.
 """
 
+from typing import TypeAlias
+
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
+
+Entries: TypeAlias = tuple[Float[Array, "..."], ...]
 
 # Below this length (m) a vector has no direction; far under any distance that is measured, far above float32's least.
 SMALLEST_LENGTH = 1e-12
@@ -28,11 +32,11 @@ def outer(vectors: Float[Array, "*b d"]) -> Float[Array, "*b d d"]:
     return vectors[..., :, None] * vectors[..., None, :]
 
 
-def inverse_and_logdet(covs: Float[Array, "*b 3 3"]) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b"]]:
-    """Inverse by the adjugate and log-determinant of symmetric positive matrices.
+def inverse_3x3(covs: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
+    """Inverse by the adjugate of symmetric positive matrices; the identity where a matrix is not positive.
 
     The matrices are scaled to unit trace first, which keeps the determinant of a millimetre-thin Gaussian inside
-    float32. A matrix that is not positive gives the inverse and the log-determinant of the identity.
+    float32.
     """
     trace = jnp.trace(covs, axis1=-2, axis2=-1)
     scale = jnp.where(trace > 0, trace, 1.0)
@@ -43,9 +47,33 @@ def inverse_and_logdet(covs: Float[Array, "*b 3 3"]) -> tuple[Float[Array, "*b 3
     is_positive = (det > 0) & (trace > 0)
     safe_det = jnp.where(is_positive, det, 1.0)
     inverse = symmetrize(adjugate) / (safe_det * scale)[..., None, None]
-    inverse = jnp.where(is_positive[..., None, None], inverse, jnp.eye(3, dtype=covs.dtype))
-    logdet = jnp.where(is_positive, jnp.log(safe_det) + 3.0 * jnp.log(scale), 0.0)
-    return inverse, logdet
+    return jnp.where(is_positive[..., None, None], inverse, jnp.eye(3, dtype=covs.dtype))
+
+
+def whitening(covs: Float[Array, "*b 3 3"]) -> tuple[Float[Array, "*b 6"], Float[Array, "*b"]]:
+    """W = L⁻¹ for the Cholesky factor Σ = L L', and log|Σ|; W x has unit covariance, and |W x|² = x' Σ⁻¹ x.
+
+    Returns:
+        The lower triangle of W, row by row, and the log-determinant; those of the identity where Σ is not positive.
+    """
+    trace = jnp.trace(covs, axis1=-2, axis2=-1)
+    scale = jnp.where(trace > 0, trace, 1.0)
+    a, b, c, d, e, f = (covs[..., row, column] / scale for row, column in zip(*jnp.tril_indices(3), strict=True))
+    # Pivots d_i and unit factors of L D L'; every pivot is made positive before it divides.
+    first = jnp.where(a > 0, a, 1.0)
+    x, y = b / first, d / first
+    second = c - b * x
+    safe_second = jnp.where(second > 0, second, 1.0)
+    z = (e - d * x) / safe_second
+    third = f - d * y - (e - d * x) * z
+    is_positive = (trace > 0) & (a > 0) & (second > 0) & (third > 0)
+    safe_third = jnp.where(third > 0, third, 1.0)
+    pivots = (first, safe_second, safe_third)
+    i, j, k = (1.0 / jnp.sqrt(scale * pivot) for pivot in pivots)
+    triangle = jnp.stack([i, -x * j, j, (x * z - y) * k, -z * k, k], axis=-1)
+    logdet = sum(jnp.log(pivot) for pivot in pivots) + 3.0 * jnp.log(scale)
+    identity = jnp.array([1.0, 0.0, 1.0, 0.0, 0.0, 1.0], covs.dtype)
+    return jnp.where(is_positive[..., None], triangle, identity), jnp.where(is_positive, logdet, 0.0)
 
 
 def inverse_2x2(matrices: Float[Array, "*b 2 2"]) -> Float[Array, "*b 2 2"]:
@@ -60,6 +88,37 @@ def inverse_2x2(matrices: Float[Array, "*b 2 2"]) -> Float[Array, "*b 2 2"]:
 def mahalanobis_sq(offsets: Float[Array, "*#b d"], precisions: Float[Array, "*#b d d"]) -> Float[Array, "*b"]:
     """Squared Mahalanobis distance d' P d, never negative."""
     return jnp.maximum(jnp.einsum("...i,...ij,...j->...", offsets, precisions, offsets), 0.0)
+
+
+# Vectors as tuples of their entries. Products of many 3-vectors are then one pass over all of them with the gathers
+# inside, on a CPU about eight times as fast as `einsum` on gathered rows.
+
+
+def gather_entries(table: Float[Array, "n c"], rows: Int[Array, "*b"]) -> Entries:
+    """table[rows], entry by entry."""
+    return tuple(column[rows] for column in jnp.unstack(table, axis=-1))
+
+
+def dot(first: Entries, second: Entries) -> Float[Array, "..."]:
+    """Inner product."""
+    return sum(a * b for a, b in zip(first, second, strict=True))
+
+
+def whiten(triangle: Entries, vector: Entries) -> Entries:
+    """W x, for the triangle of `whitening`."""
+    a, b, c, d, e, f = triangle
+    x, y, z = vector
+    return a * x, b * x + c * y, d * x + e * y + f * z
+
+
+def widen(white: Entries, noise: Entries) -> Entries:
+    """A whitened offset W x made white for the covariance Σ + ν ν', where `noise` is W ν.
+
+    (I + u u')^(-1/2) = I - u u' / (s (s + 1)) with s² = 1 + u'u.
+    """
+    growth = jnp.sqrt(1.0 + dot(noise, noise))
+    along = dot(white, noise) / (growth * (growth + 1.0))
+    return tuple(w - along * u for w, u in zip(white, noise, strict=True))
 
 
 def tangent_basis(normals: Float[Array, "*b 3"]) -> Float[Array, "*b 3 2"]:

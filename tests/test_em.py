@@ -10,6 +10,7 @@ from scene import as_numpy, assert_same, at, move_gaussians, pose, random_gaussi
 
 from emgs_jax.em import EStep, e_step, em_update, m_step, support, widened_distance_sq
 from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.linalg import whitening
 from emgs_jax.observation import transform
 
 M, N, F = 60, 40, 3
@@ -115,8 +116,9 @@ def test_features_of_width_zero_are_as_good_as_a_zero_weight(opened):
 def test_noise_along_the_ray_widens_the_gaussian_by_its_outer_product():
     offsets = jnp.asarray(np.random.default_rng(0).normal(size=(M, 5, 3)) * 0.2, jnp.float32)
     covs = np.asarray(random_gaussians(M * 5).covs, float).reshape(M, 5, 3, 3)
-    precisions = jnp.asarray(np.linalg.inv(covs), jnp.float32)
-    distance_sq, log_growth = widened_distance_sq(offsets, precisions, NOISE)
+    triangle = jnp.unstack(whitening(jnp.asarray(covs, jnp.float32))[0], axis=-1)
+    vectors = jnp.unstack(offsets, axis=-1), jnp.unstack(NOISE[:, None], axis=-1)
+    distance_sq, log_growth = widened_distance_sq(triangle, *vectors)
     noise = np.asarray(NOISE, float)
     widened = covs + (noise[:, :, None] * noise[:, None])[:, None]
     expected = np.einsum("mki,mkij,mkj->mk", offsets, np.linalg.inv(widened), offsets)

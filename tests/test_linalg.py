@@ -6,14 +6,19 @@ import numpy as np
 import pytest
 
 from emgs_jax.linalg import (
+    dot,
+    gather_entries,
     inverse_2x2,
-    inverse_and_logdet,
+    inverse_3x3,
     mahalanobis_sq,
     outer,
     principal_axes_2x2,
     safe_normalize,
     symmetrize,
     tangent_basis,
+    whiten,
+    whitening,
+    widen,
 )
 
 RNG = np.random.default_rng(0)
@@ -25,23 +30,47 @@ def spd(count, dimension, stds):
 
 
 @pytest.mark.parametrize("stds", [(0.1, 0.2, 0.3), (0.001, 0.05, 0.05), (30.0, 10.0, 20.0), (0.01, 0.01, 0.01)])
-def test_inverse_and_logdet_equal_numpy_from_millimetres_to_decametres(stds):
+def test_inverse_and_whitening_equal_numpy_from_millimetres_to_decametres(stds):
     covs = spd(50, 3, stds)
-    inverse, logdet = inverse_and_logdet(jnp.asarray(covs, jnp.float32))
     # Rounding the input alone moves the inverse by eps · condition number.
     tolerance = 1e-6 * (max(stds) / min(stds)) ** 2 + 1e-5
     expected = np.linalg.inv(covs)
+    inverse = inverse_3x3(jnp.asarray(covs, jnp.float32))
     np.testing.assert_allclose(inverse, expected, atol=tolerance * np.abs(expected).max())
+    triangle, logdet = whitening(jnp.asarray(covs, jnp.float32))
+    lower = np.linalg.inv(np.linalg.cholesky(covs))[:, *np.tril_indices(3)]
+    np.testing.assert_allclose(triangle, lower, atol=tolerance * np.abs(lower).max())
     np.testing.assert_allclose(logdet, np.linalg.slogdet(covs)[1], atol=3 * tolerance)
 
 
 @pytest.mark.parametrize("matrix", [np.zeros((3, 3)), -np.eye(3), np.diag([1.0, 1.0, -1.0])])
 def test_a_matrix_that_is_not_positive_counts_as_the_identity(matrix):
-    inverse, logdet = inverse_and_logdet(jnp.asarray(matrix, jnp.float32))
-    np.testing.assert_array_equal(inverse, np.eye(3))
+    matrix = jnp.asarray(matrix, jnp.float32)
+    np.testing.assert_array_equal(inverse_3x3(matrix), np.eye(3))
+    triangle, logdet = whitening(matrix)
+    np.testing.assert_array_equal(triangle, np.eye(3)[np.tril_indices(3)])
     assert logdet == 0
-    gradient = jax.grad(lambda m: jnp.sum(inverse_and_logdet(m)[0]))(jnp.asarray(matrix, jnp.float32))
-    assert np.isfinite(gradient).all()
+    for verb in (inverse_3x3, lambda m: whitening(m)[0]):
+        assert np.isfinite(jax.grad(lambda m, verb=verb: jnp.sum(verb(m)))(matrix)).all()
+
+
+def test_a_whitened_offset_has_the_mahalanobis_distance_also_with_noise_along_a_ray():
+    covs, offsets, noise = spd(50, 3, (0.01, 0.1, 0.2)), *RNG.normal(size=(2, 50, 3)) * 0.1
+    triangle, x, nu = (
+        jnp.unstack(jnp.asarray(rows, jnp.float32), axis=-1)
+        for rows in (whitening(jnp.asarray(covs, jnp.float32))[0], offsets, noise)
+    )
+    for white, cov in (
+        (whiten(triangle, x), covs),
+        (widen(whiten(triangle, x), whiten(triangle, nu)), covs + noise[:, :, None] * noise[:, None]),
+    ):
+        expected = np.einsum("ni,nij,nj->n", offsets, np.linalg.inv(cov), offsets)
+        np.testing.assert_allclose(dot(white, white), expected, rtol=1e-3)
+
+
+def test_entries_are_those_of_the_gathered_rows():
+    table, rows = jnp.asarray(RNG.normal(size=(7, 3))), jnp.asarray(RNG.integers(0, 7, (4, 5)))
+    np.testing.assert_array_equal(jnp.stack(gather_entries(table, rows), axis=-1), table[rows])
 
 
 def test_the_inverse_of_2x2_equals_numpy_and_is_zero_where_singular():

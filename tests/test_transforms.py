@@ -88,7 +88,8 @@ MASK, ORDER = jnp.arange(40) % 3 > 0, jnp.arange(40)
 # name: (verb of one item, its arguments by seed)
 VERBS = {
     "safe_normalize": (linalg.safe_normalize, lambda s: (points(s).points,)),
-    "inverse_and_logdet": (linalg.inverse_and_logdet, lambda s: (random_gaussians(9, s).covs,)),
+    "inverse_3x3": (linalg.inverse_3x3, lambda s: (random_gaussians(9, s).covs,)),
+    "whitening": (linalg.whitening, lambda s: (random_gaussians(9, s).covs,)),
     "tangent_basis": (linalg.tangent_basis, lambda s: (points(s).normals,)),
     "principal_axes": (linalg.principal_axes_2x2, lambda s: (random_gaussians(9, s).covs[:, :2, :2],)),
     "project": (lambda p: cam.project(CAMERA, p), lambda s: (points(s).points,)),

@@ -14,7 +14,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from emgs_jax.camera import NEAREST_DEPTH, Camera, project
-from emgs_jax.linalg import inverse_and_logdet
+from emgs_jax.linalg import inverse_3x3
 from emgs_jax.pytree import static, traced
 
 
@@ -73,7 +73,7 @@ def _moved(
     weighted = weight[..., None, None] * jacobian
     hessian = jnp.einsum("vlij,vlik->ljk", weighted, jacobian)
     trace = jnp.trace(hessian, axis1=-2, axis2=-1)
-    inverse, _ = inverse_and_logdet(hessian + (config.damping * trace)[:, None, None] * jnp.eye(3))
+    inverse = inverse_3x3(hessian + (config.damping * trace)[:, None, None] * jnp.eye(3))
     step = jnp.einsum("ljk,vlik,vli->lj", inverse, weighted, errors)
     return points - jnp.where(trace[:, None] > 0, step, 0.0)
 
