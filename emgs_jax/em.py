@@ -92,6 +92,12 @@ def widened_distance_sq(
     return jnp.maximum(distance_sq, 0.0), jnp.log(growth)
 
 
+def _offsets(gaussians: Gaussians, points: Observation, rows: Int[Array, "m k"]) -> Entries:
+    """Entries (m, k) of every point's offset from the means of its Gaussians."""
+    point = jnp.unstack(points.points[:, None], axis=-1)
+    return tuple(p - mean for p, mean in zip(point, gather_entries(gaussians.means, rows), strict=True))
+
+
 def e_step(
     gaussians: Gaussians, points: Observation, noise: Float[Array, "m 3"], config: EmConfig
 ) -> tuple[EStep, Float[Array, "m"]]:
@@ -117,7 +123,8 @@ def e_step(
     # Features are unit vectors, so their product is the cosine; with width 0 the term must vanish.
     feature_gap = 0.0
     if gaussians.features.shape[-1]:
-        feature_gap = jnp.einsum("mkf,mf->mk", gaussians.features[rows], points.features) - 1.0
+        feature = jnp.unstack(points.features[:, None], axis=-1)
+        feature_gap = dot(gather_entries(gaussians.features, rows), feature) - 1.0
     log_det_term = -config.determinant_weight * (logdets[rows] + log_growth)
     log_joint = -0.5 * distance_sq + log_det_term
     log_joint += config.normal_weight * (normal_cos - 1.0) + config.feature_weight * feature_gap
@@ -142,8 +149,9 @@ def support(gaussians: Gaussians, points: Observation, step: EStep, config: EmCo
     basis = tangent_basis(gaussians.normals)
     plane_covs = jnp.einsum("nda,ndc,ncb->nab", basis, gaussians.covs, basis)
     axes = jnp.einsum("nda,nab->ndb", basis, principal_axes_2x2(plane_covs))
-    offsets = points.points[:, None] - gaussians.means[step.rows]
-    is_positive = jnp.einsum("mkd,mkda->mka", offsets, axes[step.rows]) > 0
+    offsets = _offsets(gaussians, points, step.rows)
+    along = [dot(offsets, gather_entries(axis, step.rows)) for axis in jnp.unstack(axes, axis=-1)]
+    is_positive = jnp.stack(along, axis=-1) > 0
     r = step.responsibilities[..., None]
     sides = jnp.concatenate([jnp.where(is_positive, r, 0.0), jnp.where(is_positive, 0.0, r)], axis=-1)
     sums = jnp.zeros((gaussians.valid.shape[0], 4)).at[step.rows].add(sides)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import reference
 
-from emgs_jax.neighbours import compact_rows, knn
+from emgs_jax.neighbours import CURVE_BITS, _curve, compact_rows, knn
 
 search = jax.jit(knn, static_argnums=3)
 
@@ -112,3 +112,14 @@ def test_compaction_of_nothing_is_all_missing():
     rows, exists, overflow = compact_rows(jnp.zeros(3, bool), 5)
     np.testing.assert_array_equal(rows, [3] * 5)
     assert not exists.any() and overflow == 0
+
+
+@pytest.mark.parametrize("num_axes", [2, 3])
+def test_the_curve_passes_every_cell_once_from_neighbour_to_neighbour(num_axes):
+    axis = np.arange(16)  # the first cube of 16 cells a side, which the curve fills before it goes on
+    cells = np.stack(np.meshgrid(*[axis] * num_axes, indexing="ij"), axis=-1).reshape(-1, num_axes)
+    box = jnp.zeros(num_axes), jnp.full(num_axes, 2.0**CURVE_BITS)
+    numbers = np.asarray(_curve(jnp.asarray(cells + 0.5, jnp.float32), *box))
+    np.testing.assert_array_equal(np.sort(numbers), np.arange(16**num_axes))
+    steps = np.diff(cells[np.argsort(numbers)], axis=0)
+    np.testing.assert_array_equal(np.abs(steps).sum(axis=1), 1)

@@ -82,18 +82,17 @@ def time_icp(data: Data, offset: tuple[float, float], repetitions: int) -> list[
         (_host(jax.tree.map(lambda leaf: leaf[::stride], points)), start.as_matrix()) for points, start, _ in cases
     ]
     surface = _host(target) | {"points": _host(target)["means"]}
-    reach = 0.1
+    reach, num_steps = 0.1, config.num_searches * config.max_steps
 
     def open3d_one() -> np.ndarray:
-        return baselines.colored_icp(clouds[0][0], surface, np.asarray(clouds[0][1], float), reach, config.max_steps)
+        return baselines.colored_icp(clouds[0][0], surface, np.asarray(clouds[0][1], float), reach, num_steps)
 
     truth = [case[2] for case in cases]
     mine = [np.asarray(ours.verb(*each)[0].as_matrix(), float) for each in arguments]
     theirs = [
-        baselines.colored_icp(cloud, surface, np.asarray(start, float), reach, config.max_steps)
-        for cloud, start in clouds
+        baselines.colored_icp(cloud, surface, np.asarray(start, float), reach, num_steps) for cloud, start in clouds
     ]
-    ours.facts.update(points=len(clouds[0][0]["points"]), gaussians=len(surface["points"]), steps=config.max_steps)
+    ours.facts.update(points=len(clouds[0][0]["points"]), gaussians=len(surface["points"]), steps=num_steps)
     ours.facts.update(_pose_errors(mine, truth))
     candidates = {"emgs_jax": ours, "Open3D": Candidate(open3d_one, None, _pose_errors(theirs, truth))}
     return compare(interleaved("icp", candidates, repetitions), "Open3D")
