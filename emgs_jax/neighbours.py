@@ -16,9 +16,9 @@ def knn(
 ) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
     """The k nearest valid points of every query, nearest first, by exact search.
 
-    Points and queries are sorted along the Hilbert curve, so that groups of points and blocks of queries are compact. On
-    a CPU a block looks at the groups whose boxes are nearest to its own; where another group might hold one of the k
-    nearest, and on an accelerator, which such a condition would hold up, it looks at all points.
+    Points and queries are sorted along the Hilbert curve, so that groups of points and blocks of queries are compact.
+    On a CPU a block looks at the groups whose boxes are nearest to its own; where another group might hold one of the
+    k nearest, and on an accelerator, which such a condition would hold up, it looks at all points.
 
     Args:
         queries: m positions.
