@@ -14,7 +14,7 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.data.convert import to_se3
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.evaluation.overview import draw_overview
-from emgs_jax.pipeline import MappingRun
+from emgs_jax.mapping_run import MappingRun
 from emgs_jax.render.densify import DensifyConfig, densify
 
 _densify = eqx.filter_jit(densify)

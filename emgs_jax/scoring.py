@@ -1,11 +1,14 @@
 """metrics.json of a run: the map against the truth, the prior alone against the truth, counts and times."""
 
 from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from emgs_jax import outputs
 from emgs_jax.clock import Clock, peak_memory_mb
 from emgs_jax.data.base import Dataset
 from emgs_jax.evaluation.clouds import PointCloud
@@ -16,7 +19,8 @@ from emgs_jax.evaluation.reconstruction import (
 )
 from emgs_jax.evaluation.report import RAW_PRIOR, prefixed
 from emgs_jax.evaluation.trajectory import trajectory_metrics
-from emgs_jax.pipeline import FrameRecord, MappingRun
+from emgs_jax.mapping_run import FrameRecord, MappingRun
+from emgs_jax.render.densify import DensifyConfig
 
 Metrics = dict[str, Any]
 STATUSES = ("tracked", "degraded", "lost", "initialization")
@@ -70,6 +74,55 @@ def score_prior(run: MappingRun, cloud: PointCloud, truth: PointCloud, config: E
     """What `score` says of the raw prior, whose points are `cloud`."""
     poses = _known(run, run.raw_poses)
     return prefixed(trajectory_metrics(*poses) | compare_clouds(cloud, truth, poses, config), RAW_PRIOR)
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """What the maps of one data set are compared with, made once.
+
+    Args:
+        dataset: in use.
+        evaluation: the protocol.
+        truth: its true cloud; None without ground truth.
+        num_skipped: frames that cannot be read.
+    """
+
+    dataset: Dataset
+    evaluation: EvaluationConfig
+    truth: PointCloud | None
+    num_skipped: int
+
+
+def score_settings(
+    runs: Sequence[MappingRun],
+    raw_cloud: PointCloud,
+    densify: Sequence[DensifyConfig],
+    scorer: Scorer,
+    num_threads: int,
+) -> list[Metrics]:
+    """The metrics.json of every finished run, without times.
+
+    Args:
+        runs: that share data set, prior and protocol.
+        raw_cloud: the prior's points, the same for all.
+        densify: of each run.
+        scorer: the truth.
+        num_threads: runs that are scored side by side.
+    """
+    evaluation, truth = scorer.evaluation, scorer.truth
+    shared = {} if truth is None else score_prior(runs[0], raw_cloud, truth, evaluation)
+
+    def score(run: MappingRun, config: DensifyConfig) -> Metrics:
+        counts = {k: v for k, v in describe(run, scorer.num_skipped).items() if not k.startswith("time/")}
+        if truth is None:
+            return counts
+        dense = outputs.dense_map(run, scorer.dataset, config, evaluation.voxel_m, num_pictures=0).cloud
+        centers = outputs.center_cloud(run)
+        return score_map(run, dense, centers, truth, evaluation) | shared | counts
+
+    first = score(runs[0], densify[0])
+    with ThreadPoolExecutor(num_threads) as threads:
+        return [first, *threads.map(score, runs[1:], densify[1:])]
 
 
 def describe(run: MappingRun, num_skipped: int) -> Metrics:

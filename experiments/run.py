@@ -18,7 +18,8 @@ from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, raw_prior_cloud
 from emgs_jax.evaluation.report import print_metrics_table, provenance, write_metrics
 from emgs_jax.files import FrameLog
-from emgs_jax.pipeline import FrameRecord, MappingRun, map_frames, new_run
+from emgs_jax.mapping_run import FrameRecord, MappingRun, new_run
+from emgs_jax.pipeline import map_frames
 from emgs_jax.prior.base import Prior
 from experiments.building import build_dataset, build_prior, clear_errors, measured, use_compilation_cache
 
@@ -67,7 +68,7 @@ def _map(
             log.append(vars(FrameRecord(index, None, None, "skipped", reason)))
         try:
             with session.clock.phase("raw_prior"):
-                return raw_prior_cloud(map_frames(session, dataset, prior), evaluation)
+                return raw_prior_cloud(map_frames([session], dataset, prior), evaluation)
         except BaseException:
             with contextlib.suppress(OSError, ValueError):  # the first error is the one to show
                 outputs.save_progress(folder, session)

@@ -15,8 +15,9 @@ from emgs_jax.clock import Clock
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import ground_truth_cloud
 from emgs_jax.export import load_map_npz, load_trajectory_tum
+from emgs_jax.mapping_run import new_run
 from emgs_jax.outputs import dense_map, save_outputs, save_progress
-from emgs_jax.pipeline import map_frames, new_run, predictions
+from emgs_jax.pipeline import map_frames, predictions
 from emgs_jax.scoring import Clouds, score
 
 
@@ -195,7 +196,7 @@ def test_the_map_does_not_start_at_the_origin_but_at_the_first_true_pose_and_at_
             return super().predict(window, [dataset()[index] for index in window.views], intrinsics)
 
     session = new_run(Blind(dataset()), exact()[0].config)
-    for _ in map_frames(session, Blind(dataset()), Knowing()):
+    for _ in map_frames([session], Blind(dataset()), Knowing()):
         pass
     origin = np.linalg.inv(dataset()[0].T_world_camera)
     expected = np.stack([origin @ pose for pose in exact()[0].poses])

@@ -8,7 +8,8 @@ from pathlib import Path
 import hydra
 
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.pipeline import MappingRun, map_frames, new_run
+from emgs_jax.mapping_run import MappingRun, new_run
+from emgs_jax.pipeline import map_frames
 from emgs_jax.prior.base import PriorPrediction
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -67,6 +68,6 @@ def map_tiny(frames, prior, *overrides: str) -> tuple[MappingRun, list]:
     maps = []
     session = new_run(frames, hydra.utils.instantiate(compose(*overrides).slam))
     session.on_record = lambda record: maps.append(session.state.map)
-    for _ in map_frames(session, frames, prior):
+    for _ in map_frames([session], frames, prior):
         pass
     return session, maps
