@@ -44,8 +44,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             metrics = scoring.score(session, clouds, dataset, evaluation)
         metrics |= scoring.describe(session, len(dataset.skipped)) | scoring.spent(clock) | measured(prior)
     settings = OmegaConf.to_container(config, resolve=True)
-    seed = prior.provenance.settings.get("seed", 0)
-    metrics["provenance"] = provenance(settings, dataset, prior.provenance, seed)
+    metrics["provenance"] = provenance(settings, dataset, prior.provenance)
     write_metrics(folder / "metrics.json", metrics)
     for note in notes:
         tqdm.write(note)

@@ -38,7 +38,7 @@ def score(config: DictConfig) -> tuple[Metrics, Path]:
     metrics = trajectory_metrics(poses, truth) | counts
     if cloud is not None:
         metrics |= compare(cloud, (poses, truth), dataset, evaluation)
-    block = provenance(settings, dataset, Provenance(config.method, {}, config.simulated), 0)
+    block = provenance(settings, dataset, Provenance(config.method, {}, config.simulated))
     metrics["provenance"] = block | {"prior": None, "method": config.method}
     folder.mkdir(parents=True, exist_ok=True)
     write_metrics(folder / METRICS_FILE, metrics)

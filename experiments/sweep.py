@@ -83,7 +83,7 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
 def _provenance(config: DictConfig, dataset: ReadableFrames, prior: Prior) -> dict[str, Any]:
     plain = OmegaConf.to_container(config, resolve=True)
     shared = {key: value for key, value in plain.items() if key not in NOT_OF_RESULTS}
-    return provenance(shared, dataset, prior.provenance, prior.provenance.settings.get("seed", 0))
+    return provenance(shared, dataset, prior.provenance)
 
 
 def _chunks(left: Sequence[Variant], size: int) -> list[list[Variant]]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, register, transform_cloud, voxel_downsample
 from emgs_jax.evaluation.trajectory import align_poses
@@ -96,13 +97,6 @@ def ground_truth_cloud(
                 yield posed_cloud(points, known, frame.image, frame.T_world_camera, config)
 
     return fuse_clouds(clouds(), config.voxel_m)
-
-
-def backproject(depth: np.ndarray, intrinsics: tuple[float, float, float, float]) -> np.ndarray:
-    """Camera-frame points (h, w, 3) of a depth image (h, w); pixel centres at integers."""
-    fx, fy, cx, cy = intrinsics
-    v, u = np.indices(depth.shape)
-    return np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], -1)
 
 
 def compare_clouds(

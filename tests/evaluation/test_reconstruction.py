@@ -8,10 +8,10 @@ import pytest
 from scene import evaluation_config
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import PointCloud, transform_cloud
 from emgs_jax.evaluation.reconstruction import (
-    backproject,
     compare_clouds,
     ground_truth_cloud,
     raw_prior_cloud,
