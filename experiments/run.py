@@ -35,14 +35,16 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         raw_cloud = _map(session, dataset, prior, evaluation, folder)
         outputs.save_progress(folder, session)
         with clock.phase("densify"):
-            dense = outputs.dense_map(session, dataset, densify, evaluation.voxel_m)
+            labels = outputs.label_centers(session, prior)
+            dense = outputs.dense_map(session, dataset, densify, evaluation.voxel_m, labels)
         with clock.phase("export"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
             notes = outputs.save_outputs(folder, session, dense, densify, title)
         with clock.phase("evaluate"):
-            clouds = scoring.Clouds(dense.cloud, outputs.center_cloud(session), raw_cloud)
-            metrics = scoring.score(session, clouds, dataset, evaluation)
-        metrics |= scoring.describe(session, len(dataset.skipped)) | scoring.spent(clock) | measured(prior)
+            scorer = scoring.new_scorer(dataset, evaluation, prior)
+            metrics = scoring.score_map(session, dense.cloud, outputs.center_cloud(session), labels, scorer)
+            metrics |= scoring.score_prior(session, raw_cloud, scorer)
+        metrics |= scoring.describe(session, dataset) | scoring.spent(clock) | measured(prior)
     settings = OmegaConf.to_container(config, resolve=True)
     metrics["provenance"] = provenance(settings, dataset, prior.provenance)
     write_metrics(folder / "metrics.json", metrics)
@@ -82,7 +84,7 @@ def main(config: DictConfig) -> float:
         use_compilation_cache(config)
         metrics = run(config, folder)
     print(print_metrics_table(metrics) if "trajectory/num_frames" in metrics else "no ground truth, so no errors")
-    for key in (key for key in metrics if key.startswith("prior/")):
+    for key in (key for key in metrics if key.startswith("prior/") or key == "segmentation/miou_percent"):
         print(f"{key} {metrics[key]:.4g}")
     print(f"{metrics['time/seconds_per_frame']:.2f} s a frame; everything is in {folder}")
     error = metrics.get("trajectory/ate_sim3_m")

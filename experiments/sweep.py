@@ -62,7 +62,7 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
         results = SweepResults(folder, _provenance(config, dataset, prior))
         left = [variant for variant in grid if variant.setting not in results]
         chunks = _chunks(left, config.chunk)
-        scorer = _scorer(dataset, config) if chunks else None
+        scorer = scoring.new_scorer(dataset, instantiate(config.evaluation), prior) if chunks else None
         with _replayed(prior, dataset, chunks, folder / "predictions") as priors, _bar(dataset, chunks) as bar:
             for chunk in chunks:
                 window_size = chunk[0].slam.window_size
@@ -105,13 +105,6 @@ def _side_by_side(config: DictConfig, size: int) -> tuple[int, int]:
     """
     is_cpu = jax.default_backend() == "cpu"
     return config.at_once or (1 if is_cpu else size), os.cpu_count() if is_cpu else 1
-
-
-def _scorer(dataset: ReadableFrames, config: DictConfig) -> scoring.Scorer:
-    evaluation = instantiate(config.evaluation)
-    has_truth = any(dataset[row].T_world_camera is not None for row in range(len(dataset)))
-    truth = scoring.true_cloud(dataset, evaluation) if has_truth else None
-    return scoring.Scorer(dataset, evaluation, truth, len(dataset.skipped))
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from emgs_jax.export import load_map_npz, load_trajectory_tum
 from emgs_jax.mapping_run import new_run
 from emgs_jax.outputs import dense_map, save_outputs, save_progress
 from emgs_jax.pipeline import map_frames, predictions
-from emgs_jax.scoring import Clouds, score
+from emgs_jax.scoring import new_scorer, score_map, score_prior
 
 
 @cache
@@ -171,7 +171,8 @@ def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
     assert save_outputs(tmp_path, blind, dense, config, "blind") == []
     names = {"map.ply", "points.ply", "mesh.ply", "overview.png"}
     assert {path.name for path in tmp_path.iterdir()} == names
-    assert score(blind, Clouds(dense.cloud, dense.cloud, dense.cloud), dataset(), None) == {}
+    scorer = new_scorer(dataset(), hydra.utils.instantiate(compose().evaluation), EditedPrior())
+    assert score_map(blind, dense.cloud, dense.cloud, None, scorer) == score_prior(blind, dense.cloud, scorer) == {}
 
 
 @pytest.mark.slow

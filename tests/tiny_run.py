@@ -41,6 +41,7 @@ class EditedPrior:
     def __init__(self, edit: Callable[[PriorPrediction], PriorPrediction] = lambda prediction: prediction) -> None:
         self._prior = hydra.utils.instantiate(compose("prior.level=0").prior, classes=list(dataset().classes))
         self._edit, self.provenance = edit, self._prior.provenance
+        self.feature_names, self.text_features = self._prior.feature_names, self._prior.text_features
 
     def check(self, dataset, window_size) -> None:
         pass

@@ -17,7 +17,7 @@ from emgs_jax.prior.base import Provenance
 
 RESULT_FORMAT = 1  # of metrics.json; another one is refused where results are read
 RAW_PRIOR = "raw_prior/"  # prefix of the same metrics for the prior without any mapping
-_GROUPS = ("trajectory/", "reconstruction/", "map/", "time/")
+_GROUPS = ("trajectory/", "reconstruction/", "segmentation/", "map/", "time/")
 _ROWS = (("", "ours"), (RAW_PRIOR, "raw prior"))
 _PACKAGES = {
     "jax": ("jax",),
