@@ -84,8 +84,9 @@ def main(config: DictConfig) -> float:
         use_compilation_cache(config)
         metrics = run(config, folder)
     print(print_metrics_table(metrics) if "trajectory/num_frames" in metrics else "no ground truth, so no errors")
-    for key in (key for key in metrics if key.startswith("prior/") or key == "segmentation/miou_percent"):
-        print(f"{key} {metrics[key]:.4g}")
+    for key, value in metrics.items():
+        if value is not None and (key.startswith("prior/") or key == "segmentation/miou_percent"):
+            print(f"{key} {value:.4g}")
     print(f"{metrics['time/seconds_per_frame']:.2f} s a frame; everything is in {folder}")
     error = metrics.get("trajectory/ate_sim3_m")
     return math.inf if error is None else error
