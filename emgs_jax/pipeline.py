@@ -108,14 +108,19 @@ def map_frames(
     for row in range(0, len(runs), at_once):
         some = runs[row : row + at_once]
         groups.append(_Group(some, stack([run.config for run in some]) if len(some) > 1 else some[0].config))
-    first, anchor = runs[0], None
+    first, anchor, num_tasks = runs[0], None, 0
     with ThreadPoolExecutor(num_threads) as threads:
         for prediction, frames in predictions(dataset, prior, first.config.window_size, first.clock):
             anchor = first_pose(frames) if anchor is None else anchor
             with first.clock.phase("map"):
                 for task in _tasks(first, prediction, frames, anchor):
-                    task(groups[0])  # by itself: what it compiles is there for the others
-                    list(threads.map(task, groups[1:]))
+                    # The first task makes the maps, the second is the first step: what one group compiles by itself
+                    # is there for the others. Later all are side by side.
+                    alone = 1 if num_tasks < 2 or len(groups) == 1 else 0
+                    for group in groups[:alone]:
+                        task(group)
+                    list(threads.map(task, groups[alone:]))
+                    num_tasks += 1
             yield from raw_views(first, prediction, frames, anchor)
     for group in groups:
         group.hand_out()

@@ -19,6 +19,7 @@ from emgs_jax.evaluation.reconstruction import (
     align_cloud,
     compare_clouds,
     ground_truth_cloud,
+    reconstruction_metrics,
     reference,
 )
 from emgs_jax.evaluation.report import RAW_PRIOR, prefixed
@@ -89,9 +90,10 @@ def score_map(
     other = replace(config, alignment="se3" if config.alignment == "sim3" else "sim3")
     metrics = trajectory_metrics(*poses) | compare_clouds(dense, truth, poses, config)
     metrics |= _renamed(compare_clouds(dense, truth, poses, other), f"reconstruction_{other.alignment}/")
-    metrics |= _renamed(compare_clouds(centers, truth, poses, config), "reconstruction_centers/")
+    aligned, note = align_cloud(centers, truth, poses, config)
+    found = reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
+    metrics |= _renamed(found, "reconstruction_centers/")
     if labels is not None and scorer.labels is not None:
-        aligned, _ = align_cloud(centers, truth, poses, config)
         metrics |= compare_labels(replace(labels, points=aligned.points), scorer.labels, config.label_neighbours)
     return metrics
 
@@ -121,19 +123,20 @@ def score_settings(
         scorer: the truth.
         num_threads: runs that are scored side by side.
     """
-    shared = score_prior(runs[0], raw_cloud, scorer)
 
     def score(run: MappingRun, config: DensifyConfig) -> Metrics:
         counts = {k: v for k, v in describe(run, scorer.dataset).items() if not k.startswith("time/")}
-        if not shared:
+        if all(pose is None for pose in run.true_poses):
             return counts
         dense = outputs.dense_map(run, scorer.dataset, config, scorer.evaluation.voxel_m, num_pictures=0).cloud
         labels = outputs.label_centers(run, scorer.prior)
-        return score_map(run, dense, outputs.center_cloud(run), labels, scorer) | shared | counts
+        return score_map(run, dense, outputs.center_cloud(run), labels, scorer) | counts
 
-    first = score(runs[0], densify[0])
     with ThreadPoolExecutor(num_threads) as threads:
-        return [first, *threads.map(score, runs[1:], densify[1:])]
+        shared = threads.submit(score_prior, runs[0], raw_cloud, scorer)
+        found = [score(runs[0], densify[0])]  # by itself: what it compiles is there for the others
+        found += threads.map(score, runs[1:], densify[1:])
+    return [metrics | shared.result() for metrics in found]
 
 
 def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
