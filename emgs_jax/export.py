@@ -6,6 +6,7 @@ import json
 import os
 import typing
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.lib import recfunctions
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.files import atomic_write, write_ply
+from emgs_jax.mesh import crop, poisson, trim
 
 MAP_FORMAT, MAP_VERSION = "emgs_jax.map", 1
 _SH_C0 = 0.28209479177387814  # constant of the zeroth spherical harmonic, as 3DGS viewers use it
@@ -97,11 +100,21 @@ def save_gaussians_ply(
     return len(rows)
 
 
-def save_points_ply(path: str | os.PathLike, points: Any, normals: Any, colors: Any) -> int:
-    """Write a cloud: points (n, 3) in metres, normals (n, 3), colours (n, 3) RGB in [0, 1]. Returns how many rows."""
+def save_points_ply(
+    path: str | os.PathLike, points: Any, normals: Any, colors: Any, labels: Any = None, classes: Sequence[str] = ()
+) -> int:
+    """Write a cloud: points (n, 3) in metres, normals (n, 3), colours (n, 3) RGB in [0, 1]. Returns how many rows.
+
+    Labels (n,) become the property `label`, -1 = none; comments of the header say which class each number is.
+    """
     rows = np.concatenate([np.asarray(points), np.asarray(normals)], 1).astype(np.float32)
     keep = np.isfinite(rows).all(1)
-    write_ply(path, _with_colors(_structured(rows[keep], ["x", "y", "z", "nx", "ny", "nz"]), np.asarray(colors)[keep]))
+    vertices = _with_colors(_structured(rows[keep], ["x", "y", "z", "nx", "ny", "nz"]), np.asarray(colors)[keep])
+    if labels is not None:
+        numbers = np.asarray(labels)[keep].astype("i4")
+        vertices = recfunctions.append_fields(vertices, "label", numbers, usemask=False)
+    names = [f"label {number} {name}".encode("ascii", "replace").decode() for number, name in enumerate(classes)]
+    write_ply(path, vertices, comments=names)
     return int(keep.sum())
 
 
@@ -119,8 +132,8 @@ def save_mesh_ply(
     if len(points) < min_points:
         reason = f"{len(points)} points with a normal, at least {min_points} are needed for a mesh"
     else:
-        vertices, faces = _poisson(*_crop(points, normals), depth)
-        vertices, faces = _trim(vertices, faces, points)
+        vertices, faces = poisson(*crop(points, normals), depth)
+        vertices, faces = trim(vertices, faces, points)
         reason = None if len(faces) else "the surface reconstruction is empty"
     if reason is not None:
         Path(path).unlink(missing_ok=True)
@@ -162,35 +175,6 @@ def load_trajectory_tum(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray
     if len(rows):
         poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     return rows[:, 0], poses
-
-
-def _crop(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Leave out far flying points: the solver's grid spans all points, so they would make the cells coarse."""
-    low, high = np.percentile(points, [1, 99], axis=0)
-    margin = 0.25 * np.max(high - low)
-    keep = ((points >= low - margin) & (points <= high + margin)).all(1)
-    return points[keep], normals[keep]
-
-
-def _poisson(points: np.ndarray, normals: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
-    import open3d as o3d  # slow to import, and only a mesh needs it
-
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.normals = o3d.utility.Vector3dVector(normals)
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-            cloud, depth=depth, linear_fit=True, n_threads=1
-        )  # more threads would add in another order each time
-    return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
-
-
-def _trim(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Drop the surface that Poisson invents: what is farther from all points than their own spacing explains."""
-    spacing = np.median(cKDTree(points).query(points, k=7)[0][:, -1])
-    near = cKDTree(points).query(vertices)[0] <= 2.0 * spacing if len(vertices) else np.empty(0, bool)
-    faces = faces[near[faces].all(1)] if len(faces) else faces
-    used = np.unique(faces)
-    return vertices[used], np.searchsorted(used, faces)
 
 
 def _structured(rows: np.ndarray, names: list[str]) -> np.ndarray:

@@ -5,7 +5,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -88,15 +88,19 @@ class FrameLog:
         self.close()
 
 
-def write_ply(path: str | os.PathLike, vertices: np.ndarray, faces: np.ndarray | None = None) -> None:
+def write_ply(
+    path: str | os.PathLike, vertices: np.ndarray, faces: np.ndarray | None = None, comments: Sequence[str] = ()
+) -> None:
     """Write a binary little-endian PLY.
 
     Args:
         vertices: structured array (n,); its field names become the properties, in order.
         faces: triangles as vertex indices, int (t, 3); None for a cloud.
+        comments: lines of the header, ASCII.
     """
     vertices = vertices.astype(vertices.dtype.newbyteorder("<"))
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    header.append(f"element vertex {len(vertices)}")
     for name in vertices.dtype.names:
         header.append(f"property {_PLY_TYPES[vertices.dtype[name].str[1:]]} {name}")
     if faces is not None:

@@ -1,105 +1,33 @@
-"""A sequence through the whole pipeline, frame by frame: what the prior says, what the map takes, what is recorded."""
+"""Sequences through the whole pipeline, frame by frame: what the prior says, what the maps take, what is recorded."""
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
-from time import perf_counter
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import jax
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from emgs_jax.camera import Camera
 from emgs_jax.clock import Clock
 from emgs_jax.data.base import Dataset, Frame
-from emgs_jax.data.convert import to_camera, to_first_window, to_prediction
-from emgs_jax.localization import REASONS
+from emgs_jax.data.convert import to_first_window, to_prediction
+from emgs_jax.mapping_run import MappingRun, Timer, record_initialization, record_step
 from emgs_jax.observation import Prediction
 from emgs_jax.prior.base import Prior, PriorPrediction, windows
-from emgs_jax.slam import FirstWindow, SlamConfig, SlamState, StepInfo, advance, opening, start
+from emgs_jax.pytree import Tree, stack
+from emgs_jax.slam import (
+    FirstWindow,
+    SlamConfig,
+    SlamState,
+    advance,
+    jitted_init_state,
+    jitted_step,
+    opening,
+    start,
+)
+from emgs_jax.sweep import jitted_init_states, jitted_step_states
 
 RawView = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # points, mask, image, T_world_camera
-
-
-@dataclass(frozen=True)
-class FrameRecord:
-    """What became of one frame: a line of frames.jsonl. None where a frame was not a step.
-
-    Args:
-        index: position in the data set.
-        name: of the image.
-        timestamp: of the data set.
-        status: tracked, degraded (the coarse pose stays, nothing is fused), lost (not even that is known),
-            initialization (the map was made from it) or skipped (it cannot be read).
-        reason: why it is not tracked.
-        pose: T_world_camera as tx, ty, tz (m), qx, qy, qz, qw.
-        newest_pose: temporary pose of the next frame, likewise.
-        inliers: points that agree with the map.
-        residual: of these to the map's planes, m.
-        scale: by which the prediction was multiplied.
-        fused: points that moved Gaussians.
-        refined: candidates that were merged on the image plane.
-        new: candidates that became Gaussians.
-        num_gaussians: in the map after this frame.
-        overflow: splats that found their tile full.
-        seconds: of mapping (conversion and step), compilation included.
-        compile_seconds: of these.
-    """
-
-    index: int
-    name: str | None
-    timestamp: float | None
-    status: str
-    reason: str | None = None
-    pose: tuple[float, ...] | None = None
-    newest_pose: tuple[float, ...] | None = None
-    inliers: int | None = None
-    residual: float | None = None
-    scale: float | None = None
-    fused: int | None = None
-    refined: int | None = None
-    new: int | None = None
-    num_gaussians: int | None = None
-    overflow: int | None = None
-    seconds: float = 0.0
-    compile_seconds: float = 0.0
-
-
-@dataclass
-class MappingRun:
-    """A run as far as it is. It grows with each frame, so an interrupted one still holds what it has.
-
-    Args:
-        camera: of the frames.
-        config: all stages; capacities grow where they must.
-        clock: counts load, predict and map.
-        on_record: hears of each frame at once.
-        state: None before the first window.
-        records: of the frames in use, in order.
-        poses: T_world_camera (4, 4) of each record.
-        raw_poses: what the prior alone says, likewise; the pose before where it says none.
-        true_poses: None where unknown.
-    """
-
-    camera: Camera
-    config: SlamConfig
-    clock: Clock = field(default_factory=Clock)
-    on_record: Callable[[dict[str, Any]], None] = lambda record: None
-    state: SlamState | None = None
-    records: list[FrameRecord] = field(default_factory=list)
-    poses: list[np.ndarray] = field(default_factory=list)
-    raw_poses: list[np.ndarray] = field(default_factory=list)
-    true_poses: list[np.ndarray | None] = field(default_factory=list)
-
-
-def new_run(
-    dataset: Dataset,
-    config: SlamConfig,
-    clock: Clock | None = None,
-    on_record: Callable[[dict[str, Any]], None] = lambda record: None,
-) -> MappingRun:
-    """A run of `dataset` before its first frame."""
-    return MappingRun(to_camera(dataset), config, Clock() if clock is None else clock, on_record)
+Seconds = Mapping[str, float]  # as a `Timer` reads
 
 
 def predictions(
@@ -115,96 +43,112 @@ def predictions(
         yield prediction, frames
 
 
-def map_frames(run: MappingRun, dataset: Dataset, prior: Prior) -> Iterator[RawView]:
+@dataclass
+class _Group:
+    """Runs that one call of the step advances; where there are several, their states and configs are stacked."""
+
+    runs: Sequence[MappingRun]
+    configs: SlamConfig
+    states: SlamState | None = None
+
+    @property
+    def is_stacked(self) -> bool:
+        return len(self.runs) > 1
+
+    def start(self, window: FirstWindow, frames: list[Frame], converting: Seconds) -> None:
+        """Make the maps and record the frames that they are made from."""
+        timer, init = Timer(self.runs[0].clock), jitted_init_states if self.is_stacked else jitted_init_state
+        self.states, self.configs = start(window, self.runs[0].camera, self.configs, init)
+        self.hand_out()
+        spent = self._share(timer, converting)
+        for run in self.runs:
+            record_initialization(run, window, frames, spent)
+
+    def advance(self, prediction: Prediction, frame: Frame, converting: Seconds) -> None:
+        """Take one step and record it."""
+        timer, step = Timer(self.runs[0].clock), jitted_step_states if self.is_stacked else jitted_step
+        self.states, infos, self.configs = advance(self.states, prediction, self.runs[0].camera, self.configs, step)
+        infos = jax.device_get(infos)
+        if not self.is_stacked:  # a stack is taken apart at the end: nobody looks at one of its runs before
+            self.hand_out()
+        spent = self._share(timer, converting)
+        for position, run in enumerate(self.runs):
+            record_step(run, frame, self._item(infos, position), spent)
+
+    def hand_out(self) -> None:
+        """Give every run its own state and config."""
+        for position, run in enumerate(self.runs):
+            run.state, run.config = self._item((self.states, self.configs), position)
+
+    def _item(self, tree: Tree, position: int) -> Tree:
+        return jax.tree.map(lambda leaf: leaf[position], tree) if self.is_stacked else tree
+
+    def _share(self, timer: Timer, converting: Seconds) -> dict[str, float]:
+        """What a run would have spent by itself."""
+        return {name: converting.get(name, 0.0) + seconds / len(self.runs) for name, seconds in timer.read().items()}
+
+
+def map_frames(
+    runs: Sequence[MappingRun], dataset: Dataset, prior: Prior, at_once: int = 1, num_threads: int = 1
+) -> Iterator[RawView]:
     """Map a sequence; yields on the way what the prior alone says of each frame, for comparison.
 
-    The pose of the first frame is the true one where it is known, else the identity.
+    The pose of the first frame is the true one where it is known, else the identity. Frames are read, predicted and
+    converted once for all runs.
+
+    Args:
+        runs: before their first frame; several have to share a program (`sweep.programs`) and a clock.
+        dataset: of all of them.
+        prior: likewise.
+        at_once: runs that vmap steps together, which keeps an accelerator busy. With 1 every run takes the very
+            executable of `slam.step`, so its result does not depend on the others, bit for bit.
+        num_threads: such groups that are stepped side by side, which keeps the cores of a CPU busy.
     """
-    anchor = None
-    for prediction, frames in predictions(dataset, prior, run.config.window_size, run.clock):
-        anchor = first_pose(frames) if anchor is None else anchor
-        with run.clock.phase("map"):
-            if run.state is None:
-                _map_first_window(run, prediction, frames, anchor)
-            else:
-                _map_step(run, prediction, frames, anchor)
-        yield from raw_views(run, prediction, frames, anchor)
+    groups = []
+    for row in range(0, len(runs), at_once):
+        some = runs[row : row + at_once]
+        groups.append(_Group(some, stack([run.config for run in some]) if len(some) > 1 else some[0].config))
+    first, anchor, num_tasks = runs[0], None, 0
+    with ThreadPoolExecutor(num_threads) as threads:
+        for prediction, frames in predictions(dataset, prior, first.config.window_size, first.clock):
+            anchor = first_pose(frames) if anchor is None else anchor
+            with first.clock.phase("map"):
+                for task in _tasks(first, prediction, frames, anchor):
+                    # The first task makes the maps, the second is the first step: what one group compiles by itself
+                    # is there for the others. Later all are side by side.
+                    alone = 1 if num_tasks < 2 or len(groups) == 1 else 0
+                    for group in groups[:alone]:
+                        task(group)
+                    list(threads.map(task, groups[alone:]))
+                    num_tasks += 1
+            yield from raw_views(first, prediction, frames, anchor)
+    for group in groups:
+        group.hand_out()
+    for run in runs[1:]:
+        run.raw_poses = first.raw_poses
+
+
+def _tasks(
+    run: MappingRun, prediction: PriorPrediction, frames: Mapping[int, Frame], anchor: np.ndarray
+) -> Iterator[Callable[[_Group], None]]:
+    """What every group has to do with one prediction, which is converted here."""
+    timer = Timer(run.clock)
+    if prediction.window.inference > 0:
+        step = to_prediction(prediction, frames, anchor, run.config.observation)
+        converting = timer.read()
+        yield lambda group: group.advance(step, frames[prediction.window.current], converting)
+        return
+    window, following = opening(to_first_window(prediction, frames, anchor, run.config.observation), run.config)
+    converting, dense = timer.read(), [frames[index] for index in prediction.window.dense]
+    yield lambda group: group.start(window, dense, converting)
+    for frame, step in zip(dense[1:], following, strict=False):
+        yield lambda group, step=step, frame=frame: group.advance(step, frame, {})
 
 
 def first_pose(frames: Mapping[int, Frame]) -> np.ndarray:
     """T_world_camera of the anchor, (4, 4) float64; the identity where the truth is unknown."""
     truth = frames[0].T_world_camera
     return np.eye(4) if truth is None else np.asarray(truth, np.float64)
-
-
-def _map_first_window(
-    run: MappingRun, prediction: PriorPrediction, frames: Mapping[int, Frame], anchor: np.ndarray
-) -> None:
-    timer = Timer(run.clock)
-    window, following = opening(to_first_window(prediction, frames, anchor, run.config.observation), run.config)
-    run.state, run.config = start(window, run.camera, run.config)
-    dense = [frames[index] for index in prediction.window.dense]
-    record_initialization(run, window, dense, timer.read())
-    for frame, step in zip(dense[1:], following, strict=False):
-        _advance(run, step, frame, Timer(run.clock))
-
-
-def _map_step(run: MappingRun, prediction: PriorPrediction, frames: Mapping[int, Frame], anchor: np.ndarray) -> None:
-    timer = Timer(run.clock)
-    step = to_prediction(prediction, frames, anchor, run.config.observation)
-    _advance(run, step, frames[prediction.window.current], timer)
-
-
-def _advance(run: MappingRun, step: Prediction, frame: Frame, timer: "Timer") -> None:
-    run.state, info, run.config = advance(run.state, step, run.camera, run.config)
-    record_step(run, frame, jax.device_get(info), timer.read())
-
-
-def record_step(run: MappingRun, frame: Frame, info: StepInfo, spent: dict[str, float]) -> None:
-    """Add what a step did, `info` on the host, and the seconds that it took."""
-    _add(run, frame, _matrix(info.T_world_camera.wxyz_xyz), _described(info) | spent)
-
-
-def record_initialization(run: MappingRun, window: FirstWindow, frames: list[Frame], spent: dict[str, float]) -> None:
-    """Add the frames that the map of `run.state` was made from; raises ValueError where that map is empty."""
-    poses = np.asarray(window.T_world_views.wxyz_xyz)
-    count = int(np.asarray(run.state.map.gaussians.valid).sum())
-    if count == 0:  # no later frame could be localised in it
-        raise ValueError(
-            f"the map is empty after {len(poses)} view(s) from {frames[0].name}: the prior has no valid point there; "
-            "begin elsewhere (dataset.start=...) or use slam.initialization=merged"
-        )
-    for frame, pose in zip(frames, poses, strict=False):
-        described = {"status": "initialization", "pose": _tum(pose), "num_gaussians": count}
-        _add(run, frame, _matrix(pose), described | {key: value / len(poses) for key, value in spent.items()})
-
-
-def _add(run: MappingRun, frame: Frame, pose: np.ndarray, described: dict[str, Any]) -> None:
-    record = FrameRecord(frame.index, frame.name, frame.timestamp, **described)
-    run.records.append(record)
-    run.poses.append(pose)
-    run.true_poses.append(frame.T_world_camera)
-    run.on_record(asdict(record))
-
-
-def _described(info: StepInfo) -> dict[str, Any]:
-    """The fields of a record that a step fills; `info` is on the host."""
-    localization = info.localization
-    reasons = [words for bit, words in enumerate(REASONS) if int(localization.reason) >> bit & 1]
-    return {
-        "status": "tracked" if localization.is_tracked else "lost" if localization.is_lost else "degraded",
-        "reason": "; ".join(reasons) or None,
-        "pose": _tum(info.T_world_camera.wxyz_xyz),
-        "newest_pose": _tum(info.T_world_newest.wxyz_xyz),
-        "inliers": int(localization.icp.num_inliers),
-        "residual": float(localization.icp.residual),
-        "scale": float(localization.scale),
-        "fused": int(info.em.num_fused),
-        "refined": int(info.refinement.num_merged),
-        "new": int(info.refinement.num_fresh),
-        "num_gaussians": int(info.num_gaussians),
-        "overflow": int(info.overflow.tiles),
-    }
 
 
 def raw_views(
@@ -222,26 +166,3 @@ def raw_views(
             pose, mask = (run.raw_poses[-1] if run.raw_poses else anchor), np.zeros_like(mask)
         run.raw_poses.append(pose)
         yield prediction.points[row], mask, frames[index].image, pose
-
-
-class Timer:
-    """Seconds since it was made, and what of them was compilation."""
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock, self._begin, self._compiled = clock, perf_counter(), clock.compile_seconds
-
-    def read(self) -> dict[str, float]:
-        compiled = self._clock.compile_seconds - self._compiled
-        return {"seconds": perf_counter() - self._begin, "compile_seconds": compiled}
-
-
-def _matrix(wxyz_xyz: np.ndarray) -> np.ndarray:
-    """(4, 4) float64 of a pose as jaxlie holds it."""
-    pose, (w, x, y, z, *translation) = np.eye(4), np.asarray(wxyz_xyz, np.float64)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), translation
-    return pose
-
-
-def _tum(wxyz_xyz: np.ndarray) -> tuple[float, ...]:
-    w, x, y, z, *translation = (float(value) for value in np.asarray(wxyz_xyz))
-    return (*translation, x, y, z, w)

@@ -9,19 +9,24 @@ from typing import Any
 
 import numpy as np
 
+from emgs_jax.evaluation.columns import MAIN, Column, cell, markdown
 from emgs_jax.evaluation.heat_map import HeatMap, draw_heat_maps
 from emgs_jax.files import atomic_write, jsonable, write_json
 from emgs_jax.scoring import Metrics
 
 FORMAT, VERSION = "emgs_jax.sweep", 1
-SHOWN = (  # key, title, factor, digits, whether lower is better
-    ("trajectory/ate_sim3_m", "ATE [cm]", 100.0, 2, True),
-    ("reconstruction/accuracy_m", "accuracy [cm]", 100.0, 2, True),
-    ("reconstruction/completion_m", "completion [cm]", 100.0, 2, True),
-    ("reconstruction/f1_20cm_percent", "F1@.2 [%]", 1.0, 1, False),
-    ("reconstruction/f1_5cm_percent", "F1@.05 [%]", 1.0, 1, False),
-    ("reconstruction/normals_abs_cos_percent", "normals [%]", 1.0, 1, False),
-)
+_REMEDY = "make it again in another folder (hydra.run.dir=…), or move this one away"
+
+
+def read_sweep(path: Path) -> dict[str, Any]:
+    """A sweep.json of this version; any other raises ValueError."""
+    try:
+        sweep = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}): {_REMEDY}") from error
+    if not isinstance(sweep, dict) or (sweep.get("format"), sweep.get("version")) != (FORMAT, VERSION):
+        raise ValueError(f"{path} is not a sweep of version {VERSION}: {_REMEDY}")
+    return sweep
 
 
 class SweepResults:
@@ -41,17 +46,11 @@ class SweepResults:
             self._rows = {_key(row["setting"]): row for row in self._read()}
 
     def _read(self) -> list[dict[str, Any]]:
-        remedy = "choose another folder (hydra.run.dir=…)"
-        try:
-            old = json.loads(self.path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise ValueError(f"{self.path} is damaged ({error}): {remedy}") from error
-        if not isinstance(old, dict) or (old.get("format"), old.get("version")) != (FORMAT, VERSION):
-            raise ValueError(f"{self.path} is not a sweep of version {VERSION}: {remedy}")
+        old = read_sweep(self.path)
         for key in ("data", "prior", "config"):
             if old["provenance"][key] != self._header["provenance"][key]:
                 changed = _difference(old["provenance"][key], self._header["provenance"][key], key)
-                raise ValueError(f"{self.path} holds a sweep with {changed}: {remedy}")
+                raise ValueError(f"{self.path} holds a sweep with {changed}: {_REMEDY}")
         return old["settings"]
 
     def __contains__(self, setting: Mapping[str, Any]) -> bool:
@@ -95,20 +94,24 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def table(rows: Sequence[Mapping[str, Any]], axes: Sequence[str]) -> str:
     """Markdown with the values and main metrics of every row; the best of a column is bold."""
-    shown = [entry for entry in SHOWN if any(row.get(entry[0]) is not None for row in rows)]
+    shown = _shown(rows)
     best = {}
     for key, _, _, _, is_lower_better in shown:
         best[key] = (min if is_lower_better else max)(row[key] for row in rows if row.get(key) is not None)
-    lines = [[*axes, *(title for _, title, *_ in shown)]]
+    lines = []
     for row in rows:
         cells = [str(row[name]) for name in axes]
         for key, _, factor, digits, _ in shown:
             value = row.get(key)
-            text = "–" if value is None else f"{factor * value:.{digits}f}"
+            text = cell(value, None, factor, digits)
             cells.append(f"**{text}**" if value is not None and value == best[key] else text)
         lines.append(cells)
-    lines.insert(1, ["---"] * len(lines[0]))
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    return markdown([*axes, *(column.title for column in shown)], lines)
+
+
+def _shown(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
+    """The main metrics that some row has."""
+    return [column for column in MAIN if any(row.get(column.key) is not None for row in rows)]
 
 
 def draw(path: Path, rows: Sequence[Mapping[str, Any]], axes: Mapping[str, Sequence[Any]], title: str) -> str | None:
@@ -117,7 +120,7 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]], axes: Mapping[str, Seque
     Returns:
         None, or why there is no picture.
     """
-    shown = [entry for entry in SHOWN if any(row.get(entry[0]) is not None for row in rows)]
+    shown = _shown(rows)
     names = [name for name, values in axes.items() if len(values) > 1]
     if len(names) < 2 or not shown:
         return "a picture takes two axes with several values" if shown else "there is no ground truth to compare with"
@@ -126,10 +129,10 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]], axes: Mapping[str, Seque
     for key, metric, factor, digits, is_lower_better in shown:
         sums, counts = np.zeros((2, len(ticks[0]), len(ticks[1])))
         for row in rows:
-            cell = tuple(labels.index(str(row[name])) for labels, name in zip(ticks, names, strict=False))
+            at = tuple(labels.index(str(row[name])) for labels, name in zip(ticks, names, strict=False))
             if row.get(key) is not None:
-                sums[cell] += factor * row[key]
-                counts[cell] += 1
+                sums[at] += factor * row[key]
+                counts[at] += 1
         values = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
         maps.append(HeatMap(metric, values, digits, is_lower_better))
     if len(names) > 2:

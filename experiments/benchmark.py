@@ -48,7 +48,7 @@ def benchmark(config: DictConfig, folder: Path) -> list[Timing]:
         raise ValueError(f"parts must be some of {', '.join(known)}; got {', '.join(sorted(unknown)) or 'none'}")
     dataset = build_dataset(config)
     prior = build_prior(config, dataset)
-    about = provenance(OmegaConf.to_container(config, resolve=True), dataset, prior.provenance, 0)
+    about = provenance(OmegaConf.to_container(config, resolve=True), dataset, prior.provenance)
     timings: list[Timing] = []
     for name in tqdm(config.parts, unit="part", desc="timing"):
         timings += known[name]()

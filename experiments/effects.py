@@ -17,7 +17,8 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
-from emgs_jax.sweep_results import FORMAT, SHOWN, VERSION
+from emgs_jax.evaluation.columns import MAIN, Column, cell, markdown
+from emgs_jax.sweep_results import read_sweep
 from experiments.building import clear_errors
 
 
@@ -47,7 +48,7 @@ def read_effects(folder: str | Path, repetitions: Sequence[str]) -> list[Effect]
         raise ValueError(f"there is no sweep.json below {folder}: make some with experiments.sweep -m prior.seed=0,1,2")
     groups: dict[tuple[str, str], list[tuple]] = defaultdict(list)
     for path in paths:
-        sweep = _read(path)
+        sweep = read_sweep(path)
         groups[_described(sweep), _identity(sweep, repetitions)] += _differences(sweep, path)
     titles = [title for title, _ in groups]
     effects = []
@@ -55,16 +56,6 @@ def read_effects(folder: str | Path, repetitions: Sequence[str]) -> list[Effect]
         is_twice = titles.count(title) > 1  # the same data with another config, which no table must mix
         effects += _grouped(f"{title}, config {number}" if is_twice else title, found)
     return effects
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        sweep = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged ({error}): make it again") from error
-    if not isinstance(sweep, dict) or (sweep.get("format"), sweep.get("version")) != (FORMAT, VERSION):
-        raise ValueError(f"{path} is not a sweep of version {VERSION}: make it again or move it elsewhere")
-    return sweep
 
 
 def _described(sweep: Mapping[str, Any]) -> str:
@@ -116,39 +107,35 @@ def _grouped(data: str, found: Iterable[tuple[str | None, Any, Any, dict[str, fl
     yield from effects.values()
 
 
-def cell(numbers: Sequence[float], factor: float, digits: int, is_difference: bool) -> str:
+def spread(numbers: Sequence[float], factor: float, digits: int, is_difference: bool) -> str:
     """Mean ± standard deviation; a mean of differences is bold where all of at least three have its sign."""
-    if not numbers:
-        return "–"
-    sign = "+" if is_difference else ""
-    text = f"{factor * statistics.fmean(numbers):{sign}.{digits}f}"
-    if len(numbers) > 1:
-        text += f" ± {factor * statistics.stdev(numbers):.{digits}f}"
+    mean = statistics.fmean(numbers) if numbers else None
+    deviation = statistics.stdev(numbers) if len(numbers) > 1 else None
+    text = cell(mean, deviation, factor, digits, "+" if is_difference else "")
     agree = len(numbers) > 2 and (min(numbers) > 0 or max(numbers) < 0)
     return f"**{text}**" if is_difference and agree else text
 
 
-def columns(alignment: str) -> list[tuple]:
-    """`SHOWN` as the sweep's protocol aligns, or with the metrics after an SE(3) alignment in their place."""
+def columns(alignment: str) -> list[Column]:
+    """`MAIN` as the sweep's protocol aligns, or with the metrics after an SE(3) alignment in their place."""
     if alignment not in ("protocol", "se3"):
         raise ValueError(f"align must be protocol or se3, got {alignment!r}")
     if alignment == "protocol":
-        return list(SHOWN)
+        return list(MAIN)
     names = {"trajectory/ate_sim3_m": "trajectory/ate_se3_m"}
-    return [(names.get(key, key.replace("reconstruction/", "reconstruction_se3/")), *others) for key, *others in SHOWN]
+    other = {key: names.get(key, key.replace("reconstruction/", "reconstruction_se3/")) for key, *_ in MAIN}
+    return [column._replace(key=other[column.key]) for column in MAIN]
 
 
 def table(effects: Sequence[Effect], alignment: str = "protocol") -> str:
     """Markdown: for each sequence the metrics of its config, then what each changed value adds to them."""
-    shown = columns(alignment)
-    lines = [["data", "change", "runs", *(title for _, title, *_ in shown)]]
-    lines.append(["---"] * len(lines[0]))
+    shown, lines = columns(alignment), []
     for effect in effects:
         change = "unchanged" if effect.key is None else f"{effect.key}={effect.value} (from {effect.own})"
         runs = max(map(len, effect.metrics.values()), default=0)
-        numbers = [(effect.metrics.get(name, []), factor, digits) for name, _, factor, digits, _ in shown]
-        lines.append([effect.data, change, str(runs), *(cell(*entry, effect.key is not None) for entry in numbers)])
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+        numbers = [(effect.metrics.get(key, []), factor, digits) for key, _, factor, digits, _ in shown]
+        lines.append([effect.data, change, str(runs), *(spread(*entry, effect.key is not None) for entry in numbers)])
+    return markdown(["data", "change", "runs", *(column.title for column in shown)], lines)
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="effects")

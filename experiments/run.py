@@ -18,7 +18,8 @@ from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, raw_prior_cloud
 from emgs_jax.evaluation.report import print_metrics_table, provenance, write_metrics
 from emgs_jax.files import FrameLog
-from emgs_jax.pipeline import FrameRecord, MappingRun, map_frames, new_run
+from emgs_jax.mapping_run import FrameRecord, MappingRun, new_run
+from emgs_jax.pipeline import map_frames
 from emgs_jax.prior.base import Prior
 from experiments.building import build_dataset, build_prior, clear_errors, measured, use_compilation_cache
 
@@ -34,17 +35,18 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         raw_cloud = _map(session, dataset, prior, evaluation, folder)
         outputs.save_progress(folder, session)
         with clock.phase("densify"):
-            dense = outputs.dense_map(session, dataset, densify, evaluation.voxel_m)
+            labels = outputs.label_centers(session, prior)
+            dense = outputs.dense_map(session, dataset, densify, evaluation.voxel_m, labels)
         with clock.phase("export"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
             notes = outputs.save_outputs(folder, session, dense, densify, title)
         with clock.phase("evaluate"):
-            clouds = scoring.Clouds(dense.cloud, outputs.center_cloud(session), raw_cloud)
-            metrics = scoring.score(session, clouds, dataset, evaluation)
-        metrics |= scoring.describe(session, len(dataset.skipped)) | scoring.spent(clock) | measured(prior)
+            scorer = scoring.new_scorer(dataset, evaluation, prior)
+            metrics = scoring.score_map(session, dense.cloud, outputs.center_cloud(session), labels, scorer)
+            metrics |= scoring.score_prior(session, raw_cloud, scorer)
+        metrics |= scoring.describe(session, dataset) | scoring.spent(clock) | measured(prior)
     settings = OmegaConf.to_container(config, resolve=True)
-    seed = prior.provenance.settings.get("seed", 0)
-    metrics["provenance"] = provenance(settings, dataset, prior.provenance, seed)
+    metrics["provenance"] = provenance(settings, dataset, prior.provenance)
     write_metrics(folder / "metrics.json", metrics)
     for note in notes:
         tqdm.write(note)
@@ -67,7 +69,7 @@ def _map(
             log.append(vars(FrameRecord(index, None, None, "skipped", reason)))
         try:
             with session.clock.phase("raw_prior"):
-                return raw_prior_cloud(map_frames(session, dataset, prior), evaluation)
+                return raw_prior_cloud(map_frames([session], dataset, prior), evaluation)
         except BaseException:
             with contextlib.suppress(OSError, ValueError):  # the first error is the one to show
                 outputs.save_progress(folder, session)
@@ -82,8 +84,9 @@ def main(config: DictConfig) -> float:
         use_compilation_cache(config)
         metrics = run(config, folder)
     print(print_metrics_table(metrics) if "trajectory/num_frames" in metrics else "no ground truth, so no errors")
-    for key in (key for key in metrics if key.startswith("prior/")):
-        print(f"{key} {metrics[key]:.4g}")
+    for key, value in metrics.items():
+        if value is not None and (key.startswith("prior/") or key == "segmentation/miou_percent"):
+            print(f"{key} {value:.4g}")
     print(f"{metrics['time/seconds_per_frame']:.2f} s a frame; everything is in {folder}")
     error = metrics.get("trajectory/ate_sim3_m")
     return math.inf if error is None else error

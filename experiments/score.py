@@ -38,7 +38,7 @@ def score(config: DictConfig) -> tuple[Metrics, Path]:
     metrics = trajectory_metrics(poses, truth) | counts
     if cloud is not None:
         metrics |= compare(cloud, (poses, truth), dataset, evaluation)
-    block = provenance(settings, dataset, Provenance(config.method, {}, config.simulated), 0)
+    block = provenance(settings, dataset, Provenance(config.method, {}, config.simulated))
     metrics["provenance"] = block | {"prior": None, "method": config.method}
     folder.mkdir(parents=True, exist_ok=True)
     write_metrics(folder / METRICS_FILE, metrics)
@@ -48,7 +48,7 @@ def score(config: DictConfig) -> tuple[Metrics, Path]:
 def matched_poses(
     path: str, dataset: ReadableFrames, max_difference: float
 ) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
-    """Poses of the file and true poses of the same times (n, 4, 4), and how many there are of which."""
+    """Poses of the file and true poses of the same times (n, 4, 4), and how many of either there are in all."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"trajectory={path} does not exist: give a file with `timestamp tx ty tz qx qy qz qw`")
     times, poses = load_trajectory_tum(path)
@@ -69,6 +69,21 @@ def matched_poses(
     return poses[rows], truth, {"score/num_poses": len(times), "score/num_frames": len(known)}
 
 
+def coverage(metrics: Metrics, min_percent: float) -> str:
+    """Say how many poses and frames the numbers are about, with a warning where that are few of the frames."""
+    matched, frames = metrics["trajectory/num_frames"], metrics["score/num_frames"]
+    percent = 100.0 * matched / frames
+    text = f"{matched} of {metrics['score/num_poses']} poses are associated with true poses, which is {percent:.0f} % "
+    text += f"of the {frames} selected frames that have one"
+    if percent >= min_percent:
+        return text
+    return (
+        f"{text}\nwarning: that is less than {min_percent:g} %, so the system used other frames than the ones that are "
+        "selected or lost many, and its numbers must not be set beside ours: choose its frames (dataset.start, stop, "
+        "stride), and check the timestamps (max_time_difference)"
+    )
+
+
 def compare(
     cloud: PointCloud, poses: tuple[np.ndarray, np.ndarray], dataset: ReadableFrames, evaluation: EvaluationConfig
 ) -> Metrics:
@@ -86,8 +101,8 @@ def main(config: DictConfig) -> None:
     with clear_errors():
         metrics, path = score(config)
     print(full_table(average(estimates_of(path), each_sequence=True)))
-    counts = [metrics[key] for key in ("trajectory/num_frames", "score/num_poses", "score/num_frames")]
-    print(f"{counts[0]} of {counts[1]} poses belong to one of the {counts[2]} frames; everything is in {path}")
+    print(coverage(metrics, config.min_matched_percent))
+    print(f"everything is in {path}")
 
 
 if __name__ == "__main__":

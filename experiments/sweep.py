@@ -25,12 +25,12 @@ from emgs_jax.clock import Clock
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import raw_prior_cloud
 from emgs_jax.evaluation.report import provenance
-from emgs_jax.pipeline import new_run
+from emgs_jax.mapping_run import new_run
+from emgs_jax.pipeline import map_frames
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.sweep import programs
 from emgs_jax.sweep_results import SweepResults, draw, table, write_csv
-from emgs_jax.sweep_run import Scorer, map_settings, score_settings
 from experiments.building import build_dataset, build_prior, clear_errors, use_compilation_cache
 from experiments.grid import Variant, notes, read_axes, variants
 
@@ -39,11 +39,11 @@ NOT_OF_RESULTS = ("axes", "grid", "chunk", "at_once", "compilation_cache")  # ke
 
 @dataclass(frozen=True)
 class Work:
-    """What all settings share; `at_once` and `num_threads` as in `map_settings`."""
+    """What all settings share; `at_once` and `num_threads` as in `map_frames`."""
 
     dataset: ReadableFrames
     prior: Prior
-    scorer: Scorer
+    scorer: scoring.Scorer
     clock: Clock
     at_once: int
     num_threads: int
@@ -62,7 +62,7 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
         results = SweepResults(folder, _provenance(config, dataset, prior))
         left = [variant for variant in grid if variant.setting not in results]
         chunks = _chunks(left, config.chunk)
-        scorer = _scorer(dataset, config) if chunks else None
+        scorer = scoring.new_scorer(dataset, instantiate(config.evaluation), prior) if chunks else None
         with _replayed(prior, dataset, chunks, folder / "predictions") as priors, _bar(dataset, chunks) as bar:
             for chunk in chunks:
                 window_size = chunk[0].slam.window_size
@@ -83,7 +83,7 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
 def _provenance(config: DictConfig, dataset: ReadableFrames, prior: Prior) -> dict[str, Any]:
     plain = OmegaConf.to_container(config, resolve=True)
     shared = {key: value for key, value in plain.items() if key not in NOT_OF_RESULTS}
-    return provenance(shared, dataset, prior.provenance, prior.provenance.settings.get("seed", 0))
+    return provenance(shared, dataset, prior.provenance)
 
 
 def _chunks(left: Sequence[Variant], size: int) -> list[list[Variant]]:
@@ -105,13 +105,6 @@ def _side_by_side(config: DictConfig, size: int) -> tuple[int, int]:
     """
     is_cpu = jax.default_backend() == "cpu"
     return config.at_once or (1 if is_cpu else size), os.cpu_count() if is_cpu else 1
-
-
-def _scorer(dataset: ReadableFrames, config: DictConfig) -> Scorer:
-    evaluation = instantiate(config.evaluation)
-    has_truth = any(dataset[row].T_world_camera is not None for row in range(len(dataset)))
-    truth = scoring.true_cloud(dataset, evaluation) if has_truth else None
-    return Scorer(dataset, evaluation, truth, len(dataset.skipped))
 
 
 @contextmanager
@@ -138,9 +131,11 @@ def _bar(dataset: ReadableFrames, chunks: Sequence[Sequence[Variant]]) -> tqdm:
 
 def _map_and_score(work: Work, chunk: Sequence[Variant], bar: tqdm) -> list[scoring.Metrics]:
     runs = [new_run(work.dataset, variant.slam, work.clock, lambda record: bar.update()) for variant in chunk]
-    views = map_settings(runs, work.dataset, work.prior, work.at_once, work.num_threads)
+    views = map_frames(runs, work.dataset, work.prior, work.at_once, work.num_threads)
     raw_cloud = raw_prior_cloud(views, work.scorer.evaluation)
-    return score_settings(runs, raw_cloud, [variant.densify for variant in chunk], work.scorer, work.num_threads)
+    return scoring.score_settings(
+        runs, raw_cloud, [variant.densify for variant in chunk], work.scorer, work.num_threads
+    )
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="sweep")

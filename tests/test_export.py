@@ -161,6 +161,17 @@ def test_written_points_are_read_by_trimesh_and_open3d(tmp_path):
     np.testing.assert_allclose(np.asarray(cloud.colors), colors / 255.0, atol=1e-9)
 
 
+def test_labels_are_a_property_of_the_points_and_the_header_names_the_classes(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    points = np.arange(9.0).reshape(3, 3)
+    points[1] = np.nan  # left out, with its label
+    save_points_ply(tmp_path / "p.ply", points, points, np.zeros((3, 3)), np.array([4, 5, -1]), ("wall", "sofä"))
+    cloud = trimesh.load(tmp_path / "p.ply")
+    np.testing.assert_array_equal(cloud.metadata["_ply_raw"]["vertex"]["data"]["label"].ravel(), [4, -1])
+    header = (tmp_path / "p.ply").read_bytes().split(b"end_header")[0]
+    assert b"comment label 0 wall\ncomment label 1 sof?\n" in header
+
+
 def test_a_mesh_of_an_open_sphere_lies_on_it_stays_open_and_is_the_same_twice(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     rng = np.random.default_rng(4)

@@ -15,9 +15,10 @@ from emgs_jax.clock import Clock
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import ground_truth_cloud
 from emgs_jax.export import load_map_npz, load_trajectory_tum
+from emgs_jax.mapping_run import new_run
 from emgs_jax.outputs import dense_map, save_outputs, save_progress
-from emgs_jax.pipeline import map_frames, new_run, predictions
-from emgs_jax.scoring import Clouds, score
+from emgs_jax.pipeline import map_frames, predictions
+from emgs_jax.scoring import new_scorer, score_map, score_prior
 
 
 @cache
@@ -170,7 +171,8 @@ def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
     assert save_outputs(tmp_path, blind, dense, config, "blind") == []
     names = {"map.ply", "points.ply", "mesh.ply", "overview.png"}
     assert {path.name for path in tmp_path.iterdir()} == names
-    assert score(blind, Clouds(dense.cloud, dense.cloud, dense.cloud), dataset(), None) == {}
+    scorer = new_scorer(dataset(), hydra.utils.instantiate(compose().evaluation), EditedPrior())
+    assert score_map(blind, dense.cloud, dense.cloud, None, scorer) == score_prior(blind, dense.cloud, scorer) == {}
 
 
 @pytest.mark.slow
@@ -195,7 +197,7 @@ def test_the_map_does_not_start_at_the_origin_but_at_the_first_true_pose_and_at_
             return super().predict(window, [dataset()[index] for index in window.views], intrinsics)
 
     session = new_run(Blind(dataset()), exact()[0].config)
-    for _ in map_frames(session, Blind(dataset()), Knowing()):
+    for _ in map_frames([session], Blind(dataset()), Knowing()):
         pass
     origin = np.linalg.inv(dataset()[0].T_world_camera)
     expected = np.stack([origin @ pose for pose in exact()[0].poses])

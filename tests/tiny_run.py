@@ -8,7 +8,8 @@ from pathlib import Path
 import hydra
 
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.pipeline import MappingRun, map_frames, new_run
+from emgs_jax.mapping_run import MappingRun, new_run
+from emgs_jax.pipeline import map_frames
 from emgs_jax.prior.base import PriorPrediction
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -40,6 +41,7 @@ class EditedPrior:
     def __init__(self, edit: Callable[[PriorPrediction], PriorPrediction] = lambda prediction: prediction) -> None:
         self._prior = hydra.utils.instantiate(compose("prior.level=0").prior, classes=list(dataset().classes))
         self._edit, self.provenance = edit, self._prior.provenance
+        self.feature_names, self.text_features = self._prior.feature_names, self._prior.text_features
 
     def check(self, dataset, window_size) -> None:
         pass
@@ -67,6 +69,6 @@ def map_tiny(frames, prior, *overrides: str) -> tuple[MappingRun, list]:
     maps = []
     session = new_run(frames, hydra.utils.instantiate(compose(*overrides).slam))
     session.on_record = lambda record: maps.append(session.state.map)
-    for _ in map_frames(session, frames, prior):
+    for _ in map_frames([session], frames, prior):
         pass
     return session, maps

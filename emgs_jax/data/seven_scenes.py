@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from emgs_jax.data import reading
+from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.data.reading import Intrinsics, Number, Size
 
@@ -141,10 +142,7 @@ def register(depth: Float32[np.ndarray, "_ _"], intrinsics: Intrinsics, size: Si
 
 def color_camera_points(depth: Float32[np.ndarray, "h w"]) -> Float[np.ndarray, "p 3"]:
     """Points of the valid pixels of the depth camera in the colour camera's axes, metres."""
-    fx, fy, cx, cy = DEPTH_INTRINSICS
-    v, u = np.nonzero(depth > NEAR)
-    z = depth[v, u]
-    points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=-1)
+    points = backproject(depth, DEPTH_INTRINSICS)[depth > NEAR]
     # einsum, as a threaded matmul of this shape waits for its threads when the machine is busy
     points = np.einsum("pj,ij->pi", points, T_COLOR_DEPTH[:3, :3]) + T_COLOR_DEPTH[:3, 3]
     return points[points[:, 2] > NEAR]

@@ -80,22 +80,21 @@ def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     return fuse_clouds([cloud], voxel)
 
 
-def register(points: np.ndarray, target: np.ndarray, max_distance: float, max_steps: int) -> Alignment:
-    """Find the rigid motion of points (n, 3) onto a target (m, 3) by point-to-point ICP (Besl and McKay 1992).
+def register(points: np.ndarray, target: cKDTree, max_distance: float, max_steps: int) -> Alignment:
+    """Find the rigid motion of points (n, 3) onto those of a tree by point-to-point ICP (Besl and McKay 1992).
 
     Pairs are nearest points within `max_distance` [m]; ends when they stay the same. With fewer than 3 pairs nothing
     holds the cloud: it stays where it is.
     """
     found, known = Alignment(1.0, np.eye(3), np.zeros(3)), np.empty(0)
-    if not len(target):
+    if not target.n:
         return found
-    tree = cKDTree(target)
     for _ in range(max_steps):
-        distances, partners = tree.query(found.apply(points), distance_upper_bound=max_distance, workers=-1)
+        distances, partners = target.query(found.apply(points), distance_upper_bound=max_distance, workers=-1)
         near = np.isfinite(distances)
         if near.sum() < 3 or np.array_equal(partners, known):
             return found
-        found, known = align(points[near], target[partners[near]], with_scale=False), partners
+        found, known = align(points[near], target.data[partners[near]], with_scale=False), partners
     return found
 
 

@@ -7,9 +7,12 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
+from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.files import atomic_write
 
 _ESTIMATE, _TRUTH, _INK = "#e4572e", "#1b998b", "#333333"
@@ -17,30 +20,34 @@ _ESTIMATE, _TRUTH, _INK = "#e4572e", "#1b998b", "#333333"
 
 def draw_overview(
     path: str | os.PathLike,
-    points: np.ndarray,
-    colors: np.ndarray,
+    cloud: PointCloud,
     trajectories: tuple[np.ndarray, np.ndarray | None],
     frames: Sequence[Mapping[str, Any]],
     title: str,
+    classes: Sequence[str] = (),
 ) -> None:
     """Draw the picture and write it as PNG.
 
     Args:
-        points: (n, 3), metres, in the frame of the trajectories.
-        colors: (n, 3), RGB in [0, 1].
+        cloud: in the frame of the trajectories.
         trajectories: estimated T_world_camera (n, 4, 4), and the true ones in the same frame or None.
         frames: about four, each with `image` uint8 (h, w, 3), `rendered_color` float (h, w, 3), `rendered_depth`
-            float (h, w) in metres, `valid` bool (h, w), where it is known, and `title`.
+            float (h, w) in metres, `valid` bool (h, w), where it is known, `title`, and with classes `labels`,
+            int (h, w), -1 = none.
         title: of the whole picture.
+        classes: names of the labels.
     """
     estimate, truth = (None if poses is None else np.asarray(poses, np.float64) for poses in trajectories)
     figure = Figure(figsize=(16, max(6.0, 0.8 + 2.05 * len(frames))), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=13, color=_INK)
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.05)) if frames else (figure, None)
-    _draw_map(left.subplots(), (np.asarray(points), np.asarray(colors)), estimate, truth)
+    _draw_map(left.subplots(), cloud, estimate, truth)
     if right is not None:
-        _draw_frames(right.subplots(len(frames), 3, squeeze=False), frames)
+        grid = right.subplots(len(frames), 4 if classes else 3, squeeze=False)
+        _draw_frames(grid[:, [0, 1, -1]], frames)
+        if classes:
+            _draw_labels(grid[:, 2], frames, classes)
     with atomic_write(path) as handle:
         figure.savefig(handle, format="png", dpi=110)
 
@@ -93,11 +100,11 @@ def fill_holes(image: np.ndarray) -> np.ndarray:
     return image
 
 
-def _draw_map(axes: Axes, cloud: tuple[np.ndarray, np.ndarray], estimate: np.ndarray, truth: np.ndarray | None) -> None:
+def _draw_map(axes: Axes, cloud: PointCloud, estimate: np.ndarray, truth: np.ndarray | None) -> None:
     rotation = view_from_above(estimate)
     path = estimate[:, :3, 3] @ rotation.T
-    finite = np.isfinite(cloud[0]).all(1)
-    points, colors = cloud[0][finite] @ rotation.T, cloud[1][finite].clip(0.0, 1.0)
+    finite = np.isfinite(cloud.points).all(1)
+    points, colors = cloud.points[finite] @ rotation.T, cloud.colors[finite].clip(0.0, 1.0)
     if len(points):
         seen = below_ceiling(points[:, 2], path[:, 2])
         # Far flying points must not shrink the room to a dot.
@@ -158,10 +165,34 @@ def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]]) -> None:
         row[2].set_facecolor("#dddddd")
         row[0].set_ylabel(str(frame["title"]), fontsize=10, color=_INK)
         for axes in row:
-            axes.set_xticks([])
-            axes.set_yticks([])
-            axes.spines[:].set_visible(False)
+            _bare(axes)
     for axes, title in zip(grid[0], ("input", "rendered colour", "rendered depth"), strict=True):
         axes.set_title(title, fontsize=11, color=_INK)
     bar = grid[0, 0].figure.colorbar(mappable, ax=grid[:, 2].tolist(), shrink=0.6, aspect=30, label="depth [m]")
     bar.outline.set_visible(False)
+
+
+def _draw_labels(column: np.ndarray, frames: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> None:
+    """The classes of some frames, and a legend of those that are seen."""
+    colors = class_colors(len(classes))
+    for axes, frame in zip(column, frames, strict=True):
+        labels = np.asarray(frame["labels"])
+        axes.imshow(np.where((labels >= 0)[..., None], colors[labels], 0.867), interpolation="nearest")
+        _bare(axes)
+    column[0].set_title("labels", fontsize=11, color=_INK)
+    seen = sorted({int(label) for frame in frames for label in np.unique(frame["labels"]) if label >= 0})
+    handles = [Patch(color=colors[label], label=classes[label]) for label in seen]
+    column[-1].figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
+
+
+def class_colors(count: int) -> np.ndarray:
+    """RGB in [0, 1] (count, 3): hues a golden section apart, alternately dark and light."""
+    number = np.arange(count)
+    light = number % 2
+    return hsv_to_rgb(np.stack([0.618034 * number % 1.0, 0.8 - 0.3 * light, 0.65 + 0.3 * light], -1).reshape(count, 3))
+
+
+def _bare(axes: Axes) -> None:
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.spines[:].set_visible(False)

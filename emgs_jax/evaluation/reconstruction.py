@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, register, transform_cloud, voxel_downsample
 from emgs_jax.evaluation.trajectory import align_poses
@@ -32,6 +33,7 @@ class EvaluationConfig:
     max_normal_gap: float  # relative inverse-depth step to a tap of the normal's window
     max_normal_residual: float  # relative inverse-depth distance of a tap from the fitted plane
     min_normal_taps: int
+    label_neighbours: int  # a true point takes the most frequent label of so many nearest points of the map
 
     def __post_init__(self):
         object.__setattr__(self, "f1_thresholds_m", tuple(float(value) for value in self.f1_thresholds_m))
@@ -98,56 +100,82 @@ def ground_truth_cloud(
     return fuse_clouds(clouds(), config.voxel_m)
 
 
-def backproject(depth: np.ndarray, intrinsics: tuple[float, float, float, float]) -> np.ndarray:
-    """Camera-frame points (h, w, 3) of a depth image (h, w); pixel centres at integers."""
-    fx, fy, cx, cy = intrinsics
-    v, u = np.indices(depth.shape)
-    return np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], -1)
+@dataclass(frozen=True)
+class Reference:
+    """The true cloud as a protocol compares with it, made once for all estimates.
+
+    Args:
+        cloud: averaged per voxel.
+        tree: of its points.
+        icp_tree: of the points that ICP takes; None where the protocol has none.
+    """
+
+    cloud: PointCloud
+    tree: cKDTree
+    icp_tree: cKDTree | None
+
+
+def reference(truth: PointCloud, config: EvaluationConfig) -> Reference:
+    """Prepare a true cloud for comparisons under `config`, with either alignment."""
+    cloud = voxel_downsample(truth, config.voxel_m)
+    icp_tree = cKDTree(voxel_downsample(truth, config.icp_voxel_m).points) if config.icp_distance_m > 0 else None
+    return Reference(cloud, _tree(cloud.points), icp_tree)
 
 
 def compare_clouds(
-    cloud: PointCloud, truth: PointCloud, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
+    cloud: PointCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
 ) -> dict[str, float | int | str | None]:
-    """Bring the estimate's cloud into the frame of the truth, then measure how far they are apart.
-
-    The alignment is that of the poses, estimated and true (n, 4, 4); what they left open stands in
-    `reconstruction/alignment_note`, see `align_poses`. ICP, where the protocol has it, then moves the cloud rigidly.
-    """
-    alignment, note = align_poses(*poses, with_scale=config.alignment == "sim3")
-    aligned = transform_cloud(cloud, alignment)
-    if config.icp_distance_m > 0:
-        source, target = (voxel_downsample(rows, config.icp_voxel_m).points for rows in (aligned, truth))
-        aligned = transform_cloud(aligned, register(source, target, config.icp_distance_m, config.icp_max_steps))
+    """Bring the estimate's cloud into the frame of the truth, then measure how far they are apart."""
+    aligned, note = align_cloud(cloud, truth, poses, config)
     return reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
 
 
+def align_cloud(
+    cloud: PointCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
+) -> tuple[PointCloud, str | None]:
+    """Bring the estimate's cloud into the frame of the truth; what the poses left open is noted, see `align_poses`.
+
+    The alignment is that of the poses, estimated and true (n, 4, 4). ICP, where the protocol has it, then moves the
+    cloud rigidly.
+    """
+    alignment, note = align_poses(*poses, with_scale=config.alignment == "sim3")
+    aligned = transform_cloud(cloud, alignment)
+    if truth.icp_tree is not None:
+        source = voxel_downsample(aligned, config.icp_voxel_m).points
+        aligned = transform_cloud(
+            aligned, register(source, truth.icp_tree, config.icp_distance_m, config.icp_max_steps)
+        )
+    return aligned, note
+
+
 def reconstruction_metrics(
-    estimate: PointCloud, truth: PointCloud, config: EvaluationConfig
+    estimate: PointCloud, truth: Reference, config: EvaluationConfig
 ) -> dict[str, float | int | str | None]:
     """Compare two clouds in one frame; flat keys, metres and percent.
 
-    Both clouds are averaged per voxel first. Accuracy (estimate → truth) and completion (truth → estimate) are the
+    Both clouds are averaged per voxel. Accuracy (estimate → truth) and completion (truth → estimate) are the
     protocol's statistic of the distances to the nearest point; unless it clips them, one far outlier counts in full.
     The normal metrics take the nearest neighbours' |cos| and average both directions. Without points the values are
     None, with a reason.
     """
-    estimate, truth = voxel_downsample(estimate, config.voxel_m), voxel_downsample(truth, config.voxel_m)
+    estimate, true = voxel_downsample(estimate, config.voxel_m), truth.cloud
     metrics: dict[str, float | int | str | None] = dict.fromkeys(_metric_names(config))
     metrics["reconstruction/num_points"] = len(estimate)
-    if not len(estimate) or not len(truth):
+    if not len(estimate) or not len(true):
         which = "estimate" if not len(estimate) else "ground truth"
         metrics["reconstruction/reason"] = f"the {which} has no points"
         return metrics
     rng = np.random.default_rng(0)  # one for both: equally long clouds must not keep the same rows
-    estimate, truth = _chosen(estimate, config.max_points, rng), _chosen(truth, config.max_points, rng)
-    to_truth, partner = _nearest(estimate.points, truth.points)
-    to_estimate, back = _nearest(truth.points, estimate.points)
+    estimate, true = _chosen(estimate, config.max_points, rng), _chosen(true, config.max_points, rng)
+    tree = truth.tree if true is truth.cloud else _tree(true.points)
+    to_truth, partner = tree.query(estimate.points, workers=-1)
+    to_estimate, back = _tree(estimate.points).query(true.points, workers=-1)
     values = [_average(distances, config) for distances in (to_truth, to_estimate)]
     for threshold in config.f1_thresholds_m:
         precision, recall = 100.0 * np.mean(to_truth <= threshold), 100.0 * np.mean(to_estimate <= threshold)
         f1 = 2.0 * precision * recall / max(precision + recall, 1e-12)
         values += [float(f1), float(precision), float(recall)]
-    both = [_abs_cosines(estimate.normals, truth.normals[partner]), _abs_cosines(truth.normals, estimate.normals[back])]
+    both = [_abs_cosines(estimate.normals, true.normals[partner]), _abs_cosines(true.normals, estimate.normals[back])]
     if all(len(cosines) for cosines in both):
         limit = np.cos(np.radians(config.max_normal_angle_deg))
         values.append(100.0 * float(np.mean([cosines.mean() for cosines in both])))
@@ -178,9 +206,9 @@ def _metric_names(config: EvaluationConfig) -> list[str]:
     return [f"reconstruction/{name}" for name in names]
 
 
-def _nearest(queries: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _tree(points: np.ndarray) -> cKDTree:
     # Without balancing and compacting the tree is built, and here even searched, in half the time.
-    return cKDTree(points, balanced_tree=False, compact_nodes=False).query(queries, workers=-1)
+    return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def _abs_cosines(normals: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -11,21 +11,14 @@ from typing import Any
 import jax
 
 from emgs_jax.data.base import Dataset
+from emgs_jax.evaluation.columns import MAIN, cell
 from emgs_jax.files import write_json
 from emgs_jax.prior.base import Provenance
 
 RESULT_FORMAT = 1  # of metrics.json; another one is refused where results are read
 RAW_PRIOR = "raw_prior/"  # prefix of the same metrics for the prior without any mapping
-_GROUPS = ("trajectory/", "reconstruction/", "map/", "time/")
+_GROUPS = ("trajectory/", "reconstruction/", "segmentation/", "map/", "time/")
 _ROWS = (("", "ours"), (RAW_PRIOR, "raw prior"))
-_COLUMNS = (  # title, key, digits
-    ("ATE [m]", "trajectory/ate_sim3_m", 4),
-    ("accuracy [m]", "reconstruction/accuracy_m", 4),
-    ("completion [m]", "reconstruction/completion_m", 4),
-    ("F1@.2 [%]", "reconstruction/f1_20cm_percent", 1),
-    ("F1@.05 [%]", "reconstruction/f1_5cm_percent", 1),
-    ("normals [%]", "reconstruction/normals_abs_cos_percent", 1),
-)
 _PACKAGES = {
     "jax": ("jax",),
     "jaxlib": ("jaxlib",),
@@ -38,7 +31,7 @@ _PACKAGES = {
 }
 
 
-def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance, seed: int) -> dict[str, Any]:
+def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -> dict[str, Any]:
     """Say where a result comes from: the block that stands in every result file."""
     device = jax.devices()[0]
     return {
@@ -47,7 +40,7 @@ def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance, s
         "simulated": prior.is_simulated,
         "prior": {"name": prior.name, "settings": prior.settings},
         "data": {"name": dataset.name, "sequence": dataset.sequence, "fingerprint": dataset.fingerprint()},
-        "seed": seed,
+        "seed": prior.settings.get("seed", 0),
         "git": git_revision(Path(__file__).resolve().parents[2]),
         "versions": {"python": platform.python_version()} | {k: _version(names) for k, names in _PACKAGES.items()},
         "device": {"kind": device.device_kind, "backend": device.platform, "cpu_count": os.cpu_count()},
@@ -79,20 +72,15 @@ def write_metrics(path: str | os.PathLike, metrics: Mapping[str, Any]) -> None:
 
 def print_metrics_table(metrics: Mapping[str, Any]) -> str:
     """Lay out the main metrics, one row for the map and one for the raw prior; `–` where there is no value."""
-    titles = [title for title, _, _ in _COLUMNS]
     is_simulated = metrics.get("provenance", {}).get("simulated", False)
-    lines = [["simulated" if is_simulated else "", *titles]]
+    lines = [["simulated" if is_simulated else "", *(column.title for column in MAIN)]]
     for prefix, name in _ROWS:
-        if any(prefix + key in metrics for _, key, _ in _COLUMNS):
-            lines.append([name, *(_cell(metrics.get(prefix + key), digits) for _, key, digits in _COLUMNS)])
-    widths = [max(len(line[column]) for line in lines) for column in range(len(titles) + 1)]
+        if any(prefix + column.key in metrics for column in MAIN):
+            values = [(metrics.get(prefix + key), None, factor, digits) for key, _, factor, digits, _ in MAIN]
+            lines.append([name, *(cell(*value) for value in values)])
+    widths = [max(map(len, texts)) for texts in zip(*lines, strict=True)]
     rows = ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines]
     return "\n".join([rows[0], "─" * max(map(len, rows)), *rows[1:]])
-
-
-def _cell(value: float | None, digits: int) -> str:
-    is_number = isinstance(value, int | float) and value == value
-    return f"{value:.{digits}f}" if is_number else "–"
 
 
 def _rank(key: str) -> tuple[int, int]:

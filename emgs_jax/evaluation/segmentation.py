@@ -4,10 +4,54 @@ Classes are 0 … c - 1; any other number is no class. A confusion matrix is int
 columns predicted ones, and the last column counts points without an answer. Matrices of several scenes are added.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+
+from emgs_jax.data.backprojection import backproject
+from emgs_jax.data.base import Dataset, Frame
+
+
+@dataclass(frozen=True)
+class LabelledPoints:
+    """Points with a class each.
+
+    Args:
+        points: (n, 3), metres.
+        labels: (n,), position in `classes`; any other number is no class.
+        classes: their names.
+    """
+
+    points: np.ndarray
+    labels: np.ndarray
+    classes: tuple[str, ...]
+
+
+def true_labels(frames: Iterable[Frame], dataset: Dataset, voxel: float, max_depth: float) -> LabelledPoints | None:
+    """A point for every class that is seen in a voxel [m] of the world: its centre; None without labels."""
+    cells = []
+    for frame in frames:
+        if frame.labels is not None and frame.depth is not None and frame.T_world_camera is not None:
+            known = (frame.labels >= 0) & (frame.depth > 0) & (frame.depth <= max_depth)
+            points = backproject(frame.depth, dataset.intrinsics)[known]
+            index = np.floor((points @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]) / voxel)
+            cells.append(_distinct(np.column_stack([index, frame.labels[known]]).astype(np.int64)))
+    if not cells:
+        return None
+    rows = _distinct(np.concatenate(cells))
+    return LabelledPoints((rows[:, :3] + 0.5) * voxel, rows[:, 3], tuple(dataset.classes))
+
+
+def compare_labels(found: LabelledPoints, truth: LabelledPoints, num_neighbours: int) -> dict[str, float | int | None]:
+    """Segmentation metrics of points in the frame of the truth; classes are the same where their names are."""
+    number = {name: position for position, name in enumerate(truth.classes)}
+    # A class that the truth does not know is a wrong answer, not a missing one: it takes part in the vote.
+    positions = np.array([number.get(name, len(number)) for name in found.classes], np.int64)
+    labels = np.where(found.labels >= 0, positions[found.labels], -1)
+    predicted = transfer_labels(found.points, labels, truth.points, num_neighbours)
+    return segmentation_metrics(confusion_matrix(truth.labels, predicted, len(truth.classes)))
 
 
 def transfer_labels(points: np.ndarray, labels: np.ndarray, targets: np.ndarray, num_neighbours: int) -> np.ndarray:
@@ -58,3 +102,9 @@ def segmentation_metrics(confusion: np.ndarray, ignored: Collection[int] = ()) -
     iou, recall = right[counts] / union[counts], right[counts] / np.maximum(true[counts], 1)
     values = iou.mean(), np.average(iou, weights=true[counts]), recall.mean(), right.sum() / true.sum()
     return metrics | {f"segmentation/{name}_percent": 100.0 * float(v) for name, v in zip(names, values, strict=True)}
+
+
+def _distinct(rows: np.ndarray) -> np.ndarray:
+    """Each row (n, 4) once; as `np.unique` along an axis, in a fifth of its time."""
+    rows = rows[np.lexsort(rows.T)]
+    return rows[np.append(True, (np.diff(rows, axis=0) != 0).any(1))] if len(rows) else rows

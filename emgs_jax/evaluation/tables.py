@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from emgs_jax.evaluation.columns import DASH, MAIN, Column, cell, markdown
 from emgs_jax.evaluation.results import Estimate
 
 _PAPER_DATASETS = {"seven_scenes": "7-Scenes", "tum": "TUM"}
@@ -19,16 +20,12 @@ _PAPER_COLUMNS = (  # title, key, digits; the order of the paper's Table II
     ("Normals [%]", "reconstruction/normals_abs_cos_percent", 1),
     ("Scale [%]", "trajectory/scale_percent", 1),
 )
-_COLUMNS = (  # title, key, factor
-    ("ATE Sim(3) [cm]", "trajectory/ate_sim3_m", 100.0),
-    ("ATE SE(3) [cm]", "trajectory/ate_se3_m", 100.0),
-    ("Acc [cm]", "reconstruction/accuracy_m", 100.0),
-    ("Comp [cm]", "reconstruction/completion_m", 100.0),
-    ("F1@.2 [%]", "reconstruction/f1_20cm_percent", 1.0),
-    ("F1@.05 [%]", "reconstruction/f1_5cm_percent", 1.0),
-    ("Normals [%]", "reconstruction/normals_abs_cos_percent", 1.0),
-    ("Scale [%]", "trajectory/scale_percent", 1.0),
-    ("s a frame", "time/seconds_per_frame", 1.0),
+_COLUMNS = (
+    MAIN[0]._replace(title="ATE Sim(3) [cm]"),
+    Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True),
+    *MAIN[1:],
+    Column("trajectory/scale_percent", "scale [%]", 1.0, 1, False),
+    Column("time/seconds_per_frame", "s a frame", 1.0, 2, True),
 )
 _NOTES = """
 Sequences × seeds: ours is the mean over sequences, ± the deviation over seeds. F1 at .2 m; Normals: mean |cos|; Scale:
@@ -36,7 +33,6 @@ Sequences × seeds: ours is the mean over sequences, ± the deviation over seeds
 says nothing about a network and must not be compared with quoted rows. Quoted rows are not measured here and are means
 over seq-01 of seven scenes (7-Scenes) and nine sequences of freiburg1 (TUM).
 """
-_DASH = "–"
 
 
 @dataclass(frozen=True)
@@ -105,12 +101,12 @@ def paper_table(rows: Sequence[Row], published: Sequence[Mapping[str, Any]]) -> 
     for (kind, variant, source, protocol), members in methods.items():
         found = [(_PAPER_DATASETS[key], members[key]) for key in _PAPER_DATASETS if key in members]
         runs = "; ".join(f"{name} {len(row.sequences)} × {len(row.seeds)}" for name, row in found)
-        cells = [cell for key in _PAPER_DATASETS for cell in _paper_cells(members.get(key))]
+        cells = [text for key in _PAPER_DATASETS for text in _paper_cells(members.get(key))]
         lines.append([f"{kind}, {variant}", source, protocol, runs, *cells])
     for row in published:
-        cells = [_DASH if value is None else f"{value:g}" for key in _PAPER_DATASETS for value in row[key]]
-        lines.append([row["method"], f"quoted: {row['source']}", row["protocol"], _DASH, *cells])
-    return _markdown(["method", "source", "protocol", "sequences × seeds", *titles], lines) + _NOTES
+        cells = [DASH if value is None else f"{value:g}" for key in _PAPER_DATASETS for value in row[key]]
+        lines.append([row["method"], f"quoted: {row['source']}", row["protocol"], DASH, *cells])
+    return markdown(["method", "source", "protocol", "sequences × seeds", *titles], lines) + _NOTES
 
 
 def full_table(rows: Sequence[Row]) -> str:
@@ -118,11 +114,13 @@ def full_table(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows:
         sequences = row.sequences[0] if len(row.sequences) == 1 else f"mean of {len(row.sequences)}"
-        cells = [_cell(row, key, factor, 2 if key.startswith("time/") else 1) for _, key, factor in _COLUMNS]
+        cells = [
+            cell(row.values.get(key), row.spreads.get(key), factor, digits) for key, _, factor, digits, _ in _COLUMNS
+        ]
         what = [row.dataset, sequences, f"{row.kind}, {row.variant}", _source(row), row.protocol]
         lines.append([*what, str(len(row.seeds)), *cells])
-    titles = ["data set", "sequence", "method", "source", "protocol", "seeds", *(title for title, _, _ in _COLUMNS)]
-    return _markdown(titles, lines)
+    titles = ["data set", "sequence", "method", "source", "protocol", "seeds", *(column.title for column in _COLUMNS)]
+    return markdown(titles, lines)
 
 
 def _row(what: tuple, members: list[Estimate]) -> Row:
@@ -149,18 +147,7 @@ def _source(row: Row) -> str:
 
 def _paper_cells(row: Row | None) -> list[str]:
     if row is None:
-        return [_DASH] * len(_PAPER_COLUMNS)
+        return [DASH] * len(_PAPER_COLUMNS)
     alignment = row.protocol.rsplit("/", 1)[-1]
-    return [_cell(row, key.format(alignment=alignment), 1.0, digits) for _, key, digits in _PAPER_COLUMNS]
-
-
-def _cell(row: Row, key: str, factor: float, digits: int) -> str:
-    mean, spread = row.values.get(key), row.spreads.get(key)
-    if mean is None:
-        return _DASH
-    return f"{factor * mean:.{digits}f}" + ("" if spread is None else f" ± {factor * spread:.{digits}f}")
-
-
-def _markdown(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    rows = [titles, ["---"] * len(titles), *lines]
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+    keys = [(key.format(alignment=alignment), digits) for _, key, digits in _PAPER_COLUMNS]
+    return [cell(row.values.get(key), row.spreads.get(key), 1.0, digits) for key, digits in keys]

@@ -17,6 +17,7 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.camera import Camera
+from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.prior.base import PriorPrediction, Provenance, Window
 from emgs_jax.prior.incremental import StructureConfig, extend, initialize
@@ -95,7 +96,7 @@ class MultiviewStereo:
             initialize(self._structure, self._camera, self._num_views, self._structure_config)
         else:
             extend(self._structure, self._camera, self._num_views, self._structure_config)
-        return self._answer(window)
+        return self._answer(window, intrinsics)
 
     def _begin(self, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
         height, width = frames[0].image.shape[:2]
@@ -124,7 +125,7 @@ class MultiviewStereo:
         self._structure.views[frame.index] = detect(gray, self._structure_config.matching)
         link(self._structure, frame.index, self._structure_config.matching)
 
-    def _answer(self, window: Window) -> PriorPrediction:
+    def _answer(self, window: Window, intrinsics: Sequence[float]) -> PriorPrediction:
         views = [self._structure.views[frame] for frame in window.views]
         for frame in window.dense:
             if frame not in self._depths or not self._depths[frame].any():  # it may have been placed since
@@ -132,16 +133,14 @@ class MultiviewStereo:
         confidence = np.stack([self._confidence(frame) for frame in window.dense])
         depth = np.stack([self._depths[frame] for frame in window.dense])
         mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_agreeing)
-        depth = np.where(mask, depth, 0.0)
-        rays = np.dstack([*np.meshgrid(np.arange(depth.shape[2]), np.arange(depth.shape[1])), np.ones(depth.shape[1:])])
-        points = (rays @ np.linalg.inv(self._structure.K).T)[None] * depth[..., None]
-        features = np.zeros((*depth.shape, 0), np.float16)
+        points = backproject(np.where(mask, depth, 0.0), intrinsics).astype(np.float32)
+        features = np.zeros((*mask.shape, 0), np.float16)
         T_anchor_view = np.full((len(views), 4, 4), np.nan)
         T_anchor_view[0] = np.eye(4)  # also where nothing else is known
         for row, view in enumerate(views[1:], start=1):
             if views[0].T_ref_view is not None and view.T_ref_view is not None:
                 T_anchor_view[row] = np.linalg.inv(views[0].T_ref_view) @ view.T_ref_view
-        return PriorPrediction(window, T_anchor_view, points.astype(np.float32), confidence, mask, features)
+        return PriorPrediction(window, T_anchor_view, points, confidence, mask, features)
 
     def _depth(self, frame: int) -> np.ndarray:
         """Depth (h, w) of a view, 0 where it is not known."""

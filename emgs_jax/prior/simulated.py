@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.prior.base import PriorPrediction, Provenance, Window
 from emgs_jax.prior.noise import Stream, autoregressive, edge_band, normals, rigid, shared_normals, smooth_field
@@ -129,10 +130,7 @@ class Simulated:
         ratio = np.divide(flown, depth, out=np.ones_like(depth), where=mask)
         confidence = self._confidence(inference, frame.index, np.abs(np.log(ratio) + log_change), near_edge)
         disturbed = flown.astype(np.float64) * np.exp(log_change) * scale
-        fx, fy, cx, cy = intrinsics
-        v, u = np.indices(depth.shape)
-        points = np.stack([(u - cx) / fx * disturbed, (v - cy) / fy * disturbed, disturbed], axis=-1)
-        return points.astype(np.float32), confidence, mask
+        return backproject(disturbed, intrinsics).astype(np.float32), confidence, mask
 
     def _log_noise(self, inference: int, index: int, shape: tuple[int, int]) -> np.ndarray:
         """Return warp plus pixel noise of the log depth at level 1, float32 (h, w)."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, register, voxel_downsample
@@ -47,7 +48,7 @@ def test_registration_takes_the_steps_of_open3ds_point_to_point_icp(num_steps):
     target = rng.uniform(-1, 1, (800, 3))
     motion = Rotation.from_rotvec([0.05, -0.02, 0.03]).as_matrix()
     points = target[:500] @ motion.T + [0.02, -0.03, 0.01] + 0.01 * rng.normal(size=(500, 3))
-    found = register(points, target, 0.15, num_steps)
+    found = register(points, cKDTree(target), 0.15, num_steps)
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(rows)) for rows in (points, target)]
     criteria = registration.ICPConvergenceCriteria(0.0, 0.0, num_steps)
     expected = registration.registration_icp(*clouds, 0.15, np.eye(4), criteria=criteria).transformation
@@ -58,5 +59,5 @@ def test_registration_takes_the_steps_of_open3ds_point_to_point_icp(num_steps):
 def test_registration_without_pairs_moves_nothing():
     points = np.random.default_rng(6).uniform(size=(20, 3))
     for target in (points + 100.0, points[:0]):
-        found = register(points, target, 0.1, 10)
+        found = register(points, cKDTree(target), 0.1, 10)
         np.testing.assert_array_equal(found.apply(points), points)

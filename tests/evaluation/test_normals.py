@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scene import evaluation_config
 
-from emgs_jax.evaluation.reconstruction import backproject, window_normals
+from emgs_jax.data.backprojection import backproject
+from emgs_jax.evaluation.reconstruction import window_normals
 
 CONFIG = evaluation_config()
 INTRINSICS = (110.0, 95.0, 61.0, 47.0)  # fx ≠ fy, centre not in the middle

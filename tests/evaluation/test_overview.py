@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.evaluation.overview import below_ceiling, draw_overview, fill_holes, paint_from_above, view_from_above
+from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.evaluation.overview import (
+    below_ceiling,
+    class_colors,
+    draw_overview,
+    fill_holes,
+    paint_from_above,
+    view_from_above,
+)
 
 
 def path_along(direction, n=5):
@@ -74,7 +82,8 @@ def test_the_picture_shows_floor_and_paths_and_is_the_same_twice(tmp_path, num_f
     frame |= {"rendered_depth": depth, "valid": np.ones((24, 32), bool), "title": "frame 0"}
     for name in ("a.png", "b.png"):
         paths = (poses, poses + 0.0 if has_truth else None)
-        draw_overview(tmp_path / name, points, colors, paths, [frame] * num_frames, "a run")
+        cloud = PointCloud(points, np.zeros_like(points), colors)
+        draw_overview(tmp_path / name, cloud, paths, [frame] * num_frames, "a run")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     image = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
     assert min(image.shape[:2]) > 500
@@ -85,3 +94,25 @@ def test_the_picture_shows_floor_and_paths_and_is_the_same_twice(tmp_path, num_f
     assert (share((0, 0, 255)) > 0.1) == (num_points > 0)
     assert share((228, 87, 46)) > 1e-4
     assert (share((27, 153, 139)) > 1e-4) == has_truth
+
+
+def test_labels_are_drawn_in_the_colours_of_their_classes_with_a_legend_of_those_that_are_seen(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    labels, depth = np.full((24, 32), 2), np.full((24, 32), 2.0)
+    labels[:, 16:] = -1
+    frame = {"image": np.zeros((24, 32, 3), np.uint8), "rendered_color": np.zeros((24, 32, 3)), "labels": labels}
+    frame |= {"rendered_depth": depth, "valid": np.ones((24, 32), bool), "title": "frame 0"}
+    cloud = PointCloud(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)))
+    path = tmp_path / "a.png"
+    draw_overview(path, cloud, (path_along([1.0, -0.5, 0.0]), None), [frame] * 2, "a run", ("wall", "floor", "chair"))
+    image = cv2.imread(str(path))[..., ::-1].astype(int)
+    shares = [np.all(np.abs(image - 255 * color) <= 3, axis=-1) for color in class_colors(3)]
+    assert [bool(share.sum() > 50) for share in shares] == [False, False, True]
+    rows = np.nonzero(shares[2].any(1))[0]
+    assert rows.max() > 0.9 * len(image)  # the legend is below the frames
+
+
+def test_colours_of_many_classes_differ():
+    colors = class_colors(40)
+    distance = np.linalg.norm(colors[:, None] - colors[None], axis=-1)
+    assert distance[~np.eye(40, dtype=bool)].min() > 0.02 and colors.min() >= 0.0 and colors.max() <= 1.0

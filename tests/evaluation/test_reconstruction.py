@@ -8,14 +8,15 @@ import pytest
 from scene import evaluation_config
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import PointCloud, transform_cloud
 from emgs_jax.evaluation.reconstruction import (
-    backproject,
     compare_clouds,
     ground_truth_cloud,
     raw_prior_cloud,
     reconstruction_metrics,
+    reference,
 )
 from emgs_jax.evaluation.trajectory import Alignment
 
@@ -72,7 +73,7 @@ def test_protocols_and_alignments_are_options_and_each_names_itself():
 
 def test_a_cloud_against_itself_is_perfect():
     cloud = random_cloud(np.random.default_rng(0))
-    metrics = reconstruction_metrics(cloud, cloud, CONFIG)
+    metrics = reconstruction_metrics(cloud, reference(cloud, CONFIG), CONFIG)
     assert metrics["reconstruction/accuracy_m"] == metrics["reconstruction/completion_m"] == 0.0
     percents = [value for key, value in metrics.items() if key.endswith("percent")]
     assert len(percents) == 8
@@ -83,7 +84,7 @@ def test_parallel_planes_differ_by_their_distance():
     """10 cm apart: inside the 20 cm threshold, outside the 5 cm one; normals agree up to sign."""
     estimate = grid_cloud(0.1)
     estimate = dataclasses.replace(estimate, normals=-estimate.normals)
-    metrics = reconstruction_metrics(estimate, grid_cloud(), CONFIG)
+    metrics = reconstruction_metrics(estimate, reference(grid_cloud(), CONFIG), CONFIG)
     np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 0.1, rtol=1e-9)
     np.testing.assert_allclose(metrics["reconstruction/completion_m"], 0.1, rtol=1e-9)
     assert metrics["reconstruction/f1_20cm_percent"] == 100.0
@@ -97,7 +98,7 @@ def test_normals_that_are_turned_by_known_angles_agree_by_their_cosines():
     truth = grid_cloud()
     angles = np.radians(np.where(np.arange(len(truth)) % 2, 40.0, 20.0))
     turned = np.stack([np.sin(angles), np.zeros_like(angles), np.cos(angles)], 1)
-    metrics = reconstruction_metrics(dataclasses.replace(truth, normals=turned), truth, CONFIG)
+    metrics = reconstruction_metrics(dataclasses.replace(truth, normals=turned), reference(truth, CONFIG), CONFIG)
     expected = 50 * (np.cos(np.radians(20.0)) + np.cos(np.radians(40.0)))
     np.testing.assert_allclose(metrics["reconstruction/normals_abs_cos_percent"], expected, rtol=1e-9)
     assert metrics["reconstruction/normals_within_30deg_percent"] == 50.0
@@ -107,7 +108,8 @@ def test_half_a_plane_has_full_precision_and_half_the_recall():
     truth = grid_cloud()
     left = truth.points[:, 0] < 1.0
     half = PointCloud(truth.points[left], truth.normals[left], truth.colors[left])
-    metrics = reconstruction_metrics(half, truth, dataclasses.replace(CONFIG, f1_thresholds_m=(0.01,)))
+    config = dataclasses.replace(CONFIG, f1_thresholds_m=(0.01,))
+    metrics = reconstruction_metrics(half, reference(truth, config), config)
     assert metrics["reconstruction/precision_1cm_percent"] == 100.0
     assert metrics["reconstruction/recall_1cm_percent"] == 50.0
     np.testing.assert_allclose(metrics["reconstruction/f1_1cm_percent"], 200.0 / 3.0)
@@ -120,7 +122,7 @@ def test_one_far_outlier_counts_in_full():
     truth = grid_cloud()
     points = np.concatenate([truth.points, [[0.003, 0.003, 1600.003]]])
     estimate = PointCloud(points, np.zeros_like(points), np.zeros_like(points))
-    metrics = reconstruction_metrics(estimate, truth, CONFIG)
+    metrics = reconstruction_metrics(estimate, reference(truth, CONFIG), CONFIG)
     np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 1600.0 / 1601.0, rtol=1e-9)
 
 
@@ -128,7 +130,7 @@ def test_distances_and_normals_are_those_of_brute_force():
     rng = np.random.default_rng(1)
     estimate, truth = random_cloud(rng, 300), random_cloud(rng, 200)
     config = dataclasses.replace(CONFIG, voxel_m=1e-4)
-    metrics = reconstruction_metrics(estimate, truth, config)
+    metrics = reconstruction_metrics(estimate, reference(truth, config), config)
     distances = np.linalg.norm(estimate.points[:, None] - truth.points[None], axis=-1)
     cosines = np.abs(estimate.normals @ truth.normals.T)
     there, back = distances.argmin(1), distances.argmin(0)
@@ -151,8 +153,9 @@ def test_metrics_follow_a_similarity_of_both_clouds():
     move = Alignment(2.0, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
     small = dataclasses.replace(CONFIG, voxel_m=1e-4, f1_thresholds_m=(0.1,))
     large = dataclasses.replace(CONFIG, voxel_m=1e-4, f1_thresholds_m=(0.2,))
-    before = list(reconstruction_metrics(estimate, truth, small).values())
-    after = list(reconstruction_metrics(transform_cloud(estimate, move), transform_cloud(truth, move), large).values())
+    before = list(reconstruction_metrics(estimate, reference(truth, small), small).values())
+    moved = transform_cloud(estimate, move), reference(transform_cloud(truth, move), large)
+    after = list(reconstruction_metrics(*moved, large).values())
     np.testing.assert_allclose(after[:2], 2.0 * np.array(before[:2]), rtol=1e-6)
     np.testing.assert_allclose(after[2:], before[2:], rtol=1e-6)
 
@@ -160,12 +163,12 @@ def test_metrics_follow_a_similarity_of_both_clouds():
 def test_empty_clouds_and_unknown_normals_give_null_with_a_reason():
     empty = PointCloud(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)))
     truth = grid_cloud()
-    for estimate, reference, word in ((empty, truth, "estimate"), (truth, empty, "ground truth")):
-        metrics = reconstruction_metrics(estimate, reference, CONFIG)
+    for estimate, true, word in ((empty, truth, "estimate"), (truth, empty, "ground truth")):
+        metrics = reconstruction_metrics(estimate, reference(true, CONFIG), CONFIG)
         assert metrics["reconstruction/accuracy_m"] is None
         assert word in metrics["reconstruction/reason"]
     blank = dataclasses.replace(truth, normals=np.zeros_like(truth.points))
-    metrics = reconstruction_metrics(blank, truth, CONFIG)
+    metrics = reconstruction_metrics(blank, reference(truth, CONFIG), CONFIG)
     assert metrics["reconstruction/accuracy_m"] == 0.0
     assert metrics["reconstruction/normals_abs_cos_percent"] is None
     assert metrics["reconstruction/reason"] == "no normals to compare"
@@ -199,12 +202,12 @@ def test_a_cloud_is_aligned_by_the_poses_with_scale_or_without():
     cloud, half = random_cloud(rng), poses.copy()
     half[:, :3, 3] *= 0.5
     estimate = dataclasses.replace(cloud, points=0.5 * cloud.points)
-    metrics = compare_clouds(estimate, cloud, (half, poses), CONFIG)
+    metrics = compare_clouds(estimate, reference(cloud, CONFIG), (half, poses), CONFIG)
     assert metrics["reconstruction/alignment_note"] is None
     np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 0.0, atol=1e-12)
     kept = dataclasses.replace(estimate, points=estimate.points + 0.5 * poses[:, :3, 3].mean(0))
     rigid = evaluation_config("alignment=se3")
-    metrics = compare_clouds(estimate, kept, (half, poses), rigid)
+    metrics = compare_clouds(estimate, reference(kept, rigid), (half, poses), rigid)
     np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 0.0, atol=1e-12)
 
 
@@ -220,7 +223,7 @@ def test_distances_are_those_of_open3d_as_mean_and_as_clipped_rmse():
         (exact, np.mean),
         (clipped, lambda values: np.sqrt(np.mean(np.minimum(values, 0.1) ** 2))),
     ):
-        metrics = reconstruction_metrics(estimate, truth, config)
+        metrics = reconstruction_metrics(estimate, reference(truth, config), config)
         for name, values in zip(("accuracy_m", "completion_m"), distances, strict=True):
             np.testing.assert_allclose(metrics[f"reconstruction/{name}"], average(values), rtol=1e-6)
         # what the distances are clipped to does not touch the F1
@@ -236,10 +239,11 @@ def test_icp_of_a_protocol_takes_back_a_small_motion_that_the_poses_do_not_show(
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, :3, 3] = rng.normal(size=(5, 3))
     moved = transform_cloud(truth, small)
-    without = compare_clouds(moved, truth, (poses, poses), CONFIG)
+    without = compare_clouds(moved, reference(truth, CONFIG), (poses, poses), CONFIG)
     refined = dataclasses.replace(CONFIG, icp_distance_m=0.1, icp_voxel_m=1e-4)
     assert without["reconstruction/accuracy_m"] > 0.01
-    assert compare_clouds(moved, truth, (poses, poses), refined)["reconstruction/accuracy_m"] < 1e-9
+    found = compare_clouds(moved, reference(truth, refined), (poses, poses), refined)
+    assert found["reconstruction/accuracy_m"] < 1e-9
 
 
 def test_true_depth_beyond_the_limit_of_a_protocol_is_left_out():
@@ -253,7 +257,7 @@ def test_true_depth_beyond_the_limit_of_a_protocol_is_left_out():
 def test_a_protocol_compares_a_random_choice_of_points_that_is_the_same_each_time():
     """Of two parallel planes every choice has the precision of the whole; the distances grow with the gaps."""
     few = dataclasses.replace(CONFIG, max_points=400)
-    first, second = (reconstruction_metrics(grid_cloud(0.1), grid_cloud(), few) for _ in range(2))
+    first, second = (reconstruction_metrics(grid_cloud(0.1), reference(grid_cloud(), few), few) for _ in range(2))
     assert first == second
     assert first["reconstruction/num_points"] == 1600
     assert 0.1 < first["reconstruction/accuracy_m"] < 0.12

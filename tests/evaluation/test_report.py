@@ -37,16 +37,16 @@ class ADataset:
 
 
 def a_provenance(is_simulated):
-    prior = Provenance("simulated", {"level": 1}, is_simulated)
-    return provenance({"evaluation": {"protocol": "paper"}, "seed": 7}, ADataset(), prior, 7)
+    prior = Provenance("simulated", {"level": 1, "seed": 7}, is_simulated)
+    return provenance({"evaluation": {"protocol": "paper"}}, ADataset(), prior)
 
 
 def test_provenance_names_protocol_config_data_seed_code_and_machine():
     block = a_provenance(True)
     assert (block["protocol"], block["seed"], block["simulated"]) == ("paper", 7, True)
-    assert block["config"] == {"evaluation": {"protocol": "paper"}, "seed": 7}
+    assert block["config"] == {"evaluation": {"protocol": "paper"}}
     assert block["data"] == {"name": "synthetic", "sequence": "room-0", "fingerprint": "abc123"}
-    assert block["prior"] == {"name": "simulated", "settings": {"level": 1}}
+    assert block["prior"] == {"name": "simulated", "settings": {"level": 1, "seed": 7}}
     versions = block["versions"]
     assert set(versions) == {"python", "jax", "jaxlib", "numpy", "optimistix", "equinox", "open3d", "cv2", "emgs_jax"}
     assert (versions["jax"], versions["numpy"]) == (jax.__version__, np.__version__)
@@ -98,9 +98,9 @@ def test_metrics_are_strict_json_ours_first_then_the_raw_prior_then_provenance(t
 def test_the_table_shows_both_rows_and_says_what_is_simulated():
     metrics = METRICS | prefixed(METRICS, RAW_PRIOR) | {"raw_prior/trajectory/ate_sim3_m": 1.5}
     table = print_metrics_table(metrics | {"provenance": a_provenance(True)}).splitlines()
-    assert table[0].split()[:3] == ["simulated", "ATE", "[m]"]
-    assert table[2].split() == ["ours", "0.0412", "0.0500", "–", "98.8", "–", "88.0"]
-    assert table[3].split() == ["raw", "prior", "1.5000", "0.0500", "–", "98.8", "–", "88.0"]
+    assert table[0].split()[:3] == ["simulated", "ATE", "[cm]"]
+    assert table[2].split() == ["ours", "4.12", "5.00", "–", "98.8", "–", "88.0"]
+    assert table[3].split() == ["raw", "prior", "150.00", "5.00", "–", "98.8", "–", "88.0"]
     assert len({len(line) for line in table}) == 1
     alone = print_metrics_table(METRICS | {"provenance": a_provenance(False)})
     assert "simulated" not in alone

@@ -113,7 +113,8 @@ def test_quoted_rows_stand_only_beside_results_of_their_data_sets(tmp_path):
     write_result(tmp_path, 1.0, dataset="synthetic", sequence="room0")
     rows = average(read_estimates(tmp_path), each_sequence=False)
     assert paper_table(rows, PUBLISHED) == ""
-    assert "| synthetic | room0 | ours, default | **simulated** | paper/sim3 | 1 | 100.0 | 200.0 |" in full_table(rows)
+    line = "| synthetic | room0 | ours, default | **simulated** | paper/sim3 | 1 | 100.00 | 200.00 |"
+    assert line in full_table(rows)
 
 
 def test_another_system_is_no_run_of_ours(tmp_path):

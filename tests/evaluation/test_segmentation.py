@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from emgs_jax.evaluation.segmentation import confusion_matrix, segmentation_metrics, transfer_labels
+from emgs_jax.data.base import Frame
+from emgs_jax.evaluation.segmentation import (
+    LabelledPoints,
+    compare_labels,
+    confusion_matrix,
+    segmentation_metrics,
+    transfer_labels,
+    true_labels,
+)
 
 #                predicted: 0  1  2  none
 CONFUSION = np.array([[6, 2, 0, 2], [1, 3, 1, 0], [0, 0, 0, 0]])
@@ -67,3 +75,41 @@ def test_a_target_takes_the_most_frequent_label_of_its_neighbours():
         assert label == values[counts.argmax()]  # values ascend: the smallest of the most frequent
     assert (transfer_labels(points, np.full(200, -1), targets, 5) == -1).all()
     np.testing.assert_array_equal(transfer_labels(targets[:1], np.array([3]), targets, 5), 3)
+
+
+class Planes:
+    """A camera one metre above the plane z = 1 of its own axes; the left half is of class 0, the right of class 1."""
+
+    classes, intrinsics, shape = ("left", "right"), (20.0, 20.0, 9.5, 9.5), (20, 20)
+
+    def frame(self, offset: float, depth: float = 1.0) -> Frame:
+        pose = np.eye(4)
+        pose[0, 3] = offset
+        labels = np.repeat([[0] * 10 + [1] * 10], 20, axis=0).astype(np.int32)
+        labels[0] = -1
+        image = np.zeros((*self.shape, 3), np.uint8)
+        return Frame(0, 0.0, "f", image, np.full(self.shape, depth, np.float32), pose, labels)
+
+
+def test_true_points_are_the_voxels_that_a_class_is_seen_in_each_once():
+    room = Planes()
+    truth = true_labels([room.frame(0.0), room.frame(0.0), room.frame(0.0, depth=9.0)], room, 0.05, max_depth=5.0)
+    assert truth.classes == room.classes and np.unique(np.column_stack([truth.points, truth.labels]), axis=0).shape == (
+        380,
+        4,
+    )  # 19 rows of 20 pixels of 5 cm, seen twice
+    np.testing.assert_allclose(truth.points[:, 2], 1.025)
+    np.testing.assert_array_equal(truth.labels, truth.points[:, 0] > 0)
+    moved = true_labels([room.frame(3.0)], room, 0.05, 5.0)
+    np.testing.assert_array_equal(moved.labels, moved.points[:, 0] > 3.0)
+    assert true_labels([], room, 0.05, 5.0) is None
+
+
+def test_classes_are_compared_by_their_names_and_one_that_the_truth_lacks_is_wrong():
+    room = Planes()
+    truth = true_labels([room.frame(0.0)], room, 0.05, 5.0)
+    found = LabelledPoints(truth.points, 2 - truth.labels, ("lamp", "right", "left"))
+    assert compare_labels(found, truth, 1)["segmentation/miou_percent"] == 100.0
+    lost = LabelledPoints(truth.points, np.where(truth.labels == 0, 0, 1), ("lamp", "right"))
+    metrics = compare_labels(lost, truth, 1)
+    assert (metrics["segmentation/miou_percent"], metrics["segmentation/accuracy_percent"]) == (50.0, 50.0)

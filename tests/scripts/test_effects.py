@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from emgs_jax.sweep_results import SweepResults
-from experiments.effects import cell, read_effects, table
+from experiments.effects import read_effects, spread, table
 
 REPETITIONS = ["prior.seed", "dataset.start"]
 ATE, F1 = "trajectory/ate_sim3_m", "reconstruction/f1_5cm_percent"
@@ -68,7 +68,7 @@ def test_the_se3_table_shows_the_metrics_of_that_alignment(tmp_path):
     ],
 )
 def test_a_difference_is_bold_where_three_repetitions_agree_on_its_sign(numbers, text):
-    assert cell(numbers, 100.0, 1, is_difference=True) == text
+    assert spread(numbers, 100.0, 1, is_difference=True) == text
 
 
 @pytest.mark.parametrize(

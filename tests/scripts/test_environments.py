@@ -52,7 +52,8 @@ import sys
 import hydra
 from experiments import run  # everything that a run imports
 from experiments.building import build_dataset, build_prior
-from emgs_jax.pipeline import new_run, predictions
+from emgs_jax.mapping_run import new_run
+from emgs_jax.pipeline import predictions
 from emgs_jax.data.convert import to_first_window
 import numpy as np
 

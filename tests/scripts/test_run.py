@@ -37,6 +37,8 @@ PHASES = ("setup", "load", "predict", "map", "raw_prior", "densify", "export", "
 KEYS = {
     *COMPARED,
     *(f"raw_prior/{name}" for name in COMPARED),
+    *(f"segmentation/{name}_percent" for name in ("miou", "fmiou", "mean_recall", "accuracy")),
+    "segmentation/num_points",
     *(f"reconstruction_{kind}/{name}" for kind in ("se3", "centers") for name in RECONSTRUCTION),
     *(f"frames/{name}" for name in ("tracked", "degraded", "lost", "initialization", "skipped", "overflow")),
     *(f"time/{name}_seconds" for name in PHASES),
@@ -70,6 +72,21 @@ def test_metrics_json_has_exactly_the_promised_keys():
     written = json.loads((folder / "metrics.json").read_text())
     assert set(written) == KEYS
     assert written["provenance"]["simulated"] is True and written["provenance"]["config"]["prior"]["level"] == 0
+
+
+@pytest.mark.slow
+def test_the_labels_of_the_points_are_the_true_ones_where_prior_and_features_are_exact():
+    """But for the borders of objects, where a Gaussian is as large as the parts."""
+    folder, metrics = exact_run()
+    assert metrics["segmentation/accuracy_percent"] > 90.0
+    header, body = (folder / "points.ply").read_bytes().split(b"end_header\n", 1)
+    names = [line.split(b" ", 3)[3].decode() for line in header.splitlines() if line.startswith(b"comment label ")]
+    assert tuple(names) == dataset().classes
+    fields = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+    points = np.frombuffer(body, fields + [(name, "u1") for name in ("red", "green", "blue")] + [("label", "<i4")])
+    assert set(np.unique(points["label"])) <= set(range(len(names)))
+    is_floor = points["label"] == names.index("floor")
+    assert is_floor.sum() > 100 and np.abs(points["z"][is_floor]).mean() < 0.1  # the room stands on z = 0
 
 
 @pytest.mark.slow

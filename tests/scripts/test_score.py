@@ -12,7 +12,7 @@ from emgs_jax.evaluation.results import read_estimates
 from emgs_jax.evaluation.tables import average, full_table
 from emgs_jax.evaluation.trajectory import Alignment
 from emgs_jax.export import save_points_ply, save_trajectory_tum
-from experiments.score import score
+from experiments.score import coverage, score
 
 SIMILARITY = Alignment(0.4, Rotation.from_rotvec([0.3, -1.2, 0.5]).as_matrix(), np.array([3.0, -1.0, 7.0]))
 
@@ -72,7 +72,15 @@ def test_keyframes_are_matched_by_time_and_a_trajectory_alone_is_enough(tmp_path
     metrics, _ = scored(trajectory, out)
     assert metrics["trajectory/num_frames"] == 4 and metrics["trajectory/ate_sim3_m"] < 1e-6
     assert (metrics["score/num_poses"], metrics["score/num_frames"]) == (5, NUM_FRAMES)
+    assert coverage(metrics, 90).startswith("4 of 5 poses are associated with true poses, which is 67 % of the 6 ")
     assert not any(key.startswith("reconstruction") for key in metrics)
+
+
+@pytest.mark.parametrize(("matched", "warns"), [(18, False), (17, True)])
+def test_a_system_that_knows_less_than_the_wanted_share_of_the_frames_is_warned_of(matched, warns):
+    text = coverage({"trajectory/num_frames": matched, "score/num_poses": 40, "score/num_frames": 20}, 90)
+    assert text.startswith(f"{matched} of 40 poses are associated with true poses, which is {5 * matched} % of the 20")
+    assert ("warning" in text and "dataset.start" in text) == warns
 
 
 def test_normals_of_a_cloud_without_any_are_fitted(tmp_path, truth):
