@@ -1,7 +1,5 @@
 """ICP against Gaussians as one Levenberg–Marquardt solve."""
 
-from typing import TypeAlias
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,8 +8,9 @@ import lineax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.gaussians import Gaussians, color_gradients, intensity
-from emgs_jax.linalg import dot, gather_entries, mahalanobis_sq, whiten, whitening, widen
+from emgs_jax.gaussians import Gaussians, intensity
+from emgs_jax.linalg import whiten, widen
+from emgs_jax.matching import Candidates, Matches, Surface, match, surface_of
 from emgs_jax.neighbours import knn
 from emgs_jax.observation import Observation, transform
 from emgs_jax.pytree import choice, static, traced
@@ -88,29 +87,10 @@ class _Problem(eqx.Module):
 
     source: Observation  # camera frame
     rays: Float[Array, "p 3"]  # noise of every point along its viewing ray, camera frame
-    target: Gaussians
-    triangles: Float[Array, "n 6"]  # see `whitening`
-    plane_vars: Float[Array, "n"]  # of the Gaussians along their normals
-    gradients: Float[Array, "n 3"]
+    surface: Surface
     T_world_coarse: jaxlie.SE3
     scale_std: Float[Array, ""]
     prior: Float[Array, "7"]  # 1 / standard deviation of xi and of the scale's parameter
-
-
-class _Matches(eqx.Module):
-    """The Gaussian of every point, held fixed while a step is linearised."""
-
-    means: Float[Array, "p 3"]
-    normals: Float[Array, "p 3"]
-    triangle: Float[Array, "p 6"]
-    noise: Float[Array, "p 3"]  # of the point, whitened
-    plane_std: Float[Array, "p"]
-    light: Float[Array, "p"]
-    gradients: Float[Array, "p 3"]
-    is_inlier: Bool[Array, "p"]
-
-
-Candidates: TypeAlias = tuple[Int[Array, "p k"], Bool[Array, "p k"]]
 
 
 def _pose_problem(
@@ -123,21 +103,11 @@ def _pose_problem(
     pose_noise, depth_noise = noise
     stride = max(source.valid.shape[0] // config.num_points, 1)
     source = jax.tree.map(lambda leaf: leaf[::stride], source)
-    # Only where colour counts: the gradients cost a neighbour search over the submap.
-    gradients = jax.lax.cond(
-        config.residual != DISTRIBUTION,
-        lambda: color_gradients(target, config.num_color_neighbours),
-        lambda: jnp.zeros_like(target.means),
-    )
     prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack([pose_noise, depth_noise]), 3)
-    triangles, _ = whitening(target.covs)
     return _Problem(
         source=source,
         rays=config.noise * depth_noise * source.points,
-        target=target,
-        triangles=triangles,
-        plane_vars=mahalanobis_sq(target.normals, target.covs),  # n' Σ n
-        gradients=gradients,
+        surface=surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours),
         T_world_coarse=T_world_coarse,
         scale_std=config.scale_noise * depth_noise,
         prior=jnp.append(prior, 1.0),
@@ -152,47 +122,20 @@ def _pose(y: Float[Array, "7"], problem: _Problem) -> tuple[jaxlie.SE3, Float[Ar
 def _search(y: Float[Array, "7"], problem: _Problem, config: IcpConfig) -> Candidates:
     """The Gaussians near every point, placed by the unknowns y."""
     T, scale = _pose(y, problem)
-    placed = transform(T, problem.source, scale)
-    return knn(placed.points, problem.target.means, problem.target.valid, config.num_neighbours)
-
-
-def _match(
-    placed: Observation, noise: Float[Array, "p 3"], candidates: Candidates, problem: _Problem, config: IcpConfig
-) -> _Matches:
-    """For each world point the nearest of its candidates in Mahalanobis distance."""
-    (rows, found), target = candidates, problem.target
-    near = gather_entries(target.means, rows), gather_entries(problem.triangles, rows)
-    point, ray = (jnp.unstack(vectors[:, None], axis=-1) for vectors in (placed.points, noise))
-    offset = tuple(a - b for a, b in zip(point, near[0], strict=True))
-    white = widen(whiten(near[1], offset), whiten(near[1], ray))
-    distance_sq = jnp.where(found, dot(white, white), jnp.inf)
-    best = jnp.argmin(distance_sq, axis=-1)[:, None]
-    row = jnp.take_along_axis(rows, best, axis=1)[:, 0]
-    normals, triangle = target.normals[row], problem.triangles[row]
-    is_near = jnp.min(distance_sq, axis=-1) <= config.max_mahalanobis_sq
-    is_alike = jnp.sum(normals * placed.normals, axis=-1) >= config.min_normal_cos
-    whitened = whiten(jnp.unstack(triangle, axis=-1), jnp.unstack(noise, axis=-1))
-    return _Matches(
-        means=target.means[row],
-        normals=normals,
-        triangle=triangle,
-        noise=jnp.stack(whitened, axis=-1),
-        plane_std=jnp.sqrt(problem.plane_vars[row] + jnp.sum(normals * noise, axis=-1) ** 2 + 1e-12),
-        light=intensity(target.colors[row]),
-        gradients=problem.gradients[row],
-        is_inlier=placed.valid & is_near & is_alike,
-    )
+    target = problem.surface.gaussians
+    return knn(transform(T, problem.source, scale).points, target.means, target.valid, config.num_neighbours)
 
 
 def _place(
     y: Float[Array, "7"], candidates: Candidates, problem: _Problem, config: IcpConfig
-) -> tuple[Observation, _Matches]:
+) -> tuple[Observation, Matches]:
     """The source in the world frame for the unknowns y, and its matches, which carry no gradient."""
     T, scale = _pose(y, problem)
     placed = transform(T, problem.source, scale)
     noise = problem.rays @ T.rotation().as_matrix().T
     fixed, noise = jax.lax.stop_gradient((placed, noise))
-    return placed, jax.lax.stop_gradient(_match(fixed, noise, candidates, problem, config))
+    gates = config.max_mahalanobis_sq, config.min_normal_cos
+    return placed, jax.lax.stop_gradient(match(fixed, noise, candidates, problem.surface, gates))
 
 
 def _residuals(
@@ -200,16 +143,16 @@ def _residuals(
 ) -> tuple[Float[Array, "p 5"], Float[Array, "7"]]:
     """Rows of every point (plane, colour, whitened offset) and of the prior, in standard deviations."""
     candidates, problem, config = args
-    placed, match = _place(y, candidates, problem, config)
-    offset = placed.points - match.means
-    plane = jnp.sum(offset * match.normals, axis=-1) / match.plane_std
-    light = match.light + jnp.sum(match.gradients * offset, axis=-1)
+    placed, matches = _place(y, candidates, problem, config)
+    offset = placed.points - matches.means
+    plane = jnp.sum(offset * matches.normals, axis=-1) / matches.plane_std
+    light = matches.light + jnp.sum(matches.gradients * offset, axis=-1)
     shade = (light - intensity(placed.colors)) / config.color_std
-    triangle, noise, entries = (jnp.unstack(rows, axis=-1) for rows in (match.triangle, match.noise, offset))
+    triangle, noise, entries = (jnp.unstack(rows, axis=-1) for rows in (matches.triangle, matches.noise, offset))
     white = jnp.stack(widen(whiten(triangle, entries), noise), axis=-1)
     # A point beyond the gate costs what it would at the gate and pulls nowhere.
     edge = jnp.sqrt(config.max_mahalanobis_sq)
-    is_inlier = match.is_inlier[:, None]
+    is_inlier = matches.is_inlier[:, None]
     rows = jnp.concatenate(
         [
             (config.residual == COLORED) * jnp.where(is_inlier, plane[:, None], edge),
@@ -263,15 +206,15 @@ def icp(
     y, rounds = jax.lax.scan(search_and_solve, jnp.zeros(7), length=config.num_searches)
     candidates, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
     args = candidates, problem, config
-    placed, match = _place(y, *args)
-    num_inliers = jnp.sum(match.is_inlier)
-    distance = jnp.sum((placed.points - match.means) * match.normals, axis=-1)
+    placed, matches = _place(y, *args)
+    num_inliers = jnp.sum(matches.is_inlier)
+    distance = jnp.sum((placed.points - matches.means) * matches.normals, axis=-1)
     jacobian = jax.jacfwd(_residuals)(y, args)[0].reshape(-1, 7)[:, :6]
     hessian = jacobian.T @ jacobian / jnp.maximum(config.num_effective, 1.0)
     info = IcpInfo(
         num_inliers=num_inliers,
         inlier_fraction=num_inliers / jnp.maximum(jnp.sum(placed.valid), 1),
-        residual=jnp.sqrt(jnp.sum(jnp.where(match.is_inlier, distance, 0.0) ** 2) / jnp.maximum(num_inliers, 1)),
+        residual=jnp.sqrt(jnp.sum(jnp.where(matches.is_inlier, distance, 0.0) ** 2) / jnp.maximum(num_inliers, 1)),
         misfit=1.4826 * median(jnp.abs(distance), placed.valid),
         min_eigenvalue=jnp.linalg.eigvalsh(hessian)[0],
         num_steps=jnp.sum(rounds[1]),

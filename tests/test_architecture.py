@@ -19,6 +19,7 @@ CORE = (
         "clustering",
         "gaussians",
         "gaussian_map",
+        "matching",
         "icp",
     ),
     *("render.project", "render.tiles", "render.composite", "render.densify"),
