@@ -116,6 +116,11 @@ def record_initialization(run: MappingRun, window: FirstWindow, frames: list[Fra
         _add(run, frame, _matrix(pose), described | {key: value / len(poses) for key, value in spent.items()})
 
 
+def record_before_map(run: MappingRun, frame: Frame, pose: np.ndarray) -> None:
+    """Add a frame with nothing to start a map from; `pose` (4, 4) stands in for the one that is not known."""
+    _add(run, frame, pose, {"status": "lost", "reason": REASONS[0]})
+
+
 def _add(run: MappingRun, frame: Frame, pose: np.ndarray, described: dict[str, Any]) -> None:
     record = FrameRecord(frame.index, frame.name, frame.timestamp, **described)
     run.records.append(record)

@@ -10,7 +10,7 @@ import numpy as np
 from emgs_jax.clock import Clock
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.convert import to_first_window, to_prediction
-from emgs_jax.mapping_run import MappingRun, Timer, record_initialization, record_step
+from emgs_jax.mapping_run import MappingRun, Timer, record_before_map, record_initialization, record_step
 from emgs_jax.observation import Prediction
 from emgs_jax.prior.base import Prior, PriorPrediction, windows
 from emgs_jax.pytree import Tree, stack
@@ -64,6 +64,11 @@ class _Group:
         for run in self.runs:
             record_initialization(run, window, frames, spent)
 
+    def lose(self, frame: Frame, pose: np.ndarray) -> None:
+        """Record a frame from which no map can start."""
+        for run in self.runs:
+            record_before_map(run, frame, pose)
+
     def advance(self, prediction: Prediction, frame: Frame, converting: Seconds) -> None:
         """Take one step and record it."""
         timer, step = Timer(self.runs[0].clock), jitted_step_states if self.is_stacked else jitted_step
@@ -94,7 +99,10 @@ def map_frames(
     """Map a sequence; yields on the way what the prior alone says of each frame, for comparison.
 
     The pose of the first frame is the true one where it is known, else the identity. Frames are read, predicted and
-    converted once for all runs.
+    converted once for all runs. Frames before the first from which a map can start are lost.
+
+    Raises:
+        ValueError: there is no such frame.
 
     Args:
         runs: before their first frame; several have to share a program (`sweep.programs`) and a clock.
@@ -113,15 +121,21 @@ def map_frames(
         for prediction, frames in predictions(dataset, prior, first.config.window_size, first.clock):
             anchor = first_pose(frames) if anchor is None else anchor
             with first.clock.phase("map"):
-                for task in _tasks(first, prediction, frames, anchor):
-                    # The first task makes the maps, the second is the first step: what one group compiles by itself
-                    # is there for the others. Later all are side by side.
+                for task in _tasks(first, prediction, frames, anchor, groups[0].states is not None):
+                    # A task makes the maps, the next is the first step: what one group compiles by itself is there
+                    # for the others. Later all are side by side.
                     alone = 1 if num_tasks < 2 or len(groups) == 1 else 0
                     for group in groups[:alone]:
                         task(group)
                     list(threads.map(task, groups[alone:]))
-                    num_tasks += 1
+                    num_tasks += groups[0].states is not None
             yield from raw_views(first, prediction, frames, anchor)
+    if groups[0].states is None:
+        raise ValueError(
+            f"none of the {len(first.records)} frames of {dataset.name} {dataset.sequence} has a valid point and a "
+            "pose, so there is nothing to start a map from: take frames farther apart or closer together "
+            "(dataset.stride=...), larger images (dataset.size=...) or another prior"
+        )
     for group in groups:
         group.hand_out()
     for run in runs[1:]:
@@ -129,17 +143,27 @@ def map_frames(
 
 
 def _tasks(
-    run: MappingRun, prediction: PriorPrediction, frames: Mapping[int, Frame], anchor: np.ndarray
+    run: MappingRun,
+    prediction: PriorPrediction,
+    frames: Mapping[int, Frame],
+    anchor: np.ndarray,
+    is_started: bool,
 ) -> Iterator[Callable[[_Group], None]]:
     """What every group has to do with one prediction, which is converted here."""
     timer = Timer(run.clock)
-    if prediction.window.inference > 0:
+    if is_started:
         step = to_prediction(prediction, frames, anchor, run.config.observation)
         converting = timer.read()
         yield lambda group: group.advance(step, frames[prediction.window.current], converting)
         return
-    window, following = opening(to_first_window(prediction, frames, anchor, run.config.observation), run.config)
-    converting, dense = timer.read(), [frames[index] for index in prediction.window.dense]
+    since, end = len(run.records), prediction.window.current + 1
+    window, usable = to_first_window(prediction, frames, anchor, run.config.observation, since)
+    for index in range(since, usable[0] if usable else end):
+        yield lambda group, frame=frames[index]: group.lose(frame, anchor)
+    if window is None:
+        return
+    window, following = opening(window, run.config)
+    converting, dense = timer.read(), [frames[index] for index in usable]
     yield lambda group: group.start(window, dense, converting)
     for frame, step in zip(dense[1:], following, strict=False):
         yield lambda group, step=step, frame=frame: group.advance(step, frame, {})

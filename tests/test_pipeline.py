@@ -114,15 +114,28 @@ def test_a_view_without_a_pose_cannot_be_merged():
 
 
 @pytest.mark.slow
-def test_a_first_view_without_a_point_is_an_error_and_not_a_run_that_never_maps():
+@pytest.mark.parametrize("num_empty", [1, WINDOW_SIZE + 1])
+def test_the_map_starts_at_the_first_frame_with_a_point_and_those_before_are_lost(num_empty):
     """All later frames were degraded, the map stayed empty and nothing said so."""
 
     def edit(prediction):
-        prediction.points[0] = np.nan
+        for row, index in enumerate(prediction.window.dense):
+            if index < num_empty:
+                prediction.mask[row] = False
         return prediction
 
-    with pytest.raises(ValueError, match="the map is empty after 1 view.*begin elsewhere"):
-        map_tiny(dataset(), EditedPrior(edit))
+    session, _ = map_tiny(dataset(), EditedPrior(edit))
+    expected = ["lost"] * num_empty + ["initialization"] + ["tracked"] * (NUM_FRAMES - num_empty - 1)
+    assert [record.status for record in session.records] == expected
+    assert [record.index for record in session.records] == list(range(NUM_FRAMES))
+    truth = [dataset()[i].T_world_camera for i in range(NUM_FRAMES)]
+    np.testing.assert_allclose(session.poses[num_empty:], truth[num_empty:], atol=5e-3)
+    np.testing.assert_array_equal(session.poses[:num_empty], [truth[0]] * num_empty)
+
+
+def test_a_prior_without_any_point_is_an_error_and_not_a_run_that_never_maps():
+    with pytest.raises(ValueError, match="none of the .* frames of .*dataset.stride"):
+        map_tiny(dataset(), EditedPrior(lambda prediction: replace(prediction, mask=prediction.mask & False)))
 
 
 def test_features_without_a_grid_for_each_dense_view_are_refused():

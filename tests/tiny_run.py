@@ -68,7 +68,7 @@ def map_tiny(frames, prior, *overrides: str) -> tuple[MappingRun, list]:
     """A finished run, and the map after each record."""
     maps = []
     session = new_run(frames, hydra.utils.instantiate(compose(*overrides).slam))
-    session.on_record = lambda record: maps.append(session.state.map)
+    session.on_record = lambda record: maps.append(session.state and session.state.map)
     for _ in map_frames([session], frames, prior):
         pass
     return session, maps

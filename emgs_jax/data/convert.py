@@ -63,31 +63,38 @@ def to_se3(matrices: np.ndarray) -> jaxlie.SE3:
 
 
 def to_first_window(
-    prediction: PriorPrediction, frames: Mapping[int, Frame], T_world_anchor: np.ndarray, config: ObservationConfig
-) -> FirstWindow:
-    """All views of the first window.
+    prediction: PriorPrediction,
+    frames: Mapping[int, Frame],
+    T_world_anchor: np.ndarray,
+    config: ObservationConfig,
+    since: int = 0,
+) -> tuple[FirstWindow | None, tuple[int, ...]]:
+    """What a map can start from: the dense views from the first on that has a pose and a valid point.
 
     Args:
-        prediction: of the first window, dense in every view.
+        prediction: of a window.
         frames: by index; those of the window.
         T_world_anchor: known pose of the first frame, (4, 4).
         config: normals and thinning.
+        since: views of earlier frames are left out.
+
+    Returns:
+        The views and their frame indices; None and () where there is no such view. A later view may have no pose:
+        integrated on its own, it is lost.
 
     Raises:
-        ValueError: a shape differs from the images', no view has a valid point, or the first view no pose. Another
-            view's pose may be NaN: integrated on its own, that view is lost.
+        ValueError: a shape differs from the images'.
     """
     _check(prediction, frames)
-    dense = prediction.window.dense
-    views = [_observation(prediction, row, frames[index], config) for row, index in enumerate(dense)]
-    rows = [prediction.window.views.index(index) for index in dense]
-    poses = np.asarray(T_world_anchor) @ prediction.T_anchor_view[rows]
-    if not np.isfinite(poses[0]).all() or not any(bool(view.valid.any()) for view in views):
-        raise ValueError(
-            "the first window has no valid point or its first view no pose, so there is nothing to start a map from: "
-            "begin the sequence elsewhere (dataset.start=...) or take frames farther apart (dataset.stride=...)"
-        )
-    return FirstWindow(stack(views), to_se3(poses))
+    rows = [row for row, index in enumerate(prediction.window.dense) if index >= since]
+    dense = [prediction.window.dense[row] for row in rows]
+    views = [_observation(prediction, row, frames[index], config) for row, index in zip(rows, dense, strict=True)]
+    poses = np.asarray(T_world_anchor) @ prediction.T_anchor_view[[prediction.window.views.index(i) for i in dense]]
+    usable = [bool(view.valid.any()) and np.isfinite(pose).all() for view, pose in zip(views, poses, strict=True)]
+    if not any(usable):
+        return None, ()
+    first = usable.index(True)
+    return FirstWindow(stack(views[first:]), to_se3(poses[first:])), tuple(dense[first:])
 
 
 def to_prediction(

@@ -1,7 +1,8 @@
 """Structure from motion of a sliding window: where its views are and where their landmarks (host side, NumPy in, out).
 
-The first window is built from its best pair of views (Schönberger and Frahm, "Structure-from-motion revisited", CVPR
-2016); each later view is placed by the landmarks that it shows. Bundle adjustment refines the views of the window.
+The first window in which that succeeds is built from its best pair of views (Schönberger and Frahm,
+"Structure-from-motion revisited", CVPR 2016); each later view is placed by the landmarks that it shows. Bundle
+adjustment refines the views of the window.
 """
 
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.camera import Camera
-from emgs_jax.prior.landmarks import NONE, MatchingConfig, Structure, place, relative_pose, triangulate
+from emgs_jax.prior.landmarks import NONE, MatchingConfig, Structure, View, place, relative_pose, triangulate
 from emgs_jax.stereo.bundle_adjustment import BundleConfig, Tracks, adjust
 
 jitted_adjust = eqx.filter_jit(adjust)
@@ -40,16 +41,18 @@ class StructureConfig:
 
 
 def initialize(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> bool:
-    """Place the views of the first window, whose first is the reference; False without enough parallax or matches."""
+    """Place the views of a window, the oldest of which is the reference; False without enough parallax or matches."""
     pairs = _ranked_pairs(structure, config)
     for a, b, T_a_b in pairs[:3]:
         _reset(structure)
         structure.views[a].T_ref_view, structure.views[b].T_ref_view = np.eye(4), T_a_b
         triangulate(structure, config.matching)
         _grow(structure, camera, num_views, a, config)
-        first = structure.views[min(structure.views)]
-        if first.T_ref_view is not None and structure.known(first).sum() >= config.matching.min_matches:
-            _normalize(structure, config)
+        placed = structure.placed()
+        reference = placed[min(placed)]
+        # Two views alone are confirmed by nothing.
+        if len(placed) > 2 and structure.known(reference).sum() >= config.matching.min_matches:
+            _normalize(structure, reference, config)
             return True
     _reset(structure)
     return False
@@ -122,12 +125,11 @@ def _reset(structure: Structure) -> None:
         view.T_ref_view = None
 
 
-def _normalize(structure: Structure, config: StructureConfig) -> None:
-    """Make the first view the reference and its median landmark `median_depth` deep."""
-    first = structure.views[min(structure.views)]
-    T_first_ref = np.linalg.inv(first.T_ref_view)
+def _normalize(structure: Structure, reference: View, config: StructureConfig) -> None:
+    """Make a placed view the reference and its median landmark `median_depth` deep."""
+    T_first_ref = np.linalg.inv(reference.T_ref_view)
     structure.points = structure.points @ T_first_ref[:3, :3].T + T_first_ref[:3, 3]
-    depth = structure.points[first.landmark[structure.known(first)], 2]
+    depth = structure.points[reference.landmark[structure.known(reference)], 2]
     scale = config.median_depth / np.median(depth)
     structure.points *= scale
     for view in structure.placed().values():

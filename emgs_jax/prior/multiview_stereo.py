@@ -2,8 +2,8 @@
 
 Structure from motion of the window gives the poses, a plane sweep against some of the other views the depth. What was
 found for an image (keypoints, matches, depth) is kept while the image is in the window, so the windows of a sequence
-must be asked for in order. The frame is that of image 0 and the scale that of the first window, which is fixed by
-`median_depth`; images alone do not tell it.
+must be asked for in order. The frame is that of the first image that could be placed (image 0, unless the camera rests
+at first), and the scale that of its window, which is fixed by `median_depth`; images alone do not tell it.
 """
 
 from collections.abc import Sequence
@@ -92,10 +92,9 @@ class MultiviewStereo:
         for frame in frames:
             if frame.index not in self._structure.views:
                 self._add(frame)
-        if window.inference == 0:
-            initialize(self._structure, self._camera, self._num_views, self._structure_config)
-        else:
-            extend(self._structure, self._camera, self._num_views, self._structure_config)
+        place_views = extend if self._has_begun else initialize
+        place_views(self._structure, self._camera, self._num_views, self._structure_config)
+        self._has_begun |= bool(self._structure.placed())
         return self._answer(window, intrinsics)
 
     def _begin(self, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
@@ -103,6 +102,7 @@ class MultiviewStereo:
         focal, center = np.float32(intrinsics[:2]), np.float32(intrinsics[2:])
         self._camera = Camera(focal, center, width, height)
         self._structure = Structure(calibration(intrinsics))
+        self._has_begun = False
         self._grays: dict[int, np.ndarray] = {}
         self._depths: dict[int, np.ndarray] = {}
         # A later window sees the anchor, the FIFO, the current and the newest image.
@@ -136,10 +136,10 @@ class MultiviewStereo:
         points = backproject(np.where(mask, depth, 0.0), intrinsics).astype(np.float32)
         features = np.zeros((*mask.shape, 0), np.float16)
         T_anchor_view = np.full((len(views), 4, 4), np.nan)
-        T_anchor_view[0] = np.eye(4)  # also where nothing else is known
+        T_anchor_view[0] = np.eye(4)  # also where it is not known
         for row, view in enumerate(views[1:], start=1):
-            if views[0].T_ref_view is not None and view.T_ref_view is not None:
-                T_anchor_view[row] = np.linalg.inv(views[0].T_ref_view) @ view.T_ref_view
+            if view.T_ref_view is not None:
+                T_anchor_view[row] = view.T_ref_view
         return PriorPrediction(window, T_anchor_view, points, confidence, mask, features)
 
     def _depth(self, frame: int) -> np.ndarray:

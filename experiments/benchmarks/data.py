@@ -69,7 +69,7 @@ def load(config: DictConfig, thin: int | None = None) -> Data:
         config=slam,
         raw=calls[0][0],
         images=np.stack([frame.image for frame in shown]),
-        first=to_first_window(*calls[0], anchor, slam.observation),
+        first=to_first_window(*calls[0], anchor, slam.observation)[0],
         prediction=to_prediction(*calls[1], anchor, slam.observation),
         true_poses=np.stack([frame.T_world_camera for frame in shown]),
     )

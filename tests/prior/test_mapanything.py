@@ -315,7 +315,7 @@ def test_the_synthetic_room_comes_back_at_its_frames_pixels():
         assert mask.mean() > 0.5
         assert np.median(np.abs(error[mask])) < 1e-4  # planes come back exactly
         assert (np.abs(error[mask]) < 0.02).mean() > 0.97  # but for pixels beside an edge
-    first = to_first_window(prediction, frames, frames[0].T_world_camera, slam_config().observation)
+    first, _ = to_first_window(prediction, frames, frames[0].T_world_camera, slam_config().observation)
     world = np.asarray(first.T_world_views.as_matrix())
     expected = relative_poses([frames[index].T_world_camera for index in window.views])
     expected[:, :3, 3] *= unit

@@ -150,7 +150,7 @@ def test_a_blank_image_has_no_pose_and_the_next_is_placed_again(room, answered):
     assert np.isnan(lost.wxyz_xyz[0]).all()  # which the mapping marks as lost
 
 
-def test_images_without_texture_give_no_geometry_and_the_mapping_says_what_to_do(room):
+def test_images_without_texture_give_no_geometry_and_nothing_that_a_map_could_start_from(room):
     images = Edited(room, {index: blank(room) for index in range(NUM_FRAMES)})
     found = answers(make_prior(), images)
     for answer in found:
@@ -159,8 +159,22 @@ def test_images_without_texture_give_no_geometry_and_the_mapping_says_what_to_do
         assert not answer.mask.any() and not answer.points.any() and (answer.confidence == 1).all()
     frames = {index: images[index] for index in range(WINDOW_SIZE)}
     observation = hydra.utils.instantiate(compose("observation.normal_radius=1").slam, _convert_="all").observation
-    with pytest.raises(ValueError, match="dataset.start"):
-        to_first_window(found[0], frames, np.eye(4), observation)
+    assert to_first_window(found[0], frames, np.eye(4), observation) == (None, ())
+
+
+@pytest.mark.slow
+def test_a_sequence_may_begin_with_images_that_show_nothing(room):
+    """Oracle: the true motion between the images after them, up to the one scale that images do not tell."""
+    found = answers(make_prior(), Edited(room, {index: blank(room) for index in range(3)}))
+    assert not found[0].mask.any()  # two images with texture are confirmed by nothing
+    assert found[1].window.current == 5 and found[1].mask[1].any()
+    poses = {}
+    for answer in found[1:]:
+        poses |= dict(zip(answer.window.views, answer.T_anchor_view, strict=True))
+    np.testing.assert_array_equal(poses[3], np.eye(4))  # the oldest image that could be placed
+    estimate = np.stack([poses[index][:3, 3] for index in range(3, NUM_FRAMES)])
+    truth = np.stack([room[index].T_world_camera[:3, 3] for index in range(3, NUM_FRAMES)])
+    assert similarity_error(estimate, truth) < 0.01  # m
 
 
 def test_windows_out_of_order_are_refused(room):

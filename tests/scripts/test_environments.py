@@ -63,7 +63,7 @@ dataset = build_dataset(config)
 prior = build_prior(config, dataset)
 session = new_run(dataset, hydra.utils.instantiate(config.slam))
 steps = predictions(dataset, prior, session.config.window_size, session.clock)
-window = to_first_window(*next(steps), np.eye(4), session.config.observation)
+window, _ = to_first_window(*next(steps), np.eye(4), session.config.observation)
 print("features", window.views.features.shape[-1], "inferences", 1 + len(list(steps)))
 print([name for name in sys.modules if name.split(".")[0] in ("torch", "transformers")])
 """
