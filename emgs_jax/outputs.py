@@ -128,7 +128,7 @@ def _picture(run: MappingRun, dataset: Dataset, row: int, view: Any) -> dict[str
     return {
         "image": dataset[row].image,
         "rendered_color": view.colors,
-        "rendered_depth": view.rendering.depth,
+        "rendered_depth": view.depth,
         "valid": view.valid,
         "title": f"frame {run.records[row].index}",
     }

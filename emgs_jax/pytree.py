@@ -49,11 +49,11 @@ def put_rows(tree: Tree, rows: Int[Array, "r"], values: Tree) -> Tree:
     return jax.tree.map(lambda leaf, value: leaf.at[rows].set(value, mode="drop"), tree, values)
 
 
-def where_rows(mask: Bool[Array, "n"], yes: Tree, no: Tree) -> Tree:
-    """Choose whole rows by `mask`."""
+def where_rows(mask: Bool[Array, "*n"], yes: Tree, no: Tree) -> Tree:
+    """Choose whole rows (or pixels) by `mask`, whose axes are the first of every leaf."""
 
     def choose(a: Array, b: Array) -> Array:
-        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b)
+        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
 
     return jax.tree.map(choose, yes, no)
 

@@ -1,10 +1,13 @@
 """Front-to-back compositing of one tile, and the image from all of them."""
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from emgs_jax.camera import Camera
 from emgs_jax.gaussians import Gaussians
@@ -78,17 +81,29 @@ def splat_depth(splats: Splats, pixels: Float[Array, "q 2"], config: RenderConfi
     return 1.0 / jnp.clip(inverse, (1.0 / farthest)[:, None], highest[:, None])
 
 
-def composite(
-    splats: Splats, values: Float[Array, "c v"], pixels: Float[Array, "q 2"], config: RenderConfig
-) -> tuple[Float[Array, "q v"], Float[Array, "q"], Float[Array, "q"], Float[Array, "q"]]:
-    """Blend the splats of one tile, which come nearest first: values, alpha, Σ w z, Σ w z²."""
+def blend_weights(
+    splats: Splats, pixels: Float[Array, "q 2"], config: RenderConfig
+) -> tuple[Float[Array, "c q"], Float[Array, "c q"]]:
+    """Share of every splat of a tile, nearest first, in the light of every pixel, and its depth there (m)."""
     alpha = splat_alpha(splats, pixels, config)
     log_light = jnp.cumsum(jnp.log1p(-jnp.minimum(alpha, 0.999)), axis=0)
     light_before = jnp.exp(jnp.concatenate([jnp.zeros_like(log_light[:1]), log_light[:-1]]))
     weights = alpha * light_before
     # An invalid row may hold any depth; its weight is 0, and 0 · inf would be NaN.
-    depth = jnp.where(weights > 0, splat_depth(splats, pixels, config), 0.0)
+    return weights, jnp.where(weights > 0, splat_depth(splats, pixels, config), 0.0)
+
+
+Sums: TypeAlias = tuple[Float[Array, "q v"], Float[Array, "q"], Float[Array, "q"], Float[Array, "q"]]
+
+
+def weighted_sums(weights: Float[Array, "c q"], depth: Float[Array, "c q"], values: Float[Array, "c v"]) -> Sums:
+    """Σ w v, Σ w, Σ w z and Σ w z² of every pixel."""
     return weights.T @ values, weights.sum(0), (weights * depth).sum(0), (weights * depth**2).sum(0)
+
+
+def composite(splats: Splats, values: Float[Array, "c v"], pixels: Float[Array, "q 2"], config: RenderConfig) -> Sums:
+    """Blend the splats of one tile, which come nearest first: values, alpha, Σ w z, Σ w z²."""
+    return weighted_sums(*blend_weights(splats, pixels, config), values)
 
 
 def render(
@@ -99,27 +114,55 @@ def render(
     config: RenderConfig,
 ) -> Rendering:
     """Draw `values` (colours, normals, features or one-hot labels) of the Gaussians with depth and coverage."""
+    sums, overflow = draw_tiles(gaussians, values, T_world_camera, camera, config, composite)
+    return rendering_of(*sums, overflow, config)
+
+
+def draw_tiles(
+    gaussians: Gaussians,
+    values: Float[Array, "n v"],
+    T_world_camera: jaxlie.SE3,
+    camera: Camera,
+    config: RenderConfig,
+    blend: Callable[..., PyTree[Array]],
+) -> tuple[PyTree[Array], Int[Array, ""]]:
+    """Images (h, w, ...) of what `blend`, a function like `composite`, gives for the splats of every tile.
+
+    Returns:
+        The images, and how many splats found their tile full.
+    """
     splats = project_gaussians(gaussians, T_world_camera, camera, config.covariance_scale, config.blur)
     corners = tile_corners(camera, config.tile_size)
     rows, exists, overflow = assign_tiles(splats, corners, config.tile_size, config.tile_capacity, config.radius)
     step = jnp.arange(config.tile_size, dtype=jnp.float32)
     inside = jnp.stack(jnp.meshgrid(step, step, indexing="xy"), axis=-1).reshape(-1, 2)
 
-    def draw(tile: tuple[Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+    def draw(tile: tuple[Array, Array, Array]) -> PyTree[Array]:
         corner, tile_rows, tile_exists = tile
         near, near_values = take_rows((splats, values), tile_rows)
         near = eqx.tree_at(lambda s: s.valid, near, near.valid & tile_exists)
         near_values = jnp.where(near.valid[:, None], near_values, 0.0)
-        return composite(near, near_values, corner + inside, config)
+        return blend(near, near_values, corner + inside, config)
 
     tiles = jax.lax.map(draw, (corners, rows, exists), batch_size=min(config.tile_batch, corners.shape[0]))
-    values_sum, alpha, depth_sum, depth_sq_sum = jax.tree.map(lambda x: _assemble(x, camera, config.tile_size), tiles)
+    return jax.tree.map(lambda x: _assemble(x, camera, config.tile_size), tiles), jnp.sum(overflow)
+
+
+def rendering_of(
+    values_sum: Float[Array, "h w v"],
+    alpha: Float[Array, "h w"],
+    depth_sum: Float[Array, "h w"],
+    depth_sq_sum: Float[Array, "h w"],
+    overflow: Int[Array, ""],
+    config: RenderConfig,
+) -> Rendering:
+    """The means behind the images of `composite`."""
     is_covered = alpha >= jnp.maximum(config.min_alpha, 1e-6)
     total = jnp.where(is_covered, alpha, 1.0)
     depth = jnp.where(is_covered, depth_sum / total, 0.0)
     variance = jnp.maximum(depth_sq_sum / total - depth**2, 1e-12)
     depth_std = jnp.where(is_covered, jnp.sqrt(variance), 0.0)
-    return Rendering(values_sum, alpha, depth, depth_std, jnp.sum(overflow))
+    return Rendering(values_sum, alpha, depth, depth_std, overflow)
 
 
 def _assemble(tiles: Float[Array, "t q *c"], camera: Camera, tile_size: int) -> Float[Array, "h w *c"]:

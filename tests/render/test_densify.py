@@ -8,7 +8,7 @@ import pytest
 from scene import at, move_gaussians, pose
 
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.render.densify import DensifyConfig, densify
+from emgs_jax.render.densify import DensifyConfig, densify, in_dominant_layer
 
 dense = eqx.filter_jit(densify)
 
@@ -27,7 +27,7 @@ def wall(depth: float, normal=(0.0, 0.0, -1.0), step: float = 0.15) -> Gaussians
 
 @pytest.fixture(scope="module")
 def densify_config(config):
-    return DensifyConfig(0.9, 0.3, 0.05, config("render.tile_capacity=600").refinement.render)
+    return DensifyConfig(0.9, 0.3, 0.05, 0.75, config("render.tile_capacity=600").refinement.render)
 
 
 def test_the_points_of_a_slanted_wall_lie_on_it_with_its_normal_and_colour(camera, densify_config):
@@ -54,14 +54,36 @@ def test_points_move_with_map_and_camera(camera, densify_config):
     )  # a splat more or less at its edge
 
 
-def test_a_pixel_that_mixes_two_surfaces_is_no_point(camera, densify_config):
+def two_walls(view):
+    """Share of the valid pixels that lie on the wall at 1.5 m, on the one at 3 m, and between the two."""
+    depth = np.asarray(view.depth)[np.asarray(view.valid)]
+    on = [np.abs(depth - wall) < 0.05 * wall for wall in (1.5, 3.0)]
+    return [float(x.mean()) if len(depth) else 0.0 for x in (*on, ~on[0] & ~on[1])]
+
+
+def test_a_pixel_that_mixes_two_surfaces_shows_the_dominant_one_or_nothing(camera, densify_config):
+    """Oracle: the depths of the two walls; their mean is the depth of nothing."""
     half_open = at(densify_config, "render.opacity", 0.5)  # so that the wall behind shines through
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), wall(1.5), wall(3.0, step=0.3))
-    view = dense(both, pose(), camera, half_open)
-    assert (view.rendering.depth > 0).mean() > 0.9
+    for opacity, share in ((0.9, 0.75), (0.5, 0.75), (0.5, 0.0)):
+        view = dense(both, pose(), camera, at(at(half_open, "opacity", opacity), "min_layer_share", share))
+        mixed = np.asarray(view.rendering.depth_std) > 0.05 * np.asarray(view.rendering.depth)
+        near, far, between = two_walls(view)
+        assert near + far > 0.999 and between == 0
+        if share == 0.0:
+            assert mixed.mean() > 0.5 and np.asarray(view.valid).mean() > 0.9
+    strict = at(at(half_open, "opacity", 0.5), "min_layer_share", 1.01)  # which no layer has
+    view = dense(both, pose(), camera, strict)
     mixed = np.asarray(view.rendering.depth_std) > 0.05 * np.asarray(view.rendering.depth)
-    assert mixed.mean() > 0.5
     np.testing.assert_array_equal(np.asarray(view.valid), ~mixed & (np.asarray(view.rendering.depth) > 0))
+
+
+def test_the_dominant_layer_is_about_the_weighted_median():
+    weights = jnp.array([[0.2], [0.4], [0.3], [0.0]])
+    depth = jnp.array([[1.0], [2.0], [2.1], [9.0]])
+    np.testing.assert_array_equal(in_dominant_layer(weights, depth, jnp.asarray(0.1))[:, 0], [False, True, True, False])
+    nothing = in_dominant_layer(0.0 * weights, depth, jnp.asarray(0.1))  # no weight, no layer that matters
+    assert nothing.shape == (4, 1)
 
 
 def test_pixels_without_depth_are_invalid_and_finite(camera, densify_config):
