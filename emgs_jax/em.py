@@ -11,6 +11,7 @@ from emgs_jax.linalg import (
     Entries,
     dot,
     gather_entries,
+    gather_offsets,
     outer,
     principal_axes_2x2,
     safe_normalize,
@@ -92,12 +93,6 @@ def widened_distance_sq(
     return jnp.maximum(distance_sq, 0.0), jnp.log(growth)
 
 
-def _offsets(gaussians: Gaussians, points: Observation, rows: Int[Array, "m k"]) -> Entries:
-    """Entries (m, k) of every point's offset from the means of its Gaussians."""
-    point = jnp.unstack(points.points[:, None], axis=-1)
-    return tuple(p - mean for p, mean in zip(point, gather_entries(gaussians.means, rows), strict=True))
-
-
 def e_step(
     gaussians: Gaussians, points: Observation, noise: Float[Array, "m 3"], config: EmConfig
 ) -> tuple[EStep, Float[Array, "m"]]:
@@ -111,15 +106,10 @@ def e_step(
     """
     rows, found = knn(points.points, gaussians.means, gaussians.valid, config.num_neighbours)
     triangles, logdets = whitening(gaussians.covs)
-    triangle, means, normals = (
-        gather_entries(table, rows) for table in (triangles, gaussians.means, gaussians.normals)
-    )
-    point, point_normal, nu = (
-        jnp.unstack(vectors[:, None], axis=-1) for vectors in (points.points, points.normals, config.noise * noise)
-    )
-    offsets = tuple(a - b for a, b in zip(point, means, strict=True))
-    distance_sq, log_growth = widened_distance_sq(triangle, offsets, nu)
-    normal_cos = dot(normals, point_normal)
+    offsets = gather_offsets(points.points, gaussians.means, rows)
+    ray, normals = (jnp.unstack(vectors[:, None], axis=-1) for vectors in (config.noise * noise, points.normals))
+    distance_sq, log_growth = widened_distance_sq(gather_entries(triangles, rows), offsets, ray)
+    normal_cos = dot(gather_entries(gaussians.normals, rows), normals)
     # Features are unit vectors, so their product is the cosine; with width 0 the term must vanish.
     feature_gap = 0.0
     if gaussians.features.shape[-1]:
@@ -149,7 +139,7 @@ def support(gaussians: Gaussians, points: Observation, step: EStep, config: EmCo
     basis = tangent_basis(gaussians.normals)
     plane_covs = jnp.einsum("nda,ndc,ncb->nab", basis, gaussians.covs, basis)
     axes = jnp.einsum("nda,nab->ndb", basis, principal_axes_2x2(plane_covs))
-    offsets = _offsets(gaussians, points, step.rows)
+    offsets = gather_offsets(points.points, gaussians.means, step.rows)
     along = [dot(offsets, gather_entries(axis, step.rows)) for axis in jnp.unstack(axes, axis=-1)]
     is_positive = jnp.stack(along, axis=-1) > 0
     r = step.responsibilities[..., None]

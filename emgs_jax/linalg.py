@@ -99,6 +99,12 @@ def gather_entries(table: Float[Array, "n c"], rows: Int[Array, "*b"]) -> Entrie
     return tuple(column[rows] for column in jnp.unstack(table, axis=-1))
 
 
+def gather_offsets(points: Float[Array, "m d"], table: Float[Array, "n d"], rows: Int[Array, "m k"]) -> Entries:
+    """points[:, None] - table[rows], entry by entry."""
+    entries = jnp.unstack(points[:, None], axis=-1)
+    return tuple(a - b for a, b in zip(entries, gather_entries(table, rows), strict=True))
+
+
 def dot(first: Entries, second: Entries) -> Float[Array, "..."]:
     """Inner product."""
     return sum(a * b for a, b in zip(first, second, strict=True))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import Gaussians, color_gradients, intensity
-from emgs_jax.linalg import dot, gather_entries, mahalanobis_sq, whiten, whitening, widen
+from emgs_jax.linalg import dot, gather_entries, gather_offsets, mahalanobis_sq, whiten, whitening, widen
 from emgs_jax.observation import Observation
 
 Candidates: TypeAlias = tuple[Int[Array, "p k"], Bool[Array, "p k"]]  # of `knn`: rows of the Gaussians, which exist
@@ -79,10 +79,8 @@ def match(
         gates: largest squared Mahalanobis distance and smallest cosine between the normals of an inlier.
     """
     (rows, found), gaussians = candidates, surface.gaussians
-    means, triangles = gather_entries(gaussians.means, rows), gather_entries(surface.triangles, rows)
-    point, ray = (jnp.unstack(vectors[:, None], axis=-1) for vectors in (points.points, noise))
-    offset = tuple(a - b for a, b in zip(point, means, strict=True))
-    white = widen(whiten(triangles, offset), whiten(triangles, ray))
+    offsets, triangles = gather_offsets(points.points, gaussians.means, rows), gather_entries(surface.triangles, rows)
+    white = widen(whiten(triangles, offsets), whiten(triangles, jnp.unstack(noise[:, None], axis=-1)))
     distance_sq = jnp.where(found, dot(white, white), jnp.inf)
     best = jnp.argmin(distance_sq, axis=-1)[:, None]
     row = jnp.take_along_axis(rows, best, axis=1)[:, 0]

@@ -8,6 +8,7 @@ import pytest
 from emgs_jax.linalg import (
     dot,
     gather_entries,
+    gather_offsets,
     inverse_2x2,
     inverse_3x3,
     mahalanobis_sq,
@@ -71,6 +72,9 @@ def test_a_whitened_offset_has_the_mahalanobis_distance_also_with_noise_along_a_
 def test_entries_are_those_of_the_gathered_rows():
     table, rows = jnp.asarray(RNG.normal(size=(7, 3))), jnp.asarray(RNG.integers(0, 7, (4, 5)))
     np.testing.assert_array_equal(jnp.stack(gather_entries(table, rows), axis=-1), table[rows])
+    points = jnp.asarray(RNG.normal(size=(4, 3)))
+    expected = points[:, None] - table[rows]
+    np.testing.assert_array_equal(jnp.stack(gather_offsets(points, table, rows), axis=-1), expected)
 
 
 def test_the_inverse_of_2x2_equals_numpy_and_is_zero_where_singular():
