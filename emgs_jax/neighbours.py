@@ -1,8 +1,12 @@
 """Nearest neighbours and compaction with static shapes."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.selection import smallest
 
 GROUP = 32  # points per group: near each other
 CURVE_BITS = 8  # per axis, of the cells of the Hilbert curve
@@ -14,11 +18,11 @@ NUM_NEAR = 32  # groups that such a block looks at first, beside twice its share
 def knn(
     queries: Float[Array, "m d"], points: Float[Array, "n d"], valid: Bool[Array, "n"], k: int
 ) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
-    """The k nearest valid points of every query, nearest first, by exact search.
+    """The k nearest valid points of every query, nearest first; exact up to `smallest`'s precision.
 
     Points and queries are sorted along the Hilbert curve, so that groups of points and blocks of queries are compact.
-    On a CPU a block looks at the groups whose boxes are nearest to its own; where another group might hold one of the
-    k nearest, and on an accelerator, which such a condition would hold up, it looks at all points.
+    On a CPU a block looks at the groups whose boxes are nearest to its own, then at the next ones as long as they might
+    hold one of the k nearest; on an accelerator, which such a condition would hold up, it looks at all points.
 
     Args:
         queries: m positions.
@@ -43,9 +47,8 @@ def knn(
         cpu=lambda queries, groups: _by_blocks(queries, groups, BLOCK, NUM_NEAR, k),
         default=lambda queries, groups: _by_blocks(queries, groups, LARGE_BLOCK, groups.shape[0], k),
     )
-    back = jnp.argsort(query_order)
-    rows, exists = rows[back], exists[back]
-    return jnp.where(exists, order[jnp.where(exists, rows, 0)], 0), exists
+    found = jnp.where(exists, order[rows], 0), exists
+    return jax.tree.map(lambda sorted_rows: jnp.zeros_like(sorted_rows).at[query_order].set(sorted_rows), found)
 
 
 def _by_blocks(
@@ -54,12 +57,11 @@ def _by_blocks(
     """Neighbours of all queries, block after block, as rows of the flattened groups; free places are at infinity."""
     num_queries, num_axes = queries.shape
     blocks = jnp.pad(queries, ((0, -num_queries % size), (0, 0)), mode="edge").reshape(-1, size, num_axes)
-    boxes = jnp.min(groups, axis=1), jnp.max(jnp.where(jnp.isfinite(groups), groups, -jnp.inf), axis=1)
-    num_near += 2 * groups.shape[0] // blocks.shape[0]
-    if groups.shape[0] <= num_near or k > num_near * GROUP:
-        found = jax.lax.map(lambda block: _search_all(block, groups, k), blocks)
-    else:
-        found = jax.lax.map(lambda block: _search_near(block, groups, boxes, num_near, k), blocks)
+    num_near = max(num_near + 2 * groups.shape[0] // blocks.shape[0], -(-k // GROUP))
+    num_near = min(num_near, groups.shape[0])
+    groups = jnp.pad(groups, ((0, -groups.shape[0] % num_near), (0, 0), (0, 0)), constant_values=jnp.inf)
+    turns = _by_distance(blocks, groups, num_near)
+    found = jax.lax.map(lambda each: _search_block(*each, groups, k), (blocks, *turns))
     return jax.tree.map(lambda rows: rows.reshape(-1, k)[:num_queries], found)
 
 
@@ -92,59 +94,100 @@ def _curve(positions: Float[Array, "m d"], low: Float[Array, "d"], high: Float[A
     return code
 
 
-def _search_near(
+def _by_distance(
+    blocks: Float[Array, "b q d"], groups: Float[Array, "g p d"], num_near: int
+) -> tuple[Int[Array, "b t c"], Float[Array, "b t"]]:
+    """The groups in the order of the distance between their boxes and each block's, in turns of `num_near`.
+
+    Returns:
+        The groups of every turn, and the squared distance of the nearest group after it.
+    """
+    if groups.shape[0] == num_near:
+        one = (blocks.shape[0], 1)
+        return jnp.broadcast_to(jnp.arange(num_near), (*one, num_near)), jnp.full(one, jnp.inf)
+    low, high = jnp.min(groups, axis=1), jnp.max(jnp.where(jnp.isfinite(groups), groups, -jnp.inf), axis=1)
+    block_low, block_high = (bound(blocks, axis=1)[:, None] for bound in (jnp.min, jnp.max))
+    gaps = jnp.maximum(jnp.maximum(low - block_high, block_low - high), 0.0)
+    gaps_sq = jnp.sum(gaps**2, axis=-1)
+    order = jnp.argsort(gaps_sq, axis=-1)
+    beyond_sq = jnp.take_along_axis(gaps_sq, order[:, num_near::num_near], axis=1)
+    beyond_sq = jnp.pad(beyond_sq, ((0, 0), (0, 1)), constant_values=jnp.inf)
+    return order.reshape(blocks.shape[0], -1, num_near), beyond_sq
+
+
+def _search_block(
     queries: Float[Array, "q d"],
+    turns: Int[Array, "t c"],
+    beyond_sq: Float[Array, "t"],
     groups: Float[Array, "g p d"],
-    boxes: tuple[Float[Array, "g d"], Float[Array, "g d"]],
-    num_near: int,
     k: int,
 ) -> tuple[Int[Array, "q k"], Bool[Array, "q k"]]:
-    """Neighbours of one block, as rows of the flattened groups; free places of a group are at infinity."""
-    low, high = boxes
-    gap = jnp.maximum(jnp.maximum(low - jnp.max(queries, axis=0), jnp.min(queries, axis=0) - high), 0.0)
-    bounds, chosen = jax.lax.top_k(-jnp.sum(gap**2, axis=-1), num_near + 1)
-    near = groups[chosen[:num_near]].reshape(-1, groups.shape[2])
-    distance_sq = _distance_sq(queries[:, None], near)
-    best, index = _smallest(distance_sq, k)
-    rows = chosen[index // GROUP] * GROUP + index % GROUP
-    is_exact = jnp.all(best[:, -1] <= -bounds[num_near])
-    return jax.lax.cond(is_exact, lambda: (rows, jnp.isfinite(best)), lambda: _search_all(queries, groups, k))
+    """Neighbours of one block: turn after turn, until no group beyond can hold a nearer point."""
+
+    def look(turn: int | Int[Array, ""]) -> tuple[Int[Array, "k q"], Float[Array, "k q"]]:
+        near = turns[turn]
+        index, distance_sq = _search(queries, groups[near].reshape(-1, groups.shape[2]), k)
+        return near[index // GROUP] * GROUP + index % GROUP, distance_sq
+
+    def is_open(state: tuple) -> Bool[Array, ""]:
+        turn, (_, distance_sq) = state
+        return (turn + 1 < turns.shape[0]) & ~jnp.all(distance_sq[-1] <= beyond_sq[turn])
+
+    def look_on(state: tuple) -> tuple:
+        turn, found = state
+        both = jax.tree.map(lambda old, new: jnp.concatenate([old, new]), found, look(turn + 1))
+        best = smallest(both[1], k)
+        return turn + 1, jax.tree.map(lambda rows: jnp.take_along_axis(rows, best, axis=0), both)
+
+    found = look(0)
+    if turns.shape[0] > 1:
+        _, found = jax.lax.while_loop(is_open, look_on, (0, found))
+    rows, distance_sq = found
+    return rows.T, jnp.isfinite(distance_sq).T
 
 
-def _search_all(
-    queries: Float[Array, "q d"], groups: Float[Array, "g p d"], k: int
-) -> tuple[Int[Array, "q k"], Bool[Array, "q k"]]:
-    """The same among all points.
+def _search(
+    queries: Float[Array, "q d"], points: Float[Array, "n d"], k: int
+) -> tuple[Int[Array, "k q"], Float[Array, "k q"]]:
+    """Rows of the k nearest of all points, nearest first, and their squared distances.
 
     Every one of the k nearest is in one of k sets of points whose nearest member is nearest, so only those sets are
     sorted: a minimum over sets is much cheaper than a partial sort of all distances.
     """
-    points = groups.reshape(-1, groups.shape[2])
-    is_point, num_sets = jnp.isfinite(points[:, 0]), groups.shape[0]
-    # |q|² is the same for all points of one query. From the block's centre |p|² - 2 q·p cancels little; a query far
-    # from all points, or none at all, must not move it.
-    low = jnp.min(jnp.where(is_point[:, None], points, jnp.inf), axis=0)
-    high = jnp.max(jnp.where(is_point[:, None], points, -jnp.inf), axis=0)
-    center = jnp.nanmean(jnp.clip(queries, low, high), axis=0)
-    offsets = jnp.where(is_point[:, None], points - center, 0.0)
-    farness = jnp.where(is_point, jnp.sum(offsets**2, axis=-1), jnp.inf) - 2.0 * (queries - center) @ offsets.T
-    _, sets = _smallest(jnp.min(farness.reshape(-1, GROUP, num_sets), axis=1), min(k, num_sets))
-    near = points.reshape(GROUP, num_sets, -1)[:, sets].swapaxes(0, 1)
-    distance_sq = _distance_sq(queries[:, None, None], near).reshape(queries.shape[0], -1)
-    best, index = _smallest(distance_sq, k)
-    member, chosen = jnp.divmod(index, sets.shape[1])
-    return member * num_sets + jnp.take_along_axis(sets, chosen, axis=1), jnp.isfinite(best)
+    num_sets = GROUP * max(-(-k // GROUP), math.isqrt(k * points.shape[0]) // GROUP, 1)
+    points = jnp.pad(points, ((0, -points.shape[0] % num_sets), (0, 0)), constant_values=jnp.inf)
+    members, columns = points.reshape(-1, num_sets, points.shape[1]), queries.T
+    nearest_sq = jax.lax.platform_dependent(
+        members,
+        columns,
+        cpu=_nearest_member_by_parts,
+        default=lambda members, columns: jnp.min(_distance_sq(members[:, :, None], columns), axis=0),
+    )
+    sets = smallest(nearest_sq, k)
+    candidates = _distance_sq(members[:, sets], columns).reshape(-1, queries.shape[0])
+    best = smallest(candidates, k)
+    rows = (best // k) * num_sets + jnp.take_along_axis(sets, best % k, axis=0)
+    return rows, jnp.take_along_axis(candidates, best, axis=0)
 
 
-def _distance_sq(queries: Float[Array, "*#b d"], points: Float[Array, "*#b d"]) -> Float[Array, "*b"]:
-    # One axis after the other: a sum over a last axis of three does not fill the processor's vectors.
-    return sum((queries[..., axis] - points[..., axis]) ** 2 for axis in range(queries.shape[-1]))
+def _nearest_member_by_parts(members: Float[Array, "m s d"], columns: Float[Array, "d q"]) -> Float[Array, "s q"]:
+    """Squared distance from every query to the nearest member of each set.
+
+    Part of the sets after part, member after member: XLA would share larger pieces among the processor's threads, which
+    takes longer than the work, and would not fill the vectors in a reduction over the first axis.
+    """
+
+    def closer(least_sq: Float[Array, "p q"], points: Float[Array, "p d"]) -> tuple[Float[Array, "p q"], None]:
+        return jnp.minimum(least_sq, _distance_sq(points[:, None], columns)), None
+
+    start = jnp.full((GROUP, columns.shape[1]), jnp.inf)
+    parts = members.reshape(members.shape[0], -1, GROUP, members.shape[2]).swapaxes(0, 1)
+    return jax.lax.map(lambda part: jax.lax.scan(closer, start, part)[0], parts).reshape(-1, columns.shape[1])
 
 
-def _smallest(values: Float[Array, "q c"], k: int) -> tuple[Float[Array, "q k"], Int[Array, "q k"]]:
-    """The k smallest of every row, ascending, and where they are."""
-    negative, index = jax.lax.top_k(-values, k)
-    return -negative, index
+def _distance_sq(points: Float[Array, "*#b d"], columns: Float[Array, "d q"]) -> Float[Array, "*b"]:
+    # One axis after the other, and the queries last: so the sums fill the processor's vectors.
+    return sum((points[..., axis] - columns[axis]) ** 2 for axis in range(columns.shape[0]))
 
 
 def compact_rows(mask: Bool[Array, "n"], capacity: int) -> tuple[Int[Array, "c"], Bool[Array, "c"], Int[Array, ""]]:

@@ -6,7 +6,8 @@ from jaxtyping import install_import_hook
 
 # Before anything imports the package: every call in the tests checks its jaxtyping signature.
 CHECKED = (
-    *("pytree", "linalg", "rigid", "camera", "observation", "neighbours", "clustering", "gaussians"),
+    *("pytree", "linalg", "rigid", "camera", "observation", "selection", "neighbours"),
+    *("clustering", "gaussians"),
     *("gaussian_map", "icp"),
     *("render", "initialization", "localization", "em", "refinement", "slam", "semantics"),
     *("prior.masks", "stereo.bundle_adjustment", "stereo.plane_sweep", "stereo.semi_global", "stereo.depth"),

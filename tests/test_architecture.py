@@ -15,6 +15,7 @@ CORE = (
         "rigid",
         "camera",
         "observation",
+        "selection",
         "neighbours",
         "clustering",
         "gaussians",

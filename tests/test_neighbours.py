@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import reference
 
-from emgs_jax.neighbours import CURVE_BITS, _curve, compact_rows, knn
+from emgs_jax.neighbours import CURVE_BITS, LARGE_BLOCK, _by_blocks, _curve, compact_rows, knn
 
 search = jax.jit(knn, static_argnums=3)
 
@@ -50,6 +50,16 @@ def test_where_blocks_look_at_near_groups_only_and_where_they_must_look_at_all_n
     plane = rng.uniform(-1, 1, (2400, 3)).astype(np.float32) * np.float32([1, 1, 0.01])
     queries = np.concatenate([plane[::2], rng.uniform(-5, 5, (100, 3)).astype(np.float32)])
     check(rng.permutation(queries), plane, rng.uniform(size=2400) < 0.9, k)
+
+
+def test_an_accelerator_which_looks_at_all_points_in_one_turn_finds_the_same():
+    rng = np.random.default_rng(8)
+    points, queries = (rng.uniform(-1, 1, (count, 3)).astype(np.float32) for count in (700, 300))
+    groups = jnp.pad(jnp.asarray(points), ((0, 4), (0, 0)), constant_values=jnp.inf).reshape(-1, 32, 3)
+    rows, found = _by_blocks(jnp.asarray(queries), groups, LARGE_BLOCK, groups.shape[0], 5)
+    expected = reference.knn(queries, points, np.ones(700, bool), 5)
+    assert np.asarray(found).all()
+    np.testing.assert_allclose(np.linalg.norm(points[rows] - queries[:, None], axis=-1), expected, rtol=1e-4)
 
 
 def test_with_fewer_valid_points_than_k_the_rest_is_marked():
