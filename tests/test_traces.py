@@ -36,17 +36,27 @@ def choices(module, prefix=""):
 
 
 @pytest.fixture(scope="module")
-def compiled(camera):
-    """The step, compiled once, as a function of the config."""
+def started(camera):
+    """State, prediction and camera of a first step."""
     poses = [path_pose(i) for i in range(3)]
-    config = slam_config("slam.initialization=merged")
-    state, _ = init_state(
-        stack([observe_room(T, camera, num_features=2) for T in poses]), stack_poses(poses), camera, config
-    )
-    prediction = predict_room(3, camera, num_features=2)
-    call = lambda config: jax.block_until_ready(counted_step(state, prediction, camera, config))  # noqa: E731
-    call(config)
+    views = stack([observe_room(T, camera, num_features=2) for T in poses])
+    state, _ = init_state(views, stack_poses(poses), camera, slam_config("slam.initialization=merged"))
+    return state, predict_room(3, camera, num_features=2), camera
+
+
+@pytest.fixture(scope="module")
+def compiled(started):
+    """The step, compiled once, as a function of the config."""
+    call = lambda config: jax.block_until_ready(counted_step(*started, config))  # noqa: E731
+    call(slam_config("slam.initialization=merged"))
     return call
+
+
+def test_every_matrix_product_of_a_step_is_in_full_float32(started):
+    """By default JAX lets a GPU round the factors to ten bits, which no test on a CPU would notice."""
+    lowered = jax.jit(step).lower(*started, slam_config("slam.initialization=merged")).as_text()
+    products = [line for line in lowered.splitlines() if "stablehlo.dot_general" in line]
+    assert products and all("precision = [HIGHEST, HIGHEST]" in line for line in products)
 
 
 def test_ten_thresholds_from_yaml_are_one_trace(compiled):
