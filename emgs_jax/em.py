@@ -21,7 +21,9 @@ from emgs_jax.linalg import (
 )
 from emgs_jax.neighbours import knn
 from emgs_jax.observation import Observation
-from emgs_jax.pytree import choice, static, traced, where_rows
+from emgs_jax.pytree import choice, join_rows, split_rows, static, traced, where_rows
+
+MAX_POINTS = 16384  # whose K explanations are held at once
 
 
 class EmConfig(eqx.Module):
@@ -105,7 +107,23 @@ def e_step(
         config: gates and weights.
     """
     rows, found = knn(points.points, gaussians.means, gaussians.valid, config.num_neighbours)
-    triangles, logdets = whitening(gaussians.covs)
+    shapes = whitening(gaussians.covs)
+    parts = split_rows((points, noise, rows, found), MAX_POINTS)
+    explained = jax.lax.map(lambda part: _explain(gaussians, shapes, *part, config), parts)
+    return join_rows(explained, points.valid.shape[0])
+
+
+def _explain(
+    gaussians: Gaussians,
+    shapes: tuple[Float[Array, "n 6"], Float[Array, "n"]],
+    points: Observation,
+    noise: Float[Array, "m 3"],
+    rows: Int[Array, "m k"],
+    found: Bool[Array, "m k"],
+    config: EmConfig,
+) -> tuple[EStep, Float[Array, "m"]]:
+    """The E-step for given neighbours; `shapes` of `whitening`."""
+    triangles, logdets = shapes
     offsets = gather_offsets(points.points, gaussians.means, rows)
     ray, normals = (jnp.unstack(vectors[:, None], axis=-1) for vectors in (config.noise * noise, points.normals))
     distance_sq, log_growth = widened_distance_sq(gather_entries(triangles, rows), offsets, ray)
@@ -160,17 +178,13 @@ def m_step(
     Returns:
         The new parameters (the old ones where no point is), and the total responsibility Σ_i r_ik.
     """
-    r = step.responsibilities
-    # Sums of offsets from the old means: second moments of world coordinates would cancel in float32.
-    offsets = points.points[:, None] - gaussians.means[step.rows]
-    rows, columns = jnp.triu_indices(3)
-    products = offsets[..., rows] * offsets[..., columns]
-    others = jnp.broadcast_to(jnp.concatenate([points.normals, points.colors], axis=-1)[:, None], (*r.shape, 6))
-    statistics = jnp.concatenate([jnp.ones_like(r)[..., None], offsets, products, others], axis=-1)
-    sums = jnp.zeros((gaussians.valid.shape[0], 16)).at[step.rows].add(r[..., None] * statistics)
+    add = lambda sums, part: (_add_statistics(sums, gaussians.means, *part), None)  # noqa: E731
+    nothing = jnp.zeros((gaussians.valid.shape[0], 16))
+    sums, _ = jax.lax.scan(add, nothing, split_rows((points, step), MAX_POINTS))
     total = sums[:, 0]
     has_points = total > config.min_responsibility
     mean = sums[:, 1:] / jnp.where(has_points, total, 1.0)[:, None]
+    rows, columns = jnp.triu_indices(3)
     second = jnp.zeros((total.shape[0], 3, 3)).at[:, rows, columns].set(mean[:, 3:9])
     second = second.at[:, columns, rows].set(mean[:, 3:9])
     new = eqx.tree_at(
@@ -184,6 +198,20 @@ def m_step(
         ),
     )
     return where_rows(has_points, new, gaussians), jnp.where(has_points, total, 0.0)
+
+
+def _add_statistics(
+    sums: Float[Array, "n 16"], means: Float[Array, "n 3"], points: Observation, step: EStep
+) -> Float[Array, "n 16"]:
+    """Add Σ r (1, offset, upper triangle of offset offset', normal, colour) over the points of every Gaussian."""
+    r = step.responsibilities
+    # Offsets from the old means: second moments of world coordinates would cancel in float32.
+    offsets = points.points[:, None] - means[step.rows]
+    rows, columns = jnp.triu_indices(3)
+    products = offsets[..., rows] * offsets[..., columns]
+    others = jnp.broadcast_to(jnp.concatenate([points.normals, points.colors], axis=-1)[:, None], (*r.shape, 6))
+    statistics = jnp.concatenate([jnp.ones_like(r)[..., None], offsets, products, others], axis=-1)
+    return sums.at[step.rows].add(r[..., None] * statistics)
 
 
 def em_update(

@@ -109,7 +109,7 @@ def _by_distance(
     block_low, block_high = (bound(blocks, axis=1)[:, None] for bound in (jnp.min, jnp.max))
     gaps = jnp.maximum(jnp.maximum(low - block_high, block_low - high), 0.0)
     gaps_sq = jnp.sum(gaps**2, axis=-1)
-    order = jnp.argsort(gaps_sq, axis=-1)
+    order = smallest(gaps_sq.T, groups.shape[0]).T
     beyond_sq = jnp.take_along_axis(gaps_sq, order[:, num_near::num_near], axis=1)
     beyond_sq = jnp.pad(beyond_sq, ((0, 0), (0, 1)), constant_values=jnp.inf)
     return order.reshape(blocks.shape[0], -1, num_near), beyond_sq

@@ -233,6 +233,19 @@ def test_the_update_is_estep_mstep_support_and_average_in_a_row(opened):
     assert info.num_fused == M == is_fused.sum() and info.num_updated == (alpha > 0).sum()
 
 
+def test_many_points_are_taken_in_parts_which_changes_no_sum(opened, monkeypatch):
+    step, best = e_step(GAUSSIANS, POINTS, NOISE, opened)
+    new, total = m_step(GAUSSIANS, POINTS, step, opened)
+    monkeypatch.setattr("emgs_jax.em.MAX_POINTS", 13)  # five parts, the last with fewer points
+    step_parts, best_parts = e_step(GAUSSIANS, POINTS, NOISE, opened)
+    new_parts, total_parts = m_step(GAUSSIANS, POINTS, step_parts, opened)
+    np.testing.assert_array_equal(step_parts.rows, step.rows)
+    np.testing.assert_allclose(best_parts, best, rtol=1e-6)
+    np.testing.assert_allclose(total_parts, total, atol=1e-5)  # roundings, here and below
+    for name in ("means", "covs", "normals", "colors"):
+        np.testing.assert_allclose(getattr(new_parts, name), getattr(new, name), atol=1e-5)
+
+
 def test_the_update_moves_with_a_rigid_motion(opened):
     T, one = pose((0.4, -0.9, 0.3), (0.5, 1.0, -0.7)), jnp.ones(())
     config = changed(opened, max_mahalanobis_sq=9.0, noise=1.0)

@@ -8,7 +8,7 @@ import pytest
 from jaxtyping import Array, Float
 from scene import assert_same
 
-from emgs_jax.pytree import choice, put_rows, stack, static, take_rows, traced, where_rows
+from emgs_jax.pytree import choice, join_rows, put_rows, split_rows, stack, static, take_rows, traced, where_rows
 
 ROWS = {"a": jnp.arange(4.0), "b": jnp.arange(12.0).reshape(4, 3)}
 
@@ -61,3 +61,15 @@ def test_a_stack_holds_every_tree_as_a_row():
     stacked = stack([ROWS, jax.tree.map(lambda leaf: leaf + 1, ROWS)])
     assert_same(jax.tree.map(lambda leaf: leaf[0], stacked), ROWS)
     np.testing.assert_array_equal(stacked["a"][1], [1, 2, 3, 4])
+
+
+@pytest.mark.parametrize(
+    ("num_rows", "max_rows", "shape"), [(7, 3, (3, 3)), (6, 3, (2, 3)), (4, 9, (1, 4)), (0, 3, (1, 0))]
+)
+def test_rows_cut_into_parts_and_joined_are_the_same_and_the_rest_is_zero(num_rows, max_rows, shape):
+    tree = {"a": jnp.arange(1.0, num_rows + 1), "b": jnp.ones((num_rows, 2), bool)}
+    parts = split_rows(tree, max_rows)
+    assert parts["a"].shape == shape and parts["b"].shape == (*shape, 2)
+    assert not parts["a"].reshape(-1)[num_rows:].any() and not parts["b"].reshape(-1, 2)[num_rows:].any()
+    for joined, leaf in zip(jax.tree.leaves(join_rows(parts, num_rows)), jax.tree.leaves(tree), strict=True):
+        np.testing.assert_array_equal(joined, leaf)
