@@ -58,12 +58,11 @@ def _sort_bitonic(keys: Int[Array, "r q"], sizes: Sequence[int]) -> Int[Array, "
     """
     row = jnp.arange(keys.shape[0])
     stages = [(size, size >> power) for size in sizes for power in range(1, size.bit_length())]
-    partners = jnp.stack([row ^ gap for _, gap in stages])
-    takes_larger = jnp.stack([((row & gap) > 0) ^ ((row & size) > 0) for size, gap in stages])
 
-    def compare(keys: Int[Array, "r q"], stage: tuple) -> tuple[Int[Array, "r q"], None]:
-        partner, is_larger = stage
-        others = keys.at[partner].get(mode="promise_in_bounds", unique_indices=True)
-        return jnp.where(is_larger[:, None], jnp.maximum(keys, others), jnp.minimum(keys, others)), None
+    def compare(keys: Int[Array, "r q"], stage: Int[Array, "2"]) -> tuple[Int[Array, "r q"], None]:
+        size, gap = stage
+        others = keys.at[row ^ gap].get(mode="promise_in_bounds", unique_indices=True)
+        takes_larger = ((row & gap) > 0) ^ ((row & size) > 0)
+        return jnp.where(takes_larger[:, None], jnp.maximum(keys, others), jnp.minimum(keys, others)), None
 
-    return jax.lax.scan(compare, keys, (partners, takes_larger))[0]
+    return jax.lax.scan(compare, keys, jnp.array(stages))[0]
