@@ -233,12 +233,14 @@ def test_the_update_is_estep_mstep_support_and_average_in_a_row(opened):
     assert info.num_fused == M == is_fused.sum() and info.num_updated == (alpha > 0).sum()
 
 
+@pytest.mark.slow  # compiles both steps anew
 def test_many_points_are_taken_in_parts_which_changes_no_sum(opened, monkeypatch):
-    step, best = e_step(GAUSSIANS, POINTS, NOISE, opened)
-    new, total = m_step(GAUSSIANS, POINTS, step, opened)
+    step, best = estep(GAUSSIANS, POINTS, NOISE, opened)
+    new, total = mstep(GAUSSIANS, POINTS, step, opened)
     monkeypatch.setattr("emgs_jax.em.MAX_POINTS", 13)  # five parts, the last with fewer points
-    step_parts, best_parts = e_step(GAUSSIANS, POINTS, NOISE, opened)
-    new_parts, total_parts = m_step(GAUSSIANS, POINTS, step_parts, opened)
+    in_parts = lambda function: eqx.filter_jit(lambda *arguments: function(*arguments))  # noqa: E731
+    step_parts, best_parts = in_parts(e_step)(GAUSSIANS, POINTS, NOISE, opened)
+    new_parts, total_parts = in_parts(m_step)(GAUSSIANS, POINTS, step_parts, opened)
     np.testing.assert_array_equal(step_parts.rows, step.rows)
     np.testing.assert_allclose(best_parts, best, rtol=1e-6)
     np.testing.assert_allclose(total_parts, total, atol=1e-5)  # roundings, here and below

@@ -80,7 +80,7 @@ def test_far_from_the_origin_the_nearest_is_still_found():
 
 def test_the_nearest_comes_first():
     points = jnp.array([[3.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]])
-    rows, _ = knn(jnp.zeros((1, 3)), points, jnp.ones(4, bool), 3)
+    rows, _ = search(jnp.zeros((1, 3)), points, jnp.ones(4, bool), 3)
     np.testing.assert_array_equal(rows, [[1, 2, 0]])
 
 
