@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from emgs_jax.pytree import fill_rows, join_rows
 from emgs_jax.selection import smallest
 
 GROUP = 32  # points per group: near each other
@@ -39,8 +40,7 @@ def knn(
     order = jnp.argsort(jnp.where(valid, _curve(points, low, high), jnp.iinfo(jnp.int32).max))
     query_order = jnp.argsort(_curve(queries, low, high))
     sorted_points = jnp.where(valid[:, None], points, jnp.inf)[order]
-    padding = ((0, -points.shape[0] % GROUP), (0, 0))
-    groups = jnp.pad(sorted_points, padding, constant_values=jnp.inf).reshape(-1, GROUP, points.shape[1])
+    groups = fill_rows(sorted_points, GROUP, jnp.inf).reshape(-1, GROUP, points.shape[1])
     rows, exists = jax.lax.platform_dependent(
         queries[query_order],
         groups,
@@ -59,10 +59,10 @@ def _by_blocks(
     blocks = jnp.pad(queries, ((0, -num_queries % size), (0, 0)), mode="edge").reshape(-1, size, num_axes)
     num_near = max(num_near + 2 * groups.shape[0] // blocks.shape[0], -(-k // GROUP))
     num_near = min(num_near, groups.shape[0])
-    groups = jnp.pad(groups, ((0, -groups.shape[0] % num_near), (0, 0), (0, 0)), constant_values=jnp.inf)
+    groups = fill_rows(groups, num_near, jnp.inf)
     turns = _by_distance(blocks, groups, num_near)
     found = jax.lax.map(lambda each: _search_block(*each, groups, k), (blocks, *turns))
-    return jax.tree.map(lambda rows: rows.reshape(-1, k)[:num_queries], found)
+    return join_rows(found, num_queries)
 
 
 def _curve(positions: Float[Array, "m d"], low: Float[Array, "d"], high: Float[Array, "d"]) -> Int[Array, "m"]:
@@ -155,7 +155,7 @@ def _search(
     sorted: a minimum over sets is much cheaper than a partial sort of all distances.
     """
     num_sets = GROUP * max(-(-k // GROUP), math.isqrt(k * points.shape[0]) // GROUP, 1)
-    points = jnp.pad(points, ((0, -points.shape[0] % num_sets), (0, 0)), constant_values=jnp.inf)
+    points = fill_rows(points, num_sets, jnp.inf)
     members, columns = points.reshape(-1, num_sets, points.shape[1]), queries.T
     nearest_sq = jax.lax.platform_dependent(
         members,

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, PyTree
+from jaxtyping import Array, Bool, Int, PyTree, Shaped
 
 Tree = TypeVar("Tree")
 
@@ -63,6 +63,12 @@ def stack(trees: Sequence[Tree]) -> PyTree:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
+def fill_rows(array: Shaped[Array, "n *c"], multiple: int, value: float | int) -> Shaped[Array, "m *c"]:
+    """Rows of `value` after the last, up to the next multiple of `multiple` rows."""
+    beyond = ((0, -array.shape[0] % multiple), *[(0, 0)] * (array.ndim - 1))
+    return jnp.pad(array, beyond, constant_values=value)
+
+
 def split_rows(tree: Tree, max_rows: int) -> Tree:
     """Cut the first axis of every leaf into equal parts of at most `max_rows`, a new first axis; zeros fill the last.
 
@@ -70,11 +76,10 @@ def split_rows(tree: Tree, max_rows: int) -> Tree:
     """
     num_rows = jax.tree.leaves(tree)[0].shape[0]
     num_parts = max(-(-num_rows // max_rows), 1)
-    fill = -num_rows % num_parts
 
     def cut(leaf: Array) -> Array:
-        padded = jnp.pad(leaf, ((0, fill), *[(0, 0)] * (leaf.ndim - 1)))
-        return padded.reshape(num_parts, padded.shape[0] // num_parts, *leaf.shape[1:])
+        filled = fill_rows(leaf, num_parts, 0)
+        return filled.reshape(num_parts, filled.shape[0] // num_parts, *leaf.shape[1:])
 
     return jax.tree.map(cut, tree)
 

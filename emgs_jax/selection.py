@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from emgs_jax.pytree import fill_rows
+
 MIN_RUN = 8  # values that are sorted before they meet the best: with fewer the loop takes longer than the work
 
 
@@ -40,7 +42,7 @@ def _by_network(values: Float[Array, "n q"], k: int) -> Int[Array, "k q"]:
     row_bits = (1 << (count - 1).bit_length()) - 1
     keys = (jax.lax.bitcast_convert_type(values, jnp.int32) & ~row_bits) | jnp.arange(count)[:, None]
     last = jnp.iinfo(jnp.int32).max
-    runs = jnp.pad(keys, ((0, -count % run), (0, 0)), constant_values=last).reshape(-1, run, num_columns)
+    runs = fill_rows(keys, run, last).reshape(-1, run, num_columns)
     sizes = [1 << power for power in range(1, run.bit_length())]
 
     def merge(best: Int[Array, "r q"], keys: Int[Array, "r q"]) -> tuple[Int[Array, "r q"], None]:

@@ -44,7 +44,7 @@ def test_more_queries_than_a_block_equal_brute_force():
 
 
 @pytest.mark.parametrize("k", [1, 5])
-def test_where_blocks_look_at_near_groups_only_and_where_they_must_look_at_all_neighbours_equal_brute_force(k):
+def test_where_blocks_look_at_near_groups_only_and_where_they_must_look_on_neighbours_equal_brute_force(k):
     """A surface, whose blocks are compact, and queries far from it and from each other, whose blocks are not."""
     rng = np.random.default_rng(6)
     plane = rng.uniform(-1, 1, (2400, 3)).astype(np.float32) * np.float32([1, 1, 0.01])

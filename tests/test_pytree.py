@@ -8,7 +8,18 @@ import pytest
 from jaxtyping import Array, Float
 from scene import assert_same
 
-from emgs_jax.pytree import choice, join_rows, put_rows, split_rows, stack, static, take_rows, traced, where_rows
+from emgs_jax.pytree import (
+    choice,
+    fill_rows,
+    join_rows,
+    put_rows,
+    split_rows,
+    stack,
+    static,
+    take_rows,
+    traced,
+    where_rows,
+)
 
 ROWS = {"a": jnp.arange(4.0), "b": jnp.arange(12.0).reshape(4, 3)}
 
@@ -73,3 +84,10 @@ def test_rows_cut_into_parts_and_joined_are_the_same_and_the_rest_is_zero(num_ro
     assert not parts["a"].reshape(-1)[num_rows:].any() and not parts["b"].reshape(-1, 2)[num_rows:].any()
     for joined, leaf in zip(jax.tree.leaves(join_rows(parts, num_rows)), jax.tree.leaves(tree), strict=True):
         np.testing.assert_array_equal(joined, leaf)
+
+
+@pytest.mark.parametrize(("multiple", "num_rows"), [(1, 3), (2, 4), (3, 3), (5, 5)])
+def test_rows_are_filled_up_to_the_next_multiple(multiple, num_rows):
+    filled = np.asarray(fill_rows(ROWS["b"][:3], multiple, jnp.inf))
+    np.testing.assert_array_equal(filled[:3], ROWS["b"][:3])
+    assert filled.shape == (num_rows, 3) and np.isinf(filled[3:]).all()

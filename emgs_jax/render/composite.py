@@ -15,6 +15,8 @@ from emgs_jax.pytree import static, take_rows, traced
 from emgs_jax.render.project import Splats, project_gaussians
 from emgs_jax.render.tiles import assign_tiles, tile_corners
 
+Sums: TypeAlias = tuple[Float[Array, "q v"], Float[Array, "q"], Float[Array, "q"], Float[Array, "q"]]
+
 
 class RenderConfig(eqx.Module):
     """How the map is drawn.
@@ -91,9 +93,6 @@ def blend_weights(
     weights = alpha * light_before
     # An invalid row may hold any depth; its weight is 0, and 0 · inf would be NaN.
     return weights, jnp.where(weights > 0, splat_depth(splats, pixels, config), 0.0)
-
-
-Sums: TypeAlias = tuple[Float[Array, "q v"], Float[Array, "q"], Float[Array, "q"], Float[Array, "q"]]
 
 
 def weighted_sums(weights: Float[Array, "c q"], depth: Float[Array, "c q"], values: Float[Array, "c v"]) -> Sums:
