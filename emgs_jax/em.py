@@ -7,7 +7,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.linalg import (
+from emgs_jax.observation import Observation
+from emgs_jax.ops.linalg import (
     Entries,
     dot,
     gather_entries,
@@ -19,9 +20,8 @@ from emgs_jax.linalg import (
     whiten,
     whitening,
 )
-from emgs_jax.neighbours import knn
-from emgs_jax.observation import Observation
-from emgs_jax.pytree import choice, join_rows, split_rows, static, traced, where_rows
+from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.pytree import choice, join_rows, split_rows, static, traced, where_rows
 
 MAX_POINTS = 16384  # whose K explanations are held at once
 

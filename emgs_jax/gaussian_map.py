@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from emgs_jax.gaussians import Gaussians, blend, empty_gaussians
-from emgs_jax.neighbours import compact_rows
 from emgs_jax.observation import Observation
-from emgs_jax.pytree import choice, put_rows, static, take_rows, traced, where_rows
+from emgs_jax.ops.neighbours import compact_rows
+from emgs_jax.ops.pytree import choice, put_rows, static, take_rows, traced, where_rows
 
 
 class GaussianMap(eqx.Module):

@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.clustering import kmeans, strided_seeds
-from emgs_jax.linalg import dot, inverse_2x2, outer, safe_normalize, tangent_basis, whiten, whitening
-from emgs_jax.neighbours import knn
 from emgs_jax.observation import Observation
-from emgs_jax.pytree import static, take_rows, traced, where_rows
+from emgs_jax.ops.clustering import kmeans, strided_seeds
+from emgs_jax.ops.linalg import dot, inverse_2x2, outer, safe_normalize, tangent_basis, whiten, whitening
+from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.pytree import static, take_rows, traced, where_rows
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
 

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
-from emgs_jax.camera import Camera
-from emgs_jax.clustering import morton_order
 from emgs_jax.gaussians import FitConfig, Gaussians, cluster, spacing
 from emgs_jax.observation import Observation, transform
+from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.clustering import morton_order
 
 
 def initialize(

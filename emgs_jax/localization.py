@@ -5,12 +5,20 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.camera import Camera, nearest_pixel, project
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.icp import IcpConfig, IcpInfo, icp
 from emgs_jax.observation import Observation, Prediction, transform
-from emgs_jax.pytree import choice, stack, traced
-from emgs_jax.rigid import MIN_PAIRS, fit_rigid, fit_rigid_robust, interpolate, median, pose_row, scale_translation
+from emgs_jax.ops.camera import Camera, nearest_pixel, project
+from emgs_jax.ops.pytree import choice, stack, traced
+from emgs_jax.registration.icp import IcpConfig, IcpInfo, icp
+from emgs_jax.registration.rigid import (
+    MIN_PAIRS,
+    fit_rigid,
+    fit_rigid_robust,
+    interpolate,
+    median,
+    pose_row,
+    scale_translation,
+)
 
 # Bits of LocalizationInfo.reason; the words are for people.
 REASONS = (

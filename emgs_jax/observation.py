@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from emgs_jax.linalg import safe_normalize
-from emgs_jax.pytree import static, traced
+from emgs_jax.ops.linalg import safe_normalize
+from emgs_jax.ops.pytree import static, traced
 
 
 class Observation(eqx.Module):

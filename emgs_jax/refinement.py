@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.camera import Camera, nearest_pixel
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.linalg import inverse_2x2, mahalanobis_sq, outer, safe_normalize
-from emgs_jax.neighbours import knn
-from emgs_jax.pytree import static, traced, where_rows
+from emgs_jax.ops.camera import Camera, nearest_pixel
+from emgs_jax.ops.linalg import inverse_2x2, mahalanobis_sq, outer, safe_normalize
+from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.pytree import static, traced, where_rows
 from emgs_jax.render.composite import RenderConfig, Rendering, render
 from emgs_jax.render.project import Splats, project_gaussians
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.linalg import safe_normalize
+from emgs_jax.ops.linalg import safe_normalize
 
 
 def similarities(gaussians: Gaussians, text_features: Float[Array, "c f"]) -> Float[Array, "n c"]:

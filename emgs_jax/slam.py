@@ -10,17 +10,17 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
-from emgs_jax.camera import Camera, downscale
-from emgs_jax.clustering import morton_order
 from emgs_jax.em import EmConfig, EmInfo, em_update
 from emgs_jax.gaussian_map import GaussianMap, SubmapConfig, empty_map, grow, insert, select_submap, write_back
 from emgs_jax.gaussians import FitConfig, cluster, spacing
 from emgs_jax.initialization import initialize
 from emgs_jax.localization import LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
 from emgs_jax.observation import Observation, ObservationConfig, Prediction, transform
-from emgs_jax.pytree import static
+from emgs_jax.ops.camera import Camera, downscale
+from emgs_jax.ops.clustering import morton_order
+from emgs_jax.ops.pytree import static
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
-from emgs_jax.rigid import pose_row
+from emgs_jax.registration.rigid import pose_row
 
 
 class SlamConfig(eqx.Module):

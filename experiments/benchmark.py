@@ -16,8 +16,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from emgs_jax.evaluation.report import provenance
-from emgs_jax.files import atomic_write, write_json
+from emgs_jax.io.files import atomic_write, write_json
+from emgs_jax.report.provenance import provenance
 from experiments.benchmarks.comparisons import time_em, time_icp, time_render
 from experiments.benchmarks.data import load
 from experiments.benchmarks.scaling import time_growth, time_settings

@@ -17,8 +17,8 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
-from emgs_jax.evaluation.columns import MAIN, Column, cell, markdown
-from emgs_jax.sweep_results import read_sweep
+from emgs_jax.report.columns import MAIN, Column, cell, markdown
+from emgs_jax.report.sweeps import read_sweep
 from experiments.building import clear_errors
 
 

@@ -17,10 +17,10 @@ import jax
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from emgs_jax.evaluation.gate import read_gate, regressions, write_gate
-from emgs_jax.evaluation.results import is_finished, read_estimates, result_folder
-from emgs_jax.evaluation.tables import Row, average, full_table, paper_table, to_csv
-from emgs_jax.files import atomic_write, write_json
+from emgs_jax.io.files import atomic_write, write_json
+from emgs_jax.report.gate import read_gate, regressions, write_gate
+from emgs_jax.report.results import is_finished, read_estimates, result_folder
+from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
 from experiments.building import clear_errors, message_of, use_compilation_cache
 from experiments.run import run
 

@@ -13,8 +13,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.render.densify import DensifyConfig
+from emgs_jax.running.stacked import programs
 from emgs_jax.slam import SlamConfig
-from emgs_jax.sweep import programs
 
 Value = float | int | str | bool
 Axes = Mapping[str, Sequence[Value]]

@@ -11,16 +11,18 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from emgs_jax import outputs, scoring
-from emgs_jax.clock import Clock
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, raw_prior_cloud
-from emgs_jax.evaluation.report import print_metrics_table, provenance, write_metrics
-from emgs_jax.files import FrameLog
-from emgs_jax.mapping_run import FrameRecord, MappingRun, new_run
-from emgs_jax.pipeline import map_frames
+from emgs_jax.io.files import FrameLog
 from emgs_jax.prior.base import Prior
+from emgs_jax.report import metrics as scoring
+from emgs_jax.report.provenance import print_metrics_table, provenance, write_metrics
+from emgs_jax.report.run_files import save_outputs, save_progress
+from emgs_jax.running.clock import Clock
+from emgs_jax.running.dense import center_cloud, dense_map, label_centers
+from emgs_jax.running.drive import map_frames
+from emgs_jax.running.record import FrameRecord, MappingRun, new_run
 from experiments.building import build_dataset, build_prior, clear_errors, measured, use_compilation_cache
 
 
@@ -33,16 +35,16 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             slam, evaluation, densify = (instantiate(config[name]) for name in ("slam", "evaluation", "densify"))
         session = new_run(dataset, slam, clock)
         raw_cloud = _map(session, dataset, prior, evaluation, folder)
-        outputs.save_progress(folder, session)
+        save_progress(folder, session)
         with clock.phase("densify"):
-            labels = outputs.label_centers(session, prior)
-            dense = outputs.dense_map(session, dataset, densify, evaluation.voxel_m, labels)
+            labels = label_centers(session, prior)
+            dense = dense_map(session, dataset, densify, evaluation.voxel_m, labels)
         with clock.phase("export"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
-            notes = outputs.save_outputs(folder, session, dense, densify, title)
+            notes = save_outputs(folder, session, dense, densify, title)
         with clock.phase("evaluate"):
             scorer = scoring.new_scorer(dataset, evaluation, prior)
-            metrics = scoring.score_map(session, dense.cloud, outputs.center_cloud(session), labels, scorer)
+            metrics = scoring.score_map(session, dense.cloud, center_cloud(session), labels, scorer)
             metrics |= scoring.score_prior(session, raw_cloud, scorer)
         metrics |= scoring.describe(session, dataset) | scoring.spent(clock) | measured(prior)
     settings = OmegaConf.to_container(config, resolve=True)
@@ -72,7 +74,7 @@ def _map(
                 return raw_prior_cloud(map_frames([session], dataset, prior), evaluation)
         except BaseException:
             with contextlib.suppress(OSError, ValueError):  # the first error is the one to show
-                outputs.save_progress(folder, session)
+                save_progress(folder, session)
             raise
 
 

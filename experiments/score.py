@@ -15,13 +15,13 @@ from omegaconf import DictConfig, OmegaConf
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.clouds import PointCloud, read_cloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, compare_clouds
-from emgs_jax.evaluation.report import provenance, write_metrics
-from emgs_jax.evaluation.results import METRICS_FILE, estimates_of, is_finished, result_folder
-from emgs_jax.evaluation.tables import average, full_table
 from emgs_jax.evaluation.trajectory import associate, trajectory_metrics
-from emgs_jax.export import load_trajectory_tum
+from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.prior.base import Provenance
-from emgs_jax.scoring import true_cloud
+from emgs_jax.report.metrics import true_cloud
+from emgs_jax.report.provenance import provenance, write_metrics
+from emgs_jax.report.results import METRICS_FILE, estimates_of, is_finished, result_folder
+from emgs_jax.report.tables import average, full_table
 from experiments.building import build_dataset, clear_errors
 
 Metrics = dict[str, Any]

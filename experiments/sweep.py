@@ -20,17 +20,17 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from emgs_jax import scoring
-from emgs_jax.clock import Clock
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import raw_prior_cloud
-from emgs_jax.evaluation.report import provenance
-from emgs_jax.mapping_run import new_run
-from emgs_jax.pipeline import map_frames
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.recorded import Recorded, record
-from emgs_jax.sweep import programs
-from emgs_jax.sweep_results import SweepResults, draw, table, write_csv
+from emgs_jax.report import metrics as scoring
+from emgs_jax.report.provenance import provenance
+from emgs_jax.report.sweeps import SweepResults, draw, table, write_csv
+from emgs_jax.running.clock import Clock
+from emgs_jax.running.drive import map_frames
+from emgs_jax.running.record import new_run
+from emgs_jax.running.stacked import programs
 from experiments.building import build_dataset, build_prior, clear_errors, use_compilation_cache
 from experiments.grid import Variant, notes, read_axes, variants
 

@@ -1,18 +1,17 @@
 """Shared by all tests of the core: shapes and types checked at every call, one small config, one small camera."""
 
+from pathlib import Path
+
 import jax
 import pytest
 from jaxtyping import install_import_hook
 
-# Before anything imports the package: every call in the tests checks its jaxtyping signature.
-CHECKED = (
-    *("pytree", "linalg", "rigid", "camera", "observation", "selection", "neighbours"),
-    *("clustering", "gaussians"),
-    *("gaussian_map", "icp"),
-    *("render", "initialization", "localization", "em", "refinement", "slam", "semantics"),
-    *("prior.masks", "stereo.bundle_adjustment", "stereo.plane_sweep", "stereo.semi_global", "stereo.depth"),
+PACKAGE = Path(__file__).resolve().parents[1] / "emgs_jax"
+# Before anything imports the package: every file that declares shapes of JAX arrays has them checked at every call.
+CHECKED = [path for path in sorted(PACKAGE.rglob("*.py")) if "from jaxtyping import Array" in path.read_text()]
+install_import_hook(
+    [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in CHECKED], "beartype.beartype"
 )
-install_import_hook([f"emgs_jax.{name}" for name in CHECKED], "beartype.beartype")
 
 
 @pytest.fixture(scope="session")
@@ -26,7 +25,7 @@ def config():
 @pytest.fixture(scope="session")
 def camera():
     """fx ≠ fy, cx ≠ cy, H ≠ W."""
-    from emgs_jax.camera import Camera
+    from emgs_jax.ops.camera import Camera
 
     return Camera([20.0, 23.0], [14.5, 12.25], 32, 24)
 

@@ -10,9 +10,9 @@ import jaxlie
 import numpy as np
 from reference import room_view
 
-from emgs_jax.camera import Camera
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation, Prediction
+from emgs_jax.ops.camera import Camera
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SMALL = (

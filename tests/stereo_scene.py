@@ -6,10 +6,10 @@ import hydra
 import numpy as np
 from scene import compose
 
-from emgs_jax.camera import Camera
-from emgs_jax.prior.incremental import StructureConfig
-from emgs_jax.prior.landmarks import NONE, Structure, View
-from emgs_jax.stereo.depth import DepthConfig
+from emgs_jax.ops.camera import Camera
+from emgs_jax.prior.multiview.depth import DepthConfig
+from emgs_jax.prior.multiview.incremental import StructureConfig
+from emgs_jax.prior.multiview.landmarks import NONE, Structure, View
 
 FOCAL, CENTER, SIZE = (55.0, 53.0), (30.5, 24.25), (64, 48)
 SMALL = ("prior.dense.depth.sweep.num_planes=24",)

@@ -10,8 +10,8 @@ from scene import as_numpy, assert_same, at, move_gaussians, pose, random_gaussi
 
 from emgs_jax.em import EStep, e_step, em_update, m_step, support, widened_distance_sq
 from emgs_jax.gaussian_map import GaussianMap
-from emgs_jax.linalg import whitening
 from emgs_jax.observation import transform
+from emgs_jax.ops.linalg import whitening
 
 M, N, F = 60, 40, 3
 POINTS, GAUSSIANS = random_observation(M, num_features=F), random_gaussians(N, num_features=F)

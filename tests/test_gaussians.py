@@ -17,9 +17,9 @@ from scene import (
     random_observation,
 )
 
-from emgs_jax.clustering import morton_order
 from emgs_jax.gaussians import blend, cluster, empty_gaussians, fit_to_points, spacing
 from emgs_jax.observation import transform
+from emgs_jax.ops.clustering import morton_order
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 

@@ -10,7 +10,7 @@ from scene import move_gaussians, observe_room, path_pose, pose, stack_poses
 
 from emgs_jax.initialization import initialize
 from emgs_jax.observation import transform
-from emgs_jax.pytree import stack
+from emgs_jax.ops.pytree import stack
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 

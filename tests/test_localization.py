@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scene import assert_same, at, observe_room, path_pose, pose, pose_error, predict_room
 
-from emgs_jax.camera import Camera
 from emgs_jax.gaussians import fit_to_points
 from emgs_jax.localization import REASONS, localize_coarse, localize_fine
 from emgs_jax.observation import transform
+from emgs_jax.ops.camera import Camera
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 

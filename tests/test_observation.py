@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scene import assert_same, observe_room, path_pose, pose
 
-from emgs_jax.camera import pixel_grid, rays
 from emgs_jax.observation import normals_from_pointmap, observe, sample_features, transform
+from emgs_jax.ops.camera import pixel_grid, rays
 
 normals_from_pointmap, observe = eqx.filter_jit(normals_from_pointmap), eqx.filter_jit(observe)
 

@@ -9,7 +9,7 @@ import pytest
 from scene import assert_same, at, move_gaussians, observe_room, path_pose, pose, pose_error, predict_room, stack_poses
 
 from emgs_jax.observation import Prediction, transform
-from emgs_jax.pytree import stack
+from emgs_jax.ops.pytree import stack
 from emgs_jax.slam import FirstWindow, SlamState, init_state, run, step
 
 one_step, first_state = eqx.filter_jit(step), eqx.filter_jit(init_state)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import pytest
 from scene import observe_room, path_pose, predict_room, slam_config, stack_poses
 
-from emgs_jax.pytree import stack
+from emgs_jax.ops.pytree import stack
 from emgs_jax.slam import init_state, step
 
 traces = []

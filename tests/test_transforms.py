@@ -16,22 +16,13 @@ from scene import (
     stack_poses,
 )
 
-from emgs_jax import camera as cam
-from emgs_jax import (
-    clustering,
-    em,
-    gaussian_map,
-    gaussians,
-    icp,
-    initialization,
-    linalg,
-    localization,
-    neighbours,
-    rigid,
-)
+from emgs_jax import em, gaussian_map, gaussians, initialization, localization
 from emgs_jax import observation as obs
-from emgs_jax.pytree import stack
+from emgs_jax.ops import camera as cam
+from emgs_jax.ops import clustering, linalg, neighbours
+from emgs_jax.ops.pytree import stack
 from emgs_jax.refinement import refine
+from emgs_jax.registration import icp, rigid
 from emgs_jax.render import composite, densify, project
 
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)

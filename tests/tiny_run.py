@@ -8,9 +8,9 @@ from pathlib import Path
 import hydra
 
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.mapping_run import MappingRun, new_run
-from emgs_jax.pipeline import map_frames
 from emgs_jax.prior.base import PriorPrediction
+from emgs_jax.running.drive import map_frames
+from emgs_jax.running.record import MappingRun, new_run
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 NUM_FRAMES, WINDOW_SIZE = 6, 3

@@ -6,8 +6,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from emgs_jax.features.text import TextEmbeddings, average_over_templates, check_templates, load_text
-from emgs_jax.prior.simulated import text_embeddings
+from emgs_jax.features.text import TextEmbeddings, average_over_templates, check_templates, load_text, random_embeddings
 
 
 class RandomFeatures:
@@ -45,7 +44,7 @@ class RandomFeatures:
         vectors = np.zeros((0, self._width), np.float32)
         if names:
             vectors = average_over_templates(
-                names, self._templates, lambda prompts: text_embeddings(prompts, self._width)
+                names, self._templates, lambda prompts: random_embeddings(prompts, self._width)
             )
         return TextEmbeddings(tuple(names), vectors, self._templates, self.identity)
 

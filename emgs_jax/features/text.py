@@ -5,6 +5,7 @@ The file, format `emgs_jax.text` version 1, is an npz without pickled objects: `
 features the embeddings can be compared with).
 """
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emgs_jax.files import atomic_write
+from emgs_jax.io.files import atomic_write
 
 FORMAT, VERSION = "emgs_jax.text", 1
 REMEDY = "write it with `python -m experiments.embed`"
@@ -109,3 +110,12 @@ def _read(path: Path) -> tuple[dict, np.ndarray]:
     if not is_whole or vectors.dtype != np.float32 or len(vectors) != len(header["names"]):
         raise ValueError(f"{path} is damaged (its embeddings are not those of its header): {REMEDY}")
     return header, vectors
+
+
+def random_embeddings(names: Sequence[str], size: int) -> np.ndarray:
+    """Return one pseudo-random unit vector per name, float32 (classes, f); (0, 0) without names."""
+    if not names:
+        return np.zeros((0, 0), np.float32)
+    seeds = [int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") for name in names]
+    vectors = np.stack([np.random.default_rng(seed).standard_normal(size) for seed in seeds])
+    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)

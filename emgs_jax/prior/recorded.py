@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
-from emgs_jax.files import atomic_write
+from emgs_jax.io.files import atomic_write
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows
 
 FORMAT, VERSION = "emgs_jax.predictions", 2

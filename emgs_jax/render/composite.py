@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int, PyTree
 
-from emgs_jax.camera import Camera
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.pytree import static, take_rows, traced
+from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.pytree import static, take_rows, traced
 from emgs_jax.render.project import Splats, project_gaussians
 from emgs_jax.render.tiles import assign_tiles, tile_corners
 

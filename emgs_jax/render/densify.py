@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from emgs_jax.camera import Camera, unproject
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.linalg import safe_normalize
-from emgs_jax.pytree import traced, where_rows
+from emgs_jax.ops.camera import Camera, unproject
+from emgs_jax.ops.linalg import safe_normalize
+from emgs_jax.ops.pytree import traced, where_rows
 from emgs_jax.render.composite import (
     RenderConfig,
     Rendering,

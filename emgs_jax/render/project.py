@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from emgs_jax.camera import NEAREST_DEPTH, Camera, project
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.linalg import inverse_2x2
+from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, project
+from emgs_jax.ops.linalg import inverse_2x2
 
 # A splat that is seen at a grazing angle has no depth slope that its linearisation could hold.
 SMALLEST_COSINE = 0.1

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.camera import Camera
-from emgs_jax.neighbours import compact_rows
+from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.neighbours import compact_rows
 from emgs_jax.render.project import Splats
 
 

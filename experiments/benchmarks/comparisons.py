@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from emgs_jax.camera import downscale
 from emgs_jax.em import e_step, m_step
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.icp import icp
 from emgs_jax.observation import Observation, transform
-from emgs_jax.pytree import take_rows
+from emgs_jax.ops.camera import downscale
+from emgs_jax.ops.pytree import take_rows
+from emgs_jax.registration.icp import icp
 from emgs_jax.render.composite import render
 from emgs_jax.render.project import project_gaussians
 from experiments.benchmarks import baselines

@@ -11,16 +11,16 @@ import numpy as np
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from emgs_jax.camera import Camera
-from emgs_jax.clock import Clock
-from emgs_jax.clustering import morton_order
-from emgs_jax.data.convert import to_camera, to_first_window, to_prediction
 from emgs_jax.gaussian_map import GaussianMap, grow
 from emgs_jax.gaussians import Gaussians, cluster
 from emgs_jax.observation import Observation, Prediction, transform
-from emgs_jax.pipeline import first_pose, predictions
+from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.clustering import morton_order
+from emgs_jax.ops.pytree import take_rows
 from emgs_jax.prior.base import PriorPrediction
-from emgs_jax.pytree import take_rows
+from emgs_jax.running.clock import Clock
+from emgs_jax.running.convert import to_camera, to_first_window, to_prediction
+from emgs_jax.running.drive import first_pose, predictions
 from emgs_jax.slam import FirstWindow, SlamConfig, SlamState, start
 from experiments.building import build_dataset, build_prior
 

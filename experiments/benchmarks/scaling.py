@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from omegaconf import DictConfig, OmegaConf
 
-from emgs_jax.pytree import stack
+from emgs_jax.ops.pytree import stack
+from emgs_jax.running.stacked import step_states
 from emgs_jax.slam import step
-from emgs_jax.sweep import step_states
 from experiments.benchmarks.data import Data, enlarged, first_state, load
 from experiments.benchmarks.timing import Candidate, Timing, compare, executable, interleaved
 

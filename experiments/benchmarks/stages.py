@@ -5,13 +5,13 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from emgs_jax.camera import downscale
-from emgs_jax.clustering import morton_order
 from emgs_jax.em import e_step, m_step
 from emgs_jax.gaussian_map import insert, select_submap, write_back
 from emgs_jax.gaussians import cluster, spacing
 from emgs_jax.localization import localize_coarse, localize_fine
 from emgs_jax.observation import observe, transform
+from emgs_jax.ops.camera import downscale
+from emgs_jax.ops.clustering import morton_order
 from emgs_jax.refinement import refine
 from emgs_jax.render.composite import render
 from emgs_jax.slam import step

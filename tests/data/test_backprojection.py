@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.camera import Camera, unproject
 from emgs_jax.data.backprojection import backproject
+from emgs_jax.ops.camera import Camera, unproject
 
 
 def test_points_of_depth_images_are_those_of_the_camera_on_the_device():

@@ -16,7 +16,7 @@ from emgs_jax.evaluation.trajectory import (
     rpe,
     trajectory_metrics,
 )
-from emgs_jax.export import load_trajectory_tum
+from emgs_jax.io.trajectory import load_trajectory_tum
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
 TRAJECTORIES = SHARED / "data" / "trajectories"

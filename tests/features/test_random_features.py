@@ -5,7 +5,7 @@ import pytest
 
 from emgs_jax.features.base import FeatureModel
 from emgs_jax.features.random import RandomFeatures
-from emgs_jax.prior.simulated import text_embeddings
+from emgs_jax.features.text import random_embeddings
 
 
 def make(seed=0, templates=("{}",), **changes):
@@ -30,7 +30,7 @@ def test_a_cell_is_the_unit_projection_of_its_mean_colour():
 def test_an_embedding_is_the_mean_of_its_prompts():
     model = make(templates=("a {}.", "the {}."))
     assert isinstance(model, FeatureModel)
-    mean = text_embeddings(["a b.", "the b."], 6).mean(axis=0)
+    mean = random_embeddings(["a b.", "the b."], 6).mean(axis=0)
     np.testing.assert_allclose(model.text.vectors[1], mean / np.linalg.norm(mean), atol=1e-6)
     assert make(classes=()).text.vectors.shape == (0, 6)
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import Frame
 from emgs_jax.data.synthetic import Synthetic
-from emgs_jax.prior.framework import NORMALIZATIONS
-from emgs_jax.prior.resize import plan_resize, resize_image
+from emgs_jax.prior.network.framework import NORMALIZATIONS
+from emgs_jax.prior.network.resize import plan_resize, resize_image
 
 KEYS = {
     *("img", "data_norm_type", "intrinsics", "ray_directions", "depth_z", "camera_poses", "is_metric_scale"),

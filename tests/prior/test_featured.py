@@ -10,7 +10,7 @@ from emgs_jax.features.text import save_text
 from emgs_jax.prior.base import Prior, windows
 from emgs_jax.prior.featured import Featured, Requeried
 from emgs_jax.prior.recorded import Recorded, record
-from emgs_jax.prior.simulated import Simulated
+from emgs_jax.prior.simulated.prior import Simulated
 
 WINDOW_SIZE = 3
 

@@ -9,7 +9,7 @@ import pytest
 
 from emgs_jax.prior.base import windows
 from emgs_jax.prior.recorded import Recorded, record
-from emgs_jax.prior.simulated import Simulated
+from emgs_jax.prior.simulated.prior import Simulated
 
 WINDOW_SIZE = 3
 

@@ -8,8 +8,8 @@ import pytest
 import reference
 from scene import as_numpy, at, move_gaussians, pose, random_gaussians
 
-from emgs_jax.camera import pixel_grid, rays
 from emgs_jax.gaussians import Gaussians
+from emgs_jax.ops.camera import pixel_grid, rays
 from emgs_jax.render.composite import render
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation

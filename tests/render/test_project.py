@@ -8,7 +8,7 @@ import pytest
 import reference
 from scene import as_numpy, move_gaussians, pose, random_gaussians
 
-from emgs_jax.camera import pixel_grid, rays
+from emgs_jax.ops.camera import pixel_grid, rays
 from emgs_jax.render.project import project_gaussians
 
 project = eqx.filter_jit(project_gaussians)

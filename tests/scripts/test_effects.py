@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emgs_jax.sweep_results import SweepResults
+from emgs_jax.report.sweeps import SweepResults
 from experiments.effects import read_effects, spread, table
 
 REPETITIONS = ["prior.seed", "dataset.start"]
@@ -76,7 +76,7 @@ def test_a_difference_is_bold_where_three_repetitions_agree_on_its_sign(numbers,
     [
         (None, "no sweep.json below .*experiments.sweep -m"),
         ("{", "is damaged .* make it again"),
-        ('{"format": "emgs_jax.sweep", "version": 99}', "not a sweep of version 1"),
+        ('{"format": "emgs_jax.running.stacked", "version": 99}', "not a sweep of version 1"),
     ],
 )
 def test_a_folder_without_readable_sweeps_is_refused_with_the_remedy(content, message, tmp_path):

@@ -52,9 +52,9 @@ import sys
 import hydra
 from experiments import run  # everything that a run imports
 from experiments.building import build_dataset, build_prior
-from emgs_jax.mapping_run import new_run
-from emgs_jax.pipeline import predictions
-from emgs_jax.data.convert import to_first_window
+from emgs_jax.running.record import new_run
+from emgs_jax.running.drive import predictions
+from emgs_jax.running.convert import to_first_window
 import numpy as np
 
 with hydra.initialize_config_dir(version_base="1.3", config_dir=sys.argv[1]):

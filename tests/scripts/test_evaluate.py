@@ -16,10 +16,10 @@ from omegaconf import OmegaConf
 from tiny_run import CONF, TINY
 
 import experiments.evaluate
-from emgs_jax.evaluation.gate import read_gate
-from emgs_jax.evaluation.report import RESULT_FORMAT
-from emgs_jax.evaluation.results import METRICS_FILE
-from emgs_jax.files import write_json
+from emgs_jax.io.files import write_json
+from emgs_jax.report.gate import read_gate
+from emgs_jax.report.provenance import RESULT_FORMAT
+from emgs_jax.report.results import METRICS_FILE
 from experiments.building import clear_errors
 
 ENVIRONMENT = os.environ | {"JAX_PLATFORMS": "cpu"}

@@ -9,7 +9,7 @@ import pytest
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, compose, dataset
 
 from emgs_jax.prior.base import windows
-from emgs_jax.prior.simulated import Simulated
+from emgs_jax.prior.simulated.prior import Simulated
 from experiments.predict import predict
 from experiments.run import run
 

@@ -15,8 +15,9 @@ from tiny_run import CONF, NUM_FRAMES, TINY, WINDOW_SIZE, EditedPrior, compose, 
 import experiments.run
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.synthetic import Synthetic
-from emgs_jax.export import load_map_npz, load_trajectory_tum
 from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.io.map_file import load_map_npz
+from emgs_jax.io.trajectory import load_trajectory_tum
 from experiments.building import clear_errors
 
 FILES = {"trajectory.txt", "map.npz", "map.ply", "points.ply", "mesh.ply", "frames.jsonl", "overview.png"}

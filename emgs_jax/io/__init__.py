@@ -1,0 +1,1 @@
+"""Files of maps, clouds, meshes and trajectories; every write is atomic."""

@@ -1,0 +1,90 @@
+"""Files that stay valid: whatever interrupts a write, the old content or the complete new one is there."""
+
+import contextlib
+import dataclasses
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+
+@contextlib.contextmanager
+def atomic_write(path: str | os.PathLike, mode: str = "wb") -> Iterator[IO]:
+    """Open a temporary file beside `path`; move it to `path` if the block succeeds, else remove it.
+
+    An OSError raised inside (full disk, no permission) is raised again with the name of `path`.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        with open(temporary, mode, encoding=None if "b" in mode else "utf-8") as handle:
+            yield handle
+            handle.flush()
+            os.fsync(handle.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise _named(error, path) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def jsonable(value: Any) -> Any:
+    """Turn arrays, NumPy scalars, paths, dataclasses and mappings into what JSON has; NaN and infinities into None."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: jsonable(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [jsonable(item) for item in (sorted(value) if isinstance(value, set | frozenset) else value)]
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if hasattr(value, "__array__"):
+        return jsonable(np.asarray(value).tolist())
+    return str(value)
+
+
+def write_json(path: str | os.PathLike, value: Any) -> None:
+    """Write `value` as indented, strictly valid JSON."""
+    with atomic_write(path, "w") as handle:
+        handle.write(json.dumps(jsonable(value), indent=2, allow_nan=False) + "\n")
+
+
+class FrameLog:
+    """A JSON-lines file with one record per frame, complete after every line; starts empty.
+
+    A line that did not fit on the disk is cut off again, so what is in the file can always be parsed.
+    """
+
+    def __init__(self, path: str | os.PathLike):
+        self.path = Path(path)
+        self._file = open(self.path, "wb", buffering=0)  # noqa: SIM115 (closed by close or by the with statement)
+
+    def append(self, record: Mapping[str, Any]) -> None:
+        line = (json.dumps(jsonable(record), allow_nan=False) + "\n").encode()
+        start = self._file.tell()
+        try:
+            while line:
+                line = line[self._file.write(line) :]
+        except OSError as error:
+            self._file.truncate(start)
+            self._file.seek(start)
+            raise _named(error, self.path) from error
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> "FrameLog":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _named(error: OSError, path: Path) -> OSError:
+    return OSError(error.errno, f"cannot write ({error.strerror or error})", str(path))

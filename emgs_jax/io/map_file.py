@@ -1,0 +1,106 @@
+"""The map's file: every leaf under its field path, bit for bit, and a header that says what it is."""
+
+import dataclasses
+import io
+import json
+import os
+import typing
+import zipfile
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emgs_jax.io.files import atomic_write
+
+MAP_FORMAT, MAP_VERSION = "emgs_jax.map", 1
+
+
+def save_map_npz(path: str | os.PathLike, tree: eqx.Module) -> None:
+    """Write a module of arrays: each leaf under its field path, and a header with version, class and static fields."""
+    leaves = {_name(key): leaf for key, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]}
+    for name, leaf in leaves.items():
+        if not eqx.is_array(leaf) or np.asarray(leaf).dtype.kind not in "biufc":
+            raise ValueError(f"map leaf {name!r} is {type(leaf).__name__}, not a plain array: it would not reload")
+    header = {"format": MAP_FORMAT, "version": MAP_VERSION, "class": type(tree).__name__}
+    header |= {"leaves": sorted(leaves), "static": _static_fields(tree)}
+    with atomic_write(path) as handle:
+        np.savez(handle, __header__=np.array(json.dumps(header)), **{k: np.asarray(v) for k, v in leaves.items()})
+
+
+def load_map_npz(path: str | os.PathLike, like: Any) -> Any:
+    """Read a map back, bit for bit.
+
+    Args:
+        like: the class that was saved (an eqx.Module whose fields are arrays, modules or static), or an instance of
+            it; the shapes are those of the file.
+
+    Raises ValueError for every file that is not a complete map of this class and version.
+    """
+    try:
+        arrays = _read_arrays(path)
+        header = json.loads(str(arrays.pop("__header__", "{}")))
+        header = header if isinstance(header, dict) else {}
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # a broken zip raises a dozen types
+        raise ValueError(f"{path} is not a readable map ({error}): it is truncated or damaged, map again") from error
+    cls = like if isinstance(like, type) else type(like)
+    if header.get("format") != MAP_FORMAT:
+        raise ValueError(f"{path} is not a map of emgs_jax: give the map.npz of a run")
+    if header.get("version") != MAP_VERSION:
+        raise ValueError(f"{path} has map version {header.get('version')}, this code reads {MAP_VERSION}: map again")
+    if header.get("class") != cls.__name__ or header.get("leaves") != sorted(arrays):
+        raise ValueError(
+            f"{path} holds a {header.get('class')}, expected {cls.__name__} with all its arrays: map again"
+        )
+    try:
+        tree = _build(cls, "", arrays, header["static"])
+    except Exception as error:
+        raise ValueError(f"{path} does not fit {cls.__name__} ({error!r}): written by other code, map again") from error
+    if arrays:
+        raise ValueError(f"{path} has arrays that {cls.__name__} does not know: {sorted(arrays)}; map again")
+    return tree
+
+
+def _name(key_path: tuple) -> str:
+    return jax.tree_util.keystr(key_path, simple=True, separator=".")
+
+
+def _read_arrays(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """Read every member completely before it is parsed, so that its checksum is tested first."""
+    arrays = {}
+    with zipfile.ZipFile(path) as archive:
+        for name in archive.namelist():
+            member = io.BytesIO(archive.read(name))
+            arrays[name.removesuffix(".npy")] = np.lib.format.read_array(member, allow_pickle=False)
+    return arrays
+
+
+def _static_fields(tree: eqx.Module, prefix: str = "") -> dict[str, Any]:
+    """Values of static fields by path; they must be what JSON has."""
+    values = {}
+    for field in dataclasses.fields(tree):
+        value = getattr(tree, field.name)
+        if field.metadata.get("static", False):
+            values[prefix + field.name] = value
+        elif isinstance(value, eqx.Module):
+            values |= _static_fields(value, f"{prefix}{field.name}.")
+    return values
+
+
+def _build(cls: type, prefix: str, arrays: dict[str, np.ndarray], static: dict[str, Any]) -> Any:
+    """Make an instance of `cls` from the arrays of its fields, which are taken out of `arrays`."""
+    hints = typing.get_type_hints(cls)
+    fields = {}
+    for field in dataclasses.fields(cls):
+        name, hint = prefix + field.name, hints[field.name]
+        if field.metadata.get("static", False):
+            fields[field.name] = static[name]
+        elif isinstance(hint, type) and issubclass(hint, eqx.Module):
+            fields[field.name] = _build(hint, f"{name}.", arrays, static)
+        else:
+            fields[field.name] = jnp.asarray(arrays.pop(name))
+    return cls(**fields)

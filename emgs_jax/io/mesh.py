@@ -1,0 +1,65 @@
+"""A surface through oriented points: Poisson reconstruction without what it invents, written as PLY."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from emgs_jax.io.ply import structured, with_colors, write_ply
+
+
+def save_mesh_ply(
+    path: str | os.PathLike, points: Any, normals: Any, colors: Any, depth: int = 8, min_points: int = 50
+) -> str | None:
+    """Mesh oriented points (Poisson, trimmed where points are far) and write it; deterministic.
+
+    Returns None, or the reason why there is no mesh; then no file is written and an older one is removed.
+    """
+    points, normals, colors = (np.asarray(value, np.float64) for value in (points, normals, colors))
+    keep = np.isfinite(points).all(1) & np.isfinite(normals).all(1) & (np.linalg.norm(normals, axis=1) > 0.5)
+    points, normals, colors = points[keep], normals[keep], colors[keep]
+    reason = None
+    if len(points) < min_points:
+        reason = f"{len(points)} points with a normal, at least {min_points} are needed for a mesh"
+    else:
+        vertices, faces = poisson(*crop(points, normals), depth)
+        vertices, faces = trim(vertices, faces, points)
+        reason = None if len(faces) else "the surface reconstruction is empty"
+    if reason is not None:
+        Path(path).unlink(missing_ok=True)
+        return reason
+    nearest = cKDTree(points).query(vertices)[1]
+    write_ply(path, with_colors(structured(vertices.astype(np.float32), ["x", "y", "z"]), colors[nearest]), faces)
+    return None
+
+
+def crop(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Leave out far flying points: the solver's grid spans all points, so they would make the cells coarse."""
+    low, high = np.percentile(points, [1, 99], axis=0)
+    margin = 0.25 * np.max(high - low)
+    keep = ((points >= low - margin) & (points <= high + margin)).all(1)
+    return points[keep], normals[keep]
+
+
+def poisson(points: np.ndarray, normals: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (v, 3) and triangles (t, 3) of the surface through points with normals, both (n, 3)."""
+    import open3d as o3d  # slow to import, and only a mesh needs it
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.normals = o3d.utility.Vector3dVector(normals)
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+            cloud, depth=depth, linear_fit=True, n_threads=1
+        )  # more threads would add in another order each time
+    return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+
+
+def trim(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Drop the surface that Poisson invents: what is farther from all points than their own spacing explains."""
+    spacing = np.median(cKDTree(points).query(points, k=7)[0][:, -1])
+    near = cKDTree(points).query(vertices)[0] <= 2.0 * spacing if len(vertices) else np.empty(0, bool)
+    faces = faces[near[faces].all(1)] if len(faces) else faces
+    used = np.unique(faces)
+    return vertices[used], np.searchsorted(used, faces)

@@ -1,0 +1,44 @@
+"""Trajectories in TUM's format: `timestamp tx ty tz qx qy qz qw`, metres, camera → world."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.io.files import atomic_write
+
+
+def save_trajectory_tum(path: str | os.PathLike, timestamps: Any, T_world_camera: Any) -> None:
+    """Write poses (n, 4, 4) as lines `timestamp tx ty tz qx qy qz qw`, metres, camera → world, qw ≥ 0."""
+    poses, timestamps = np.asarray(T_world_camera, np.float64), np.asarray(timestamps, np.float64)
+    if poses.shape != (len(timestamps), 4, 4) or not np.isfinite(poses).all():
+        raise ValueError(f"T_world_camera must be finite ({len(timestamps)}, 4, 4), got {poses.shape}")
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for time, pose in zip(timestamps, poses, strict=True):
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+        lines.append(" ".join([f"{time:.6f}", *(f"{value:.9f}" for value in (*pose[:3, 3], *quaternion))]))
+    with atomic_write(path, "w") as handle:
+        handle.write("\n".join(lines) + "\n")
+
+
+def load_trajectory_tum(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
+    """Read a TUM trajectory: timestamps (n,) and T_world_camera (n, 4, 4), float64; `#` starts a comment."""
+    rows = []
+    for number, line in enumerate(Path(path).read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        fields = line.split("#")[0].split()
+        try:
+            values = [float(field) for field in fields]
+        except ValueError:
+            values = [np.nan]
+        if fields and (len(values) != 8 or not np.isfinite(values).all() or not np.any(values[4:])):
+            raise ValueError(f"{path}:{number}: expected `timestamp tx ty tz qx qy qz qw`, got {line[:80]!r}")
+        if fields:
+            rows.append(values)
+    rows = np.array(rows, np.float64).reshape(-1, 8)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, 3] = rows[:, 1:4]
+    if len(rows):
+        poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    return rows[:, 0], poses

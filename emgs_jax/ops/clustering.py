@@ -1,0 +1,57 @@
+"""k-means with static shapes and no random key: the seeds are a regular choice of the points."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.ops.neighbours import knn
+
+
+def morton_order(height: int, width: int) -> Int[Array, "{height}*{width}"]:
+    """Row-major pixel numbers along the Z curve, so that an even choice of them is even over the image."""
+    y, x = jnp.divmod(jnp.arange(height * width), width)
+    code = jnp.zeros_like(x)
+    for bit in range(max(height, width).bit_length()):
+        code |= ((x >> bit) & 1) << (2 * bit) | ((y >> bit) & 1) << (2 * bit + 1)
+    return jnp.argsort(code)
+
+
+def strided_seeds(
+    valid: Bool[Array, "m"], order: Int[Array, "m"], spacing: int, num_seeds: int
+) -> tuple[Int[Array, "k"], Bool[Array, "k"]]:
+    """Rows of every `spacing`-th valid point along `order`, and which seeds exist."""
+    ranks = jnp.cumsum(valid[order])
+    wanted = spacing // 2 + spacing * jnp.arange(num_seeds) + 1
+    exists = wanted <= ranks[-1]
+    # Fewer points than half a spacing still make one seed.
+    first = jnp.minimum(wanted[0], ranks[-1])
+    wanted, exists = wanted.at[0].set(first), exists.at[0].set(ranks[-1] > 0)
+    positions = jnp.searchsorted(ranks, jnp.where(exists, wanted, 1))
+    return order[jnp.minimum(positions, order.shape[0] - 1)], exists
+
+
+def kmeans(
+    points: Float[Array, "m 3"],
+    valid: Bool[Array, "m"],
+    seeds: Float[Array, "k 3"],
+    seed_exists: Bool[Array, "k"],
+    num_iterations: int,
+) -> tuple[Float[Array, "k 3"], Bool[Array, "k"], Float[Array, "k"]]:
+    """Lloyd's algorithm for a fixed number of iterations.
+
+    Returns:
+        Centroids, which of them have points, and how many; an empty cluster stays where it was and becomes invalid.
+    """
+
+    def iterate(_: Int[Array, ""], state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        centroids, exists, _ = state
+        nearest, _ = knn(points, centroids, exists, 1)
+        rows = jnp.where(valid, nearest[:, 0], seeds.shape[0])
+        count = jnp.zeros(seeds.shape[0]).at[rows].add(1.0, mode="drop")
+        # Offsets instead of positions: sums of many coordinates lose digits in float32.
+        offsets = points - centroids[nearest[:, 0]]
+        total = jnp.zeros_like(seeds).at[rows].add(offsets, mode="drop")
+        return centroids + total / jnp.maximum(count, 1.0)[:, None], exists & (count > 0), count
+
+    start = seeds, seed_exists, seed_exists.astype(seeds.dtype)
+    return jax.lax.fori_loop(0, num_iterations, iterate, start)

@@ -1,0 +1,1 @@
+"""Classical multi-view geometry from the images alone."""

@@ -1,0 +1,114 @@
+"""Dense depth of one view from several others, with holes where the images do not determine it."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from emgs_jax.ops.camera import Camera, nearest_pixel, project, unproject
+from emgs_jax.ops.pytree import static, traced
+from emgs_jax.prior.multiview.plane_sweep import SweepConfig, inverse_depths, sweep
+from emgs_jax.prior.multiview.semi_global import SemiGlobalConfig, aggregate
+
+
+class DepthConfig(eqx.Module):
+    """Matching, and what a depth must pass.
+
+    Args:
+        sweep: matching cost of every plane.
+        semi_global: its aggregation.
+        max_cost: of the best plane, before aggregation.
+        min_margin: by which the aggregated cost of any plane that is not next to the best must exceed the best's.
+        median_radius: half the side of the window whose median replaces a depth: removes speckle, keeps edges.
+        max_depth_step: two views agree where their depths differ by at most this fraction.
+    """
+
+    sweep: SweepConfig
+    semi_global: SemiGlobalConfig
+    max_cost: Float[Array, "*b"] = traced()
+    min_margin: Float[Array, "*b"] = traced()
+    median_radius: int = static()
+    max_depth_step: Float[Array, "*b"] = traced()
+
+
+def _between_planes(total: Float[Array, "h w d"], best: Array) -> Float[Array, "h w"]:
+    """Where between its neighbours the minimum lies, in planes from `best`, by the parabola through the three costs."""
+    last = total.shape[-1] - 1
+    before, at, after = (
+        jnp.take_along_axis(total, jnp.clip(best + step, 0, last)[..., None], axis=-1)[..., 0] for step in (-1, 0, 1)
+    )
+    curvature = before - 2.0 * at + after
+    is_bent = curvature > 0
+    offset = 0.5 * (before - after) / jnp.where(is_bent, curvature, 1.0)
+    return jnp.where(is_bent, jnp.clip(offset, -0.5, 0.5), 0.0)
+
+
+def _median(depth: Float[Array, "h w"], radius: int) -> Float[Array, "h w"]:
+    """Median of the surroundings; a hole (0) stays one unless most of its surroundings are surface."""
+    height, width = depth.shape
+    padded = jnp.pad(depth, radius, mode="edge")
+    steps = range(2 * radius + 1)
+    around = [jax.lax.dynamic_slice(padded, (dy, dx), (height, width)) for dy in steps for dx in steps]
+    return jnp.sort(jnp.stack(around), axis=0)[len(around) // 2]
+
+
+def estimate_depth(
+    gray: Float[Array, "h w"],
+    sources: Float[Array, "s h w"],
+    T_source_reference: jaxlie.SE3,
+    is_used: Bool[Array, "s"],
+    depth_range: Float[Array, "2"],
+    camera: Camera,
+    config: DepthConfig,
+) -> Float[Array, "h w"]:
+    """Depth z (m) of every pixel; 0 where no plane stands out or the best is the first or last.
+
+    Args:
+        gray: the view, in [0, 1].
+        sources: other views.
+        T_source_reference: view -> other view, batched like `sources`.
+        is_used: sources that count.
+        depth_range: nearest and farthest depth that is tried, m.
+        camera: of all views.
+        config: matching and acceptance.
+    """
+    planes = inverse_depths(depth_range[0], depth_range[1], config.sweep)
+    cost = sweep(gray, sources, T_source_reference, is_used, planes, camera, config.sweep)
+    total = aggregate(cost, gray, config.semi_global)
+    best = jnp.argmin(total, axis=-1)
+    is_near_best = jnp.abs(jnp.arange(planes.shape[0]) - best[..., None]) <= 1
+    runner_up = jnp.min(jnp.where(is_near_best, jnp.inf, total), axis=-1)
+    matched = jnp.take_along_axis(cost, best[..., None], axis=-1)[..., 0]
+    valid = (runner_up - jnp.min(total, axis=-1) >= config.min_margin) & (matched <= config.max_cost)
+    valid &= (best > 0) & (best < planes.shape[0] - 1)
+    inverse = planes[0] + (best + _between_planes(total, best)) * (planes[1] - planes[0])
+    return _median(jnp.where(valid, 1.0 / inverse, 0.0), config.median_radius)
+
+
+def count_agreeing(
+    depth: Float[Array, "h w"],
+    others: Float[Array, "s h w"],
+    T_other_reference: jaxlie.SE3,
+    camera: Camera,
+    config: DepthConfig,
+) -> Float[Array, "h w"]:
+    """How many other views' depth maps confirm each depth; 0 where there is none.
+
+    Args:
+        depth: of the view, m; 0 = none.
+        others: of other views, likewise; a map of zeros confirms nothing.
+        T_other_reference: view -> other view, batched like `others`.
+        camera: of all views.
+        config: tolerance.
+    """
+    points = unproject(camera, depth)
+
+    def agrees(T: Array, other: Array) -> Array:
+        T = jaxlie.SE3(T)
+        pixels, seen_depth = project(camera, points @ T.rotation().as_matrix().T + T.translation())
+        index, inside = nearest_pixel(pixels, other.shape)
+        there = other.reshape(-1)[index]
+        return inside & (depth > 0) & (there > 0) & (jnp.abs(seen_depth - there) <= config.max_depth_step * there)
+
+    return jnp.sum(jax.vmap(agrees)(T_other_reference.wxyz_xyz, others).astype(jnp.float32), axis=0)

@@ -1,0 +1,175 @@
+"""Structure from motion of a sliding window: where its views are and where their landmarks (host side, NumPy in, out).
+
+The first window in which that succeeds is built from its best pair of views (Schönberger and Frahm,
+"Structure-from-motion revisited", CVPR 2016); each later view is placed by the landmarks that it shows. Bundle
+adjustment refines the views of the window.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from emgs_jax.ops.camera import Camera
+from emgs_jax.prior.multiview.bundle_adjustment import BundleConfig, Tracks, adjust
+from emgs_jax.prior.multiview.landmarks import NONE, MatchingConfig, Structure, View, place, relative_pose, triangulate
+
+jitted_adjust = eqx.filter_jit(adjust)
+
+
+@dataclass(frozen=True)
+class StructureConfig:
+    """How the structure grows.
+
+    Args:
+        matching: detection, matching and acceptance.
+        bundle: the refinement.
+        max_landmarks: that take part in the refinement; those that most views see.
+        num_fixed: at most, the oldest views of a window, which hold the frame and scale of the ones before.
+        num_rounds: of refinement; observations that do not fit are dropped after each.
+        median_depth: m; what the median landmark of the first view is taken for: images alone do not tell the scale.
+    """
+
+    matching: MatchingConfig
+    bundle: BundleConfig
+    max_landmarks: int
+    num_fixed: int
+    num_rounds: int
+    median_depth: float
+
+
+def initialize(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> bool:
+    """Place the views of a window, the oldest of which is the reference; False without enough parallax or matches."""
+    pairs = _ranked_pairs(structure, config)
+    for a, b, T_a_b in pairs[:3]:
+        _reset(structure)
+        structure.views[a].T_ref_view, structure.views[b].T_ref_view = np.eye(4), T_a_b
+        triangulate(structure, config.matching)
+        _grow(structure, camera, num_views, a, config)
+        placed = structure.placed()
+        reference = placed[min(placed)]
+        # Two views alone are confirmed by nothing.
+        if len(placed) > 2 and structure.known(reference).sum() >= config.matching.min_matches:
+            _normalize(structure, reference, config)
+            return True
+    _reset(structure)
+    return False
+
+
+def extend(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> None:
+    """Place the views that are not placed yet, as far as they can be, and refine the window."""
+    for view in structure.views.values():
+        if view.T_ref_view is None and place(structure, view, config.matching):
+            triangulate(structure, config.matching)
+    frames = sorted(structure.placed())
+    # A short window refines its two newest views too; it takes two others to hold the scale.
+    num_fixed = min(config.num_fixed, len(frames) - 2)
+    if num_fixed >= 2:
+        refine(structure, camera, num_views, frames[:num_fixed], config)
+
+
+def refine(structure: Structure, camera: Camera, num_views: int, fixed: list[int], config: StructureConfig) -> None:
+    """Bundle adjustment of all placed views; drops what does not fit and triangulates what now does."""
+    for _ in range(config.num_rounds):
+        frames = sorted(structure.placed())
+        ids, tracks = _tracks(structure, frames, num_views, config)
+        poses = np.tile(np.eye(4), (num_views, 1, 1))
+        poses[: len(frames)] = [structure.views[frame].T_ref_view for frame in frames]
+        points = np.zeros((config.max_landmarks, 3))
+        points[: len(ids)] = structure.points[ids]
+        is_fixed = np.array([frame in fixed for frame in frames] + [True] * (num_views - len(frames)))
+        T, points, error = jitted_adjust(
+            jaxlie.SE3.from_matrix(jnp.asarray(poses, jnp.float32)),
+            jnp.asarray(points, jnp.float32),
+            tracks,
+            jnp.asarray(is_fixed),
+            camera,
+            config.bundle,
+        )
+        poses, error = np.asarray(T.as_matrix(), np.float64), np.asarray(error)
+        structure.points[ids] = np.asarray(points, np.float64)[: len(ids)]
+        for row, frame in enumerate(frames):
+            if frame not in fixed:
+                structure.views[frame].T_ref_view = poses[row]
+        _drop(structure, frames, ids, error, config)
+        triangulate(structure, config.matching)
+
+
+def _ranked_pairs(structure: Structure, config: StructureConfig) -> list[tuple[int, int, np.ndarray]]:
+    """Pairs of views with their relative pose, the one with most matches and parallax first."""
+    frames, found = sorted(structure.views), []
+    for i, a in enumerate(frames):
+        for b in frames[i + 1 :]:
+            result = relative_pose(structure.views[a], structure.views[b], structure.K, config.matching)
+            if result is not None:
+                found.append((result[1], a, b, result[0]))
+    return [item[1:] for item in sorted(found, key=lambda item: -item[0])]
+
+
+def _grow(structure: Structure, camera: Camera, num_views: int, origin: int, config: StructureConfig) -> None:
+    """Place one view after the other, the one with most known landmarks first."""
+    while True:
+        refine(structure, camera, num_views, [origin], config)
+        waiting = [view for view in structure.views.values() if view.T_ref_view is None]
+        waiting.sort(key=lambda view: -structure.known(view).sum())
+        if not any(place(structure, view, config.matching) for view in waiting):
+            return
+        triangulate(structure, config.matching)
+
+
+def _reset(structure: Structure) -> None:
+    structure.points[:] = np.nan
+    for view in structure.views.values():
+        view.T_ref_view = None
+
+
+def _normalize(structure: Structure, reference: View, config: StructureConfig) -> None:
+    """Make a placed view the reference and its median landmark `median_depth` deep."""
+    T_first_ref = np.linalg.inv(reference.T_ref_view)
+    structure.points = structure.points @ T_first_ref[:3, :3].T + T_first_ref[:3, 3]
+    depth = structure.points[reference.landmark[structure.known(reference)], 2]
+    scale = config.median_depth / np.median(depth)
+    structure.points *= scale
+    for view in structure.placed().values():
+        view.T_ref_view = T_first_ref @ view.T_ref_view
+        view.T_ref_view[:3, 3] *= scale
+
+
+def _columns(structure: Structure, ids: np.ndarray) -> np.ndarray:
+    """Position in `ids` of every landmark, or NONE; NONE itself looks up the last entry, which is NONE."""
+    column = np.full(len(structure.points) + 1, NONE)
+    column[ids] = np.arange(len(ids))
+    return column
+
+
+def _tracks(
+    structure: Structure, frames: list[int], num_views: int, config: StructureConfig
+) -> tuple[np.ndarray, Tracks]:
+    """The landmarks that most views see, and where."""
+    views = [structure.views[frame] for frame in frames]
+    seen = np.concatenate([view.landmark[structure.known(view)] for view in views])
+    ids, count = np.unique(seen, return_counts=True)
+    ids = ids[count >= 2][np.argsort(-count[count >= 2], kind="stable")][: config.max_landmarks]
+    column = _columns(structure, ids)
+    pixels = np.zeros((num_views, config.max_landmarks, 2), np.float32)
+    is_seen = np.zeros((num_views, config.max_landmarks), bool)
+    for row, view in enumerate(views):
+        places = column[view.landmark]
+        pixels[row, places[places >= 0]] = view.pixels[places >= 0]
+        is_seen[row, places[places >= 0]] = True
+    return ids, Tracks(jnp.asarray(pixels), jnp.asarray(is_seen))
+
+
+def _drop(structure: Structure, frames: list[int], ids: np.ndarray, error: np.ndarray, config: StructureConfig) -> None:
+    """Take landmarks from the keypoints that do not fit them, and positions from those that too few views see."""
+    column = _columns(structure, ids)
+    count = np.zeros(len(ids), int)
+    for row, frame in enumerate(frames):
+        view = structure.views[frame]
+        places = column[view.landmark]
+        fits = (places < 0) | (error[row, places] < config.matching.max_reprojection_error)
+        view.landmark[~fits] = NONE
+        count[places[fits & (places >= 0)]] += 1
+    structure.points[ids[count < 2]] = np.nan

@@ -1,0 +1,116 @@
+"""Plane sweep: how well each inverse depth of a pixel is confirmed by other images (Collins, CVPR 1996)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, UInt32
+
+from emgs_jax.ops.camera import Camera, nearest_pixel, pixel_grid, project, rays
+from emgs_jax.ops.pytree import static, traced
+
+
+class SweepConfig(eqx.Module):
+    """Planes and the matching cost.
+
+    Args:
+        num_planes: inverse depths that are tried.
+        num_best: of the sources, how many confirm a plane: the others may not see the point.
+        census_radius: half the side of the window that is compared.
+        census_spacing: of which every `census_spacing`-th row and column is used.
+        census_margin: grey value difference, image in [0, 1], below which two pixels count as equal.
+        unseen_cost: of a plane that leads out of a source's image; a random match costs about .5.
+    """
+
+    num_planes: int = static()
+    num_best: int = static()
+    census_radius: int = static()
+    census_spacing: int = static()
+    census_margin: Float[Array, "*b"] = traced()
+    unseen_cost: Float[Array, "*b"] = traced()
+
+    def __check_init__(self) -> None:
+        if len(_taps(self)) > 32:
+            raise ValueError("census_radius and census_spacing give more than 32 comparisons; choose a larger spacing")
+
+
+def _taps(config: SweepConfig) -> list[tuple[int, int]]:
+    steps = range(-config.census_radius, config.census_radius + 1, config.census_spacing)
+    return [(dy, dx) for dy in steps for dx in steps if (dy, dx) != (0, 0)]
+
+
+def census(gray: Float[Array, "h w"], config: SweepConfig, scale: int = 1) -> UInt32[Array, "h w"]:
+    """One bit per neighbour: is it brighter than the pixel (Zabih and Woodfill, ECCV 1994)? Survives exposure changes.
+
+    Args:
+        gray: in [0, 1].
+        config: the neighbours.
+        scale: spacing of the neighbours in pixels of `gray` is that many times the config's.
+    """
+    reach = scale * config.census_radius
+    height, width = gray.shape
+    padded = jnp.pad(gray, reach, mode="edge")
+    code = jnp.zeros(gray.shape, jnp.uint32)
+    for bit, (dy, dx) in enumerate(_taps(config)):
+        row, column = reach + scale * dy, reach + scale * dx
+        other = jax.lax.dynamic_slice(padded, (row, column), (height, width))
+        code |= (other > gray + config.census_margin).astype(jnp.uint32) << bit
+    return code
+
+
+def _double(gray: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
+    """The image at twice the resolution: pixel (2y, 2x) is pixel (y, x), those between are means."""
+
+    def along(image: Array) -> Array:
+        following = jnp.concatenate([image[1:], image[-1:]])
+        return jnp.stack([image, 0.5 * (image + following)], axis=1).reshape(2 * image.shape[0], *image.shape[1:])
+
+    return along(along(gray).T).T
+
+
+def inverse_depths(near: Float[Array, ""], far: Float[Array, ""], config: SweepConfig) -> Float[Array, "d"]:
+    """The planes, uniform in 1/z (1/m), from far to near."""
+    return jnp.linspace(1.0 / far, 1.0 / near, config.num_planes)
+
+
+def sweep(
+    gray: Float[Array, "h w"],
+    sources: Float[Array, "s h w"],
+    T_source_reference: jaxlie.SE3,
+    is_used: Bool[Array, "s"],
+    planes: Float[Array, "d"],
+    camera: Camera,
+    config: SweepConfig,
+) -> Float[Array, "h w d"]:
+    """Matching cost of every plane at every pixel, 0 (all comparisons agree) to 1.
+
+    The codes of the sources are taken at half a pixel's resolution, without interpolation.
+
+    Args:
+        gray: reference image in [0, 1].
+        sources: other images of the same camera.
+        T_source_reference: reference camera -> source camera, batched like `sources`.
+        is_used: sources that count.
+        planes: inverse depths, 1/m.
+        camera: of all images.
+        config: planes and cost.
+    """
+    reference = census(gray, config)
+    codes = jax.vmap(lambda image: census(_double(image), config, scale=2))(sources)
+    num_taps = len(_taps(config))
+    directions = rays(camera, pixel_grid(camera))
+
+    def plane_cost(plane: Array) -> Array:
+        def source_cost(T: Array, code: Array, used: Array) -> Array:
+            T = jaxlie.SE3(T)
+            # Homogeneous: the point of a plane at infinity is a direction.
+            points = directions @ T.rotation().as_matrix().T + plane * T.translation()
+            pixels, depth = project(camera, points)
+            index, inside = nearest_pixel(2.0 * pixels, code.shape)
+            differing = jax.lax.population_count(code.reshape(-1)[index] ^ reference).astype(jnp.float32)
+            return jnp.where(inside & (depth > 0) & used, differing / num_taps, config.unseen_cost)
+
+        costs = jax.vmap(source_cost)(T_source_reference.wxyz_xyz, codes, is_used)
+        return jnp.mean(jnp.sort(costs, axis=0)[: config.num_best], axis=0)
+
+    return jnp.moveaxis(jax.lax.map(plane_cost, planes), 0, -1)

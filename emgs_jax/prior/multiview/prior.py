@@ -1,0 +1,215 @@
+"""The prior `multiview_stereo`: classical geometry from calibrated images, without weights and without a GPU.
+
+Structure from motion of the window gives the poses, a plane sweep against some of the other views the depth. What was
+found for an image (keypoints, matches, depth) is kept while the image is in the window, so the windows of a sequence
+must be asked for in order. The frame is that of the first image that could be placed (image 0, unless the camera rests
+at first), and the scale that of its window, which is fixed by `median_depth`; images alone do not tell it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import cv2
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from emgs_jax.data.backprojection import backproject
+from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.ops.camera import Camera
+from emgs_jax.prior.base import PriorPrediction, Provenance, Window
+from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate_depth
+from emgs_jax.prior.multiview.incremental import StructureConfig, extend, initialize
+from emgs_jax.prior.multiview.landmarks import Structure, View, calibration, detect, forget, link
+
+jitted_depth = eqx.filter_jit(estimate_depth)
+jitted_agreeing = eqx.filter_jit(count_agreeing)
+
+
+@dataclass(frozen=True)
+class DenseConfig:
+    """Which views the depth of a view comes from.
+
+    Args:
+        depth: matching and acceptance.
+        num_sources: views that it is matched against.
+        best_parallax_rad: between the rays of a landmark, beyond which more is no better.
+        num_checks: views whose depth is compared with it.
+        min_agreeing: of these must confirm a depth.
+        depth_margin: the range of depths that is tried goes beyond the landmarks' by this factor.
+    """
+
+    depth: DepthConfig
+    num_sources: int
+    best_parallax_rad: float
+    num_checks: int
+    min_agreeing: int
+    depth_margin: float
+
+
+def _values(config: StructureConfig | DenseConfig) -> dict:
+    """What a config was given, as JSON holds it: a device's .1 is .1 again."""
+    return jax.tree.map(lambda v: float(str(np.float32(v))) if isinstance(v, jax.Array) else v, asdict(config))
+
+
+class MultiviewStereo:
+    """Structure from motion and plane-sweep stereo of a sliding window (implements `Prior`).
+
+    Args:
+        structure: poses and landmarks.
+        dense: depth.
+    """
+
+    feature_names: tuple[str, ...] = ()
+    text_features = np.zeros((0, 0), np.float32)
+    is_sequential = True  # a window needs those before it
+
+    def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:
+        self._structure_config, self._dense_config = structure, dense
+        settings = {"structure": _values(structure), "dense": _values(dense)}
+        self.provenance = Provenance("multiview_stereo", {"version": 1} | settings)
+        self._next = 0
+
+    def check(self, dataset: Dataset, window_size: int) -> None:
+        """Raise ValueError where a window has too few images to confirm a depth."""
+        least = 1 + max(self._dense_config.min_agreeing, 1)
+        if window_size < least:
+            raise ValueError(f"multiview_stereo compares at least {least} images, got slam.window_size={window_size}")
+
+    def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
+        """Poses of all views and depth of `window.dense`; a view that cannot be placed has NaN and no valid point."""
+        if window.inference == 0:
+            self._begin(frames, intrinsics)
+        elif window.inference != self._next:
+            raise ValueError(
+                f"multiview_stereo carries its landmarks from window to window: expected window {self._next}, got "
+                f"{window.inference}; ask for all windows in order"
+            )
+        self._next = window.inference + 1
+        self._forget(window)
+        for frame in frames:
+            if frame.index not in self._structure.views:
+                self._add(frame)
+        place_views = extend if self._has_begun else initialize
+        place_views(self._structure, self._camera, self._num_views, self._structure_config)
+        self._has_begun |= bool(self._structure.placed())
+        return self._answer(window, intrinsics)
+
+    def _begin(self, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
+        height, width = frames[0].image.shape[:2]
+        focal, center = np.float32(intrinsics[:2]), np.float32(intrinsics[2:])
+        self._camera = Camera(focal, center, width, height)
+        self._structure = Structure(calibration(intrinsics))
+        self._has_begun = False
+        self._grays: dict[int, np.ndarray] = {}
+        self._depths: dict[int, np.ndarray] = {}
+        # A later window sees the anchor, the FIFO, the current and the newest image.
+        self._num_views = len(frames) + 3
+
+    def _forget(self, window: Window) -> None:
+        forget(self._structure, [frame for frame in self._structure.views if frame not in window.views])
+        for known in (self._grays, self._depths):
+            for frame in [frame for frame in known if frame not in window.views]:
+                del known[frame]
+
+    def _add(self, frame: Frame) -> None:
+        gray = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+        if gray.shape != (self._camera.height, self._camera.width):
+            raise ValueError(
+                f"{frame.name} has size {gray.shape[::-1]}, the window's first image "
+                f"{(self._camera.width, self._camera.height)}: give dataset.size=[width,height]"
+            )
+        self._grays[frame.index] = np.float32(gray) / 255.0
+        self._structure.views[frame.index] = detect(gray, self._structure_config.matching)
+        link(self._structure, frame.index, self._structure_config.matching)
+
+    def _answer(self, window: Window, intrinsics: Sequence[float]) -> PriorPrediction:
+        views = [self._structure.views[frame] for frame in window.views]
+        for frame in window.dense:
+            if frame not in self._depths or not self._depths[frame].any():  # it may have been placed since
+                self._depths[frame] = self._depth(frame)
+        confidence = np.stack([self._confidence(frame) for frame in window.dense])
+        depth = np.stack([self._depths[frame] for frame in window.dense])
+        mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_agreeing)
+        points = backproject(np.where(mask, depth, 0.0), intrinsics).astype(np.float32)
+        features = np.zeros((*mask.shape, 0), np.float16)
+        T_anchor_view = np.full((len(views), 4, 4), np.nan)
+        T_anchor_view[0] = np.eye(4)  # also where it is not known
+        for row, view in enumerate(views[1:], start=1):
+            if view.T_ref_view is not None:
+                T_anchor_view[row] = view.T_ref_view
+        return PriorPrediction(window, T_anchor_view, points, confidence, mask, features)
+
+    def _depth(self, frame: int) -> np.ndarray:
+        """Depth (h, w) of a view, 0 where it is not known."""
+        view, nothing = self._structure.views[frame], np.zeros_like(self._grays[frame])
+        sources = self._sources(frame)
+        if not sources:
+            return nothing
+        known = self._structure.known(view)
+        T_view_ref = np.linalg.inv(view.T_ref_view)
+        z = self._structure.points[view.landmark[known]] @ T_view_ref[2, :3] + T_view_ref[2, 3]
+        z = z[z > 0]
+        if not len(z):
+            return nothing
+        margin = self._dense_config.depth_margin
+        depth_range = np.float32([np.percentile(z, 1) / margin, np.percentile(z, 99) * margin])
+        count = self._dense_config.num_sources
+        is_used = np.arange(count) < len(sources)
+        sources = (sources * count)[:count]
+        return np.asarray(
+            jitted_depth(
+                jnp.asarray(self._grays[frame]),
+                jnp.asarray(np.stack([self._grays[other] for other in sources])),
+                self._relative(sources, frame),
+                jnp.asarray(is_used),
+                jnp.asarray(depth_range),
+                self._camera,
+                self._dense_config.depth,
+            )
+        )
+
+    def _sources(self, frame: int) -> list[int]:
+        """The placed views that show most of the view's landmarks under most parallax, best first."""
+        view, placed = self._structure.views[frame], self._structure.placed()
+        if frame not in placed:
+            return []
+        scores = {other: self._parallax(view, placed[other]) for other in placed if other != frame}
+        ranked = sorted((other for other in scores if scores[other] > 0), key=lambda other: -scores[other])
+        return ranked[: self._dense_config.num_sources]
+
+    def _parallax(self, view: View, other: View) -> float:
+        """Sum over the shared landmarks of their parallax, as a share of the best."""
+        shared = np.intersect1d(view.landmark[self._structure.known(view)], other.landmark)
+        points, best = self._structure.points[shared], self._dense_config.best_parallax_rad
+        if not len(points):
+            return 0.0
+        a, b = (points - pose.T_ref_view[:3, 3] for pose in (view, other))
+        sine = np.linalg.norm(np.cross(a, b), axis=1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
+        return float(np.minimum(sine / best, 1.0).sum())
+
+    def _confidence(self, frame: int) -> np.ndarray:
+        """One more than the number of views that confirm each depth."""
+        placed, count = self._structure.placed(), self._dense_config.num_checks
+        others = sorted((o for o in self._depths if o in placed and o != frame), key=lambda o: abs(o - frame))[:count]
+        if frame not in placed or not others:
+            return np.ones_like(self._depths[frame])
+        maps = np.zeros((count, *self._depths[frame].shape), np.float32)
+        maps[: len(others)] = [self._depths[other] for other in others]
+        others = (others * count)[:count]
+        agreeing = jitted_agreeing(
+            jnp.asarray(self._depths[frame]),
+            jnp.asarray(maps),
+            self._relative(others, frame),
+            self._camera,
+            self._dense_config.depth,
+        )
+        return 1.0 + np.asarray(agreeing, np.float32)
+
+    def _relative(self, others: Sequence[int], frame: int) -> jaxlie.SE3:
+        """T_other_frame of several views."""
+        views = self._structure.views
+        T = [np.linalg.inv(views[other].T_ref_view) @ views[frame].T_ref_view for other in others]
+        return jaxlie.SE3.from_matrix(jnp.asarray(np.stack(T), jnp.float32))

@@ -1,0 +1,1 @@
+"""Feed-forward networks of MapAnything's framework."""

@@ -1,0 +1,1 @@
+"""Ground truth, disturbed the way a feed-forward model errs."""

@@ -1,0 +1,215 @@
+"""The `simulated` prior, version 1: true depth and poses, disturbed the way that a feed-forward model disturbs them.
+
+How the disturbances of one inference are put together:
+
+- *Poses.* The walk starts at the middle of `views[1:]`, whose true pose relative to the anchor is multiplied from the
+  right by the window's pose error: the window turns about its middle camera. Each neighbour outward follows by the
+  disturbed relative pose of its pair, `T_a_b · exp(noise)` with a before b, the same one in either direction.
+- *Anchor.* View 0 defines the frame, so its pose is the identity and the walk never includes it. The window's pose
+  error stands between it and all other views, also in the first window, where the anchor is one of the FIFO's images:
+  no disturbance is dropped there. (The other reading, expressing that window relative to its own disturbed view 0,
+  would cancel the window's pose error.) Its geometry, where it is dense, is disturbed like that of any other view.
+- *Scale* multiplies every point and every translation of the inference.
+- *Depth.* Flying points first, then the product of the smooth warps and the pixel noise, all in the logarithm of the
+  depth: it stays positive and a point stays on the ray of its pixel.
+
+Every random number is drawn from a generator seeded by (seed, stream, inference, frames), so one inference alone gives
+the same bits as a whole run.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from emgs_jax.data.backprojection import backproject
+from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.features.text import random_embeddings
+from emgs_jax.prior.base import PriorPrediction, Provenance, Window
+from emgs_jax.prior.simulated.noise import (
+    Stream,
+    autoregressive,
+    edge_band,
+    normals,
+    rigid,
+    shared_normals,
+    smooth_field,
+)
+
+
+@dataclass(frozen=True)
+class Standard:
+    """The disturbances at level 1: standard deviations in metres, radians and log depth; lengths in pixels."""
+
+    scale: float = 0.03
+    window_translation: float = 0.015
+    window_rotation: float = math.radians(0.5)
+    autocorrelation: float = 0.9  # of scale and window pose, from one inference to the next
+    pair_translation: float = 0.01
+    pair_rotation: float = math.radians(0.3)
+    image_share: float = 0.7  # of the variance of walk and warp: belongs to the images; the rest to the inference
+    warp: tuple[float, ...] = (0.03, 0.01)
+    warp_length: tuple[float, ...] = (64.0, 16.0)  # correlation exp(-r²/2ℓ²), at an image width of `reference_width`
+    reference_width: float = 640.0
+    pixel: float = 0.01
+    edge_step: float = 0.05  # relative depth difference between neighbouring pixels
+    flying_share: float = 0.5  # of the pixels within 2 px of such a step
+    max_confidence: float = 5.0
+    confidence_error: float = 0.03  # log-depth error that divides the confidence's excess over 1 by e
+    confidence_cap: float = 2.0  # times that error; beyond it, more error is not noticed: the confidence is no oracle
+    confidence_edge: float = 1.5
+    confidence_noise: float = 0.5
+    feature_cosine: float = 0.8  # expected cosine of a feature and the embedding of its class
+
+
+class Simulated:
+    """A prior that disturbs the ground truth (implements `Prior`).
+
+    Args:
+        level: 0 gives the exact truth, 1 the standard disturbance; all standard deviations scale with it.
+        seed: a different one gives a different draw of all disturbances.
+        feature_size: width f of the features, used where there are classes.
+        classes: names of the data set's labels (`Dataset.classes`); without them features have width 0.
+    """
+
+    def __init__(
+        self, level: float | int = 1.0, seed: int = 0, feature_size: int = 16, classes: Sequence[str] = ()
+    ) -> None:
+        if not (math.isfinite(level) and level >= 0):
+            raise ValueError(f"prior.level must be finite and at least 0 (0 is an exact prior), got {level}")
+        if seed < 0 or feature_size < 1:
+            raise ValueError(f"prior.seed must be ≥ 0 and prior.feature_size ≥ 1, got {seed} and {feature_size}")
+        self.level, self.seed, self.standard = float(level), int(seed), Standard()
+        self.feature_names = tuple(classes)
+        self.text_features = random_embeddings(self.feature_names, feature_size)
+        settings = {"version": 1, "level": self.level, "seed": self.seed, "feature_size": self.text_features.shape[1]}
+        self.provenance = Provenance("simulated", settings, is_simulated=True)
+
+    def check(self, dataset: Dataset, window_size: int) -> None:
+        """Raise ValueError, before any work is done, where the data set has no truth to disturb."""
+        if not dataset.has_ground_truth:
+            raise ValueError(_no_truth(f"{dataset.name} {dataset.sequence} has none"))
+
+    def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
+        """Disturb the truth of `frames` (in the order of `window.views`); see the module for how."""
+        by_index = check_frames(window, frames)
+        drift = autoregressive(self.seed, window.inference, self.standard.autocorrelation, 7)
+        scale = math.exp(self.level * self.standard.scale * drift[0])
+        T_anchor_view = self._poses(window, [frame.T_world_camera for frame in frames], drift[1:])
+        T_anchor_view[:, :3, 3] *= scale
+        views = [self._geometry(window.inference, by_index[index], intrinsics, scale) for index in window.dense]
+        points, confidence, mask = (np.stack(parts) for parts in zip(*views, strict=True))
+        features = np.stack([self._features(window.inference, by_index[index]) for index in window.dense])
+        return PriorPrediction(window, T_anchor_view, points, confidence, mask, features)
+
+    def _poses(self, window: Window, truth: Sequence[np.ndarray], drift: np.ndarray) -> np.ndarray:
+        """Return the disturbed camera -> anchor poses (v, 4, 4), before the scale; `drift` (6,) has unit variance."""
+        noise, views = self.standard, window.views
+        T_true = np.linalg.inv(np.asarray(truth[0], np.float64)) @ np.asarray(truth, np.float64)
+        T_out = np.tile(np.eye(4), (len(views), 1, 1))
+        if len(views) == 1:
+            return T_out
+        middle = 1 + (len(views) - 1) // 2
+        reach = self.level * (1 + np.linalg.norm(T_true[middle, :3, 3]))
+        T_out[middle] = T_true[middle] @ rigid(drift, reach * noise.window_translation, reach * noise.window_rotation)
+        for left in range(middle, len(views) - 1):
+            T_out[left + 1] = T_out[left] @ self._pair(window, left, T_true)
+        for left in range(middle - 1, 0, -1):
+            T_out[left] = T_out[left + 1] @ np.linalg.inv(self._pair(window, left, T_true))
+        return T_out
+
+    def _pair(self, window: Window, left: int, T_true: np.ndarray) -> np.ndarray:
+        """Return the disturbed relative pose (4, 4) of the views `left` and `left + 1`."""
+        noise, pair = self.standard, window.views[left : left + 2]
+        xi = shared_normals((6,), (self.seed, Stream.PAIR, window.inference, *pair), noise.image_share)
+        T_left_right = np.linalg.inv(T_true[left]) @ T_true[left + 1]
+        return T_left_right @ rigid(xi, self.level * noise.pair_translation, self.level * noise.pair_rotation)
+
+    def _geometry(
+        self, inference: int, frame: Frame, intrinsics: Sequence[float], scale: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return points (h, w, 3), confidence (h, w) and mask (h, w) of one view."""
+        depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0), frame.depth, 0).astype(np.float32)
+        mask = depth > 0
+        flown, near_edge = self._flying(inference, frame.index, depth)
+        log_change = self.level * self._log_noise(inference, frame.index, depth.shape)
+        ratio = np.divide(flown, depth, out=np.ones_like(depth), where=mask)
+        confidence = self._confidence(inference, frame.index, np.abs(np.log(ratio) + log_change), near_edge)
+        disturbed = flown.astype(np.float64) * np.exp(log_change) * scale
+        return backproject(disturbed, intrinsics).astype(np.float32), confidence, mask
+
+    def _log_noise(self, inference: int, index: int, shape: tuple[int, int]) -> np.ndarray:
+        """Return warp plus pixel noise of the log depth at level 1, float32 (h, w)."""
+        noise = self.standard
+        total = noise.pixel * normals(shape, (self.seed, Stream.PIXEL, inference, index))
+        for number, (sigma, length) in enumerate(zip(noise.warp, noise.warp_length, strict=True)):
+            key = (self.seed, Stream.WARP + number, inference, index)
+            total += sigma * smooth_field(shape, length * shape[1] / noise.reference_width, key, noise.image_share)
+        return total
+
+    def _flying(self, inference: int, index: int, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the depth with flying points and the mask of the pixels within 2 px of a depth step, both (h, w)."""
+        near_edge = edge_band(depth, self.standard.edge_step)
+        window = np.ones((5, 5), np.uint8)
+        low = -cv2.dilate(np.where(depth > 0, -depth, -np.inf).astype(np.float32), window)
+        high = cv2.dilate(depth, window)
+        chance, between = np.random.default_rng((self.seed, Stream.FLYING, inference, index)).random(
+            (2, *depth.shape), np.float32
+        )
+        flies = near_edge & (chance < self.standard.flying_share * min(1.0, self.level))
+        # At the unused pixels `low` may be infinite; they get a neutral value before the arithmetic.
+        low = np.where(flies, low, 0)
+        return np.where(flies, low + between * (high - low), depth), near_edge
+
+    def _confidence(self, inference: int, index: int, error: np.ndarray, near_edge: np.ndarray) -> np.ndarray:
+        """Return the confidence (h, w) ≥ 1 for the absolute log-depth `error` without the common scale."""
+        noise = self.standard
+        # It hides part of the error; above level 1 more of it would hide everything.
+        jitter = normals(error.shape, (self.seed, Stream.CONFIDENCE, inference, index))
+        jitter *= min(1.0, self.level) * noise.confidence_noise
+        doubt = np.minimum(error / noise.confidence_error, noise.confidence_cap) + noise.confidence_edge * near_edge
+        return (1 + (noise.max_confidence - 1) * np.exp(jitter - doubt)).astype(np.float32)
+
+    def _features(self, inference: int, frame: Frame) -> np.ndarray:
+        """Return the noisy unit text embedding of each pixel's label, float16 (h, w, f); zero where there is none."""
+        shape, (num_classes, size) = frame.depth.shape, self.text_features.shape
+        if frame.labels is None or size == 0:
+            return np.zeros((*shape, size), np.float16)
+        if frame.labels.max() >= num_classes:
+            raise ValueError(
+                f"frame {frame.index} ({frame.name}) has label {frame.labels.max()} of {num_classes} classes"
+            )
+        # The cosine of e and e + n is 1 / sqrt(1 + |n|²) in expectation, and |n|² = sigma² f.
+        sigma = self.level * math.sqrt((self.standard.feature_cosine**-2 - 1) / size)
+        features = self.text_features[frame.labels]
+        if sigma > 0:
+            features += sigma * normals(features.shape, (self.seed, Stream.FEATURE, inference, frame.index))
+            features /= np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-12)
+        features[frame.labels < 0] = 0
+        return features.astype(np.float16)
+
+
+def _no_truth(what: str) -> str:
+    return f"prior=simulated needs a data set with ground truth; use prior=recorded or another data set: {what}"
+
+
+def check_frames(window: Window, frames: Sequence[Frame]) -> dict[int, Frame]:
+    """Return the frames by index; raise ValueError naming the first one whose truth cannot be used."""
+    indices = tuple(frame.index for frame in frames)
+    if indices != window.views:
+        raise ValueError(f"frames must be those of window.views {window.views} in that order, got {indices}")
+    for frame in frames:
+        label, pose, depth = f"frame {frame.index} ({frame.name})", frame.T_world_camera, frame.depth
+        if pose is None:
+            raise ValueError(_no_truth(f"{label} has no true pose"))
+        if np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError(f"the true pose of {label} must be a finite (4, 4) matrix: leave the frame out")
+        if frame.index in window.dense and depth is None:
+            raise ValueError(_no_truth(f"{label} has no depth"))
+        if depth is not None and depth.shape != frame.image.shape[:2]:
+            raise ValueError(
+                f"the depth of {label} must have its image's size {frame.image.shape[:2]}, got {depth.shape}"
+            )
+    return dict(zip(indices, frames, strict=True))

@@ -1,0 +1,1 @@
+"""Placing points on Gaussians: rigid motions, matching, ICP."""

@@ -1,0 +1,223 @@
+"""ICP against Gaussians as one Levenberg–Marquardt solve."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import lineax
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.gaussians import Gaussians, intensity
+from emgs_jax.observation import Observation, transform
+from emgs_jax.ops.linalg import whiten, widen
+from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.pytree import choice, static, traced
+from emgs_jax.registration.matching import Candidates, Matches, Surface, match, surface_of
+from emgs_jax.registration.rigid import median
+
+RESIDUALS = ("colored", "distribution", "colored+distribution")
+COLORED, DISTRIBUTION = 0, 1
+
+
+class IcpConfig(eqx.Module):
+    """Terms, gates and limits of the solve (R9).
+
+    Args:
+        residual: `colored` (printed): distance to the Gaussian's plane and intensity difference (Park et al.,
+            "Colored point cloud registration revisited", ICCV 2017); `distribution`: offset from the mean, whitened by
+            the Gaussian's covariance; or `colored+distribution`: offset and intensity difference.
+        color_std: standard deviation of intensity.
+        noise: factor on the points' noise along their viewing rays, which widens every Gaussian for them.
+        max_mahalanobis_sq: a point farther from all its neighbours than this is no inlier.
+        min_normal_cos: nor one whose normal differs more from its Gaussian's.
+        num_effective: how many independent measurements the points are worth: their errors are correlated.
+        prior_information: of the coarse pose, in units of one effective point as noisy as the coarse step shows;
+            0 = no prior, the printed form.
+        scale_noise: standard deviation of the logarithm of the scale about the coarse step's, in units of the points'
+            depth noise; 0 = no scale (printed).
+        num_points: how many points take part.
+        num_searches: how often the Gaussians near every point are looked up, each time with a solve after it.
+        num_neighbours: Gaussians near a point, which every step of a solve compares.
+        num_color_neighbours: Gaussians from which a Gaussian's intensity gradient is fitted.
+        max_steps: of every solve.
+        tolerance: relative and absolute, of the solver.
+    """
+
+    residual: Float[Array, "*b"] = choice(*RESIDUALS)
+    color_std: Float[Array, "*b"] = traced()
+    noise: Float[Array, "*b"] = traced()
+    max_mahalanobis_sq: Float[Array, "*b"] = traced()
+    min_normal_cos: Float[Array, "*b"] = traced()
+    num_effective: Float[Array, "*b"] = traced()
+    prior_information: Float[Array, "*b"] = traced()
+    scale_noise: Float[Array, "*b"] = traced()
+    num_points: int = static()
+    num_searches: int = static()
+    num_neighbours: int = static()
+    num_color_neighbours: int = static()
+    max_steps: int = static()
+    tolerance: float = static()
+
+
+class IcpInfo(eqx.Module):
+    """What the solve found.
+
+    Args:
+        num_inliers: points with a Gaussian that passes the gates.
+        inlier_fraction: of the points that take part.
+        residual: m; root mean square distance of the inliers to their Gaussians' planes.
+        misfit: m; the same distance of all points, as 1.4826 times the median, a robust standard deviation.
+        min_eigenvalue: smallest eigenvalue of the data's Hessian per effective point (1/m² and 1/rad²).
+        num_steps: of all solves.
+        is_converged: False where the last solve reached `max_steps` or failed.
+    """
+
+    num_inliers: Int[Array, ""]
+    inlier_fraction: Float[Array, ""]
+    residual: Float[Array, ""]
+    misfit: Float[Array, ""]
+    min_eigenvalue: Float[Array, ""]
+    num_steps: Int[Array, ""]
+    is_converged: Bool[Array, ""]
+
+
+class _Problem(eqx.Module):
+    """What stays the same while the pose moves; lengths in metres."""
+
+    source: Observation  # camera frame
+    rays: Float[Array, "p 3"]  # noise of every point along its viewing ray, camera frame
+    surface: Surface
+    T_world_coarse: jaxlie.SE3
+    scale_std: Float[Array, ""]
+    prior: Float[Array, "7"]  # 1 / standard deviation of xi and of the scale's parameter
+
+
+def _pose_problem(
+    source: Observation,
+    target: Gaussians,
+    T_world_coarse: jaxlie.SE3,
+    noise: tuple[Float[Array, ""], Float[Array, ""]],
+    config: IcpConfig,
+) -> _Problem:
+    pose_noise, depth_noise = noise
+    stride = max(source.valid.shape[0] // config.num_points, 1)
+    source = jax.tree.map(lambda leaf: leaf[::stride], source)
+    prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack([pose_noise, depth_noise]), 3)
+    return _Problem(
+        source=source,
+        rays=config.noise * depth_noise * source.points,
+        surface=surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours),
+        T_world_coarse=T_world_coarse,
+        scale_std=config.scale_noise * depth_noise,
+        prior=jnp.append(prior, 1.0),
+    )
+
+
+def _pose(y: Float[Array, "7"], problem: _Problem) -> tuple[jaxlie.SE3, Float[Array, ""]]:
+    """T_world_coarse exp(xi), and the scale exp(scale_std · y_6)."""
+    return problem.T_world_coarse @ jaxlie.SE3.exp(y[:6]), jnp.exp(problem.scale_std * y[6])
+
+
+def _search(y: Float[Array, "7"], problem: _Problem, config: IcpConfig) -> Candidates:
+    """The Gaussians near every point, placed by the unknowns y."""
+    T, scale = _pose(y, problem)
+    target = problem.surface.gaussians
+    return knn(transform(T, problem.source, scale).points, target.means, target.valid, config.num_neighbours)
+
+
+def _place(
+    y: Float[Array, "7"], candidates: Candidates, problem: _Problem, config: IcpConfig
+) -> tuple[Observation, Matches]:
+    """The source in the world frame for the unknowns y, and its matches, which carry no gradient."""
+    T, scale = _pose(y, problem)
+    placed = transform(T, problem.source, scale)
+    noise = problem.rays @ T.rotation().as_matrix().T
+    fixed, noise = jax.lax.stop_gradient((placed, noise))
+    gates = config.max_mahalanobis_sq, config.min_normal_cos
+    return placed, jax.lax.stop_gradient(match(fixed, noise, candidates, problem.surface, gates))
+
+
+def _residuals(
+    y: Float[Array, "7"], args: tuple[Candidates, _Problem, IcpConfig]
+) -> tuple[Float[Array, "p 5"], Float[Array, "7"]]:
+    """Rows of every point (plane, colour, whitened offset) and of the prior, in standard deviations."""
+    candidates, problem, config = args
+    placed, matches = _place(y, candidates, problem, config)
+    offset = placed.points - matches.means
+    plane = jnp.sum(offset * matches.normals, axis=-1) / matches.plane_std
+    light = matches.light + jnp.sum(matches.gradients * offset, axis=-1)
+    shade = (light - intensity(placed.colors)) / config.color_std
+    triangle, noise, entries = (jnp.unstack(rows, axis=-1) for rows in (matches.triangle, matches.noise, offset))
+    white = jnp.stack(widen(whiten(triangle, entries), noise), axis=-1)
+    # A point beyond the gate costs what it would at the gate and pulls nowhere.
+    edge = jnp.sqrt(config.max_mahalanobis_sq)
+    is_inlier = matches.is_inlier[:, None]
+    rows = jnp.concatenate(
+        [
+            (config.residual == COLORED) * jnp.where(is_inlier, plane[:, None], edge),
+            (config.residual != DISTRIBUTION) * jnp.where(is_inlier, jnp.clip(shade, -edge, edge)[:, None], edge),
+            (config.residual != COLORED) * jnp.where(is_inlier, white, edge / jnp.sqrt(3.0)),
+        ],
+        axis=-1,
+    )
+    valid = placed.valid
+    share = jnp.sqrt(config.num_effective / jnp.maximum(jnp.sum(valid), 1))
+    return share * jnp.where(valid[:, None], rows, 0.0), problem.prior * y
+
+
+def icp(
+    source: Observation,
+    target: Gaussians,
+    T_world_coarse: jaxlie.SE3,
+    noise: tuple[Float[Array, ""], Float[Array, ""]],
+    config: IcpConfig,
+) -> tuple[jaxlie.SE3, Float[Array, ""], IcpInfo]:
+    """Place camera-frame `source` on `target`: argmin over xi and s of data + prior, T = T_world_coarse exp(xi).
+
+    The data term is a truncated least-squares sum over the points, scaled so that all of them together weigh as much
+    as `num_effective` independent ones. The prior holds xi at 0 with `prior_information`, and the scale s of the
+    points about the camera at 1 with `scale_noise`: the predictions of one call share an error of scale, and only the
+    map remembers the scale of the calls before.
+
+    Args:
+        source: points to align, camera frame.
+        target: Gaussians of the submap, world frame.
+        T_world_coarse: where to start, and the mean of the prior.
+        noise: standard deviation of the coarse pose in metres, and of the points' depth as a fraction of it.
+        config: terms and gates.
+
+    Returns:
+        T_world_camera, the scale, and what the solve found.
+    """
+    problem = _pose_problem(source, target, T_world_coarse, noise, config)
+    # Seven unknowns: on a CPU the normal equations take a fraction of a QR of all rows.
+    solver = optx.LevenbergMarquardt(
+        rtol=config.tolerance, atol=config.tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
+    )
+
+    def search_and_solve(y: Float[Array, "7"], _: None) -> tuple[Float[Array, "7"], tuple]:
+        candidates = _search(y, problem, config)
+        args = candidates, problem, config
+        solution = optx.least_squares(_residuals, solver, y, args, max_steps=config.max_steps, throw=False)
+        y = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, y)
+        return y, (candidates, solution.stats["num_steps"], solution.result == optx.RESULTS.successful)
+
+    y, rounds = jax.lax.scan(search_and_solve, jnp.zeros(7), length=config.num_searches)
+    candidates, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
+    args = candidates, problem, config
+    placed, matches = _place(y, *args)
+    num_inliers = jnp.sum(matches.is_inlier)
+    distance = jnp.sum((placed.points - matches.means) * matches.normals, axis=-1)
+    jacobian = jax.jacfwd(_residuals)(y, args)[0].reshape(-1, 7)[:, :6]
+    hessian = jacobian.T @ jacobian / jnp.maximum(config.num_effective, 1.0)
+    info = IcpInfo(
+        num_inliers=num_inliers,
+        inlier_fraction=num_inliers / jnp.maximum(jnp.sum(placed.valid), 1),
+        residual=jnp.sqrt(jnp.sum(jnp.where(matches.is_inlier, distance, 0.0) ** 2) / jnp.maximum(num_inliers, 1)),
+        misfit=1.4826 * median(jnp.abs(distance), placed.valid),
+        min_eigenvalue=jnp.linalg.eigvalsh(hessian)[0],
+        num_steps=jnp.sum(rounds[1]),
+        is_converged=is_converged,
+    )
+    return *_pose(y, problem), info

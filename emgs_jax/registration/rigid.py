@@ -1,0 +1,68 @@
+"""Rigid motions: what jaxlie does not bring, and fits of paired points."""
+
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.ops.linalg import SMALLEST_LENGTH
+
+MIN_PAIRS = 16  # fewer pairs of noisy points do not make a pose
+
+
+def pose_row(poses: jaxlie.SE3, row: int | Int[Array, ""]) -> jaxlie.SE3:
+    """One pose of a batch."""
+    return jaxlie.SE3(poses.wxyz_xyz[row])
+
+
+def scale_translation(T: jaxlie.SE3, scale: Float[Array, ""]) -> jaxlie.SE3:
+    """The pose with its translation multiplied."""
+    return jaxlie.SE3.from_rotation_and_translation(T.rotation(), scale * T.translation())
+
+
+def interpolate(start: jaxlie.SE3, end: jaxlie.SE3, share: Float[Array, ""]) -> jaxlie.SE3:
+    """The pose `share` of the way along the screw motion from `start` to `end`."""
+    return start @ jaxlie.SE3.exp(share * (start.inverse() @ end).log())
+
+
+def median(values: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
+    """Lower median of the valid values; 1 without any."""
+    count = jnp.sum(valid)
+    ordered = jnp.sort(jnp.where(valid, values, jnp.inf))
+    return jnp.where(count > 0, ordered[jnp.maximum(count - 1, 0) // 2], 1.0)
+
+
+def fit_rigid(
+    source: Float[Array, "p 3"], target: Float[Array, "p 3"], weights: Float[Array, "p"]
+) -> tuple[jaxlie.SE3, Float[Array, ""]]:
+    """Weighted least-squares T_target_source of paired points, and the scale of the similarity that would fit best.
+
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
+    Without weights the identity and 1.
+    """
+    total = jnp.sum(weights)
+    share = weights / jnp.where(total > 0, total, 1.0)
+    source_mean, target_mean = share @ source, share @ target
+    a, b = source - source_mean, target - target_mean
+    u, s, vt = jnp.linalg.svd((share[:, None] * b).T @ a)
+    handed = jnp.array([1.0, 1.0, 1.0]).at[2].set(jnp.sign(jnp.linalg.det(u @ vt)))
+    rotation = jnp.where(total > 0, (u * handed) @ vt, jnp.eye(3))
+    spread = share @ jnp.sum(a * a, axis=-1)
+    scale = jnp.where(spread > 0, (s @ handed) / jnp.where(spread > 0, spread, 1.0), 1.0)
+    T = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.from_matrix(rotation), target_mean - rotation @ source_mean)
+    return T, scale
+
+
+def fit_rigid_robust(
+    source: Float[Array, "p 3"], target: Float[Array, "p 3"], paired: Bool[Array, "p"], start: jaxlie.SE3
+) -> jaxlie.SE3:
+    """Rigid fit of pairs, robust by three reweightings around the median distance; `start` with too few pairs."""
+    T = start
+    for _ in range(3):
+        difference = source @ T.rotation().as_matrix().T + T.translation() - target
+        # Exact pairs: the square root has no gradient at 0.
+        distance = jnp.sqrt(jnp.sum(difference**2, axis=-1) + SMALLEST_LENGTH**2)
+        spread = jnp.maximum(median(distance, paired), 1e-6)
+        weights = jnp.where(paired, 1.0 / (1.0 + (distance / (2.0 * spread)) ** 2), 0.0)
+        T, _ = fit_rigid(source, target, weights)
+    keep = jnp.sum(paired) >= MIN_PAIRS
+    return jaxlie.SE3(jnp.where(keep, T.wxyz_xyz, start.wxyz_xyz))

@@ -1,0 +1,79 @@
+"""A committed baseline: results must not get worse than it by more than a tolerance."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from emgs_jax.io.files import atomic_write
+from emgs_jax.report.tables import Row
+
+GATE_FORMAT = 1
+
+
+def write_gate(path: str | os.PathLike, rows: Sequence[Row], tolerances: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write the mean of each metric of `tolerances` for our own rows.
+
+    Args:
+        rows: one for each sequence and variant.
+        tolerances: metric -> {direction: lower or higher is better, tolerance: by which it may get worse}.
+    """
+    baseline = {}
+    for row in rows:
+        if row.kind == "ours" and row.seeds:
+            metrics = {
+                key: {"value": row.values[key], **rule}
+                for key, rule in tolerances.items()
+                if row.values.get(key) is not None
+            }
+            baseline[_name(row)] = {"protocol": row.protocol, "seeds": list(row.seeds), "metrics": metrics}
+    if not baseline:
+        raise ValueError(f"{path} is not written: there is no result of ours to take a baseline from")
+    with atomic_write(path, "w") as handle:
+        yaml.safe_dump({"format": GATE_FORMAT, "baseline": baseline}, handle, sort_keys=False)
+
+
+def read_gate(path: str | os.PathLike) -> dict[str, Any]:
+    """The baseline by name of its row, from YAML or JSON; ValueError where it cannot be compared with."""
+    remedy = "write one with python -m experiments.evaluate … write_gate=FILE"
+    if not Path(path).is_file():
+        raise ValueError(f"gate={path} does not exist: {remedy}")
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        if content["format"] != GATE_FORMAT:
+            raise ValueError(f"format {content['format']}, not {GATE_FORMAT}")
+        for entry in content["baseline"].values():
+            for key, rule in entry["metrics"].items():
+                if rule["direction"] not in ("lower", "higher") or not float(rule["tolerance"]) >= 0:
+                    raise ValueError(f"{key} needs direction: lower or higher, and a tolerance of 0 or more")
+                float(rule["value"])
+            entry["protocol"], [int(seed) for seed in entry["seeds"]]
+    except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"gate={path} is no baseline ({error!r}): {remedy}") from error
+    return content["baseline"]
+
+
+def regressions(baseline: Mapping[str, Any], rows: Sequence[Row]) -> list[str]:
+    """One line for each metric that is worse than the baseline allows, or that is missing."""
+    found = {(_name(row), row.protocol): row for row in rows if row.kind == "ours"}
+    lines = []
+    for name, entry in baseline.items():
+        row = found.get((name, entry["protocol"]))
+        if row is None or list(row.seeds) != list(entry["seeds"]):
+            seeds = "no result" if row is None else f"results of the seeds {list(row.seeds)}"
+            lines.append(f"{name}: {seeds} under {entry['protocol']}, the baseline has {entry['seeds']}")
+            continue
+        for key, rule in entry["metrics"].items():
+            value, tolerance = row.values.get(key), float(rule["tolerance"])
+            loss = None if value is None else (value - rule["value"]) * (1 if rule["direction"] == "lower" else -1)
+            if loss is None or not loss <= tolerance:
+                shown = "missing" if value is None else f"{value:.6g}"
+                allowed = f"{rule['direction']} is better, tolerance {tolerance:g}"
+                lines.append(f"{name}: {key} is {shown}, baseline {rule['value']:.6g} ({allowed})")
+    return lines
+
+
+def _name(row: Row) -> str:
+    return f"{row.dataset}/{row.sequences[0]}/{row.variant}"

@@ -1,0 +1,176 @@
+"""metrics.json of a run: the map against the truth, the prior alone against the truth, counts and times."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from emgs_jax.data.base import Frame
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.evaluation.reconstruction import (
+    EvaluationConfig,
+    Reference,
+    align_cloud,
+    compare_clouds,
+    ground_truth_cloud,
+    reconstruction_metrics,
+    reference,
+)
+from emgs_jax.evaluation.segmentation import LabelledPoints, compare_labels, true_labels
+from emgs_jax.evaluation.trajectory import trajectory_metrics
+from emgs_jax.prior.base import Prior
+from emgs_jax.render.densify import DensifyConfig
+from emgs_jax.report.provenance import RAW_PRIOR, prefixed
+from emgs_jax.running.clock import Clock, peak_memory_mb
+from emgs_jax.running.dense import center_cloud, dense_map, label_centers
+from emgs_jax.running.record import FrameRecord, MappingRun
+
+Metrics = dict[str, Any]
+STATUSES = ("tracked", "degraded", "lost", "initialization")
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """What the maps of one data set are compared with, made once.
+
+    Args:
+        dataset: in use.
+        evaluation: the protocol.
+        truth: the true cloud, empty without ground truth.
+        labels: the true classes; None where data set or prior have none.
+        prior: its text embeddings are the classes of a map.
+    """
+
+    dataset: ReadableFrames
+    evaluation: EvaluationConfig
+    truth: Reference
+    labels: LabelledPoints | None
+    prior: Prior
+
+
+def new_scorer(dataset: ReadableFrames, evaluation: EvaluationConfig, prior: Prior) -> Scorer:
+    """Read the truth of a data set."""
+    labels = None
+    if dataset.classes and prior.feature_names:
+        labels = true_labels(_true_frames(dataset), dataset, evaluation.voxel_m, evaluation.max_depth_m)
+    return Scorer(dataset, evaluation, true_cloud(dataset, evaluation), labels, prior)
+
+
+def true_cloud(dataset: ReadableFrames, config: EvaluationConfig) -> Reference:
+    """The true points of the frames whose pose is known."""
+    return reference(ground_truth_cloud(_true_frames(dataset), dataset.intrinsics, config), config)
+
+
+def _true_frames(dataset: ReadableFrames) -> Iterator[Frame]:
+    return (dataset[row] for row in range(len(dataset) if dataset.has_ground_truth else 0))
+
+
+def score_map(
+    run: MappingRun, dense: PointCloud, centers: PointCloud, labels: LabelledPoints | None, scorer: Scorer
+) -> Metrics:
+    """Trajectory, reconstruction and segmentation metrics of the map; empty without any true pose.
+
+    The dense map is compared as the protocol says, under the other alignment as `reconstruction_<alignment>/…`, and
+    the plain centres as `reconstruction_centers/…`.
+
+    Args:
+        run: finished.
+        dense: the map, densified.
+        centers: the Gaussians' means.
+        labels: of the centres, row by row.
+        scorer: the truth.
+    """
+    if all(pose is None for pose in run.true_poses):
+        return {}
+    poses, truth, config = _known(run, run.poses), scorer.truth, scorer.evaluation
+    other = replace(config, alignment="se3" if config.alignment == "sim3" else "sim3")
+    metrics = trajectory_metrics(*poses) | compare_clouds(dense, truth, poses, config)
+    metrics |= _renamed(compare_clouds(dense, truth, poses, other), f"reconstruction_{other.alignment}/")
+    aligned, note = align_cloud(centers, truth, poses, config)
+    found = reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
+    metrics |= _renamed(found, "reconstruction_centers/")
+    if labels is not None and scorer.labels is not None:
+        metrics |= compare_labels(replace(labels, points=aligned.points), scorer.labels, config.label_neighbours)
+    return metrics
+
+
+def score_prior(run: MappingRun, cloud: PointCloud, scorer: Scorer) -> Metrics:
+    """The same metrics, but for segmentation, of the raw prior, whose points are `cloud`."""
+    if all(pose is None for pose in run.true_poses):
+        return {}
+    poses = _known(run, run.raw_poses)
+    metrics = trajectory_metrics(*poses) | compare_clouds(cloud, scorer.truth, poses, scorer.evaluation)
+    return prefixed(metrics, RAW_PRIOR)
+
+
+def score_settings(
+    runs: Sequence[MappingRun],
+    raw_cloud: PointCloud,
+    densify: Sequence[DensifyConfig],
+    scorer: Scorer,
+    num_threads: int,
+) -> list[Metrics]:
+    """The metrics.json of every finished run, without times.
+
+    Args:
+        runs: that share data set, prior and protocol.
+        raw_cloud: the prior's points, the same for all.
+        densify: of each run.
+        scorer: the truth.
+        num_threads: runs that are scored side by side.
+    """
+
+    def score(run: MappingRun, config: DensifyConfig) -> Metrics:
+        counts = {k: v for k, v in describe(run, scorer.dataset).items() if not k.startswith("time/")}
+        if all(pose is None for pose in run.true_poses):
+            return counts
+        dense = dense_map(run, scorer.dataset, config, scorer.evaluation.voxel_m, num_pictures=0).cloud
+        labels = label_centers(run, scorer.prior)
+        return score_map(run, dense, center_cloud(run), labels, scorer) | counts
+
+    with ThreadPoolExecutor(num_threads) as threads:
+        shared = threads.submit(score_prior, runs[0], raw_cloud, scorer)
+        found = [score(runs[0], densify[0])]  # by itself: what it compiles is there for the others
+        found += threads.map(score, runs[1:], densify[1:])
+    return [metrics | shared.result() for metrics in found]
+
+
+def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
+    """Size of the map, how many frames came to what, time and memory."""
+    counts = Counter(record.status for record in run.records)
+    metrics: Metrics = {"map/num_gaussians": int(np.asarray(run.state.map.gaussians.valid).sum())}
+    metrics["map/capacity"] = run.config.submap.map_capacity
+    metrics |= {f"frames/{status}": counts[status] for status in STATUSES}
+    metrics["frames/skipped"] = len(dataset.skipped)
+    metrics["frames/overflow"] = sum(record.overflow or 0 for record in run.records)
+    metrics["time/seconds_per_frame"] = seconds_per_frame(run.records)
+    return metrics
+
+
+def spent(clock: Clock) -> Metrics:
+    """Seconds of each phase, compilation included; of compilation in all phases; peak memory."""
+    metrics: Metrics = {f"time/{name}_seconds": seconds for name, seconds in clock.phases.items()}
+    metrics |= {"time/compile_seconds": clock.compile_seconds, "time/total_seconds": clock.total_seconds}
+    return metrics | {"memory/peak_mb": peak_memory_mb()}
+
+
+def seconds_per_frame(records: list[FrameRecord]) -> float | None:
+    """Mean over the steps in which nothing was compiled; if there is none, over all without their compilation."""
+    steps = [record for record in records if record.status != "initialization"] or records
+    steady = [record.seconds for record in steps if record.compile_seconds == 0]
+    return float(np.mean(steady or [record.seconds - record.compile_seconds for record in steps])) if steps else None
+
+
+def _known(run: MappingRun, poses: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """`poses` and the true ones (n, 4, 4), of the frames whose true pose is known."""
+    pairs = [(pose, true) for pose, true in zip(poses, run.true_poses, strict=True) if true is not None]
+    ours, truth = zip(*pairs, strict=True)
+    return np.stack(ours), np.stack(truth).astype(np.float64)
+
+
+def _renamed(metrics: Metrics, prefix: str) -> Metrics:
+    return {prefix + key.removeprefix("reconstruction/"): value for key, value in metrics.items()}

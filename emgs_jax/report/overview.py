@@ -1,0 +1,198 @@
+"""One picture of a run: the map from above with both paths, and what the map renders beside what the camera saw."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import hsv_to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
+
+from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.io.files import atomic_write
+
+_ESTIMATE, _TRUTH, _INK = "#e4572e", "#1b998b", "#333333"
+
+
+def draw_overview(
+    path: str | os.PathLike,
+    cloud: PointCloud,
+    trajectories: tuple[np.ndarray, np.ndarray | None],
+    frames: Sequence[Mapping[str, Any]],
+    title: str,
+    classes: Sequence[str] = (),
+) -> None:
+    """Draw the picture and write it as PNG.
+
+    Args:
+        cloud: in the frame of the trajectories.
+        trajectories: estimated T_world_camera (n, 4, 4), and the true ones in the same frame or None.
+        frames: about four, each with `image` uint8 (h, w, 3), `rendered_color` float (h, w, 3), `rendered_depth`
+            float (h, w) in metres, `valid` bool (h, w), where it is known, `title`, and with classes `labels`,
+            int (h, w), -1 = none.
+        title: of the whole picture.
+        classes: names of the labels.
+    """
+    estimate, truth = (None if poses is None else np.asarray(poses, np.float64) for poses in trajectories)
+    figure = Figure(figsize=(16, max(6.0, 0.8 + 2.05 * len(frames))), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=13, color=_INK)
+    left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.05)) if frames else (figure, None)
+    _draw_map(left.subplots(), cloud, estimate, truth)
+    if right is not None:
+        grid = right.subplots(len(frames), 4 if classes else 3, squeeze=False)
+        _draw_frames(grid[:, [0, 1, -1]], frames)
+        if classes:
+            _draw_labels(grid[:, 2], frames, classes)
+    with atomic_write(path) as handle:
+        figure.savefig(handle, format="png", dpi=110)
+
+
+def view_from_above(poses: np.ndarray) -> np.ndarray:
+    """World → picture rotation (3, 3) with rows right, forward, up; up is the cameras' mean -y (OpenCV axes)."""
+    up = -poses[:, :3, 1].mean(0)
+    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else -poses[0, :3, 1]
+    centers = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
+    flat = centers - np.outer(centers @ up, up)
+    # The longest way of the path runs to the right; a camera at rest looks up the picture.
+    direction = np.linalg.svd(flat, full_matrices=True)[2][0] if len(poses) > 2 else poses[0, :3, 0]
+    direction = direction if np.abs(flat).max() > 1e-3 else poses[0, :3, 0]
+    direction = direction * np.where(direction @ poses[0, :3, 0] < 0, -1.0, 1.0)
+    right = direction - (direction @ up) * up
+    right /= max(np.linalg.norm(right), 1e-9)
+    return np.stack([right, np.cross(up, right), up])
+
+
+def below_ceiling(heights: np.ndarray, camera_heights: np.ndarray) -> np.ndarray:
+    """Mask of what may be seen from above: nothing higher than the camera, unless that would hide most of the map."""
+    visible = heights <= camera_heights.max() + 0.1
+    return visible if visible.mean() > 0.2 else np.ones_like(visible)
+
+
+def paint_from_above(points: np.ndarray, colors: np.ndarray, cell: float) -> tuple[np.ndarray, tuple[float, ...]]:
+    """Paint points (x, y right and up, z height) into cells [m]; of each cell the highest point is seen.
+
+    Returns RGBA (h, w, 4), transparent where there is no point, and the extent (left, right, bottom, top) in metres.
+    """
+    low = np.floor(points[:, :2].min(0) / cell)
+    index = (np.floor(points[:, :2] / cell) - low).astype(np.int64)
+    width, height = index.max(0) + 1
+    image = np.zeros((height, width, 4))
+    order = np.argsort(points[:, 2], kind="stable")  # of repeated indices the last assignment stays
+    image[index[order, 1], index[order, 0], :3] = colors[order]
+    image[index[order, 1], index[order, 0], 3] = 1.0
+    left, bottom = low * cell
+    return image, (left, left + width * cell, bottom, bottom + height * cell)
+
+
+def fill_holes(image: np.ndarray) -> np.ndarray:
+    """Give empty cells of an RGBA picture (h, w, 4) that lie among painted ones their mean colour; twice."""
+    for _ in range(2):
+        padded = np.pad(image, ((1, 1), (1, 1), (0, 0)))
+        h, w = image.shape[:2]
+        around = sum(padded[row : row + h, column : column + w] for row in range(3) for column in range(3))
+        is_hole = (image[..., 3] == 0) & (around[..., 3] >= 3.5)
+        image = np.where(is_hole[..., None], around / np.maximum(around[..., 3:], 1.0), image)
+    return image
+
+
+def _draw_map(axes: Axes, cloud: PointCloud, estimate: np.ndarray, truth: np.ndarray | None) -> None:
+    rotation = view_from_above(estimate)
+    path = estimate[:, :3, 3] @ rotation.T
+    finite = np.isfinite(cloud.points).all(1)
+    points, colors = cloud.points[finite] @ rotation.T, cloud.colors[finite].clip(0.0, 1.0)
+    if len(points):
+        seen = below_ceiling(points[:, 2], path[:, 2])
+        # Far flying points must not shrink the room to a dot.
+        low, high = np.percentile(points[seen, :2], [0.5, 99.5], axis=0)
+        margin = 0.1 * (high - low) + 0.05
+        seen &= ((points[:, :2] >= low - margin) & (points[:, :2] <= high + margin)).all(1)
+        size = float(np.max(high - low + 2 * margin))
+        cell = size / np.clip(1.2 * np.sqrt(seen.sum()), 100, 700)
+        image, extent = paint_from_above(points[seen], colors[seen], cell)
+        axes.imshow(fill_holes(image), extent=extent, origin="lower", interpolation="nearest", zorder=1)
+    if truth is not None:
+        _draw_path(axes, truth[:, :3, 3] @ rotation.T, _TRUTH, "true path", 5.0)
+    # Thinner with its outline than the true path, so that one on top of the other shows both.
+    _draw_path(axes, path, _ESTIMATE, "estimated path", 1.6)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_facecolor("#e3e6ea")
+    axes.set_xlabel("metres", color=_INK)
+    axes.tick_params(colors=_INK, labelsize=9)
+    axes.grid(color="white", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[:].set_visible(False)
+    axes.set_title(f"map from above, {len(points):,} points", fontsize=11, color=_INK)
+    axes.legend(loc="upper right", fontsize=10, framealpha=0.9)
+    _draw_scale_bar(axes)
+
+
+def _draw_path(axes: Axes, path: np.ndarray, color: str, label: str, width: float) -> None:
+    outline = [withStroke(linewidth=width + 1.6, foreground="white")]
+    axes.plot(path[:, 0], path[:, 1], color=color, linewidth=width, label=label, path_effects=outline)
+    axes.plot(*path[0, :2], marker="o", markersize=7, color=color, markeredgecolor="white", linestyle="none")
+    axes.plot(*path[-1, :2], marker="s", markersize=7, color=color, markeredgecolor="white", linestyle="none")
+
+
+def _draw_scale_bar(axes: Axes) -> None:
+    left, right = axes.get_xlim()
+    length = 10.0 ** np.floor(np.log10(max(right - left, 1e-6) / 4))
+    length *= max(step for step in (1, 2, 5) if step * length <= (right - left) / 4)
+    transform = axes.get_xaxis_transform()  # x in metres, y in shares of the axes
+    start = left + 0.04 * (right - left)
+    axes.plot(
+        [start, start + length], [0.04, 0.04], color=_INK, linewidth=4, transform=transform, solid_capstyle="butt"
+    )
+    text = axes.text(start + length / 2, 0.055, f"{length:g} m", transform=transform, ha="center", color=_INK)
+    text.set_path_effects([withStroke(linewidth=3, foreground="white")])
+
+
+def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]]) -> None:
+    depths = [np.asarray(frame["rendered_depth"])[np.asarray(frame["valid"])] for frame in frames]
+    depths = np.concatenate([depth[np.isfinite(depth) & (depth > 0)].ravel() for depth in depths])
+    near, far = np.percentile(depths, [1, 99]) if len(depths) else (0.0, 1.0)
+    mappable = None
+    for row, frame in zip(grid, frames, strict=True):
+        covered = np.asarray(frame["valid"]) & np.isfinite(frame["rendered_depth"])
+        row[0].imshow(np.asarray(frame["image"]))
+        row[1].imshow(np.nan_to_num(np.asarray(frame["rendered_color"], np.float64)).clip(0.0, 1.0))
+        depth = np.ma.masked_where(~covered, np.asarray(frame["rendered_depth"], np.float64))
+        mappable = row[2].imshow(depth, cmap="turbo", vmin=near, vmax=far)
+        row[2].set_facecolor("#dddddd")
+        row[0].set_ylabel(str(frame["title"]), fontsize=10, color=_INK)
+        for axes in row:
+            _bare(axes)
+    for axes, title in zip(grid[0], ("input", "rendered colour", "rendered depth"), strict=True):
+        axes.set_title(title, fontsize=11, color=_INK)
+    bar = grid[0, 0].figure.colorbar(mappable, ax=grid[:, 2].tolist(), shrink=0.6, aspect=30, label="depth [m]")
+    bar.outline.set_visible(False)
+
+
+def _draw_labels(column: np.ndarray, frames: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> None:
+    """The classes of some frames, and a legend of those that are seen."""
+    colors = class_colors(len(classes))
+    for axes, frame in zip(column, frames, strict=True):
+        labels = np.asarray(frame["labels"])
+        axes.imshow(np.where((labels >= 0)[..., None], colors[labels], 0.867), interpolation="nearest")
+        _bare(axes)
+    column[0].set_title("labels", fontsize=11, color=_INK)
+    seen = sorted({int(label) for frame in frames for label in np.unique(frame["labels"]) if label >= 0})
+    handles = [Patch(color=colors[label], label=classes[label]) for label in seen]
+    column[-1].figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
+
+
+def class_colors(count: int) -> np.ndarray:
+    """RGB in [0, 1] (count, 3): hues a golden section apart, alternately dark and light."""
+    number = np.arange(count)
+    light = number % 2
+    return hsv_to_rgb(np.stack([0.618034 * number % 1.0, 0.8 - 0.3 * light, 0.65 + 0.3 * light], -1).reshape(count, 3))
+
+
+def _bare(axes: Axes) -> None:
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.spines[:].set_visible(False)

@@ -1,0 +1,108 @@
+"""What a run writes and prints about itself: provenance, metrics.json, the table on the terminal."""
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from emgs_jax.data.base import Dataset
+from emgs_jax.io.files import write_json
+from emgs_jax.prior.base import Provenance
+from emgs_jax.report.columns import MAIN, cell
+
+RESULT_FORMAT = 1  # of metrics.json; another one is refused where results are read
+RAW_PRIOR = "raw_prior/"  # prefix of the same metrics for the prior without any mapping
+_GROUPS = ("trajectory/", "reconstruction/", "segmentation/", "map/", "time/")
+_ROWS = (("", "ours"), (RAW_PRIOR, "raw prior"))
+_PACKAGES = {
+    "jax": ("jax",),
+    "jaxlib": ("jaxlib",),
+    "numpy": ("numpy",),
+    "optimistix": ("optimistix",),
+    "equinox": ("equinox",),
+    "open3d": ("open3d-cpu", "open3d"),
+    "cv2": ("opencv-python-headless", "opencv-python"),
+    "emgs_jax": ("emgs_jax",),
+}
+
+
+def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -> dict[str, Any]:
+    """Say where a result comes from: the block that stands in every result file."""
+    device = jax.devices()[0]
+    return {
+        "format": RESULT_FORMAT,
+        "protocol": config.get("evaluation", {}).get("protocol"),
+        "simulated": prior.is_simulated,
+        "prior": {"name": prior.name, "settings": prior.settings},
+        "data": {"name": dataset.name, "sequence": dataset.sequence, "fingerprint": dataset.fingerprint()},
+        "seed": prior.settings.get("seed", 0),
+        "git": git_revision(Path(__file__).resolve().parents[2]),
+        "versions": {"python": platform.python_version()} | {k: _version(names) for k, names in _PACKAGES.items()},
+        "device": {"kind": device.device_kind, "backend": device.platform, "cpu_count": os.cpu_count()},
+        "platform": platform.platform(),
+        "config": config,
+    }
+
+
+def git_revision(folder: Path) -> dict[str, Any] | None:
+    """Revision of the checkout whose top is `folder`, and whether tracked files differ from it; None elsewhere."""
+    top = _git(folder, "rev-parse", "--show-toplevel")
+    # An installed package may lie somewhere inside another project's checkout, which says nothing about this code.
+    if top is None or Path(top).resolve() != folder.resolve():
+        return None
+    revision = _git(folder, "rev-parse", "HEAD")
+    status = _git(folder, "status", "--porcelain", "--untracked-files=no")
+    return None if revision is None else {"revision": revision, "dirty": None if status is None else bool(status)}
+
+
+def prefixed(metrics: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """The same metrics under `prefix`, for example RAW_PRIOR."""
+    return {prefix + key: value for key, value in metrics.items()}
+
+
+def write_metrics(path: str | os.PathLike, metrics: Mapping[str, Any]) -> None:
+    """Write metrics.json: ours, then the raw prior's, then everything else; NaN and infinities become null."""
+    write_json(path, {key: metrics[key] for key in sorted(metrics, key=_rank)})
+
+
+def print_metrics_table(metrics: Mapping[str, Any]) -> str:
+    """Lay out the main metrics, one row for the map and one for the raw prior; `–` where there is no value."""
+    is_simulated = metrics.get("provenance", {}).get("simulated", False)
+    lines = [["simulated" if is_simulated else "", *(column.title for column in MAIN)]]
+    for prefix, name in _ROWS:
+        if any(prefix + column.key in metrics for column in MAIN):
+            values = [(metrics.get(prefix + key), None, factor, digits) for key, _, factor, digits, _ in MAIN]
+            lines.append([name, *(cell(*value) for value in values)])
+    widths = [max(map(len, texts)) for texts in zip(*lines, strict=True)]
+    rows = ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines]
+    return "\n".join([rows[0], "─" * max(map(len, rows)), *rows[1:]])
+
+
+def _rank(key: str) -> tuple[int, int]:
+    is_raw = key.startswith(RAW_PRIOR)
+    name = key.removeprefix(RAW_PRIOR)
+    group = next((rank for rank, prefix in enumerate(_GROUPS) if name.startswith(prefix)), len(_GROUPS))
+    return (1 if is_raw else 2 if "/" not in key else 0), group
+
+
+def _version(names: tuple[str, ...]) -> str | None:
+    for name in names:
+        try:
+            return importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return None
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        command = ["git", "-C", str(folder), *arguments]
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return answer.stdout.strip() if answer.returncode == 0 else None

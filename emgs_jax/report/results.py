@@ -1,0 +1,122 @@
+"""Where results lie: OUT/data set/sequence/variant/seed/metrics.json, and what may be read back from there."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from emgs_jax.io.files import jsonable
+from emgs_jax.report.provenance import RAW_PRIOR, RESULT_FORMAT
+
+METRICS_FILE = "metrics.json"
+_PLACES = ("dataset.root", "compilation_cache")  # say where things are, not what is computed
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What was compared with the truth in one run: the map, or what the prior alone says.
+
+    Args:
+        folder: of the result.
+        dataset: name of the data set.
+        sequence: name of its sequence.
+        variant: name of the overrides, or of another system.
+        kind: "ours", "raw prior", or "scored" for another system.
+        seed: of the prior.
+        prior: name of the prior; None for another system.
+        is_simulated: made from the ground truth.
+        protocol: of the comparison, and alignment.
+        revision: of the code; None where unknown.
+        values: the metrics that are numbers.
+    """
+
+    folder: Path
+    dataset: str
+    sequence: str
+    variant: str
+    kind: str
+    seed: int
+    prior: str | None
+    is_simulated: bool
+    protocol: str
+    revision: str | None
+    values: dict[str, float]
+
+
+def result_folder(out: Path, dataset: str, sequence: str, variant: str, seed: int) -> Path:
+    """Folder of one result; each part is one level."""
+    return out / dataset / str(sequence).replace("/", "_") / variant / str(seed)
+
+
+def read_metrics(path: Path) -> dict[str, Any]:
+    """A metrics.json of this version; any other raises ValueError."""
+    remedy = "move its folder away or choose another out=FOLDER"
+    try:
+        metrics = json.loads(path.read_text(encoding="utf-8"))
+        found = metrics["provenance"].get("format")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is not the result of a run ({error!r}): {remedy}") from error
+    if found != RESULT_FORMAT:
+        raise ValueError(f"{path} was written by another version (format {found}, not {RESULT_FORMAT}): {remedy}")
+    return metrics
+
+
+def is_finished(folder: Path, config: Mapping[str, Any]) -> bool:
+    """Whether the result is there; raises ValueError if it was made with another config."""
+    path = folder / METRICS_FILE
+    if not path.exists():
+        return False
+    made, wanted = _flat(read_metrics(path)["provenance"]["config"]), _flat(jsonable(config))
+    changes = [
+        f"{key} was {made.get(key)}, now {wanted.get(key)}"
+        for key in sorted({*made, *wanted} - set(_PLACES))
+        if made.get(key) != wanted.get(key)
+    ]
+    if changes:
+        raise ValueError(
+            f"{path} was made with other settings ({'; '.join(changes[:3])}{'; …' * (len(changes) > 3)}): "
+            "give these settings another name (+variants.NAME=[…], method=NAME), choose another out=FOLDER or move the "
+            "folder away"
+        )
+    return True
+
+
+def read_estimates(out: Path) -> list[Estimate]:
+    """All results below `out`, in the order of their folders."""
+    return [item for path in sorted(out.glob(f"*/*/*/*/{METRICS_FILE}")) for item in estimates_of(path)]
+
+
+def estimates_of(path: Path) -> list[Estimate]:
+    """What one result holds: ours and the raw prior, or another system."""
+    metrics = read_metrics(path)
+    found = [_estimate(path.parent, metrics, "ours" if metrics["provenance"]["prior"] else "scored", "")]
+    if any(key.startswith(RAW_PRIOR) for key in metrics):
+        found.append(_estimate(path.parent, metrics, "raw prior", RAW_PRIOR))
+    return found
+
+
+def _estimate(folder: Path, metrics: dict[str, Any], kind: str, prefix: str) -> Estimate:
+    block = metrics["provenance"]
+    own = {key: value for key, value in metrics.items() if key.startswith(RAW_PRIOR) == (prefix == RAW_PRIOR)}
+    return Estimate(
+        folder=folder,
+        dataset=block["data"]["name"],
+        sequence=block["data"]["sequence"],
+        variant=folder.parent.name,
+        kind=kind,
+        seed=int(folder.name),
+        prior=(block["prior"] or {}).get("name"),
+        is_simulated=block["simulated"],
+        protocol=block["protocol"],
+        revision=(block["git"] or {}).get("revision"),
+        values={key.removeprefix(prefix): value for key, value in own.items() if isinstance(value, int | float)},
+    )
+
+
+def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values by dotted key."""
+    values = {}
+    for key, value in config.items():
+        values |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return values

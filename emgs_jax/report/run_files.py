@@ -1,0 +1,44 @@
+"""The files of a run: trajectory, map, Gaussians, densified points, mesh and the overview."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from emgs_jax.io.map_file import save_map_npz
+from emgs_jax.io.mesh import save_mesh_ply
+from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
+from emgs_jax.io.trajectory import save_trajectory_tum
+from emgs_jax.render.densify import DensifyConfig
+from emgs_jax.report.overview import draw_overview
+from emgs_jax.running.dense import DenseMap, center_cloud
+from emgs_jax.running.record import MappingRun
+
+
+def save_progress(folder: Path, run: MappingRun) -> None:
+    """Write trajectory.txt and map.npz of the frames so far; nothing before there is a map."""
+    if run.state is not None:
+        save_trajectory_tum(
+            folder / "trajectory.txt", [record.timestamp for record in run.records], np.stack(run.poses)
+        )
+        save_map_npz(folder / "map.npz", run.state.map)
+
+
+def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: DensifyConfig, title: str) -> list[str]:
+    """Write the files that show the map; returns what could not be made, and why."""
+    gaussians = jax.device_get(run.state.map.gaussians)
+    valid = gaussians.valid
+    # As drawn: the covariances are those that close the surface.
+    covs = gaussians.covs[valid] * float(config.render.covariance_scale)
+    rest = gaussians.colors[valid], float(config.render.opacity), gaussians.normals[valid]
+    save_gaussians_ply(folder / "map.ply", gaussians.means[valid], covs, *rest)
+    labels = () if dense.labels is None else (dense.labels.labels, dense.labels.classes)
+    save_points_ply(folder / "points.ply", dense.cloud.points, dense.cloud.normals, dense.cloud.colors, *labels)
+    centers = center_cloud(run)
+    no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, centers.colors)
+    is_known = all(pose is not None for pose in run.true_poses)
+    truth = np.stack(run.true_poses) if is_known else None
+    paths = np.stack(run.poses), truth
+    classes = () if dense.labels is None else dense.labels.classes
+    draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes)
+    return [] if no_mesh is None else [f"no mesh.ply: {no_mesh}"]

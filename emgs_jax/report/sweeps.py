@@ -1,0 +1,141 @@
+"""The files of a sweep: sweep.json after every chunk, from which it is resumed, then sweep.csv and heat_map.png."""
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emgs_jax.io.files import atomic_write, jsonable, write_json
+from emgs_jax.report.columns import MAIN, Column, cell, markdown
+from emgs_jax.report.heat_map import HeatMap, draw_heat_maps
+from emgs_jax.report.metrics import Metrics
+
+FORMAT, VERSION = "emgs_jax.running.stacked", 1
+_REMEDY = "make it again in another folder (hydra.run.dir=…), or move this one away"
+
+
+def read_sweep(path: Path) -> dict[str, Any]:
+    """A sweep.json of this version; any other raises ValueError."""
+    try:
+        sweep = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}): {_REMEDY}") from error
+    if not isinstance(sweep, dict) or (sweep.get("format"), sweep.get("version")) != (FORMAT, VERSION):
+        raise ValueError(f"{path} is not a sweep of version {VERSION}: {_REMEDY}")
+    return sweep
+
+
+class SweepResults:
+    """Metrics by setting, on disk after each `add`; a folder that holds some of the same sweep is continued.
+
+    Args:
+        folder: of the results.
+        provenance: what all settings share. Results of other data, predictions or values are not mixed with these:
+            ValueError.
+    """
+
+    def __init__(self, folder: Path, provenance: Mapping[str, Any]) -> None:
+        self.path = folder / "sweep.json"
+        self._header = jsonable({"format": FORMAT, "version": VERSION, "provenance": provenance})
+        self._rows: dict[str, dict[str, Any]] = {}
+        if self.path.exists():
+            self._rows = {_key(row["setting"]): row for row in self._read()}
+
+    def _read(self) -> list[dict[str, Any]]:
+        old = read_sweep(self.path)
+        for key in ("data", "prior", "config"):
+            if old["provenance"][key] != self._header["provenance"][key]:
+                changed = _difference(old["provenance"][key], self._header["provenance"][key], key)
+                raise ValueError(f"{self.path} holds a sweep with {changed}: {_REMEDY}")
+        return old["settings"]
+
+    def __contains__(self, setting: Mapping[str, Any]) -> bool:
+        return _key(setting) in self._rows
+
+    def add(self, settings: Sequence[Mapping[str, Any]], metrics: Sequence[Metrics]) -> None:
+        """Keep the metrics of some settings and write all of them."""
+        for setting, values in zip(settings, metrics, strict=True):
+            self._rows[_key(setting)] = jsonable({"setting": setting, "metrics": values})
+        write_json(self.path, self._header | {"settings": list(self._rows.values())})
+
+    def rows(self, settings: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """One flat row for each setting: its values, then its metrics."""
+        found = [self._rows[_key(setting)] for setting in settings]
+        return [{"setting": number} | row["setting"] | row["metrics"] for number, row in enumerate(found)]
+
+
+def _key(setting: Mapping[str, Any]) -> str:
+    return json.dumps(jsonable(setting), sort_keys=True)
+
+
+def _difference(old: Any, new: Any, path: str) -> str:
+    """The first value that differs, with its path."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for name in [*old, *new]:
+            if old.get(name) != new.get(name):
+                return _difference(old.get(name), new.get(name), f"{path}.{name}")
+    return f"{path} {old!r}, and this one has {new!r}"
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write one line for each row; a metric that a setting does not have is empty."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with atomic_write(path, "w") as handle:
+        handle.write(text.getvalue())
+
+
+def table(rows: Sequence[Mapping[str, Any]], axes: Sequence[str]) -> str:
+    """Markdown with the values and main metrics of every row; the best of a column is bold."""
+    shown = _shown(rows)
+    best = {}
+    for key, _, _, _, is_lower_better in shown:
+        best[key] = (min if is_lower_better else max)(row[key] for row in rows if row.get(key) is not None)
+    lines = []
+    for row in rows:
+        cells = [str(row[name]) for name in axes]
+        for key, _, factor, digits, _ in shown:
+            value = row.get(key)
+            text = cell(value, None, factor, digits)
+            cells.append(f"**{text}**" if value is not None and value == best[key] else text)
+        lines.append(cells)
+    return markdown([*axes, *(column.title for column in shown)], lines)
+
+
+def _shown(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
+    """The main metrics that some row has."""
+    return [column for column in MAIN if any(row.get(column.key) is not None for row in rows)]
+
+
+def draw(path: Path, rows: Sequence[Mapping[str, Any]], axes: Mapping[str, Sequence[Any]], title: str) -> str | None:
+    """Draw the main metrics over the first two axes with several values, as means over all others.
+
+    Returns:
+        None, or why there is no picture.
+    """
+    shown = _shown(rows)
+    names = [name for name, values in axes.items() if len(values) > 1]
+    if len(names) < 2 or not shown:
+        return "a picture takes two axes with several values" if shown else "there is no ground truth to compare with"
+    ticks = [[str(value) for value in axes[name]] for name in names[:2]]
+    maps = []
+    for key, metric, factor, digits, is_lower_better in shown:
+        sums, counts = np.zeros((2, len(ticks[0]), len(ticks[1])))
+        for row in rows:
+            at = tuple(labels.index(str(row[name])) for labels, name in zip(ticks, names, strict=False))
+            if row.get(key) is not None:
+                sums[at] += factor * row[key]
+                counts[at] += 1
+        values = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+        maps.append(HeatMap(metric, values, digits, is_lower_better))
+    if len(names) > 2:
+        title += f", means over {', '.join(names[2:])}"
+    draw_heat_maps(path, maps, (names[0], ticks[0]), (names[1], ticks[1]), title)
+    return None

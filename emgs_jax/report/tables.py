@@ -1,0 +1,153 @@
+"""Results as one row per estimate (CSV), as mean and spread over seeds (JSON), and as Markdown tables."""
+
+import csv
+import io
+import statistics
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from emgs_jax.report.columns import DASH, MAIN, Column, cell, markdown
+from emgs_jax.report.results import Estimate
+
+_PAPER_DATASETS = {"seven_scenes": "7-Scenes", "tum": "TUM"}
+_PAPER_COLUMNS = (  # title, key, digits; the order of the paper's Table II
+    ("Acc [m]", "reconstruction/accuracy_m", 3),
+    ("Comp [m]", "reconstruction/completion_m", 3),
+    ("ATE [m]", "trajectory/ate_{alignment}_m", 3),
+    ("F1 [%]", "reconstruction/f1_20cm_percent", 1),
+    ("Normals [%]", "reconstruction/normals_abs_cos_percent", 1),
+    ("Scale [%]", "trajectory/scale_percent", 1),
+)
+_COLUMNS = (
+    MAIN[0]._replace(title="ATE Sim(3) [cm]"),
+    Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True),
+    *MAIN[1:],
+    Column("trajectory/scale_percent", "scale [%]", 1.0, 1, False),
+    Column("time/seconds_per_frame", "s a frame", 1.0, 2, True),
+)
+_NOTES = """
+Sequences × seeds: ours is the mean over sequences, ± the deviation over seeds. F1 at .2 m; Normals: mean |cos|; Scale:
+100 · min(s, 1/s); the paper defines neither of the last two. **simulated**: the prior is disturbed ground truth, which
+says nothing about a network and must not be compared with quoted rows. Quoted rows are not measured here and are means
+over seq-01 of seven scenes (7-Scenes) and nine sequences of freiburg1 (TUM).
+"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Mean and spread over the seeds of one kind of estimate.
+
+    Args:
+        dataset, variant, kind, prior, is_simulated, protocol: as of its estimates.
+        sequences: over which each seed's value is the mean.
+        seeds: that have a result for each of the sequences.
+        values: metric -> mean over the seeds, None where one has none.
+        spreads: metric -> standard deviation over the seeds, None for fewer than two.
+    """
+
+    dataset: str
+    variant: str
+    kind: str
+    prior: str | None
+    is_simulated: bool
+    protocol: str
+    sequences: tuple[str, ...]
+    seeds: tuple[int, ...]
+    values: dict[str, float | None]
+    spreads: dict[str, float | None]
+
+
+def average(estimates: Iterable[Estimate], each_sequence: bool) -> list[Row]:
+    """Rows in the order of the estimates: one over all sequences of a data set, or one for each of them.
+
+    A seed counts if it has a result for every sequence that any seed has: means over different sequences differ.
+    """
+    groups: dict[tuple, list[Estimate]] = defaultdict(list)
+    for item in estimates:
+        what = item.dataset, item.variant, item.kind, item.prior, item.is_simulated, item.protocol
+        groups[(*what, item.sequence if each_sequence else None)].append(item)
+    return [_row(what[:-1], members) for what, members in groups.items()]
+
+
+def to_csv(estimates: Sequence[Estimate]) -> str:
+    """One line per estimate: what it is of, then every metric."""
+    names = ("dataset", "sequence", "variant", "kind", "seed", "prior", "is_simulated", "protocol", "revision")
+    metrics = sorted({key for item in estimates for key in item.values})
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*names, *metrics])
+    for item in estimates:
+        writer.writerow([*(getattr(item, name) for name in names), *(item.values.get(key) for key in metrics)])
+    return text.getvalue()
+
+
+def paper_table(rows: Sequence[Row], published: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown in the shape of the paper's Table II; empty if no row is of its data sets.
+
+    Args:
+        rows: over all sequences.
+        published: quoted rows: method, source, protocol and the columns' values by data set.
+    """
+    methods: dict[tuple, dict[str, Row]] = defaultdict(dict)
+    for row in rows:
+        if row.dataset in _PAPER_DATASETS:
+            methods[(row.kind, row.variant, _source(row), row.protocol)][row.dataset] = row
+    if not methods:
+        return ""
+    titles = [f"{name}: {title}" for name in _PAPER_DATASETS.values() for title, _, _ in _PAPER_COLUMNS]
+    lines = []
+    for (kind, variant, source, protocol), members in methods.items():
+        found = [(_PAPER_DATASETS[key], members[key]) for key in _PAPER_DATASETS if key in members]
+        runs = "; ".join(f"{name} {len(row.sequences)} × {len(row.seeds)}" for name, row in found)
+        cells = [text for key in _PAPER_DATASETS for text in _paper_cells(members.get(key))]
+        lines.append([f"{kind}, {variant}", source, protocol, runs, *cells])
+    for row in published:
+        cells = [DASH if value is None else f"{value:g}" for key in _PAPER_DATASETS for value in row[key]]
+        lines.append([row["method"], f"quoted: {row['source']}", row["protocol"], DASH, *cells])
+    return markdown(["method", "source", "protocol", "sequences × seeds", *titles], lines) + _NOTES
+
+
+def full_table(rows: Sequence[Row]) -> str:
+    """Markdown: a line per row with the main metrics."""
+    lines = []
+    for row in rows:
+        sequences = row.sequences[0] if len(row.sequences) == 1 else f"mean of {len(row.sequences)}"
+        cells = [
+            cell(row.values.get(key), row.spreads.get(key), factor, digits) for key, _, factor, digits, _ in _COLUMNS
+        ]
+        what = [row.dataset, sequences, f"{row.kind}, {row.variant}", _source(row), row.protocol]
+        lines.append([*what, str(len(row.seeds)), *cells])
+    titles = ["data set", "sequence", "method", "source", "protocol", "seeds", *(column.title for column in _COLUMNS)]
+    return markdown(titles, lines)
+
+
+def _row(what: tuple, members: list[Estimate]) -> Row:
+    sequences = tuple(dict.fromkeys(item.sequence for item in members))
+    found = {(item.sequence, item.seed): item.values for item in members}
+    seeds = sorted({item.seed for item in members})
+    seeds = tuple(seed for seed in seeds if all((sequence, seed) in found for sequence in sequences))
+    values: dict[str, float | None] = {}
+    spreads: dict[str, float | None] = {}
+    for key in dict.fromkeys(key for item in members for key in item.values):
+        numbers = [[found[sequence, seed].get(key) for sequence in sequences] for seed in seeds]
+        known = bool(seeds) and all(number is not None for line in numbers for number in line)
+        means = [statistics.fmean(line) for line in numbers] if known else []
+        values[key] = statistics.fmean(means) if known else None
+        spreads[key] = statistics.stdev(means) if len(means) > 1 else None
+    return Row(*what, sequences, seeds, values, spreads)
+
+
+def _source(row: Row) -> str:
+    """What the numbers are made from; simulated ones say so in every table."""
+    label = "**simulated**" if row.is_simulated else "measured"
+    return label if row.prior in (None, "simulated") else f"{label}, {row.prior}"
+
+
+def _paper_cells(row: Row | None) -> list[str]:
+    if row is None:
+        return [DASH] * len(_PAPER_COLUMNS)
+    alignment = row.protocol.rsplit("/", 1)[-1]
+    keys = [(key.format(alignment=alignment), digits) for _, key, digits in _PAPER_COLUMNS]
+    return [cell(row.values.get(key), row.spreads.get(key), 1.0, digits) for key, digits in keys]

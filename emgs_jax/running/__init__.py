@@ -1,0 +1,1 @@
+"""A sequence being mapped: frames, prior, step, record; one run or many configs side by side."""

@@ -1,0 +1,124 @@
+"""From what a prior predicts on the host to the arrays of a step: every check of the input is here."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.observation import Observation, ObservationConfig, Prediction, observe
+from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.pytree import stack
+from emgs_jax.prior.base import PriorPrediction
+from emgs_jax.slam import FirstWindow
+
+_observe = eqx.filter_jit(observe)
+
+
+def to_camera(dataset: Dataset) -> Camera:
+    """The camera of a data set's frames."""
+    fx, fy, cx, cy = dataset.intrinsics
+    return Camera((fx, fy), (cx, cy), *dataset.size)
+
+
+def _check(prediction: PriorPrediction, frames: Mapping[int, Frame]) -> None:
+    height, width = frames[prediction.window.current].image.shape[:2]
+    expected = len(prediction.window.dense), height, width
+    for name, got in (
+        ("points", prediction.points.shape[:-1]),
+        ("confidence", prediction.confidence.shape),
+        ("mask", prediction.mask.shape),
+    ):
+        if got != expected:
+            raise ValueError(
+                f"the prior's {name} have shape {got} at frame {prediction.window.current}, expected {expected} "
+                "(dense views, height, width): predict at the data set's size"
+            )
+    if prediction.features.ndim != 4 or len(prediction.features) != expected[0]:
+        raise ValueError(
+            f"the prior's features have shape {prediction.features.shape} at frame {prediction.window.current}, "
+            f"expected ({expected[0]}, rows, columns, width): a grid that covers the image of each dense view"
+        )
+
+
+def _observation(prediction: PriorPrediction, view: int, frame: Frame, config: ObservationConfig) -> Observation:
+    return _observe(
+        jnp.asarray(prediction.points[view], jnp.float32),
+        jnp.asarray(frame.image, jnp.float32) / 255.0,
+        jnp.asarray(prediction.features[view], jnp.float32),
+        jnp.asarray(prediction.confidence[view], jnp.float32),
+        jnp.asarray(prediction.mask[view]),
+        config,
+    )
+
+
+def to_se3(matrices: np.ndarray) -> jaxlie.SE3:
+    """(..., 4, 4) float64 -> poses; a matrix that is not finite gives a pose of NaN, which a step marks as lost."""
+    matrices = np.asarray(matrices, np.float64)
+    is_finite = np.isfinite(matrices).all(axis=(-2, -1))
+    T = jaxlie.SE3.from_matrix(jnp.asarray(np.where(is_finite[..., None, None], matrices, np.eye(4)), jnp.float32))
+    return jaxlie.SE3(jnp.where(is_finite[..., None], T.wxyz_xyz, jnp.nan))
+
+
+def to_first_window(
+    prediction: PriorPrediction,
+    frames: Mapping[int, Frame],
+    T_world_anchor: np.ndarray,
+    config: ObservationConfig,
+    since: int = 0,
+) -> tuple[FirstWindow | None, tuple[int, ...]]:
+    """What a map can start from: the dense views from the first on that has a pose and a valid point.
+
+    Args:
+        prediction: of a window.
+        frames: by index; those of the window.
+        T_world_anchor: known pose of the first frame, (4, 4).
+        config: normals and thinning.
+        since: views of earlier frames are left out.
+
+    Returns:
+        The views and their frame indices; None and () where there is no such view. A later view may have no pose:
+        integrated on its own, it is lost.
+
+    Raises:
+        ValueError: a shape differs from the images'.
+    """
+    _check(prediction, frames)
+    rows = [row for row, index in enumerate(prediction.window.dense) if index >= since]
+    dense = [prediction.window.dense[row] for row in rows]
+    views = [_observation(prediction, row, frames[index], config) for row, index in zip(rows, dense, strict=True)]
+    poses = np.asarray(T_world_anchor) @ prediction.T_anchor_view[[prediction.window.views.index(i) for i in dense]]
+    usable = [bool(view.valid.any()) and np.isfinite(pose).all() for view, pose in zip(views, poses, strict=True)]
+    if not any(usable):
+        return None, ()
+    first = usable.index(True)
+    return FirstWindow(stack(views[first:]), to_se3(poses[first:])), tuple(dense[first:])
+
+
+def to_prediction(
+    prediction: PriorPrediction, frames: Mapping[int, Frame], T_world_anchor: np.ndarray, config: ObservationConfig
+) -> Prediction:
+    """The current and the previous view of one step.
+
+    Args:
+        prediction: dense in (previous, current).
+        frames: by index; those of the window.
+        T_world_anchor: known pose of the first frame, (4, 4).
+        config: normals and thinning.
+
+    Raises:
+        ValueError: a shape differs from the images'.
+    """
+    _check(prediction, frames)
+    views, (previous, current) = prediction.window.views, prediction.window.dense
+    has_newest = current + 1 in views
+    rows = [views.index(previous), views.index(current), views.index(current + 1 if has_newest else current)]
+    return Prediction(
+        current=_observation(prediction, 1, frames[current], config),
+        previous=_observation(prediction, 0, frames[previous], config),
+        T_world_views=to_se3(np.asarray(T_world_anchor) @ prediction.T_anchor_view[rows]),
+        T_world_anchor=to_se3(T_world_anchor),
+        has_newest=jnp.asarray(has_newest),
+    )

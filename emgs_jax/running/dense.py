@@ -1,0 +1,115 @@
+"""The map as points: what is rendered of it from the poses of its frames, its centres, and their classes."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emgs_jax.data.base import Dataset
+from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
+from emgs_jax.evaluation.segmentation import LabelledPoints, transfer_labels
+from emgs_jax.prior.base import Prior
+from emgs_jax.render.densify import DensifyConfig, densify
+from emgs_jax.running.convert import to_se3
+from emgs_jax.running.record import MappingRun
+from emgs_jax.semantics import classify
+
+_densify = eqx.filter_jit(densify)
+
+
+@dataclass(frozen=True)
+class DenseMap:
+    """The map as points.
+
+    Args:
+        cloud: a point per pixel of every frame whose pose is known, averaged per voxel.
+        labels: class of each of its points; None without classes.
+        pictures: what the overview shows of some frames.
+    """
+
+    cloud: PointCloud
+    labels: LabelledPoints | None = None
+    pictures: list[dict[str, Any]] = field(default_factory=list)
+
+
+def dense_map(
+    run: MappingRun,
+    dataset: Dataset,
+    config: DensifyConfig,
+    voxel: float,
+    centers: LabelledPoints | None = None,
+    num_pictures: int = 4,
+) -> DenseMap:
+    """Render the map from the pose of every frame that is not lost.
+
+    Args:
+        run: finished.
+        dataset: for the images in the pictures.
+        config: what becomes a point.
+        voxel: m; points of one voxel are averaged.
+        centers: of the `label_centers`, whose nearest one labels a point.
+        num_pictures: frames that are shown, evenly spread.
+    """
+    known = [row for row, record in enumerate(run.records) if record.status != "lost"]
+    shown = {known[int(i)] for i in np.linspace(0, len(known) - 1, num_pictures)} if known else set()
+    pictures: list[dict[str, Any]] = []
+
+    def clouds() -> Iterator[PointCloud]:
+        for row in known:
+            view = jax.device_get(_densify(run.state.map.gaussians, to_se3(run.poses[row]), run.camera, config))
+            if row in shown:
+                pictures.append(_picture(run, dataset, row, view) | _label_image(view, centers))
+            yield PointCloud(
+                *(rows[view.valid].astype(np.float64) for rows in (view.points, view.normals, view.colors))
+            )
+
+    cloud = fuse_clouds(clouds(), voxel)
+    return DenseMap(cloud, None if centers is None else _labelled(centers, cloud.points), pictures)
+
+
+def center_cloud(run: MappingRun) -> PointCloud:
+    """The Gaussians' means with their normals and colours."""
+    gaussians = jax.device_get(run.state.map.gaussians)
+    rows = (gaussians.means, gaussians.normals, gaussians.colors)
+    return PointCloud(*(values[gaussians.valid].astype(np.float64) for values in rows))
+
+
+def label_centers(run: MappingRun, prior: Prior) -> LabelledPoints | None:
+    """The Gaussians' means with the class whose text is closest to their feature; None without features or classes.
+
+    Raises:
+        ValueError: the embeddings' width differs from the features'.
+    """
+    gaussians = run.state.map.gaussians
+    if not prior.feature_names or not gaussians.features.shape[-1]:
+        return None
+    labels = np.asarray(classify(gaussians, jnp.asarray(prior.text_features, jnp.float32)))
+    valid = np.asarray(gaussians.valid)
+    return LabelledPoints(np.asarray(gaussians.means, np.float64)[valid], labels[valid], tuple(prior.feature_names))
+
+
+def _picture(run: MappingRun, dataset: Dataset, row: int, view: Any) -> dict[str, Any]:
+    return {
+        "image": dataset[row].image,
+        "rendered_color": view.colors,
+        "rendered_depth": view.depth,
+        "valid": view.valid,
+        "title": f"frame {run.records[row].index}",
+    }
+
+
+def _labelled(centers: LabelledPoints, points: np.ndarray) -> LabelledPoints:
+    return LabelledPoints(points, transfer_labels(centers.points, centers.labels, points, 1), centers.classes)
+
+
+def _label_image(view: Any, centers: LabelledPoints | None) -> dict[str, np.ndarray]:
+    """Class of each pixel (h, w), -1 = none."""
+    if centers is None:
+        return {}
+    labels = np.full(view.valid.shape, -1)
+    labels[view.valid] = _labelled(centers, view.points[view.valid]).labels
+    return {"labels": labels}

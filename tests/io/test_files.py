@@ -1,0 +1,65 @@
+"""Oracles: what is on the disk after an interruption, a full disk and a cut line; strict JSON."""
+
+import errno
+import json
+import os
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from emgs_jax.io.files import FrameLog, atomic_write, jsonable, write_json
+from emgs_jax.io.ply import save_points_ply
+
+
+def test_an_interrupted_or_full_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
+    path = tmp_path / "metrics.json"
+    write_json(path, {"a": 1})
+    with pytest.raises(KeyboardInterrupt), atomic_write(path) as handle:
+        handle.write(b"half")
+        raise KeyboardInterrupt
+
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left on device.*metrics.json") as caught:
+        write_json(path, {"a": 2})
+    assert caught.value.errno == errno.ENOSPC
+    with pytest.raises(OSError, match="points.ply"):
+        save_points_ply(tmp_path / "points.ply", np.ones((2, 3)), np.ones((2, 3)), np.ones((2, 3)))
+    assert json.loads(path.read_text()) == {"a": 1}
+    assert os.listdir(tmp_path) == ["metrics.json"]
+
+
+def test_every_line_of_the_frame_log_is_on_disk_at_once_and_a_cut_one_is_taken_back(tmp_path):
+    path = tmp_path / "frames.jsonl"
+    path.write_text("of an older run\n")
+    with FrameLog(path) as log:
+        log.append({"frame": 0, "residual": np.float32("nan"), "counts": jnp.arange(2)})
+        assert [json.loads(line) for line in path.read_text().splitlines()] == [
+            {"frame": 0, "residual": None, "counts": [0, 1]}
+        ]
+        real = log._file
+
+        class Full:
+            def write(self, data):
+                real.write(data[:5])
+                raise OSError(errno.ENOSPC, "No space left on device")
+
+            def __getattr__(self, name):
+                return getattr(real, name)
+
+        log._file = Full()
+        with pytest.raises(OSError, match="No space left.*frames.jsonl"):
+            log.append({"frame": 1})
+        log._file = real
+        log.append({"frame": 2})
+    assert [json.loads(line)["frame"] for line in path.read_text().splitlines()] == [0, 2]
+
+
+def test_jsonable_is_strict_json_of_the_same_values():
+    value = {"a": np.float32(0.5), "b": (np.int64(3), float("inf")), "c": np.array([1.0, np.nan]), 4: {"x", "y"}}
+    expected = {"a": 0.5, "b": [3, None], "c": [1.0, None], "4": ["x", "y"]}
+    assert json.loads(json.dumps(jsonable(value), allow_nan=False)) == expected
+    assert jsonable(np.bool_(True)) is True

@@ -1,0 +1,104 @@
+"""Oracles: bit-for-bit reloading, and every damage is noticed."""
+
+import json
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.io.map_file import load_map_npz, save_map_npz
+
+
+class Leaves(eqx.Module):
+    """Stands in for Gaussians."""
+
+    means: Float[Array, "n 3"]
+    features: Float[Array, "n f"]
+    valid: Bool[Array, " n"]
+
+
+class Map(eqx.Module):
+    """Stands in for GaussianMap: a nested module, bookkeeping and a static field."""
+
+    gaussians: Leaves
+    gain: Float[Array, " n"]
+    count: Int[Array, ""]
+    capacity: int = eqx.field(static=True)
+
+
+class Other(eqx.Module):
+    gain: Float[Array, " n"]
+
+
+def a_map(n=5, f=2):
+    means = jnp.asarray(np.random.default_rng(0).normal(size=(n, 3)), jnp.float32).at[0, 0].set(jnp.nan)
+    gaussians = Leaves(means, jnp.ones((n, f), jnp.float16), jnp.arange(n) % 2 == 0)
+    return Map(gaussians, jnp.full(n, -0.0), jnp.asarray(3, jnp.int32), n)
+
+
+def assert_same(a, b):
+    assert jax.tree_util.tree_structure(a) == jax.tree_util.tree_structure(b)
+    for x, y in zip(jax.tree_util.tree_leaves(a), jax.tree_util.tree_leaves(b), strict=True):
+        assert (x.dtype, x.shape) == (y.dtype, y.shape)
+        assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
+
+
+@pytest.mark.parametrize("width", [0, 2])
+def test_a_map_reloads_bit_for_bit_from_its_class_or_an_instance(tmp_path, width):
+    tree = a_map(f=width)
+    save_map_npz(tmp_path / "map.npz", tree)
+    assert_same(load_map_npz(tmp_path / "map.npz", Map), tree)
+    assert_same(load_map_npz(tmp_path / "map.npz", a_map(n=9)), tree)
+    save_map_npz(tmp_path / "again.npz", tree)
+    assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
+    with np.load(tmp_path / "map.npz", allow_pickle=False) as arrays:
+        assert set(arrays) == {
+            *("gaussians.means", "gaussians.features", "gaussians.valid"),
+            *("gain", "count", "__header__"),
+        }
+
+
+def test_truncated_or_flipped_maps_raise_value_error_or_hold_the_same(tmp_path):
+    path = tmp_path / "map.npz"
+    tree = a_map()
+    save_map_npz(path, tree)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(1)
+    damaged = [whole[:length] for length in (0, 1, 30, len(whole) // 2, len(whole) - 1)]
+    for position in np.linspace(0, len(whole) - 1, 500).astype(int):
+        flipped = bytearray(whole)
+        flipped[position] ^= 1 << rng.integers(8)
+        damaged.append(bytes(flipped))
+    rejected = 0
+    for content in damaged:
+        path.write_bytes(content)
+        try:
+            assert_same(load_map_npz(path, Map), tree)
+        except ValueError as error:
+            rejected += 1
+            assert "map.npz" in str(error)
+    assert rejected > 250
+
+
+def test_foreign_and_newer_maps_are_named_with_the_remedy(tmp_path):
+    path = tmp_path / "map.npz"
+    np.savez(path, gain=np.ones(3))
+    with pytest.raises(ValueError, match=r"map\.npz is not a map of emgs_jax"):
+        load_map_npz(path, Other)
+    header = {"format": "emgs_jax.map", "version": 99, "class": "Other", "leaves": ["gain"], "static": {}}
+    np.savez(path, __header__=np.array(json.dumps(header)), gain=np.ones(3))
+    with pytest.raises(ValueError, match="map version 99, this code reads 1"):
+        load_map_npz(path, Other)
+    save_map_npz(path, a_map())
+    with pytest.raises(ValueError, match="holds a Map, expected Other"):
+        load_map_npz(path, Other)
+    np.savez(path, __header__=np.array([{}], dtype=object))
+    with pytest.raises(ValueError, match="not a readable map"):
+        load_map_npz(path, Other)
+    with pytest.raises(FileNotFoundError):
+        load_map_npz(tmp_path / "none.npz", Other)
+    with pytest.raises(ValueError, match="'gain' is float"):
+        save_map_npz(path, Other(1.0))

@@ -1,0 +1,110 @@
+"""Poses of a window from noisy points: right up to a similarity, of a given scale, refused where not known."""
+
+import numpy as np
+import pytest
+from stereo_scene import arc, cloud, matrix, similarity_error, small_camera, structure_config, structure_of, views_of
+
+from emgs_jax.prior.multiview.incremental import extend, initialize
+from emgs_jax.prior.multiview.landmarks import NONE, forget, link
+
+pytestmark = pytest.mark.slow  # compiling the solver takes ten seconds
+NUM_POINTS, NUM_VIEWS, MOST_VIEWS = 90, 6, 10
+CONFIG = structure_config("prior.structure.num_fixed=3")
+
+
+def linked(poses, noise=0.2):
+    """The structure of views of one cloud, linked as they come."""
+    views = views_of(cloud(NUM_POINTS), poses, noise)
+    structure = structure_of(views[:1])
+    for frame in range(1, len(views)):
+        structure.views[frame] = views[frame]
+        link(structure, frame, CONFIG.matching)
+    return structure
+
+
+def begin(structure):
+    return initialize(structure, small_camera(), MOST_VIEWS, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def started():
+    """A structure after its first window, and the true poses."""
+    structure = linked(arc(NUM_VIEWS))
+    assert begin(structure)
+    return structure, arc(NUM_VIEWS)
+
+
+def test_the_first_window_has_the_true_poses_up_to_a_similarity(started):
+    structure, truth = started
+    assert len(structure.placed()) == NUM_VIEWS
+    poses = np.stack([structure.views[frame].T_ref_view for frame in range(NUM_VIEWS)])
+    assert similarity_error(poses[:, :3, 3], truth[:, :3, 3]) < 0.01 * np.linalg.norm(truth[-1, :3, 3])
+    turned = np.linalg.inv(truth[0])[:3, :3] @ truth[:, :3, :3]
+    np.testing.assert_allclose(poses[:, :3, :3], turned, atol=0.01)
+
+
+def test_the_first_view_is_the_reference_and_its_median_landmark_has_the_given_depth(started):
+    structure, _ = started
+    first = structure.views[0]
+    np.testing.assert_allclose(first.T_ref_view, np.eye(4), atol=1e-9)
+    depth = structure.points[first.landmark[structure.known(first)], 2]
+    assert np.median(depth) == pytest.approx(CONFIG.median_depth)
+
+
+def test_without_parallax_the_first_window_is_refused():
+    turning = np.stack([matrix((0.0, 0.02 * i, 0.0)) for i in range(NUM_VIEWS)])
+    structure = linked(turning)
+    assert not begin(structure)
+    assert not structure.placed() and np.isnan(structure.points).all()
+
+
+def test_without_matches_the_first_window_is_refused():
+    structure = linked(arc(3))
+    for view in structure.views.values():
+        view.landmark[:] = NONE
+    assert not begin(structure)
+    assert not structure.placed()
+
+
+def test_later_views_keep_the_frame_and_scale_while_old_ones_and_their_landmarks_go():
+    truth, most = arc(14, step=0.04), 7
+    views = views_of(cloud(NUM_POINTS), truth, 0.2)
+    structure = structure_of(views[:1])
+    found = {}
+    for frame in range(1, len(views)):
+        structure.views[frame] = views[frame]
+        link(structure, frame, CONFIG.matching)
+        if frame == NUM_VIEWS - 1:
+            assert begin(structure)
+            found |= {k: structure.views[k].T_ref_view for k in structure.views}
+        elif frame >= NUM_VIEWS:
+            extend(structure, small_camera(), MOST_VIEWS, CONFIG)
+            found[frame] = structure.views[frame].T_ref_view
+            forget(structure, [k for k in structure.views if 0 < k < frame - most + 2])
+        assert len(structure.points) <= NUM_POINTS
+    assert all(T is not None for T in found.values())
+    positions = np.stack([found[frame][:3, 3] for frame in range(len(views))])
+    assert similarity_error(positions, truth[:, :3, 3]) < 0.02 * np.linalg.norm(truth[-1, :3, 3])
+
+
+def test_the_two_newest_views_are_refined_in_a_window_shorter_than_what_is_fixed(started):
+    structure = linked(arc(4))
+    assert begin(structure)
+    wrong = matrix(translation=(0.01, 0.0, 0.0))
+    before = [structure.views[frame].T_ref_view.copy() for frame in range(4)]
+    structure.views[3].T_ref_view = structure.views[3].T_ref_view @ wrong
+    config = structure_config("prior.structure.num_fixed=9")
+    extend(structure, small_camera(), MOST_VIEWS, config)
+    for frame in (0, 1):
+        np.testing.assert_array_equal(structure.views[frame].T_ref_view, before[frame])
+    np.testing.assert_allclose(structure.views[3].T_ref_view, before[3], atol=3e-3)
+
+
+def test_a_view_without_landmarks_is_left_out_and_the_others_are_not_changed_by_it():
+    poses = arc(NUM_VIEWS)
+    structure = linked(poses)
+    structure.views[3].landmark[:] = NONE  # a blurred image
+    assert begin(structure)
+    assert sorted(structure.placed()) == [0, 1, 2, 4, 5]
+    positions = np.stack([view.T_ref_view[:3, 3] for view in structure.placed().values()])
+    assert similarity_error(positions, poses[[0, 1, 2, 4, 5], :3, 3]) < 0.01

@@ -1,0 +1,198 @@
+"""Keypoints, matches, tracks and poses from points whose projections are known."""
+
+import numpy as np
+import pytest
+from stereo_scene import arc, calibration, cloud, projected, structure_config, structure_of, views_of, whose
+
+from emgs_jax.prior.multiview.landmarks import (
+    NONE,
+    View,
+    detect,
+    forget,
+    link,
+    match,
+    place,
+    relative_pose,
+    triangulate,
+)
+
+NUM_POINTS = 60
+
+
+@pytest.fixture
+def config():
+    return structure_config().matching
+
+
+@pytest.fixture
+def views():
+    return views_of(cloud(NUM_POINTS), arc(4))
+
+
+def tracks(structure):
+    """For each landmark the (view, point) pairs that have it; points are numbered as view 0 has them."""
+    first, found = structure.views[0], {}
+    for frame, view in structure.views.items():
+        for number, point in zip(view.landmark, whose(view, first), strict=True):
+            if number != NONE:
+                found.setdefault(int(number), []).append((frame, int(point)))
+    return found
+
+
+def test_a_blob_is_detected_at_its_centre_with_pixel_centres_at_integers(config):
+    y, x = np.mgrid[:48, :64]
+    gray = np.zeros((48, 64))
+    for u, v in ((20.0, 15.0), (40.25, 30.5)):
+        gray += 200 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 2.5**2))
+    found = detect(np.uint8(gray), config).pixels
+    for center in ((20.0, 15.0), (40.25, 30.5)):
+        assert np.linalg.norm(found - center, axis=1).min() < 0.06
+
+
+def test_a_blank_image_has_no_keypoint_and_no_match(config, views):
+    blank = detect(np.full((48, 64), 128, np.uint8), config)
+    assert blank.pixels.shape == (0, 2) and blank.descriptors.shape == (0, 128) and blank.landmark.shape == (0,)
+    assert not len(match(blank, views[0], calibration(), config)[0])
+    assert not len(match(views[0], blank, calibration(), config)[1])
+
+
+def test_matches_are_right_and_the_same_from_either_side(config, views):
+    rows_a, rows_b = match(views[0], views[1], calibration(), config)
+    assert len(rows_a) > 0.9 * NUM_POINTS
+    np.testing.assert_array_equal(whose(views[1], views[0])[rows_b], rows_a)
+    back_b, back_a = match(views[1], views[0], calibration(), config)
+    assert set(zip(rows_a, rows_b, strict=True)) == set(zip(back_a, back_b, strict=True))
+
+
+def test_matches_that_leave_the_epipolar_line_are_left_out(views):
+    # At 55 px of focal length 1.5 px are wide: a second motion fits within them.
+    config = structure_config("prior.structure.matching.max_epipolar_error=0.2").matching
+    rng = np.random.default_rng(0)
+    views[1].pixels[:10, 1] += rng.uniform(4, 12, 10) * rng.choice([-1, 1], 10)  # the camera moves sideways
+    _, rows_b = match(views[0], views[1], calibration(), config)
+    assert len(rows_b) > 0.65 * NUM_POINTS
+    assert np.sum(rows_b < 10) <= 2  # a line may pass by chance
+
+
+def test_too_few_keypoints_give_no_match(config):
+    views = views_of(cloud(config.min_matches - 1), arc(2))
+    assert not len(match(*views, calibration(), config)[0])
+
+
+def test_linking_gives_every_point_one_landmark_in_all_views(config, views):
+    structure = structure_of(views[:1])
+    for frame, view in enumerate(views[1:], start=1):
+        structure.views[frame] = view
+        link(structure, frame, config)
+    found = tracks(structure)
+    assert len(structure.points) == len(found) and np.isnan(structure.points).all()
+    for members in found.values():
+        assert len({point for _, point in members}) == 1
+        assert len({frame for frame, _ in members}) == len(members) >= 2
+    points = [members[0][1] for members in found.values()]
+    assert len(set(points)) == len(points) > 0.9 * NUM_POINTS
+
+
+def test_forgetting_views_keeps_the_tracks_and_points_of_the_others(config, views):
+    structure = structure_of(views[:1])
+    for frame, view in enumerate(views[1:], start=1):
+        structure.views[frame] = view
+        link(structure, frame, config)
+    structure.points[:] = np.arange(len(structure.points))[:, None]
+    structure.views[2].landmark[:5] = NONE
+    structure.views[3].landmark[:] = NONE
+    view = structure.views[2]
+    before = np.where(view.landmark >= 0, view.landmark, -5)
+    forget(structure, [0, 1])
+    assert sorted(structure.views) == [2, 3]
+    assert len(structure.points) == np.sum(before >= 0)  # those of views 0 and 1 only are gone
+    assert (view.landmark[:5] == NONE).all() and (structure.views[3].landmark == NONE).all()
+    has = view.landmark >= 0
+    np.testing.assert_array_equal(has, before >= 0)
+    np.testing.assert_array_equal(structure.points[view.landmark[has], 0], before[has])
+
+
+def placed_structure(poses, points, seen_by):
+    """All points are landmark = row; views hold their true poses."""
+    views = [
+        View(projected(T, points), np.zeros((len(points), 128), np.float32), np.arange(len(points)), T) for T in poses
+    ]
+    for frame, view in enumerate(views):
+        view.landmark[~seen_by[frame]] = NONE
+    structure = structure_of(views)
+    structure.points = np.full((len(points), 3), np.nan)
+    return structure
+
+
+def test_exact_rays_meet_in_the_point_and_one_ray_or_none_gives_none(config):
+    poses, points = arc(3), cloud(12)
+    seen_by = np.ones((3, 12), bool)
+    seen_by[1:, 0] = False
+    structure = placed_structure(poses, points, seen_by)
+    structure.points[1] = 7.0  # it has a position, which is not for triangulation to change
+    triangulate(structure, config)
+    assert np.isnan(structure.points[0]).all()
+    np.testing.assert_array_equal(structure.points[1], 7.0)
+    np.testing.assert_allclose(structure.points[2:], points[2:], atol=1e-9)
+
+
+def test_two_skew_rays_give_the_middle_of_their_common_perpendicular(config):
+    poses, points = arc(2, step=0.5), np.array([[0.2, 0.1, 2.0]])
+    structure = placed_structure(poses, points, np.ones((2, 1), bool))
+    structure.views[1].pixels += (0.0, 0.5)
+    origins, rays = poses[:, :3, 3], []
+    for view in structure.views.values():
+        ray = view.T_ref_view[:3, :3] @ np.linalg.inv(calibration()) @ [*view.pixels[0], 1]
+        rays.append(ray / np.linalg.norm(ray))
+    s, t = np.linalg.lstsq(np.stack([rays[0], -rays[1]], axis=1), origins[1] - origins[0], rcond=None)[0]
+    triangulate(structure, config)
+    np.testing.assert_allclose(structure.points[0], 0.5 * (origins[0] + s * rays[0] + origins[1] + t * rays[1]))
+
+
+def test_rays_without_parallax_or_that_do_not_meet_give_no_point(config):
+    points = cloud(6)
+    still = np.stack([arc(1)[0]] * 3)
+    structure = placed_structure(still, points, np.ones((3, 6), bool))
+    triangulate(structure, config)
+    assert np.isnan(structure.points).all()
+    structure = placed_structure(arc(3), points, np.ones((3, 6), bool))
+    structure.views[2].pixels += (0.0, 4 * config.max_reprojection_error)
+    triangulate(structure, config)
+    assert np.isnan(structure.points).all()
+
+
+def test_a_view_is_placed_where_it_is_despite_wrong_landmarks(config):
+    poses, points = arc(4), cloud(NUM_POINTS)
+    structure = placed_structure(poses, points, np.ones((4, NUM_POINTS), bool))
+    structure.points = points.copy()
+    view = structure.views[3]
+    view.T_ref_view = None
+    view.pixels[:15] += (15.0, -9.0)
+    assert place(structure, view, config)
+    np.testing.assert_allclose(view.T_ref_view, poses[3], atol=1e-5)
+
+
+def test_a_view_with_too_few_landmarks_is_not_placed(config):
+    points = cloud(NUM_POINTS)
+    seen_by = np.ones((4, NUM_POINTS), bool)
+    seen_by[3, config.min_matches - 1 :] = False
+    structure = placed_structure(arc(4), points, seen_by)
+    structure.points = points.copy()
+    structure.views[3].T_ref_view = None
+    assert not place(structure, structure.views[3], config)
+    assert structure.views[3].T_ref_view is None
+
+
+def test_the_relative_pose_is_the_true_one_up_to_the_length_of_the_baseline(config):
+    poses = arc(3)
+    structure = placed_structure(poses, cloud(NUM_POINTS), np.ones((3, NUM_POINTS), bool))
+    near, far = (relative_pose(structure.views[0], structure.views[b], calibration(), config) for b in (1, 2))
+    expected = np.linalg.inv(poses[0]) @ poses[2]
+    expected[:3, 3] /= np.linalg.norm(expected[:3, 3])
+    np.testing.assert_allclose(far[0], expected, atol=1e-4)
+    assert far[1] > near[1]  # twice the parallax
+
+
+def test_fewer_matches_than_a_pose_needs_are_refused_in_the_config():
+    with pytest.raises(Exception, match="at least 6"):
+        structure_config("prior.structure.matching.min_matches=5")

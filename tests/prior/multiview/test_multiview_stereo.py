@@ -1,0 +1,211 @@
+"""The classical prior on the synthetic room: true geometry up to a scale, the protocol, and images without any."""
+
+from dataclasses import replace
+
+import hydra
+import numpy as np
+import pytest
+from scene import compose
+from stereo_scene import similarity_error
+
+from emgs_jax.data.synthetic import Synthetic
+from emgs_jax.prior.base import Prior, windows
+from emgs_jax.prior.recorded import Recorded, record
+from emgs_jax.running.clock import Clock
+from emgs_jax.running.convert import to_first_window, to_se3
+from emgs_jax.running.drive import predictions
+
+WINDOW_SIZE, NUM_FRAMES = 5, 8  # at this size a first window of 4 images leaves depths 15 % wrong
+SMALL = (
+    *("prior=multiview_stereo", "prior.structure.max_landmarks=192", "prior.structure.num_fixed=3"),
+    *("prior.dense.depth.sweep.num_planes=40", "prior.structure.matching.num_features=600"),
+)
+
+
+class Edited:
+    """A data set with some images replaced, which are kept so that a frame is drawn once."""
+
+    def __init__(self, dataset, images=()):
+        self.name, self.sequence, self.size = dataset.name, dataset.sequence, dataset.size
+        self.intrinsics, self.classes, self.has_ground_truth = dataset.intrinsics, dataset.classes, True
+        self._frames = [dataset[index] for index in range(len(dataset))]
+        for index, image in dict(images).items():
+            self._frames[index] = replace(self._frames[index], image=image)
+
+    def __len__(self):
+        return len(self._frames)
+
+    def __getitem__(self, index):
+        return self._frames[index]
+
+    def fingerprint(self):
+        return "edited"
+
+
+def make_prior(*overrides):
+    return hydra.utils.instantiate(compose(*SMALL, *overrides).prior)
+
+
+@pytest.fixture(scope="module")
+def room():
+    return Edited(Synthetic(num_frames=40, stop=NUM_FRAMES, size=(128, 96)))
+
+
+def answers(prior, dataset):
+    return [prediction for prediction, _ in predictions(dataset, prior, WINDOW_SIZE, Clock())]
+
+
+@pytest.fixture(scope="module")
+def answered(room):
+    return answers(make_prior(), room)
+
+
+def blank(room):
+    return np.full_like(room[0].image, 128)
+
+
+def same_bits(a, b):
+    arrays = ("T_anchor_view", "points", "confidence", "mask", "features")
+    return a.window == b.window and all(getattr(a, n).tobytes() == getattr(b, n).tobytes() for n in arrays)
+
+
+@pytest.mark.slow
+def test_poses_and_depths_are_the_true_ones_up_to_one_scale(room, answered):
+    poses = {}
+    for answer in answered:
+        poses |= dict(zip(answer.window.views, answer.T_anchor_view, strict=True))
+    estimate = np.stack([poses[index][:3, 3] for index in range(NUM_FRAMES)])
+    truth = np.stack([room[index].T_world_camera[:3, 3] for index in range(NUM_FRAMES)])
+    assert similarity_error(estimate, truth) < 0.01  # m, of a path of .45 m
+    scale = np.linalg.norm(truth[-1] - truth[0]) / np.linalg.norm(estimate[-1] - estimate[0])
+    for answer in answered:
+        for row, index in enumerate(answer.window.dense):
+            mask = answer.mask[row]
+            relative = np.abs(scale * answer.points[row, ..., 2][mask] / room[index].depth[mask] - 1)
+            assert mask.mean() > 0.4 and np.median(relative) < 0.06, (answer.window, index)
+
+
+@pytest.mark.slow
+def test_an_answer_obeys_the_protocol(room, answered):
+    assert isinstance(make_prior(), Prior)
+    fx, fy, cx, cy = room.intrinsics
+    u, v = np.meshgrid(np.arange(128), np.arange(96))
+    for answer, window in zip(answered, windows(NUM_FRAMES, WINDOW_SIZE), strict=True):
+        num_views, num_dense = len(window.views), len(window.dense)
+        assert answer.window == window
+        np.testing.assert_array_equal(answer.T_anchor_view[0], np.eye(4))
+        expected = {
+            "T_anchor_view": (np.float64, (num_views, 4, 4)),
+            "points": (np.float32, (num_dense, 96, 128, 3)),
+            "confidence": (np.float32, (num_dense, 96, 128)),
+            "mask": (np.bool_, (num_dense, 96, 128)),
+            "features": (np.float16, (num_dense, 96, 128, 0)),
+        }
+        got = {name: (getattr(answer, name).dtype, getattr(answer, name).shape) for name in expected}
+        assert got == expected
+        assert answer.confidence.min() >= 1 and not answer.points[~answer.mask].any()
+        x, y, z = np.moveaxis(answer.points, -1, 0)
+        z_or_1 = np.where(answer.mask, z, 1)
+        assert (z_or_1 > 0).all()
+        np.testing.assert_allclose(
+            (fx * x / z_or_1 + cx)[answer.mask], np.broadcast_to(u, z.shape)[answer.mask], atol=1e-3
+        )
+        np.testing.assert_allclose(
+            (fy * y / z_or_1 + cy)[answer.mask], np.broadcast_to(v, z.shape)[answer.mask], atol=1e-3
+        )
+
+
+@pytest.mark.slow
+def test_the_same_images_give_the_same_answers_bit_for_bit(room, answered):
+    prior = make_prior()
+    for _ in range(2):  # a new sequence begins with window 0
+        assert all(same_bits(a, b) for a, b in zip(answers(prior, room), answered, strict=True))
+
+
+@pytest.mark.slow
+def test_a_recording_that_was_interrupted_is_completed_to_the_same_bits(tmp_path, room, answered):
+    class Interrupted(type(make_prior())):
+        def predict(self, window, frames, intrinsics):
+            if window.inference == 2:
+                raise KeyboardInterrupt
+            return super().predict(window, frames, intrinsics)
+
+    config = compose(*SMALL).prior
+    parts = [hydra.utils.instantiate(config[name]) for name in ("structure", "dense")]
+    with pytest.raises(KeyboardInterrupt):
+        record(Interrupted(*parts), room, WINDOW_SIZE, tmp_path)
+    record(make_prior(), room, WINDOW_SIZE, tmp_path)
+    assert all(same_bits(a, b) for a, b in zip(answers(Recorded(tmp_path), room), answered, strict=True))
+
+
+@pytest.mark.slow
+def test_a_blank_image_has_no_pose_and_the_next_is_placed_again(room, answered):
+    found = answers(make_prior(), Edited(room, {5: blank(room)}))
+    for answer in found:
+        row = dict(zip(answer.window.views, answer.T_anchor_view, strict=True))
+        assert all(np.isfinite(row[index]).all() == (index != 5) for index in row)
+        assert not any(answer.mask[k].any() for k, index in enumerate(answer.window.dense) if index == 5)
+    np.testing.assert_allclose(found[-1].T_anchor_view[-1], answered[-1].T_anchor_view[-1], atol=0.02)
+    lost = to_se3(next(a for a in found if a.window.current == 5).T_anchor_view[-2:])
+    assert np.isnan(lost.wxyz_xyz[0]).all()  # which the mapping marks as lost
+
+
+def test_images_without_texture_give_no_geometry_and_nothing_that_a_map_could_start_from(room):
+    images = Edited(room, {index: blank(room) for index in range(NUM_FRAMES)})
+    found = answers(make_prior(), images)
+    for answer in found:
+        np.testing.assert_array_equal(answer.T_anchor_view[0], np.eye(4))
+        assert np.isnan(answer.T_anchor_view[1:]).all()
+        assert not answer.mask.any() and not answer.points.any() and (answer.confidence == 1).all()
+    frames = {index: images[index] for index in range(WINDOW_SIZE)}
+    observation = hydra.utils.instantiate(compose("observation.normal_radius=1").slam, _convert_="all").observation
+    assert to_first_window(found[0], frames, np.eye(4), observation) == (None, ())
+
+
+@pytest.mark.slow
+def test_a_sequence_may_begin_with_images_that_show_nothing(room):
+    """Oracle: the true motion between the images after them, up to the one scale that images do not tell."""
+    found = answers(make_prior(), Edited(room, {index: blank(room) for index in range(3)}))
+    assert not found[0].mask.any()  # two images with texture are confirmed by nothing
+    assert found[1].window.current == 5 and found[1].mask[1].any()
+    poses = {}
+    for answer in found[1:]:
+        poses |= dict(zip(answer.window.views, answer.T_anchor_view, strict=True))
+    np.testing.assert_array_equal(poses[3], np.eye(4))  # the oldest image that could be placed
+    estimate = np.stack([poses[index][:3, 3] for index in range(3, NUM_FRAMES)])
+    truth = np.stack([room[index].T_world_camera[:3, 3] for index in range(3, NUM_FRAMES)])
+    assert similarity_error(estimate, truth) < 0.01  # m
+
+
+def test_windows_out_of_order_are_refused(room):
+    images = Edited(room, {index: blank(room) for index in range(NUM_FRAMES)})
+    prior, calls = make_prior(), list(windows(NUM_FRAMES, WINDOW_SIZE))
+    with pytest.raises(ValueError, match="expected window 0, got 1"):
+        prior.predict(calls[1], [images[index] for index in calls[1].views], images.intrinsics)
+    prior.predict(calls[0], [images[index] for index in calls[0].views], images.intrinsics)
+    with pytest.raises(ValueError, match="expected window 1, got 3; ask for all windows in order"):
+        prior.predict(calls[3], [images[index] for index in calls[3].views], images.intrinsics)
+
+
+def test_images_of_another_size_are_refused(room):
+    images = Edited(room, {2: blank(room)[:90], 0: blank(room), 1: blank(room)})
+    window = next(windows(NUM_FRAMES, WINDOW_SIZE))
+    with pytest.raises(ValueError, match=r"frame 2 has size \(128, 90\).*\(128, 96\).*dataset.size"):
+        make_prior().predict(window, [images[index] for index in window.views], images.intrinsics)
+
+
+def test_a_window_too_short_to_confirm_a_depth_is_refused(room):
+    with pytest.raises(ValueError, match="at least 3 images, got slam.window_size=2"):
+        make_prior("prior.dense.min_agreeing=2").check(room, 2)
+    make_prior("prior.dense.min_agreeing=2").check(room, 3)
+
+
+def test_the_provenance_holds_every_value_of_the_config_as_it_was_written():
+    config = compose(*SMALL)
+    settings = make_prior().provenance.settings
+
+    def without_targets(node):
+        return {k: without_targets(v) for k, v in node.items() if k != "_target_"} if hasattr(node, "items") else node
+
+    assert settings == {"version": 1} | without_targets(config.prior)
+    assert settings != make_prior("prior.dense.depth.max_cost=0.11").provenance.settings

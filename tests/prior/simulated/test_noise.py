@@ -1,0 +1,79 @@
+"""The seeded numbers and fields against their stated statistics; tolerances are about four standard errors."""
+
+import hashlib
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from emgs_jax.prior.simulated.noise import Stream, autoregressive, edge_band, smooth_field
+
+
+def test_another_process_gives_the_same_bits():
+    program = (
+        "from emgs_jax.prior.simulated.noise import *; import hashlib; "
+        "print(hashlib.sha256(smooth_field((24, 32), 3.2, (1, 7, 2, 5), .7).tobytes() "
+        "+ autoregressive(1, 50, .9, 7).tobytes()).hexdigest())"
+    )
+    outputs = {
+        subprocess.run(
+            [sys.executable, "-c", program],
+            capture_output=True,
+            text=True,
+            check=True,
+            env=os.environ | {"OPENBLAS_NUM_THREADS": n},
+        ).stdout.strip()
+        for n in "12"
+    }
+    here = smooth_field((24, 32), 3.2, (1, 7, 2, 5), 0.7).tobytes() + autoregressive(1, 50, 0.9, 7).tobytes()
+    assert outputs == {hashlib.sha256(here).hexdigest()}
+
+
+def test_drift_is_stationary_with_unit_variance_and_its_autocorrelation_is_rho():
+    for inference in (0, 1, 5, 40):
+        pairs = np.stack([[autoregressive(s, t, 0.9, 7) for t in (inference, inference + 1)] for s in range(400)])
+        first, second = pairs[:, 0].ravel(), pairs[:, 1].ravel()
+        assert np.std(first) == pytest.approx(1, abs=0.05)
+        assert np.corrcoef(first, second)[0, 1] == pytest.approx(0.9, abs=0.015)
+    five_apart = np.stack([[autoregressive(s, t, 0.9, 7) for t in (10, 15)] for s in range(400)])
+    assert np.corrcoef(five_apart[:, 0].ravel(), five_apart[:, 1].ravel())[0, 1] == pytest.approx(0.9**5, abs=0.04)
+
+
+def test_smooth_field_has_unit_variance_everywhere_and_the_stated_correlation_length():
+    length, shape = 8.0, (48, 64)
+    fields = np.stack([smooth_field(shape, length, (0, Stream.WARP, 1, i), 0.7) for i in range(1500)])
+    assert fields.dtype == np.float32
+    deviation = fields.std(axis=0)
+    assert deviation.min() > 0.92 and deviation.max() < 1.08  # of each pixel, borders included
+    for distance in (4, 8, 16):
+        expected = math.exp(-0.5 * (distance / length) ** 2)
+        for a, b in [
+            (fields[:, :, distance:], fields[:, :, :-distance]),
+            (fields[:, distance:], fields[:, :-distance]),
+        ]:
+            assert np.mean(a * b) == pytest.approx(expected, abs=0.03)
+    assert np.mean(fields[:, :-32, :-32] * fields[:, 32:, 32:]) == pytest.approx(0, abs=0.03)
+
+
+def test_70_percent_of_the_fields_variance_belongs_to_the_image():
+    a, b, other = (
+        np.stack([smooth_field((24, 32), 2.0, (s, Stream.WARP, inference, image), 0.7) for s in range(400)])
+        for inference, image in [(1, 4), (2, 4), (1, 5)]
+    )
+    assert np.mean(a * b) == pytest.approx(0.7, abs=0.03)
+    assert np.mean(a * other) == pytest.approx(0, abs=0.025)
+
+
+def test_edge_band_is_two_pixels_on_each_side_of_a_step_of_more_than_5_percent():
+    depth = np.full((7, 12), 2.0, np.float32)
+    depth[:, 6:] = 2.2
+    expected = np.zeros((7, 12), bool)
+    expected[:, 4:8] = True
+    np.testing.assert_array_equal(edge_band(depth, 0.05), expected)
+    depth[:, 6:] = 2.09
+    assert not edge_band(depth, 0.05).any()
+    depth[:, 6:] = 0  # the border of missing depth is no step
+    assert not edge_band(depth, 0.05).any()

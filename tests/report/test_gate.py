@@ -1,0 +1,84 @@
+"""Oracles: the same results pass, results moved by a known amount pass or fail on the right side of the tolerance."""
+
+import dataclasses
+import json
+
+import pytest
+
+from emgs_jax.report.gate import read_gate, regressions, write_gate
+from emgs_jax.report.tables import Row
+
+ATE, F1 = "trajectory/ate_sim3_m", "reconstruction/f1_20cm_percent"
+TOLERANCES = {ATE: {"direction": "lower", "tolerance": 0.01}, F1: {"direction": "higher", "tolerance": 1.0}}
+
+
+def a_row(ate=0.05, f1=90.0, **changes):
+    values = {ATE: ate, F1: f1, "time/total_seconds": 3.0}
+    row = Row("tum", "default", "ours", "simulated", True, "paper/sim3", ("xyz",), (0, 1), values, {})
+    return dataclasses.replace(row, **changes)
+
+
+@pytest.fixture
+def baseline(tmp_path):
+    """As written from `a_row()` and read back."""
+    raw = dataclasses.replace(a_row(), kind="raw prior")
+    write_gate(tmp_path / "gate.yaml", [a_row(), raw], TOLERANCES)
+    return read_gate(tmp_path / "gate.yaml")
+
+
+def test_a_written_baseline_holds_our_rows_and_passes_with_the_same_results(baseline):
+    assert list(baseline) == ["tum/xyz/default"]
+    assert baseline["tum/xyz/default"]["metrics"] == {
+        ATE: {"value": 0.05, "direction": "lower", "tolerance": 0.01},
+        F1: {"value": 90.0, "direction": "higher", "tolerance": 1.0},
+    }
+    assert regressions(baseline, [a_row()]) == []
+
+
+@pytest.mark.parametrize(
+    ("ate", "f1", "worse"),
+    [(0.059, 90, []), (0.061, 90, [ATE]), (0.05, 88.9, [F1]), (0.0, 100, []), (0.07, 80, [ATE, F1])],
+)
+def test_only_what_is_worse_than_the_tolerance_is_a_regression(baseline, ate, f1, worse):
+    lines = regressions(baseline, [a_row(ate, f1)])
+    assert [next(key for key in TOLERANCES if key in line) for line in lines] == worse
+
+
+def test_a_regression_names_row_metric_value_baseline_and_tolerance(baseline):
+    (line,) = regressions(baseline, [a_row(ate=0.0715)])
+    assert line == ("tum/xyz/default: trajectory/ate_sim3_m is 0.0715, baseline 0.05 (lower is better, tolerance 0.01)")
+
+
+def test_a_missing_result_is_a_regression(baseline):
+    assert "no result" in regressions(baseline, [])[0]
+    assert "no result" in regressions(baseline, [a_row(protocol="paper/se3")])[0]
+    assert "results of the seeds [0]" in regressions(baseline, [a_row(seeds=(0,))])[0]
+    for value in (None, float("nan")):
+        lines = regressions(baseline, [a_row(ate=value)])
+        assert len(lines) == 1 and ATE in lines[0]
+
+
+def test_a_baseline_may_be_json(tmp_path, baseline):
+    (tmp_path / "gate.json").write_text(json.dumps({"format": 1, "baseline": baseline}))
+    assert read_gate(tmp_path / "gate.json") == baseline
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "[",
+        "format: 7\nbaseline: {}",
+        "just text",
+        "format: 1\nbaseline: {a: {protocol: p, seeds: [0], metrics: {m: {value: 1, direction: up, tolerance: 0}}}}",
+        "format: 1\nbaseline: {a: {protocol: p, seeds: [0], metrics: {m: {value: 1, direction: lower}}}}",
+        "format: 1\nbaseline: {a: {seeds: [0], metrics: {}}}",
+    ],
+)
+def test_a_file_that_is_no_baseline_is_refused_with_a_remedy(tmp_path, content):
+    (tmp_path / "gate.yaml").write_text(content)
+    with pytest.raises(ValueError, match=r"gate.yaml is no baseline.*write_gate=FILE"):
+        read_gate(tmp_path / "gate.yaml")
+    with pytest.raises(ValueError, match=r"missing.yaml does not exist.*write_gate=FILE"):
+        read_gate(tmp_path / "missing.yaml")
+    with pytest.raises(ValueError, match="no result of ours"):
+        write_gate(tmp_path / "new.yaml", [], TOLERANCES)

@@ -1,0 +1,118 @@
+"""Oracles: rotations that are known by hand, the pixels of the picture, the same bytes twice."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.report.overview import (
+    below_ceiling,
+    class_colors,
+    draw_overview,
+    fill_holes,
+    paint_from_above,
+    view_from_above,
+)
+
+
+def path_along(direction, n=5):
+    """Level cameras (OpenCV axes in a z-up world) that look along x and move along `direction`."""
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, :3, :3] = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    poses[:, :3, 3] = np.outer(np.linspace(0, 1, n), direction)
+    return poses
+
+
+def test_from_above_up_is_up_and_the_path_runs_to_the_right():
+    rotation = view_from_above(path_along([0.0, -3.0, 0.2]))
+    np.testing.assert_allclose(rotation, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+
+
+def test_the_view_turns_with_the_world():
+    turn = Rotation.from_rotvec([0.3, -1.2, 0.5]).as_matrix()
+    poses = path_along([0.5, -3.0, 0.2])
+    turned = poses.copy()
+    turned[:, :3, :3], turned[:, :3, 3] = turn @ poses[:, :3, :3], poses[:, :3, 3] @ turn.T
+    np.testing.assert_allclose(view_from_above(turned) @ turn, view_from_above(poses), atol=1e-9)
+
+
+@pytest.mark.parametrize("poses", [path_along([0.0, 0.0, 0.0]), path_along([0, 0, 0], 1), path_along([0, 0, 5.0])])
+def test_cameras_that_do_not_move_sideways_still_give_a_rotation(poses):
+    rotation = view_from_above(poses)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(rotation), 1.0)
+    np.testing.assert_allclose(rotation[2], [0, 0, 1], atol=1e-9)
+
+
+def test_the_highest_point_of_a_cell_is_seen_and_the_ceiling_is_not():
+    points = np.array([[0.05, 0.05, 0.0], [0.06, 0.04, 1.0], [0.35, 0.15, 0.2], [0.05, 0.05, 2.5]])
+    colors = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [1.0, 1.0, 1.0]])
+    seen = below_ceiling(points[:, 2], np.array([1.4, 1.5]))
+    np.testing.assert_array_equal(seen, [True, True, True, False])
+    image, extent = paint_from_above(points[seen], colors[seen], 0.1)
+    np.testing.assert_allclose(extent, (0.0, 0.4, 0.0, 0.2))
+    assert image.shape == (2, 4, 4)
+    np.testing.assert_array_equal(image[0, 0], [0, 1, 0, 1])
+    np.testing.assert_array_equal(image[1, 3], [0, 0, 1, 1])
+    assert image[..., 3].sum() == 2
+    assert below_ceiling(np.full(10, 9.0), np.zeros(2)).all()
+
+
+def test_holes_take_the_colour_around_them_and_painted_cells_keep_theirs():
+    image = np.zeros((7, 7, 4))
+    image[1:6, 1:6] = [0.2, 0.4, 0.6, 1.0]
+    image[3, 3] = 0.0
+    filled = fill_holes(image)
+    np.testing.assert_allclose(filled[3, 3], [0.2, 0.4, 0.6, 1.0])
+    np.testing.assert_array_equal(filled[image[..., 3] > 0], image[image[..., 3] > 0])
+    np.testing.assert_array_equal(filled[0], 0.0)
+
+
+@pytest.mark.parametrize(("num_frames", "num_points", "has_truth"), [(2, 3000, True), (0, 0, False)])
+def test_the_picture_shows_floor_and_paths_and_is_the_same_twice(tmp_path, num_frames, num_points, has_truth):
+    cv2 = pytest.importorskip("cv2")
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-2, 2, (num_points, 2)), np.full((num_points, 1), -1.0)], 1)
+    points[: num_points // 100] = np.nan
+    colors = np.tile([0.0, 0.0, 1.0], (num_points, 1))
+    poses = path_along([1.0, -0.5, 0.0])
+    depth = np.full((24, 32), np.nan)
+    depth[4:, :] = 2.0
+    frame = {"image": np.zeros((24, 32, 3), np.uint8), "rendered_color": np.full((24, 32, 3), np.nan)}
+    frame |= {"rendered_depth": depth, "valid": np.ones((24, 32), bool), "title": "frame 0"}
+    for name in ("a.png", "b.png"):
+        paths = (poses, poses + 0.0 if has_truth else None)
+        cloud = PointCloud(points, np.zeros_like(points), colors)
+        draw_overview(tmp_path / name, cloud, paths, [frame] * num_frames, "a run")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    image = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
+    assert min(image.shape[:2]) > 500
+
+    def share(color):
+        return np.all(np.abs(image.astype(int) - color) <= 8, axis=-1).mean()
+
+    assert (share((0, 0, 255)) > 0.1) == (num_points > 0)
+    assert share((228, 87, 46)) > 1e-4
+    assert (share((27, 153, 139)) > 1e-4) == has_truth
+
+
+def test_labels_are_drawn_in_the_colours_of_their_classes_with_a_legend_of_those_that_are_seen(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    labels, depth = np.full((24, 32), 2), np.full((24, 32), 2.0)
+    labels[:, 16:] = -1
+    frame = {"image": np.zeros((24, 32, 3), np.uint8), "rendered_color": np.zeros((24, 32, 3)), "labels": labels}
+    frame |= {"rendered_depth": depth, "valid": np.ones((24, 32), bool), "title": "frame 0"}
+    cloud = PointCloud(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)))
+    path = tmp_path / "a.png"
+    draw_overview(path, cloud, (path_along([1.0, -0.5, 0.0]), None), [frame] * 2, "a run", ("wall", "floor", "chair"))
+    image = cv2.imread(str(path))[..., ::-1].astype(int)
+    shares = [np.all(np.abs(image - 255 * color) <= 3, axis=-1) for color in class_colors(3)]
+    assert [bool(share.sum() > 50) for share in shares] == [False, False, True]
+    rows = np.nonzero(shares[2].any(1))[0]
+    assert rows.max() > 0.9 * len(image)  # the legend is below the frames
+
+
+def test_colours_of_many_classes_differ():
+    colors = class_colors(40)
+    distance = np.linalg.norm(colors[:, None] - colors[None], axis=-1)
+    assert distance[~np.eye(40, dtype=bool)].min() > 0.02 and colors.min() >= 0.0 and colors.max() <= 1.0

@@ -1,0 +1,107 @@
+"""Oracles: the repository's own git, strict JSON, hand-made tables."""
+
+import json
+import platform
+import subprocess
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from emgs_jax.prior.base import Provenance
+from emgs_jax.report.provenance import (
+    RAW_PRIOR,
+    git_revision,
+    prefixed,
+    print_metrics_table,
+    provenance,
+    write_metrics,
+)
+
+METRICS = {
+    "trajectory/ate_sim3_m": 0.0412,
+    "reconstruction/accuracy_m": 0.05,
+    "reconstruction/completion_m": None,
+    "reconstruction/f1_20cm_percent": 98.76,
+    "reconstruction/f1_5cm_percent": float("nan"),
+    "reconstruction/normals_abs_cos_percent": 88.0,
+}
+
+
+class ADataset:
+    name, sequence = "synthetic", "room-0"
+
+    def fingerprint(self):
+        return "abc123"
+
+
+def a_provenance(is_simulated):
+    prior = Provenance("simulated", {"level": 1, "seed": 7}, is_simulated)
+    return provenance({"evaluation": {"protocol": "paper"}}, ADataset(), prior)
+
+
+def test_provenance_names_protocol_config_data_seed_code_and_machine():
+    block = a_provenance(True)
+    assert (block["protocol"], block["seed"], block["simulated"]) == ("paper", 7, True)
+    assert block["config"] == {"evaluation": {"protocol": "paper"}}
+    assert block["data"] == {"name": "synthetic", "sequence": "room-0", "fingerprint": "abc123"}
+    assert block["prior"] == {"name": "simulated", "settings": {"level": 1, "seed": 7}}
+    versions = block["versions"]
+    assert set(versions) == {"python", "jax", "jaxlib", "numpy", "optimistix", "equinox", "open3d", "cv2", "emgs_jax"}
+    assert (versions["jax"], versions["numpy"]) == (jax.__version__, np.__version__)
+    assert versions["python"] == platform.python_version()
+    assert block["device"]["backend"] == jax.default_backend()
+
+
+def test_the_revision_is_that_of_git_and_none_outside_of_its_checkout(tmp_path):
+    def git(*arguments):
+        identity = ["-c", "user.name=t", "-c", "user.email=t@example.org"]
+        command = ["git", "-C", str(tmp_path), *identity, *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    try:
+        git("init", "-q")
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("git is not here")
+    assert git_revision(tmp_path) is None
+    (tmp_path / "file").write_text("1")
+    git("add", "file")
+    git("commit", "-qm", "one")
+    assert git_revision(tmp_path) == {"revision": git("rev-parse", "HEAD"), "dirty": False}
+    (tmp_path / "file").write_text("2")
+    assert git_revision(tmp_path)["dirty"] is True
+    (tmp_path / "inside").mkdir()
+    assert git_revision(tmp_path / "inside") is None
+    assert git_revision(Path("/")) is None
+
+
+def test_metrics_are_strict_json_ours_first_then_the_raw_prior_then_provenance(tmp_path):
+    metrics = {
+        "provenance": a_provenance(True),
+        **prefixed(METRICS, RAW_PRIOR),
+        "time/seconds_per_frame": 0.5,
+        **METRICS,
+    }
+    write_metrics(tmp_path / "metrics.json", metrics)
+
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    loaded = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=refuse)
+    assert list(loaded) == [*METRICS, "time/seconds_per_frame", *prefixed(METRICS, RAW_PRIOR), "provenance"]
+    assert loaded["reconstruction/f1_5cm_percent"] is None
+    assert loaded["raw_prior/trajectory/ate_sim3_m"] == 0.0412
+    assert loaded["provenance"] == metrics["provenance"]
+
+
+def test_the_table_shows_both_rows_and_says_what_is_simulated():
+    metrics = METRICS | prefixed(METRICS, RAW_PRIOR) | {"raw_prior/trajectory/ate_sim3_m": 1.5}
+    table = print_metrics_table(metrics | {"provenance": a_provenance(True)}).splitlines()
+    assert table[0].split()[:3] == ["simulated", "ATE", "[cm]"]
+    assert table[2].split() == ["ours", "4.12", "5.00", "–", "98.8", "–", "88.0"]
+    assert table[3].split() == ["raw", "prior", "150.00", "5.00", "–", "98.8", "–", "88.0"]
+    assert len({len(line) for line in table}) == 1
+    alone = print_metrics_table(METRICS | {"provenance": a_provenance(False)})
+    assert "simulated" not in alone
+    assert "raw prior" not in alone
