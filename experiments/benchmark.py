@@ -34,7 +34,7 @@ def parts(config: DictConfig) -> dict[str, Callable[[], Iterable[Timing]]]:
         "stages": lambda: time_stages(load(config), turns),
         "em": lambda: time_em(load(config, thin=1), count, turns),
         "icp": lambda: time_icp(load(config), tuple(chosen.icp_offset), turns),
-        "render": lambda: time_render(load(config, thin=1), config.observation.thin, count, turns),
+        "render": lambda: time_render(load(config, thin=1), config.slam.observation.thin, count, turns),
         "sweep": lambda: time_settings(load(config), chosen.num_settings, turns),
         "growth": lambda: time_growth(config, chosen.image_sizes, chosen.map_sizes, turns),
     }

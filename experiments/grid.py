@@ -41,7 +41,7 @@ def read_axes(config: DictConfig) -> dict[str, list[Value]]:
     known = sorted(set(_leaf_keys(OmegaConf.to_container(config, resolve=False), "slam")))
     axes = OmegaConf.to_container(config)["axes"]
     if not axes:
-        raise ValueError("the sweep has no axis: choose one with sweep=gates or 'axes={em.normal_weight:[0,5]}'")
+        raise ValueError("the sweep has no axis: choose one with sweep=gates or 'axes={slam.em.normal_weight:[0,5]}'")
     if config.grid not in GRIDS:
         raise ValueError(f"grid must be one of {', '.join(GRIDS)}, got {config.grid!r}")
     for key, values in axes.items():

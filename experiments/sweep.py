@@ -1,6 +1,6 @@
 """A grid of settings on one sequence: `python -m experiments.sweep sweep=gates dataset=… prior=…`.
 
-The axes are keys of a stage, from conf/sweep/ or the command line: `'axes={em.normal_weight:[0,5],em.noise:[0,1]}'`.
+The axes are keys of a stage, from conf/sweep/ or the command line: `'axes={slam.em.normal_weight:[0,5],slam.em.noise:[0,1]}'`.
 Frames, predictions and the truth are made once for the whole grid. An interrupted sweep goes on with the same command
 and `hydra.run.dir=` its folder.
 """

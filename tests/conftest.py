@@ -16,7 +16,7 @@ install_import_hook(
 
 @pytest.fixture(scope="session")
 def config():
-    """`config("em.noise=0", ...)`: a small SlamConfig from conf/ with Hydra overrides."""
+    """`config("slam.em.noise=0", ...)`: a small SlamConfig from conf/ with Hydra overrides."""
     from scene import slam_config  # after the hook
 
     return slam_config

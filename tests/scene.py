@@ -16,11 +16,16 @@ from emgs_jax.ops.camera import Camera
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SMALL = (
-    *("observation.thin=1", "observation.normal_radius=1", "observation.normal_spacing=1", "slam.window_size=3"),
-    *("fit.points_per_gaussian=8", "fit.num_fit_neighbours=8", "fit.num_kmeans_iterations=2"),
-    *("submap.map_capacity=256", "submap.submap_capacity=192", "em.num_neighbours=6"),
+    *(
+        "slam.observation.thin=1",
+        "slam.observation.normal_radius=1",
+        "slam.observation.normal_spacing=1",
+        "slam.window_size=3",
+    ),
+    *("slam.fit.points_per_gaussian=8", "slam.fit.num_fit_neighbours=8", "slam.fit.num_kmeans_iterations=2"),
+    *("slam.submap.map_capacity=256", "slam.submap.submap_capacity=192", "slam.em.num_neighbours=6"),
     *("render.tile_size=8", "render.tile_capacity=192", "render.covariance_scale=2.0", "render.radius=3.0"),
-    "localization.icp.num_points=256",
+    "slam.localization.icp.num_points=256",
 )
 
 

@@ -57,9 +57,9 @@ def test_every_option_of_slam_instantiates(path):
 
 def test_an_unknown_key_is_refused():
     with pytest.raises(hydra.errors.ConfigCompositionException):
-        compose("em.max_mahalanobis=3")
+        compose("slam.em.max_mahalanobis=3")
     with pytest.raises(hydra.errors.InstantiationException, match="max_mahalanobis"):
-        slam_config("+em.max_mahalanobis=3")
+        slam_config("+slam.em.max_mahalanobis=3")
 
 
 def test_table_i_is_the_paper_preset():

@@ -22,7 +22,7 @@ def map_of(count: int, capacity: int, seed: int = 0) -> GaussianMap:
 
 @pytest.fixture(scope="module")
 def average(config):
-    return {kind: config(f"em.average.gain={kind}").em.average for kind in ("ema_printed", "count")}
+    return {kind: config(f"slam.em.average.gain={kind}").em.average for kind in ("ema_printed", "count")}
 
 
 def averaged(values, evidence, config):
@@ -101,7 +101,7 @@ CLOUDS = box_cloud([-0.5, -0.4, 1.2], [0.0, 0.3, 1.9]), box_cloud([-0.2, 0.0, 1.
 
 
 def test_a_submap_holds_the_gaussians_in_the_box_of_the_clouds(config):
-    config = config("submap.voxel_size=0.13", "submap.margin=0.07").submap
+    config = config("slam.submap.voxel_size=0.13", "slam.submap.margin=0.07").submap
     map = map_of(200, 256)
     submap, rows, overflow = select(map, CLOUDS, config)
     expected = in_box(map, CLOUDS, config)
@@ -131,14 +131,14 @@ def test_a_submap_that_is_too_small_by_one_counts_one(config):
     map = map_of(200, 256)
     count = len(in_box(map, CLOUDS, config().submap))
     for capacity, expected in ((count, 0), (count - 1, 1)):
-        submap, _, overflow = select(map, CLOUDS, config(f"submap.submap_capacity={capacity}").submap)
+        submap, _, overflow = select(map, CLOUDS, config(f"slam.submap.submap_capacity={capacity}").submap)
         assert overflow == expected and submap.gaussians.valid.all()
 
 
 @pytest.mark.parametrize("capacity", [192, 10])
 def test_writing_an_unchanged_submap_back_changes_no_bit(config, capacity):
     map = map_of(200, 256)
-    submap, rows, _ = select(map, CLOUDS, config(f"submap.submap_capacity={capacity}").submap)
+    submap, rows, _ = select(map, CLOUDS, config(f"slam.submap.submap_capacity={capacity}").submap)
     assert_same(write_back(map, submap, rows), map)
 
 

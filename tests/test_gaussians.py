@@ -102,7 +102,7 @@ def test_fitting_moves_with_a_rigid_motion(fit_config):
 
 def test_one_gaussian_stands_for_lambda_pixels_of_the_full_image(config):
     for thin, expected in ((1, 128), (2, 32), (4, 8), (16, 1)):
-        assert spacing(thin, config("fit.points_per_gaussian=128").fit) == expected
+        assert spacing(thin, config("slam.fit.points_per_gaussian=128").fit) == expected
 
 
 def test_clustering_a_room_gives_thin_gaussians_on_its_walls(fit_config, camera):

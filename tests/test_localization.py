@@ -39,7 +39,7 @@ def coarse_of(prediction, camera, config, previous=None):
 @pytest.fixture(scope="module")
 def printed(config):
     """Scale `none` and memory 1, whatever the presets say."""
-    return at(config("localization.coarse_scale=none").localization, "scale_memory", 1.0)
+    return at(config("slam.localization.coarse_scale=none").localization, "scale_memory", 1.0)
 
 
 @pytest.mark.parametrize("reading", ["same_image", "anchored", "fused"])
@@ -170,7 +170,11 @@ def submap(camera, config):
 @pytest.fixture(scope="module")
 def lenient(config):
     """Coarse as the prior says, fine as printed but with wide gates; every check passes."""
-    readings = "localization.coarse=anchored", "localization.coarse_scale=none", "localization.icp.residual=colored"
+    readings = (
+        "slam.localization.coarse=anchored",
+        "slam.localization.coarse_scale=none",
+        "slam.localization.icp.residual=colored",
+    )
     settings = config(*readings).localization
     for name, value in {
         "min_inlier_fraction": 0.0,

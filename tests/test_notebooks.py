@@ -10,8 +10,8 @@ from tiny_run import TINY
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
 IDS = [path.stem for path in NOTEBOOKS]
-AXES = "grid=one_at_a_time axes={em.support:[printed,normalized],em.noise:[0.0,1.0]}"
-GRID = "axes={em.max_mahalanobis_sq:[1.0,9.0],em.max_log_gap:[8.0,inf]}"
+AXES = "grid=one_at_a_time axes={slam.em.support:[printed,normalized],slam.em.noise:[0.0,1.0]}"
+GRID = "axes={slam.em.max_mahalanobis_sq:[1.0,9.0],slam.em.max_log_gap:[8.0,inf]}"
 
 
 def cells(path: Path) -> list[dict]:
@@ -78,7 +78,7 @@ def test_one_step_taken_apart_is_the_step(monkeypatch, tmp_path):
 def test_the_readings_are_compared_seed_by_seed_and_loaded_when_run_again(monkeypatch, tmp_path):
     found = execute(2, " ".join((*TINY, AXES)), monkeypatch, tmp_path)
     changes = [(effect.key, effect.value) for effect in found["effects"]]
-    assert changes == [(None, None), ("em.support", "printed"), ("em.noise", 0.0)]
+    assert changes == [(None, None), ("slam.em.support", "printed"), ("slam.em.noise", 0.0)]
     first, second = (rows[1]["trajectory/ate_sim3_m"] - rows[0]["trajectory/ate_sim3_m"] for rows in found["rows"])
     assert found["effects"][1].metrics["trajectory/ate_sim3_m"] == [first, second] and first != second
     monkeypatch.setattr("experiments.sweep._map_and_score", None)  # calling it would fail
@@ -94,7 +94,7 @@ def test_the_heat_maps_show_the_metrics_of_each_setting_at_its_place(monkeypatch
     found = execute(3, " ".join((*TINY, GRID)), monkeypatch, tmp_path)
     drawn = found["values"]("trajectory/ate_sim3_m")
     for row in found["rows"]:
-        place = [1.0, 9.0].index(row["em.max_mahalanobis_sq"]), [8.0, "inf"].index(row["em.max_log_gap"])
+        place = [1.0, 9.0].index(row["slam.em.max_mahalanobis_sq"]), [8.0, "inf"].index(row["slam.em.max_log_gap"])
         assert drawn[place] == row["trajectory/ate_sim3_m"]
     assert len(np.unique(drawn)) == 4
 
@@ -102,7 +102,7 @@ def test_the_heat_maps_show_the_metrics_of_each_setting_at_its_place(monkeypatch
 @pytest.mark.slow
 def test_own_images_become_a_map_of_the_room_that_they_show(monkeypatch, tmp_path):
     """Oracle: the true path of the camera, up to the scale that images do not tell."""
-    small = "slam.window_size=4 dataset.size=[160,120] submap.map_capacity=4096 submap.submap_capacity=2048"
+    small = "slam.window_size=4 dataset.size=[160,120] slam.submap.map_capacity=4096 slam.submap.submap_capacity=2048"
     found = execute(4, small, monkeypatch, tmp_path)
     truth = np.array([found["room"][row].T_world_camera[:3, 3] for row in range(len(found["room"]))])
     path = np.loadtxt(found["results"] / "trajectory.txt")[:, 1:4]

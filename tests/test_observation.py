@@ -30,7 +30,9 @@ EVERY = np.ones((24, 32), bool)
 @pytest.mark.parametrize("normal", [(0, 0, -1), (0.5, 0.2, -1), (-0.3, -0.6, -1)])
 def test_the_normals_of_a_plane_are_exact_and_face_the_camera(camera, config, normal):
     points, truth = plane_points(camera, normal, 1.5)
-    config = config("observation.max_depth_step=0.3").observation  # tilted planes leave 5 % a pixel at this resolution
+    config = config(
+        "slam.observation.max_depth_step=0.3"
+    ).observation  # tilted planes leave 5 % a pixel at this resolution
     normals = np.asarray(normals_from_pointmap(points, EVERY, config))
     # Inverse depth is exactly linear; the rest is float32: eps / (a window of .1 rad) ~ 1e-5 rad.
     assert degrees(normals, truth).max() < 0.05
@@ -90,7 +92,7 @@ def test_pixels_in_one_row_alone_determine_no_normal(camera, config):
     points, _ = plane_points(camera, (0.3, 0.2, -1), 1.5)
     valid = np.zeros_like(EVERY)
     valid[::4] = True
-    config = config("observation.max_depth_step=0.3").observation
+    config = config("slam.observation.max_depth_step=0.3").observation
     np.testing.assert_array_equal(normals_from_pointmap(points, valid, config), 0)
 
 
@@ -104,7 +106,7 @@ def example(camera, num_features=2):
 @pytest.mark.parametrize("thin", [1, 2, 5])
 def test_a_row_is_a_pixel_of_the_thinned_image_row_major(camera, config, thin):
     inputs = example(camera)
-    o = observe(*inputs, config(f"observation.thin={thin}").observation)
+    o = observe(*inputs, config(f"slam.observation.thin={thin}").observation)
     points, colors, features, confidence, _ = (x[::thin, ::thin].reshape(-1, *x.shape[2:]) for x in inputs)
     for actual, expected in zip(
         (o.points, o.colors, o.features, o.confidence), (points, colors, features, confidence), strict=True
@@ -142,7 +144,7 @@ def test_an_observation_holds_the_sampled_features_where_it_is_valid(camera, con
     points, colors, _, confidence, mask = example(camera)
     mask[6:9, 4:7] = False
     grid = jnp.asarray(np.random.default_rng(1).normal(size=(3, 4, 5)), jnp.float32)
-    o = observe(points, colors, grid, confidence, mask, config("observation.thin=2").observation)
+    o = observe(points, colors, grid, confidence, mask, config("slam.observation.thin=2").observation)
     expected = np.asarray(sample_features(grid, (24, 32), 2)).reshape(-1, 5)
     np.testing.assert_allclose(o.features, np.where(o.valid[:, None], expected, 0), atol=1e-6)
     assert not o.valid.all()

@@ -16,7 +16,7 @@ one_step, first_state = eqx.filter_jit(step), eqx.filter_jit(init_state)
 FRAME = 3
 pytestmark = pytest.mark.slow  # one compilation of the whole step is half a minute
 WHOLE = (
-    "submap.margin=100",
+    "slam.submap.margin=100",
 )  # the whole map, so that the axis-aligned voxels choose the same Gaussians in every frame
 
 
@@ -29,7 +29,9 @@ def window(camera):
 @pytest.fixture(scope="module")
 def settings(config):
     """Merged initialisation, an exact chain, lenient checks: the room is coarse at this resolution."""
-    chosen = config(*WHOLE, "slam.initialization=merged", "localization.coarse=same_image", "em.average.gain=count")
+    chosen = config(
+        *WHOLE, "slam.initialization=merged", "slam.localization.coarse=same_image", "slam.em.average.gain=count"
+    )
     return at(at(chosen, "localization.max_residual", 1.0), "localization.min_eigenvalue", 0.0)
 
 
@@ -145,8 +147,8 @@ def test_growing_on_the_way_gives_the_same_map_as_starting_large(window, camera,
     def mapped(capacity, submap):
         chosen = config(
             *WHOLE,
-            *("slam.initialization=merged", "localization.coarse=same_image", "em.average.gain=count"),
-            *(f"submap.map_capacity={capacity}", f"submap.submap_capacity={submap}"),
+            *("slam.initialization=merged", "slam.localization.coarse=same_image", "slam.em.average.gain=count"),
+            *(f"slam.submap.map_capacity={capacity}", f"slam.submap.submap_capacity={submap}"),
         )
         chosen = at(at(chosen, "localization.max_residual", 1.0), "localization.min_eigenvalue", 0.0)
         infos = []
@@ -168,7 +170,10 @@ def test_a_run_follows_the_exact_path_reports_every_step_and_repeats_bit_for_bit
     window, camera, config, initialization
 ):
     chosen = config(
-        *WHOLE, f"slam.initialization={initialization}", "submap.map_capacity=256", "submap.submap_capacity=128"
+        *WHOLE,
+        f"slam.initialization={initialization}",
+        "slam.submap.map_capacity=256",
+        "slam.submap.submap_capacity=128",
     )
     chosen = at(chosen, "localization.max_residual", 1.0)
     results = []

@@ -62,7 +62,9 @@ def test_every_matrix_product_of_a_step_is_in_full_float32(started):
 def test_ten_thresholds_from_yaml_are_one_trace(compiled):
     before = len(traces)
     for value in ("1", "2.5", "3.0", "4", "5.5", "6", "7.25", "8", "9.0", ".inf"):
-        compiled(slam_config("slam.initialization=merged", f"em.max_mahalanobis_sq={value.replace('.inf', 'inf')}"))
+        compiled(
+            slam_config("slam.initialization=merged", f"slam.em.max_mahalanobis_sq={value.replace('.inf', 'inf')}")
+        )
     assert len(traces) == before
 
 

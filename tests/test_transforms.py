@@ -26,7 +26,7 @@ from emgs_jax.registration import icp, rigid
 from emgs_jax.render import composite, densify, project
 
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
-CONFIG = slam_config("submap.map_capacity=48", "submap.submap_capacity=32", "render.tile_capacity=32")
+CONFIG = slam_config("slam.submap.map_capacity=48", "slam.submap.submap_capacity=32", "render.tile_capacity=32")
 ONE = jnp.ones(())
 
 

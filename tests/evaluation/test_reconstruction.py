@@ -67,7 +67,7 @@ def test_protocols_and_alignments_are_options_and_each_names_itself():
     assert evaluation_config().protocol == "paper/sim3"
     for protocol in ("paper", "mast3r", "nice_slam"):
         for alignment in ("sim3", "se3"):
-            config = evaluation_config(f"evaluation={protocol}", f"alignment={alignment}")
+            config = evaluation_config(f"evaluation={protocol}", f"evaluation.alignment={alignment}")
             assert (config.protocol, config.alignment) == (f"{protocol}/{alignment}", alignment)
 
 
@@ -206,7 +206,7 @@ def test_a_cloud_is_aligned_by_the_poses_with_scale_or_without():
     assert metrics["reconstruction/alignment_note"] is None
     np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 0.0, atol=1e-12)
     kept = dataclasses.replace(estimate, points=estimate.points + 0.5 * poses[:, :3, 3].mean(0))
-    rigid = evaluation_config("alignment=se3")
+    rigid = evaluation_config("evaluation.alignment=se3")
     metrics = compare_clouds(estimate, reference(kept, rigid), (half, poses), rigid)
     np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 0.0, atol=1e-12)
 

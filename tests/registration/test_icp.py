@@ -55,7 +55,7 @@ def target(camera, config):
 @pytest.fixture(scope="module")
 def settings(config):
     """No prior, wide gates, enough steps: what is tested is where the data term has its minimum."""
-    settings = config("localization.icp.max_steps=20", "localization.icp.num_points=768").localization.icp
+    settings = config("slam.localization.icp.max_steps=20", "slam.localization.icp.num_points=768").localization.icp
     return at(at(settings, "prior_information", 0.0), "max_mahalanobis_sq", 25.0)
 
 

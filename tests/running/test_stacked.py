@@ -9,7 +9,7 @@ from emgs_jax.ops.pytree import stack
 from emgs_jax.running.stacked import map_configs, programs
 from emgs_jax.slam import FirstWindow, run
 
-WHOLE = ("localization.coarse=same_image", "slam.initialization=merged")
+WHOLE = ("slam.localization.coarse=same_image", "slam.initialization=merged")
 FRAME = 3
 
 
@@ -26,7 +26,8 @@ def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_
     configs, roomy = (
         [at(at(base, "em.max_mahalanobis_sq", x), "refinement.max_mahalanobis_sq_2d", x) for x in (0.0, 4.6, 20.0)]
         for base in (
-            slam_config(*WHOLE, f"submap.map_capacity={size}", "submap.submap_capacity=256") for size in (128, 512)
+            slam_config(*WHOLE, f"slam.submap.map_capacity={size}", "slam.submap.submap_capacity=256")
+            for size in (128, 512)
         )
     )
     infos, alone = [], []
@@ -46,7 +47,7 @@ def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_
 
 def test_configs_share_a_program_where_only_traced_leaves_differ(sequence, camera):
     base = slam_config()
-    configs = [base, at(base, "em.noise", 0.5), slam_config("em.num_neighbours=4"), at(base, "fit.min_std", 0.02)]
+    configs = [base, at(base, "em.noise", 0.5), slam_config("slam.em.num_neighbours=4"), at(base, "fit.min_std", 0.02)]
     configs.append(at(base, "observation.min_confidence", 2.0))
     assert programs(configs) == [[0, 1, 3], [2], [4]]
     with pytest.raises(ValueError, match="programs"):

@@ -108,7 +108,7 @@ def test_em_agrees_with_numpy_and_scipy_on_the_same_points():
 
 @pytest.mark.slow
 def test_both_registrations_find_the_pose_of_exact_views():
-    config = benchmark_config("prior.level=0", "fit.points_per_gaussian=4", "dataset.num_frames=100")
+    config = benchmark_config("prior.level=0", "slam.fit.points_per_gaussian=4", "dataset.num_frames=100")
     for timing in time_icp(load(config), (0.02, 0.01), 1):
         assert timing.facts["translation_error_cm"][0] < 2.0, timing.name  # pixels are 5 cm apart
 

@@ -182,11 +182,11 @@ def test_every_experiment_composes_and_builds_its_config(name):
 
 def test_the_paper_experiment_takes_the_printed_readings():
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        config = hydra.compose("config", overrides=["experiment=paper", "em.num_neighbours=7"])
-    assert config.slam.initialization == "merged" and config.em.determinant_weight == 1.0
-    assert config.em.average.gain == "ema_printed" and config.localization.coarse == "via_previous"
-    assert config.fit.points_per_gaussian == 128 and config.observation.thin == 1
-    assert config.refinement.front_margin == 0.0 and config.slam.em.num_neighbours == 7
+        config = hydra.compose("config", overrides=["experiment=paper", "slam.em.num_neighbours=7"])
+    assert config.slam.initialization == "merged" and config.slam.em.determinant_weight == 1.0
+    assert config.slam.em.average.gain == "ema_printed" and config.slam.localization.coarse == "via_previous"
+    assert config.slam.fit.points_per_gaussian == 128 and config.slam.observation.thin == 1
+    assert config.slam.refinement.front_margin == 0.0 and config.slam.em.num_neighbours == 7
 
 
 def test_an_error_of_a_constructor_is_one_clear_line(monkeypatch):
@@ -195,7 +195,7 @@ def test_an_error_of_a_constructor_is_one_clear_line(monkeypatch):
         hydra.utils.instantiate(compose("prior.level=-1").prior)
     assert caught.value.code not in (0, None)
     with pytest.raises(SystemExit, match="unexpected keyword argument 'foo'"), clear_errors():
-        hydra.utils.instantiate(compose("+em.foo=1").em)
+        hydra.utils.instantiate(compose("+slam.em.foo=1").slam.em)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(hydra.errors.InstantiationException), clear_errors():
         hydra.utils.instantiate(compose("prior.level=-1").prior)

@@ -52,7 +52,7 @@ def test_the_truth_in_another_frame_and_scale_is_perfect_under_sim3(tmp_path, tr
 
 
 def test_without_scale_the_error_of_the_scale_is_seen(tmp_path, truth):
-    metrics, _ = scored(*write_system(tmp_path, *truth), "alignment=se3")
+    metrics, _ = scored(*write_system(tmp_path, *truth), "evaluation.alignment=se3")
     assert metrics["trajectory/ate_sim3_m"] < 1e-6 < 0.01 < metrics["trajectory/ate_se3_m"]
     assert metrics["reconstruction/accuracy_m"] > 0.1
 
@@ -103,7 +103,7 @@ def test_another_result_is_never_replaced_but_the_same_one_may_be_made_again(tmp
     assert scored(*files)[0]["trajectory/ate_sim3_m"] == first["trajectory/ate_sim3_m"]
     before = path.read_bytes()
     with pytest.raises(ValueError, match="made with other settings .*method=NAME"):
-        scored(*files, "alignment=se3")
+        scored(*files, "evaluation.alignment=se3")
     assert path.read_bytes() == before
 
 

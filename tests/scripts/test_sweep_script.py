@@ -15,7 +15,7 @@ import experiments.run
 import experiments.sweep
 from experiments.grid import notes, read_axes, variants
 
-AXES = "axes={em.max_mahalanobis_sq:[1.0,9.0],em.average.gain:[count,ema_printed]}"
+AXES = "axes={slam.em.max_mahalanobis_sq:[1.0,9.0],slam.em.average.gain:[count,ema_printed]}"
 COMPARED = ("trajectory/", "reconstruction", "raw_prior/", "map/", "frames/")
 
 
@@ -39,7 +39,7 @@ def assert_same_metrics(row: dict, metrics: dict, rtol: float) -> None:
 @pytest.mark.slow
 def test_every_setting_has_the_metrics_of_a_run_with_its_values(tmp_path):
     for row in swept()[1]:
-        values = [f"{name}={row[name]}" for name in ("em.max_mahalanobis_sq", "em.average.gain")]
+        values = [f"{name}={row[name]}" for name in ("slam.em.max_mahalanobis_sq", "slam.em.average.gain")]
         metrics = experiments.run.run(compose(*values), tmp_path)
         assert_same_metrics(row, metrics, 1e-5)
     assert len({row["trajectory/ate_sim3_m"] for row in swept()[1]}) == 4  # the axes do something
@@ -52,7 +52,7 @@ def test_the_files_hold_every_row_and_the_recorded_predictions_are_removed():
     with open(folder / "sweep.csv", newline="") as file:
         lines = list(csv.DictReader(file))
     assert [float(line["trajectory/ate_sim3_m"]) for line in lines] == [row["trajectory/ate_sim3_m"] for row in rows]
-    assert [line["em.average.gain"] for line in lines] == ["count", "ema_printed"] * 2
+    assert [line["slam.em.average.gain"] for line in lines] == ["count", "ema_printed"] * 2
     written = json.loads((folder / "sweep.json").read_text())
     assert written["provenance"]["simulated"] is True and len(written["settings"]) == 4
     assert (folder / "heat_map.png").read_bytes()[:4] == b"\x89PNG"
@@ -63,11 +63,11 @@ def test_a_finished_setting_is_not_mapped_again_and_another_sweep_is_not_mixed_i
     folder, rows = swept()
     (tmp_path / "sweep.json").write_bytes((folder / "sweep.json").read_bytes())
     monkeypatch.setattr(experiments.sweep, "_map_and_score", None)  # calling it would fail
-    subset = compose("axes={em.max_mahalanobis_sq:[9.0],em.average.gain:[count]}", name="sweep")
+    subset = compose("axes={slam.em.max_mahalanobis_sq:[9.0],slam.em.average.gain:[count]}", name="sweep")
     (row,) = experiments.sweep.sweep(subset, tmp_path)
     assert row | {"setting": 2} == rows[2]
     with pytest.raises(ValueError, match=r"em\.noise 1\.0, and this one has 0\.5: .*another folder"):
-        experiments.sweep.sweep(compose(AXES, "em.noise=0.5", name="sweep"), tmp_path)
+        experiments.sweep.sweep(compose(AXES, "slam.em.noise=0.5", name="sweep"), tmp_path)
     (tmp_path / "sweep.json").write_text('{"format": "emgs_jax.running.stacked", "version": 99}')
     with pytest.raises(ValueError, match="version 1.*another folder"):
         experiments.sweep.sweep(subset, tmp_path)
@@ -91,18 +91,18 @@ def test_an_interrupted_sweep_keeps_its_chunks(monkeypatch, tmp_path):
 
 
 def test_the_grid_is_every_combination_and_shared_nodes_change_wherever_they_are_used():
-    config = compose("axes={em.normal_weight:[0,5],render.opacity:[0.5,0.7]}", name="sweep")
+    config = compose("axes={slam.em.normal_weight:[0,5],render.opacity:[0.5,0.7]}", name="sweep")
     grid = variants(config, read_axes(config))
     got = [
         (float(v.slam.em.normal_weight), float(v.slam.refinement.render.opacity), float(v.densify.render.opacity))
         for v in grid
     ]
     np.testing.assert_allclose(got, [(0, 0.5, 0.5), (0, 0.7, 0.7), (5, 0.5, 0.5), (5, 0.7, 0.7)])
-    assert [v.setting for v in grid][1] == {"em.normal_weight": 0, "render.opacity": 0.7}
+    assert [v.setting for v in grid][1] == {"slam.em.normal_weight": 0, "render.opacity": 0.7}
 
 
 def test_one_at_a_time_keeps_the_other_keys_as_the_config_has_them():
-    axes = "axes={em.normal_weight:[0,5.0,9],em.average.gain:[ema_printed,count]}"
+    axes = "axes={slam.em.normal_weight:[0,5.0,9],slam.em.average.gain:[ema_printed,count]}"
     config = compose(axes, "grid=one_at_a_time", name="sweep")
     settings = [tuple(v.setting.values()) for v in variants(config, read_axes(config))]
     assert settings == [(5.0, "count"), (0, "count"), (9, "count"), (5.0, "ema_printed")]
@@ -114,20 +114,20 @@ def test_a_grid_that_is_none_is_refused():
 
 
 def test_an_infinite_value_is_text_in_the_results():
-    config = compose("axes={em.max_log_gap:[8.0,inf]}", name="sweep")
+    config = compose("axes={slam.em.max_log_gap:[8.0,inf]}", name="sweep")
     grid = variants(config, read_axes(config))
-    assert [v.setting["em.max_log_gap"] for v in grid] == [8.0, "inf"] and np.isinf(grid[1].slam.em.max_log_gap)
+    assert [v.setting["slam.em.max_log_gap"] for v in grid] == [8.0, "inf"] and np.isinf(grid[1].slam.em.max_log_gap)
 
 
 @pytest.mark.parametrize(
     ("axes", "message"),
     [
         ("null", "no axis: choose one with sweep=gates"),
-        ("{em.max_mahalanobis:[3]}", r"no key of a stage; near names: em\.max_mahalanobis_sq"),
+        ("{slam.em.max_mahalanobis:[3]}", r"no key of a stage; near names: slam\.em\.max_mahalanobis_sq"),
         ("{max_mahalanobis_sq:[3]}", r"near names: .*em\.max_mahalanobis_sq|near names: .*max_mahalanobis_sq"),
-        ("{em.noise:3}", r"must be a list of values, got 3: write em\.noise: \[3"),
-        ("{em.noise:[]}", "must be a list of values"),
-        ("{em.noise:[[1,2]]}", "numbers or names"),
+        ("{slam.em.noise:3}", r"must be a list of values, got 3: write slam\.em\.noise: \[3"),
+        ("{slam.em.noise:[]}", "must be a list of values"),
+        ("{slam.em.noise:[[1,2]]}", "numbers or names"),
         ("{prior.seed:[0,1]}", r"experiments\.sweep -m prior\.seed"),
     ],
 )
@@ -137,11 +137,14 @@ def test_an_axis_that_is_none_is_refused_with_the_remedy(axes, message):
 
 
 def test_a_static_axis_says_that_it_compiles_for_each_value_and_a_traced_one_says_nothing():
-    config = compose("axes={em.num_neighbours:[4,6],em.noise:[0,1],observation.min_confidence:[1.0,2.0]}", name="sweep")
+    config = compose(
+        "axes={slam.em.num_neighbours:[4,6],slam.em.noise:[0,1],slam.observation.min_confidence:[1.0,2.0]}",
+        name="sweep",
+    )
     said = notes(config, read_axes(config))
     assert said == [
-        "em.num_neighbours is static: it compiles once for each of its 2 values",
-        "observation.min_confidence decides what a prediction becomes: its 2 values are mapped in turn",
+        "slam.em.num_neighbours is static: it compiles once for each of its 2 values",
+        "slam.observation.min_confidence decides what a prediction becomes: its 2 values are mapped in turn",
     ]
 
 

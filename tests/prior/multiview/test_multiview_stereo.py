@@ -158,7 +158,7 @@ def test_images_without_texture_give_no_geometry_and_nothing_that_a_map_could_st
         assert np.isnan(answer.T_anchor_view[1:]).all()
         assert not answer.mask.any() and not answer.points.any() and (answer.confidence == 1).all()
     frames = {index: images[index] for index in range(WINDOW_SIZE)}
-    observation = hydra.utils.instantiate(compose("observation.normal_radius=1").slam, _convert_="all").observation
+    observation = hydra.utils.instantiate(compose("slam.observation.normal_radius=1").slam, _convert_="all").observation
     assert to_first_window(found[0], frames, np.eye(4), observation) == (None, ())
 
 
