@@ -92,13 +92,15 @@ def fit_to_points(
     return where_rows(valid, fitted, empty_gaussians(centers.shape[0], observation.features.shape[-1]))
 
 
+@eqx.filter_jit
 def cluster(
     observation: Observation, order: Int[Array, "p"], spacing: int, config: FitConfig
 ) -> tuple[Gaussians, Float[Array, "g"]]:
     """Gaussians of the valid points: k-means from every `spacing`-th point along `order`, then eq. 1.
 
     The M neighbours of eq. 1 are taken from an even choice of the points in which a cluster has about M of them, so
-    that a Gaussian is as large as its cluster whatever the number of merged images is.
+    that a Gaussian is as large as its cluster whatever the number of merged images is. Compiled by itself, because the
+    first map and every step share it.
 
     Returns:
         ceil(p / spacing) Gaussians, and the number of points of each in units of `spacing`; 0 where invalid.

@@ -1,14 +1,28 @@
 """Initialisation (Method B): the map from the merged predictions of the first window."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from emgs_jax.gaussians import FitConfig, Gaussians, cluster, spacing
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import morton_order
+
+
+@eqx.filter_jit
+def merge(
+    views: Observation, T_world_views: jaxlie.SE3, camera: Camera
+) -> tuple[Observation, Observation, Int[Array, "q"]]:
+    """The views in the world frame, the same as one cloud of q points, and an order that is even over every image."""
+    world = jax.vmap(lambda T, view: transform(T, view, jnp.ones(())))(T_world_views, views)
+    num_views, num_points = views.valid.shape
+    order = morton_order(camera.height, camera.width)
+    order = (jnp.arange(num_views)[:, None] * num_points + order).reshape(-1)
+    merged = jax.tree.map(lambda leaf: leaf.reshape(num_views * num_points, *leaf.shape[2:]), world)
+    return world, merged, order
 
 
 def initialize(
@@ -26,10 +40,7 @@ def initialize(
     Returns:
         The Gaussians, their number of points in units of λ, and the views in the world frame.
     """
-    world = jax.vmap(lambda T, view: transform(T, view, jnp.ones(())))(T_world_views, views)
-    num_views, num_points = views.valid.shape
-    order = morton_order(camera.height, camera.width)
-    order = (jnp.arange(num_views)[:, None] * num_points + order).reshape(-1)
-    merged = jax.tree.map(lambda leaf: leaf.reshape(num_views * num_points, *leaf.shape[2:]), world)
+    num_views = views.valid.shape[0]
+    world, merged, order = merge(views, T_world_views, camera)
     gaussians, weight = cluster(merged, order, spacing(thin, config) * num_views, config)
     return gaussians, weight * num_views, world

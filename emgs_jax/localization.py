@@ -1,6 +1,7 @@
 """Localization (Method C): where the current frame is, first through the previous frame, then against the map."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
@@ -123,26 +124,28 @@ def _repeat_scale(
     return jnp.where(jnp.isfinite(scale) & (scale > 0.1), scale, 1.0) ** config.scale_memory
 
 
-def _via_previous(
+def _pairs_via_previous(
     prediction: Prediction,
     previous: Observation,
     scale: Float[Array, ""],
-    motion: tuple[jaxlie.SE3, jaxlie.SE3],
+    T_previous_current: jaxlie.SE3,
     camera: Camera,
     config: LocalizationConfig,
-) -> jaxlie.SE3:
+) -> tuple[Float[Array, "p 3"], Bool[Array, "p"]]:
     """The printed chain (R7): current point -> closest point of the previous image now -> the same pixel before.
 
-    The closest point is looked up by projection, which needs no tree. `motion` is T_world_previous and
-    T_previous_current of the prior, where the search starts.
+    The closest point is looked up by projection, which needs no tree, from `T_previous_current` of the prior.
+
+    Returns:
+        A world-frame point for every current one, and which of these pairs exist.
     """
     now, current = prediction.previous, prediction.current
-    seen = transform(motion[1], current, scale)
+    seen = transform(T_previous_current, current, scale)
     pixels, depth = project(camera, seen.points)
     match, inside = nearest_pixel(pixels, (camera.height, camera.width))
     is_close = jnp.linalg.norm(seen.points - scale * now.points[match], axis=-1) <= config.max_pair_distance
     via = inside & (depth > 0) & is_close & (now.valid & previous.valid)[match] & current.valid
-    return fit_rigid_robust(scale * current.points, previous.points[match], via, motion[0] @ motion[1])
+    return previous.points[match], via
 
 
 def localize_coarse(
@@ -169,8 +172,11 @@ def localize_coarse(
     T_previous_current = scale_translation(raw_previous.inverse() @ raw_current, scale)
     T_current_newest = scale_translation(raw_current.inverse() @ pose_row(views, 2), scale)
 
-    same_image = fit_rigid_robust(scale * now.points, previous.points, paired, T_world_previous) @ T_previous_current
-    via_previous = _via_previous(prediction, previous, scale, (T_world_previous, T_previous_current), camera, config)
+    carried, via = _pairs_via_previous(prediction, previous, scale, T_previous_current, camera, config)
+    direct = scale * now.points, previous.points, paired, T_world_previous
+    chained = scale * prediction.current.points, carried, via, T_world_previous @ T_previous_current
+    fits = jax.vmap(fit_rigid_robust)(*stack([direct, chained]))  # side by side: one copy of the solve to compile
+    same_image, via_previous = pose_row(fits, 0) @ T_previous_current, pose_row(fits, 1)
     anchor = prediction.T_world_anchor
     anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, scale)
     # After a frame that could not be placed the chain is broken, and the prior's own pose stands in for it.
@@ -192,7 +198,14 @@ def localize_coarse(
     has_newest = prediction.has_newest & is_finite & jnp.all(jnp.isfinite(newest.wxyz_xyz))
     newest = jaxlie.SE3(jnp.where(has_newest, newest.wxyz_xyz, coarse.wxyz_xyz))
     is_usable = is_finite & (jnp.sum(prediction.current.valid) >= MIN_PAIRS)
-    return CoarsePose(coarse, newest, scale, repeat_rms, median(now.points[:, 2], now.valid), is_usable)
+    return CoarsePose(
+        T_world_camera=coarse,
+        T_world_newest=newest,
+        scale=scale,
+        repeat_rms=repeat_rms,
+        mean_depth=median(now.points[:, 2], now.valid),
+        is_usable=is_usable,
+    )
 
 
 def localize_fine(
@@ -234,14 +247,14 @@ def localize_fine(
         T,
         aligned,
         LocalizationInfo(
-            is_tracked,
-            ~coarse.is_usable,
-            bits,
-            scale,
-            coarse.repeat_rms,
-            info.misfit / coarse.mean_depth,
-            step_m,
-            step_rad,
-            info,
+            is_tracked=is_tracked,
+            is_lost=~coarse.is_usable,
+            reason=bits,
+            scale=scale,
+            repeat_rms=coarse.repeat_rms,
+            depth_noise=info.misfit / coarse.mean_depth,
+            step_m=step_m,
+            step_rad=step_rad,
+            icp=info,
         ),
     )

@@ -12,8 +12,8 @@ from emgs_jax.ops.camera import Camera, nearest_pixel
 from emgs_jax.ops.linalg import inverse_2x2, mahalanobis_sq, outer, safe_normalize
 from emgs_jax.ops.neighbours import knn
 from emgs_jax.ops.pytree import static, traced, where_rows
-from emgs_jax.render.composite import RenderConfig, Rendering, render
-from emgs_jax.render.project import Splats, project_gaussians
+from emgs_jax.render.composite import RenderConfig, Rendering, render_splats, splats_of
+from emgs_jax.render.project import Splats
 
 
 class RefinementConfig(eqx.Module):
@@ -137,12 +137,10 @@ def refine(
         The submap with merged candidates, the candidates with only the fresh ones valid, and counts.
     """
     old = submap.gaussians
-    scale, blur = config.render.covariance_scale, config.render.blur
-    rendering = render(old, old.colors, T_world_camera, camera, config.render)
-    map_splats = project_gaussians(old, T_world_camera, camera, scale, blur)
-    candidate_splats = project_gaussians(candidates, T_world_camera, camera, scale, blur)
+    map_splats, candidate_splats = (splats_of(g, T_world_camera, camera, config.render) for g in (old, candidates))
+    rendering = render_splats(map_splats, old.colors, camera, config.render)
 
-    widest = jnp.sqrt(jnp.trace(candidate_splats.covs, axis1=-2, axis2=-1) / scale)
+    widest = jnp.sqrt(jnp.trace(candidate_splats.covs, axis1=-2, axis2=-1) / config.render.covariance_scale)
     is_surface = candidates.valid & (widest <= config.max_splat_std)
     candidates = eqx.tree_at(lambda g: g.valid, candidates, is_surface)
     map_depth = depth_at(rendering, candidate_splats, camera)

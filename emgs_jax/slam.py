@@ -11,10 +11,19 @@ import jaxlie
 from jaxtyping import Array, Float, Int
 
 from emgs_jax.em import EmConfig, EmInfo, em_update
-from emgs_jax.gaussian_map import GaussianMap, SubmapConfig, empty_map, grow, insert, select_submap, write_back
-from emgs_jax.gaussians import FitConfig, cluster, spacing
+from emgs_jax.gaussian_map import (
+    AverageConfig,
+    GaussianMap,
+    SubmapConfig,
+    empty_map,
+    grow,
+    insert,
+    select_submap,
+    write_back,
+)
+from emgs_jax.gaussians import FitConfig, Gaussians, cluster, spacing
 from emgs_jax.initialization import initialize
-from emgs_jax.localization import LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
+from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
 from emgs_jax.observation import Observation, ObservationConfig, Prediction, transform
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
@@ -86,9 +95,9 @@ class StepInfo(eqx.Module):
     overflow: Overflow
 
 
-def _first_weight(weight: Float[Array, "g"], config: SlamConfig) -> Float[Array, "g"]:
+def _first_weight(weight: Float[Array, "g"], config: AverageConfig) -> Float[Array, "g"]:
     """Weight of a new Gaussian: α_0 = 1 as printed, or the number of images that its points amount to."""
-    return jnp.where(config.em.average.gain > 0, weight, 1.0)
+    return jnp.where(config.gain > 0, weight, 1.0)
 
 
 def init_state(
@@ -107,14 +116,24 @@ def init_state(
     """
     thin = config.observation.thin
     gaussians, weight, world = initialize(views, T_world_views, downscale(camera, thin), thin, config.fit)
-    empty = empty_map(config.submap.map_capacity, views.features.shape[-1])
-    map, _, overflow = insert(empty, gaussians, _first_weight(weight, config))
+    return _first_state(gaussians, weight, world, T_world_views, config)
+
+
+@eqx.filter_jit
+def _first_state(
+    gaussians: Gaussians, weight: Float[Array, "g"], world: Observation, T_world_views: jaxlie.SE3, config: SlamConfig
+) -> tuple[SlamState, Int[Array, ""]]:
+    empty = empty_map(config.submap.map_capacity, world.features.shape[-1])
+    map, _, overflow = insert(empty, gaussians, _first_weight(weight, config.em.average))
     previous = jax.tree.map(lambda leaf: leaf[-1], world)
     return SlamState(map, previous, pose_row(T_world_views, -1)), overflow
 
 
 def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig) -> tuple[SlamState, StepInfo]:
     """Integrate one frame: localise, select, E-step, M-step, refine, insert (the paper's pipeline figure).
+
+    Called as it is, each line is an executable of its own, so that a larger map compiles the look-up and the insertion
+    anew and not the work on the submap; inside another jit or vmap all of it is one.
 
     Args:
         state: of the last step.
@@ -123,25 +142,85 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
         config: all stages.
     """
     thin = config.observation.thin
-    view = downscale(camera, thin)
-    coarse = localize_coarse(prediction, state.previous, state.T_world_previous, view, config.localization)
-    guess = transform(coarse.T_world_camera, prediction.current, coarse.scale)
-    submap, rows, submap_overflow = select_submap(state.map, (state.previous, guess), config.submap)
-    T, aligned, localization = localize_fine(prediction.current, submap.gaussians, coarse, config.localization)
+    coarse, guess = _approach(prediction, state.previous, state.T_world_previous, camera, thin, config.localization)
+    submap, rows, submap_overflow = _select(state.map, (state.previous, guess), config.submap)
+    T, aligned, localization = _place(prediction.current, submap.gaussians, coarse, config.localization)
+    submap, rest, em = _fuse(submap, aligned, T, localization, config.em)
+    candidates, weight = cluster(rest, _order(camera, thin), spacing(thin, config.fit), config.fit)
+    submap, fresh, refinement = _refine(submap, candidates, T, camera, thin, config.refinement)
+    map, count, map_overflow = _store(state.map, submap, rows, fresh, weight, config.em.average)
 
+    info = StepInfo(
+        T_world_camera=T,
+        T_world_newest=coarse.T_world_newest,
+        localization=localization,
+        em=em,
+        refinement=refinement,
+        num_gaussians=count,
+        overflow=Overflow(map_overflow, submap_overflow, refinement.overflow),
+    )
+    return SlamState(map, aligned, T), info
+
+
+@eqx.filter_jit
+def _approach(
+    prediction: Prediction,
+    previous: Observation,
+    T_world_previous: jaxlie.SE3,
+    camera: Camera,
+    thin: int,
+    config: LocalizationConfig,
+) -> tuple[CoarsePose, Observation]:
+    """The coarse pose, and the current frame placed by it."""
+    coarse = localize_coarse(prediction, previous, T_world_previous, downscale(camera, thin), config)
+    return coarse, transform(coarse.T_world_camera, prediction.current, coarse.scale)
+
+
+_select = eqx.filter_jit(select_submap)
+_place = eqx.filter_jit(localize_fine)
+
+
+@eqx.filter_jit
+def _fuse(
+    submap: GaussianMap, aligned: Observation, T: jaxlie.SE3, localization: LocalizationInfo, config: EmConfig
+) -> tuple[GaussianMap, Observation, EmInfo]:
+    """Fuse the points of a frame that is tracked; returns those that no Gaussian explains."""
     trusted = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & localization.is_tracked)
     noise = localization.depth_noise * (trusted.points - T.translation())
-    submap, is_fused, em = em_update(submap, trusted, noise, config.em)
-    rest = eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~is_fused)
-    order = morton_order(view.height, view.width)
-    candidates, weight = cluster(rest, order, spacing(thin, config.fit), config.fit)
-    submap, fresh, refinement = refine(submap, candidates, T, view, config.refinement)
-    map, _, map_overflow = insert(write_back(state.map, submap, rows), fresh, _first_weight(weight, config))
+    submap, is_fused, em = em_update(submap, trusted, noise, config)
+    return submap, eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~is_fused), em
 
-    overflow = Overflow(map_overflow, submap_overflow, refinement.overflow)
-    count = jnp.sum(map.gaussians.valid)
-    info = StepInfo(T, coarse.T_world_newest, localization, em, refinement, count, overflow)
-    return SlamState(map, aligned, T), info
+
+@eqx.filter_jit
+def _order(camera: Camera, thin: int) -> Int[Array, "p"]:
+    view = downscale(camera, thin)
+    return morton_order(view.height, view.width)
+
+
+@eqx.filter_jit
+def _refine(
+    submap: GaussianMap,
+    candidates: Gaussians,
+    T: jaxlie.SE3,
+    camera: Camera,
+    thin: int,
+    config: RefinementConfig,
+) -> tuple[GaussianMap, Gaussians, RefinementInfo]:
+    return refine(submap, candidates, T, downscale(camera, thin), config)
+
+
+@eqx.filter_jit
+def _store(
+    map: GaussianMap,
+    submap: GaussianMap,
+    rows: Int[Array, "s"],
+    fresh: Gaussians,
+    weight: Float[Array, "g"],
+    config: AverageConfig,
+) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""]]:
+    """The map with the submap written back and the fresh Gaussians in free rows, their count, and what did not fit."""
+    map, _, overflow = insert(write_back(map, submap, rows), fresh, _first_weight(weight, config))
+    return map, jnp.sum(map.gaussians.valid), overflow
 
 
 class FirstWindow(eqx.Module):
@@ -184,8 +263,7 @@ def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[
     return jax.tree.map(lambda leaf: leaf[:1], window), following
 
 
-jitted_init_state = eqx.filter_jit(init_state)
-jitted_step = eqx.filter_jit(step)
+jitted_init_state, jitted_step = init_state, step
 
 
 def with_room(config: SlamConfig, overflow: Overflow) -> SlamConfig:

@@ -37,8 +37,9 @@ def knn(
     queries, points = jax.lax.stop_gradient((queries, points))  # a row number has no gradient
     low = jnp.min(jnp.where(valid[:, None], points, jnp.inf), axis=0)
     high = jnp.max(jnp.where(valid[:, None], points, -jnp.inf), axis=0)
-    order = jnp.argsort(jnp.where(valid, _curve(points, low, high), jnp.iinfo(jnp.int32).max))
-    query_order = jnp.argsort(_curve(queries, low, high))
+    cells = _curve(jnp.concatenate([points, queries]), low, high)
+    order = jnp.argsort(jnp.where(valid, cells[: points.shape[0]], jnp.iinfo(jnp.int32).max))
+    query_order = jnp.argsort(cells[points.shape[0] :])
     sorted_points = jnp.where(valid[:, None], points, jnp.inf)[order]
     groups = fill_rows(sorted_points, GROUP, jnp.inf).reshape(-1, GROUP, points.shape[1])
     rows, exists = jax.lax.platform_dependent(
@@ -100,29 +101,29 @@ def _by_distance(
     """The groups in the order of the distance between their boxes and each block's, in turns of `num_near`.
 
     Returns:
-        The groups of every turn, and the squared distance of the nearest group after it.
+        The groups of every turn, and the squared distance of the nearest of them; 0 for the first turn.
     """
     if groups.shape[0] == num_near:
         one = (blocks.shape[0], 1)
-        return jnp.broadcast_to(jnp.arange(num_near), (*one, num_near)), jnp.full(one, jnp.inf)
+        return jnp.broadcast_to(jnp.arange(num_near), (*one, num_near)), jnp.zeros(one)
     low, high = jnp.min(groups, axis=1), jnp.max(jnp.where(jnp.isfinite(groups), groups, -jnp.inf), axis=1)
     block_low, block_high = (bound(blocks, axis=1)[:, None] for bound in (jnp.min, jnp.max))
     gaps = jnp.maximum(jnp.maximum(low - block_high, block_low - high), 0.0)
     gaps_sq = jnp.sum(gaps**2, axis=-1)
     order = smallest(gaps_sq.T, groups.shape[0]).T
-    beyond_sq = jnp.take_along_axis(gaps_sq, order[:, num_near::num_near], axis=1)
-    beyond_sq = jnp.pad(beyond_sq, ((0, 0), (0, 1)), constant_values=jnp.inf)
-    return order.reshape(blocks.shape[0], -1, num_near), beyond_sq
+    least_sq = jnp.take_along_axis(gaps_sq, order[:, num_near::num_near], axis=1)
+    least_sq = jnp.pad(least_sq, ((0, 0), (1, 0)))
+    return order.reshape(blocks.shape[0], -1, num_near), least_sq
 
 
 def _search_block(
     queries: Float[Array, "q d"],
     turns: Int[Array, "t c"],
-    beyond_sq: Float[Array, "t"],
+    least_sq: Float[Array, "t"],
     groups: Float[Array, "g p d"],
     k: int,
 ) -> tuple[Int[Array, "q k"], Bool[Array, "q k"]]:
-    """Neighbours of one block: turn after turn, until no group beyond can hold a nearer point."""
+    """Neighbours of one block: turn after turn, until no group of the next one can hold a nearer point."""
 
     def look(turn: int | Int[Array, ""]) -> tuple[Int[Array, "k q"], Float[Array, "k q"]]:
         near = turns[turn]
@@ -131,18 +132,19 @@ def _search_block(
 
     def is_open(state: tuple) -> Bool[Array, ""]:
         turn, (_, distance_sq) = state
-        return (turn + 1 < turns.shape[0]) & ~jnp.all(distance_sq[-1] <= beyond_sq[turn])
+        return (turn < turns.shape[0]) & ~jnp.all(distance_sq[-1] <= least_sq[turn])
 
     def look_on(state: tuple) -> tuple:
         turn, found = state
-        both = jax.tree.map(lambda old, new: jnp.concatenate([old, new]), found, look(turn + 1))
+        both = jax.tree.map(lambda old, new: jnp.concatenate([old, new]), found, look(turn))
         best = smallest(both[1], k)
         return turn + 1, jax.tree.map(lambda rows: jnp.take_along_axis(rows, best, axis=0), both)
 
-    found = look(0)
-    if turns.shape[0] > 1:
-        _, found = jax.lax.while_loop(is_open, look_on, (0, found))
-    rows, distance_sq = found
+    if turns.shape[0] == 1:
+        rows, distance_sq = look(0)
+    else:
+        nothing = jnp.zeros((k, queries.shape[0]), jnp.int32), jnp.full((k, queries.shape[0]), jnp.inf)
+        _, (rows, distance_sq) = jax.lax.while_loop(is_open, look_on, (0, nothing))
     return rows.T, jnp.isfinite(distance_sq).T
 
 

@@ -126,24 +126,29 @@ def _search(y: Float[Array, "7"], problem: _Problem, config: IcpConfig) -> Candi
     return knn(transform(T, problem.source, scale).points, target.means, target.valid, config.num_neighbours)
 
 
-def _place(
-    y: Float[Array, "7"], candidates: Candidates, problem: _Problem, config: IcpConfig
-) -> tuple[Observation, Matches]:
-    """The source in the world frame for the unknowns y, and its matches, which carry no gradient."""
-    T, scale = _pose(y, problem)
-    placed = transform(T, problem.source, scale)
-    noise = problem.rays @ T.rotation().as_matrix().T
-    fixed, noise = jax.lax.stop_gradient((placed, noise))
-    gates = config.max_mahalanobis_sq, config.min_normal_cos
-    return placed, jax.lax.stop_gradient(match(fixed, noise, candidates, problem.surface, gates))
-
-
 def _residuals(
     y: Float[Array, "7"], args: tuple[Candidates, _Problem, IcpConfig]
-) -> tuple[Float[Array, "p 5"], Float[Array, "7"]]:
-    """Rows of every point (plane, colour, whitened offset) and of the prior, in standard deviations."""
+) -> tuple[tuple[Float[Array, "p 5"], Float[Array, "7"]], tuple[Matches, Float[Array, "p 5 7"]]]:
+    """Rows of every point and of the prior, in standard deviations; beside them the matches and the rows' derivative.
+
+    The matches carry no gradient. The derivative is made here, once, and the solver gets rows that are linear in y:
+    otherwise each of its uses of the derivative would be compiled, and computed, anew.
+    """
     candidates, problem, config = args
-    placed, matches = _place(y, candidates, problem, config)
+    fixed = jax.lax.stop_gradient(y)
+    T, scale = _pose(fixed, problem)
+    placed, noise = transform(T, problem.source, scale), problem.rays @ T.rotation().as_matrix().T
+    gates = config.max_mahalanobis_sq, config.min_normal_cos
+    matches = jax.lax.stop_gradient(match(placed, noise, candidates, problem.surface, gates))
+    jacobian = jax.lax.stop_gradient(jax.jacfwd(_rows)(fixed, matches, problem, config))
+    rows = _rows(fixed, matches, problem, config) + jacobian @ (y - fixed)
+    return (rows, problem.prior * y), (matches, jacobian)
+
+
+def _rows(y: Float[Array, "7"], matches: Matches, problem: _Problem, config: IcpConfig) -> Float[Array, "p 5"]:
+    """Plane, colour and whitened offset of every point for given matches, in standard deviations."""
+    T, scale = _pose(y, problem)
+    placed = transform(T, problem.source, scale)
     offset = placed.points - matches.means
     plane = jnp.sum(offset * matches.normals, axis=-1) / matches.plane_std
     light = matches.light + jnp.sum(matches.gradients * offset, axis=-1)
@@ -163,7 +168,7 @@ def _residuals(
     )
     valid = placed.valid
     share = jnp.sqrt(config.num_effective / jnp.maximum(jnp.sum(valid), 1))
-    return share * jnp.where(valid[:, None], rows, 0.0), problem.prior * y
+    return share * jnp.where(valid[:, None], rows, 0.0)
 
 
 def icp(
@@ -197,19 +202,21 @@ def icp(
     )
 
     def search_and_solve(y: Float[Array, "7"], _: None) -> tuple[Float[Array, "7"], tuple]:
-        candidates = _search(y, problem, config)
-        args = candidates, problem, config
-        solution = optx.least_squares(_residuals, solver, y, args, max_steps=config.max_steps, throw=False)
+        args = _search(y, problem, config), problem, config
+        solution = optx.least_squares(
+            _residuals, solver, y, args, has_aux=True, max_steps=config.max_steps, throw=False
+        )
         y = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, y)
-        return y, (candidates, solution.stats["num_steps"], solution.result == optx.RESULTS.successful)
+        # Not `solution.aux`, which lags one accepted step behind.
+        return y, (solution.state.aux, solution.stats["num_steps"], solution.result == optx.RESULTS.successful)
 
     y, rounds = jax.lax.scan(search_and_solve, jnp.zeros(7), length=config.num_searches)
-    candidates, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
-    args = candidates, problem, config
-    placed, matches = _place(y, *args)
+    (matches, jacobian), _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
+    T, scale = _pose(y, problem)
+    placed = transform(T, problem.source, scale)
     num_inliers = jnp.sum(matches.is_inlier)
     distance = jnp.sum((placed.points - matches.means) * matches.normals, axis=-1)
-    jacobian = jax.jacfwd(_residuals)(y, args)[0].reshape(-1, 7)[:, :6]
+    jacobian = jacobian.reshape(-1, 7)[:, :6]
     hessian = jacobian.T @ jacobian / jnp.maximum(config.num_effective, 1.0)
     info = IcpInfo(
         num_inliers=num_inliers,
@@ -220,4 +227,4 @@ def icp(
         num_steps=jnp.sum(rounds[1]),
         is_converged=is_converged,
     )
-    return *_pose(y, problem), info
+    return T, scale, info

@@ -1,5 +1,6 @@
 """Rigid motions: what jaxlie does not bring, and fits of paired points."""
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
@@ -56,13 +57,15 @@ def fit_rigid_robust(
     source: Float[Array, "p 3"], target: Float[Array, "p 3"], paired: Bool[Array, "p"], start: jaxlie.SE3
 ) -> jaxlie.SE3:
     """Rigid fit of pairs, robust by three reweightings around the median distance; `start` with too few pairs."""
-    T = start
-    for _ in range(3):
+
+    def reweight(T: jaxlie.SE3, _: None) -> tuple[jaxlie.SE3, None]:
         difference = source @ T.rotation().as_matrix().T + T.translation() - target
         # Exact pairs: the square root has no gradient at 0.
         distance = jnp.sqrt(jnp.sum(difference**2, axis=-1) + SMALLEST_LENGTH**2)
         spread = jnp.maximum(median(distance, paired), 1e-6)
         weights = jnp.where(paired, 1.0 / (1.0 + (distance / (2.0 * spread)) ** 2), 0.0)
-        T, _ = fit_rigid(source, target, weights)
+        return fit_rigid(source, target, weights)[0], None
+
+    T, _ = jax.lax.scan(reweight, start, length=3)
     keep = jnp.sum(paired) >= MIN_PAIRS
     return jaxlie.SE3(jnp.where(keep, T.wxyz_xyz, start.wxyz_xyz))

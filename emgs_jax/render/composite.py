@@ -113,14 +113,24 @@ def render(
     config: RenderConfig,
 ) -> Rendering:
     """Draw `values` (colours, normals, features or one-hot labels) of the Gaussians with depth and coverage."""
-    sums, overflow = draw_tiles(gaussians, values, T_world_camera, camera, config, composite)
+    splats = splats_of(gaussians, T_world_camera, camera, config)
+    return render_splats(splats, values, camera, config)
+
+
+def splats_of(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, config: RenderConfig) -> Splats:
+    """The Gaussians on the image plane, as they are drawn."""
+    return project_gaussians(gaussians, T_world_camera, camera, config.covariance_scale, config.blur)
+
+
+def render_splats(splats: Splats, values: Float[Array, "n v"], camera: Camera, config: RenderConfig) -> Rendering:
+    """`render` for Gaussians that are projected already."""
+    sums, overflow = draw_tiles(splats, values, camera, config, composite)
     return rendering_of(*sums, overflow, config)
 
 
 def draw_tiles(
-    gaussians: Gaussians,
+    splats: Splats,
     values: Float[Array, "n v"],
-    T_world_camera: jaxlie.SE3,
     camera: Camera,
     config: RenderConfig,
     blend: Callable[..., PyTree[Array]],
@@ -130,7 +140,6 @@ def draw_tiles(
     Returns:
         The images, and how many splats found their tile full.
     """
-    splats = project_gaussians(gaussians, T_world_camera, camera, config.covariance_scale, config.blur)
     corners = tile_corners(camera, config.tile_size)
     rows, exists, overflow = assign_tiles(splats, corners, config.tile_size, config.tile_capacity, config.radius)
     step = jnp.arange(config.tile_size, dtype=jnp.float32)
