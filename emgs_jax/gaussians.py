@@ -148,7 +148,7 @@ def intensity(colors: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
 
 def color_gradients(gaussians: Gaussians, num_neighbours: int) -> Float[Array, "n 3"]:
     """Intensity gradient (1/m) of every Gaussian in its tangent plane, fitted to its neighbours; orthogonal to n."""
-    rows, found = knn(gaussians.means, gaussians.means, gaussians.valid, num_neighbours)
+    rows, found = knn(gaussians.means, gaussians.means, gaussians.valid, num_neighbours, gaussians.valid)
     basis = tangent_basis(gaussians.normals)
     offsets = jnp.einsum("nkd,nda->nka", gaussians.means[rows] - gaussians.means[:, None], basis)
     offsets = jnp.where(found[..., None], offsets, 0.0)

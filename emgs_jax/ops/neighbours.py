@@ -17,7 +17,11 @@ NUM_NEAR = 32  # groups that such a block looks at first, beside twice its share
 
 
 def knn(
-    queries: Float[Array, "m d"], points: Float[Array, "n d"], valid: Bool[Array, "n"], k: int
+    queries: Float[Array, "m d"],
+    points: Float[Array, "n d"],
+    valid: Bool[Array, "n"],
+    k: int,
+    asked: Bool[Array, "m"] | None = None,
 ) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
     """The k nearest valid points of every query, nearest first; exact up to `smallest`'s precision.
 
@@ -30,39 +34,54 @@ def knn(
         points: n positions.
         valid: which points count.
         k: number of neighbours, static; at most n.
+        asked: queries that need an answer, None for all; on a CPU the others cost next to nothing.
 
     Returns:
-        Row numbers into `points`, and which of them exist: False where fewer than k points are valid.
+        Row numbers into `points`, and which of them exist: False where fewer than k points are valid. A query that is
+        not asked may have any or none.
     """
     queries, points = jax.lax.stop_gradient((queries, points))  # a row number has no gradient
     low = jnp.min(jnp.where(valid[:, None], points, jnp.inf), axis=0)
     high = jnp.max(jnp.where(valid[:, None], points, -jnp.inf), axis=0)
     cells = _curve(jnp.concatenate([points, queries]), low, high)
     order = jnp.argsort(jnp.where(valid, cells[: points.shape[0]], jnp.iinfo(jnp.int32).max))
-    query_order = jnp.argsort(cells[points.shape[0] :])
+    asked = jnp.ones(queries.shape[0], bool) if asked is None else asked
+    query_order = jnp.argsort(jnp.where(asked, cells[points.shape[0] :], jnp.iinfo(jnp.int32).max))
     sorted_points = jnp.where(valid[:, None], points, jnp.inf)[order]
     groups = fill_rows(sorted_points, GROUP, jnp.inf).reshape(-1, GROUP, points.shape[1])
+    # Those that are not asked come last; wherever they are, they must not widen the box of a block.
+    sorted_queries = jnp.where(asked[:, None], queries, queries[query_order[0]])[query_order]
     rows, exists = jax.lax.platform_dependent(
-        queries[query_order],
+        sorted_queries,
+        asked[query_order],
         groups,
-        cpu=lambda queries, groups: _by_blocks(queries, groups, BLOCK, NUM_NEAR, k),
-        default=lambda queries, groups: _by_blocks(queries, groups, LARGE_BLOCK, groups.shape[0], k),
+        cpu=lambda queries, asked, groups: _by_blocks(queries, asked, groups, BLOCK, NUM_NEAR, k),
+        default=lambda queries, asked, groups: _by_blocks(queries, asked, groups, LARGE_BLOCK, groups.shape[0], k),
     )
     found = jnp.where(exists, order[rows], 0), exists
     return jax.tree.map(lambda sorted_rows: jnp.zeros_like(sorted_rows).at[query_order].set(sorted_rows), found)
 
 
 def _by_blocks(
-    queries: Float[Array, "m d"], groups: Float[Array, "g p d"], size: int, num_near: int, k: int
+    queries: Float[Array, "m d"],
+    asked: Bool[Array, "m"],
+    groups: Float[Array, "g p d"],
+    size: int,
+    num_near: int,
+    k: int,
 ) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
     """Neighbours of all queries, block after block, as rows of the flattened groups; free places are at infinity."""
     num_queries, num_axes = queries.shape
     blocks = jnp.pad(queries, ((0, -num_queries % size), (0, 0)), mode="edge").reshape(-1, size, num_axes)
+    is_asked = jnp.any(fill_rows(asked, size, False).reshape(-1, size), axis=1)
     num_near = max(num_near + 2 * groups.shape[0] // blocks.shape[0], -(-k // GROUP))
-    num_near = min(num_near, groups.shape[0])
-    groups = fill_rows(groups, num_near, jnp.inf)
-    turns = _by_distance(blocks, groups, num_near)
-    found = jax.lax.map(lambda each: _search_block(*each, groups, k), (blocks, *turns))
+    if num_near < groups.shape[0]:
+        boxes = jnp.min(groups, axis=1), jnp.max(jnp.where(jnp.isfinite(groups), groups, -jnp.inf), axis=1)
+        search = lambda block: _search_near(*block, groups, boxes, num_near, k)  # noqa: E731
+    else:
+        search = lambda block: _search(block[0], groups.reshape(-1, num_axes), k)  # noqa: E731
+    rows, distance_sq = jax.lax.map(search, (blocks, is_asked))
+    found = rows.swapaxes(1, 2), jnp.isfinite(distance_sq).swapaxes(1, 2)
     return join_rows(found, num_queries)
 
 
@@ -95,57 +114,37 @@ def _curve(positions: Float[Array, "m d"], low: Float[Array, "d"], high: Float[A
     return code
 
 
-def _by_distance(
-    blocks: Float[Array, "b q d"], groups: Float[Array, "g p d"], num_near: int
-) -> tuple[Int[Array, "b t c"], Float[Array, "b t"]]:
-    """The groups in the order of the distance between their boxes and each block's, in turns of `num_near`.
-
-    Returns:
-        The groups of every turn, and the squared distance of the nearest of them; 0 for the first turn.
-    """
-    if groups.shape[0] == num_near:
-        one = (blocks.shape[0], 1)
-        return jnp.broadcast_to(jnp.arange(num_near), (*one, num_near)), jnp.zeros(one)
-    low, high = jnp.min(groups, axis=1), jnp.max(jnp.where(jnp.isfinite(groups), groups, -jnp.inf), axis=1)
-    block_low, block_high = (bound(blocks, axis=1)[:, None] for bound in (jnp.min, jnp.max))
-    gaps = jnp.maximum(jnp.maximum(low - block_high, block_low - high), 0.0)
-    gaps_sq = jnp.sum(gaps**2, axis=-1)
-    order = smallest(gaps_sq.T, groups.shape[0]).T
-    least_sq = jnp.take_along_axis(gaps_sq, order[:, num_near::num_near], axis=1)
-    least_sq = jnp.pad(least_sq, ((0, 0), (1, 0)))
-    return order.reshape(blocks.shape[0], -1, num_near), least_sq
-
-
-def _search_block(
+def _search_near(
     queries: Float[Array, "q d"],
-    turns: Int[Array, "t c"],
-    least_sq: Float[Array, "t"],
+    is_asked: Bool[Array, ""],
     groups: Float[Array, "g p d"],
+    boxes: tuple[Float[Array, "g d"], Float[Array, "g d"]],
+    num_near: int,
     k: int,
-) -> tuple[Int[Array, "q k"], Bool[Array, "q k"]]:
-    """Neighbours of one block: turn after turn, until no group of the next one can hold a nearer point."""
-
-    def look(turn: int | Int[Array, ""]) -> tuple[Int[Array, "k q"], Float[Array, "k q"]]:
-        near = turns[turn]
-        index, distance_sq = _search(queries, groups[near].reshape(-1, groups.shape[2]), k)
-        return near[index // GROUP] * GROUP + index % GROUP, distance_sq
+) -> tuple[Int[Array, "k q"], Float[Array, "k q"]]:
+    """`_search` in the `num_near` groups nearest to the queries' box, then in the next, until none is nearer."""
+    low, high = boxes
+    gaps = jnp.maximum(jnp.maximum(low - jnp.max(queries, axis=0), jnp.min(queries, axis=0) - high), 0.0)
 
     def is_open(state: tuple) -> Bool[Array, ""]:
-        turn, (_, distance_sq) = state
-        return (turn < turns.shape[0]) & ~jnp.all(distance_sq[-1] <= least_sq[turn])
+        ahead_sq, (_, distance_sq) = state
+        nearest_sq = jnp.min(ahead_sq)
+        return is_asked & jnp.isfinite(nearest_sq) & ~jnp.all(distance_sq[-1] <= nearest_sq)
 
-    def look_on(state: tuple) -> tuple:
-        turn, found = state
-        both = jax.tree.map(lambda old, new: jnp.concatenate([old, new]), found, look(turn))
+    def look(state: tuple) -> tuple:
+        ahead_sq, found = state
+        near_sq, near = jax.lax.top_k(-ahead_sq, num_near)
+        # The last turn may have room left, which must not be filled with groups that were looked at before.
+        members = jnp.where(jnp.isfinite(near_sq)[:, None, None], groups[near], jnp.inf)
+        index, distance_sq = _search(queries, members.reshape(-1, groups.shape[2]), k)
+        rows = near[index // GROUP] * GROUP + index % GROUP
+        both = jax.tree.map(lambda old, new: jnp.concatenate([old, new]), found, (rows, distance_sq))
         best = smallest(both[1], k)
-        return turn + 1, jax.tree.map(lambda rows: jnp.take_along_axis(rows, best, axis=0), both)
+        found = jax.tree.map(lambda values: jnp.take_along_axis(values, best, axis=0), both)
+        return ahead_sq.at[near].set(jnp.inf), found
 
-    if turns.shape[0] == 1:
-        rows, distance_sq = look(0)
-    else:
-        nothing = jnp.zeros((k, queries.shape[0]), jnp.int32), jnp.full((k, queries.shape[0]), jnp.inf)
-        _, (rows, distance_sq) = jax.lax.while_loop(is_open, look_on, (0, nothing))
-    return rows.T, jnp.isfinite(distance_sq).T
+    nothing = jnp.zeros((k, queries.shape[0]), jnp.int32), jnp.full((k, queries.shape[0]), jnp.inf)
+    return jax.lax.while_loop(is_open, look, (jnp.sum(gaps**2, axis=-1), nothing))[1]
 
 
 def _search(

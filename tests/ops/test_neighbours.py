@@ -52,11 +52,24 @@ def test_where_blocks_look_at_near_groups_only_and_where_they_must_look_on_neigh
     check(rng.permutation(queries), plane, rng.uniform(size=2400) < 0.9, k)
 
 
+def test_queries_that_are_not_asked_change_nothing_for_the_others():
+    """Among them are ones at infinity, as free rows of a map may be."""
+    rng = np.random.default_rng(9)
+    points, queries = (rng.uniform(-1, 1, (count, 3)).astype(np.float32) for count in (2400, 900))
+    asked = rng.uniform(size=900) < 0.3
+    queries[~asked & (rng.uniform(size=900) < 0.5)] = np.inf
+    rows, found = search(*map(jnp.asarray, (queries, points, np.ones(2400, bool))), 4, jnp.asarray(asked))
+    expected = reference.knn(queries[asked], points, np.ones(2400, bool), 4)
+    assert np.asarray(found)[asked].all()
+    distances = np.linalg.norm(points[np.asarray(rows)[asked]] - queries[asked][:, None], axis=-1)
+    np.testing.assert_allclose(distances, expected, rtol=1e-4)
+
+
 def test_an_accelerator_which_looks_at_all_points_in_one_turn_finds_the_same():
     rng = np.random.default_rng(8)
     points, queries = (rng.uniform(-1, 1, (count, 3)).astype(np.float32) for count in (700, 300))
     groups = jnp.pad(jnp.asarray(points), ((0, 4), (0, 0)), constant_values=jnp.inf).reshape(-1, 32, 3)
-    rows, found = _by_blocks(jnp.asarray(queries), groups, LARGE_BLOCK, groups.shape[0], 5)
+    rows, found = _by_blocks(jnp.asarray(queries), jnp.ones(300, bool), groups, LARGE_BLOCK, groups.shape[0], 5)
     expected = reference.knn(queries, points, np.ones(700, bool), 5)
     assert np.asarray(found).all()
     np.testing.assert_allclose(np.linalg.norm(points[rows] - queries[:, None], axis=-1), expected, rtol=1e-4)
