@@ -9,8 +9,10 @@ from emgs_jax.gaussians import FitConfig, Gaussians, cluster, spacing
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import morton_order
+from emgs_jax.ops.precision import full_precision
 
 
+@full_precision
 def initialize(
     views: Observation, T_world_views: jaxlie.SE3, camera: Camera, thin: int, config: FitConfig
 ) -> tuple[Gaussians, Float[Array, "g"], Observation]:

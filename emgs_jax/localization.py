@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation, Prediction, transform
 from emgs_jax.ops.camera import Camera, nearest_pixel, project
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
 from emgs_jax.registration.icp import IcpConfig, IcpInfo, icp
 from emgs_jax.registration.rigid import (
@@ -145,6 +146,7 @@ def _via_previous(
     return fit_rigid_robust(scale * current.points, previous.points[match], via, motion[0] @ motion[1])
 
 
+@full_precision
 def localize_coarse(
     prediction: Prediction,
     previous: Observation,
@@ -195,6 +197,7 @@ def localize_coarse(
     return CoarsePose(coarse, newest, scale, repeat_rms, median(now.points[:, 2], now.valid), is_usable)
 
 
+@full_precision
 def localize_fine(
     current: Observation, submap: Gaussians, coarse: CoarsePose, config: LocalizationConfig
 ) -> tuple[jaxlie.SE3, Observation, LocalizationInfo]:

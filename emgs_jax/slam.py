@@ -14,6 +14,7 @@ from emgs_jax.localization import LocalizationConfig, LocalizationInfo, localize
 from emgs_jax.observation import Observation, ObservationConfig, Prediction, transform
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
 from emgs_jax.registration.rigid import pose_row
@@ -87,6 +88,7 @@ def _first_weight(weight: Float[Array, "g"], config: SlamConfig) -> Float[Array,
     return jnp.where(config.em.average.gain > 0, weight, 1.0)
 
 
+@full_precision
 def init_state(
     views: Observation, T_world_views: jaxlie.SE3, camera: Camera, config: SlamConfig
 ) -> tuple[SlamState, Int[Array, ""]]:
@@ -109,6 +111,7 @@ def init_state(
     return SlamState(map, previous, pose_row(T_world_views, -1)), overflow
 
 
+@full_precision
 def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig) -> tuple[SlamState, StepInfo]:
     """Integrate one frame: localise, select, E-step, M-step, refine, insert (the paper's pipeline figure).
 
