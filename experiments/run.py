@@ -16,6 +16,7 @@ from emgs_jax.evaluation.reconstruction import EvaluationConfig, raw_prior_cloud
 from emgs_jax.io.files import FrameLog
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import describe, new_scorer, score_map, score_prior, spent
+from emgs_jax.report.printout import frame_lines
 from emgs_jax.report.provenance import print_metrics_table, provenance, write_metrics
 from emgs_jax.report.run_files import save_outputs, save_progress
 from emgs_jax.running.clock import Clock
@@ -51,7 +52,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     settings = OmegaConf.to_container(config, resolve=True)
     metrics["provenance"] = provenance(settings, dataset, prior.provenance)
     write_metrics(folder / "metrics.json", metrics)
-    for note in notes:
+    for note in [*frame_lines(session.records, len(dataset.skipped)), *notes]:
         tqdm.write(note)
     return metrics
 
