@@ -1,10 +1,106 @@
-"""MonoEM-GS as pure functions in JAX. README.md says what is where."""
+"""MonoEM-GS as pure functions in JAX: everything that a user needs, by name.
+
+`map_sequence(load_config("dataset=images", …))` maps a sequence; `init_state` and `step` are the same for a loop of
+your own. Importing this module loads nothing else: a name is fetched when it is first used.
+"""
+
+# ruff: noqa: F401 (names for type checkers)
+
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
+    from emgs_jax.data.base import BadFrameError, Dataset, Frame
+    from emgs_jax.em import EmConfig, EmInfo, em_update
+    from emgs_jax.evaluation.reconstruction import EvaluationConfig
+    from emgs_jax.gaussian_map import (
+        AverageConfig,
+        GaussianMap,
+        SubmapConfig,
+        empty_map,
+        grow,
+        insert,
+        select_submap,
+        write_back,
+    )
+    from emgs_jax.gaussians import FitConfig, Gaussians, cluster, fit_to_points
+    from emgs_jax.initialization import initialize
+    from emgs_jax.io.map_file import load_map, save_map
+    from emgs_jax.localization import (
+        CoarsePose,
+        LocalizationConfig,
+        LocalizationInfo,
+        localize_coarse,
+        localize_fine,
+    )
+    from emgs_jax.observation import Observation, ObservationConfig, Prediction, observe, transform
+    from emgs_jax.ops.camera import Camera, downscale
+    from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows
+    from emgs_jax.prior.recorded import Recorded, record
+    from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
+    from emgs_jax.registration.icp import IcpConfig, IcpInfo, icp
+    from emgs_jax.render.composite import RenderConfig, Rendering
+    from emgs_jax.render.composite import render as render_gaussians
+    from emgs_jax.render.densify import DensifyConfig, densify
+    from emgs_jax.running.compilation import use_compilation_cache
+    from emgs_jax.running.configure import RunConfig, build_dataset, build_prior, load_config
+    from emgs_jax.running.convert import FirstWindow, opening, to_camera, to_first_window, to_prediction
+    from emgs_jax.running.drive import map_frames, map_sequence, take
+    from emgs_jax.running.growth import advance, start
+    from emgs_jax.running.inputs import Input, inputs
+    from emgs_jax.running.record import FrameRecord, MappingRun, new_run
+    from emgs_jax.semantics import classify
+    from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
+
+_HOMES = {
+    "data.base": ("BadFrameError", "Dataset", "Frame"),
+    "em": ("EmConfig", "EmInfo", "em_update"),
+    "evaluation.reconstruction": ("EvaluationConfig",),
+    "gaussian_map": (
+        *("AverageConfig", "GaussianMap", "SubmapConfig"),
+        *("empty_map", "grow", "insert", "select_submap", "write_back"),
+    ),
+    "gaussians": ("FitConfig", "Gaussians", "cluster", "fit_to_points"),
+    "initialization": ("initialize",),
+    "io.map_file": ("load_map", "save_map"),
+    "localization": ("CoarsePose", "LocalizationConfig", "LocalizationInfo", "localize_coarse", "localize_fine"),
+    "observation": ("Observation", "ObservationConfig", "Prediction", "observe", "transform"),
+    "ops.camera": ("Camera", "downscale"),
+    "prior.base": ("Prior", "PriorPrediction", "Provenance", "Window", "windows"),
+    "prior.recorded": ("Recorded", "record"),
+    "refinement": ("RefinementConfig", "RefinementInfo", "refine"),
+    "registration.icp": ("IcpConfig", "IcpInfo", "icp"),
+    "render.composite": ("RenderConfig", "Rendering", "render_gaussians"),
+    "render.densify": ("DensifyConfig", "densify"),
+    "running.compilation": ("use_compilation_cache",),
+    "running.configure": ("RunConfig", "build_dataset", "build_prior", "load_config"),
+    "running.convert": ("FirstWindow", "opening", "to_camera", "to_first_window", "to_prediction"),
+    "running.drive": ("map_frames", "map_sequence", "take"),
+    "running.growth": ("advance", "start"),
+    "running.inputs": ("Input", "inputs"),
+    "running.record": ("FrameRecord", "MappingRun", "new_run"),
+    "semantics": ("classify",),
+    "slam": ("Overflow", "SlamConfig", "SlamState", "StepInfo", "init_state", "step"),
+}
+_OWN_NAMES = {"render_gaussians": "render"}  # in its file; `emgs_jax.render` is a folder
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = ["__version__", *_HOME_OF]  # noqa: PLE0604 (names from the table)
 
 try:
-    import jax
-except ImportError:  # recording predictions needs no JAX
-    pass
-else:
-    # On recent GPUs JAX rounds the factors of matrix products to ten bits (TF32): millimetres for a distant point.
-    if jax.config.jax_default_matmul_precision is None:
-        jax.config.update("jax_default_matmul_precision", "float32")
+    __version__ = version("emgs_jax")
+except PackageNotFoundError:  # a clone that is not installed
+    __version__ = "0+unknown"
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), _OWN_NAMES.get(name, name))
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -21,6 +21,7 @@ from emgs_jax.ops.linalg import (
     whitening,
 )
 from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, join_rows, split_rows, static, traced, where_rows
 
 MAX_POINTS = 16384  # whose K explanations are held at once
@@ -95,6 +96,7 @@ def widened_distance_sq(
     return jnp.maximum(distance_sq, 0.0), jnp.log(growth)
 
 
+@full_precision
 def e_step(
     gaussians: Gaussians, points: Observation, noise: Float[Array, "m 3"], config: EmConfig
 ) -> tuple[EStep, Float[Array, "m"]]:
@@ -214,6 +216,7 @@ def _add_statistics(
     return sums.at[step.rows].add(r[..., None] * statistics)
 
 
+@full_precision
 def em_update(
     submap: GaussianMap, aligned: Observation, noise: Float[Array, "m 3"], config: EmConfig
 ) -> tuple[GaussianMap, Bool[Array, "m"], EmInfo]:

@@ -46,7 +46,7 @@ class SubmapConfig(eqx.Module):
     Args:
         voxel_size: m; Gaussians are looked up by the voxel of their mean.
         margin: m; by which the box round the previous cloud is grown.
-        map_capacity: rows of the map at the start; `slam.run` doubles it when it is full.
+        map_capacity: rows of the map at the start; doubled when it is full.
         submap_capacity: rows of a submap at the start; likewise.
     """
 

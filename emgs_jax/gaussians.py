@@ -9,6 +9,7 @@ from emgs_jax.observation import Observation
 from emgs_jax.ops.clustering import kmeans, strided_seeds
 from emgs_jax.ops.linalg import dot, inverse_2x2, outer, safe_normalize, tangent_basis, whiten, whitening
 from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, take_rows, traced, where_rows
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
@@ -58,6 +59,7 @@ def spacing(thin: int, config: FitConfig) -> int:
     return max(config.points_per_gaussian // thin**2, 1)
 
 
+@full_precision
 def fit_to_points(
     centers: Float[Array, "k 3"], exists: Bool[Array, "k"], observation: Observation, config: FitConfig
 ) -> Gaussians:
@@ -93,6 +95,7 @@ def fit_to_points(
 
 
 @eqx.filter_jit
+@full_precision
 def cluster(
     observation: Observation, order: Int[Array, "p"], spacing: int, config: FitConfig
 ) -> tuple[Gaussians, Float[Array, "g"]]:

@@ -10,6 +10,7 @@ from emgs_jax.gaussians import FitConfig, Gaussians, cluster, spacing
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import morton_order
+from emgs_jax.ops.precision import full_precision
 
 
 @eqx.filter_jit
@@ -25,6 +26,7 @@ def merge(
     return world, merged, order
 
 
+@full_precision
 def initialize(
     views: Observation, T_world_views: jaxlie.SE3, camera: Camera, thin: int, config: FitConfig
 ) -> tuple[Gaussians, Float[Array, "g"], Observation]:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation, Prediction, transform
 from emgs_jax.ops.camera import Camera, nearest_pixel, project
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
 from emgs_jax.registration.icp import IcpConfig, IcpInfo, icp
 from emgs_jax.registration.rigid import (
@@ -148,6 +149,7 @@ def _pairs_via_previous(
     return previous.points[match], via
 
 
+@full_precision
 def localize_coarse(
     prediction: Prediction,
     previous: Observation,
@@ -208,6 +210,7 @@ def localize_coarse(
     )
 
 
+@full_precision
 def localize_fine(
     current: Observation, submap: Gaussians, coarse: CoarsePose, config: LocalizationConfig
 ) -> tuple[jaxlie.SE3, Observation, LocalizationInfo]:

@@ -7,6 +7,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from emgs_jax.ops.linalg import safe_normalize
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, traced
 
 
@@ -140,6 +141,7 @@ def sample_features(grid: Float[Array, "y x f"], size: tuple[int, int], thin: in
     return safe_normalize(grid)
 
 
+@full_precision
 def observe(
     points: Float[Array, "h w 3"],
     colors: Float[Array, "h w 3"],
@@ -169,6 +171,7 @@ def observe(
     return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), image)
 
 
+@full_precision
 def transform(T_target_source: jaxlie.SE3, observation: Observation, scale: Float[Array, ""]) -> Observation:
     """Scale the points about the source's origin, then move points and normals to the target frame."""
     rotate = T_target_source.rotation().as_matrix().T

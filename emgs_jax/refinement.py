@@ -11,6 +11,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, nearest_pixel
 from emgs_jax.ops.linalg import inverse_2x2, mahalanobis_sq, outer, safe_normalize
 from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, traced, where_rows
 from emgs_jax.render.composite import RenderConfig, Rendering, render_splats, splats_of
 from emgs_jax.render.project import Splats
@@ -114,6 +115,7 @@ def average_candidates(
     return where_rows(sums > 0, averaged, old)
 
 
+@full_precision
 def refine(
     submap: GaussianMap,
     candidates: Gaussians,

@@ -5,13 +5,16 @@ from jaxtyping import Array, Float, Int
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.linalg import safe_normalize
+from emgs_jax.ops.precision import full_precision
 
 
+@full_precision
 def similarities(gaussians: Gaussians, text_features: Float[Array, "c f"]) -> Float[Array, "n c"]:
     """Cosine of every Gaussian's feature and every class's text embedding; 0 for a Gaussian without a feature."""
     return safe_normalize(gaussians.features) @ safe_normalize(text_features).T
 
 
+@full_precision
 def classify(gaussians: Gaussians, text_features: Float[Array, "c f"]) -> Int[Array, "n"]:
     """Class of every Gaussian; -1 for invalid rows and for Gaussians without a feature.
 

@@ -1,8 +1,4 @@
-"""The pipeline: `init_state` and `step` are pure and jitted; `run` replays a sequence and grows what is full."""
-
-from collections.abc import Callable, Iterable
-from dataclasses import replace
-from itertools import chain
+"""The pipeline: `init_state` makes the map of the first window, `step` integrates one frame. Both are pure."""
 
 import equinox as eqx
 import jax
@@ -16,7 +12,6 @@ from emgs_jax.gaussian_map import (
     GaussianMap,
     SubmapConfig,
     empty_map,
-    grow,
     insert,
     select_submap,
     write_back,
@@ -27,6 +22,7 @@ from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationIn
 from emgs_jax.observation import Observation, ObservationConfig, Prediction, transform
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
 from emgs_jax.registration.rigid import pose_row
@@ -100,6 +96,7 @@ def _first_weight(weight: Float[Array, "g"], config: AverageConfig) -> Float[Arr
     return jnp.where(config.gain > 0, weight, 1.0)
 
 
+@full_precision
 def init_state(
     views: Observation, T_world_views: jaxlie.SE3, camera: Camera, config: SlamConfig
 ) -> tuple[SlamState, Int[Array, ""]]:
@@ -129,6 +126,7 @@ def _first_state(
     return SlamState(map, previous, pose_row(T_world_views, -1)), overflow
 
 
+@full_precision
 def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig) -> tuple[SlamState, StepInfo]:
     """Integrate one frame: localise, select, E-step, M-step, refine, insert (the paper's pipeline figure).
 
@@ -221,115 +219,3 @@ def _store(
     """The map with the submap written back and the fresh Gaussians in free rows, their count, and what did not fit."""
     map, _, overflow = insert(write_back(map, submap, rows), fresh, _first_weight(weight, config))
     return map, jnp.sum(map.gaussians.valid), overflow
-
-
-class FirstWindow(eqx.Module):
-    """The first prediction of a sequence: all views, camera frames, oldest first, with the prior's poses."""
-
-    views: Observation
-    T_world_views: jaxlie.SE3
-
-
-def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[Prediction]]:
-    """What the map is initialised from, and the steps that follow from the same window.
-
-    These are the whole window and none, or (incremental initialisation) the first view alone and each further view as
-    if it were a step's current frame. Consecutive views come from one inference, so the previous image's two
-    predictions agree exactly and the coarse pose of a step is the prior's own.
-
-    Raises:
-        ValueError: `merged`, and a view has no pose.
-    """
-    if config.initialization == "merged":
-        if not bool(jnp.all(jnp.isfinite(window.T_world_views.wxyz_xyz))):
-            raise ValueError(
-                "a view of the first window has no pose, so its points cannot be merged: use "
-                "slam.initialization=incremental, which leaves such a view out, or begin elsewhere (dataset.start=...)"
-            )
-        return window, []
-    num_views = window.views.valid.shape[0]
-    view = lambda i: jax.tree.map(lambda leaf: leaf[i], window.views)  # noqa: E731
-    poses = window.T_world_views.wxyz_xyz
-    following = [
-        Prediction(
-            current=view(i),
-            previous=view(i - 1),
-            T_world_views=jaxlie.SE3(poses[jnp.array([i - 1, i, min(i + 1, num_views - 1)])]),
-            T_world_anchor=jaxlie.SE3(poses[0]),
-            has_newest=jnp.asarray(i + 1 < num_views),
-        )
-        for i in range(1, num_views)
-    ]
-    return jax.tree.map(lambda leaf: leaf[:1], window), following
-
-
-jitted_init_state, jitted_step = init_state, step
-
-
-def with_room(config: SlamConfig, overflow: Overflow) -> SlamConfig:
-    """The config with doubled capacities where rows did not fit (host side: each new size compiles once)."""
-    submap = config.submap
-    map_factor, submap_factor = (2 if jnp.any(lost > 0) else 1 for lost in (overflow.map, overflow.submap))
-    capacities = submap.map_capacity * map_factor, submap.submap_capacity * submap_factor
-    return replace(config, submap=replace(submap, map_capacity=capacities[0], submap_capacity=capacities[1]))
-
-
-def start(
-    first: FirstWindow, camera: Camera, config: SlamConfig, init: Callable = jitted_init_state
-) -> tuple[SlamState, SlamConfig]:
-    """State of the first window, with the capacity that it needs (host side); `init` is as in `run`."""
-    state, overflow = init(first.views, first.T_world_views, camera, config)
-    while jnp.any(overflow > 0):
-        config = with_room(config, Overflow(overflow, jnp.zeros((), int), jnp.zeros((), int)))
-        state, overflow = init(first.views, first.T_world_views, camera, config)
-    return state, config
-
-
-def advance(
-    state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig, step: Callable = jitted_step
-) -> tuple[SlamState, StepInfo, SlamConfig]:
-    """One step; a map or submap that is full is doubled and the frame repeated (host side); `step` is as in `run`.
-
-    That gives the same map as starting with the larger capacity. Splats that find their tile full are only counted:
-    they change what is drawn, not what is kept.
-    """
-    new, info = step(state, prediction, camera, config)
-    while jnp.any((info.overflow.map > 0) | (info.overflow.submap > 0)):
-        config = with_room(config, info.overflow)
-        if config.submap.map_capacity > state.map.weight.shape[-1]:
-            state = eqx.tree_at(lambda s: s.map, state, grow(state.map, config.submap.map_capacity))
-        new, info = step(state, prediction, camera, config)
-    return new, info, config
-
-
-def run(
-    predictions: Iterable[FirstWindow | Prediction],
-    camera: Camera,
-    config: SlamConfig,
-    on_step: Callable[[SlamState, StepInfo], None] = lambda state, info: None,
-    init: Callable = jitted_init_state,
-    step: Callable = jitted_step,
-) -> SlamState:
-    """Map a sequence (host side): the first window, then one step for each further prediction.
-
-    Args:
-        predictions: one `FirstWindow`, then `Prediction`s in order.
-        camera: of the full images.
-        config: all stages; capacities are where to start.
-        on_step: called after each step; the views that the map is initialised from have none.
-        init: `init_state`, or what does the same for stacked configs and states (sweep.py).
-        step: `step`, likewise.
-
-    Raises:
-        ValueError: there is no prediction.
-    """
-    remaining = iter(predictions)
-    first = next(remaining, None)
-    if first is None:
-        raise ValueError("there is no prediction to map: the sequence is empty")
-    first, following = opening(first, config)
-    state, config = start(first, camera, config, init)
-    for prediction in chain(following, remaining):
-        state, info, config = advance(state, prediction, camera, config, step)
-        on_step(state, info)
-    return state

@@ -10,7 +10,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import hydra
 import jax
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -18,12 +17,14 @@ from tqdm import tqdm
 
 from emgs_jax.io.files import atomic_write, write_json
 from emgs_jax.report.provenance import provenance
-from experiments.benchmarks.comparisons import time_em, time_icp, time_render
-from experiments.benchmarks.data import load
-from experiments.benchmarks.scaling import time_growth, time_settings
-from experiments.benchmarks.stages import time_stages
-from experiments.benchmarks.timing import Timing, spread
-from experiments.building import build_dataset, build_prior, clear_errors, use_compilation_cache
+from emgs_jax.running.configure import build_dataset, build_prior
+
+from .benchmarks.comparisons import time_em, time_icp, time_render
+from .benchmarks.data import load
+from .benchmarks.scaling import time_growth, time_settings
+from .benchmarks.stages import time_stages
+from .benchmarks.timing import Timing, spread
+from .command import command
 
 
 def parts(config: DictConfig) -> dict[str, Callable[[], Iterable[Timing]]]:
@@ -85,13 +86,11 @@ def _text(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="benchmark")
+@command("benchmark")
 def main(config: DictConfig) -> None:
     """Time, print the tables and the folder."""
     folder = Path(HydraConfig.get().runtime.output_dir)
-    with clear_errors():
-        use_compilation_cache(config)
-        timings = benchmark(config, folder)
+    timings = benchmark(config, folder)
     print(report(timings))
     print(f"everything is in {folder}")
 

@@ -14,12 +14,12 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
-import hydra
 from omegaconf import DictConfig
 
 from emgs_jax.report.columns import MAIN, Column, cell, markdown
 from emgs_jax.report.sweeps import read_sweep
-from experiments.building import clear_errors
+
+from .command import command
 
 
 @dataclass(frozen=True)
@@ -138,11 +138,10 @@ def table(effects: Sequence[Effect], alignment: str = "protocol") -> str:
     return markdown(["data", "change", "runs", *(column.title for column in shown)], lines)
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="effects")
+@command("effects")
 def main(config: DictConfig) -> None:
     """Print the table."""
-    with clear_errors():
-        print(table(read_effects(config.folder, config.repetitions), config.align))
+    print(table(read_effects(config.folder, config.repetitions), config.align))
 
 
 if __name__ == "__main__":

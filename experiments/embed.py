@@ -5,12 +5,12 @@ With `features.text=FILE` a run compares the features with these classes and nee
 
 from pathlib import Path
 
-import hydra
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from emgs_jax.features.text import save_text
-from experiments.building import clear_errors
+
+from .command import command
 
 
 def embed(config: DictConfig) -> Path:
@@ -29,11 +29,10 @@ def embed(config: DictConfig) -> Path:
     return path
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="embed")
+@command("embed")
 def main(config: DictConfig) -> None:
     """Embed, and say what was written."""
-    with clear_errors():
-        embed(config)
+    embed(config)
 
 
 if __name__ == "__main__":

@@ -21,8 +21,10 @@ from emgs_jax.io.files import atomic_write, write_json
 from emgs_jax.report.gate import read_gate, regressions, write_gate
 from emgs_jax.report.results import is_finished, read_estimates, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
-from experiments.building import clear_errors, message_of, use_compilation_cache
-from experiments.run import run
+from emgs_jax.running.configure import message_of
+
+from .command import command
+from .run import run
 
 ERROR_FILE = "error.txt"
 
@@ -130,14 +132,12 @@ def _write_tables(
     return rows
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="evaluate")
+@command("evaluate")
 def main(config: DictConfig) -> None:
     """Evaluate; the exit status is 1 if a job failed or a metric got worse."""
-    with clear_errors():
-        use_compilation_cache(config)
-        problems = evaluate(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-        if problems:
-            raise ValueError("\n       ".join([f"problems: {len(problems)}", *problems]))
+    problems = evaluate(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    if problems:
+        raise ValueError("\n       ".join([f"problems: {len(problems)}", *problems]))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """The axes of a sweep: dotted keys of the config with their values, checked, and the configs of their grid."""
 
-import difflib
 import itertools
 import math
 import re
@@ -13,6 +12,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.render.densify import DensifyConfig
+from emgs_jax.running.configure import near
 from emgs_jax.running.stacked import programs
 from emgs_jax.slam import SlamConfig
 
@@ -76,11 +76,7 @@ def _at(root: dict[str, Any], path: str) -> Any:
 def _advice(key: str, known: list[str]) -> str:
     if key.split(".")[0] in ("dataset", "prior"):
         return f"a sweep predicts once, so sweep it around: experiments.sweep -m {key}=…,… or experiments.run -m"
-    ends = {name.rsplit(".", 1)[-1]: name for name in known}
-    near = difflib.get_close_matches(key, known, 5) or [
-        ends[end] for end in difflib.get_close_matches(key.rsplit(".", 1)[-1], ends, 5)
-    ]
-    return f"near names: {', '.join(near)}" if near else f"the keys are {', '.join(known)}"
+    return near(key, known)
 
 
 def variants(config: DictConfig, axes: Axes) -> list[Variant]:

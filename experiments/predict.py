@@ -8,13 +8,14 @@ own environment.
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 from tqdm import tqdm
 
 from emgs_jax.prior.base import Window
 from emgs_jax.prior.recorded import record
-from experiments.building import build_dataset, build_prior, clear_errors, measured
+from emgs_jax.running.configure import build_dataset, build_prior
+
+from .command import command
 
 
 def predict(config: DictConfig) -> Path:
@@ -31,16 +32,15 @@ def predict(config: DictConfig) -> Path:
     per_frame = f"{size / len(dataset):.2f} a frame"
     print(f"{folder}: {size:.1f} MiB, {per_frame}, {dataset.name} {dataset.sequence}, {len(dataset)} frames")
     print(f"prior {prior.provenance.name} {prior.provenance.settings}")
-    for key, value in measured(prior).items():
+    for key, value in prior.report().items():
         print(f"{key} {value:.4g}")
     return folder
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="predict")
+@command("predict")
 def main(config: DictConfig) -> None:
     """Record, and say what was recorded."""
-    with clear_errors():
-        predict(config)
+    predict(config)
 
 
 if __name__ == "__main__":

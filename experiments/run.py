@@ -5,7 +5,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -16,14 +15,17 @@ from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, raw_prior_cloud
 from emgs_jax.io.files import FrameLog
 from emgs_jax.prior.base import Prior
-from emgs_jax.report import metrics as scoring
+from emgs_jax.report.metrics import describe, new_scorer, score_map, score_prior, spent
+from emgs_jax.report.printout import frame_lines
 from emgs_jax.report.provenance import print_metrics_table, provenance, write_metrics
 from emgs_jax.report.run_files import save_outputs, save_progress
 from emgs_jax.running.clock import Clock
+from emgs_jax.running.configure import build_dataset, build_prior
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
-from emgs_jax.running.drive import map_frames
-from emgs_jax.running.record import FrameRecord, MappingRun, new_run
-from experiments.building import build_dataset, build_prior, clear_errors, measured, use_compilation_cache
+from emgs_jax.running.drive import map_frames, show_record
+from emgs_jax.running.record import FrameRecord, MappingRun, new_run, to_line
+
+from .command import command
 
 
 def run(config: DictConfig, folder: Path) -> dict[str, Any]:
@@ -43,14 +45,14 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
             notes = save_outputs(folder, session, dense, densify, title)
         with clock.phase("evaluate"):
-            scorer = scoring.new_scorer(dataset, evaluation, prior)
-            metrics = scoring.score_map(session, dense.cloud, center_cloud(session), labels, scorer)
-            metrics |= scoring.score_prior(session, raw_cloud, scorer)
-        metrics |= scoring.describe(session, dataset) | scoring.spent(clock) | measured(prior)
+            scorer = new_scorer(dataset, evaluation, prior)
+            metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
+            metrics |= score_prior(session, raw_cloud, scorer)
+        metrics |= describe(session, dataset) | spent(clock) | prior.report()
     settings = OmegaConf.to_container(config, resolve=True)
     metrics["provenance"] = provenance(settings, dataset, prior.provenance)
     write_metrics(folder / "metrics.json", metrics)
-    for note in notes:
+    for note in [*frame_lines(session.records, len(dataset.skipped)), *notes]:
         tqdm.write(note)
     return metrics
 
@@ -61,30 +63,27 @@ def _map(
     """Map all frames and log each; returns the raw prior's cloud. What an interrupted run has is written."""
     with FrameLog(folder / "frames.jsonl") as log, tqdm(total=len(dataset), unit="frame", desc="mapping") as bar:
 
-        def on_record(record: dict[str, Any]) -> None:
-            log.append(record | {"index": dataset.kept[record["index"]]})
-            bar.set_postfix_str(f"{record['status']}, {record['num_gaussians']} Gaussians", refresh=False)
-            bar.update()
+        def on_record(record: FrameRecord) -> None:
+            log.append(to_line(record) | {"index": dataset.kept[record.index]})
+            show_record(bar, record)
 
         session.on_record = on_record
         for index, reason in dataset.skipped.items():
-            log.append(vars(FrameRecord(index, None, None, "skipped", reason)))
+            log.append(to_line(FrameRecord(index, None, None, "skipped", reason)))
         try:
             with session.clock.phase("raw_prior"):
-                return raw_prior_cloud(map_frames([session], dataset, prior), evaluation)
+                return raw_prior_cloud(map_frames(session, dataset, prior), evaluation)
         except BaseException:
             with contextlib.suppress(OSError, ValueError):  # the first error is the one to show
                 save_progress(folder, session)
             raise
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="config")
+@command("config")
 def main(config: DictConfig) -> float:
     """Run, print the table and the folder; returns the trajectory error for Hydra's sweepers, inf without one."""
     folder = Path(HydraConfig.get().runtime.output_dir)
-    with clear_errors():
-        use_compilation_cache(config)
-        metrics = run(config, folder)
+    metrics = run(config, folder)
     print(print_metrics_table(metrics) if "trajectory/num_frames" in metrics else "no ground truth, so no errors")
     for key, value in metrics.items():
         if value is not None and (key.startswith("prior/") or key == "segmentation/miou_percent"):

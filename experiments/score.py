@@ -7,7 +7,6 @@ The same data, protocol and code as for our own runs; the result lies beside the
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -22,7 +21,9 @@ from emgs_jax.report.metrics import true_cloud
 from emgs_jax.report.provenance import provenance, write_metrics
 from emgs_jax.report.results import METRICS_FILE, estimates_of, is_finished, result_folder
 from emgs_jax.report.tables import average, full_table
-from experiments.building import build_dataset, clear_errors
+from emgs_jax.running.configure import build_dataset
+
+from .command import command
 
 Metrics = dict[str, Any]
 
@@ -95,11 +96,10 @@ def _span(times: np.ndarray) -> str:
     return f"{times.min():.3f} to {times.max():.3f}" if len(times) else "none"
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="score")
+@command("score")
 def main(config: DictConfig) -> None:
     """Score, print the table and where the result lies."""
-    with clear_errors():
-        metrics, path = score(config)
+    metrics, path = score(config)
     print(full_table(average(estimates_of(path), each_sequence=True)))
     print(coverage(metrics, config.min_matched_percent))
     print(f"everything is in {path}")

@@ -1,8 +1,8 @@
 """A grid of settings on one sequence: `python -m experiments.sweep sweep=gates dataset=… prior=…`.
 
-The axes are keys of a stage, from conf/sweep/ or the command line: `'axes={slam.em.normal_weight:[0,5],slam.em.noise:[0,1]}'`.
-Frames, predictions and the truth are made once for the whole grid. An interrupted sweep goes on with the same command
-and `hydra.run.dir=` its folder.
+The axes are keys of a stage, from conf/sweep/ or the command line: `'axes={slam.em.noise:[0,1]}'`. Frames, predictions
+and the truth are made once for the whole grid. An interrupted sweep goes on with the same command and `hydra.run.dir=`
+its folder.
 """
 
 import os
@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import hydra
 import jax
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
@@ -24,26 +23,27 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import raw_prior_cloud
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.recorded import Recorded, record
-from emgs_jax.report import metrics as scoring
+from emgs_jax.report.metrics import Metrics, Scorer, new_scorer, score_settings
 from emgs_jax.report.provenance import provenance
 from emgs_jax.report.sweeps import SweepResults, draw, table, write_csv
 from emgs_jax.running.clock import Clock
-from emgs_jax.running.drive import map_frames
+from emgs_jax.running.configure import build_dataset, build_prior
 from emgs_jax.running.record import new_run
-from emgs_jax.running.stacked import programs
-from experiments.building import build_dataset, build_prior, clear_errors, use_compilation_cache
-from experiments.grid import Variant, notes, read_axes, variants
+from emgs_jax.running.stacked import map_together, programs
+
+from .command import command
+from .grid import Variant, notes, read_axes, variants
 
 NOT_OF_RESULTS = ("axes", "grid", "chunk", "at_once", "compilation_cache")  # keys that change no number
 
 
 @dataclass(frozen=True)
 class Work:
-    """What all settings share; `at_once` and `num_threads` as in `map_frames`."""
+    """What all settings share; `at_once` and `num_threads` as in `map_together`."""
 
     dataset: ReadableFrames
     prior: Prior
-    scorer: scoring.Scorer
+    scorer: Scorer
     clock: Clock
     at_once: int
     num_threads: int
@@ -62,7 +62,7 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
         results = SweepResults(folder, _provenance(config, dataset, prior))
         left = [variant for variant in grid if variant.setting not in results]
         chunks = _chunks(left, config.chunk)
-        scorer = scoring.new_scorer(dataset, instantiate(config.evaluation), prior) if chunks else None
+        scorer = new_scorer(dataset, instantiate(config.evaluation), prior) if chunks else None
         with _replayed(prior, dataset, chunks, folder / "predictions") as priors, _bar(dataset, chunks) as bar:
             for chunk in chunks:
                 window_size = chunk[0].slam.window_size
@@ -129,22 +129,19 @@ def _bar(dataset: ReadableFrames, chunks: Sequence[Sequence[Variant]]) -> tqdm:
     return tqdm(total=len(dataset) * sum(map(len, chunks)), unit="frame", desc="mapping", disable=not chunks)
 
 
-def _map_and_score(work: Work, chunk: Sequence[Variant], bar: tqdm) -> list[scoring.Metrics]:
+def _map_and_score(work: Work, chunk: Sequence[Variant], bar: tqdm) -> list[Metrics]:
     runs = [new_run(work.dataset, variant.slam, work.clock, lambda record: bar.update()) for variant in chunk]
-    views = map_frames(runs, work.dataset, work.prior, work.at_once, work.num_threads)
+    views = map_together(runs, work.dataset, work.prior, work.at_once, work.num_threads)
     raw_cloud = raw_prior_cloud(views, work.scorer.evaluation)
-    return scoring.score_settings(
-        runs, raw_cloud, [variant.densify for variant in chunk], work.scorer, work.num_threads
-    )
+    densify = [variant.densify for variant in chunk]
+    return score_settings(runs, raw_cloud, densify, work.scorer, work.num_threads)
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="sweep")
+@command("sweep")
 def main(config: DictConfig) -> None:
     """Sweep, and say where the results are."""
     folder = Path(HydraConfig.get().runtime.output_dir)
-    with clear_errors():
-        use_compilation_cache(config)
-        sweep(config, folder)
+    sweep(config, folder)
     print(f"everything is in {folder}")
 
 

@@ -10,7 +10,9 @@ from scene import assert_same, at, move_gaussians, observe_room, path_pose, pose
 
 from emgs_jax.observation import Prediction, transform
 from emgs_jax.ops.pytree import stack
-from emgs_jax.slam import FirstWindow, SlamState, init_state, run, step
+from emgs_jax.running.convert import FirstWindow, opening
+from emgs_jax.running.growth import advance, start
+from emgs_jax.slam import SlamState, init_state, step
 
 one_step, first_state = eqx.filter_jit(step), eqx.filter_jit(init_state)
 FRAME = 3
@@ -139,6 +141,17 @@ def test_free_rows_of_the_map_and_invalid_points_change_nothing(state, camera, s
     assert_same(*jax.tree.map(lambda x: x[valid], (bad.map, clean.map)))
 
 
+def run(given, camera, config):
+    """State after a first window and its predictions, and what each step did."""
+    first, following = opening(given[0], config)
+    state, config = start(first, camera, config)
+    infos = []
+    for prediction in [*following, *given[1:]]:
+        state, info, config = advance(state, prediction, camera, config)
+        infos.append(info)
+    return state, infos
+
+
 def predictions(window, camera, count):
     return [window, *(predict_room(FRAME + i, camera, has_newest=i < count - 1, num_features=2) for i in range(count))]
 
@@ -151,8 +164,7 @@ def test_growing_on_the_way_gives_the_same_map_as_starting_large(window, camera,
             *(f"slam.submap.map_capacity={capacity}", f"slam.submap.submap_capacity={submap}"),
         )
         chosen = at(at(chosen, "localization.max_residual", 1.0), "localization.min_eigenvalue", 0.0)
-        infos = []
-        return run(predictions(window, camera, 3), camera, chosen, lambda s, i: infos.append(i)), infos
+        return run(predictions(window, camera, 3), camera, chosen)
 
     small, infos = mapped(64, 64)
     large, large_infos = mapped(256, 128)
@@ -178,17 +190,14 @@ def test_a_run_follows_the_exact_path_reports_every_step_and_repeats_bit_for_bit
     chosen = at(chosen, "localization.max_residual", 1.0)
     results = []
     for _ in range(2):
-        poses = []
-        state = run(predictions(window, camera, 3), camera, chosen, lambda s, i, p=poses: p.append(i.T_world_camera))
-        results.append((state, poses))
+        state, infos = run(predictions(window, camera, 3), camera, chosen)
+        results.append((state, [info.T_world_camera for info in infos]))
     assert_same(*results)
     truth = [path_pose(i) for i in range(1 if initialization == "incremental" else FRAME, FRAME + 3)]
     assert len(results[0][1]) == len(truth)
     assert max(pose_error(T, t)[0] for T, t in zip(results[0][1], truth, strict=True)) < 0.04  # 10 cm pixels
 
 
-def test_an_empty_sequence_and_an_unknown_initialisation_are_refused(camera, config, settings):
-    with pytest.raises(ValueError, match="empty"):
-        run([], camera, settings)
+def test_an_unknown_initialisation_is_refused(config):
     with pytest.raises(Exception, match="merged or incremental.*'random'"):
         config("slam.initialization=random")

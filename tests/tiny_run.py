@@ -3,16 +3,16 @@
 import dataclasses
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 
 import hydra
 
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.prior.base import PriorPrediction
+from emgs_jax.prior.base import Prior, PriorPrediction
+from emgs_jax.running import configure
+from emgs_jax.running.configure import CONF  # noqa: F401 (for the tests of scripts)
 from emgs_jax.running.drive import map_frames
 from emgs_jax.running.record import MappingRun, new_run
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 NUM_FRAMES, WINDOW_SIZE = 6, 3
 TINY = (
     *("dataset.size=[64,48]", "dataset.num_frames=40", f"dataset.stop={NUM_FRAMES}"),
@@ -26,8 +26,7 @@ TINY = (
 
 def compose(*overrides: str, name: str = "config"):
     """conf/ as Hydra composes it for a script, with the small setting."""
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        return hydra.compose(name, overrides=[*TINY, *overrides])
+    return configure.compose(*TINY, *overrides, name=name)
 
 
 @cache
@@ -35,16 +34,13 @@ def dataset() -> ReadableFrames:
     return ReadableFrames(hydra.utils.instantiate(compose().dataset))
 
 
-class EditedPrior:
+class EditedPrior(Prior):
     """The exact prior, with each prediction passed through `edit`, which may raise."""
 
     def __init__(self, edit: Callable[[PriorPrediction], PriorPrediction] = lambda prediction: prediction) -> None:
         self._prior = hydra.utils.instantiate(compose("prior.level=0").prior, classes=list(dataset().classes))
         self._edit, self.provenance = edit, self._prior.provenance
         self.feature_names, self.text_features = self._prior.feature_names, self._prior.text_features
-
-    def check(self, dataset, window_size) -> None:
-        pass
 
     def predict(self, window, frames, intrinsics) -> PriorPrediction:
         return self._edit(self._prior.predict(window, frames, intrinsics))
@@ -69,6 +65,6 @@ def map_tiny(frames, prior, *overrides: str) -> tuple[MappingRun, list]:
     maps = []
     session = new_run(frames, hydra.utils.instantiate(compose(*overrides).slam))
     session.on_record = lambda record: maps.append(session.state and session.state.map)
-    for _ in map_frames([session], frames, prior):
+    for _ in map_frames(session, frames, prior):
         pass
     return session, maps

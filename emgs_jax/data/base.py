@@ -1,7 +1,7 @@
 """What a data set gives: frames in order, their calibration and, where it is known, the truth."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -33,6 +33,7 @@ class Frame:
     labels: np.ndarray | None = None
 
 
+@runtime_checkable
 class Dataset(Protocol):
     """A sequence of frames. Construction checks the layout; `dataset[i]` reads frame i and may raise BadFrameError."""
 

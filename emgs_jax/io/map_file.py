@@ -13,9 +13,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.files import atomic_write
 
 MAP_FORMAT, MAP_VERSION = "emgs_jax.map", 1
+
+
+def save_map(path: str | os.PathLike, map: GaussianMap) -> None:
+    """Write a map as .npz; `load_map` reads the same bits."""
+    save_map_npz(path, map)
+
+
+def load_map(path: str | os.PathLike) -> GaussianMap:
+    """Read the map.npz of a run; raises ValueError for every file that is not a complete map of this version."""
+    return load_map_npz(path, GaussianMap)
 
 
 def save_map_npz(path: str | os.PathLike, tree: eqx.Module) -> None:

@@ -17,10 +17,15 @@ def save_trajectory_tum(path: str | os.PathLike, timestamps: Any, T_world_camera
         raise ValueError(f"T_world_camera must be finite ({len(timestamps)}, 4, 4), got {poses.shape}")
     lines = ["# timestamp tx ty tz qx qy qz qw"]
     for time, pose in zip(timestamps, poses, strict=True):
-        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
-        lines.append(" ".join([f"{time:.6f}", *(f"{value:.9f}" for value in (*pose[:3, 3], *quaternion))]))
+        lines.append(" ".join([f"{time:.6f}", *(f"{value:.9f}" for value in to_tum(pose))]))
     with atomic_write(path, "w") as handle:
         handle.write("\n".join(lines) + "\n")
+
+
+def to_tum(pose: np.ndarray) -> tuple[float, ...]:
+    """tx, ty, tz, qx, qy, qz, qw of a pose (4, 4), qw ≥ 0."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    return tuple(float(value) for value in (*pose[:3, 3], *quaternion))
 
 
 def load_trajectory_tum(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:

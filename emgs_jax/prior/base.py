@@ -1,12 +1,12 @@
 """What a prior gives: for a window of images, the pose of every view and dense geometry of some of them."""
 
-from collections.abc import Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from emgs_jax.data.base import Frame
+from emgs_jax.data.base import Dataset, Frame
 
 
 @dataclass(frozen=True)
@@ -58,17 +58,33 @@ class Provenance:
     is_simulated: bool = False
 
 
-@runtime_checkable
-class Prior(Protocol):
-    """Anything that predicts geometry from a window of frames. `predict` is deterministic."""
+class Prior(ABC):
+    """Anything that predicts geometry from a window of frames: a subclass has `provenance` and `predict`.
+
+    `predict` is deterministic. What else callers ask for has the answer of a prior without it.
+
+    Attributes:
+        provenance: where its predictions come from.
+        feature_names: classes that `text_features` describes; empty without features.
+        text_features: (classes, f) unit embeddings comparable with `PriorPrediction.features`.
+        is_sequential: an answer depends on the windows before it, so none of them can be left out.
+    """
 
     provenance: Provenance
-    feature_names: tuple[str, ...]  # classes that `text_features` describes; empty without features
-    text_features: np.ndarray  # (classes, f) unit embeddings comparable with `PriorPrediction.features`
+    feature_names: tuple[str, ...] = ()
+    text_features: np.ndarray = np.zeros((0, 0), np.float32)
+    is_sequential: bool = False
 
+    @abstractmethod
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Predict for `frames`, which are in the order of `window.views`."""
-        ...
+
+    def check(self, dataset: Dataset, window_size: int) -> None:  # noqa: B027 (most can answer for any data set)
+        """Raise ValueError where the prior cannot answer for the data set."""
+
+    def report(self) -> dict[str, float]:
+        """What the prior measured of itself while it predicted, as keys `prior/…`."""
+        return {}
 
 
 def windows(num_frames: int, window_size: int) -> Iterator[Window]:
@@ -85,3 +101,11 @@ def windows(num_frames: int, window_size: int) -> Iterator[Window]:
     for inference, current in enumerate(range(len(first), num_frames), start=1):
         recent = range(max(current - window_size, 0), min(current + 2, num_frames))
         yield Window(inference, tuple(dict.fromkeys((0, *recent))), (current - 1, current), current)
+
+
+def with_frames(calls: Iterable[Window], dataset: Dataset) -> Iterator[tuple[Window, dict[int, Frame]]]:
+    """Yield each window with its frames; one is read when a window needs it and dropped when the next does not."""
+    frames: dict[int, Frame] = {}
+    for window in calls:
+        frames = {index: frames[index] if index in frames else dataset[index] for index in window.views}
+        yield window, frames

@@ -11,8 +11,8 @@ from emgs_jax.features.text import load_text
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 
 
-class Featured:
-    """A prior whose predictions have the features of a feature model in place of their own (implements `Prior`).
+class Featured(Prior):
+    """A prior whose predictions have the features of a feature model in place of their own.
 
     Args:
         prior: for poses, points, confidence and mask, which are passed on unchanged.
@@ -21,7 +21,7 @@ class Featured:
 
     def __init__(self, prior: Prior, model: FeatureModel) -> None:
         self._prior, self._model = prior, model
-        self.is_sequential = getattr(prior, "is_sequential", False)
+        self.is_sequential = prior.is_sequential
         self._known: list[tuple[np.ndarray, np.ndarray]] = []  # (image, features) of the window before
         features = {**model.settings, "model": model.identity}  # before the text: names all missing files
         self.feature_names, self.text_features = model.text.names, model.text.vectors
@@ -39,7 +39,7 @@ class Featured:
 
     def report(self) -> dict[str, float]:
         """What the prior measured of itself, if it does."""
-        return getattr(self._prior, "report", dict)()
+        return self._prior.report()
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Predict geometry, and describe the dense images; an image of the window before is not described again."""
@@ -56,8 +56,8 @@ class Featured:
         return self._model.extract(image)
 
 
-class Requeried:
-    """A prior with its own features and the text embeddings of a file (implements `Prior`).
+class Requeried(Prior):
+    """A prior with its own features and the text embeddings of a file.
 
     Args:
         prior: one whose features are a feature model's: live ones or recorded.
@@ -72,8 +72,8 @@ class Requeried:
                 "choose features=… or a recording that was made with it"
             )
         text = load_text(path, features["model"])
-        self._prior, self.predict = prior, prior.predict
-        self.is_sequential = getattr(prior, "is_sequential", False)
+        self._prior = prior
+        self.is_sequential = prior.is_sequential
         self.feature_names, self.text_features = text.names, text.vectors
         settings = prior.provenance.settings | {"features": features | {"templates": [*text.templates]}}
         self.provenance = replace(prior.provenance, settings=settings)
@@ -84,4 +84,8 @@ class Requeried:
 
     def report(self) -> dict[str, float]:
         """What the prior measured of itself, if it does."""
-        return getattr(self._prior, "report", dict)()
+        return self._prior.report()
+
+    def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
+        """What the prior predicts."""
+        return self._prior.predict(window, frames, intrinsics)

@@ -27,7 +27,7 @@ import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.io.files import atomic_write
-from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows
+from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows, with_frames
 
 FORMAT, VERSION = "emgs_jax.predictions", 2
 READABLE = (1, 2)
@@ -61,12 +61,8 @@ def record(
     files["text_features.npz"] = _write(folder / "text_features.npz", _npz({"text_features": prior.text_features}))
     names = [f"{window.inference:06d}.npz" for window in calls]
     missing = {row for row, name in enumerate(names) if _digest_of(folder / name) != files.get(name, "")}
-    asked = range(max(missing, default=-1) + 1) if getattr(prior, "is_sequential", False) else missing
-    frames: dict[int, Frame] = {}
-    for window in progress(calls):
-        if window.inference not in asked:
-            continue
-        frames = {index: frames[index] if index in frames else dataset[index] for index in window.views}
+    asked = range(max(missing, default=-1) + 1) if prior.is_sequential else missing
+    for window, frames in with_frames((call for call in progress(calls) if call.inference in asked), dataset):
         prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
         if window.inference in missing:
             name = names[window.inference]
@@ -75,8 +71,8 @@ def record(
     _write_manifest(folder, header | {"complete": True}, files)
 
 
-class Recorded:
-    """A prior that replays a folder written by `record` (implements `Prior`).
+class Recorded(Prior):
+    """A prior that replays a folder written by `record`.
 
     Args:
         folder: the recording; it must be complete.

@@ -12,6 +12,7 @@ from emgs_jax.gaussians import Gaussians, intensity
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.linalg import whiten, widen
 from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, static, traced
 from emgs_jax.registration.matching import Candidates, Matches, Surface, match, surface_of
 from emgs_jax.registration.rigid import median
@@ -171,6 +172,7 @@ def _rows(y: Float[Array, "7"], matches: Matches, problem: _Problem, config: Icp
     return share * jnp.where(valid[:, None], rows, 0.0)
 
 
+@full_precision
 def icp(
     source: Observation,
     target: Gaussians,

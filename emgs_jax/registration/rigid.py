@@ -6,6 +6,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.ops.linalg import SMALLEST_LENGTH
+from emgs_jax.ops.precision import full_precision
 
 MIN_PAIRS = 16  # fewer pairs of noisy points do not make a pose
 
@@ -32,6 +33,7 @@ def median(values: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, "
     return jnp.where(count > 0, ordered[jnp.maximum(count - 1, 0) // 2], 1.0)
 
 
+@full_precision
 def fit_rigid(
     source: Float[Array, "p 3"], target: Float[Array, "p 3"], weights: Float[Array, "p"]
 ) -> tuple[jaxlie.SE3, Float[Array, ""]]:
@@ -53,6 +55,7 @@ def fit_rigid(
     return T, scale
 
 
+@full_precision
 def fit_rigid_robust(
     source: Float[Array, "p 3"], target: Float[Array, "p 3"], paired: Bool[Array, "p"], start: jaxlie.SE3
 ) -> jaxlie.SE3:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, take_rows, traced
 from emgs_jax.render.project import Splats, project_gaussians
 from emgs_jax.render.tiles import assign_tiles, tile_corners
@@ -105,6 +106,7 @@ def composite(splats: Splats, values: Float[Array, "c v"], pixels: Float[Array, 
     return weighted_sums(*blend_weights(splats, pixels, config), values)
 
 
+@full_precision
 def render(
     gaussians: Gaussians,
     values: Float[Array, "n v"],

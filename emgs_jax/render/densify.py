@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, unproject
 from emgs_jax.ops.linalg import safe_normalize
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import traced, where_rows
 from emgs_jax.render.composite import (
     RenderConfig,
@@ -53,6 +54,7 @@ class DenseView(eqx.Module):
     rendering: Rendering  # of all splats
 
 
+@full_precision
 def densify(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, config: DensifyConfig) -> DenseView:
     """Render depth, normals and colours of the map from one pose and back-project every pixel that has a depth."""
     values = jnp.concatenate([gaussians.colors, gaussians.normals], axis=-1)

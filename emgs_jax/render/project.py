@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, project
 from emgs_jax.ops.linalg import inverse_2x2
+from emgs_jax.ops.precision import full_precision
 
 # A splat that is seen at a grazing angle has no depth slope that its linearisation could hold.
 SMALLEST_COSINE = 0.1
@@ -32,6 +33,7 @@ class Splats(eqx.Module):
     valid: Bool[Array, "n"]  # in front of the camera
 
 
+@full_precision
 def project_gaussians(
     gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, scale: Float[Array, ""], blur: Float[Array, ""]
 ) -> Splats:

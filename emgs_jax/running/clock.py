@@ -4,10 +4,12 @@ import contextlib
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
 
 import jax.monitoring
 
+Item = TypeVar("Item")
 _COMPILING = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration", "backend_compile_duration")
 
 
@@ -42,6 +44,16 @@ class Clock:
             self.phases[name] += seconds - self._inner
             self._inner = around + seconds
 
+    def each(self, name: str, items: Iterable[Item]) -> Iterator[Item]:
+        """Yield the items, and count as `name` what it takes to make each of them."""
+        iterator, end = iter(items), object()
+        while True:
+            with self.phase(name):
+                item = next(iterator, end)
+            if item is end:
+                return
+            yield item
+
     @contextlib.contextmanager
     def watching(self) -> Iterator["Clock"]:
         """Listen to what JAX says of its compilations."""
@@ -64,6 +76,17 @@ class Clock:
         begin = max(begin, self._spans[-1][1]) if self._spans else begin
         self._spans.append((begin, end))
         self.compile_seconds += end - begin
+
+
+class Timer:
+    """Seconds since it was made, and what of them was compilation."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock, self._begin, self._compiled = clock, time.perf_counter(), clock.compile_seconds
+
+    def read(self) -> dict[str, float]:
+        compiled = self._clock.compile_seconds - self._compiled
+        return {"seconds": time.perf_counter() - self._begin, "compile_seconds": compiled}
 
 
 def peak_memory_mb() -> float | None:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -12,9 +13,16 @@ from emgs_jax.observation import Observation, ObservationConfig, Prediction, obs
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.pytree import stack
 from emgs_jax.prior.base import PriorPrediction
-from emgs_jax.slam import FirstWindow
+from emgs_jax.slam import SlamConfig
 
 _observe = eqx.filter_jit(observe)
+
+
+class FirstWindow(eqx.Module):
+    """The first prediction of a sequence: all views, camera frames, oldest first, with the prior's poses."""
+
+    views: Observation
+    T_world_views: jaxlie.SE3
 
 
 def to_camera(dataset: Dataset) -> Camera:
@@ -122,3 +130,36 @@ def to_prediction(
         T_world_anchor=to_se3(T_world_anchor),
         has_newest=jnp.asarray(has_newest),
     )
+
+
+def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[Prediction]]:
+    """What the map is initialised from, and the steps that follow from the same window.
+
+    These are the whole window and none, or (incremental initialisation) the first view alone and each further view as
+    if it were a step's current frame. Consecutive views come from one inference, so the previous image's two
+    predictions agree exactly and the coarse pose of a step is the prior's own.
+
+    Raises:
+        ValueError: `merged`, and a view has no pose.
+    """
+    if config.initialization == "merged":
+        if not bool(jnp.all(jnp.isfinite(window.T_world_views.wxyz_xyz))):
+            raise ValueError(
+                "a view of the first window has no pose, so its points cannot be merged: use "
+                "slam.initialization=incremental, which leaves such a view out, or begin elsewhere (dataset.start=...)"
+            )
+        return window, []
+    num_views = window.views.valid.shape[0]
+    view = lambda i: jax.tree.map(lambda leaf: leaf[i], window.views)  # noqa: E731
+    poses = window.T_world_views.wxyz_xyz
+    following = [
+        Prediction(
+            current=view(i),
+            previous=view(i - 1),
+            T_world_views=jaxlie.SE3(poses[jnp.array([i - 1, i, min(i + 1, num_views - 1)])]),
+            T_world_anchor=jaxlie.SE3(poses[0]),
+            has_newest=jnp.asarray(i + 1 < num_views),
+        )
+        for i in range(1, num_views)
+    ]
+    return jax.tree.map(lambda leaf: leaf[:1], window), following

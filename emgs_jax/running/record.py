@@ -1,19 +1,26 @@
-"""One run of the pipeline as far as it is: the state, the poses and what became of each frame."""
+"""One run of the pipeline as far as it is: the state, and what became of each frame.
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from time import perf_counter
+A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; files write it as TUM's seven numbers.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.data.base import Dataset
+from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.io.trajectory import to_tum
 from emgs_jax.localization import REASONS
 from emgs_jax.ops.camera import Camera
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.convert import to_camera
-from emgs_jax.slam import FirstWindow, SlamConfig, SlamState, StepInfo
+from emgs_jax.running.inputs import Input
+from emgs_jax.slam import SlamConfig, SlamState, StepInfo
+
+Seconds = Mapping[str, float]  # as a `Timer` reads
 
 
 @dataclass(frozen=True)
@@ -27,14 +34,23 @@ class FrameRecord:
         status: tracked, degraded (the coarse pose stays, nothing is fused), lost (not even that is known),
             initialization (the map was made from it) or skipped (it cannot be read).
         reason: why it is not tracked.
-        pose: T_world_camera as tx, ty, tz (m), qx, qy, qz, qw.
-        newest_pose: temporary pose of the next frame, likewise.
+        pose: T_world_camera; of a lost frame what stands in for it.
+        raw_pose: the same as the prior alone says; the one before where it says none.
+        true_pose: None where unknown.
+        newest_pose: temporary pose of the next frame.
         inliers: points that agree with the map.
         residual: of these to the map's planes, m.
         scale: by which the prediction was multiplied.
+        depth_noise: how much the points differ from the map, as a fraction of their depth.
+        step_m: between the coarse and the fine pose.
+        step_rad: likewise.
+        repeat_rms: how far the two predictions of the previous image are apart, m.
         fused: points that moved Gaussians.
-        refined: candidates that were merged on the image plane.
-        new: candidates that became Gaussians.
+        updated: Gaussians that they moved.
+        mean_log_joint: of the fused points with their best Gaussians.
+        candidates: Gaussians made from the points that were not fused.
+        refined: of these, merged on the image plane.
+        new: of these, added to the map.
         num_gaussians: in the map after this frame.
         overflow: splats that found their tile full.
         seconds: of mapping (conversion and step), compilation included.
@@ -46,12 +62,21 @@ class FrameRecord:
     timestamp: float | None
     status: str
     reason: str | None = None
-    pose: tuple[float, ...] | None = None
-    newest_pose: tuple[float, ...] | None = None
+    pose: np.ndarray | None = None
+    raw_pose: np.ndarray | None = None
+    true_pose: np.ndarray | None = None
+    newest_pose: np.ndarray | None = None
     inliers: int | None = None
     residual: float | None = None
     scale: float | None = None
+    depth_noise: float | None = None
+    step_m: float | None = None
+    step_rad: float | None = None
+    repeat_rms: float | None = None
     fused: int | None = None
+    updated: int | None = None
+    mean_log_joint: float | None = None
+    candidates: int | None = None
     refined: int | None = None
     new: int | None = None
     num_gaussians: int | None = None
@@ -71,102 +96,124 @@ class MappingRun:
         on_record: hears of each frame at once.
         state: None before the first window.
         records: of the frames in use, in order.
-        poses: T_world_camera (4, 4) of each record.
-        raw_poses: what the prior alone says, likewise; the pose before where it says none.
-        true_poses: None where unknown.
     """
 
     camera: Camera
     config: SlamConfig
     clock: Clock = field(default_factory=Clock)
-    on_record: Callable[[dict[str, Any]], None] = lambda record: None
+    on_record: Callable[[FrameRecord], None] = lambda record: None
     state: SlamState | None = None
     records: list[FrameRecord] = field(default_factory=list)
-    poses: list[np.ndarray] = field(default_factory=list)
-    raw_poses: list[np.ndarray] = field(default_factory=list)
-    true_poses: list[np.ndarray | None] = field(default_factory=list)
+
+    @property
+    def map(self) -> GaussianMap | None:
+        """All Gaussians; None before the first window."""
+        return None if self.state is None else self.state.map
+
+    @property
+    def poses(self) -> np.ndarray:
+        """T_world_camera of each record, (n, 4, 4)."""
+        return _stacked([record.pose for record in self.records])
+
+    @property
+    def raw_poses(self) -> np.ndarray:
+        """What the prior alone says, likewise."""
+        return _stacked([record.raw_pose for record in self.records])
+
+    @property
+    def true_poses(self) -> list[np.ndarray | None]:
+        """What the data set says, likewise; None where unknown."""
+        return [record.true_pose for record in self.records]
 
 
 def new_run(
     dataset: Dataset,
     config: SlamConfig,
     clock: Clock | None = None,
-    on_record: Callable[[dict[str, Any]], None] = lambda record: None,
+    on_record: Callable[[FrameRecord], None] = lambda record: None,
 ) -> MappingRun:
     """A run of `dataset` before its first frame."""
     return MappingRun(to_camera(dataset), config, Clock() if clock is None else clock, on_record)
 
 
-def record_step(run: MappingRun, frame: Frame, info: StepInfo, spent: dict[str, float]) -> None:
-    """Add what a step did, `info` on the host, and the seconds that it took."""
-    _add(run, frame, _matrix(info.T_world_camera.wxyz_xyz), _described(info) | spent)
+def record_lost(run: MappingRun, given: Input) -> None:
+    """Add a frame with nothing to start a map from; the anchor's pose stands in for the one that is not known."""
+    _add(run, given, 0, status="lost", reason=REASONS[0], pose=given.T_world_anchor)
 
 
-def record_initialization(run: MappingRun, window: FirstWindow, frames: list[Frame], spent: dict[str, float]) -> None:
-    """Add the frames that the map of `run.state` was made from; raises ValueError where that map is empty."""
-    poses = np.asarray(window.T_world_views.wxyz_xyz)
-    count = int(np.asarray(run.state.map.gaussians.valid).sum())
+def record_start(run: MappingRun, given: Input, spent: Seconds) -> None:
+    """Add the frames that the map of `run` was made from; raises ValueError where that map is empty."""
+    poses = np.asarray(given.taken.T_world_views.wxyz_xyz)
+    count = int(np.asarray(run.map.gaussians.valid).sum())
     if count == 0:  # no later frame could be localised in it
         raise ValueError(
-            f"the map is empty after {len(poses)} view(s) from {frames[0].name}: the prior has no valid point there; "
-            "begin elsewhere (dataset.start=...) or use slam.initialization=merged"
+            f"the map is empty after {len(poses)} view(s) from {given.frames[0].name}: the prior has no valid point "
+            "there; begin elsewhere (dataset.start=...) or use slam.initialization=merged"
         )
-    for frame, pose in zip(frames, poses, strict=False):
-        described = {"status": "initialization", "pose": _tum(pose), "num_gaussians": count}
-        _add(run, frame, _matrix(pose), described | {key: value / len(poses) for key, value in spent.items()})
+    share = {key: value / len(poses) for key, value in spent.items()}
+    for row, pose in enumerate(poses):
+        _add(run, given, row, status="initialization", pose=to_matrix(pose), num_gaussians=count, **share)
 
 
-def record_before_map(run: MappingRun, frame: Frame, pose: np.ndarray) -> None:
-    """Add a frame with nothing to start a map from; `pose` (4, 4) stands in for the one that is not known."""
-    _add(run, frame, pose, {"status": "lost", "reason": REASONS[0]})
+def record_step(run: MappingRun, given: Input, info: StepInfo, spent: Seconds) -> None:
+    """Add what a step did, `info` on the host, and the seconds that it took."""
+    _add(run, given, 0, **_described(info), **spent)
 
 
-def _add(run: MappingRun, frame: Frame, pose: np.ndarray, described: dict[str, Any]) -> None:
-    record = FrameRecord(frame.index, frame.name, frame.timestamp, **described)
+def _add(run: MappingRun, given: Input, row: int, **described: Any) -> None:
+    frame = given.frames[row]
+    record = FrameRecord(
+        index=frame.index,
+        name=frame.name,
+        timestamp=frame.timestamp,
+        raw_pose=given.raw[row].T_world_camera,
+        true_pose=frame.T_world_camera,
+        **described,
+    )
     run.records.append(record)
-    run.poses.append(pose)
-    run.true_poses.append(frame.T_world_camera)
-    run.on_record(asdict(record))
+    run.on_record(record)
 
 
 def _described(info: StepInfo) -> dict[str, Any]:
     """The fields of a record that a step fills; `info` is on the host."""
-    localization = info.localization
+    localization, em, refinement = info.localization, info.em, info.refinement
     reasons = [words for bit, words in enumerate(REASONS) if int(localization.reason) >> bit & 1]
     return {
         "status": "tracked" if localization.is_tracked else "lost" if localization.is_lost else "degraded",
         "reason": "; ".join(reasons) or None,
-        "pose": _tum(info.T_world_camera.wxyz_xyz),
-        "newest_pose": _tum(info.T_world_newest.wxyz_xyz),
+        "pose": to_matrix(info.T_world_camera.wxyz_xyz),
+        "newest_pose": to_matrix(info.T_world_newest.wxyz_xyz),
         "inliers": int(localization.icp.num_inliers),
         "residual": float(localization.icp.residual),
         "scale": float(localization.scale),
-        "fused": int(info.em.num_fused),
-        "refined": int(info.refinement.num_merged),
-        "new": int(info.refinement.num_fresh),
+        "depth_noise": float(localization.depth_noise),
+        "step_m": float(localization.step_m),
+        "step_rad": float(localization.step_rad),
+        "repeat_rms": float(localization.repeat_rms),
+        "fused": int(em.num_fused),
+        "updated": int(em.num_updated),
+        "mean_log_joint": float(em.mean_log_joint) if em.num_fused else None,
+        "candidates": int(refinement.num_candidates),
+        "refined": int(refinement.num_merged),
+        "new": int(refinement.num_fresh),
         "num_gaussians": int(info.num_gaussians),
         "overflow": int(info.overflow.tiles),
     }
 
 
-class Timer:
-    """Seconds since it was made, and what of them was compilation."""
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock, self._begin, self._compiled = clock, perf_counter(), clock.compile_seconds
-
-    def read(self) -> dict[str, float]:
-        compiled = self._clock.compile_seconds - self._compiled
-        return {"seconds": perf_counter() - self._begin, "compile_seconds": compiled}
+def to_line(record: FrameRecord) -> dict[str, Any]:
+    """A line of frames.jsonl: poses as tx, ty, tz (m), qx, qy, qz, qw."""
+    line = dict(vars(record))
+    poses = {name: value for name, value in line.items() if name.endswith("pose") and value is not None}
+    return line | {name: to_tum(pose) for name, pose in poses.items()}
 
 
-def _matrix(wxyz_xyz: np.ndarray) -> np.ndarray:
+def to_matrix(wxyz_xyz: np.ndarray) -> np.ndarray:
     """(4, 4) float64 of a pose as jaxlie holds it."""
     pose, (w, x, y, z, *translation) = np.eye(4), np.asarray(wxyz_xyz, np.float64)
     pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), translation
     return pose
 
 
-def _tum(wxyz_xyz: np.ndarray) -> tuple[float, ...]:
-    w, x, y, z, *translation = (float(value) for value in np.asarray(wxyz_xyz))
-    return (*translation, x, y, z, w)
+def _stacked(poses: list[np.ndarray]) -> np.ndarray:
+    return np.stack(poses) if poses else np.zeros((0, 4, 4))

@@ -1,21 +1,35 @@
-"""Many settings in one program: configs that differ in traced leaves only are stacked, and vmap steps them together."""
+"""Many runs of one sequence: frames are read, predicted and converted once for all of them.
+
+Runs that share a program (their configs differ in traced leaves only) can be stacked, so that vmap steps them together;
+threads step runs or stacks side by side.
+"""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import equinox as eqx
 import jax
 import jaxlie
 from jaxtyping import Array, Int
 
+from emgs_jax.data.base import Dataset
 from emgs_jax.observation import Observation, Prediction
 from emgs_jax.ops.camera import Camera
-from emgs_jax.ops.pytree import stack
-from emgs_jax.slam import FirstWindow, SlamConfig, SlamState, StepInfo, init_state, run, step
+from emgs_jax.ops.pytree import Tree, stack
+from emgs_jax.prior.base import Prior
+from emgs_jax.running.clock import Timer
+from emgs_jax.running.convert import FirstWindow
+from emgs_jax.running.drive import spent, take
+from emgs_jax.running.growth import advance, start
+from emgs_jax.running.inputs import Input, RawView, inputs
+from emgs_jax.running.record import MappingRun, record_lost, record_start, record_step
+from emgs_jax.slam import SlamConfig, SlamState, StepInfo, init_state, step
 
 
 def programs(configs: Sequence[SlamConfig]) -> list[list[int]]:
-    """Positions of the configs that can share an executable: their static fields are equal (host side).
+    """Positions of the configs that can share an executable: their static fields are equal.
 
     `observation` has to be equal as well: it decides what the predictions become before a step sees them.
     """
@@ -24,6 +38,80 @@ def programs(configs: Sequence[SlamConfig]) -> list[list[int]]:
         observation = tuple(float(leaf) for leaf in jax.tree.leaves(config.observation))
         found[jax.tree.structure(config), observation].append(position)
     return list(found.values())
+
+
+def map_together(
+    runs: Sequence[MappingRun], dataset: Dataset, prior: Prior, at_once: int = 1, num_threads: int = 1
+) -> Iterator[RawView]:
+    """`map_frames` of several runs; yields on the way what the prior alone says of each frame.
+
+    Args:
+        runs: before their first frame, with one clock; their configs share a program.
+        dataset: of all of them.
+        prior: likewise.
+        at_once: runs that vmap steps together, which keeps an accelerator busy. With 1 every run takes the very
+            executable of `map_frames`, so its result does not depend on the others, bit for bit.
+        num_threads: runs, or stacks of them, that are stepped side by side, which keeps the cores of a CPU busy.
+
+    Raises:
+        ValueError: the configs do not share a program, or there is nothing to start a map from.
+    """
+    if len(programs([run.config for run in runs])) != 1:
+        raise ValueError("the configs differ in a static field or in `observation`: map each of `programs` by itself")
+    clock = runs[0].clock
+    groups = [runs[row : row + at_once] for row in range(0, len(runs), at_once)]
+    stacks = [Stack(some) for some in groups if len(some) > 1]
+    takers = [*(group.take for group in stacks), *(partial(take, some[0]) for some in groups if len(some) == 1)]
+    num_alone = 2  # inputs with a map: the first compiles `init_state`, the second the step, once for all groups
+    with ThreadPoolExecutor(num_threads) as threads:
+        for given in inputs(dataset, prior, runs[0].config, clock):
+            with clock.phase("map"):
+                alone = takers[: 1 if num_alone else 0]
+                for taker in alone:
+                    taker(given)
+                list(threads.map(lambda taker, given=given: taker(given), takers[len(alone) :]))
+            num_alone -= bool(num_alone) and given.taken is not None
+            yield from given.raw
+    for group in stacks:
+        group.hand_out()
+
+
+class Stack:
+    """Runs whose states and configs are stacked and stepped by one call.
+
+    A stack is taken apart by `hand_out`, at the end: nobody looks at the state of one of its runs before.
+    """
+
+    def __init__(self, runs: Sequence[MappingRun]) -> None:
+        self._runs, self._configs = runs, stack([run.config for run in runs])
+        self._states: SlamState | None = None
+
+    def take(self, given: Input) -> None:
+        """`drive.take` for all runs; where the map or submap of one is full, all of them get more room."""
+        timer, camera = Timer(self._runs[0].clock), self._runs[0].camera
+        match given.taken:
+            case None:
+                for run in self._runs:
+                    record_lost(run, given)
+            case FirstWindow() as first:
+                self._states, self._configs = start(first, camera, self._configs, jitted_init_states)
+                self.hand_out()
+                for run in self._runs:
+                    record_start(run, given, spent(given, timer, len(self._runs)))
+            case Prediction() as prediction:
+                stepped = advance(self._states, prediction, camera, self._configs, jitted_step_states)
+                self._states, infos, self._configs = stepped[0], jax.device_get(stepped[1]), stepped[2]
+                for position, run in enumerate(self._runs):
+                    record_step(run, given, _item(infos, position), spent(given, timer, len(self._runs)))
+
+    def hand_out(self) -> None:
+        """Give every run its own state and config."""
+        for position, run in enumerate(self._runs):
+            run.state, run.config = _item((self._states, self._configs), position)
+
+
+def _item(tree: Tree, position: int) -> Tree:
+    return jax.tree.map(lambda leaf: leaf[position], tree)
 
 
 def init_states(
@@ -42,30 +130,3 @@ def step_states(
 
 jitted_init_states = eqx.filter_jit(init_states)
 jitted_step_states = eqx.filter_jit(step_states)
-
-
-def map_configs(
-    predictions: Iterable[FirstWindow | Prediction],
-    camera: Camera,
-    configs: Sequence[SlamConfig],
-    on_step: Callable[[SlamState, StepInfo], None] = lambda states, infos: None,
-) -> SlamState:
-    """`slam.run` for many settings with one compilation (host side).
-
-    Where one setting's map or submap is full, all of them get more room.
-
-    Args:
-        predictions: as in `slam.run`; all settings see the same.
-        camera: of the full images.
-        configs: they differ in traced leaves only, see `programs`.
-        on_step: called after each step with the stacked states and infos.
-
-    Returns:
-        The states, stacked in the order of `configs`.
-
-    Raises:
-        ValueError: the configs do not share a program, or there is no prediction.
-    """
-    if len(programs(configs)) != 1:
-        raise ValueError("the configs differ in a static field or in `observation`: map each of `programs` by itself")
-    return run(predictions, camera, stack(configs), on_step, jitted_init_states, jitted_step_states)

@@ -18,9 +18,10 @@ from emgs_jax.ops.pytree import take_rows
 from emgs_jax.registration.icp import icp
 from emgs_jax.render.composite import render
 from emgs_jax.render.project import project_gaussians
-from experiments.benchmarks import baselines
-from experiments.benchmarks.data import Data, gaussians_of, view
-from experiments.benchmarks.timing import Candidate, Timing, compare, executable, interleaved, spread
+
+from . import baselines
+from .data import Data, gaussians_of, view
+from .timing import Candidate, Timing, compare, executable, interleaved, spread
 
 
 def _host(tree: eqx.Module, valid: np.ndarray | None = None) -> dict[str, np.ndarray]:

@@ -15,8 +15,9 @@ from omegaconf import DictConfig, OmegaConf
 from emgs_jax.ops.pytree import stack
 from emgs_jax.running.stacked import step_states
 from emgs_jax.slam import step
-from experiments.benchmarks.data import Data, enlarged, first_state, load
-from experiments.benchmarks.timing import Candidate, Timing, compare, executable, interleaved
+
+from .data import Data, enlarged, first_state, load
+from .timing import Candidate, Timing, compare, executable, interleaved
 
 FAR = 50.0  # m between copies of the map: none of them is in the submap
 

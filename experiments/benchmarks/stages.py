@@ -15,8 +15,9 @@ from emgs_jax.ops.clustering import morton_order
 from emgs_jax.refinement import refine
 from emgs_jax.render.composite import render
 from emgs_jax.slam import step
-from experiments.benchmarks.data import Data, first_state
-from experiments.benchmarks.timing import Candidate, Timing, executable, interleaved
+
+from .data import Data, first_state
+from .timing import Candidate, Timing, executable, interleaved
 
 
 def time_stages(data: Data, repetitions: int) -> list[Timing]:

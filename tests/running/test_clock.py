@@ -52,6 +52,19 @@ def test_a_phase_inside_another_is_counted_once():
     assert sum(clock.phases.values()) <= clock.total_seconds
 
 
+def test_what_it_takes_to_make_items_is_counted_and_what_is_done_with_them_is_not():
+    def slow():
+        for number in range(3):
+            time.sleep(0.02)
+            yield number
+
+    clock, seen = Clock(), []
+    for item in clock.each("make", slow()):
+        time.sleep(0.1)
+        seen.append(item)
+    assert seen == [0, 1, 2] and 0.06 <= clock.phases["make"] < 0.2
+
+
 def test_the_peak_memory_contains_an_array_that_was_touched():
     before = peak_memory_mb()
     block = np.ones(64 * 2**20, np.uint8)

@@ -15,11 +15,13 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import ground_truth_cloud
 from emgs_jax.io.map_file import load_map_npz
 from emgs_jax.io.trajectory import load_trajectory_tum
+from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import new_scorer, score_map, score_prior
 from emgs_jax.report.run_files import save_outputs, save_progress
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.dense import dense_map
-from emgs_jax.running.drive import map_frames, predictions
+from emgs_jax.running.drive import map_frames
+from emgs_jax.running.inputs import inputs, predictions
 from emgs_jax.running.record import new_run
 
 
@@ -47,8 +49,8 @@ class Counting:
         return index
 
 
-class Echo:
-    """A prior that answers with the frames that it was given."""
+class Echo(Prior):
+    """Answers with the frames that it was given."""
 
     def predict(self, window, frames, intrinsics):
         return window, frames
@@ -68,11 +70,11 @@ def test_every_frame_has_one_record_with_its_true_pose_where_the_prior_is_exact(
     assert [record.index for record in session.records] == list(range(NUM_FRAMES))
     assert [record.status for record in session.records] == ["initialization"] + ["tracked"] * (NUM_FRAMES - 1)
     truth = np.stack([dataset()[i].T_world_camera for i in range(NUM_FRAMES)])
-    np.testing.assert_allclose(np.stack(session.poses), truth, atol=1e-3)  # a tenth of the bar
-    np.testing.assert_allclose(np.stack(session.raw_poses), truth, atol=1e-12)
+    np.testing.assert_allclose(session.poses, truth, atol=1e-3)  # a tenth of the bar
+    np.testing.assert_allclose(session.raw_poses, truth, atol=1e-12)
     for record, following in zip(session.records[1:], truth[2:], strict=False):
         if record.index + 1 != WINDOW_SIZE:  # the last view of the first window has no image after it
-            np.testing.assert_allclose(record.newest_pose[:3], following[:3, 3], atol=1e-3)
+            np.testing.assert_allclose(record.newest_pose[:3, 3], following[:3, 3], atol=1e-3)
 
 
 @pytest.mark.slow
@@ -85,7 +87,7 @@ def test_a_prediction_without_a_valid_point_or_pose_marks_its_frame_and_leaves_t
     record = session.records[bad]
     assert record.status == "lost" and "no valid point or pose" in record.reason
     assert same_bits(maps[bad], maps[bad - 1])
-    assert np.isfinite(np.stack(session.poses)).all() and np.isfinite(np.stack(session.raw_poses)).all()
+    assert np.isfinite(session.poses).all() and np.isfinite(session.raw_poses).all()
     gaussians = session.state.map.gaussians
     assert np.isfinite(np.asarray(gaussians.means)[np.asarray(gaussians.valid)]).all()
 
@@ -101,7 +103,7 @@ def test_a_bad_view_in_the_first_window_is_lost_and_the_others_are_not(damaged):
     session, maps = map_tiny(dataset(), EditedPrior(edit))
     assert [record.status for record in session.records[:3]] == ["initialization", "lost", "tracked"]
     assert same_bits(maps[0], maps[1])
-    found, truth = np.stack(session.poses)[2:], [dataset()[i].T_world_camera for i in range(2, NUM_FRAMES)]
+    found, truth = session.poses[2:], [dataset()[i].T_world_camera for i in range(2, NUM_FRAMES)]
     # The chain is broken, the prior's own pose is not; but how good it is nobody knows, so the tiny map pulls at it.
     np.testing.assert_allclose(found, truth, atol=0.05)
 
@@ -140,6 +142,13 @@ def test_a_prior_without_any_point_is_an_error_and_not_a_run_that_never_maps():
         map_tiny(dataset(), EditedPrior(lambda prediction: replace(prediction, mask=prediction.mask & False)))
 
 
+def test_a_sequence_without_frames_is_refused():
+    empty = Counting(0)
+    empty.name, empty.sequence = "nothing", ""
+    with pytest.raises(ValueError, match="none of the 0 frames of nothing"):
+        list(inputs(empty, Echo(), hydra.utils.instantiate(compose().slam), Clock()))
+
+
 def test_features_without_a_grid_for_each_dense_view_are_refused():
     def edit(prediction):
         return replace(prediction, features=prediction.features[0])
@@ -155,7 +164,7 @@ def test_the_merged_initialization_makes_the_map_from_the_whole_window():
     session, maps = map_tiny(frames, EditedPrior(), "slam.initialization=merged")
     assert [record.status for record in session.records] == ["initialization"] * WINDOW_SIZE
     truth = np.stack([frame.T_world_camera for frame in map(dataset().__getitem__, range(WINDOW_SIZE))])
-    np.testing.assert_allclose(np.stack(session.poses), truth, atol=1e-5)
+    np.testing.assert_allclose(session.poses, truth, atol=1e-5)
     assert len(maps) == WINDOW_SIZE and maps[0].gaussians.valid.sum() == session.records[-1].num_gaussians > 100
 
 
@@ -166,7 +175,7 @@ def test_what_is_saved_reloads_to_the_state_and_to_the_poses_at_the_data_sets_ti
     assert same_bits(load_map_npz(tmp_path / "map.npz", type(session.state.map)), session.state.map)
     times, poses = load_trajectory_tum(tmp_path / "trajectory.txt")
     assert times.tolist() == [dataset()[i].timestamp for i in range(NUM_FRAMES)]
-    np.testing.assert_allclose(poses, np.stack(session.poses), atol=1e-8)  # nine digits are written
+    np.testing.assert_allclose(poses, session.poses, atol=1e-8)  # nine digits are written
 
 
 def test_before_the_first_map_nothing_is_saved(tmp_path):
@@ -178,8 +187,7 @@ def test_before_the_first_map_nothing_is_saved(tmp_path):
 def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
     session, _ = exact()
     blind = new_run(dataset(), session.config)
-    blind.state, blind.records, blind.poses = session.state, session.records, session.poses
-    blind.raw_poses, blind.true_poses = session.raw_poses, [None] * NUM_FRAMES
+    blind.state, blind.records = session.state, [replace(record, true_pose=None) for record in session.records]
     config = hydra.utils.instantiate(compose().densify)
     dense = dense_map(blind, dataset(), config, voxel=0.02)
     assert len(dense.cloud) > 1000 and len(dense.pictures) == 4
@@ -212,9 +220,9 @@ def test_the_map_does_not_start_at_the_origin_but_at_the_first_true_pose_and_at_
             return super().predict(window, [dataset()[index] for index in window.views], intrinsics)
 
     session = new_run(Blind(dataset()), exact()[0].config)
-    for _ in map_frames([session], Blind(dataset()), Knowing()):
+    for _ in map_frames(session, Blind(dataset()), Knowing()):
         pass
     origin = np.linalg.inv(dataset()[0].T_world_camera)
     expected = np.stack([origin @ pose for pose in exact()[0].poses])
-    np.testing.assert_allclose(np.stack(session.poses), expected, atol=1e-3)
+    np.testing.assert_allclose(session.poses, expected, atol=1e-3)
     assert session.true_poses == [None] * NUM_FRAMES

@@ -1,16 +1,26 @@
-"""Many settings at once; oracle: `slam.run` with each of them by itself."""
+"""Many settings at once; oracle: a run with each of them by itself."""
 
 import jax
 import numpy as np
 import pytest
 from scene import at, observe_room, path_pose, predict_room, slam_config, stack_poses
+from tiny_run import EditedPrior, dataset
 
+from emgs_jax.data.base import Frame
 from emgs_jax.ops.pytree import stack
-from emgs_jax.running.stacked import map_configs, programs
-from emgs_jax.slam import FirstWindow, run
+from emgs_jax.running.convert import FirstWindow
+from emgs_jax.running.drive import take
+from emgs_jax.running.inputs import Input, RawView
+from emgs_jax.running.record import MappingRun
+from emgs_jax.running.stacked import Stack, map_together, programs
 
 WHOLE = ("slam.localization.coarse=same_image", "slam.initialization=merged")
 FRAME = 3
+
+
+def shown(index: int) -> tuple[Frame, RawView]:
+    image = np.zeros((24, 32, 3), np.uint8)
+    return Frame(index, float(index), str(index), image), RawView(image, image[..., 0] > 0, image, np.eye(4))
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +28,11 @@ def sequence(camera):
     poses = [path_pose(i) for i in range(FRAME)]
     views = stack([observe_room(T, camera, num_features=2) for T in poses])
     steps = [predict_room(FRAME + i, camera, has_newest=i < 1, num_features=2) for i in range(2)]
-    return [FirstWindow(views, stack_poses(poses)), *steps]
+    first = Input(*zip(*map(shown, range(FRAME)), strict=True), FirstWindow(views, stack_poses(poses)), np.eye(4), {})
+    return [
+        first,
+        *(Input(*((part,) for part in shown(FRAME + i)), step, np.eye(4), {}) for i, step in enumerate(steps)),
+    ]
 
 
 @pytest.mark.slow
@@ -30,25 +44,29 @@ def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_
             for size in (128, 512)
         )
     )
-    infos, alone = [], []
-    states = map_configs(sequence, camera, configs, lambda _, info: infos.append(info))
-    for i, config in enumerate(roomy):
-        state = run(sequence, camera, config, lambda _, info: alone.append(info))
-        count, mine = int(state.map.gaussians.valid.sum()), jax.tree.map(lambda leaf, i=i: leaf[i], states)
-        assert int(mine.map.gaussians.valid.sum()) == count
-        for a, b in zip(jax.tree.leaves(mine.map), jax.tree.leaves(state.map), strict=True):
+    together, alone = ([MappingRun(camera, config) for config in some] for some in (configs, roomy))
+    stacked = Stack(together)
+    for given in sequence:
+        stacked.take(given)
+        for run in alone:
+            take(run, given)
+    stacked.hand_out()
+    for mine, run in zip(together, alone, strict=True):
+        count = int(run.map.gaussians.valid.sum())
+        assert int(mine.map.gaussians.valid.sum()) == count and mine.map.weight.shape == (512,)
+        for a, b in zip(jax.tree.leaves(mine.map), jax.tree.leaves(run.map), strict=True):
             np.testing.assert_allclose(a[:count], b[:count], atol=1e-5)
-        np.testing.assert_allclose(mine.T_world_previous.wxyz_xyz, state.T_world_previous.wxyz_xyz, atol=1e-5)
-    assert states.map.weight.shape == (3, 512)
-    for step in range(2):
-        fused = [int(alone[2 * i + step].em.num_fused) for i in range(3)]
-        assert infos[step].em.num_fused.tolist() == fused and len(set(fused)) == 3
+        np.testing.assert_allclose(mine.poses, run.poses, atol=1e-5)
+        assert [record.fused for record in mine.records] == [record.fused for record in run.records]
+        assert [record.index for record in mine.records] == list(range(FRAME + 2))
+    for step in range(FRAME, FRAME + 2):
+        assert len({run.records[step].fused for run in alone}) == 3  # the settings do something
 
 
-def test_configs_share_a_program_where_only_traced_leaves_differ(sequence, camera):
+def test_configs_share_a_program_where_only_traced_leaves_differ(camera):
     base = slam_config()
     configs = [base, at(base, "em.noise", 0.5), slam_config("slam.em.num_neighbours=4"), at(base, "fit.min_std", 0.02)]
     configs.append(at(base, "observation.min_confidence", 2.0))
     assert programs(configs) == [[0, 1, 3], [2], [4]]
     with pytest.raises(ValueError, match="programs"):
-        map_configs(sequence, camera, configs)
+        next(map_together([MappingRun(camera, config) for config in configs], dataset(), EditedPrior()))

@@ -8,7 +8,7 @@ from hydra.errors import ConfigCompositionException
 from hydra.utils import instantiate
 from tiny_run import CONF, compose, dataset
 
-from experiments.building import build_prior
+from emgs_jax.running.configure import build_prior
 from experiments.embed import embed
 
 

@@ -51,14 +51,13 @@ MAPPING = """
 import sys
 import hydra
 from experiments import run  # everything that a run imports
-from experiments.building import build_dataset, build_prior
+from emgs_jax.running.configure import build_dataset, build_prior, compose
 from emgs_jax.running.record import new_run
-from emgs_jax.running.drive import predictions
+from emgs_jax.running.inputs import predictions
 from emgs_jax.running.convert import to_first_window
 import numpy as np
 
-with hydra.initialize_config_dir(version_base="1.3", config_dir=sys.argv[1]):
-    config = hydra.compose("config", overrides=sys.argv[2:])
+config = compose(*sys.argv[1:])
 dataset = build_dataset(config)
 prior = build_prior(config, dataset)
 session = new_run(dataset, hydra.utils.instantiate(config.slam))
@@ -80,5 +79,5 @@ def test_mapping_a_recording_imports_no_pytorch(tmp_path):
     text = ("experiments.embed", "features=random", "classes=[lamp]", f"out={tmp_path / 'text.npz'}")
     python(program, *text)
     replay = ("prior=recorded", f"prior.folder={tmp_path / 'recording'}", f"features.text={tmp_path / 'text.npz'}")
-    said = python(MAPPING, ROOT / "conf", *TINY, *replay, path=tmp_path)
+    said = python(MAPPING, *TINY, *replay, path=tmp_path)
     assert said.splitlines() == ["features 16 inferences 4", "[]"]

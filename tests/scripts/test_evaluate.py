@@ -20,7 +20,7 @@ from emgs_jax.io.files import write_json
 from emgs_jax.report.gate import read_gate
 from emgs_jax.report.provenance import RESULT_FORMAT
 from emgs_jax.report.results import METRICS_FILE
-from experiments.building import clear_errors
+from experiments.command import clear_errors
 
 ENVIRONMENT = os.environ | {"JAX_PLATFORMS": "cpu"}
 

@@ -18,7 +18,7 @@ from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.map_file import load_map_npz
 from emgs_jax.io.trajectory import load_trajectory_tum
-from experiments.building import clear_errors
+from experiments.command import clear_errors
 
 FILES = {"trajectory.txt", "map.npz", "map.ply", "points.ply", "mesh.ply", "frames.jsonl", "overview.png"}
 ERRORS = [f"{kind}_{size}cm_percent" for size in (20, 5) for kind in ("f1", "precision", "recall")]

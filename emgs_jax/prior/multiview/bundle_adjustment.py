@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, project
 from emgs_jax.ops.linalg import inverse_3x3
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, traced
 
 
@@ -104,6 +105,7 @@ def _residuals(xi: Float[Array, "v 6"], args: tuple) -> Float[Array, "v l 2"]:
     return jnp.where(seen, jnp.sqrt(jnp.log1p(safe) / safe), 0.0)[..., None] * errors
 
 
+@full_precision
 def adjust(
     T_ref_view: jaxlie.SE3,
     points: Float[Array, "l 3"],

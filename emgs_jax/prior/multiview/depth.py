@@ -7,6 +7,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from emgs_jax.ops.camera import Camera, nearest_pixel, project, unproject
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, traced
 from emgs_jax.prior.multiview.plane_sweep import SweepConfig, inverse_depths, sweep
 from emgs_jax.prior.multiview.semi_global import SemiGlobalConfig, aggregate
@@ -53,6 +54,7 @@ def _median(depth: Float[Array, "h w"], radius: int) -> Float[Array, "h w"]:
     return jnp.sort(jnp.stack(around), axis=0)[len(around) // 2]
 
 
+@full_precision
 def estimate_depth(
     gray: Float[Array, "h w"],
     sources: Float[Array, "s h w"],
@@ -86,6 +88,7 @@ def estimate_depth(
     return _median(jnp.where(valid, 1.0 / inverse, 0.0), config.median_radius)
 
 
+@full_precision
 def count_agreeing(
     depth: Float[Array, "h w"],
     others: Float[Array, "s h w"],

@@ -19,7 +19,7 @@ import numpy as np
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.ops.camera import Camera
-from emgs_jax.prior.base import PriorPrediction, Provenance, Window
+from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate_depth
 from emgs_jax.prior.multiview.incremental import StructureConfig, extend, initialize
 from emgs_jax.prior.multiview.landmarks import Structure, View, calibration, detect, forget, link
@@ -54,16 +54,14 @@ def _values(config: StructureConfig | DenseConfig) -> dict:
     return jax.tree.map(lambda v: float(str(np.float32(v))) if isinstance(v, jax.Array) else v, asdict(config))
 
 
-class MultiviewStereo:
-    """Structure from motion and plane-sweep stereo of a sliding window (implements `Prior`).
+class MultiviewStereo(Prior):
+    """Structure from motion and plane-sweep stereo of a sliding window.
 
     Args:
         structure: poses and landmarks.
         dense: depth.
     """
 
-    feature_names: tuple[str, ...] = ()
-    text_features = np.zeros((0, 0), np.float32)
     is_sequential = True  # a window needs those before it
 
     def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:

@@ -24,8 +24,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.data.base import Dataset, Frame
-from emgs_jax.prior.base import PriorPrediction, Provenance, Window
+from emgs_jax.data.base import Frame
+from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.network.framework import (
     MODELS,
     ComputeConfig,
@@ -42,8 +42,8 @@ from emgs_jax.prior.network.torch_network import load_network
 _usable, _consistent = eqx.filter_jit(usable), eqx.filter_jit(consistent)
 
 
-class MapAnything:
-    """A prior that asks a network of the framework (implements `Prior`).
+class MapAnything(Prior):
+    """A prior that asks a network of the framework.
 
     Args:
         model: name in `framework.MODELS`.
@@ -57,9 +57,6 @@ class MapAnything:
         masks: which pixels can be used.
         load: makes the network; tests put another one here.
     """
-
-    feature_names: tuple[str, ...] = ()
-    text_features = np.zeros((0, 0), np.float32)
 
     def __init__(
         self,
@@ -105,9 +102,6 @@ class MapAnything:
             "memory_efficient": compute.memory_efficient,
             "minibatch_size": compute.minibatch_size,
         }
-
-    def check(self, dataset: Dataset, window_size: int) -> None:
-        """Accept every data set: all have images of one size with intrinsics."""
 
     def report(self) -> dict[str, float]:
         """What was measured so far: seconds of an inference (median), peak of the GPU's memory (0 without one)."""

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.ops.camera import NEAREST_DEPTH
 from emgs_jax.ops.linalg import safe_normalize
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import traced
 
 
@@ -97,6 +98,7 @@ def above_percentile(confidence: Float[Array, "h w"], percentile: Float[Array, "
     return (confidence > jnp.quantile(confidence, percentile / 100.0)) | (percentile <= 0)
 
 
+@full_precision
 def usable(
     points: Float[Array, "h w 3"],
     confidence: Float[Array, "h w"],
@@ -160,6 +162,7 @@ def consistent_share(
     return jnp.sum(agrees, axis=0) / jnp.maximum(num_seen, 1).astype(jnp.float32), num_seen
 
 
+@full_precision
 def consistent(
     row: Int[Array, ""],
     depths: Float[Array, "v h w"],

@@ -27,7 +27,7 @@ import numpy as np
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.features.text import random_embeddings
-from emgs_jax.prior.base import PriorPrediction, Provenance, Window
+from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.simulated.noise import (
     Stream,
     autoregressive,
@@ -64,8 +64,8 @@ class Standard:
     feature_cosine: float = 0.8  # expected cosine of a feature and the embedding of its class
 
 
-class Simulated:
-    """A prior that disturbs the ground truth (implements `Prior`).
+class Simulated(Prior):
+    """A prior that disturbs the ground truth.
 
     Args:
         level: 0 gives the exact truth, 1 the standard disturbance; all standard deviations scale with it.

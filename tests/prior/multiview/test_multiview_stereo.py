@@ -13,7 +13,7 @@ from emgs_jax.prior.base import Prior, windows
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.convert import to_first_window, to_se3
-from emgs_jax.running.drive import predictions
+from emgs_jax.running.inputs import predictions
 
 WINDOW_SIZE, NUM_FRAMES = 5, 8  # at this size a first window of 4 images leaves depths 15 % wrong
 SMALL = (

@@ -1,0 +1,49 @@
+"""Executables kept on disk for the next process."""
+
+import os
+import sys
+from pathlib import Path
+
+MAX_BYTES = 2 * 2**30  # what was not used for longest goes first
+
+
+def cache_folder() -> Path:
+    """Where executables are kept unless something else is said: below XDG_CACHE_HOME or ~/.cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "emgs_jax" / "jax"
+
+
+def use_compilation_cache(folder: str | None = "auto") -> None:
+    """Keep executables in a folder from here on; several processes may share it.
+
+    Args:
+        folder: `auto` is `cache_folder()`, but where JAX has been told a folder (JAX_COMPILATION_CACHE_DIR or
+            `jax.config`) that one stays, with its settings; None or `off` keeps nothing that nobody asked for.
+    """
+    if folder is None or str(folder) in ("off", "False"):
+        return
+    try:
+        import jax
+    except ImportError:  # recording predictions needs no JAX, unless the prior does
+        return
+    if str(folder) == "auto" and jax.config.jax_compilation_cache_dir is not None:
+        return
+    path = cache_folder() if str(folder) == "auto" else Path(folder).expanduser()
+    if (problem := _problem_of(path)) is not None:
+        print(f"warning: nothing is kept of what JAX compiles, {path}: {problem}", file=sys.stderr)
+        return
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _problem_of(path: Path) -> str | None:
+    """Why nothing can be written into a folder, which is made where it is missing; None where all is well."""
+    probe = path / f".{os.getpid()}.tmp"
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        return error.strerror or str(error)
+    return None

@@ -1,0 +1,199 @@
+"""From words to what a run is made of: conf/ composed with overrides, the data set and the prior that it names.
+
+Nothing here needs JAX, because predictions are recorded where there may be none.
+"""
+
+import copy
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.singleton import Singleton
+from hydra.errors import ConfigCompositionException, HydraException, InstantiationException, MissingConfigException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.prior.base import Prior
+from emgs_jax.prior.featured import Featured, Requeried
+
+if TYPE_CHECKING:
+    from emgs_jax.evaluation.reconstruction import EvaluationConfig
+    from emgs_jax.render.densify import DensifyConfig
+    from emgs_jax.slam import SlamConfig
+
+# Installed below the package, in a clone beside it.
+CONF = next(
+    folder for folder in (Path(__file__).parents[1] / "conf", Path(__file__).parents[2] / "conf") if folder.is_dir()
+)
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """One sequence and how it is mapped.
+
+    Args:
+        settings: everything, as plain values; what the next ones are made of.
+        slam: all stages.
+        densify: what of a rendered view becomes a point.
+        evaluation: the protocol of the comparison with the truth.
+    """
+
+    settings: dict[str, Any]
+    slam: "SlamConfig"
+    densify: "DensifyConfig"
+    evaluation: "EvaluationConfig"
+
+
+def load_config(*overrides: str, name: str = "config") -> RunConfig:
+    """What the command line makes of the same words: `load_config("dataset=images", "dataset.root=video.mp4")`.
+
+    Args:
+        overrides: as for `emgs run`; `emgs run --help` lists them.
+        name: of a file of conf/.
+
+    Raises:
+        ValueError: an override names no key or option; the message names near ones.
+    """
+    config = compose(*overrides, name=name)
+    try:
+        slam, densify, evaluation = (instantiate(config[part]) for part in ("slam", "densify", "evaluation"))
+    except InstantiationException as error:
+        raise ValueError(message_of(error)) from error
+    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    return RunConfig(settings=settings, slam=slam, densify=densify, evaluation=evaluation)
+
+
+def compose(*overrides: str, name: str = "config") -> DictConfig:
+    """conf/`name`.yaml with overrides; raises ValueError where one names no key or option."""
+    with _hydra():
+        try:
+            config = hydra.compose(name, list(overrides))
+        except (ConfigCompositionException, MissingConfigException) as error:
+            raise ValueError(_explained(error, name, overrides)) from error
+        except HydraException as error:  # of the grammar
+            raise ValueError(str(error)) from error
+    for group, options in groups().items():
+        value = OmegaConf.select(config, group.replace("/", "."), default=None)
+        if isinstance(value, str):
+            raise ValueError(
+                f"{group.replace('/', '.')}={value} would put a word in the place of all its keys: choose one of its "
+                f"options ({', '.join(options)}) with {group}={value if value in options else options[0]}"
+            )
+    return config
+
+
+@contextmanager
+def _hydra() -> Iterator[None]:
+    """Hydra over conf/; whatever state of it there is comes back at the end, so this works inside of its programs."""
+    before = copy.deepcopy(Singleton.get_state())
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+            yield
+    finally:
+        Singleton.set_state(before)
+
+
+def groups() -> dict[str, list[str]]:
+    """Every group of conf/ and the names of its options."""
+    found: dict[str, list[str]] = {}
+    for path in sorted(CONF.rglob("*.yaml")):
+        if path.parent != CONF:
+            found.setdefault(path.parent.relative_to(CONF).as_posix(), []).append(path.stem)
+    return found
+
+
+def _explained(error: HydraException, name: str, overrides: Sequence[str]) -> str:
+    """What is wrong with the overrides, and what might have been meant."""
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    options = groups()
+    choices = [override for override in parsed if override.key_or_group.split("@")[0] in options]
+    for override in choices:
+        group = override.key_or_group
+        if override.value() is not None and str(override.value()) not in options.get(group, [str(override.value())]):
+            return f"{override.input_line} is no option of {group}: there are {', '.join(options[group])}"
+    values = [override for override in parsed if override not in choices]
+    try:
+        known = keys_of(hydra.compose(name, [override.input_line for override in choices]))
+    except HydraException:
+        return str(error)
+    for override in values:
+        key = override.key_or_group
+        parts = [group for group in options if group.startswith(f"{key}/")]
+        if parts:
+            return f"{override.input_line}: {key} is chosen by its parts: {', '.join(f'{part}=…' for part in parts)}"
+        if not override.is_add() and not key.startswith("hydra") and key not in known:
+            return f"{key} is no key of the config; {near(key, sorted(known))}"
+    return str(error)
+
+
+def first_of_sweep(override: Override) -> str:
+    """The override of the first job where there are several values, else the override."""
+    if not override.is_sweep_override():
+        return override.input_line
+    return f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}"
+
+
+def keys_of(config: DictConfig) -> set[str]:
+    """Dotted keys of all nodes."""
+    found = set()
+
+    def walk(node: Any, path: tuple[str, ...]) -> None:
+        found.add(".".join(path))
+        if isinstance(node, Mapping):
+            for name, value in node.items():
+                walk(value, (*path, str(name)))
+
+    walk(OmegaConf.to_container(config, resolve=False), ())
+    return found - {""}
+
+
+def near(key: str, known: Sequence[str]) -> str:
+    """Words that name what `key` may have meant."""
+    last = key.rsplit(".", 1)[-1]
+    ends = {name: name.rsplit(".", 1)[-1] for name in known}
+    similar = difflib.get_close_matches(last, set(ends.values()), 5)
+    found = [name for name in known if ends[name] == last] + difflib.get_close_matches(key, known, 5)
+    found += [name for end in similar for name in known if ends[name] == end]
+    found = list(dict.fromkeys(found))[:5]
+    return f"near names: {', '.join(found)}" if found else f"the keys are {', '.join(known)}"
+
+
+def build_dataset(config: DictConfig) -> ReadableFrames:
+    """The data set of a config, without unreadable frames where it says so."""
+    dataset = instantiate(config.dataset)
+    return ReadableFrames(dataset, config.on_bad_frame, partial(tqdm, desc="checking", unit="frame"))
+
+
+def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
+    """The prior of a config; raises ValueError where it cannot answer for the data set."""
+    known = {"classes": list(dataset.classes)} if "classes" in config.prior else {}
+    prior = attach_features(config.features, dataset, instantiate(config.prior, **known))
+    prior.check(dataset, config.slam.window_size)
+    return prior
+
+
+def attach_features(config: DictConfig, dataset: ReadableFrames, prior: Prior) -> Prior:
+    """The prior with the features of a config; without a feature model its own, compared with the text of a file."""
+    if "_target_" not in config:
+        return prior if config.text is None else Requeried(prior, config.text)
+    classes = config.classes
+    if classes is None:  # all names of the file, or the data set's
+        classes = dataset.classes if config.text is None else ()
+    return Featured(prior, instantiate(config, classes=list(classes)))
+
+
+def message_of(error: Exception) -> str:
+    """What is wrong, without Hydra's wrapping."""
+    cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
+    return str(cause) or type(cause).__name__

@@ -1,0 +1,143 @@
+"""What a run takes, one input after the other: frames are read, predicted and converted when their turn comes."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.observation import Prediction
+from emgs_jax.prior.base import Prior, PriorPrediction, windows, with_frames
+from emgs_jax.running.clock import Clock, Timer
+from emgs_jax.running.convert import FirstWindow, opening, to_first_window, to_prediction
+from emgs_jax.slam import SlamConfig
+
+
+class RawView(NamedTuple):
+    """What the prior alone says of a frame: points (h, w, 3) of its camera, under the mask that the mapping uses."""
+
+    points: np.ndarray
+    mask: np.ndarray
+    image: np.ndarray
+    T_world_camera: np.ndarray  # the frame's before where the prior says none
+
+
+@dataclass(frozen=True)
+class Input:
+    """What a run takes at once.
+
+    Args:
+        frames: one; several where the map is made from all of them.
+        raw: what the prior alone says of each.
+        taken: what the map starts from, or the prediction of a step; None where there is nothing to start from yet.
+        T_world_anchor: known pose of the first frame.
+        spent: seconds of the conversion.
+    """
+
+    frames: tuple[Frame, ...]
+    raw: tuple[RawView, ...]
+    taken: FirstWindow | Prediction | None
+    T_world_anchor: np.ndarray
+    spent: Mapping[str, float]
+
+
+def inputs(dataset: Dataset, prior: Prior, config: SlamConfig, clock: Clock) -> Iterator[Input]:
+    """All inputs of a sequence: frames from which no map can start, what it starts from, then steps.
+
+    The pose of the first frame is the true one where it is known, else the identity.
+
+    Raises:
+        ValueError: no frame has a point and a pose from which a map can start.
+    """
+    num_done, last, is_started = 0, np.eye(4), False
+    for prediction, frames in predictions(dataset, prior, config.window_size, clock):
+        with clock.phase("map"):
+            anchor = first_pose(frames)
+            raw = _raw_views(prediction, frames, anchor, (num_done, last if num_done else anchor), config)
+            convert = _step if is_started else _opening
+            found = convert(prediction, frames, anchor, raw, config, clock)
+        yield from found
+        num_done, last = prediction.window.current + 1, found[-1].raw[-1].T_world_camera
+        is_started = found[-1].taken is not None
+    if not is_started:
+        raise ValueError(
+            f"none of the {num_done} frames of {dataset.name} {dataset.sequence} has a valid point and a "
+            "pose, so there is nothing to start a map from: take frames farther apart or closer together "
+            "(dataset.stride=...), larger images (dataset.size=...) or another prior"
+        )
+
+
+def predictions(
+    dataset: Dataset, prior: Prior, window_size: int, clock: Clock
+) -> Iterator[tuple[PriorPrediction, dict[int, Frame]]]:
+    """Ask the prior window by window; a frame is read when a window needs it and dropped when none does."""
+    for window, frames in clock.each("load", with_frames(windows(len(dataset), window_size), dataset)):
+        with clock.phase("predict"):
+            prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
+        yield prediction, frames
+
+
+def first_pose(frames: Mapping[int, Frame]) -> np.ndarray:
+    """T_world_camera of the anchor, (4, 4) float64; the identity where the truth is unknown."""
+    truth = frames[0].T_world_camera
+    return np.eye(4) if truth is None else np.asarray(truth, np.float64)
+
+
+def _step(
+    prediction: PriorPrediction,
+    frames: Mapping[int, Frame],
+    anchor: np.ndarray,
+    raw: Mapping[int, RawView],
+    config: SlamConfig,
+    clock: Clock,
+) -> list[Input]:
+    """The step that integrates the current frame."""
+    timer, current = Timer(clock), prediction.window.current
+    step = to_prediction(prediction, frames, anchor, config.observation)
+    return [Input((frames[current],), (raw[current],), step, anchor, timer.read())]
+
+
+def _opening(
+    prediction: PriorPrediction,
+    frames: Mapping[int, Frame],
+    anchor: np.ndarray,
+    raw: Mapping[int, RawView],
+    config: SlamConfig,
+    clock: Clock,
+) -> list[Input]:
+    """The new frames that come before a map can start, what it starts from, and the steps from the same window."""
+    timer = Timer(clock)
+    window, usable = to_first_window(prediction, frames, anchor, config.observation, since=min(raw))
+    before = [index for index in raw if not usable or index < usable[0]]
+    found = [Input((frames[index],), (raw[index],), None, anchor, {}) for index in before]
+    if window is None:
+        return found
+    first, steps = opening(window, config)
+    count = len(usable) - len(steps)  # views that the map is made from
+    shown = tuple(frames[index] for index in usable[:count]), tuple(raw[index] for index in usable[:count])
+    found.append(Input(*shown, first, anchor, timer.read()))
+    for index, step in zip(usable[count:], steps, strict=True):
+        found.append(Input((frames[index],), (raw[index],), step, anchor, {}))
+    return found
+
+
+def _raw_views(
+    prediction: PriorPrediction,
+    frames: Mapping[int, Frame],
+    anchor: np.ndarray,
+    done: tuple[int, np.ndarray],
+    config: SlamConfig,
+) -> dict[int, RawView]:
+    """Pose and points of each new frame as predicted; `done`: how many frames there were, and the last one's pose."""
+    window, (num_done, pose_before), views = prediction.window, done, {}
+    for row, index in enumerate(window.dense):
+        if index < num_done:
+            continue
+        pose = anchor @ prediction.T_anchor_view[window.views.index(index)]
+        mask = prediction.mask[row] & (prediction.confidence[row] >= float(config.observation.min_confidence))
+        if not np.isfinite(pose).all():
+            pose, mask = pose_before, np.zeros_like(mask)
+        views[index] = RawView(prediction.points[row], mask, frames[index].image, pose)
+        pose_before = pose
+    return views

@@ -1,0 +1,42 @@
+"""The commands of the package: `emgs run dataset=…`; `emgs --help` lists them."""
+
+import sys
+from importlib import import_module
+
+COMMANDS = {  # name: (what it does, an example)
+    "run": ("map one sequence", "emgs run dataset=tum dataset.root=tum dataset.sequence=rgbd_dataset_freiburg1_desk"),
+    "evaluate": ("data sets × sequences × variants × seeds, with one table", "emgs evaluate suite=smoke seeds=[0,1,2]"),
+    "score": ("any other system under the same protocol", "emgs score trajectory=poses.txt method=peer dataset=tum …"),
+    "sweep": ("a grid of settings on one sequence", "emgs sweep sweep=gates experiment=smoke"),
+    "effects": ("what each value of sweeps changes", "emgs effects folder=multirun/sweep"),
+    "predict": ("record what a prior says of a sequence", "emgs predict dataset=… prior=mapanything out=predictions"),
+    "embed": ("class names to text features", "emgs embed features=dinov3_text 'classes=[wall,floor]' out=text.npz"),
+    "benchmark": ("how long the stages take", "emgs benchmark 'parts=[em,icp]'"),
+}
+
+
+def usage() -> str:
+    """One line and an example for each command."""
+    lines = ["usage: emgs COMMAND [key=value …]", "", "commands:"]
+    for name, (purpose, example) in COMMANDS.items():
+        lines += [f"  {name:10} {purpose}", f"  {'':10}   {example}"]
+    lines += ["", "emgs COMMAND --help lists what can be chosen, emgs COMMAND --cfg job every key with its value."]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Hand the rest of the command line to a command."""
+    name, *rest = sys.argv[1:] or ["--help"]
+    if name in ("-h", "--help", "help"):
+        print(usage())
+    elif name == "--version":
+        print(import_module("emgs_jax").__version__)
+    elif name not in COMMANDS:
+        raise SystemExit(f"error: {name} is no command of emgs: choose one of {', '.join(COMMANDS)}")
+    else:
+        sys.argv = [f"emgs {name}", *rest]
+        import_module(f".{name}", __package__).main()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""What the commands share: Hydra, the compilation cache, and an error that is one clear line."""
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from functools import wraps
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException, InstantiationException
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from emgs_jax.running.compilation import use_compilation_cache
+from emgs_jax.running.configure import CONF, compose, first_of_sweep, message_of
+
+
+def command(name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
+    """Make a program of a function of conf/`name`.yaml with the command line's overrides."""
+
+    def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
+        @wraps(task)
+        def job(config: DictConfig) -> Any:
+            with clear_errors():
+                if "compilation_cache" in config:
+                    use_compilation_cache(config.compilation_cache)
+                return task(config)
+
+        def main() -> None:
+            with clear_errors():
+                check_arguments(name, sys.argv[1:])
+            hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name=name)(job)()
+
+        main.__doc__ = task.__doc__
+        return main
+
+    return decorate
+
+
+def check_arguments(name: str, arguments: list[str]) -> None:
+    """Raise ValueError with near names where an override names no key or option."""
+    try:
+        parsed = OverridesParser.create().parse_overrides([text for text in arguments if not text.startswith("-")])
+    except HydraException:
+        return  # Hydra shows the place
+    overrides = [first_of_sweep(override) for override in parsed if not override.key_or_group.startswith("hydra")]
+    compose(*overrides, name=name)
+
+
+@contextlib.contextmanager
+def clear_errors() -> Iterator[None]:
+    """End the program with the message of what is wrong with the input; HYDRA_FULL_ERROR=1 shows the traceback.
+
+    In a multirun the error goes on to Hydra, which reports it after the other jobs; an exit would end them too.
+    """
+    try:
+        yield
+    except (ValueError, OSError, InstantiationException, OmegaConfBaseException) as error:
+        is_multirun = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+        if is_multirun or os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        raise SystemExit(f"error: {message_of(error)}\n(HYDRA_FULL_ERROR=1 shows where it was raised)") from None

@@ -1,0 +1,67 @@
+"""What the command line says: the choices in its help, and one line with the remedy for a word that is wrong."""
+
+import subprocess
+import sys
+
+import pytest
+from tiny_run import CONF
+
+from emgs_jax.running.configure import compose, groups
+from experiments.command import check_arguments
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["em.num_neighbours=4"],
+            r"^em\.num_neighbours is no key of the config; near names: slam\.em\.num_neighbours,",
+        ),
+        (["slam.em.max_mahalanobis=3"], r"is no key of the config; near names: slam\.em\.max_mahalanobis_sq"),
+        (["slam.refinement.render.opacity=0.3"], r"near names: .*\brender\.opacity"),
+        (["dataset=tum", "dataset.num_frames=3"], r"dataset\.num_frames is no key of the config"),
+        (["slam.em=paper"], r"one of its options \(default, paper\) with slam/em=paper$"),
+        (["slam.em=papre"], r"one of its options \(default, paper\) with slam/em=default$"),
+        (["render=bright"], "render=bright is no option of render: there are default"),
+        (["slam=paper"], r"slam is chosen by its parts: slam/em=…, slam/fit=…"),
+        (["dataset=kitti"], "dataset=kitti is no option of dataset: there are images, replica, seven_scenes"),
+        (["slam/em=paper,nothing"], "slam/em=paper,nothing is no option"),
+    ],
+)
+def test_an_override_that_names_nothing_is_one_line_with_what_was_perhaps_meant(overrides, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        compose(*overrides)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_word_in_the_place_of_a_group_is_an_error_for_every_group():
+    """It was a string in the place of a stage's config."""
+    for group in groups():
+        key = group.replace("/", ".")
+        if "/" in group:
+            with pytest.raises(ValueError, match=f"{group}=default"):
+                compose(f"{key}=default")
+
+
+def test_the_arguments_of_a_multirun_are_checked_and_those_of_hydra_are_left_to_it():
+    check_arguments("config", ["-m", "slam.em.noise=0,1", "prior=simulated,multiview_stereo", "hydra.run.dir=x"])
+    with pytest.raises(ValueError, match=r"slam\.em\.nose is no key"):
+        check_arguments("config", ["-m", "slam.em.nose=0,1"])
+
+
+def test_the_help_of_a_run_lists_every_choice():
+    said = run("experiments.run", "--help").stdout
+    for group in ("dataset", "prior", "features", "experiment", "evaluation", "render", "slam/em"):
+        assert f"{group}=" in said and all(name in said for name in groups()[group]), group
+    assert all(name in said for name in groups() if name.startswith("slam/"))
+
+
+def test_the_wrong_word_ends_a_command_with_one_line():
+    done = run("experiments.run", "slam.em=paper")
+    assert done.returncode == 1 and done.stderr.startswith("error: slam.em=paper would put a word")
+    assert "Traceback" not in done.stderr
+
+
+def run(module: str, *arguments: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", module, *arguments]
+    return subprocess.run(command, cwd=CONF.parent, capture_output=True, text=True, check=False)
