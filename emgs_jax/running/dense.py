@@ -14,13 +14,12 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.evaluation.segmentation import LabelledPoints, transfer_labels
 from emgs_jax.prior.base import Prior
-from emgs_jax.render.densify import DensifyConfig, DenseView, densify
+from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.running.convert import to_se3
 from emgs_jax.running.record import MappingRun
 from emgs_jax.semantics import classify
 
-# Without the rendering behind the points, which nobody looks at here.
-_densify = eqx.filter_jit(lambda *arguments: eqx.tree_at(lambda view: view.rendering, densify(*arguments), None))
+_densify = eqx.filter_jit(densify)
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,8 @@ def _drawn_ahead(run: MappingRun, rows: list[int], config: DensifyConfig) -> Ite
     poses = to_se3(np.reshape([run.poses[row] for row in rows], (-1, 4, 4)))
     for position in range(len(rows)):
         pose = jaxlie.SE3(poses.wxyz_xyz[position])
-        drawing = _densify(run.state.map.gaussians, pose, run.camera, config)
+        view = _densify(run.state.map.gaussians, pose, run.camera, config)
+        drawing = eqx.tree_at(lambda view: view.rendering, view, None)  # nobody looks at it, so it is not fetched
         if pending is not None:
             yield jax.device_get(pending)
         pending = drawing
