@@ -66,7 +66,7 @@ def densify(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, co
         return weighted_sums(weights, depth, values), weighted_sums(layer, depth, values)
 
     splats = splats_of(gaussians, T_world_camera, camera, soft)
-    (whole, layer), overflow = draw_tiles(splats, values, camera, soft, blend)
+    (whole, layer), overflow = draw_tiles(splats, values, camera, soft, blend, num_sizes=3)
     rendering = rendering_of(*whole, overflow, soft)
     is_mixed = rendering.depth_std > config.max_depth_spread * rendering.depth
     values_sum, weight, depth_sum, _ = where_rows(is_mixed, layer, whole)
