@@ -29,6 +29,7 @@ COLUMNS = (
     Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 1, True),
     *(column._replace(digits=1) for column in MAIN[1:]),
 )
+SHOWN = (*COLUMNS, Column("time/seconds_per_frame", "s a frame", 1.0, 2, True))
 
 
 def evaluations(config: Mapping[str, Any], table: str) -> Iterator[Settings]:
@@ -92,10 +93,10 @@ def _table(estimates: Sequence[Estimate], titles: Mapping[str, str]) -> str:
     rows = sorted(average(estimates, each_sequence=True), key=lambda row: list(titles).index(row.dataset))
     lines = []
     for row in rows:
-        numbers = [(row.values.get(key), row.spreads.get(key), factor, digits) for key, _, factor, digits, _ in COLUMNS]
+        numbers = [(row.values.get(key), row.spreads.get(key), factor, digits) for key, _, factor, digits, _ in SHOWN]
         name = titles[row.dataset] + ("" if row.variant == "default" else f", {row.variant}")
         lines.append([name, row.kind, str(len(row.seeds)), *(cell(*number) for number in numbers)])
-    return markdown(["data, setting", "", "runs", *(column.title for column in COLUMNS)], lines)
+    return markdown(["data, setting", "", "runs", *(column.title for column in SHOWN)], lines)
 
 
 def _better(estimates: Sequence[Estimate]) -> str:
@@ -106,8 +107,8 @@ def _better(estimates: Sequence[Estimate]) -> str:
     lines = []
     for variant, runs in variants.items():
         counts = ", ".join(f"{column.title.split(' [')[0]} {_count(runs.values(), column)}" for column in COLUMNS)
-        lines.append(f"Ours is better than the raw prior in so many of {len(runs)} runs ({variant}): {counts}.")
-    return "\n".join(lines)
+        lines.append(f"Runs of {len(runs)} in which ours is better than the raw prior ({variant}): {counts}.")
+    return "\n\n".join(lines)
 
 
 def _count(runs: Iterable[Mapping[str, Estimate]], column: Column) -> int:

@@ -29,7 +29,7 @@ def written(folder: Path, seed: int, git: dict | None = ONE_COMMIT, ours: float 
     block["data"] = {"name": "synthetic", "sequence": "room0"}
     path = folder / str(seed) / METRICS_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, metrics | {"trajectory/num_frames": 40, "provenance": block})
+    write_json(path, metrics | {"trajectory/num_frames": 40, "time/seconds_per_frame": 0.5, "provenance": block})
     return path
 
 
@@ -43,9 +43,12 @@ def test_rows_are_mean_and_deviation_over_the_seeds_and_the_map_is_counted_again
     paths = [written(folder, 3, ours=0.02), written(folder, 4, ours=0.04)]
     text = block(paths, {"synthetic": "room"})
     rows = [cells(line) for line in text.splitlines() if line.startswith("| room")]
-    assert rows == [["room", "ours", "2", *["3.0 ± 1.4"] * 7], ["room", "raw prior", "2", *["3.0 ± 0.0"] * 7]]
-    counts = next(line for line in text.splitlines() if line.startswith("Ours is better"))
-    assert "2 runs" in counts and counts.count(" 1,") + counts.count(" 1.") == len(COLUMNS)
+    assert rows == [
+        ["room", "ours", "2", *["3.0 ± 1.4"] * 7, "0.50 ± 0.00"],
+        ["room", "raw prior", "2", *["3.0 ± 0.0"] * 7, "–"],
+    ]
+    counts = next(line for line in text.splitlines() if line.startswith("Runs of 2"))
+    assert counts.count(" 1,") + counts.count(" 1.") == len(COLUMNS)
 
 
 def test_the_line_above_a_table_says_where_it_comes_from(tmp_path):
@@ -124,7 +127,7 @@ def test_what_is_finished_is_not_run_again_and_the_page_is_written_when_all_is_t
     tables(settings)
     assert runs == [(1.0, 3), (1.0, 4), (2.0, 3), (2.0, 4), (2.0, 3)]
     text = page.read_text()
-    assert "2 runs (default)" in text and "2 runs (level 2)" in text and "old" not in text
+    assert "Runs of 2" in text and "(default):" in text and "(level 2):" in text and "old" not in text
     # What is there can be written again by other code, which did not make it.
     monkeypatch.setattr(experiments.tables, "git_revision", lambda folder: None)
     tables(settings)
