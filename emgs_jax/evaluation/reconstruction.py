@@ -14,7 +14,7 @@ from emgs_jax.evaluation.trajectory import align_poses
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """The protocol of a comparison; it is written into every result. Values: conf/evaluation and conf/alignment."""
+    """The protocol of a comparison; it is written into every result. Values: conf/evaluation."""
 
     protocol: str
     alignment: str  # "sim3", or "se3": without the scale
