@@ -165,7 +165,8 @@ def observe(
     points, colors, normals, confidence, valid = (
         image[::thin, ::thin] for image in (points, colors, normals, confidence, valid)
     )
-    features = sample_features(features, mask.shape, thin)
+    height, width = mask.shape
+    features = sample_features(features, (height, width), thin)
     colors, features = (jnp.where(valid[..., None], image, 0.0) for image in (colors, features))
     image = Observation(points, colors, normals, features, confidence, valid)
     return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), image)

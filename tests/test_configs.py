@@ -74,7 +74,7 @@ def test_table_i_is_the_paper_preset():
 
 
 def test_the_paper_preset_takes_every_printed_reading():
-    """design/method.md, section 4."""
+    """The column *printed* of docs/readings.md."""
     paper = compose(*(f"slam/{g}=paper" for g in ("observation", "fit", "localization", "em", "refinement")))
     printed = {
         "em.determinant_weight": 1.0,  # R2

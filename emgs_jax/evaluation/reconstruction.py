@@ -16,7 +16,7 @@ _BAND_ROWS = 40  # of an image whose normals are fitted at a time: what is compu
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """The protocol of a comparison; it is written into every result. Values: conf/evaluation and conf/alignment."""
+    """The protocol of a comparison; it is written into every result. Values: conf/evaluation."""
 
     protocol: str
     alignment: str  # "sim3", or "se3": without the scale

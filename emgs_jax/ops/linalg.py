@@ -107,7 +107,7 @@ def gather_offsets(points: Float[Array, "m d"], table: Float[Array, "n d"], rows
 
 def dot(first: Entries, second: Entries) -> Float[Array, "..."]:
     """Inner product."""
-    return sum(a * b for a, b in zip(first, second, strict=True))
+    return sum((a * b for a, b in zip(first, second, strict=True)), start=jnp.zeros(()))
 
 
 def whiten(triangle: Entries, vector: Entries) -> Entries:

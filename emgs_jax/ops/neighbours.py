@@ -188,7 +188,7 @@ def _nearest_member_by_parts(members: Float[Array, "m s d"], columns: Float[Arra
 
 def _distance_sq(points: Float[Array, "*#b d"], columns: Float[Array, "d q"]) -> Float[Array, "*b"]:
     # One axis after the other, and the queries last: so the sums fill the processor's vectors.
-    return sum((points[..., axis] - columns[axis]) ** 2 for axis in range(columns.shape[0]))
+    return sum(((points[..., axis] - columns[axis]) ** 2 for axis in range(columns.shape[0])), start=jnp.zeros(()))
 
 
 def compact_rows(mask: Bool[Array, "n"], capacity: int) -> tuple[Int[Array, "c"], Bool[Array, "c"], Int[Array, ""]]:

@@ -94,6 +94,7 @@ def time_icp(data: Data, offset: tuple[float, float], repetitions: int) -> list[
         baselines.colored_icp(cloud, surface, np.asarray(start, float), reach, num_steps) for cloud, start in clouds
     ]
     ours.facts.update(points=len(clouds[0][0]["points"]), gaussians=len(surface["points"]), steps=num_steps)
+    ours.facts.update(start_cm=100.0 * offset[0], start_deg=float(np.degrees(offset[1])), views=len(cases))
     ours.facts.update(_pose_errors(mine, truth))
     candidates = {"emgs_jax": ours, "Open3D": Candidate(open3d_one, None, _pose_errors(theirs, truth))}
     return compare(interleaved("icp", candidates, repetitions), "Open3D")

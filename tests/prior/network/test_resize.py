@@ -12,7 +12,7 @@ from emgs_jax.prior.network.resize import (
     to_frame,
 )
 
-# What upstream's preprocess_inputs gave (reference/prior_models.md, A.8): frame, fx, fy, cx, cy, grid, the same on it.
+# What upstream's preprocess_inputs gave: frame, fx, fy, cx, cy, grid, the same on it.
 UPSTREAM = {
     "7-Scenes 585": ((640, 480), (585, 585, 320, 240), (518, 392), (477.75, 477.75, 258.9083, 195.9083)),
     "7-Scenes 525": ((640, 480), (525, 525, 320, 240), (518, 392), (428.75, 428.75, 258.9083, 195.9083)),

@@ -1,4 +1,4 @@
-"""Depth, confidence and features of the simulated prior against their specification (method.md §5)."""
+"""Depth, confidence and features of the simulated prior against docs/priors.md."""
 
 import math
 from dataclasses import replace

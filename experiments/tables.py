@@ -1,0 +1,161 @@
+"""Write the tables of README.md: `python -m experiments.tables root=FOLDER`.
+
+The rows are the evaluations of conf/tables.yaml; what is finished is not run again. Nothing is written unless all of
+them are finished and of the same commit. The line above a table says where it comes from, those below count the runs
+in which the map is better than the raw prior.
+"""
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+import emgs_jax
+from emgs_jax.io.files import atomic_write
+from emgs_jax.report.columns import MAIN, Column, cell, markdown
+from emgs_jax.report.provenance import git_revision
+from emgs_jax.report.results import METRICS_FILE, Estimate, estimates_of, read_metrics
+from emgs_jax.report.tables import average
+
+from .building import clear_errors, use_compilation_cache
+from .evaluate import Job, evaluate, plan
+
+Settings = Mapping[str, Any]  # a resolved conf/evaluate.yaml
+COLUMNS = (
+    MAIN[0]._replace(title="ATE Sim(3) [cm]", digits=1),
+    Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 1, True),
+    *(column._replace(digits=1) for column in MAIN[1:]),
+)
+SHOWN = (*COLUMNS, Column("time/seconds_per_frame", "s a frame", 1.0, 2, True))
+
+
+def evaluations(config: Mapping[str, Any], table: str) -> Iterator[Settings]:
+    """The settings of the evaluations of one table; `config` is a resolved conf/tables.yaml."""
+    for entry in config["tables"][table]:
+        composed = hydra.compose("evaluate", [f"suite.root='{config['root']}'", "suite=slices"])
+        settings = OmegaConf.to_container(composed, resolve=True)
+        data = {name: settings["suite"]["data"][name] for name in entry["data"]}
+        out = str(Path(config["out"]) / table)
+        changes = {"suite": {"data": data}, "seeds": entry["seeds"], "variants": entry["settings"], "out": out}
+        yield settings | changes | {"compilation_cache": config["compilation_cache"]}
+
+
+def revision_of(blocks: Iterable[Mapping[str, Any] | None]) -> str:
+    """The commit that all of these say they are of; raises ValueError where there is no such one."""
+    found = {None if block is None or block["dirty"] is not False else block["revision"] for block in blocks}
+    revision = found.pop() if found else None
+    if found or revision is None:
+        raise ValueError(
+            "the tables are of one commit without changes: commit, move results of other code away, and run again"
+        )
+    return revision[:12]
+
+
+def _code_of(paths: Iterable[Path]) -> list[Mapping[str, Any] | None]:
+    return [read_metrics(path)["provenance"]["git"] for path in paths]
+
+
+def block(paths: Sequence[Path], titles: Mapping[str, str]) -> str:
+    """The Markdown between two markers: where the results come from, the table, and how often ours is better."""
+    estimates = [item for path in paths for item in estimates_of(path)]
+    return f"\n{_about(paths)}\n\n{_table(estimates, titles)}\n{_better(estimates)}\n\n"
+
+
+def _about(paths: Sequence[Path]) -> str:
+    """Prior, data, seeds, protocol, device and commit, in words."""
+    blocks = [read_metrics(path) for path in paths]
+    origins = [block["provenance"] for block in blocks]
+    frames: dict[str, int] = {}
+    for found, origin in zip(blocks, origins, strict=True):
+        frames[f"{origin['data']['name']} {origin['data']['sequence']}"] = found["trajectory/num_frames"]
+    data = ", ".join(f"{name} ({count} frames)" for name, count in frames.items())
+    device = origins[0]["device"]
+    label = " (**simulated**)" if any(origin["simulated"] for origin in origins) else ""
+    facts = {
+        "Prior": _distinct(origin["prior"]["name"] for origin in origins) + label,
+        "data": data,
+        "`prior.seed`": _distinct(origin["seed"] for origin in origins),
+        "protocol": _distinct(origin["protocol"] for origin in origins),
+        "device": f"{device['kind']}, {device['cpu_count']} CPU cores",
+        "commit": f"`{revision_of(origin['git'] for origin in origins)}`",
+    }
+    return "; ".join(f"{name} {value}" for name, value in facts.items()) + "."
+
+
+def _distinct(values: Iterable[Any]) -> str:
+    return ", ".join(map(str, dict.fromkeys(values)))
+
+
+def _table(estimates: Sequence[Estimate], titles: Mapping[str, str]) -> str:
+    rows = sorted(average(estimates, each_sequence=True), key=lambda row: list(titles).index(row.dataset))
+    lines = []
+    for row in rows:
+        numbers = [(row.values.get(key), row.spreads.get(key), factor, digits) for key, _, factor, digits, _ in SHOWN]
+        name = titles[row.dataset] + ("" if row.variant == "default" else f", {row.variant}")
+        lines.append([name, row.kind, str(len(row.seeds)), *(cell(*number) for number in numbers)])
+    return markdown(["data, setting", "", "runs", *(column.title for column in SHOWN)], lines)
+
+
+def _better(estimates: Sequence[Estimate]) -> str:
+    """For each setting and metric, in how many runs ours is better than the raw prior."""
+    variants: dict[str, dict[Path, dict[str, Estimate]]] = {}
+    for item in estimates:
+        variants.setdefault(item.variant, {}).setdefault(item.folder, {})[item.kind] = item
+    lines = []
+    for variant, runs in variants.items():
+        counts = ", ".join(f"{column.title.split(' [')[0]} {_count(runs.values(), column)}" for column in COLUMNS)
+        lines.append(f"Runs of {len(runs)} in which ours is better than the raw prior ({variant}): {counts}.")
+    return "\n\n".join(lines)
+
+
+def _count(runs: Iterable[Mapping[str, Estimate]], column: Column) -> int:
+    sign = 1 if column.is_lower_better else -1
+    return sum(sign * (run["ours"].values[column.key] - run["raw prior"].values[column.key]) < 0 for run in runs)
+
+
+def write_blocks(page: Path, blocks: Mapping[str, str]) -> None:
+    """Replace what is between `<!-- table: NAME -->` and `<!-- end -->`; raises ValueError where a pair is missing."""
+    text = page.read_text(encoding="utf-8")
+    for name, content in blocks.items():
+        start = f"<!-- table: {name} -->"
+        place = re.compile(re.escape(start) + r"\n.*?(?=<!-- end -->)", re.DOTALL)
+        text, count = place.subn(lambda _, new=f"{start}\n{content}": new, text)
+        if count != 1:
+            raise ValueError(f"{page} has {count} places {start} … <!-- end -->, not one: write the markers once")
+    with atomic_write(page, "w") as handle:
+        handle.write(text)
+
+
+def tables(config: Mapping[str, Any]) -> None:
+    """Run what is not finished and write all tables of the page; `config` is a resolved conf/tables.yaml."""
+    planned = {table: list(evaluations(config, table)) for table in config["tables"]}
+    paths = {name: [_result(job) for settings in table for job in plan(settings)] for name, table in planned.items()}
+    everything = [path for found in paths.values() for path in found]
+    finished = [path for path in everything if path.is_file()]
+    if len(finished) < len(everything):  # in half an hour it would be too late to learn that the code has changes
+        revision_of([git_revision(Path(emgs_jax.__file__).resolve().parents[1]), *_code_of(finished)])
+    problems = [line for table in planned.values() for settings in table for line in evaluate(settings)]
+    if problems:
+        raise ValueError("\n       ".join([f"problems: {len(problems)}", *problems]))
+    revision_of(_code_of(everything))
+    write_blocks(Path(config["page"]), {table: block(found, config["titles"]) for table, found in paths.items()})
+
+
+def _result(job: Job) -> Path:
+    return job.folder / METRICS_FILE
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="tables")
+def main(config: DictConfig) -> None:
+    """Write the tables."""
+    with clear_errors():
+        use_compilation_cache(config)
+        tables(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+        print(f"the tables of {config.page} are written")
+
+
+if __name__ == "__main__":
+    main()

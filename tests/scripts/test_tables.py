@@ -1,0 +1,143 @@
+"""The tables of README.md from made-up runs: numbers worked out by hand, and nothing else on the page changes."""
+
+import json
+from pathlib import Path
+
+import hydra
+import pytest
+from omegaconf import OmegaConf
+from tiny_run import CONF
+
+import experiments.evaluate
+import experiments.tables
+from emgs_jax.io.files import write_json
+from emgs_jax.report.provenance import RAW_PRIOR, RESULT_FORMAT, prefixed
+from emgs_jax.report.results import METRICS_FILE
+from experiments.tables import COLUMNS, block, tables, write_blocks
+
+PAGE = "before\n<!-- table: some -->\nold\n<!-- end -->\nbetween\n<!-- table: other -->\n<!-- end -->\nafter\n"
+ONE_COMMIT = {"revision": "0123456789abcdef", "dirty": False}
+
+
+def written(folder: Path, seed: int, git: dict | None = ONE_COMMIT, ours: float = 0.02, raw: float = 0.03) -> Path:
+    """A result of the built-in room: every length is `ours` metres, every percentage 100 times that."""
+    values = {column.key: 1.0 if column.factor == 100.0 else 100.0 for column in COLUMNS}
+    metrics = {key: ours * unit for key, unit in values.items()}
+    metrics |= prefixed({key: raw * unit for key, unit in values.items()}, RAW_PRIOR)
+    block = {"format": RESULT_FORMAT, "protocol": "paper/sim3", "simulated": True, "git": git, "seed": seed}
+    block |= {"prior": {"name": "simulated"}, "device": {"kind": "cpu", "cpu_count": 2}, "config": {}}
+    block["data"] = {"name": "synthetic", "sequence": "room0"}
+    path = folder / str(seed) / METRICS_FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, metrics | {"trajectory/num_frames": 40, "time/seconds_per_frame": 0.5, "provenance": block})
+    return path
+
+
+def cells(line: str) -> list[str]:
+    return [text.strip() for text in line.strip().strip("|").split("|")]
+
+
+def test_rows_are_mean_and_deviation_over_the_seeds_and_the_map_is_counted_against_the_prior(tmp_path):
+    """Ours 2 and 4 (mean 3, deviation √2), the prior 3 and 3: of two runs each metric is better in one."""
+    folder = tmp_path / "default"
+    paths = [written(folder, 3, ours=0.02), written(folder, 4, ours=0.04)]
+    text = block(paths, {"synthetic": "room"})
+    rows = [cells(line) for line in text.splitlines() if line.startswith("| room")]
+    assert rows == [
+        ["room", "ours", "2", *["3.0 ± 1.4"] * 7, "0.50 ± 0.00"],
+        ["room", "raw prior", "2", *["3.0 ± 0.0"] * 7, "–"],
+    ]
+    counts = next(line for line in text.splitlines() if line.startswith("Runs of 2"))
+    assert counts.count(" 1,") + counts.count(" 1.") == len(COLUMNS)
+
+
+def test_the_line_above_a_table_says_where_it_comes_from(tmp_path):
+    about = block([written(tmp_path, 3), written(tmp_path, 4)], {"synthetic": "room"}).strip().splitlines()[0]
+    for fact in (
+        "simulated",
+        "synthetic room0 (40 frames)",
+        "3, 4",
+        "paper/sim3",
+        "cpu, 2 CPU cores",
+        "`0123456789ab`",
+    ):
+        assert fact in about, fact
+
+
+@pytest.mark.parametrize(
+    "other", [{"revision": "f" * 16, "dirty": False}, ONE_COMMIT | {"dirty": True}, ONE_COMMIT | {"dirty": None}, None]
+)
+def test_results_of_other_or_changed_code_are_refused(tmp_path, other):
+    with pytest.raises(ValueError, match="of one commit without changes"):
+        block([written(tmp_path, 3), written(tmp_path, 4, other)], {"synthetic": "room"})
+
+
+def test_only_what_stands_between_the_markers_changes_and_a_second_time_nothing_does(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(PAGE)
+    write_blocks(page, {"some": "\nnew\n", "other": r"\1 & $2" + "\n"})
+    once = page.read_text()
+    assert once == PAGE.replace("old\n", "\nnew\n").replace("other -->\n", "other -->\n\\1 & $2\n")
+    write_blocks(page, {"some": "\nnew\n"})
+    assert page.read_text() == once
+
+
+@pytest.mark.parametrize("page", [PAGE.replace("some", "none"), PAGE + PAGE, PAGE.replace("<!-- end -->", "")])
+def test_a_page_without_its_markers_stays_as_it_is(tmp_path, page):
+    path = tmp_path / "page.md"
+    path.write_text(page)
+    with pytest.raises(ValueError, match="not one"):
+        write_blocks(path, {"some": "new"})
+    assert path.read_text() == page
+
+
+@pytest.fixture
+def settings(tmp_path):
+    """conf/tables.yaml with the built-in room alone."""
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        config = hydra.compose("tables", ["root=nowhere", f"out={tmp_path / 'out'}", f"page={tmp_path / 'page.md'}"])
+        config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+        settings = {"default": [], "level 2": ["prior.level=2"]}
+        config["tables"] = {"some": [{"data": ["synthetic"], "seeds": [3, 4], "settings": settings}]}
+        (tmp_path / "page.md").write_text(PAGE)
+        yield config
+
+
+def test_what_is_finished_is_not_run_again_and_the_page_is_written_when_all_is_there(settings, monkeypatch):
+    runs, page = [], Path(settings["page"])
+
+    def run(config, folder):
+        runs.append((config.prior.level, config.prior.seed))
+        if config.prior.level == 2 and len(runs) == 3:
+            raise OSError("the disk is full")
+        path = written(folder.parent, config.prior.seed)
+        metrics = json.loads(path.read_text())
+        metrics["provenance"]["config"] = OmegaConf.to_container(config, resolve=True)
+        write_json(path, metrics)
+
+    monkeypatch.setattr(experiments.evaluate, "run", run)
+    monkeypatch.setattr(experiments.tables, "git_revision", lambda folder: ONE_COMMIT | {"dirty": True})
+    with pytest.raises(ValueError, match="of one commit without changes"):
+        tables(settings)
+    assert not runs
+    monkeypatch.setattr(experiments.tables, "git_revision", lambda folder: ONE_COMMIT)
+    with pytest.raises(ValueError, match="the disk is full"):
+        tables(settings)
+    assert page.read_text() == PAGE
+    tables(settings)
+    assert runs == [(1.0, 3), (1.0, 4), (2.0, 3), (2.0, 4), (2.0, 3)]
+    text = page.read_text()
+    assert "Runs of 2" in text and "(default):" in text and "(level 2):" in text and "old" not in text
+    # What is there can be written again by other code, which did not make it.
+    monkeypatch.setattr(experiments.tables, "git_revision", lambda folder: None)
+    tables(settings)
+    assert len(runs) == 5 and page.read_text() == text
+
+
+def test_the_readme_has_the_places_of_all_tables_and_every_row_has_a_title():
+    config = OmegaConf.load(CONF / "tables.yaml")
+    text = (CONF.parent / config.page).read_text()
+    for name, entries in config.tables.items():
+        assert text.count(f"<!-- table: {name} -->") == 1
+        assert {data for entry in entries for data in entry.data} <= set(config.titles)
+    assert text.count("<!-- end -->") == len(config.tables)

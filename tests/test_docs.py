@@ -1,0 +1,88 @@
+"""README, docs/ and CONTRIBUTING name only what is there: files, commands, options, config keys; no private page."""
+
+import importlib.util
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+from scene import CONF, compose
+
+ROOT = CONF.parent
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+GROUPS = ("dataset", "prior", "features", "evaluation", "experiment", "suite", "sweep")
+pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+
+
+BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.DOTALL | re.MULTILINE)
+
+
+@cache
+def code(page: Path) -> str:
+    """What stands in blocks and spans of code, a line each."""
+    text = page.read_text()
+    return "\n".join(BLOCK.findall(text) + re.findall(r"`([^`\n]+)`", BLOCK.sub("", text)))
+
+
+def slug(heading: str) -> str:
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+@pages
+def test_links_lead_to_files_and_headings_that_are_there(page):
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        target, _, heading = link.partition("#")
+        if not target.startswith("http"):
+            path = page.parent / target if target else page
+            assert path.exists(), link
+            slugs = {slug(line) for line in re.findall(r"^#+ (.*)$", path.read_text() if heading else "", re.MULTILINE)}
+            assert not heading or heading in slugs, link
+
+
+@pages
+def test_commands_are_scripts_that_are_there(page):
+    for name in re.findall(r"python -m experiments\.([a-z]\w*)", code(page)):
+        assert importlib.util.find_spec(f"experiments.{name}"), name
+
+
+@pages
+def test_options_are_files_of_conf(page):
+    for group, option in re.findall(rf"(?<![\w./])({'|'.join(GROUPS)})=([a-z]\w*)", code(page)):
+        assert (CONF / group / f"{option}.yaml").is_file(), f"{group}={option}"
+    for group, option in re.findall(r"\bslam/(\w+)=(\w+)", code(page)):
+        assert (CONF / "slam" / group / f"{option}.yaml").is_file(), f"slam/{group}={option}"
+
+
+@pages
+def test_keys_of_the_stages_are_keys_of_the_config(page):
+    """A key has a value after it, or is the whole span."""
+    config = OmegaConf.to_container(compose(), resolve=True)
+    keys = re.findall(r"\b((?:slam|render|densify|evaluation)\.[a-z_0-9.]+)[=:]", code(page))
+    for key in {*keys, *re.findall(r"^((?:slam)\.[a-z_0-9]+\.[a-z_0-9.]+)$", code(page), re.MULTILINE)}:
+        node = config
+        for name in key.split("."):
+            assert name in node, key
+            node = node[name]
+
+
+@pages
+def test_files_of_the_project_are_there(page):
+    for name in re.findall(r"^((?:emgs_jax|conf|tests|docs|notebooks|experiments)/[\w./]+)$", code(page), re.MULTILINE):
+        assert (ROOT / name).exists(), name
+
+
+def test_the_readme_lists_every_room_of_the_package():
+    text = next(block for block in BLOCK.findall((ROOT / "README.md").read_text()) if "\nops/" in block)
+    listed = {line.split()[0] for line in text.splitlines() if re.match(r"[a-z_]+/? ", line)}
+    found = [path for path in (ROOT / "emgs_jax").iterdir() if not path.name.startswith(("_", "."))]
+    files = {path.stem for path in found if path.suffix == ".py"}
+    assert listed == files | {f"{path.name}/" for path in found if path.is_dir()}
+
+
+def test_nothing_refers_to_pages_that_users_do_not_have():
+    """`design/` and `reference/` are no folders of this project, and there is no path of a machine."""
+    for folder in ("emgs_jax", "experiments", "conf", "docs", "notebooks"):
+        for path in (ROOT / folder).rglob("*"):
+            if path.suffix in (".py", ".yaml", ".md", ".ipynb"):
+                assert not re.search(r"\b(design|reference)/\w|\bmethod\.md|/work/|\.\./shared", path.read_text()), path
