@@ -11,6 +11,7 @@ COMMANDS = {  # name: (what it does, an example)
     "effects": ("what each value of sweeps changes", "emgs effects folder=multirun/sweep"),
     "predict": ("record what a prior says of a sequence", "emgs predict dataset=… prior=mapanything out=predictions"),
     "embed": ("class names to text features", "emgs embed features=dinov3_text 'classes=[wall,floor]' out=text.npz"),
+    "tables": ("the tables of README.md, from one commit", "emgs tables root=data"),
     "benchmark": ("how long the stages take", "emgs benchmark 'parts=[em,icp]'"),
 }
 

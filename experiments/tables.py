@@ -20,7 +20,7 @@ from emgs_jax.report.provenance import git_revision
 from emgs_jax.report.results import METRICS_FILE, Estimate, estimates_of, read_metrics
 from emgs_jax.report.tables import average
 
-from .building import clear_errors, use_compilation_cache
+from .command import command
 from .evaluate import Job, evaluate, plan
 
 Settings = Mapping[str, Any]  # a resolved conf/evaluate.yaml
@@ -148,13 +148,11 @@ def _result(job: Job) -> Path:
     return job.folder / METRICS_FILE
 
 
-@hydra.main(version_base="1.3", config_path="../conf", config_name="tables")
+@command("tables")
 def main(config: DictConfig) -> None:
     """Write the tables."""
-    with clear_errors():
-        use_compilation_cache(config)
-        tables(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-        print(f"the tables of {config.page} are written")
+    tables(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    print(f"the tables of {config.page} are written")
 
 
 if __name__ == "__main__":
