@@ -1,5 +1,7 @@
 """The pipeline: `init_state` makes the map of the first window, `step` integrates one frame. Both are pure."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -127,7 +129,13 @@ def _first_state(
 
 
 @full_precision
-def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig) -> tuple[SlamState, StepInfo]:
+def step(
+    state: SlamState,
+    prediction: Prediction,
+    camera: Camera,
+    config: SlamConfig,
+    call: Callable = lambda executable, *arguments: executable(*arguments),
+) -> tuple[SlamState, StepInfo]:
     """Integrate one frame: localise, select, E-step, M-step, refine, insert (the paper's pipeline figure).
 
     Called as it is, each line is an executable of its own, so that a larger map compiles the look-up and the insertion
@@ -138,15 +146,16 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
         prediction: of this one.
         camera: of the full images.
         config: all stages.
+        call: how an executable is called; `running.growth.prepare` learns from it what there is to compile.
     """
-    thin = config.observation.thin
-    coarse, guess = _approach(prediction, state.previous, state.T_world_previous, camera, thin, config.localization)
-    submap, rows, submap_overflow = _select(state.map, (state.previous, guess), config.submap)
-    T, aligned, localization = _place(prediction.current, submap.gaussians, coarse, config.localization)
-    submap, rest, em = _fuse(submap, aligned, T, localization, config.em)
-    candidates, weight = cluster(rest, _order(camera, thin), spacing(thin, config.fit), config.fit)
-    submap, fresh, refinement = _refine(submap, candidates, T, camera, thin, config.refinement)
-    map, count, map_overflow = _store(state.map, submap, rows, fresh, weight, config.em.average)
+    thin, last = config.observation.thin, (state.previous, state.T_world_previous)
+    coarse, guess = call(_approach, prediction, *last, camera, thin, config.localization)
+    submap, rows, submap_overflow = call(_select, state.map, (state.previous, guess), config.submap)
+    T, aligned, localization = call(_place, prediction.current, submap.gaussians, coarse, config.localization)
+    submap, rest, em = call(_fuse, submap, aligned, T, localization, config.em)
+    candidates, weight = call(cluster, rest, call(_order, camera, thin), spacing(thin, config.fit), config.fit)
+    submap, fresh, refinement = call(_refine, submap, candidates, T, camera, thin, config.refinement)
+    map, count, map_overflow = call(_store, state.map, submap, rows, fresh, weight, config.em.average)
 
     info = StepInfo(
         T_world_camera=T,

@@ -14,7 +14,7 @@ from emgs_jax.running.clock import Clock, Timer
 from emgs_jax.running.compilation import use_compilation_cache
 from emgs_jax.running.configure import RunConfig, build_dataset, build_prior
 from emgs_jax.running.convert import FirstWindow
-from emgs_jax.running.growth import advance, start
+from emgs_jax.running.growth import advance, prepare, start
 from emgs_jax.running.inputs import Input, RawView, inputs
 from emgs_jax.running.record import FrameRecord, MappingRun, new_run, record_lost, record_start, record_step
 
@@ -67,6 +67,7 @@ def take(run: MappingRun, given: Input) -> None:
         case None:
             record_lost(run, given)
         case FirstWindow() as first:
+            prepare(first, run.camera, run.config)
             run.state, run.config = start(first, run.camera, run.config)
             record_start(run, given, spent(given, timer))
         case Prediction() as prediction:

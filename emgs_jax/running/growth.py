@@ -1,16 +1,24 @@
-"""Maps that grow: whatever finds the map or the submap full is repeated with twice the room."""
+"""What a map needs from the host: executables before it starts, and twice the room where it or its submap is full."""
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import jaxlie
+import numpy as np
 
-from emgs_jax.gaussian_map import grow
+from emgs_jax.gaussian_map import empty_map, grow
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
 from emgs_jax.running.convert import FirstWindow
 from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
+
+_prepared: set[tuple] = set()  # shapes whose step this process has compiled
 
 
 def start(
@@ -29,6 +37,43 @@ def start(
         config = with_room(config, Overflow(overflow, jnp.zeros((), int), jnp.zeros((), int)))
         state, overflow = init(first.views, first.T_world_views, camera, config)
     return state, config
+
+
+def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
+    """Compile the executables of `step` side by side, which takes as many cores as there are.
+
+    Each is called once, with zeros; what a process has compiled already is not called again.
+
+    Args:
+        first: whose shapes the observations of the sequence have.
+        camera: of the full images.
+        config: all stages.
+    """
+    calls: list[tuple[Callable, tuple]] = []
+
+    def note(executable: Callable, *arguments: Any) -> Any:
+        calls.append((executable, arguments))
+        return _zeros(eqx.filter_eval_shape(executable, *arguments))
+
+    view = _zeros(jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), first.views))
+    pose, poses = (jaxlie.SE3(jnp.asarray(np.eye(1, 7).repeat(n, 0).squeeze(), jnp.float32)) for n in (1, 3))
+    prediction = Prediction(
+        current=view, previous=view, T_world_views=poses, T_world_anchor=pose, has_newest=jnp.asarray(False)
+    )
+    map = empty_map(config.submap.map_capacity, view.features.shape[-1])
+    key = jax.tree.structure((map, view, config)), tuple(leaf.shape for leaf in jax.tree.leaves((map, view)))
+    if key in _prepared:
+        return
+    step(SlamState(map, view, pose), prediction, camera, config, note)
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        list(threads.map(lambda call: jax.block_until_ready(call[0](*call[1])), calls))
+    _prepared.add(key)
+
+
+def _zeros(shapes: Any) -> Any:
+    """Arrays of zeros from NumPy, which compiles nothing; what is no shape stays."""
+    is_shape = lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct)  # noqa: E731
+    return jax.tree.map(lambda leaf: jnp.asarray(np.zeros(leaf.shape, leaf.dtype)) if is_shape(leaf) else leaf, shapes)
 
 
 def advance(
