@@ -48,5 +48,5 @@ class Dataset(Protocol):
     def __getitem__(self, index: int) -> Frame: ...
 
     def fingerprint(self) -> str:
-        """Hex digest over what defines the frames (files' names and sizes, options), for provenance."""
+        """Hex digest over what defines the frames (files' names and contents, options), for provenance."""
         ...

@@ -2,7 +2,6 @@
 
 import hashlib
 import math
-import os
 import re
 import struct
 import zlib
@@ -240,11 +239,20 @@ def as_pose(text: str, where: object) -> Float[np.ndarray, "4 4"]:
 
 
 def fingerprint(root: Path, files: Iterable[Path], options: dict[str, object]) -> str:
-    """sha256 over names and sizes of the files and the options; the same on every machine."""
+    """Hex digest of the names and contents of the files and of the options; the same on every machine."""
     digest = hashlib.sha256()
     files = set(files)
-    names = {p: p.relative_to(root).as_posix() if p.is_relative_to(root) else p.name for p in files}
-    sizes = {names[p]: os.path.getsize(p) if os.path.isfile(p) else -1 for p in files}
-    for item in [*sorted(options.items()), *sorted(sizes.items())]:
+    names = {p.relative_to(root).as_posix() if p.is_relative_to(root) else p.name: p for p in files}
+    contents = {name: _content(path) for name, path in names.items()}
+    for item in [*sorted(options.items()), *sorted(contents.items())]:
         digest.update(repr(item).encode())
     return digest.hexdigest()
+
+
+def _content(path: Path) -> str:
+    """Digest of a file's bytes, empty where there is no file that can be read."""
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, hashlib.blake2b).hexdigest()
+    except OSError:
+        return ""

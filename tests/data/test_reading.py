@@ -119,9 +119,9 @@ def test_a_pose_that_is_none_names_its_file(value):
         reading.as_pose(f"{value} 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1", "frame-7.pose.txt")
 
 
-def test_the_fingerprint_is_of_names_sizes_and_options_not_of_the_place(tmp_path):
+def test_the_fingerprint_is_of_names_contents_and_options_not_of_the_place(tmp_path):
     digests = []
-    for name, text in (("a", "one"), ("b", "two"), ("c", "three")):
+    for name, text in (("a", "one"), ("b", "one"), ("c", "two")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "f.txt").write_text(text)
         digests.append(reading.fingerprint(tmp_path / name, [tmp_path / name / "f.txt"], {"size": (4, 3)}))
@@ -132,3 +132,20 @@ def test_the_fingerprint_is_of_names_sizes_and_options_not_of_the_place(tmp_path
 def test_a_principal_point_outside_of_the_images_tells_that_the_size_is_wrong():
     with pytest.raises(ValueError, match="size of the images on disk"):
         reading.check_intrinsics((525, 525, 320, 240), (320, 240))
+
+
+def test_one_changed_byte_of_one_file_changes_the_fingerprint(tmp_path):
+    files = [tmp_path / f"{number}.png" for number in range(3)]
+    for file in files:
+        file.write_bytes(bytes(range(256)))
+    before = reading.fingerprint(tmp_path, files, {})
+    files[1].write_bytes(bytes(range(255)) + b"\0")  # as long as it is
+    assert reading.fingerprint(tmp_path, files, {}) != before
+    files[1].write_bytes(bytes(range(256)))
+    assert reading.fingerprint(tmp_path, files, {}) == before
+
+
+def test_a_missing_file_has_another_fingerprint_than_an_empty_one(tmp_path):
+    missing = reading.fingerprint(tmp_path, [tmp_path / "f.png"], {})
+    (tmp_path / "f.png").write_bytes(b"")
+    assert reading.fingerprint(tmp_path, [tmp_path / "f.png"], {}) != missing
