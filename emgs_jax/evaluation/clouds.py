@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from emgs_jax.evaluation.trajectory import Alignment, align
@@ -66,9 +67,9 @@ def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
         tables.append(_cells(cloud, voxel))
         if sum(len(keys) for keys, _ in tables[1:]) > max(_MERGE_ROWS, len(tables[0][0])):
             tables = [_merge(tables)]
-    empty = (np.empty(0, np.int64), np.empty((10, 0)))
+    empty = (np.empty(0, np.int64), np.empty((0, 10)))
     _, sums = tables[0] if len(tables) == 1 else _merge([empty, *tables])
-    means = np.ascontiguousarray((sums[:9] / sums[9]).T)
+    means = sums[:, :9] / sums[:, 9:]
     length = np.linalg.norm(means[:, 3:6], axis=1, keepdims=True)
     # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
     normals = np.where(length > 0.1, means[:, 3:6] / np.maximum(length, 0.1), 0.0)
@@ -99,27 +100,24 @@ def register(points: np.ndarray, target: cKDTree, max_distance: float, max_steps
 
 
 def _cells(cloud: PointCloud, voxel: float) -> tuple[np.ndarray, np.ndarray]:
-    """Reduce one cloud to its occupied cells: packed cell numbers (n,), sorted, and sums (10, n), the last a count."""
+    """Reduce one cloud to its occupied cells: packed cell numbers (n,), sorted, and sums (n, 10), the last a count."""
     finite = np.isfinite(cloud.points).all(axis=1)
     points = np.asarray(cloud.points[finite], np.float64)
     # 21 bits an axis; what is farther than a million voxels shares the border cells.
     index = np.floor(np.clip(points / voxel, -(2.0**20), 2.0**20 - 1)).astype(np.int64) + 2**20
     keys = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
-    columns = (*points.T, *cloud.normals[finite].T, *cloud.colors[finite].T, np.ones(len(points)))
-    return _sum_cells(keys, columns)
+    rows = np.concatenate([points, cloud.normals[finite], cloud.colors[finite], np.ones((len(points), 1))], axis=1)
+    return _sum_cells(keys, rows)
 
 
 def _merge(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    return _sum_cells(
-        np.concatenate([keys for keys, _ in tables]), np.concatenate([sums for _, sums in tables], axis=1)
-    )
+    return _sum_cells(*(np.concatenate(column) for column in zip(*tables, strict=True)))
 
 
-def _sum_cells(keys: np.ndarray, columns: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Sum the rows of equal keys (n,), column by column."""
+def _sum_cells(keys: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sum the rows (n, 10) of equal keys (n,), in the order in which they stand."""
     order = np.argsort(keys, kind="stable")
-    is_first = np.diff(keys[order], prepend=-1) != 0
-    cell = np.empty(len(keys), np.int64)
-    cell[order] = np.cumsum(is_first) - 1
-    unique = keys[order][is_first]
-    return unique, np.stack([np.bincount(cell, column, minlength=len(unique)) for column in columns])
+    begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    # A sparse matrix that picks the rows of each cell: whole rows are read once, whatever the number of columns.
+    picks = csr_array((np.ones(len(keys)), order, np.append(begins, len(keys))), shape=(len(begins), len(keys)))
+    return keys[order][begins], picks @ rows

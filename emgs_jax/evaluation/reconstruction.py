@@ -11,6 +11,8 @@ from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, register, transform_cloud, voxel_downsample
 from emgs_jax.evaluation.trajectory import align_poses
 
+_BAND_ROWS = 40  # of an image whose normals are fitted at a time: what is computed in between stays in the cache
+
 
 @dataclass(frozen=True)
 class EvaluationConfig:
@@ -227,19 +229,13 @@ def _fit_planes(
     Takes the taps within `previous`' gap of its plane (slopes, offset, gap). Returns slopes (2, h, w), offset (h, w)
     and whether there were enough taps in both directions.
     """
-    (_, h, w), (slopes, offset, gap) = samples.shape, previous
-    radius, step = config.normal_radius_px, config.normal_step_px
-    padded = np.pad(samples, ((0, 0), (radius, radius), (radius, radius)))
-    is_valid = np.pad(valid, radius)
-    shifts = range(0, 2 * radius + 1, step)
+    (_, h, w), radius = samples.shape, config.normal_radius_px
+    padded, is_valid = np.pad(samples, ((0, 0), (radius, radius), (radius, radius))), np.pad(valid, radius)
     sums = np.zeros((9, h, w), np.float32)
-    for row, column in ((row, column) for row in shifts for column in shifts):
-        window = (slice(row, row + h), slice(column, column + w))
-        x, y, d = padded[(slice(None), *window)] - samples
-        keep = is_valid[window] & (np.abs(d - offset - slopes[0] * x - slopes[1] * y) <= gap)
-        x, y, d = x * keep, y * keep, d * keep
-        for total, term in zip(sums, (keep, x, y, d, x * x, x * y, y * y, x * d, y * d), strict=True):
-            total += term
+    for top in range(0, h, _BAND_ROWS):
+        rows, around = slice(top, top + _BAND_ROWS), slice(top, top + _BAND_ROWS + 2 * radius)
+        slopes, offset, gap = (values[..., rows, :] for values in previous)
+        _add_taps(sums[:, rows], samples[:, rows], (padded[:, around], is_valid[around]), (slopes, offset, gap), config)
     count = np.maximum(sums[0], 1.0)
     x, y, d, xx, xy, yy, xd, yd = sums[1:] / count
     xx, xy, yy, xd, yd = xx - x * x, xy - x * y, yy - y * y, xd - x * d, yd - y * d
@@ -248,3 +244,28 @@ def _fit_planes(
     scale = np.where(good, 1.0 / np.where(good, determinant, 1.0), 0.0)
     a, b = (yy * xd - xy * yd) * scale, (xx * yd - xy * xd) * scale
     return np.stack([a, b]), d - a * x - b * y, good
+
+
+def _add_taps(
+    sums: np.ndarray,
+    samples: np.ndarray,
+    around: tuple[np.ndarray, np.ndarray],
+    previous: tuple[np.ndarray, np.ndarray, np.ndarray],
+    config: EvaluationConfig,
+) -> None:
+    """Add 1, x, y, d and their products over the taps of the pixels of a band to sums (9, b, w).
+
+    Args:
+        samples: of the band's pixels, (3, b, w).
+        around: samples and their validity with the window's radius on every side.
+        previous: slopes, offset and gap of the planes that a tap has to be near to.
+    """
+    (_, h, w), (padded, is_valid), (slopes, offset, gap) = samples.shape, around, previous
+    shifts = range(0, 2 * config.normal_radius_px + 1, config.normal_step_px)
+    for row, column in ((row, column) for row in shifts for column in shifts):
+        window = (slice(row, row + h), slice(column, column + w))
+        x, y, d = padded[(slice(None), *window)] - samples
+        keep = is_valid[window] & (np.abs(d - offset - slopes[0] * x - slopes[1] * y) <= gap)
+        x, y, d = x * keep, y * keep, d * keep
+        for total, term in zip(sums, (keep, x, y, d, x * x, x * y, y * y, x * d, y * d), strict=True):
+            total += term

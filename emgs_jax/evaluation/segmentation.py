@@ -4,7 +4,7 @@ Classes are 0 … c - 1; any other number is no class. A confusion matrix is int
 columns predicted ones, and the last column counts points without an answer. Matrices of several scenes are added.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,16 +29,19 @@ class LabelledPoints:
     classes: tuple[str, ...]
 
 
-def true_labels(frames: Iterable[Frame], dataset: Dataset, voxel: float, max_depth: float) -> LabelledPoints | None:
-    """A point for every class that is seen in a voxel [m] of the world: its centre; None without labels."""
-    cells = []
-    for frame in frames:
-        if frame.labels is not None and frame.depth is not None and frame.T_world_camera is not None:
-            known = (frame.labels >= 0) & (frame.depth > 0) & (frame.depth <= max_depth)
-            points = backproject(frame.depth, dataset.intrinsics)[known]
-            index = np.floor((points @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]) / voxel)
-            cells.append(_distinct(np.column_stack([index, frame.labels[known]]).astype(np.int64)))
-    if not cells:
+def label_cells(frame: Frame, dataset: Dataset, voxel: float, max_depth: float) -> np.ndarray:
+    """The voxels [m] of the world that a frame sees and the true class in them, each pair once: rows (n, 4)."""
+    if frame.labels is None or frame.depth is None or frame.T_world_camera is None:
+        return np.empty((0, 4), np.int64)
+    known = (frame.labels >= 0) & (frame.depth > 0) & (frame.depth <= max_depth)
+    points = backproject(frame.depth, dataset.intrinsics)[known]
+    index = np.floor((points @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]) / voxel)
+    return _distinct(np.column_stack([index, frame.labels[known]]).astype(np.int64))
+
+
+def true_labels(cells: Sequence[np.ndarray], dataset: Dataset, voxel: float) -> LabelledPoints | None:
+    """A point for every class that is seen in a voxel [m]: its centre; None where no frame has `label_cells`."""
+    if not any(map(len, cells)):
         return None
     rows = _distinct(np.concatenate(cells))
     return LabelledPoints((rows[:, :3] + 0.5) * voxel, rows[:, 3], tuple(dataset.classes))

@@ -20,7 +20,7 @@ from emgs_jax.evaluation.reconstruction import (
     reconstruction_metrics,
     reference,
 )
-from emgs_jax.evaluation.segmentation import LabelledPoints, compare_labels, true_labels
+from emgs_jax.evaluation.segmentation import LabelledPoints, compare_labels, label_cells, true_labels
 from emgs_jax.evaluation.trajectory import trajectory_metrics
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
@@ -53,20 +53,24 @@ class Scorer:
 
 
 def new_scorer(dataset: ReadableFrames, evaluation: EvaluationConfig, prior: Prior) -> Scorer:
-    """Read the truth of a data set."""
-    labels = None
-    if dataset.classes and prior.feature_names:
-        labels = true_labels(_true_frames(dataset), dataset, evaluation.voxel_m, evaluation.max_depth_m)
-    return Scorer(dataset, evaluation, true_cloud(dataset, evaluation), labels, prior)
+    """Read the truth of a data set, each frame once."""
+    cells: list[np.ndarray] | None = [] if dataset.classes and prior.feature_names else None
+    truth = true_cloud(dataset, evaluation, cells)
+    labels = None if cells is None else true_labels(cells, dataset, evaluation.voxel_m)
+    return Scorer(dataset, evaluation, truth, labels, prior)
 
 
-def true_cloud(dataset: ReadableFrames, config: EvaluationConfig) -> Reference:
-    """The true points of the frames whose pose is known."""
-    return reference(ground_truth_cloud(_true_frames(dataset), dataset.intrinsics, config), config)
+def true_cloud(dataset: ReadableFrames, config: EvaluationConfig, cells: list[np.ndarray] | None = None) -> Reference:
+    """The true points of the frames whose pose is known; `cells` takes the `label_cells` of each frame on the way."""
 
+    def frames() -> Iterator[Frame]:
+        for row in range(len(dataset) if dataset.has_ground_truth else 0):
+            frame = dataset[row]
+            if cells is not None:
+                cells.append(label_cells(frame, dataset, config.voxel_m, config.max_depth_m))
+            yield frame
 
-def _true_frames(dataset: ReadableFrames) -> Iterator[Frame]:
-    return (dataset[row] for row in range(len(dataset) if dataset.has_ground_truth else 0))
+    return reference(ground_truth_cloud(frames(), dataset.intrinsics, config), config)
 
 
 def score_map(

@@ -10,7 +10,6 @@ from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.render.densify import DensifyConfig
-from emgs_jax.report.overview import draw_overview
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.record import MappingRun
 
@@ -34,6 +33,8 @@ def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: Densify
     save_gaussians_ply(folder / "map.ply", gaussians.means[valid], covs, *rest)
     labels = () if dense.labels is None else (dense.labels.labels, dense.labels.classes)
     save_points_ply(folder / "points.ply", dense.cloud.points, dense.cloud.normals, dense.cloud.colors, *labels)
+    from emgs_jax.report.overview import draw_overview  # matplotlib is slow to import, and the map does not wait for it
+
     centers = center_cloud(run)
     no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, centers.colors)
     is_known = all(pose is not None for pose in run.true_poses)

@@ -7,13 +7,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.evaluation.segmentation import LabelledPoints, transfer_labels
 from emgs_jax.prior.base import Prior
-from emgs_jax.render.densify import DensifyConfig, densify
+from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.running.convert import to_se3
 from emgs_jax.running.record import MappingRun
 from emgs_jax.semantics import classify
@@ -59,8 +60,7 @@ def dense_map(
     pictures: list[dict[str, Any]] = []
 
     def clouds() -> Iterator[PointCloud]:
-        for row in known:
-            view = jax.device_get(_densify(run.state.map.gaussians, to_se3(run.poses[row]), run.camera, config))
+        for row, view in zip(known, _drawn_ahead(run, known, config), strict=True):
             if row in shown:
                 pictures.append(_picture(run, dataset, row, view) | _label_image(view, centers))
             yield PointCloud(
@@ -69,6 +69,21 @@ def dense_map(
 
     cloud = fuse_clouds(clouds(), voxel)
     return DenseMap(cloud, None if centers is None else _labelled(centers, cloud.points), pictures)
+
+
+def _drawn_ahead(run: MappingRun, rows: list[int], config: DensifyConfig) -> Iterator[DenseView]:
+    """The views of frames on the host; the next is being drawn while one is looked at."""
+    pending: DenseView | None = None
+    poses = to_se3(np.reshape([run.poses[row] for row in rows], (-1, 4, 4)))
+    for position in range(len(rows)):
+        pose = jaxlie.SE3(poses.wxyz_xyz[position])
+        view = _densify(run.state.map.gaussians, pose, run.camera, config)
+        drawing = eqx.tree_at(lambda view: view.rendering, view, None)  # nobody looks at it, so it is not fetched
+        if pending is not None:
+            yield jax.device_get(pending)
+        pending = drawing
+    if pending is not None:
+        yield jax.device_get(pending)
 
 
 def center_cloud(run: MappingRun) -> PointCloud:

@@ -8,6 +8,7 @@ from emgs_jax.evaluation.segmentation import (
     LabelledPoints,
     compare_labels,
     confusion_matrix,
+    label_cells,
     segmentation_metrics,
     transfer_labels,
     true_labels,
@@ -91,23 +92,28 @@ class Planes:
         return Frame(0, 0.0, "f", image, np.full(self.shape, depth, np.float32), pose, labels)
 
 
+def truth_of(room: "Planes", frames: list[Frame]) -> LabelledPoints | None:
+    """True labels per voxel of 5 cm of what is nearer than 5 m."""
+    return true_labels([label_cells(frame, room, 0.05, 5.0) for frame in frames], room, 0.05)
+
+
 def test_true_points_are_the_voxels_that_a_class_is_seen_in_each_once():
     room = Planes()
-    truth = true_labels([room.frame(0.0), room.frame(0.0), room.frame(0.0, depth=9.0)], room, 0.05, max_depth=5.0)
+    truth = truth_of(room, [room.frame(0.0), room.frame(0.0), room.frame(0.0, depth=9.0)])
     assert truth.classes == room.classes and np.unique(np.column_stack([truth.points, truth.labels]), axis=0).shape == (
         380,
         4,
     )  # 19 rows of 20 pixels of 5 cm, seen twice
     np.testing.assert_allclose(truth.points[:, 2], 1.025)
     np.testing.assert_array_equal(truth.labels, truth.points[:, 0] > 0)
-    moved = true_labels([room.frame(3.0)], room, 0.05, 5.0)
+    moved = truth_of(room, [room.frame(3.0)])
     np.testing.assert_array_equal(moved.labels, moved.points[:, 0] > 3.0)
-    assert true_labels([], room, 0.05, 5.0) is None
+    assert truth_of(room, []) is None and truth_of(room, [room.frame(0.0, depth=9.0)]) is None
 
 
 def test_classes_are_compared_by_their_names_and_one_that_the_truth_lacks_is_wrong():
     room = Planes()
-    truth = true_labels([room.frame(0.0)], room, 0.05, 5.0)
+    truth = truth_of(room, [room.frame(0.0)])
     found = LabelledPoints(truth.points, 2 - truth.labels, ("lamp", "right", "left"))
     assert compare_labels(found, truth, 1)["segmentation/miou_percent"] == 100.0
     lost = LabelledPoints(truth.points, np.where(truth.labels == 0, 0, 1), ("lamp", "right"))
