@@ -19,8 +19,10 @@ from emgs_jax.running.compilation import use_compilation_cache
 from emgs_jax.running.configure import CONF, compose, first_of_sweep, message_of
 
 
-def command(name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
-    """Make a program of a function of conf/`name`.yaml with the command line's overrides."""
+def command(
+    name: str, rewritten: Callable[[list[str]], list[str]] = list
+) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
+    """Make a program of a function of conf/`name`.yaml with the command line's overrides, `rewritten` if need be."""
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
         @wraps(task)
@@ -32,6 +34,7 @@ def command(name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], N
 
         def main() -> None:
             with clear_errors():
+                sys.argv[1:] = rewritten(sys.argv[1:])
                 check_arguments(name, sys.argv[1:])
             hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name=name)(job)()
 

@@ -6,13 +6,13 @@ gets one folder per job, results.csv, results.json and results.md.
 
 import contextlib
 import copy
+import re
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import hydra
 import jax
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
@@ -21,7 +21,7 @@ from emgs_jax.io.files import atomic_write, write_json
 from emgs_jax.report.gate import read_gate, regressions, write_gate
 from emgs_jax.report.results import is_finished, read_estimates, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
-from emgs_jax.running.configure import message_of
+from emgs_jax.running.configure import compose, message_of
 
 from .command import command
 from .run import run
@@ -43,8 +43,9 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
     """All jobs, those of one data set one after the other; `settings` is a resolved conf/evaluate.yaml."""
     for dataset, data in settings["suite"]["data"].items():
         for variant, changes in settings["variants"].items():
-            overrides = [f"dataset={dataset}", *data["overrides"], *settings["overrides"], *changes]
-            common = hydra.compose("config", overrides=overrides)
+            own, changed = ([_override(*item) for item in some.items()] for some in (data["overrides"], changes))
+            overrides = [f"dataset={dataset}", *own, *settings["overrides"], *changed]
+            common = compose(*overrides)
             has_seed = "seed" in common.prior
             if not has_seed and len(settings["seeds"]) > 1:
                 raise ValueError(f"prior.seed is no key of {common.prior._target_}: give one seed, seeds=[0]")
@@ -56,6 +57,33 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
                         config.prior.seed = seed
                     folder = result_folder(Path(settings["out"]), dataset, sequence, variant, seed)
                     yield Job(f"{dataset}/{sequence}/{variant}/{seed}", dataset, config, folder)
+
+
+def _override(key: str, value: Any) -> str:
+    """`key=value` as Hydra reads it; text with anything special in it is quoted."""
+    is_plain = not isinstance(value, str) or re.fullmatch(r"[\w./-]+", value)
+    return f"{key}={value}" if is_plain else f"{key}={_quoted(value)}"
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "\\'") + "'"
+
+
+def delegated(arguments: Sequence[str]) -> list[str]:
+    """The arguments with those that are no key of conf/evaluate.yaml, such as `prior=recorded`, in `overrides`."""
+    own = {*compose("suite=smoke", name="evaluate"), "hydra"}
+    is_own = [
+        text.startswith("-") or re.split(r"[=./@]", text.lstrip("+~"), maxsplit=1)[0] in own for text in arguments
+    ]
+    rest = [text for text, mine in zip(arguments, is_own, strict=True) if not mine]
+    kept = [text for text, mine in zip(arguments, is_own, strict=True) if mine]
+    if rest and any(text.startswith("overrides=") for text in kept):
+        raise ValueError(
+            f"{rest[0]} is for the runs: write it into overrides=[…], or all of those as words of their own"
+        )
+    # Interpolations are the run's, so they are not resolved here.
+    words = [_quoted(text.replace("${", r"\${")) for text in rest]
+    return [*kept, f"overrides=[{','.join(words)}]"] if rest else kept
 
 
 def evaluate(settings: Mapping[str, Any]) -> list[str]:
@@ -132,7 +160,7 @@ def _write_tables(
     return rows
 
 
-@command("evaluate")
+@command("evaluate", delegated)
 def main(config: DictConfig) -> None:
     """Evaluate; the exit status is 1 if a job failed or a metric got worse."""
     problems = evaluate(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))

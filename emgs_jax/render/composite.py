@@ -11,12 +11,8 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
-<<<<<<< ours
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import fill_rows, static, take_rows, traced
-=======
 from emgs_jax.ops.pytree import static, take_rows, traced
->>>>>>> theirs
 from emgs_jax.render.project import Splats, project_gaussians
 from emgs_jax.render.tiles import assign_tiles, tile_corners
 

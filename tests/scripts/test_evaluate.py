@@ -20,6 +20,7 @@ from emgs_jax.io.files import write_json
 from emgs_jax.report.gate import read_gate
 from emgs_jax.report.provenance import RESULT_FORMAT
 from emgs_jax.report.results import METRICS_FILE
+from emgs_jax.running.configure import compose
 from experiments.command import clear_errors
 
 ENVIRONMENT = os.environ | {"JAX_PLATFORMS": "cpu"}
@@ -55,7 +56,7 @@ def evaluate(tmp_path, monkeypatch):
 
 
 def test_every_sequence_is_run_with_every_seed_and_variant(evaluate):
-    assert evaluate("seeds=[0,2]", '+variants.wide=["slam.window_size=7"]') == []
+    assert evaluate("seeds=[0,2]", "+variants.wide={slam.window_size:7}") == []
     assert evaluate.runs == [(0, 0), (0, 2), (1, 0), (1, 2)] * 2
     configs = {
         path.relative_to(evaluate.out).parent.as_posix(): json.loads(path.read_text())["provenance"]["config"]
@@ -198,6 +199,24 @@ def test_an_error_in_a_multirun_goes_to_hydra_so_that_the_other_jobs_run(monkeyp
     monkeypatch.setattr(HydraConfig, "get", lambda: running.hydra)
     with pytest.raises(error, match="what is wrong"), clear_errors():
         raise ValueError("what is wrong")
+
+
+def test_words_that_are_no_key_of_an_evaluation_go_to_its_runs_as_they_are():
+    """Written into overrides=[…] by hand they had to be quoted twice."""
+    words = ["prior=recorded", "prior.folder='my predictions/${dataset.sequence}'", "dataset.size=[160,120]"]
+    own = ["suite=tum", "-m", "suite.root=it", "hydra/launcher=joblib", "+variants.wide={slam.window_size:7}"]
+    arguments = experiments.evaluate.delegated([*words[:1], *own, *words[1:]])
+    assert arguments[:-1] == own and experiments.evaluate.delegated(own) == own
+    given = [text for text in arguments if text[0] != "-" and not text.startswith(("hydra", "suite.root"))]
+    config = compose(*given, "suite.root='some folder'", name="evaluate")
+    jobs = list(experiments.evaluate.plan(OmegaConf.to_container(config, resolve=True)))
+    for job in jobs:
+        sequence = job.config.dataset.sequence
+        assert job.config.prior.folder == f"my predictions/{sequence}" and job.config.dataset.root == "some folder"
+        assert job.config.dataset.size == [160, 120]
+    assert [job.config.slam.window_size for job in jobs] == [10] * 9 + [7] * 9
+    with pytest.raises(ValueError, match="prior=recorded is for the runs"):
+        experiments.evaluate.delegated(["prior=recorded", "overrides=['prior.seed=1']"])
 
 
 def run_script(*arguments):
