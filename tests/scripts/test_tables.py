@@ -97,7 +97,7 @@ def settings(tmp_path):
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         config = hydra.compose("tables", ["root=nowhere", f"out={tmp_path / 'out'}", f"page={tmp_path / 'page.md'}"])
         config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        settings = {"default": [], "level 2": ["prior.level=2"]}
+        settings = {"default": {}, "level 2": {"prior.level": 2}}
         config["tables"] = {"some": [{"data": ["synthetic"], "seeds": [3, 4], "settings": settings}]}
         (tmp_path / "page.md").write_text(PAGE)
         yield config
