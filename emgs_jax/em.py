@@ -10,6 +10,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import (
     Entries,
+    Whitening,
     dot,
     gather_entries,
     gather_offsets,
@@ -98,7 +99,11 @@ def widened_distance_sq(
 
 @full_precision
 def e_step(
-    gaussians: Gaussians, points: Observation, noise: Float[Array, "m 3"], config: EmConfig
+    gaussians: Gaussians,
+    points: Observation,
+    noise: Float[Array, "m 3"],
+    config: EmConfig,
+    white: Whitening | None = None,
 ) -> tuple[EStep, Float[Array, "m"]]:
     """Responsibilities of the K nearest Gaussians for every point (eq. 2 and 3), and each point's best log-joint.
 
@@ -107,25 +112,26 @@ def e_step(
         points: m observed points, world frame.
         noise: m; standard deviation of every point along its viewing ray, as a vector.
         config: gates and weights.
+        white: `whitening` of the Gaussians' covariances; None makes it here.
     """
     rows, found = knn(points.points, gaussians.means, gaussians.valid, config.num_neighbours)
-    shapes = whitening(gaussians.covs)
+    white = whitening(gaussians.covs) if white is None else white
     parts = split_rows((points, noise, rows, found), MAX_POINTS)
-    explained = jax.lax.map(lambda part: _explain(gaussians, shapes, *part, config), parts)
+    explained = jax.lax.map(lambda part: _explain(gaussians, white, *part, config), parts)
     return join_rows(explained, points.valid.shape[0])
 
 
 def _explain(
     gaussians: Gaussians,
-    shapes: tuple[Float[Array, "n 6"], Float[Array, "n"]],
+    white: Whitening,
     points: Observation,
     noise: Float[Array, "m 3"],
     rows: Int[Array, "m k"],
     found: Bool[Array, "m k"],
     config: EmConfig,
 ) -> tuple[EStep, Float[Array, "m"]]:
-    """The E-step for given neighbours; `shapes` of `whitening`."""
-    triangles, logdets = shapes
+    """The E-step for given neighbours."""
+    triangles, logdets = white
     offsets = gather_offsets(points.points, gaussians.means, rows)
     ray, normals = (jnp.unstack(vectors[:, None], axis=-1) for vectors in (config.noise * noise, points.normals))
     distance_sq, log_growth = widened_distance_sq(gather_entries(triangles, rows), offsets, ray)
@@ -218,17 +224,21 @@ def _add_statistics(
 
 @full_precision
 def em_update(
-    submap: GaussianMap, aligned: Observation, noise: Float[Array, "m 3"], config: EmConfig
+    submap: GaussianMap,
+    aligned: Observation,
+    noise: Float[Array, "m 3"],
+    config: EmConfig,
+    white: Whitening | None = None,
 ) -> tuple[GaussianMap, Bool[Array, "m"], EmInfo]:
     """One incremental EM step: fuse the points of `aligned` (world frame) that the submap explains.
 
-    `noise` is the standard deviation of each point along its viewing ray, a vector in metres.
+    `noise` is the standard deviation of each point along its viewing ray, a vector in metres; `white` as in `e_step`.
 
     Returns:
         The updated submap, which points were fused, and counts. Without any fused point the submap is unchanged.
     """
     gaussians = submap.gaussians
-    step, best = e_step(gaussians, aligned, noise, config)
+    step, best = e_step(gaussians, aligned, noise, config, white)
     new, total = m_step(gaussians, aligned, step, config)
     evidence = jnp.where(total > 0, support(gaussians, aligned, step, config), 0.0)
     updated, gain = update_average(submap, new, evidence, config.average)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation, Prediction, transform
 from emgs_jax.ops.camera import Camera, nearest_pixel, project
+from emgs_jax.ops.linalg import Whitening
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
 from emgs_jax.registration.icp import IcpConfig, IcpInfo, icp
@@ -212,7 +213,11 @@ def localize_coarse(
 
 @full_precision
 def localize_fine(
-    current: Observation, submap: Gaussians, coarse: CoarsePose, config: LocalizationConfig
+    current: Observation,
+    submap: Gaussians,
+    coarse: CoarsePose,
+    config: LocalizationConfig,
+    white: Whitening | None = None,
 ) -> tuple[jaxlie.SE3, Observation, LocalizationInfo]:
     """Fine registration against the submap; the coarse pose and scale stay where a check fails.
 
@@ -221,6 +226,7 @@ def localize_fine(
         submap: Gaussians, world frame.
         coarse: result of `localize_coarse`.
         config: terms, gates and checks.
+        white: `whitening` of the submap's covariances; None makes it here.
 
     Returns:
         T_world_camera, the observation in the world frame, and the outcome.
@@ -228,7 +234,8 @@ def localize_fine(
     scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
     # The coarse pose is as good as two predictions of one image agree; a millimetre keeps the solve well scaled.
     noise_m = jnp.maximum(coarse.repeat_rms, 1e-3)
-    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, (noise_m, noise_m / coarse.mean_depth), config.icp)
+    noise = noise_m, noise_m / coarse.mean_depth
+    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, noise, config.icp, white)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     step_m, step_rad = jnp.linalg.norm(step[:3]), jnp.linalg.norm(step[3:])
     failed = jnp.stack(

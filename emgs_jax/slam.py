@@ -24,6 +24,7 @@ from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationIn
 from emgs_jax.observation import Observation, ObservationConfig, Prediction, transform
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
+from emgs_jax.ops.linalg import Whitening, whitening
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
@@ -150,9 +151,9 @@ def step(
     """
     thin, last = config.observation.thin, (state.previous, state.T_world_previous)
     coarse, guess = call(_approach, prediction, *last, camera, thin, config.localization)
-    submap, rows, submap_overflow = call(_select, state.map, (state.previous, guess), config.submap)
-    T, aligned, localization = call(_place, prediction.current, submap.gaussians, coarse, config.localization)
-    submap, rest, em = call(_fuse, submap, aligned, T, localization, config.em)
+    submap, white, rows, submap_overflow = call(_select, state.map, (state.previous, guess), config.submap)
+    T, aligned, localization = call(_place, prediction.current, submap.gaussians, coarse, config.localization, white)
+    submap, rest, em = call(_fuse, submap, white, aligned, T, localization, config.em)
     candidates, weight = call(cluster, rest, call(_order, camera, thin), spacing(thin, config.fit), config.fit)
     submap, fresh, refinement = call(_refine, submap, candidates, T, camera, thin, config.refinement)
     map, count, map_overflow = call(_store, state.map, submap, rows, fresh, weight, config.em.average)
@@ -183,18 +184,31 @@ def _approach(
     return coarse, transform(coarse.T_world_camera, prediction.current, coarse.scale)
 
 
-_select = eqx.filter_jit(select_submap)
+@eqx.filter_jit
+def _select(
+    map: GaussianMap, clouds: tuple[Observation, ...], config: SubmapConfig
+) -> tuple[GaussianMap, Whitening, Int[Array, "s"], Int[Array, ""]]:
+    """`select_submap` with the whitening of its covariances, which stay as they are until EM."""
+    submap, rows, overflow = select_submap(map, clouds, config)
+    return submap, whitening(submap.gaussians.covs), rows, overflow
+
+
 _place = eqx.filter_jit(localize_fine)
 
 
 @eqx.filter_jit
 def _fuse(
-    submap: GaussianMap, aligned: Observation, T: jaxlie.SE3, localization: LocalizationInfo, config: EmConfig
+    submap: GaussianMap,
+    white: Whitening,
+    aligned: Observation,
+    T: jaxlie.SE3,
+    localization: LocalizationInfo,
+    config: EmConfig,
 ) -> tuple[GaussianMap, Observation, EmInfo]:
     """Fuse the points of a frame that is tracked; returns those that no Gaussian explains."""
     trusted = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & localization.is_tracked)
     noise = localization.depth_noise * (trusted.points - T.translation())
-    submap, is_fused, em = em_update(submap, trusted, noise, config)
+    submap, is_fused, em = em_update(submap, trusted, noise, config, white)
     return submap, eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~is_fused), em
 
 

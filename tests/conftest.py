@@ -1,10 +1,18 @@
 """Shared by all tests of the core: shapes and types checked at every call, one small config, one small camera."""
 
+import os
 from pathlib import Path
 
-import jax
-import pytest
-from jaxtyping import install_import_hook
+from emgs_jax.running.compilation import cache_folder
+
+# Before JAX is imported, and for the processes that tests start: most of the time of the tests is compilation.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder()))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
 
 PACKAGE = Path(__file__).resolve().parents[1] / "emgs_jax"
 # Before anything imports the package: every file that declares shapes of JAX arrays has them checked at every call.

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 Entries: TypeAlias = tuple[Float[Array, "..."], ...]
+Whitening: TypeAlias = tuple[Float[Array, "n 6"], Float[Array, "n"]]  # what `whitening` gives for n covariances
 
 # Below this length (m) a vector has no direction; far under any distance that is measured, far above float32's least.
 SMALLEST_LENGTH = 1e-12

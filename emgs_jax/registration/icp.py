@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import Gaussians, intensity
 from emgs_jax.observation import Observation, transform
-from emgs_jax.ops.linalg import whiten, widen
+from emgs_jax.ops.linalg import Whitening, whiten, widen
 from emgs_jax.ops.neighbours import knn
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, static, traced
@@ -100,6 +100,7 @@ def _pose_problem(
     T_world_coarse: jaxlie.SE3,
     noise: tuple[Float[Array, ""], Float[Array, ""]],
     config: IcpConfig,
+    white: Whitening | None,
 ) -> _Problem:
     pose_noise, depth_noise = noise
     stride = max(source.valid.shape[0] // config.num_points, 1)
@@ -108,7 +109,7 @@ def _pose_problem(
     return _Problem(
         source=source,
         rays=config.noise * depth_noise * source.points,
-        surface=surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours),
+        surface=surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, white),
         T_world_coarse=T_world_coarse,
         scale_std=config.scale_noise * depth_noise,
         prior=jnp.append(prior, 1.0),
@@ -179,6 +180,7 @@ def icp(
     T_world_coarse: jaxlie.SE3,
     noise: tuple[Float[Array, ""], Float[Array, ""]],
     config: IcpConfig,
+    white: Whitening | None = None,
 ) -> tuple[jaxlie.SE3, Float[Array, ""], IcpInfo]:
     """Place camera-frame `source` on `target`: argmin over xi and s of data + prior, T = T_world_coarse exp(xi).
 
@@ -193,11 +195,12 @@ def icp(
         T_world_coarse: where to start, and the mean of the prior.
         noise: standard deviation of the coarse pose in metres, and of the points' depth as a fraction of it.
         config: terms and gates.
+        white: `whitening` of the target's covariances; None makes it here.
 
     Returns:
         T_world_camera, the scale, and what the solve found.
     """
-    problem = _pose_problem(source, target, T_world_coarse, noise, config)
+    problem = _pose_problem(source, target, T_world_coarse, noise, config, white)
     # Seven unknowns: on a CPU the normal equations take a fraction of a QR of all rows.
     solver = optx.LevenbergMarquardt(
         rtol=config.tolerance, atol=config.tolerance, linear_solver=lineax.Normal(lineax.Cholesky())

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import Gaussians, color_gradients, intensity
 from emgs_jax.observation import Observation
-from emgs_jax.ops.linalg import dot, gather_entries, gather_offsets, mahalanobis_sq, whiten, whitening, widen
+from emgs_jax.ops.linalg import Whitening, dot, gather_entries, gather_offsets, mahalanobis_sq, whiten, whitening, widen
 
 Candidates: TypeAlias = tuple[Int[Array, "p k"], Bool[Array, "p k"]]  # of `knn`: rows of the Gaussians, which exist
 
@@ -45,8 +45,10 @@ class Matches(eqx.Module):
     is_inlier: Bool[Array, "p"]
 
 
-def surface_of(gaussians: Gaussians, has_color: Bool[Array, ""], num_color_neighbours: int) -> Surface:
-    """Whitening, thickness and colour gradients of Gaussians; zero gradients unless `has_color`."""
+def surface_of(
+    gaussians: Gaussians, has_color: Bool[Array, ""], num_color_neighbours: int, white: Whitening | None = None
+) -> Surface:
+    """Whitening (made here where it is None), thickness and colour gradients; zero gradients unless `has_color`."""
     # Only where colour counts: the gradients cost a neighbour search over the submap.
     gradients = jax.lax.cond(
         has_color,
@@ -55,7 +57,7 @@ def surface_of(gaussians: Gaussians, has_color: Bool[Array, ""], num_color_neigh
     )
     return Surface(
         gaussians=gaussians,
-        triangles=whitening(gaussians.covs)[0],
+        triangles=(whitening(gaussians.covs) if white is None else white)[0],
         plane_vars=mahalanobis_sq(gaussians.normals, gaussians.covs),  # n' Σ n
         light=intensity(gaussians.colors),
         gradients=gradients,
