@@ -44,7 +44,7 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.render.composite import render as render_gaussians
     from emgs_jax.render.densify import DensifyConfig, densify
     from emgs_jax.running.compilation import use_compilation_cache
-    from emgs_jax.running.configure import RunConfig, build_dataset, build_prior, load_config
+    from emgs_jax.running.configure import RunConfig, build_dataset, build_prior, compose, load_config
     from emgs_jax.running.convert import FirstWindow, opening, to_camera, to_first_window, to_prediction
     from emgs_jax.running.drive import map_frames, map_sequence, take
     from emgs_jax.running.growth import advance, start
@@ -74,7 +74,7 @@ _HOMES = {
     "render.composite": ("RenderConfig", "Rendering", "render_gaussians"),
     "render.densify": ("DensifyConfig", "densify"),
     "running.compilation": ("use_compilation_cache",),
-    "running.configure": ("RunConfig", "build_dataset", "build_prior", "load_config"),
+    "running.configure": ("RunConfig", "build_dataset", "build_prior", "compose", "load_config"),
     "running.convert": ("FirstWindow", "opening", "to_camera", "to_first_window", "to_prediction"),
     "running.drive": ("map_frames", "map_sequence", "take"),
     "running.growth": ("advance", "start"),

@@ -1,10 +1,11 @@
 """Every YAML composes, every key is a parameter of its class, and every field of a config class is read somewhere."""
 
 import ast
+import dataclasses
 import inspect
+import typing
 from pathlib import Path
 
-import equinox as eqx
 import hydra
 import pytest
 from omegaconf import OmegaConf
@@ -14,7 +15,7 @@ from emgs_jax.slam import SlamConfig
 
 ROOT = CONF.parent
 # Studies and suites hold no class; tests/scripts composes them.
-UNTYPED = {CONF, CONF / "experiment", CONF / "suite", CONF / "baseline", CONF / "sweep"}
+UNTYPED = {CONF, CONF / "experiment", CONF / "experiment_on", CONF / "suite", CONF / "baseline", CONF / "sweep"}
 GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent not in UNTYPED)
 
 
@@ -93,15 +94,22 @@ def test_the_paper_preset_takes_every_printed_reading():
     assert {key: OmegaConf.select(paper.slam, key) for key in printed} == printed
 
 
-def config_fields(module: type, seen: set):
-    """All fields of a config class and of those it holds."""
-    if module in seen:
-        return
-    seen.add(module)
-    for name, field in module.__dataclass_fields__.items():
-        yield module.__name__, name
-        if inspect.isclass(field.type) and issubclass(field.type, eqx.Module):
-            yield from config_fields(field.type, seen)
+def config_classes():
+    """Every class of conf/ that holds settings only, and the config classes that they hold."""
+    seen = set()
+
+    def visit(module):
+        if module in seen or not dataclasses.is_dataclass(module):
+            return
+        seen.add(module)
+        for hint in typing.get_type_hints(module).values():
+            if inspect.isclass(hint):
+                visit(hint)
+
+    for group, option in map(group_and_option, GROUPED):
+        for node in targets(OmegaConf.to_container(compose(f"{group}={option}"), resolve=False)):
+            visit(hydra.utils.get_class(node["_target_"]))
+    return seen
 
 
 def test_every_field_of_a_config_class_is_read():
@@ -111,5 +119,21 @@ def test_every_field_of_a_config_class_is_read():
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
                     read.add(node.attr)
-    unread = [f"{owner}.{name}" for owner, name in config_fields(SlamConfig, set()) if name not in read]
-    assert not unread
+    classes = config_classes()
+    names = {module.__name__ for module in classes}
+    assert {"SlamConfig", "IcpConfig", "DensifyConfig", "EvaluationConfig", "MaskConfig", "SweepConfig"} <= names
+    unread = [f"{module.__name__}.{field.name}" for module in classes for field in dataclasses.fields(module)]
+    assert not [name for name in unread if name.rpartition(".")[2] not in read]
+
+
+def test_a_value_that_stands_in_a_constructor_too_is_the_same_there():
+    """conf/ is where a value is looked up; a class that can be made by hand must not disagree with it."""
+    for group, option in map(group_and_option, GROUPED):
+        if option not in ("default", "paper", "none", group):
+            for node in targets(OmegaConf.to_container(compose(f"{group}={option}"))):
+                if node["_target_"].startswith(("emgs_jax.data.", "emgs_jax.prior.")):
+                    parameters = inspect.signature(hydra.utils.get_class(node["_target_"])).parameters
+                    for key, value in node.items():
+                        if key in parameters and parameters[key].default is not inspect.Parameter.empty:
+                            default = parameters[key].default
+                            assert (list(default) if isinstance(default, tuple) else default) == value, key

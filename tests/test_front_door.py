@@ -102,6 +102,18 @@ def test_a_sequence_becomes_a_map_that_is_saved_loaded_and_carried_on_by_ones_ow
     assert int(info.num_gaussians) == run.records[-1].num_gaussians and same_bits(state, run.state)
 
 
+@pytest.mark.slow
+def test_the_snippet_of_the_readme_runs_and_both_ways_give_the_same_map(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = (PACKAGE.parent / "README.md").read_text(encoding="utf-8")
+    (snippet,) = [part.split("```")[0] for part in text.split("```python\n")[1:] if "map_sequence" in part]
+    tiny = ", ".join(repr(word) for word in (*TINY, "compilation_cache=off"))
+    assert snippet.count('"dataset=synthetic", "experiment=smoke"') == 2
+    found: dict = {}
+    exec(snippet.replace('"dataset=synthetic", "experiment=smoke"', tiny), found)
+    assert same_bits(found["map"], found["run"].map) and same_bits(found["state"], found["run"].state)
+
+
 def same_bits(tree, other) -> bool:
     pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
     return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)

@@ -42,7 +42,7 @@ class Input:
     spent: Mapping[str, float]
 
 
-def inputs(dataset: Dataset, prior: Prior, config: SlamConfig, clock: Clock) -> Iterator[Input]:
+def inputs(dataset: Dataset, prior: Prior, config: SlamConfig, clock: Clock | None = None) -> Iterator[Input]:
     """All inputs of a sequence: frames from which no map can start, what it starts from, then steps.
 
     The pose of the first frame is the true one where it is known, else the identity.
@@ -50,7 +50,7 @@ def inputs(dataset: Dataset, prior: Prior, config: SlamConfig, clock: Clock) -> 
     Raises:
         ValueError: no frame has a point and a pose from which a map can start.
     """
-    num_done, last, is_started = 0, np.eye(4), False
+    num_done, last, is_started, clock = 0, np.eye(4), False, clock or Clock()
     for prediction, frames in predictions(dataset, prior, config.window_size, clock):
         with clock.phase("map"):
             anchor = first_pose(frames)
