@@ -127,7 +127,7 @@ def moved(g, k, new, gain):
 
 
 def em_update(points, normals, features, colors, noise, valid, g, weight, config):
-    """One update: {row: (mean, cov, normal, colour, weight)} of the Gaussians that change, who is fused, mean log-joint."""
+    """{row: (mean, cov, normal, colour, weight)} of the Gaussians that change, who is fused, and the mean log-joint."""
     r, is_fused, best = e_step(points, normals, features, noise, valid, g, config)
     kind, changed = ("printed", "normalized")[int(config.support)], {}
     for k in np.flatnonzero(r.sum(axis=0) > float(config.min_responsibility)):

@@ -54,7 +54,7 @@ def arrays(points):
 
 READINGS = {
     "printed": {"support": 0.0, "determinant_weight": 1.0, "average.gain": 0.0, "noise": 0.0, "max_log_gap": 30.0},
-    "default": {"support": 1.0, "determinant_weight": 0.5, "average.gain": 1.0, "noise": 1.0, "max_log_gap": 14.0},
+    "default": {"support": 1.0, "determinant_weight": 0.5, "average.gain": 1.0, "noise": 1.0, "max_log_gap": 20.0},
     "half the noise": {"support": 1.0, "determinant_weight": 0.5, "average.gain": 1.0, "noise": 0.5},
     "few points": {"min_responsibility": 1.5, "average.forgetting": 0.7, "noise": 2.0},
 }
