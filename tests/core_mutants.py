@@ -141,6 +141,7 @@ STAGES = [
         ("-0.5 * dot(white, white)", "-dot(white, white)", "eq. 1's weights with twice the exponent"),
         ("max(spacing // num_neighbours, 1)", "1", "a Gaussian smaller than its cluster"),
         ("count / spacing", "count", "a weight in points"),
+        ("even.valid & row_exists", "even.valid", "points that are not there count in eq. 1"),
         ("0.01 * jnp.trace(moments", "0.1 * jnp.trace(moments", "ten times the ridge"),
         ("jnp.sum(found, axis=-1) >= 4", "jnp.sum(found, axis=-1) >= 3", "a covariance from three points"),
         ("config.min_std**2 * jnp.eye(3)", "config.min_std * jnp.eye(3)", "a deviation for a variance"),

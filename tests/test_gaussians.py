@@ -141,6 +141,23 @@ def test_a_gaussian_is_as_large_as_its_cluster_whatever_the_number_of_points_in_
     assert 0.6 * expected < np.median(trace) < 1.5 * expected
 
 
+def test_a_handful_of_points_makes_one_gaussian_of_just_these(fit_config, camera):
+    """Five valid points of 768: what is not there has no part in eq. 1."""
+    points = random_observation(768)
+    points = eqx.tree_at(lambda o: o.valid, points, jnp.arange(768) % 170 == 40)
+    arrays = [np.asarray(x, float) for x in (points.points, points.normals, points.colors, points.features)]
+    valid = np.asarray(points.valid)
+    gaussians, weight = eqx.filter_jit(cluster)(points, morton_order(24, 32), 8, fit_config)
+    np.testing.assert_array_equal(gaussians.valid, np.arange(96) == 0)
+    assert valid.sum() == 5 and weight[0] == 5 / 8
+    center = arrays[0][valid].mean(axis=0)
+    expected = reference.fit_to_points(center, *arrays, valid, fit_config.num_fit_neighbours, float(fit_config.min_std))
+    actual = gaussians.covs[0], gaussians.normals[0], gaussians.colors[0]
+    np.testing.assert_allclose(gaussians.means[0], center, atol=1e-5)  # roundings of coordinates of 2 m
+    for a, b in zip(actual, expected, strict=False):
+        np.testing.assert_allclose(a, b, atol=2e-4)  # as for eq. 1
+
+
 def test_free_rows_are_neutral():
     rows = empty_gaussians(3, 2)
     np.testing.assert_array_equal(rows.covs, np.tile(np.eye(3), (3, 1, 1)))

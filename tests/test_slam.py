@@ -11,6 +11,7 @@ import reference
 from scene import assert_same, at, move_gaussians, observe_room, path_pose, pose, pose_error, predict_room, stack_poses
 
 from emgs_jax.observation import Prediction, transform
+from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.pytree import stack
 from emgs_jax.slam import (
     FirstWindow,
@@ -29,9 +30,10 @@ from emgs_jax.slam import (
 one_step, first_state = eqx.filter_jit(step), eqx.filter_jit(init_state)
 FRAME = 3
 pytestmark = pytest.mark.slow  # one compilation of the whole step is half a minute
-WHOLE = (
-    "slam.submap.margin=100",
-)  # the whole map, so that the axis-aligned voxels choose the same Gaussians in every frame
+# Every second row and column of the full images is kept, which are those of `camera`; 32 of their pixels make 8 rows.
+FULL = Camera([40.0, 46.0], [29.0, 24.5], 64, 48)
+# The whole map, so that the axis-aligned voxels choose the same Gaussians in every frame.
+WHOLE = ("slam.submap.margin=100", "slam.observation.thin=2", "slam.fit.points_per_gaussian=32")
 
 
 @pytest.fixture(scope="module")
@@ -51,12 +53,12 @@ def settings(config):
 
 @pytest.fixture(scope="module")
 def state(window, camera, settings):
-    return first_state(window.views, window.T_world_views, camera, settings)[0]
+    return first_state(window.views, window.T_world_views, FULL, settings)[0]
 
 
 @pytest.fixture(scope="module")
 def stepped(state, camera, settings):
-    return one_step(state, predict_room(FRAME, camera, num_features=2), camera, settings)
+    return one_step(state, predict_room(FRAME, camera, num_features=2), FULL, settings)
 
 
 def test_the_first_state_holds_the_last_view_as_it_is_in_the_world(state, window, camera):
@@ -100,13 +102,13 @@ def test_a_new_gaussian_weighs_as_many_images_as_its_points_amount_to_or_one_as_
     prediction, held = predict_room(FRAME, camera, num_features=2), np.asarray(state.map.gaussians.valid)
     elsewhere = eqx.tree_at(lambda c: c.em.max_mahalanobis_sq, settings, jnp.zeros(()))  # so that EM fuses nothing
     apart = at(elsewhere, "refinement.max_mahalanobis_sq_2d", 0.0)
-    new, info = one_step(state, prediction, camera, apart)
+    new, info = one_step(state, prediction, FULL, apart)
     fresh = np.asarray(new.map.gaussians.valid) & ~held
     assert info.em.num_fused == 0 and fresh.sum() == info.refinement.num_fresh > 50
     weight = np.asarray(new.map.weight)[fresh]
     np.testing.assert_allclose(8 * weight, np.round(8 * weight), atol=1e-4)
     assert weight.std() > 0.05 and 0.8 * 768 < 8 * weight.sum() <= 768.01
-    printed, _ = one_step(state, prediction, camera, at(apart, "em.average.gain", 0))
+    printed, _ = one_step(state, prediction, FULL, at(apart, "em.average.gain", 0))
     np.testing.assert_array_equal(np.asarray(printed.map.weight)[fresh], 1)
 
 
@@ -126,7 +128,7 @@ def test_a_frame_that_is_not_tracked_leaves_the_map_bit_for_bit(state, camera, s
         )
     else:
         config = at(settings, "localization.max_residual", 0.0)
-    new, info = one_step(state, prediction, camera, config)
+    new, info = one_step(state, prediction, FULL, config)
     assert not info.localization.is_tracked and info.localization.reason > 0
     assert info.em.num_fused == 0 and info.em.num_points == 0 and info.refinement.num_fresh == 0
     assert_same(new.map, state.map)
@@ -135,8 +137,8 @@ def test_a_frame_that_is_not_tracked_leaves_the_map_bit_for_bit(state, camera, s
 
 def test_a_step_after_a_lost_frame_is_tracked_again(state, camera, settings):
     lost = eqx.tree_at(lambda p: p.current.valid, predict_room(FRAME, camera, num_features=2), jnp.zeros(768, bool))
-    between, _ = one_step(state, lost, camera, settings)
-    _, info = one_step(between, predict_room(FRAME + 1, camera, num_features=2), camera, settings)
+    between, _ = one_step(state, lost, FULL, settings)
+    _, info = one_step(between, predict_room(FRAME + 1, camera, num_features=2), FULL, settings)
     assert info.localization.is_tracked
     assert pose_error(info.T_world_camera, path_pose(FRAME + 1))[0] < 0.05  # as above, over two frames
 
@@ -169,8 +171,8 @@ def test_a_step_moves_with_a_rigid_motion_of_the_world(state, camera, settings):
     """With noisy depths, so that the noise along the rays from the camera, wherever that is, decides what is fused."""
     motion, one = pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5)), jnp.ones(())
     prediction = noisy_prediction(FRAME, camera, np.random.default_rng(0))
-    stepped = one_step(state, prediction, camera, settings)
-    quiet = one_step(state, prediction, camera, at(settings, "em.noise", 0.0))[1]
+    stepped = one_step(state, prediction, FULL, settings)
+    quiet = one_step(state, prediction, FULL, at(settings, "em.noise", 0.0))[1]
     assert stepped[1].localization.is_tracked and quiet.em.num_fused < stepped[1].em.num_fused
     moved_prediction = Prediction(
         prediction.current,
@@ -181,7 +183,7 @@ def test_a_step_moves_with_a_rigid_motion_of_the_world(state, camera, settings):
     )
     map = eqx.tree_at(lambda m: m.gaussians, state.map, move_gaussians(motion, state.map.gaussians))
     moved_state = SlamState(map, transform(motion, state.previous, one), motion @ state.T_world_previous)
-    new, info = one_step(moved_state, moved_prediction, camera, settings)
+    new, info = one_step(moved_state, moved_prediction, FULL, settings)
     # The solver ends within its tolerance of the same pose; points near a gate may pass it or not.
     assert max(pose_error(info.T_world_camera, motion @ stepped[1].T_world_camera)) < 2e-3
     assert abs(int(info.em.num_fused) - int(stepped[1].em.num_fused)) <= 0.02 * 768
@@ -200,12 +202,12 @@ def test_free_rows_of_the_map_and_invalid_points_change_nothing(state, camera, s
     seen = jnp.arange(768) % 6 > 0
     views = lambda p: (p.current.valid, p.previous.valid)  # noqa: E731
     prediction = eqx.tree_at(views, predict_room(FRAME, camera, num_features=2), (seen, seen))
-    clean, clean_info = one_step(state, prediction, camera, settings)
+    clean, clean_info = one_step(state, prediction, FULL, settings)
     bad_prediction = eqx.tree_at(
         lambda p: (p.current, p.previous), prediction, (put(prediction.current, seen), put(prediction.previous, seen))
     )
     bad_state = eqx.tree_at(lambda s: s.map, state, put(state.map, state.map.gaussians.valid))
-    bad, bad_info = one_step(bad_state, bad_prediction, camera, settings)
+    bad, bad_info = one_step(bad_state, bad_prediction, FULL, settings)
     assert_same(bad_info, clean_info)
     valid = clean.map.gaussians.valid
     assert_same(*jax.tree.map(lambda x: x[valid], (bad.map, clean.map)))
@@ -225,10 +227,10 @@ def test_growing_on_the_way_gives_the_same_map_as_starting_large(window, camera,
         chosen = at(at(chosen, "localization.max_residual", 1.0), "localization.min_eigenvalue", 0.0)
         infos = []
         on_step = lambda s, i: infos.append(i)  # noqa: E731
-        return run(predictions(window, camera, 3), camera, chosen, on_step, first_state, one_step), infos
+        return run(predictions(window, camera, 3), FULL, chosen, on_step, first_state, one_step), infos
 
     small, infos = mapped(64, 64)
-    large, large_infos = mapped(256, 128)
+    large, large_infos = mapped(256, 192)
     count = int(large.map.gaussians.valid.sum())
     assert count > 96 and len(infos) == len(large_infos) == 3
     assert small.map.weight.shape[0] in (128, 256)
@@ -247,7 +249,7 @@ def test_a_run_follows_the_exact_path_reports_every_step_and_repeats_bit_for_bit
     for _ in range(2):
         poses = []
         on_step = lambda s, i, p=poses: p.append(i.T_world_camera)  # noqa: E731
-        state = run(predictions(window, camera, 3), camera, chosen, on_step, first_state, one_step)
+        state = run(predictions(window, camera, 3), FULL, chosen, on_step, first_state, one_step)
         results.append((state, poses))
     assert_same(*results)
     truth = [path_pose(i) for i in range(1 if initialization == "incremental" else FRAME, FRAME + 3)]
@@ -276,28 +278,15 @@ def test_a_map_of_noisy_predictions_is_more_accurate_than_their_points(camera, s
     infos = []
     chosen = config(*WHOLE, "slam.initialization=merged", "slam.em.average.gain=count")
     chosen = at(at(chosen, "localization.max_residual", 1.0), "localization.min_eigenvalue", 0.0)
-    final = run([first, *sequence], camera, chosen, lambda s, i: infos.append(i), first_state, one_step)
+    final = run([first, *sequence], FULL, chosen, lambda s, i: infos.append(i), first_state, one_step)
     raw_poses = [jaxlie.SE3(p.T_world_views.wxyz_xyz[1]) for p in sequence]
     pairs = [*zip(poses, views, strict=True), *zip(raw_poses, (p.current for p in sequence), strict=True)]
     raw = np.concatenate([off_walls(transform(T, o, jnp.ones(())).points) for T, o in pairs])
     ours = off_walls(final.map.gaussians.means)[np.asarray(final.map.gaussians.valid)]
-    truth = [path_pose(FRAME + i) for i in range(count)]
-    path = [
-        [pose_error(T, t)[0] for T, t in zip(p, truth, strict=True)]
-        for p in (raw_poses, [i.T_world_camera for i in infos])
-    ]
-    print(
-        "QUALITY",
-        seed,
-        np.quantile(raw, [0.5, 0.75, 0.9]),
-        np.quantile(ours, [0.5, 0.75, 0.9]),
-        np.mean(path, axis=1),
-        [bool(i.localization.is_tracked) for i in infos],
-        [int(i.em.num_fused) for i in infos],
-        [int(i.num_gaussians) for i in infos],
-    )
     assert all(i.localization.is_tracked for i in infos)
-    assert np.median(ours) < 0.7 * np.median(raw)
+    # Twelve frames see a wall, with errors that are independent but for the path's: a third is the most to hope for.
+    assert np.median(ours) < 0.65 * np.median(raw)
+    assert np.quantile(ours, 0.9) < 0.8 * np.quantile(raw, 0.9)
 
 
 def test_room_is_doubled_where_rows_did_not_fit(settings):
@@ -320,7 +309,7 @@ def test_a_frame_is_repeated_from_the_same_state_until_it_fits(state, stepped, c
         lost = jnp.asarray(chosen.submap.map_capacity < 4 * settings.submap.map_capacity, int)
         return given, eqx.tree_at(lambda i: i.overflow, stepped[1], Overflow(lost, 0 * lost, 1 + lost))
 
-    _, info, chosen = advance(state, prediction, camera, settings, crowded)
+    _, info, chosen = advance(state, prediction, FULL, settings, crowded)
     assert isinstance(info, StepInfo) and [size for _, size in calls] == [256, 512, 1024]
     assert chosen.submap.map_capacity == 1024 and chosen.submap.submap_capacity == settings.submap.submap_capacity
     for given, size in calls:
@@ -336,7 +325,7 @@ def test_the_first_map_is_made_again_until_it_fits(state, window, camera, settin
         sizes.append(chosen.submap.map_capacity)
         return state, jnp.asarray(chosen.submap.map_capacity < 1000, int)
 
-    started, chosen = start(window, camera, settings, crowded)
+    started, chosen = start(window, FULL, settings, crowded)
     assert sizes == [256, 512, 1024] and chosen.submap.map_capacity == 1024
     assert started is state
 
@@ -362,6 +351,6 @@ def test_a_window_opens_whole_or_view_by_view(window, config):
 
 def test_an_empty_sequence_and_an_unknown_initialisation_are_refused(camera, config, settings):
     with pytest.raises(ValueError, match="empty"):
-        run([], camera, settings)
+        run([], FULL, settings)
     with pytest.raises(Exception, match="merged or incremental.*'random'"):
         config("slam.initialization=random")
