@@ -29,9 +29,9 @@ def lloyd(points, seeds, num_iterations):
     return centroids, counts
 
 
-def fit_to_points(center, points, normals, colors, features, num_neighbours, min_std):
-    """Eq. 1 for one centre: covariance, normal, colour and medoid feature of its nearest points."""
-    rows = nearest_rows(center, points, np.ones(len(points), bool), num_neighbours)
+def fit_to_points(center, points, normals, colors, features, valid, num_neighbours, min_std):
+    """Eq. 1 for one centre: covariance, normal, colour and medoid feature of its nearest valid points."""
+    rows = nearest_rows(center, points, valid, num_neighbours)
     x = points[rows]
     cov = np.cov(x.T, bias=True) + min_std**2 * np.eye(3)
     weights = np.array([np.exp(-0.5 * (p - center) @ np.linalg.inv(cov) @ (p - center)) for p in x])
@@ -42,36 +42,42 @@ def fit_to_points(center, points, normals, colors, features, num_neighbours, min
     return cov, normal / np.linalg.norm(normal), share @ colors[rows], features[medoid]
 
 
-def log_joint(point, normal, feature, g, rows, determinant_weight, normal_weight, feature_weight):
-    """Eq. 3 for one point: log-joint and determinant term for the Gaussians `rows`; d² is squared once (R1)."""
-    joint, determinant = [], []
+def log_joint(point, normal, feature, noise, g, rows, config):
+    """Eq. 3 for one point: log-joint, determinant term and d² for the Gaussians `rows`, widened by the point's noise.
+
+    d² is squared once (R1).
+    """
+    joint, determinant, distances_sq = [], [], []
     for k in rows:
-        offset = point - g["means"][k]
-        determinant.append(-determinant_weight * np.linalg.slogdet(g["covs"][k])[1])
-        value = -0.5 * offset @ np.linalg.inv(g["covs"][k]) @ offset + determinant[-1]
-        value += normal_weight * (g["normals"][k] @ normal - 1.0)
+        offset, cov = point - g["means"][k], g["covs"][k] + np.outer(noise, noise)
+        distances_sq.append(offset @ np.linalg.inv(cov) @ offset)
+        determinant.append(-float(config.determinant_weight) * np.linalg.slogdet(cov)[1])
+        value = -0.5 * distances_sq[-1] + determinant[-1]
+        value += float(config.normal_weight) * (g["normals"][k] @ normal - 1.0)
         if len(feature):
-            value += feature_weight * (g["features"][k] @ feature - 1.0)
+            value += float(config.feature_weight) * (g["features"][k] @ feature - 1.0)
         joint.append(value)
-    return np.array(joint), np.array(determinant)
+    return np.array(joint), np.array(determinant), np.array(distances_sq)
 
 
-def e_step(points, normals, features, g, config):
-    """Eq. 2 and 3: responsibilities as a dense (m, n) matrix, zero outside the K neighbours, and who is fused."""
+def e_step(points, normals, features, noise, valid, g, config):
+    """Eq. 2 and 3: responsibilities as a dense (m, n) matrix, zero outside the K neighbours, who is fused, and the best
+    log-joint of every point. `noise` is along the viewing rays, before the config's factor."""
     m, n = len(points), len(g["means"])
-    responsibilities, is_fused = np.zeros((m, n)), np.zeros(m, bool)
+    responsibilities, is_fused, best = np.zeros((m, n)), np.zeros(m, bool), np.zeros(m)
     for i in range(m):
-        rows = nearest_rows(points[i], g["means"], np.ones(n, bool), config.num_neighbours)
-        weights = float(config.determinant_weight), float(config.normal_weight), float(config.feature_weight)
-        joint, determinant = log_joint(points[i], normals[i], features[i], g, rows, *weights)
-        offsets = points[i] - g["means"][rows]
-        distance_sq = [o @ np.linalg.inv(g["covs"][k]) @ o for o, k in zip(offsets, rows, strict=True)]
+        rows = nearest_rows(points[i], g["means"], g["valid"], config.num_neighbours)
+        if not valid[i] or len(rows) == 0:
+            continue
+        ray = float(config.noise) * noise[i]
+        joint, determinant, distances_sq = log_joint(points[i], normals[i], features[i], ray, g, rows, config)
+        best[i] = joint.max()
         is_fused[i] = np.mean(g["normals"][rows] @ normals[i]) >= config.min_normal_cos
-        is_fused[i] &= min(distance_sq) <= config.max_mahalanobis_sq
+        is_fused[i] &= distances_sq.min() <= config.max_mahalanobis_sq
         is_fused[i] &= determinant.max() - joint.max() <= config.max_log_gap
         exponent = np.exp(joint - joint.max())
         responsibilities[i, rows] = exponent / exponent.sum() * is_fused[i]
-    return responsibilities, is_fused
+    return responsibilities, is_fused, best
 
 
 def m_step(responsibilities, points, normals, colors, k, min_std):
@@ -96,6 +102,12 @@ def support(responsibilities, points, mean, cov, normal, k, kind):
     return min(scores)
 
 
+def gain_and_weight(weight, evidence, config):
+    """α of eq. 4 and what is kept of it (R4)."""
+    total = float(config.forgetting) * weight + evidence
+    return evidence / total, total if config.gain > 0 else evidence / total
+
+
 def running_average(values, start, evidence, gain):
     """Eq. 4 over a sequence of scalars from α_0 = W_0 = 1; returns the average after each."""
     average, weight, result = start, 1.0, []
@@ -105,6 +117,26 @@ def running_average(values, start, evidence, gain):
         weight = alpha if gain == "ema_printed" else weight + delta
         result.append(average)
     return result
+
+
+def moved(g, k, new, gain):
+    """(1 - α) old + α new of Gaussian k: mean, covariance (linear), normal and colour."""
+    old = g["means"][k], g["covs"][k], g["normals"][k], g["colors"][k]
+    mean, cov, normal, color = ((1 - gain) * a + gain * b for a, b in zip(old, new, strict=True))
+    return mean, cov, normal / np.linalg.norm(normal), color
+
+
+def em_update(points, normals, features, colors, noise, valid, g, weight, config):
+    """{row: (mean, cov, normal, colour, weight)} of the Gaussians that change, who is fused, and the mean log-joint."""
+    r, is_fused, best = e_step(points, normals, features, noise, valid, g, config)
+    kind, changed = ("printed", "normalized")[int(config.support)], {}
+    for k in np.flatnonzero(r.sum(axis=0) > float(config.min_responsibility)):
+        new = m_step(r, points, normals, colors, k, float(config.min_std))
+        delta = support(r, points, g["means"][k], g["covs"][k], g["normals"][k], k, kind)
+        if delta > 0:
+            gain, kept = gain_and_weight(weight[k], delta, config.average)
+            changed[k] = (*moved(g, k, new, gain), kept)
+    return changed, is_fused, best[is_fused].mean() if is_fused.any() else 0.0
 
 
 def umeyama(source, target, weights):
@@ -118,31 +150,100 @@ def umeyama(source, target, weights):
     return rotation, share @ target - rotation @ (share @ source), scale
 
 
-def splat(mean, cov, pose, focal, center, scale, blur):
-    """EWA: pixel, image-plane covariance, camera-frame point and covariance of one Gaussian."""
+def rigid_robust(source, target, start, paired):
+    """Rotation and translation after three fits, each weighted by 1 / (1 + (distance / (2 median distance))²)."""
+    rotation, translation = start[:3, :3], start[:3, 3]
+    source, target = source[paired], target[paired]
+    for _ in range(3):
+        distance = np.linalg.norm(source @ rotation.T + translation - target, axis=1)
+        weights = 1 / (1 + (distance / (2 * np.sort(distance)[(len(distance) - 1) // 2])) ** 2)
+        rotation, _, _ = umeyama(source, target, weights)
+        share = weights / weights.sum()
+        translation = share @ target - rotation @ (share @ source)
+    return rotation, translation
+
+
+def color_gradient(k, means, normals, colors, valid, num_neighbours):
+    """Slope of the luminance in the tangent plane of Gaussian k: ridge regression over its neighbours."""
+    rows = nearest_rows(means[k], means, valid, num_neighbours)
+    projector = np.eye(3) - np.outer(normals[k], normals[k])
+    offsets = (means[rows] - means[k]) @ projector
+    light = colors @ [0.299, 0.587, 0.114]  # ITU-R BT.601
+    moments = offsets.T @ offsets
+    ridge = 0.01 * np.trace(moments) * projector
+    return np.linalg.pinv(moments + ridge, rcond=1e-6) @ offsets.T @ (light[rows] - light[k])
+
+
+def matched(points, normals, noise, g, gates):
+    """Row of every point's Gaussian, nearest under Σ + ν ν', and whether the two agree; `g` holds valid rows only."""
+    widened = g["covs"] + (noise[:, :, None] * noise[:, None])[:, None]
+    offsets = points[:, None] - g["means"]
+    distance_sq = np.einsum("pki,pkij,pkj->pk", offsets, np.linalg.inv(widened), offsets)
+    rows = distance_sq.argmin(axis=1)
+    cos = np.sum(g["normals"][rows] * normals, axis=1)
+    return rows, (distance_sq.min(axis=1) <= gates[0]) & (cos >= gates[1])
+
+
+def registered(points, normals, light, noise, g, gradients, config, pose_std):
+    """The translation that ICP's cost asks for where rotation and scale are held, for matches that do not change.
+
+    Rows of a point: distance to the plane (`colored`) or whitened offset (`distribution`), and its intensity. All
+    points together weigh as much as `num_effective`, against the prior's information over the coarse pose's variance.
+    """
+    residual = ("colored", "distribution", "colored+distribution")[int(config.residual)]
+    rows, is_inlier = matched(
+        points, normals, noise, g, (float(config.max_mahalanobis_sq), float(config.min_normal_cos))
+    )
+    hessian, force = float(config.prior_information) / pose_std**2 * np.eye(3), np.zeros(3)
+    share = float(config.num_effective) / len(points)
+    for i in np.flatnonzero(is_inlier):
+        k, nu = rows[i], noise[i]
+        offset, normal, gradient = points[i] - g["means"][k], g["normals"][k], gradients[k]
+        if residual == "colored":
+            information = np.outer(normal, normal) / (normal @ g["covs"][k] @ normal + (normal @ nu) ** 2)
+        else:
+            information = np.linalg.inv(g["covs"][k] + np.outer(nu, nu))
+        hessian, force = hessian + share * information, force - share * information @ offset
+        luminance = g["colors"][k] @ [0.299, 0.587, 0.114]
+        shade = (luminance + gradient @ offset - light[i]) / float(config.color_std)
+        if residual != "distribution" and abs(shade) < np.sqrt(float(config.max_mahalanobis_sq)):
+            hessian = hessian + share * np.outer(gradient, gradient) / float(config.color_std) ** 2
+            force = force - share * shade * gradient / float(config.color_std)
+    return np.linalg.solve(hessian, force)
+
+
+def splat(mean, cov, pose, camera, scale, blur):
+    """EWA: pixel, image-plane covariance, camera-frame point and covariance of one Gaussian.
+
+    The Jacobian is taken at most .3 of the image's size outside of it.
+    """
+    focal, center = np.asarray(camera.focal, float), np.asarray(camera.center, float)
+    size = np.array([camera.width, camera.height])
     rotation, translation = pose[:3, :3], pose[:3, 3]
     x, y, z = point = rotation.T @ (mean - translation)
     camera_cov = scale * rotation.T @ cov @ rotation
-    jacobian = np.array([[focal[0] / z, 0, -focal[0] * x / z**2], [0, focal[1] / z, -focal[1] * y / z**2]])
-    pixel = np.array([focal[0] * x / z + center[0], focal[1] * y / z + center[1]])
+    pixel = focal * [x / z, y / z] + center
+    tangent = (np.clip(pixel, -0.3 * size, 1.3 * size) - center) / focal
+    jacobian = np.array([[focal[0] / z, 0, -focal[0] * tangent[0] / z], [0, focal[1] / z, -focal[1] * tangent[1] / z]])
     return pixel, jacobian @ camera_cov @ jacobian.T + blur * np.eye(2), point, camera_cov
 
 
 def render(g, values, pose, camera, config):
-    """Every Gaussian at every pixel, nearest first, no tiles: values, alpha, expected depth."""
+    """Every Gaussian at every pixel, nearest first, no tiles: values, alpha, mean and standard deviation of depth."""
     focal, center = np.asarray(camera.focal, float), np.asarray(camera.center, float)
     shape = camera.height, camera.width
     light, image, alpha, depth = np.ones(shape), np.zeros((*shape, values.shape[1])), np.zeros(shape), np.zeros(shape)
-    scale, radius = float(config.covariance_scale), float(config.radius)
+    depth_sq, scale, radius = np.zeros(shape), float(config.covariance_scale), float(config.radius)
     rows = [k for k in range(len(g["means"])) if g["valid"][k]]
     depth_of = {k: (pose[:3, :3].T @ (g["means"][k] - pose[:3, 3]))[2] for k in rows}
     for k in sorted((k for k in rows if depth_of[k] > 1e-3), key=depth_of.get):
-        pixel, cov_2d, point, cov = splat(g["means"][k], g["covs"][k], pose, focal, center, scale, float(config.blur))
+        pixel, cov_2d, point, cov = splat(g["means"][k], g["covs"][k], pose, camera, scale, float(config.blur))
         normal, reach = pose[:3, :3].T @ g["normals"][k], radius * np.sqrt(cov[2, 2])
+        precision = np.linalg.inv(cov_2d)
         for row in range(shape[0]):
             for column in range(shape[1]):
                 offset = np.array([column, row]) - pixel
-                distance_sq = offset @ np.linalg.inv(cov_2d) @ offset
+                distance_sq = offset @ precision @ offset
                 if distance_sq > radius**2:
                     continue
                 weight = light[row, column] * float(config.opacity) * np.exp(-0.5 * distance_sq)
@@ -154,9 +255,58 @@ def render(g, values, pose, camera, config):
                 z = 1 / np.clip(inverse, 1 / (point[2] + reach), 1 / max(point[2] - reach, 0.1 * point[2]))
                 image[row, column] += weight * values[k]
                 depth[row, column] += weight * z
+                depth_sq[row, column] += weight * z**2
                 alpha[row, column] += weight
                 light[row, column] -= weight
-    return image, alpha, np.where(alpha >= config.min_alpha, depth / np.maximum(alpha, 1e-9), 0.0)
+    is_covered, total = alpha >= config.min_alpha, np.maximum(alpha, 1e-9)
+    mean = np.where(is_covered, depth / total, 0.0)
+    return image, alpha, mean, np.sqrt(np.where(is_covered, np.maximum(depth_sq / total - mean**2, 0), 0.0))
+
+
+def refine(g, weight, candidates, pose, camera, config):
+    """Eq. 5 and 6: {row: (mean, cov, normal, colour, weight)} of the map Gaussians that change, and who is fresh."""
+    scale, blur = float(config.render.covariance_scale), float(config.render.blur)
+    _, _, depth, _ = render(g, g["colors"], pose, camera, config.render)
+
+    def seen(h):
+        found = {}
+        for k in np.flatnonzero(h["valid"]):
+            if (pose[:3, :3].T @ (h["means"][k] - pose[:3, 3]))[2] > 1e-3:
+                pixel, cov_2d, point, cov = splat(h["means"][k], h["covs"][k], pose, camera, scale, blur)
+                column, row = np.round(pixel).astype(int)
+                is_inside = 0 <= column < camera.width and 0 <= row < camera.height
+                found[k] = pixel, cov_2d, point[2], np.sqrt(cov[2, 2]), depth[row, column] if is_inside else 0.0
+        return found
+
+    known = seen(g)
+    visible = [k for k, (*_, z, std, d) in known.items() if d > 0 and z <= d + float(config.render.radius) * std]
+    shares, is_fresh = {}, np.array(candidates["valid"])
+    for j, (pixel, cov_2d, z, _, d) in seen(candidates).items():
+        if np.sqrt(np.trace(cov_2d) / scale) > config.max_splat_std:
+            is_fresh[j] = False
+            continue
+        if d == 0 or not -config.front_margin <= z / d - 1 <= config.back_margin:
+            continue
+        nearest = sorted(visible, key=lambda k, at=pixel: np.linalg.norm(known[k][0] - at))[: config.num_candidates]
+        offsets = [known[k][0] - pixel for k in nearest]
+        distances_sq = [o @ np.linalg.inv(known[k][1] + cov_2d) @ o for k, o in zip(nearest, offsets, strict=True)]
+        exponent = np.exp(-0.5 * np.array(distances_sq))
+        for k, distance_sq, omega in zip(nearest, distances_sq, exponent / exponent.sum(), strict=True):
+            omega *= max(g["features"][k] @ candidates["features"][j], 0.0) if g["features"].shape[1] else 1.0
+            if distance_sq < config.max_mahalanobis_sq_2d and omega > 0:
+                shares.setdefault(k, []).append((j, omega))
+                is_fresh[j] = False
+    changed = {}
+    for k, merging in shares.items():
+        rows, omega = [j for j, _ in merging], np.array([omega for _, omega in merging])
+        share, x = omega / omega.sum(), candidates["means"][[j for j, _ in merging]]
+        mean = share @ x
+        cov = np.einsum("i,iab->ab", share, candidates["covs"][rows]) + (share[:, None] * (x - mean)).T @ (x - mean)
+        normal = share @ candidates["normals"][rows]
+        new = mean, cov, normal / np.linalg.norm(normal), share @ candidates["colors"][rows]
+        gain, kept = gain_and_weight(weight[k], omega.max(), config.average)  # eq. 6: the best of them, not their sum
+        changed[k] = (*moved(g, k, new, gain), kept)
+    return changed, is_fresh
 
 
 ROOM_LOW, ROOM_HIGH = np.array([-0.9, -0.7, -0.8]), np.array([1.0, 0.75, 2.2])  # m; a box, seen from inside

@@ -52,11 +52,47 @@ def arrays(points):
     return tuple(np.asarray(x, float) for x in (points.points, points.normals, points.features))
 
 
+READINGS = {
+    "printed": {"support": 0.0, "determinant_weight": 1.0, "average.gain": 0.0, "noise": 0.0, "max_log_gap": 30.0},
+    "default": {"support": 1.0, "determinant_weight": 0.5, "average.gain": 1.0, "noise": 1.0, "max_log_gap": 20.0},
+    "half the noise": {"support": 1.0, "determinant_weight": 0.5, "average.gain": 1.0, "noise": 0.5},
+    "few points": {"min_responsibility": 1.5, "average.forgetting": 0.7, "noise": 2.0},
+}
+
+
+@pytest.mark.parametrize("reading", READINGS)
+@pytest.mark.parametrize("num_valid", [N, 4])
+def test_an_update_equals_equations_2_to_4_one_item_at_a_time(paper, reading, num_valid):
+    """With four valid Gaussians a point has fewer neighbours than it asks for."""
+    gates = {"min_normal_cos": 0.85, "max_mahalanobis_sq": 60.0, "min_responsibility": 0.1}
+    config = changed(paper, **(gates | READINGS[reading]))
+    map = eqx.tree_at(lambda m: m.gaussians.valid, MAP, jnp.arange(N) % (N // num_valid) == 0)
+    map = eqx.tree_at(lambda m: m.weight, map, jnp.linspace(0.5, 3.0, N))
+    points = eqx.tree_at(lambda o: o.valid, POINTS, jnp.arange(M) % 9 > 0)
+    updated, is_fused, info = em(map, points, NOISE, config)
+    observed = (*arrays(points), *(np.asarray(x, float) for x in (points.colors, NOISE)), np.asarray(points.valid))
+    weight = np.asarray(map.weight, float)
+    rows, fused, log_joint = reference.em_update(*observed, as_numpy(map.gaussians), weight, config)
+    np.testing.assert_array_equal(is_fused, fused)
+    assert 0 < fused.sum() < points.valid.sum() and len(rows) > 0
+    assert (info.num_points, info.num_fused, info.num_updated) == (points.valid.sum(), fused.sum(), len(rows))
+    assert info.mean_log_joint == pytest.approx(log_joint, rel=1e-4)  # a mean of numbers up to 50 in float32
+    g = updated.gaussians
+    for k, expected in rows.items():
+        # Exponents near 60 lose 1e-5 each in float32, and shares are divided by totals down to .1.
+        for a, b in zip((g.means[k], g.covs[k], g.normals[k], g.colors[k], updated.weight[k]), expected, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-3)
+    others = np.setdiff1d(np.arange(N), list(rows))
+    assert_same(*jax.tree.map(lambda x: x[others], (updated, map)))
+    np.testing.assert_array_equal(updated.num_updates[np.array(list(rows))], 2)
+
+
 @pytest.mark.parametrize("gates", [{}, {"max_mahalanobis_sq": 50.0}, {"max_log_gap": 30.0, "max_mahalanobis_sq": 1e9}])
 def test_responsibilities_equal_equation_3_and_gates_equation_2(paper, gates):
     config = changed(paper, min_normal_cos=0.85, **gates)
     step, _ = estep(GAUSSIANS, POINTS, QUIET, config)
-    expected, is_fused = reference.e_step(*arrays(POINTS), as_numpy(GAUSSIANS), config)
+    every = np.ones(M, bool)
+    expected, is_fused, _ = reference.e_step(*arrays(POINTS), np.asarray(QUIET), every, as_numpy(GAUSSIANS), config)
     np.testing.assert_array_equal(step.is_fused, is_fused)
     assert 0 < is_fused.sum() < M
     np.testing.assert_allclose(dense(step), expected, atol=1e-3)  # exponents near 100 lose 1e-5 each in float32

@@ -17,13 +17,13 @@ from scene import (
     random_observation,
 )
 
-from emgs_jax.gaussians import blend, cluster, empty_gaussians, fit_to_points, spacing
+from emgs_jax.gaussians import blend, cluster, color_gradients, empty_gaussians, fit_to_points, intensity, spacing
 from emgs_jax.observation import transform
 from emgs_jax.ops.clustering import morton_order
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 
-fit = eqx.filter_jit(fit_to_points)
+fit, gradients_of = eqx.filter_jit(fit_to_points), eqx.filter_jit(color_gradients)
 ONE = jnp.ones(())
 
 
@@ -32,12 +32,16 @@ def fit_config(config):
     return config().fit
 
 
-@pytest.mark.parametrize("num_features", [0, 4])
-def test_fitting_equals_equation_1(fit_config, num_features):
+@pytest.mark.parametrize(("num_features", "num_valid"), [(0, 200), (4, 200), (4, 6)])
+def test_fitting_equals_equation_1(fit_config, num_features, num_valid):
+    """With six points a centre has fewer than the eight that it asks for."""
     points = random_observation(200, num_features=num_features)
+    valid = np.arange(200) % (200 // num_valid) == 0 if num_valid < 200 else np.ones(200, bool)
+    points = eqx.tree_at(lambda o: o.valid, points, jnp.asarray(valid & (np.cumsum(valid) <= num_valid)))
     centers = points.points[:20] + 0.02
     fitted = fit(centers, jnp.ones(20, bool), points, fit_config)
     arrays = [np.asarray(x, float) for x in (points.points, points.normals, points.colors, points.features)]
+    arrays.append(np.asarray(points.valid))
     assert fitted.valid.all()
     for k, center in enumerate(np.asarray(centers, float)):
         expected = reference.fit_to_points(center, *arrays, fit_config.num_fit_neighbours, float(fit_config.min_std))
@@ -120,6 +124,80 @@ def test_clustering_a_room_gives_thin_gaussians_on_its_walls(fit_config, camera)
         "ni,nij,nj->n", *(np.asarray(x, float) for x in (gaussians.normals, gaussians.covs, gaussians.normals))
     )
     assert np.median(flat[on_wall]) < 1.2 * float(fit_config.min_std) ** 2
+
+
+def test_a_gaussian_is_as_large_as_its_cluster_whatever_the_number_of_points_in_it(fit_config):
+    """A cluster of n pixels of a plane with pitch a is about a disc of area n a², whose covariance has trace n a² / 2π.
+
+    The eight nearest points of 64 would make it an eighth of that.
+    """
+    y, x = np.divmod(np.arange(768), 32)
+    plane = random_observation(768)
+    positions = jnp.asarray(np.stack([0.02 * x, 0.02 * y, 2.0 + 0.0 * x], axis=-1), jnp.float32)
+    plane = eqx.tree_at(lambda o: o.points, plane, positions)
+    gaussians, _ = eqx.filter_jit(cluster)(plane, morton_order(24, 32), 64, fit_config)
+    trace = np.trace(np.asarray(gaussians.covs), axis1=1, axis2=2) - 3 * float(fit_config.min_std) ** 2
+    expected = 64 * 0.02**2 / (2 * np.pi)
+    assert 0.6 * expected < np.median(trace) < 1.5 * expected
+
+
+def test_a_handful_of_points_makes_one_gaussian_of_just_these(fit_config, camera):
+    """Five valid points of 768: what is not there has no part in eq. 1."""
+    points = random_observation(768)
+    points = eqx.tree_at(lambda o: o.valid, points, jnp.arange(768) % 170 == 40)
+    arrays = [np.asarray(x, float) for x in (points.points, points.normals, points.colors, points.features)]
+    valid = np.asarray(points.valid)
+    gaussians, weight = eqx.filter_jit(cluster)(points, morton_order(24, 32), 8, fit_config)
+    np.testing.assert_array_equal(gaussians.valid, np.arange(96) == 0)
+    assert valid.sum() == 5 and weight[0] == 5 / 8
+    center = arrays[0][valid].mean(axis=0)
+    expected = reference.fit_to_points(center, *arrays, valid, fit_config.num_fit_neighbours, float(fit_config.min_std))
+    actual = gaussians.covs[0], gaussians.normals[0], gaussians.colors[0]
+    np.testing.assert_allclose(gaussians.means[0], center, atol=1e-5)  # roundings of coordinates of 2 m
+    for a, b in zip(actual, expected, strict=False):
+        np.testing.assert_allclose(a, b, atol=2e-4)  # as for eq. 1
+
+
+def test_free_rows_are_neutral():
+    rows = empty_gaussians(3, 2)
+    np.testing.assert_array_equal(rows.covs, np.tile(np.eye(3), (3, 1, 1)))
+    others = rows.means, rows.colors, rows.normals, rows.features, rows.valid
+    assert not any(np.asarray(x).any() for x in others) and rows.features.shape == (3, 2)
+
+
+def test_the_luminance_weighs_red_green_and_blue_as_the_eye_does():
+    light = intensity(jnp.eye(3))
+    np.testing.assert_allclose(light, [0.299, 0.587, 0.114], rtol=1e-6)  # ITU-R BT.601
+
+
+@pytest.mark.parametrize("num_valid", [80, 5])
+def test_colour_gradients_equal_least_squares_over_the_valid_neighbours(num_valid):
+    """With five valid Gaussians each has fewer neighbours than it asks for."""
+    g = random_gaussians(80)
+    g = eqx.tree_at(lambda g: g.valid, g, jnp.arange(80) % 16 < num_valid / 5)
+    numbers = [as_numpy(g)[name] for name in ("means", "normals", "colors", "valid")]
+    gradients = np.asarray(gradients_of(g, 12))
+    for k in np.flatnonzero(numbers[-1]):
+        expected = reference.color_gradient(k, *numbers, 12)
+        # float32 inverses of moments whose ridge keeps their condition number below 100
+        np.testing.assert_allclose(gradients[k], expected, atol=1e-4 * max(1.0, np.linalg.norm(expected)))
+
+
+def test_a_linear_intensity_on_a_plane_has_its_gradient_within_the_plane():
+    g = random_gaussians(80)
+    normal = np.array([0.2, -0.3, -1.0]) / np.linalg.norm([0.2, -0.3, -1.0])
+    means = np.asarray(g.means, float)
+    means -= (means @ normal)[:, None] * normal
+    slope = np.array([0.1, 0.2, -0.1])
+    light = 0.5 + means @ slope
+    colors = np.tile(light[:, None], (1, 3))  # luminance of grey is grey
+    arrays = [jnp.asarray(x, jnp.float32) for x in (means, colors, np.tile(normal, (80, 1)))]
+    g = eqx.tree_at(lambda x: (x.means, x.colors, x.normals), g, tuple(arrays))
+    gradients = np.asarray(gradients_of(g, 12))
+    expected = slope - (slope @ normal) * normal
+    np.testing.assert_allclose(gradients @ normal, 0, atol=1e-6)
+    # The documented ridge of a hundredth of the spread shrinks the gradient by a few per cent.
+    np.testing.assert_allclose(gradients, np.tile(expected, (80, 1)), atol=0.12 * np.linalg.norm(expected))
 
 
 @pytest.mark.parametrize("moment_matched", [0.0, 1.0])

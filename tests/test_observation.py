@@ -66,6 +66,45 @@ def test_a_depth_step_leaves_the_normals_of_both_sides_exact(camera, config):
     assert degrees(normals, np.where(is_near[..., None], near_normal, far_normal)).max() < 0.05
 
 
+@pytest.mark.parametrize(("step", "is_other_surface"), [(0.04, False), (0.06, True)])
+def test_a_step_separates_surfaces_from_a_fraction_of_the_depth_on(camera, config, step, is_other_surface):
+    """5 % of the inverse depth, here at 4 m; 5 cm or 5 % of a metre would be something else."""
+    near, normal = plane_points(camera, (0, 0, -1), 4.0)
+    far, _ = plane_points(camera, (0, 0, -1), 4.0 / (1 - step))
+    points = np.where((np.arange(32) < 16)[:, None], near, far)
+    normals = normals_from_pointmap(points, EVERY, config().observation)
+    assert (degrees(normals, normal)[5:-5, :16].max() < 0.05) == is_other_surface
+
+
+@pytest.mark.parametrize("direction", [(0, 1), (1, 0)])
+def test_the_window_is_the_configured_taps_and_no_others(camera, config, direction):
+    """Every second row and column, up to four away: a dent of 2 % at (12, 16) is felt there alone."""
+    settings = config("slam.observation.normal_radius=4", "slam.observation.normal_spacing=2").observation
+    points, _ = plane_points(camera, (0.05, 0.1, -1), 1.5)
+    dented = points.copy()
+    dented[12, 16] *= 1.02
+    before, after = (np.asarray(normals_from_pointmap(x, EVERY, settings)) for x in (points, dented))
+    moves = [
+        degrees(
+            before[12 - n * direction[0], 16 - n * direction[1]], after[12 - n * direction[0], 16 - n * direction[1]]
+        )
+        > 0.1
+        for n in range(-7, 8)
+    ]
+    assert [n for n, is_felt in zip(range(-7, 8), moves, strict=True) if is_felt] in ([-4, -2, 2, 4], [-4, -2, 0, 2, 4])
+
+
+@pytest.mark.parametrize(("count", "has_normal"), [(5, False), (6, True)])
+def test_a_normal_needs_more_than_a_fifth_of_its_window(camera, config, count, has_normal):
+    settings = config("slam.observation.normal_radius=4", "slam.observation.normal_spacing=2").observation
+    points, _ = plane_points(camera, (0, 0, -1), 1.5)
+    valid = np.zeros_like(EVERY)
+    for row, column in [(12, 16), (14, 16), (12, 18), (10, 14), (16, 12), (8, 20)][:count]:
+        valid[row, column] = True
+    normals = np.asarray(normals_from_pointmap(points, valid, settings))
+    assert (np.linalg.norm(normals[12, 16]) > 0.99) == has_normal
+
+
 @pytest.mark.parametrize("poison", [0.0, 1e6])
 def test_holes_have_no_normal_and_do_not_touch_their_surroundings(camera, config, poison):
     points, truth = plane_points(camera, (0, 0.1, -1), 1.5)
@@ -114,7 +153,8 @@ def test_a_row_is_a_pixel_of_the_thinned_image_row_major(camera, config, thin):
         np.testing.assert_array_equal(actual, expected)
     assert o.valid.all()
     full = normals_from_pointmap(inputs[0], EVERY, config().observation)[::thin, ::thin].reshape(-1, 3)
-    np.testing.assert_array_equal(o.normals, full)  # normals come from the full point map
+    # Normals come from the full point map, here by another program: float32 over a window of .1 rad.
+    np.testing.assert_allclose(o.normals, full, atol=2e-5)
 
 
 @pytest.mark.parametrize("thin", [1, 3])
@@ -148,6 +188,27 @@ def test_an_observation_holds_the_sampled_features_where_it_is_valid(camera, con
     expected = np.asarray(sample_features(grid, (24, 32), 2)).reshape(-1, 5)
     np.testing.assert_allclose(o.features, np.where(o.valid[:, None], expected, 0), atol=1e-6)
     assert not o.valid.all()
+
+
+def test_a_point_without_a_normal_is_no_measurement_and_its_row_is_neutral(camera, config):
+    """A pixel alone in a hole; its values, which no one may read, are those of a row that is not there."""
+    points, colors, features, confidence, mask = example(camera)
+    mask[9:14, 9:14] = False
+    mask[11, 11] = True
+    o = observe(points, colors, features, confidence, mask, config().observation)
+    valid = np.asarray(o.valid).reshape(24, 32)
+    assert not valid[9:14, 9:14].any() and valid.sum() == 768 - 25
+    gone = ~np.asarray(o.valid)
+    np.testing.assert_array_equal(o.confidence[gone], 1)
+    assert not any(np.asarray(x[gone]).any() for x in (o.colors, o.features, o.normals))
+
+
+def test_the_least_confidence_is_enough_and_a_point_at_depth_zero_is_none(camera, config):
+    points, colors, features, confidence, mask = example(camera)
+    confidence[4, 5] = 1.0
+    points[20, 7] = points[20, 7] * [1, 1, 0]
+    o = observe(points, colors, features, confidence, mask, config().observation)
+    assert o.valid[4 * 32 + 5] and not o.valid[20 * 32 + 7] and o.valid.sum() == 767
 
 
 def test_features_of_width_zero_are_possible(camera, config):

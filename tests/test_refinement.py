@@ -5,7 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scene import assert_same, at, move_gaussians, pose
+import reference
+from scene import as_numpy, assert_same, at, move_gaussians, pose
 
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.gaussians import Gaussians
@@ -78,6 +79,66 @@ def test_a_candidate_that_is_not_on_the_surface_is_fresh_and_the_map_unchanged(s
     merged, fresh, info = run(settings, camera, discs(mean, std=0.05))
     assert (info.num_merged, info.num_fresh) == (0, 1) and fresh.valid.all(), why
     assert_same(merged, map_of(discs(GRID)))
+
+
+def test_two_candidates_on_one_gaussian_count_as_much_as_the_better_of_them(settings, camera):
+    """Eq. 6: γ from the largest ω, here the cosines .8 and .6, and not from their sum; the average is by ω."""
+    old = discs((0, 0, 2.0), std=0.3)
+    new = discs([(0.02, 0.01, 2.01), (-0.02, 0.0, 2.02)], std=0.3, color=0.9)
+    new = eqx.tree_at(lambda g: g.features, new, jnp.array([[0.8, 0.6], [0.6, -0.8]]))
+    merged, _, info = run(settings, camera, new, old)
+    gamma, share = 0.8 / 1.8, np.array([0.8, 0.6]) / 1.4
+    assert info.num_merged == 2
+    np.testing.assert_allclose(merged.weight, gamma, atol=1e-6)
+    expected = (1 - gamma) * np.array([0, 0, 2]) + gamma * share @ np.array([[0.02, 0.01, 2.01], [-0.02, 0, 2.02]])
+    np.testing.assert_allclose(merged.gaussians.means[0], expected, atol=1e-6)  # roundings
+
+
+READINGS = {
+    "printed": {"back_margin": np.inf, "max_mahalanobis_sq_2d": 4.6, "average.gain": 0.0},
+    "default": {"back_margin": 0.06, "front_margin": 0.06, "max_splat_std": 2.5, "average.gain": 1.0},
+    "narrow": {"max_mahalanobis_sq_2d": 0.5, "back_margin": 0.1, "front_margin": 0.02, "average.forgetting": 0.7},
+}
+
+
+@pytest.mark.parametrize("reading", READINGS)
+def test_a_refinement_equals_equations_5_and_6_one_candidate_at_a_time(settings, camera, reading):
+    """A wall of discs of many sizes, features and weights, one before and one behind it, and candidates all around."""
+    rng, count = np.random.default_rng(3), 27
+    config = settings
+    for name, value in READINGS[reading].items():
+        config = at(config, name, value)
+    means = np.array([*GRID, (0.1, 0.1, 1.4), (0.02, 0.02, 3.0)]) + rng.uniform(-0.05, 0.05, (count, 3))
+    old = discs(means)
+    turns = jnp.asarray(rng.uniform(-0.9, 0.9, (count + 40, 1)), jnp.float32)
+    features = jnp.concatenate([jnp.cos(turns), jnp.sin(turns)], axis=1)
+    size = jnp.asarray(rng.uniform(0.6, 2.0, (count, 1, 1)), jnp.float32)
+    known = jnp.arange(count) % 9 != 4
+    old = eqx.tree_at(lambda g: (g.features, g.covs, g.valid), old, (features[:count], old.covs * size, known))
+    new, size = random_candidates(), jnp.asarray(rng.uniform(0.6, 6.0, (40, 1, 1)), jnp.float32)
+    colors = jnp.asarray(rng.uniform(0, 1, (40, 3)), jnp.float32)
+    normals = rng.normal(size=(40, 3)) * 0.3 + [0, 0, -1]
+    normals = jnp.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True), jnp.float32)
+    new = eqx.tree_at(
+        lambda g: (g.features, g.covs, g.colors, g.normals),
+        new,
+        (features[count:].at[0].set(-features[0]), new.covs * size, colors, normals),
+    )
+    weight = jnp.linspace(0.5, 3.0, count)
+    map, T = GaussianMap(old, weight, jnp.ones(count, jnp.int32)), pose((0.02, -0.03, 0.01), (0.05, -0.02, 0.1))
+    merged, fresh, info = refined(map, new, T, camera, config)
+    arrays = as_numpy(old), np.asarray(weight, float), as_numpy(new), np.asarray(T.as_matrix(), float)
+    rows, is_fresh = reference.refine(*arrays, camera, config)
+    np.testing.assert_array_equal(fresh.valid, is_fresh)
+    assert len(rows) > 2 < info.num_merged and info.num_fresh == is_fresh.sum() > 5
+    assert info.overflow == 0 and info.num_candidates == info.num_merged + info.num_fresh
+    g = merged.gaussians
+    for k, expected in rows.items():
+        # 2D distances of pixels in float32, through an exponential into shares; values of 2 m and less
+        for a, b in zip((g.means[k], g.covs[k], g.normals[k], g.colors[k], merged.weight[k]), expected, strict=True):
+            np.testing.assert_allclose(a, b, atol=2e-4)
+    others = np.setdiff1d(np.arange(count), list(rows))
+    assert_same(*jax.tree.map(lambda x: x[others], (merged, map)))
 
 
 def test_the_margins_say_how_far_in_front_and_behind_may_still_merge(settings, camera):

@@ -12,7 +12,7 @@ from emgs_jax.semantics import classify, similarities
 @pytest.fixture
 def three():
     """Three valid Gaussians with known features, and one row of padding."""
-    features = jnp.array([[1.0, 0.0, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    features = jnp.array([[1.0, 0.0, 0.0], [1.2, 1.6, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     valid = jnp.array([True, True, True, False])
     return eqx.tree_at(lambda g: (g.features, g.valid), empty_gaussians(4, 3), (features, valid))
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from emgs_jax.ops.camera import Camera, downscale, pixel_grid, project, rays, unproject
+from emgs_jax.ops.camera import Camera, downscale, nearest_pixel, pixel_grid, project, rays, unproject
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform([-2, -2, 0.5], [2, 2, 6], (200, 3)).astype(np.float32)
@@ -50,6 +50,22 @@ def test_a_point_that_is_not_in_front_projects_as_from_one_metre_with_its_own_de
     np.testing.assert_allclose(pixels, [20 * 0.1 + 14.5, -23 * 0.2 + 12.25], rtol=1e-6)
     assert depth == jnp.float32(z)
     assert np.isfinite(jax.jacfwd(lambda p: project(camera, p)[0])(jnp.array([0.1, -0.2, z]))).all()
+
+
+def test_a_point_two_millimetres_in_front_of_the_camera_still_has_its_own_pixel(camera):
+    pixels, _ = project(camera, jnp.array([0.0002, -0.0004, 0.002]))
+    np.testing.assert_allclose(pixels, [20 * 0.1 + 14.5, -23 * 0.2 + 12.25], rtol=1e-5)  # a few roundings
+
+
+def test_the_nearest_pixel_is_numbered_row_by_row_and_a_pixel_reaches_half_way_to_the_next():
+    pixels = [(0.4, 0.3), (2.6, 1.4), (2.4, 1.6), (3.4, 2.4), (-0.4, -0.4)]
+    rows, inside = nearest_pixel(jnp.array(pixels), (3, 4))
+    np.testing.assert_array_equal(rows, [0, 7, 10, 11, 0])
+    assert inside.all()
+    beyond = [(-0.6, 0.0), (0.0, -0.6), (3.6, 1.0), (1.0, 2.6), (3.0, 3.0)]  # one side each; the last is (4, 3) turned
+    rows, inside = nearest_pixel(jnp.array(beyond), (3, 4))
+    np.testing.assert_array_equal(rows, 0)
+    assert not inside.any()
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3, 5])

@@ -12,18 +12,13 @@ cluster = jax.jit(kmeans, static_argnums=4)
 RNG = np.random.default_rng(0)
 
 
-@pytest.mark.parametrize(("height", "width"), [(8, 8), (5, 7), (24, 32), (1, 9)])
-def test_the_z_curve_visits_every_pixel_once(height, width):
-    np.testing.assert_array_equal(np.sort(morton_order(height, width)), np.arange(height * width))
+@pytest.mark.parametrize(("height", "width"), [(8, 8), (5, 7), (24, 32), (1, 9), (9, 1), (3, 70)])
+def test_the_z_curve_visits_every_pixel_once_in_the_order_of_its_interleaved_bits(height, width):
+    def code(number):
+        y, x = (f"{n:08b}" for n in divmod(number, width))
+        return "".join(a + b for a, b in zip(y, x, strict=True))
 
-
-def test_four_consecutive_pixels_of_the_z_curve_are_a_square():
-    y, x = np.divmod(np.asarray(morton_order(8, 8)), 8)
-    np.testing.assert_array_equal(x[:4], [0, 1, 0, 1])
-    np.testing.assert_array_equal(y[:4], [0, 0, 1, 1])
-    for axis in (x, y):
-        quads = axis.reshape(-1, 4)
-        assert (quads.max(1) - quads.min(1) == 1).all()
+    np.testing.assert_array_equal(morton_order(height, width), sorted(range(height * width), key=code))
 
 
 def test_seeds_are_every_spacing_th_valid_point_along_the_order():
@@ -35,6 +30,14 @@ def test_seeds_are_every_spacing_th_valid_point_along_the_order():
     assert np.asarray(valid)[np.asarray(rows)[np.asarray(exists)]].all()
     np.testing.assert_array_equal(np.diff(ranks), 5)
     assert abs(int(exists.sum()) - int(valid.sum()) / 5) <= 1
+
+
+def test_a_seed_is_in_the_middle_of_the_points_that_it_stands_for():
+    rows, exists = strided_seeds(jnp.ones(14, bool), jnp.arange(14), 5, 4)
+    np.testing.assert_array_equal(rows[:3], [2, 7, 12])  # of 0 to 4, 5 to 9 and 10 to 14
+    np.testing.assert_array_equal(exists, [True, True, True, False])
+    _, exists = strided_seeds(jnp.arange(14) < 12, jnp.arange(14), 5, 3)
+    np.testing.assert_array_equal(exists, [True, True, False])  # the third would be the 13th valid point
 
 
 def test_few_points_make_one_seed_and_none_make_none():

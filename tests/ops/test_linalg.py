@@ -69,6 +69,17 @@ def test_a_whitened_offset_has_the_mahalanobis_distance_also_with_noise_along_a_
         np.testing.assert_allclose(dot(white, white), expected, rtol=1e-3)
 
 
+def test_widening_is_the_symmetric_root_of_the_inverse_and_nothing_without_noise():
+    """(I + u u')^(-1/2) by its eigenvectors; another root would have the same length, but turn or mirror offsets."""
+    white, u = RNG.normal(size=(2, 20, 3))
+    values, axes = np.linalg.eigh(np.eye(3) + u[:, :, None] * u[:, None])
+    root = np.einsum("nij,nj,nkj->nik", axes, values**-0.5, axes)
+    entries = [jnp.unstack(jnp.asarray(x, jnp.float32), axis=-1) for x in (white, u, 0.0 * u)]
+    widened = jnp.stack(widen(entries[0], entries[1]), axis=-1)
+    np.testing.assert_allclose(widened, np.einsum("nij,nj->ni", root, white), atol=1e-5)  # roundings of values near 1
+    np.testing.assert_array_equal(jnp.stack(widen(entries[0], entries[2]), axis=-1), jnp.asarray(white, jnp.float32))
+
+
 def test_entries_are_those_of_the_gathered_rows():
     table, rows = jnp.asarray(RNG.normal(size=(7, 3))), jnp.asarray(RNG.integers(0, 7, (4, 5)))
     np.testing.assert_array_equal(jnp.stack(gather_entries(table, rows), axis=-1), table[rows])

@@ -1,4 +1,4 @@
-"""Rigid fits against Umeyama, ICP against the true pose of a closed room and against Open3D from the same starts."""
+"""ICP against the closed form of small problems, the true pose of a closed room, and Open3D from the same starts."""
 
 import equinox as eqx
 import jax
@@ -17,15 +17,12 @@ from scene import (
     path_pose,
     pose,
     pose_error,
-    random_gaussians,
 )
 
-from emgs_jax.gaussians import color_gradients, fit_to_points
-from emgs_jax.observation import transform
+from emgs_jax.gaussians import Gaussians, color_gradients, fit_to_points
+from emgs_jax.observation import Observation, transform
 from emgs_jax.registration.icp import icp
-from emgs_jax.registration.rigid import fit_rigid, median
 
-RNG = np.random.default_rng(0)
 pytestmark = pytest.mark.slow  # the solver compiles for 10 s; the quick subset has test_localization
 RESIDUALS = {"colored": 0, "distribution": 1, "colored+distribution": 2}
 NOISE = jnp.asarray(0.02), jnp.asarray(0.01)
@@ -37,6 +34,235 @@ STARTS = [
 ]
 solve = eqx.filter_jit(icp)
 TRUTH = path_pose(2)
+
+
+# Problems of 16 points and at most 12 Gaussians, whose answer is a linear system; all is in the coarse camera's frame,
+# whose pose is any.
+
+COARSE = pose((0.4, -0.9, 0.3), (0.5, 1.0, -0.7))
+NUM_POINTS, NUM_GAUSSIANS = 16, 12
+TOWARDS = (0.0, 0.0, -1.0)
+# A coarse pose known to 2 cm, whose rotation and scale are as good as held.
+POSE_STD, STIFF = 0.02, 1e-4
+
+
+@pytest.fixture(scope="module")
+def small(config):
+    """Every second row of 32 is to be looked at; two candidates per point, two searches."""
+    settings = config(
+        "slam.localization.icp.num_points=16",
+        "slam.localization.icp.num_neighbours=2",
+        "slam.localization.icp.max_steps=40",
+        "slam.localization.icp.tolerance=1e-6",
+    ).localization.icp
+    for name, value in {"prior_information": 30.0, "noise": 0.0, "scale_noise": 0.0}.items():
+        settings = at(settings, name, value)
+    return settings
+
+
+def gaussians_of(means, stds, normals=TOWARDS, colors=0.5) -> Gaussians:
+    """Valid Gaussians, camera frame, with standard deviations along the axes, and free rows with wild values."""
+    means, count = np.atleast_2d(means), len(np.atleast_2d(means))
+    covs = np.zeros((count, 3, 3))
+    covs[:, range(3), range(3)] = np.broadcast_to(stds, (count, 3)) ** 2
+    colors = np.broadcast_to(np.reshape(colors, (-1, 1)), (count, 3))
+
+    def padded(rows, wild):
+        filled = np.full((NUM_GAUSSIANS, *rows.shape[1:]), wild)
+        filled[:count] = rows
+        return jnp.asarray(filled, jnp.float32)
+
+    normals = np.broadcast_to(normals, (count, 3))
+    arrays = padded(means, 7.0), padded(covs, 0.0), padded(colors, 9.0), padded(normals, 0.5)
+    return Gaussians(*arrays, jnp.zeros((NUM_GAUSSIANS, 0)), jnp.arange(NUM_GAUSSIANS) < count)
+
+
+def points_of(points, normals=TOWARDS, light=0.5, valid=True) -> Observation:
+    """The points again and again on the even rows; on the odd ones, which are not to be looked at, wild values."""
+
+    def repeated(rows, wild):
+        rows = np.resize(rows, (NUM_POINTS, *np.shape(rows)[1:]))
+        return jnp.asarray(np.stack([rows, np.full_like(rows, wild)], axis=1).reshape(-1, *rows.shape[1:]))
+
+    points = np.atleast_2d(points).astype(np.float32)
+    normals, light = np.broadcast_to(normals, points.shape), np.broadcast_to(light, len(points))
+    colors = np.tile(light[:, None], 3)
+    arrays = (repeated(np.asarray(x, np.float32), 0.1) for x in (points, colors, normals))
+    rows = 2 * NUM_POINTS
+    valid = repeated(np.broadcast_to(valid, len(points)), True)
+    return Observation(*arrays, jnp.zeros((rows, 0)), jnp.ones(rows), valid)
+
+
+def solved(points, gaussians, settings, pose_std=POSE_STD, depth_noise=STIFF):
+    """xi of T = COARSE exp(xi), the scale and the info."""
+    noise = jnp.asarray(pose_std, jnp.float32), jnp.asarray(depth_noise, jnp.float32)
+    T, scale, info = solve(points, move_gaussians(COARSE, gaussians), COARSE, noise, settings)
+    return np.asarray((COARSE.inverse() @ T).log(), float), float(scale), info
+
+
+def stated(points, gaussians, settings, pose_std=POSE_STD, depth_noise=STIFF):
+    """The same by `reference.registered`; the first pass of the points is enough."""
+    keep = np.asarray(points.valid)[::2]
+    x, normals, colors = (np.asarray(x, float)[::2][keep] for x in (points.points, points.normals, points.colors))
+    g, valid = as_numpy(gaussians), np.asarray(gaussians.valid)
+    gradients = np.asarray(color_gradients(gaussians, settings.num_color_neighbours), float)[valid]
+    g = {name: rows[valid] for name, rows in g.items()}
+    noise = float(settings.noise) * depth_noise * x
+    light = colors @ [0.299, 0.587, 0.114]
+    return reference.registered(x, normals, light, noise, g, gradients, settings, pose_std)
+
+
+def assert_as_stated(xi, expected):
+    """The solver stops where a step is a 1e-6th; products of 1e9 (what is held) and 1e5 lose a few digits more."""
+    np.testing.assert_allclose(xi[:3], expected, atol=5e-3 * np.abs(expected).max() + 1e-6)
+    np.testing.assert_allclose(xi[3:], 0, atol=1e-5)
+
+
+WALL = gaussians_of((0, 0, 2.0), (1.0, 1.0, 0.02))
+SHEARED = [(0.03, -0.02, 2.02), (0.02, 0.03, 2.01)]
+
+
+@pytest.mark.parametrize("residual", RESIDUALS)
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"num_effective": 15.0},
+        {"prior_information": 90.0},
+        {"noise": 100.0},  # times 1e-4 of 2 m: 2 cm along the ray
+    ],
+    ids=lambda change: "-".join(change) or "as it is",
+)
+def test_points_and_prior_share_the_offset_by_their_information(small, residual, change):
+    """Offsets of some centimetres from a Gaussian with deviations of 6, 4 and 2 cm: the answer is a linear system."""
+    settings = at(small, "residual", RESIDUALS[residual])
+    for name, value in change.items():
+        settings = at(settings, name, value)
+    gaussians = gaussians_of((0, 0, 2.0), (0.06, 0.04, 0.02))
+    points = points_of(SHEARED)
+    expected = stated(points, gaussians, settings)
+    assert np.abs(expected).max() > 1e-3
+    xi, scale, _ = solved(points, gaussians, settings)
+    assert_as_stated(xi, expected)
+    assert scale == 1
+
+
+def test_the_coarse_poses_own_noise_is_in_metres(small):
+    """A wall half a sigma away: t = d A / (A + B) with A = num_effective / σ², B = information / pose_std²."""
+    settings = at(small, "residual", RESIDUALS["colored"])
+    for pose_std in (0.01, 0.02, 0.05):
+        xi, _, _ = solved(points_of((0, 0, 2.01)), WALL, settings, pose_std)
+        points, prior = 60 / 0.02**2, 30 / pose_std**2
+        assert_as_stated(xi, [0, 0, -0.01 * points / (points + prior)])
+
+
+def test_the_noise_of_depth_holds_the_rotation_in_radians(small):
+    """Two walls, one a centimetre nearer to the left, one farther to the right, turn the camera about its y axis."""
+    settings = at(small, "residual", RESIDUALS["colored"])
+    walls = gaussians_of([(1, 0, 2.01), (-1, 0, 1.99)], (0.3, 0.3, 0.02))
+    for depth_noise in (0.005, 0.01):
+        xi, _, _ = solved(points_of([(1, 0, 2), (-1, 0, 2)]), walls, settings, 1e-4, depth_noise)
+        points, prior = 60 / 0.02**2, 30 / depth_noise**2
+        expected = -0.01 * points / (points + prior)
+        np.testing.assert_allclose(xi[3:], [0, expected, 0], atol=0.01 * abs(expected))  # sin θ for θ = 1e-2
+
+
+def test_the_scale_is_held_in_units_of_the_depth_noise(small):
+    """y = d z s A / (1 + (z s)² A) for the scale exp(s y), s = scale_noise · depth_noise, where the pose is held."""
+    settings = at(at(small, "residual", RESIDUALS["colored"]), "prior_information", 1e6)
+    for scale_noise in (0.2, 0.5):
+        _, scale, _ = solved(
+            points_of((0, 0, 2)),
+            gaussians_of((0, 0, 2.01), (1, 1, 0.02)),
+            at(settings, "scale_noise", scale_noise),
+            1e-3,
+            0.01,
+        )
+        s, points = scale_noise * 0.01, 60 / 0.02**2
+        expected = s * (2 * s * points * 0.01) / (1 + (2 * s) ** 2 * points)
+        assert np.log(scale) == pytest.approx(expected, rel=0.02)  # exp(s y) is linear up to s y = 5e-3
+
+
+@pytest.mark.parametrize(("difference", "gate"), [(0.05, 9.0), (0.35, 9.0), (0.35, 25.0)])
+def test_an_intensity_pulls_along_its_gradient_unless_it_is_beyond_the_gate(small, difference, gate):
+    """Grey Gaussians that get brighter to the right; .35 is 3.5 deviations."""
+    x = np.arange(-5, 6) * 0.3
+    ramp = gaussians_of(np.stack([x, 0 * x, 0 * x + 2], axis=-1), (0.25, 0.25, 0.02), colors=0.5 + 0.5 * x)
+    settings = at(at(small, "residual", RESIDUALS["colored"]), "max_mahalanobis_sq", gate)
+    points = points_of((0.01, 0, 2), light=0.5 + difference)
+    expected = stated(points, ramp, settings, 0.1, 1e-3)
+    assert (abs(expected[0]) > 0.003) == (difference**2 < 0.01 * gate)
+    xi, _, _ = solved(points, ramp, settings, 0.1, 1e-3)
+    np.testing.assert_allclose(
+        xi[:3], expected, atol=0.02 * abs(expected[0]) + 1e-5
+    )  # rotation gives way by a hundredth
+
+
+@pytest.mark.parametrize(
+    ("point", "normal", "valid"),
+    [((0, 0, 2.07), TOWARDS, True), ((0.0, 0.0, 2.01), (0.9, 0, -0.436), True), ((0, 0, 2.01), TOWARDS, False)],
+    ids=["3.5 deviations away", "turned by 64 degrees", "invalid"],
+)
+def test_a_point_that_no_gaussian_explains_pulls_nowhere_but_counts_unless_it_is_invalid(small, point, normal, valid):
+    settings = at(small, "residual", RESIDUALS["colored"])
+    points = points_of([(0, 0, 2.01), point], normals=[TOWARDS, normal], valid=[True, valid])
+    xi, _, info = solved(points, WALL, settings)
+    data, prior = 60 / 0.02**2 / (2 if valid else 1), 30 / POSE_STD**2
+    assert_as_stated(xi, [0, 0, -0.01 * data / (data + prior)])
+    assert info.num_inliers == 8 and info.inlier_fraction == (0.5 if valid else 1.0)
+
+
+@pytest.mark.parametrize("noise", [0.0, 500.0])
+def test_a_point_belongs_to_the_gaussian_that_explains_it_best_with_its_noise(small, noise):
+    """The nearer one is a wall before the point, the other a post beside it: along the ray the point may be wrong."""
+    two = gaussians_of([(0.02, 0, 2.06), (0.1, 0, 2.0)], [(0.05, 0.05, 0.018), (0.04, 0.04, 0.02)])
+    settings = at(at(at(small, "residual", RESIDUALS["distribution"]), "noise", noise), "max_mahalanobis_sq", 25.0)
+    points = points_of((0, 0, 2.0))
+    rays = noise * STIFF * np.array([[0, 0, 2.0]])
+    g = {name: rows[:2] for name, rows in as_numpy(two).items()}
+    row, _ = reference.matched(np.array([[0, 0, 2.0]]), np.array([TOWARDS]), rays, g, (25.0, 0.5))
+    assert row[0] == (0 if noise else 1)
+    xi, _, _ = solved(points, two, settings)
+    assert_as_stated(xi, stated(points, two, settings))
+
+
+def test_the_second_search_looks_where_the_first_solve_has_moved_the_points(small):
+    """14 points pull by .4 m to the right, where the other two find what they had too much before it to see."""
+    settings = at(at(small, "residual", RESIDUALS["distribution"]), "prior_information", 1e-3)
+    seen, hidden = (0.0, 0.5, 2.0), (0.0, -0.5, 2.0)
+    means = [(0.4, 0.5, 2.0), (-0.3, -0.51, 2.0), (-0.3, -0.49, 2.0), (0.4, -0.5, 2.0)]
+    target = gaussians_of(means, [(0.2, 0.2, 0.2), *[(0.02, 0.02, 0.02)] * 3])
+    xi, _, info = solved(points_of([seen] * 7 + [hidden]), target, settings)
+    assert info.num_inliers == 16
+    np.testing.assert_allclose(xi[:3], [0.4, 0, 0], atol=1e-3)
+
+
+def test_the_info_says_what_the_points_at_the_held_pose_look_like(small):
+    settings = at(small, "prior_information", 1e9)
+    away = np.array([0.01, -0.02, 0.03, 0.04, -0.05, 0.005, 0.3, 0.02])
+    normals = np.tile(TOWARDS, (8, 1))
+    normals[5] = 1.0, 0.0, 0.0
+    points = points_of([(0, 0, 2 + d) for d in away], normals=normals, valid=np.arange(8) < 7)
+    _, _, info = solved(points, WALL, settings, 1e-3, 1e-3)
+    assert info.num_inliers == 2 * 5 and info.inlier_fraction == pytest.approx(5 / 7)
+    # Roundings of coordinates of 2 m, here and below.
+    assert info.residual == pytest.approx(np.sqrt(np.mean(away[:5] ** 2)), abs=1e-6)
+    assert info.misfit == pytest.approx(1.4826 * 0.03, abs=2e-6)  # the median of seven; .3 m do not matter
+
+
+@pytest.mark.parametrize(("arm", "num_effective"), [(0.5, 60.0), (0.5, 7.0), (2.0, 60.0)])
+def test_the_least_eigenvalue_is_that_of_one_effective_point(small, arm, num_effective):
+    """Points on the axes at ±a with unit information 1/σ²: Σ = I / σ² for translation, (2/3) a² I / σ² for rotation."""
+    axes = arm * np.concatenate([np.eye(3), -np.eye(3)])
+    settings = at(at(small, "residual", RESIDUALS["distribution"]), "num_effective", num_effective)
+    # 18 rows would be needed for three passes; the first 16 hold ±x and ±y three times, ±z twice or three times.
+    points = eqx.tree_at(lambda o: o.valid, points_of(axes), jnp.arange(32) < 24)
+    _, _, info = solved(points, gaussians_of(axes, (0.1, 0.1, 0.1)), settings)
+    expected = min(1.0, 2 / 3 * arm**2) / 0.1**2
+    assert info.min_eigenvalue == pytest.approx(expected, rel=1e-3)  # roundings of a product of 16 rows
+
+
+# The closed room.
 
 
 @pytest.fixture(scope="module")
@@ -57,65 +283,6 @@ def settings(config):
     """No prior, wide gates, enough steps: what is tested is where the data term has its minimum."""
     settings = config("slam.localization.icp.max_steps=20", "slam.localization.icp.num_points=768").localization.icp
     return at(at(settings, "prior_information", 0.0), "max_mahalanobis_sq", 25.0)
-
-
-def test_a_rigid_fit_equals_umeyama_and_recovers_scale():
-    source, weights = RNG.normal(size=(50, 3)), RNG.uniform(0, 1, 50)
-    truth = pose((0.5, -1.0, 0.7), (1, 2, 3))
-    matrix = np.asarray(truth.as_matrix(), float)
-    target = 1.3 * source @ matrix[:3, :3].T + matrix[:3, 3] + RNG.normal(size=(50, 3)) * 0.05
-    rotation, _, scale = reference.umeyama(source, target, weights)
-    share = weights / weights.sum()
-    T, actual = fit_rigid(*(jnp.asarray(x, jnp.float32) for x in (source, target, weights)))
-    np.testing.assert_allclose(T.rotation().as_matrix(), rotation, atol=1e-5)  # float32 SVD
-    # Rigid, so the translation is that of scale 1.
-    np.testing.assert_allclose(T.translation(), share @ target - rotation @ (share @ source), atol=1e-5)
-    np.testing.assert_allclose(actual, scale, rtol=1e-5)
-
-
-@pytest.mark.parametrize("flatten", [(1, 1, 0), (1, 1, 1), (-1, 1, 1)])
-def test_exact_pairs_give_a_proper_rotation_even_from_a_plane_or_a_mirror(flatten):
-    source = (RNG.normal(size=(30, 3)) * [1, 1, abs(flatten[2])]).astype(np.float32)
-    truth = pose((0.2, 2.0, -0.4), (0.1, 0, -3))
-    mirrored = source * np.float32([flatten[0], 1, 1])
-    target = jnp.asarray(mirrored) @ truth.rotation().as_matrix().T + truth.translation()
-    T, _ = fit_rigid(jnp.asarray(source), target, jnp.ones(30))
-    assert np.linalg.det(np.asarray(T.rotation().as_matrix(), float)) == pytest.approx(1, abs=1e-4)
-    if flatten[0] > 0:
-        assert max(pose_error(T, truth)) < 1e-3  # quaternions from float32 matrices
-
-
-def test_pairs_without_weight_do_not_count_and_none_at_all_give_the_identity():
-    source = jnp.asarray(RNG.normal(size=(20, 3)), jnp.float32)
-    target = (source + jnp.array([1.0, 0, 0])).at[10:].set(1e3)
-    T, scale = fit_rigid(source, target, (jnp.arange(20) < 10).astype(jnp.float32))
-    assert max(pose_error(T, pose(translation=(1, 0, 0)))) < 1e-3  # float32 means over values up to 1000
-    T, scale = fit_rigid(source, target, jnp.zeros(20))
-    assert max(pose_error(T, pose())) == 0 and scale == 1
-
-
-def test_the_median_is_the_lower_one_of_the_valid_values():
-    values = jnp.array([5.0, 1.0, jnp.nan, 3.0, 9.0])
-    assert median(values, jnp.array([1, 1, 0, 1, 1], bool)) == 3
-    assert median(values, jnp.array([1, 1, 0, 0, 1], bool)) == 5
-    assert median(values, jnp.zeros(5, bool)) == 1
-
-
-def test_a_linear_intensity_on_a_plane_has_its_gradient_within_the_plane():
-    g = random_gaussians(80)
-    normal = np.array([0.2, -0.3, -1.0]) / np.linalg.norm([0.2, -0.3, -1.0])
-    means = np.asarray(g.means, float)
-    means -= (means @ normal)[:, None] * normal
-    slope = np.array([0.1, 0.2, -0.1])
-    light = 0.5 + means @ slope
-    colors = np.tile(light[:, None], (1, 3))  # luminance of grey is grey
-    arrays = [jnp.asarray(x, jnp.float32) for x in (means, colors, np.tile(normal, (80, 1)))]
-    g = eqx.tree_at(lambda x: (x.means, x.colors, x.normals), g, tuple(arrays))
-    gradients = np.asarray(color_gradients(g, 12))
-    expected = slope - (slope @ normal) * normal
-    np.testing.assert_allclose(gradients @ normal, 0, atol=1e-6)
-    # The documented ridge of a hundredth of the spread shrinks the gradient by a few per cent.
-    np.testing.assert_allclose(gradients, np.tile(expected, (80, 1)), atol=0.12 * np.linalg.norm(expected))
 
 
 def errors(target, source, config, starts):

@@ -19,9 +19,9 @@ GAUSSIANS = random_gaussians(30, 1, low=(-0.7, -0.5, 1.5), high=(0.7, 0.5, 3))
 
 def test_splats_equal_the_local_affine_approximation(camera):
     splats, g = project(GAUSSIANS, T, camera, SCALE, BLUR), as_numpy(GAUSSIANS)
-    matrix, focal, center = (np.asarray(x, float) for x in (T.as_matrix(), camera.focal, camera.center))
+    matrix = np.asarray(T.as_matrix(), float)
     for k in range(30):
-        pixel, cov_2d, point, cov = reference.splat(g["means"][k], g["covs"][k], matrix, focal, center, 2.0, 0.3)
+        pixel, cov_2d, point, cov = reference.splat(g["means"][k], g["covs"][k], matrix, camera, 2.0, 0.3)
         np.testing.assert_allclose(splats.means[k], pixel, atol=1e-4)  # pixels; coordinates of about 30
         np.testing.assert_allclose(splats.covs[k], cov_2d, rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(splats.precisions[k], np.linalg.inv(cov_2d), rtol=1e-3, atol=1e-4)
@@ -52,6 +52,31 @@ def test_the_inverse_depth_of_a_slanted_plane_is_exact_at_every_pixel(camera):
         offset = np.asarray(pixel_grid(camera) - splats.means[k])
         actual = float(splats.inverse_depth[k]) + offset @ np.asarray(splats.depth_slope[k])
         np.testing.assert_allclose(actual, expected, atol=2e-5)  # 1/m; slopes of .1 over 30 pixels in float32
+
+
+@pytest.mark.parametrize("mean", [(-9, 0.1, 2), (9, 0.2, 2), (0.1, -8, 2), (0, 8, 2), (1.3, 0.2, 2), (0.1, -0.9, 2)])
+def test_far_outside_the_image_the_jacobian_is_that_of_its_margin(camera, mean):
+    """30 % of the image's size beyond its border; the last two are outside, but nearer than that."""
+    far = eqx.tree_at(lambda g: g.means, GAUSSIANS, jnp.tile(jnp.asarray(mean, jnp.float32), (30, 1)))
+    splats, g = project(far, pose(), camera, SCALE, BLUR), as_numpy(far)
+    for k in range(3):
+        _, cov_2d, *_ = reference.splat(g["means"][k], g["covs"][k], np.eye(4), camera, 2.0, 0.3)
+        np.testing.assert_allclose(splats.covs[k], cov_2d, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(("cosine", "has_slope"), [(0.09, False), (-0.09, False), (0.11, True), (-0.11, True)])
+def test_a_gaussian_has_a_depth_slope_from_a_cosine_of_a_tenth_on(camera, cosine, has_slope):
+    """Of the angle between its normal and the ray to it, wherever in the image it is."""
+    ray = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
+    across = np.cross(ray, [0, 1, 0]) / np.linalg.norm(np.cross(ray, [0, 1, 0]))
+    normal = cosine * ray + np.sqrt(1 - cosine**2) * across
+    tilted = eqx.tree_at(
+        lambda g: (g.means, g.normals),
+        GAUSSIANS,
+        tuple(jnp.tile(jnp.asarray(x, jnp.float32), (30, 1)) for x in (2.5 * ray, normal)),
+    )
+    splats = project(tilted, pose(), camera, SCALE, BLUR)
+    assert np.any(np.asarray(splats.depth_slope) != 0) == has_slope
 
 
 def test_a_gaussian_seen_edge_on_has_no_depth_slope(camera):

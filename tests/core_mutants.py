@@ -1,0 +1,269 @@
+"""Plausible bugs of the core: small algebra, search, registration, the stages, rendering, and the step."""
+
+from mutant import Mutant
+
+
+def own(file: str, *tests: str):
+    """Mutants of one file: its own tests, then (text, what stands there instead, the bug) of each."""
+    paths = tuple(f"tests/{test}.py" for test in tests)
+    return lambda *changes: [Mutant(f"emgs_jax/{file}.py", before, after, paths, bug) for before, after, bug in changes]
+
+
+OPS = [
+    *own("ops/camera", "ops/test_camera")(
+        ("camera.focal / stride, camera", "camera.focal, camera", "a smaller image keeps the focal length"),
+        ("jnp.round(pixels)", "jnp.floor(pixels)", "the pixel to the upper left, not the nearest"),
+        ("row * width + column", "row * height + column", "rows are numbered by the image's height"),
+        ("NEAREST_DEPTH = 1e-3", "NEAREST_DEPTH = 1e-2", "a point is in front from a centimetre on"),
+        ("(pixels - camera.center) / camera.focal", "pixels / camera.focal", "rays without the principal point"),
+    ),
+    *own("ops/clustering", "ops/test_clustering")(
+        (
+            "max(height, width).bit_length()",
+            "min(height, width).bit_length()",
+            "the Z curve misses the long side's bits",
+        ),
+        ("wanted = spacing // 2 + ", "wanted = ", "seeds at the start of what they stand for"),
+        ("jnp.where(valid, nearest[:, 0], seeds.shape[0])", "nearest[:, 0]", "invalid points pull a cluster"),
+        ("exists & (count > 0)", "exists", "an empty cluster exists"),
+    ),
+    *own("ops/k_smallest", "ops/test_k_smallest")(
+        ("[::-1])", ")", "runs are merged without turning one round"),
+        ("jax.lax.top_k(-values.T, k)", "jax.lax.top_k(values.T, k)", "the largest on an accelerator"),
+    ),
+    *own("ops/linalg", "ops/test_linalg")(
+        ("3.0 * jnp.log(scale)", "jnp.log(scale)", "the log-determinant of the scaled matrix"),
+        ("(growth * (growth + 1.0))", "(growth * (growth - 1.0))", "the other root, which mirrors along the noise"),
+        ("0.5 * jnp.arctan2", "jnp.arctan2", "principal axes at twice their angle"),
+        ("stack([c, -b], -1)", "stack([a, -b], -1)", "the inverse of a 2x2 matrix with its diagonal as it was"),
+    ),
+    *own("ops/neighbours", "ops/test_neighbours")(
+        ("distance_sq[-1] <= beyond_sq[turn]", "distance_sq[0] <= beyond_sq[turn]", "the search ends with the nearest"),
+        ("jnp.where(valid[:, None], points, jnp.inf)[order]", "points[order]", "invalid points are neighbours"),
+        ("jnp.maximum(ranks[-1] - capacity, 0)", "ranks[-1] - capacity", "free places count as a negative overflow"),
+    ),
+    *own("ops/pytree", "ops/test_pytree")(
+        ('set(value, mode="drop")', 'set(value, mode="clip")', "a row past the end overwrites the last"),
+        ("max(-(-num_rows // max_rows), 1)", "max(num_rows // max_rows, 1)", "parts are larger than they may be"),
+    ),
+]
+
+REGISTRATION = [
+    *own("registration/rigid", "registration/test_rigid")(
+        ("start @ jaxlie.SE3.exp(share", "jaxlie.SE3.exp(share", "a pose on the way that begins at the origin"),
+        ("jnp.maximum(count - 1, 0) // 2", "count // 2", "the upper median"),
+        ("T.rotation(), scale * T.translation()", "T.rotation(), T.translation()", "a pose that ignores the scale"),
+        ("jnp.sign(jnp.linalg.det(u @ vt))", "1.0", "mirrored points give a reflection"),
+        ("for _ in range(3)", "for _ in range(1)", "one reweighting"),
+        ("(distance / (2.0 * spread)) ** 2", "(distance / (2.0 * spread))", "weights that forgive too much"),
+        ("jnp.sum(paired) >= MIN_PAIRS", "jnp.sum(paired) > MIN_PAIRS", "sixteen pairs are too few"),
+    ),
+    *own("registration/matching", "registration/test_icp")(
+        (
+            "surface.plane_vars[row] + jnp.sum(normals * noise, axis=-1) ** 2",
+            "surface.plane_vars[row]",
+            "the distance to a plane does not know of the ray's noise",
+        ),
+        ("jnp.min(distance_sq, axis=-1) <= max_mahalanobis_sq", "True", "no gate on the distance"),
+        (">= min_normal_cos", ">= -1.0", "no gate on the normal"),
+        (
+            "widen(whiten(triangles, offsets), whiten(triangles, jnp.unstack(noise[:, None], axis=-1)))",
+            "whiten(triangles, offsets)",
+            "the best Gaussian is chosen without the noise",
+        ),
+        ("points.valid & is_near", "is_near", "invalid points are inliers"),
+    ),
+    *own("registration/icp", "registration/test_icp")(
+        ("[pose_noise, depth_noise]", "[depth_noise, pose_noise]", "metres for radians"),
+        (
+            "config.num_effective / jnp.maximum(jnp.sum(valid), 1)",
+            "1 / jnp.maximum(jnp.sum(valid), 1)",
+            "points as one",
+        ),
+        ("config.noise * depth_noise * source", "depth_noise * source", "the factor on the points' noise is dropped"),
+        ("scale_std=config.scale_noise * depth_noise", "scale_std=config.scale_noise", "scale in absolute units"),
+        ("jnp.sqrt(config.prior_information) /", "config.prior_information /", "information for its root"),
+        ("misfit=1.4826 * median", "misfit=median", "the misfit is no standard deviation"),
+        (
+            "/ jnp.maximum(config.num_effective, 1.0)",
+            "/ jnp.maximum(jnp.sum(placed.valid), 1)",
+            "another Hessian's unit",
+        ),
+        ("jnp.clip(shade, -edge, edge)", "shade", "an intensity pulls however different it is"),
+        ("/ config.color_std", "* config.color_std", "the weight of the intensity inverted"),
+        ("problem.rays @ T.rotation().as_matrix().T", "problem.rays", "rays stay in the camera's frame"),
+        ("(config.residual != COLORED) * jnp", "1.0 * jnp", "`colored` with the offset"),
+        ("_search(y, problem, config)", "_search(0.0 * y, problem, config)", "the search never follows the points"),
+    ),
+]
+
+STAGES = [
+    *own("localization", "test_localization")(
+        ("anchor_noise * reach**2", "anchor_noise * reach", "the anchor's deviation for its variance"),
+        ("coarse.scale * jnp.where(is_tracked, scale, 1.0)", "coarse.scale", "the accepted scale is dropped"),
+        ("info.misfit / coarse.mean_depth", "info.misfit", "the depth's noise in metres"),
+        (
+            "scale_translation(raw_current.inverse() @ pose_row(views, 2), scale)",
+            "raw_current.inverse() @ pose_row(views, 2)",
+            "the newest pose without its scale",
+        ),
+        ("noise_m / coarse.mean_depth), config", "noise_m), config", "metres for a fraction of the depth"),
+        ("jnp.maximum(coarse.repeat_rms, 1e-3)", "coarse.repeat_rms", "a coarse pose without any noise"),
+        (" <= config.max_pair_distance\n", " <= jnp.inf\n", "pairs however far apart"),
+        ("** config.scale_memory", "", "the memory of the scale is not used"),
+        ("1.4826 * jnp.sqrt", "jnp.sqrt", "the disagreement is no standard deviation"),
+        ("aligned.valid & coarse.is_usable", "aligned.valid", "a lost frame's points count"),
+        (
+            "jnp.stack([jnp.ones(()), ratio, similarity])",
+            "jnp.stack([jnp.ones(()), similarity, ratio])",
+            "R8's readings",
+        ),
+        ("(scale > 0.1)", "(scale > 0.0)", "any scale is believed"),
+    ),
+    *own("observation", "test_observation")(
+        ("    valid &= jnp.any(normals != 0, axis=-1)\n", "", "points without a normal stay valid"),
+        ("config.max_depth_step * inverse_depth)", "config.max_depth_step)", "a depth step in absolute units"),
+        ("count > len(taps) / 5", "count > len(taps) / 9", "a normal from a nearly empty window"),
+        ("xx * yy - xy * xy\n", "xx * yy\n", "the determinant without its mixed term"),
+        ("radius + 1, spacing) for dx", "radius + 1) for dx", "every row of the window"),
+        (
+            "confidence >= config.min_confidence",
+            "confidence > config.min_confidence",
+            "the least confidence is too little",
+        ),
+        ("+ 0.5) * (cells / length) - 0.5", ") * (cells / length)", "features by the cells' corners"),
+        ("scale * observation.points @ rotate", "observation.points @ rotate", "points without their scale"),
+        ("observation.normals @ rotate", "observation.normals", "normals do not turn"),
+        ("jnp.where(valid, confidence, 1.0)", "confidence", "an invalid row keeps its confidence"),
+    ),
+    *own("gaussians", "test_gaussians")(
+        ("(0.299, 0.587, 0.114)", "(0.333, 0.333, 0.333)", "luminance as a plain mean"),
+        ("-0.5 * dot(white, white)", "-dot(white, white)", "eq. 1's weights with twice the exponent"),
+        ("max(spacing // num_neighbours, 1)", "1", "a Gaussian smaller than its cluster"),
+        ("count / spacing", "count", "a weight in points"),
+        ("even.valid & row_exists", "even.valid", "points that are not there count in eq. 1"),
+        ("0.01 * jnp.trace(moments", "0.1 * jnp.trace(moments", "ten times the ridge"),
+        ("jnp.sum(found, axis=-1) >= 4", "jnp.sum(found, axis=-1) >= 3", "a covariance from three points"),
+        ("config.min_std**2 * jnp.eye(3)", "config.min_std * jnp.eye(3)", "a deviation for a variance"),
+        ("(gain * (1.0 - gain))", "gain", "the spread of a mixture by its gain alone"),
+    ),
+    *own("gaussian_map", "test_gaussian_map")(
+        ("config.forgetting * map.weight", "map.weight", "nothing is forgotten"),
+        ("axis=0) + config.margin", "axis=0)", "no margin above"),
+        ("jnp.where(config.gain > 0, kept, gain)", "kept", "the printed gain keeps the sum"),
+        ("(evidence > 0) & map", "(evidence >= 0) & map", "no evidence counts as an update"),
+        ("jnp.sum(exists & ~is_free)", "jnp.sum(~is_free)", "what was not fresh is counted as lost"),
+    ),
+    *own("initialization", "test_initialization")(
+        ("weight * num_views", "weight", "weights of one view"),
+        ("spacing(thin, config) * num_views", "spacing(thin, config)", "as many Gaussians for every view"),
+        (
+            "morton_order(camera.height, camera.width)",
+            "jnp.arange(camera.height * camera.width)",
+            "seeds along the rows",
+        ),
+        ("transform(T, view, jnp.ones(()))", "transform(T.inverse(), view, jnp.ones(()))", "poses the wrong way round"),
+    ),
+    *own("em", "test_em")(
+        ("config.noise * noise", "noise", "the factor on the noise is dropped"),
+        ("(logdets[rows] + log_growth)", "logdets[rows]", "the determinant does not know of the noise"),
+        (
+            "config.normal_weight * (normal_cos - 1.0)",
+            "config.normal_weight * normal_cos / 2",
+            "half the normals' weight",
+        ),
+        (
+            "jnp.sum(jnp.where(found, normal_cos, 0.0), axis=-1)",
+            "jnp.sum(normal_cos, axis=-1)",
+            "normals of no neighbour",
+        ),
+        ("log_gap <= config.max_log_gap", "log_gap <= jnp.inf", "τ_π is not looked at"),
+        ("second - outer(mean[:, :3])", "second", "a covariance about the old mean"),
+        ("+ config.min_std**2 * jnp.eye(3)", "", "no floor under new covariances"),
+        ("2.0 * jnp.minimum(sums[:, :2]", "jnp.minimum(sums[:, :2]", "half the support"),
+        ("jnp.min(both, axis=-1)", "jnp.max(both, axis=-1)", "the better of the two axes"),
+        ("total > config.min_responsibility", "total > 0", "any responsibility is enough"),
+        ("jnp.where(step.is_fused, best, 0.0)", "best", "the mean log-joint of all points"),
+        ("dot(white, noise) ** 2 / growth", "dot(white, noise) ** 2", "Sherman and Morrison without the denominator"),
+    ),
+    *own("refinement", "test_refinement")(
+        (".at[rows].max(omega)", ".at[rows].add(omega)", "γ from the sum of ω"),
+        ("softmax(-0.5 * distance_sq", "softmax(-distance_sq", "eq. 5 with twice the exponent"),
+        ("jnp.maximum(cosine, 0.0)", "jnp.abs(cosine)", "opposite meanings merge"),
+        ("map_splats.covs[rows] + candidate_splats.covs[:, None]", "map_splats.covs[rows]", "one of two covariances"),
+        ("(relative >= -config.front_margin)", "(relative >= -config.back_margin)", "one margin for both sides"),
+        ("map_depth > 0, map_depth, 1.0) - 1.0", "map_depth > 0, 1.0, 1.0) - map_depth", "margins in metres"),
+        ("candidates.covs[:, None] + outer(around)", "candidates.covs[:, None]", "no spread of the merged means"),
+        ("candidates.valid & ~is_merged", "candidates.valid", "merged candidates are inserted, too"),
+        ("map_splats.depth <= own_depth + reach", "map_splats.depth <= jnp.inf", "occluded Gaussians merge"),
+        ("axis2=-1) / scale)", "axis2=-1))", "the widest splat with the factor that closes surfaces"),
+        ("(map_depth > 0) & (relative", "(relative", "candidates merge where the map has no depth"),
+    ),
+    *own("semantics", "test_semantics")(
+        ("safe_normalize(gaussians.features) @", "gaussians.features @", "features by their length"),
+        ("gaussians.valid & jnp.any", "jnp.any", "free rows have a class"),
+    ),
+    *own("slam", "test_slam")(
+        ("aligned.valid & localization.is_tracked", "aligned.valid", "a frame that is not tracked is mapped"),
+        ("trusted.valid & ~is_fused", "trusted.valid", "fused points become Gaussians, too"),
+        ("(trusted.points - T.translation())", "trusted.points", "the noise along rays from the world's origin"),
+        ("insert(write_back(state.map, submap, rows), fresh", "insert(state.map, fresh", "the submap is not put back"),
+        (
+            "jnp.where(config.em.average.gain > 0, weight, 1.0)",
+            "jnp.ones_like(weight)",
+            "every new Gaussian weighs one",
+        ),
+        (
+            "StepInfo(T, coarse.T_world_newest",
+            "StepInfo(state.T_world_previous, coarse.T_world_newest",
+            "one frame late",
+        ),
+        (
+            "SlamState(map, aligned, T), info",
+            "SlamState(map, aligned, coarse.T_world_camera), info",
+            "the coarse pose stays",
+        ),
+        (
+            "StepInfo(T, coarse.T_world_newest",
+            "StepInfo(T, coarse.T_world_camera",
+            "the newest image where the current is",
+        ),
+    ),
+]
+
+RENDER = [
+    *own("render/composite", "render/test_composite")(
+        ("jnp.sqrt(variance)", "variance", "a variance for a deviation"),
+        ("-0.5 * distance_sq", "-distance_sq", "splats that fall off twice as fast"),
+        ("2.0 * precision[:, None, 0, 1]", "precision[:, None, 0, 1]", "half the mixed term"),
+        ("config.radius * splats.depth_std", "splats.depth_std", "a splat's extent of one deviation"),
+        ("0.1 * splats.depth)", "0.5 * splats.depth)", "a near splat is cut at half its depth"),
+        ("alpha * light_before", "alpha", "nothing hides what is behind"),
+        ("alpha >= jnp.maximum(config.min_alpha", "alpha >= jnp.maximum(0.0", "any coverage has a depth"),
+    ),
+    *own("render/densify", "render/test_densify")(
+        ("(config.opacity, config.min_alpha)", "(config.render.opacity, config.min_alpha)", "the refinement's opacity"),
+        (
+            "(config.opacity, config.min_alpha)",
+            "(config.opacity, config.render.min_alpha)",
+            "the refinement's coverage",
+        ),
+        ("reach * middle", "reach", "a layer in metres"),
+        ("0.5 * weights.sum(0)", "0.25 * weights.sum(0)", "the first quartile for the median"),
+        ("config.min_layer_share * whole[1]", "config.min_layer_share", "the share of light, not of weight"),
+        ("values_sum[..., :3] / weight", "values_sum[..., :3] / whole[1]", "a layer's colour by the whole weight"),
+    ),
+    *own("render/project", "render/test_project")(
+        ("jnp.clip(means, low, high)", "means", "unbounded Jacobians outside the image"),
+        ("+ blur * jnp.eye(2)", "", "no low-pass filter"),
+        ("SMALLEST_COSINE * jnp", "SMALLEST_COSINE / 2 * jnp", "slopes at grazing angles"),
+        ("scale * jnp.einsum", "jnp.einsum", "covariances without the factor that closes surfaces"),
+    ),
+    *own("render/tiles", "render/test_tiles")(
+        ("(tile_size - 1)", "tile_size", "a tile a pixel too wide"),
+        ("radius * jnp.sqrt", "jnp.sqrt", "boxes of one standard deviation"),
+        ("splats.valid, splats.depth, jnp.inf", "splats.valid, -splats.depth, jnp.inf", "farthest first"),
+    ),
+]
+
+MUTANTS = (*OPS, *REGISTRATION, *STAGES, *RENDER)
