@@ -1,22 +1,21 @@
 """Front-to-back compositing of one tile, and the image from all of them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
-from emgs_jax.ops.pytree import fill_rows, static, take_rows, traced
+from emgs_jax.ops.pytree import static, take_rows, traced
 from emgs_jax.render.project import Splats, project_gaussians
 from emgs_jax.render.tiles import assign_tiles, tile_corners
 
 Sums: TypeAlias = tuple[Float[Array, "q v"], Float[Array, "q"], Float[Array, "q"], Float[Array, "q"]]
-Tile: TypeAlias = tuple[Float[Array, "2"], Int[Array, "c"], Bool[Array, "c"]]  # corner, rows of its splats, which exist
 
 
 class RenderConfig(eqx.Module):
@@ -125,14 +124,8 @@ def draw_tiles(
     camera: Camera,
     config: RenderConfig,
     blend: Callable[..., PyTree[Array]],
-    num_sizes: int = 1,
 ) -> tuple[PyTree[Array], Int[Array, ""]]:
     """Images (h, w, ...) of what `blend`, a function like `composite`, gives for the splats of every tile.
-
-    Args:
-        num_sizes: programs of `blend`, for tiles of the capacity, half of it, a quarter, …: equally full tiles are
-            drawn together and take the smallest that holds their splats. The image does not depend on it; each
-            program has to be compiled, and most tiles of a map fill a quarter.
 
     Returns:
         The images, and how many splats found their tile full.
@@ -143,47 +136,15 @@ def draw_tiles(
     step = jnp.arange(config.tile_size, dtype=jnp.float32)
     inside = jnp.stack(jnp.meshgrid(step, step, indexing="xy"), axis=-1).reshape(-1, 2)
 
-    def draw(tile: Tile) -> PyTree[Array]:
+    def draw(tile: tuple[Array, Array, Array]) -> PyTree[Array]:
         corner, tile_rows, tile_exists = tile
         near, near_values = take_rows((splats, values), tile_rows)
         near = eqx.tree_at(lambda s: s.valid, near, near.valid & tile_exists)
         near_values = jnp.where(near.valid[:, None], near_values, 0.0)
         return blend(near, near_values, corner + inside, config)
 
-    batch_size = min(config.tile_batch, corners.shape[0])
-    if num_sizes == 1:
-        tiles = jax.lax.map(draw, (corners, rows, exists), batch_size=batch_size)
-    else:
-        sizes = [config.tile_capacity >> power for power in reversed(range(num_sizes))]
-        tiles = _map_by_size(draw, (corners, rows, exists), sizes, batch_size)
+    tiles = jax.lax.map(draw, (corners, rows, exists), batch_size=min(config.tile_batch, corners.shape[0]))
     return jax.tree.map(lambda x: _assemble(x, camera, config.tile_size), tiles), jnp.sum(overflow)
-
-
-def _map_by_size(
-    draw: Callable[[Tile], PyTree[Array]], tiles: Tile, sizes: Sequence[int], batch_size: int
-) -> PyTree[Array]:
-    """Draw all tiles, `batch_size` at once, each batch with as few of its rows as the fullest tile needs.
-
-    Args:
-        draw: what one tile becomes; the splats that exist are its first rows.
-        tiles: corners (t, 2), rows (t, c), which exist (t, c).
-        sizes: numbers of rows that a program is made for, ascending up to c.
-        batch_size: tiles; at most t.
-    """
-    counts = jnp.sum(tiles[2], axis=1)
-    order = jnp.argsort(counts)
-    batches = jax.tree.map(lambda x: fill_rows(x[order], batch_size, 0).reshape(-1, batch_size, *x.shape[1:]), tiles)
-
-    def first_rows(size: int) -> Callable[[Tile], PyTree[Array]]:
-        return jax.vmap(lambda tile: draw((tile[0], tile[1][:size], tile[2][:size])))
-
-    def draw_batch(batch: Tile) -> PyTree[Array]:
-        fullest = jnp.max(jnp.sum(batch[2], axis=1))
-        return jax.lax.switch(jnp.sum(fullest > jnp.array(sizes[:-1])), [first_rows(size) for size in sizes], batch)
-
-    drawn = jax.lax.map(draw_batch, batches)
-    back = jnp.argsort(order)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[back], drawn)
 
 
 def rendering_of(

@@ -62,7 +62,7 @@ def densify(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, co
         layer = jnp.where(in_dominant_layer(weights, depth, config.max_depth_spread), weights, 0.0)
         return weighted_sums(weights, depth, values), weighted_sums(layer, depth, values)
 
-    (whole, layer), overflow = draw_tiles(gaussians, values, T_world_camera, camera, soft, blend, num_sizes=3)
+    (whole, layer), overflow = draw_tiles(gaussians, values, T_world_camera, camera, soft, blend)
     rendering = rendering_of(*whole, overflow, soft)
     is_mixed = rendering.depth_std > config.max_depth_spread * rendering.depth
     values_sum, weight, depth_sum, _ = where_rows(is_mixed, layer, whole)

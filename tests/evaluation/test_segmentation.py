@@ -8,9 +8,9 @@ from emgs_jax.evaluation.segmentation import (
     LabelledPoints,
     compare_labels,
     confusion_matrix,
+    label_cells,
     segmentation_metrics,
     transfer_labels,
-    label_cells,
     true_labels,
 )
 

@@ -10,7 +10,7 @@ from scene import as_numpy, at, move_gaussians, pose, random_gaussians
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import pixel_grid, rays
-from emgs_jax.render.composite import composite, draw_tiles, render
+from emgs_jax.render.composite import render
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 
@@ -93,17 +93,6 @@ def test_the_depth_of_a_slanted_gaussian_is_that_of_its_plane(camera, render_con
 def test_the_image_does_not_depend_on_the_tile_size(camera, config, image, size):
     other = config(f"render.tile_size={size}").refinement.render
     assert_images_equal(draw(GAUSSIANS, GAUSSIANS.colors, T, camera, other), image, 2e-5)  # order of sums
-
-
-def test_tiles_of_several_sizes_give_the_image_of_one(camera, config):
-    """Tiles from empty to nearly full: each of the three programs draws some of them."""
-    some = config("render.tile_capacity=24", "render.tile_size=5", "render.tile_batch=4").refinement.render
-
-    def drawn(num_sizes):
-        tiles = eqx.filter_jit(draw_tiles)(GAUSSIANS, GAUSSIANS.colors, T, camera, some, composite, num_sizes)
-        return jax.device_get(tiles)
-
-    jax.tree.map(np.testing.assert_array_equal, drawn(3), drawn(1))
 
 
 def test_the_image_does_not_depend_on_the_order_of_rows(camera, render_config, image):
