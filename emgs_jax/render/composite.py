@@ -12,10 +12,12 @@ from jaxtyping import Array, Float, Int, PyTree
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import static, take_rows, traced
+from emgs_jax.ops.pytree import fill_rows, static, take_rows, traced
 from emgs_jax.render.project import Splats, project_gaussians
 from emgs_jax.render.tiles import assign_tiles, tile_corners
 
+NUM_SIZES = 3  # programs for tiles of the capacity, half and a quarter of it, which most tiles of a map do not exceed
+Tile: TypeAlias = tuple[Array, Array, Array]  # corner, rows of its splats, which of them exist
 Sums: TypeAlias = tuple[Float[Array, "q v"], Float[Array, "q"], Float[Array, "q"], Float[Array, "q"]]
 
 
@@ -147,15 +149,40 @@ def draw_tiles(
     step = jnp.arange(config.tile_size, dtype=jnp.float32)
     inside = jnp.stack(jnp.meshgrid(step, step, indexing="xy"), axis=-1).reshape(-1, 2)
 
-    def draw(tile: tuple[Array, Array, Array]) -> PyTree[Array]:
+    def draw(tile: Tile) -> PyTree[Array]:
         corner, tile_rows, tile_exists = tile
         near, near_values = take_rows((splats, values), tile_rows)
         near = eqx.tree_at(lambda s: s.valid, near, near.valid & tile_exists)
         near_values = jnp.where(near.valid[:, None], near_values, 0.0)
         return blend(near, near_values, corner + inside, config)
 
-    tiles = jax.lax.map(draw, (corners, rows, exists), batch_size=min(config.tile_batch, corners.shape[0]))
+    tiles = _map_by_fill(draw, (corners, rows, exists), min(config.tile_batch, corners.shape[0]))
     return jax.tree.map(lambda x: _assemble(x, camera, config.tile_size), tiles), jnp.sum(overflow)
+
+
+def _map_by_fill(draw: Callable[[Tile], PyTree[Array]], tiles: Tile, batch_size: int) -> PyTree[Array]:
+    """Draw all tiles, equally full ones together, each batch with as few of its rows as the fullest tile needs.
+
+    Args:
+        draw: what one tile becomes; the splats that exist are its first rows.
+        tiles: corners (t, 2), rows (t, c), which exist (t, c).
+        batch_size: tiles at once; at most t.
+    """
+    capacity = tiles[1].shape[1]
+    sizes = [-(-capacity // 2**power) for power in reversed(range(NUM_SIZES))]
+    order = jnp.argsort(jnp.sum(tiles[2], axis=1))
+    batches = jax.tree.map(lambda x: fill_rows(x[order], batch_size, 0).reshape(-1, batch_size, *x.shape[1:]), tiles)
+
+    def first_rows(size: int) -> Callable[[Tile], PyTree[Array]]:
+        return jax.vmap(lambda tile: draw((tile[0], tile[1][:size], tile[2][:size])))
+
+    def draw_batch(batch: Tile) -> PyTree[Array]:
+        fullest = jnp.max(jnp.sum(batch[2], axis=1))
+        return jax.lax.switch(jnp.sum(fullest > jnp.array(sizes[:-1])), [first_rows(size) for size in sizes], batch)
+
+    drawn = jax.lax.map(draw_batch, batches)
+    back = jnp.argsort(order)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[back], drawn)
 
 
 def rendering_of(
