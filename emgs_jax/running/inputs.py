@@ -15,7 +15,10 @@ from emgs_jax.slam import SlamConfig
 
 
 class RawView(NamedTuple):
-    """What the prior alone says of a frame: points (h, w, 3) of its camera, under the mask that the mapping uses."""
+    """What the prior alone says of a frame: points (h, w, 3) of its camera, and which have the least confidence.
+
+    The mapping leaves out points without a normal as well.
+    """
 
     points: np.ndarray
     mask: np.ndarray
