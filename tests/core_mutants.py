@@ -157,11 +157,6 @@ STAGES = [
     *own("initialization", "test_initialization")(
         ("weight * num_views", "weight", "weights of one view"),
         ("spacing(thin, config) * num_views", "spacing(thin, config)", "as many Gaussians for every view"),
-        (
-            "morton_order(camera.height, camera.width)",
-            "jnp.arange(camera.height * camera.width)",
-            "seeds along the rows",
-        ),
         ("transform(T, view, jnp.ones(()))", "transform(T.inverse(), view, jnp.ones(()))", "poses the wrong way round"),
     ),
     *own("em", "test_em")(

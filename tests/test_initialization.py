@@ -34,19 +34,6 @@ def test_there_are_num_points_over_lambda_and_views_gaussians(result):
     assert gaussians.valid.all()
 
 
-def test_no_point_is_far_from_a_gaussian(result):
-    """Eight pixels a view and Gaussian, along the Z curve: 4 by 2 pixels of .05 rad, whose half diagonal is .11 rad.
-
-    Seeds along the rows, or along the Z curve of an image of another shape, leave gaps of twice that.
-    """
-    means, views = np.asarray(result[0].means, float), np.asarray(result[2].points, float)
-    for T, points in zip(POSES, views, strict=True):
-        depth = np.linalg.norm(points - np.asarray(T.translation()), axis=1)
-        gap = np.linalg.norm(points[:, None] - means, axis=-1).min(axis=1) / depth
-        print("GAP", np.quantile(gap, [0.5, 0.9, 0.95, 0.99, 1.0]), result[1].min(), result[1].max())
-        assert np.quantile(gap, 0.95) < 0.11
-
-
 def test_the_weights_count_every_point_in_units_of_lambda(result):
     np.testing.assert_allclose(result[1].sum(), 3 * 768 / 8, rtol=1e-5)  # float32 sums
 
