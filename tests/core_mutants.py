@@ -191,7 +191,11 @@ STAGES = [
         ("candidates.covs[:, None] + outer(around)", "candidates.covs[:, None]", "no spread of the merged means"),
         ("candidates.valid & ~is_merged", "candidates.valid", "merged candidates are inserted, too"),
         ("map_splats.depth <= own_depth + reach", "map_splats.depth <= jnp.inf", "occluded Gaussians merge"),
-        ("axis2=-1) / config.render.covariance_scale)", "axis2=-1))", "the widest splat with the factor that closes surfaces"),
+        (
+            "axis2=-1) / config.render.covariance_scale)",
+            "axis2=-1))",
+            "the widest splat with the factor that closes surfaces",
+        ),
         ("(map_depth > 0) & (relative", "(relative", "candidates merge where the map has no depth"),
     ),
     *own("semantics", "test_semantics")(

@@ -15,6 +15,7 @@ import numpy as np
 from emgs_jax.gaussian_map import empty_map, grow
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.running.convert import FirstWindow
 from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
 
@@ -33,8 +34,10 @@ def start(
         init: `init_state`, or what does the same for stacked configs.
     """
     state, overflow = init(first.views, first.T_world_views, camera, config)
-    while jnp.any(overflow > 0):
-        config = with_room(config, Overflow(overflow, jnp.zeros((), int), jnp.zeros((), int)))
+    while np.any(overflow):
+        config = with_room(
+            config, Overflow(map=overflow, submap=jnp.zeros_like(overflow), tiles=jnp.zeros_like(overflow))
+        )
         state, overflow = init(first.views, first.T_world_views, camera, config)
     return state, config
 
@@ -65,8 +68,9 @@ def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
     if key in _prepared:
         return
     step(SlamState(map, view, pose), prediction, camera, config, note)
+    run = full_precision(lambda call: jax.block_until_ready(call[0](*call[1])))  # as inside `step`: else it is another
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        list(threads.map(lambda call: jax.block_until_ready(call[0](*call[1])), calls))
+        list(threads.map(run, calls))
     _prepared.add(key)
 
 
@@ -85,7 +89,7 @@ def advance(
     they change what is drawn, not what is kept. `step` is `slam.step`, or what does the same for stacked states.
     """
     new, info = step(state, prediction, camera, config)
-    while jnp.any((info.overflow.map > 0) | (info.overflow.submap > 0)):
+    while np.any(info.overflow.map) or np.any(info.overflow.submap):
         config = with_room(config, info.overflow)
         if config.submap.map_capacity > state.map.weight.shape[-1]:
             state = eqx.tree_at(lambda s: s.map, state, grow(state.map, config.submap.map_capacity))
@@ -96,6 +100,6 @@ def advance(
 def with_room(config: SlamConfig, overflow: Overflow) -> SlamConfig:
     """The config with doubled capacities where rows did not fit; each new size compiles once."""
     submap = config.submap
-    map_factor, submap_factor = (2 if jnp.any(lost > 0) else 1 for lost in (overflow.map, overflow.submap))
+    map_factor, submap_factor = (2 if np.any(lost) else 1 for lost in (overflow.map, overflow.submap))
     capacities = submap.map_capacity * map_factor, submap.submap_capacity * submap_factor
     return replace(config, submap=replace(submap, map_capacity=capacities[0], submap_capacity=capacities[1]))

@@ -1,0 +1,62 @@
+"""What is compiled when: all of a step before the first, and of a larger map only the look-up and the insertion."""
+
+import contextlib
+
+import jax
+import jax.monitoring
+import pytest
+from scene import observe_room, path_pose, predict_room, slam_config, stack_poses
+
+from emgs_jax.gaussian_map import grow
+from emgs_jax.ops.pytree import stack
+from emgs_jax.running.convert import FirstWindow
+from emgs_jax.running.growth import advance, prepare, start
+
+pytestmark = pytest.mark.slow  # the whole step is compiled
+
+
+@contextlib.contextmanager
+def compiled():
+    """Names of the functions that XLA makes executables of inside the block."""
+    names = []
+
+    def hear(event, _, **about):
+        if event.endswith("backend_compile_duration"):
+            names.append(about["fun_name"].removeprefix("jit_").removeprefix("jit(").removesuffix(")"))
+
+    jax.monitoring.register_event_duration_secs_listener(hear)
+    try:
+        yield names
+    finally:
+        jax.monitoring.unregister_event_duration_listener(hear)
+
+
+@pytest.fixture(scope="module")
+def prepared(camera):
+    """A map and its config after `prepare`, and what `prepare` compiled."""
+    config = slam_config("slam.initialization=merged")
+    poses = [path_pose(i) for i in range(3)]
+    first = FirstWindow(stack([observe_room(T, camera, num_features=2) for T in poses]), stack_poses(poses))
+    jax.clear_caches()
+    with compiled() as names:
+        prepare(first, camera, config)
+    return *start(first, camera, config), names
+
+
+def test_a_step_after_its_preparation_compiles_nothing(prepared, camera):
+    state, config, names = prepared
+    assert {"_approach", "_select", "localize_fine", "_fuse", "cluster", "_refine", "_store"} <= set(names)
+    given = predict_room(3, camera, num_features=2), camera, config
+    with compiled() as more:
+        advance(state, *given)
+    assert not more
+
+
+def test_a_larger_map_compiles_the_look_up_and_the_insertion_and_nothing_of_the_work_on_the_submap(prepared, camera):
+    state, config, _ = prepared
+    state, _, config = advance(state, predict_room(3, camera, num_features=2), camera, config)
+    larger = grow(state.map, 2 * config.submap.map_capacity)
+    state = type(state)(larger, state.previous, state.T_world_previous)
+    with compiled() as names:
+        advance(state, predict_room(4, camera, num_features=2), camera, config)
+    assert set(names) == {"_select", "_store"}
