@@ -572,8 +572,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/running/dense.py",
-        "return LabelledPoints(np.asarray(gaussians.means, np.float64)[valid], labels[valid], tuple(prior.feature_names))",
-        "return LabelledPoints(np.asarray(gaussians.means, np.float64)[valid], labels[: valid.sum()], tuple(prior.feature_names))",
+        "np.float64)[valid], labels[valid], tuple(",
+        "np.float64)[valid], labels[: valid.sum()], tuple(",
         DENSE,
         "labels of free rows shift the others",
     ),
@@ -804,10 +804,10 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/prior/recorded.py",
-        "files[name] = _write(folder / name, _npz(_arrays(prediction)))",
-        'files[name] = _write(folder / name, _npz(_arrays(prediction) | {"mask": prediction.mask & (prediction.confidence > 1)}))',
+        "arrays[key] = getattr(prediction, key)",
+        "arrays[key] = np.round(getattr(prediction, key), 3)",
         RECORDED,
-        "a recording drops points of low confidence",
+        "a recording is rounded to millimetres",
     ),
     Mutant(
         "emgs_jax/prior/recorded.py",
@@ -892,13 +892,6 @@ MUTANTS = (
         "jnp.abs(seen_depth - there) <= config.max_depth_step",
         DEPTH,
         "views agree within metres, not within a share",
-    ),
-    Mutant(
-        "emgs_jax/prior/multiview/depth.py",
-        "return inside & (depth > 0) & (there > 0) &",
-        "return inside & (depth > 0) &",
-        DEPTH,
-        "a hole confirms",
     ),
     Mutant(
         "emgs_jax/prior/multiview/incremental.py",
@@ -1156,7 +1149,7 @@ MUTANTS = (
     Mutant(
         "emgs_jax/io/mesh.py",
         "colors[nearest]), faces)",
-        "colors[: len(vertices)] if len(colors) >= len(vertices) else colors[np.arange(len(vertices)) % len(colors)]), faces)",
+        "colors[np.arange(len(nearest)) % len(colors)]), faces)",
         MESH,
         "vertices take colours of other points",
     ),

@@ -21,8 +21,8 @@ def a_row(ate=0.05, f1=90.0, **changes):
 @pytest.fixture
 def baseline(tmp_path):
     """As written from `a_row()` and read back."""
-    raw = dataclasses.replace(a_row(), kind="raw prior")
-    write_gate(tmp_path / "gate.yaml", [a_row(), raw], TOLERANCES)
+    raw = dataclasses.replace(a_row(ate=0.5, f1=10.0), kind="raw prior")
+    write_gate(tmp_path / "gate.yaml", [raw, a_row(), raw], TOLERANCES)
     return read_gate(tmp_path / "gate.yaml")
 
 
