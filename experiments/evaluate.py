@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.io.files import atomic_write, write_json
-from emgs_jax.report.gate import read_gate, regressions, write_gate
+from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
 from emgs_jax.report.results import is_finished, read_estimates, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
 from emgs_jax.running.configure import compose, message_of
@@ -103,7 +103,11 @@ def evaluate(settings: Mapping[str, Any]) -> list[str]:
     finally:
         rows = _write_tables(out, jobs, failures, settings["published"])
     if settings["write_gate"]:
-        write_gate(settings["write_gate"], rows, settings["tolerances"])
+        tolerances = settings["tolerances"]
+        if settings["rounded"]:
+            rounded = read_estimates(Path(settings["rounded"]))
+            tolerances = rounding_tolerances(tolerances, read_estimates(out), rounded, len(settings["seeds"]))
+        write_gate(settings["write_gate"], rows, tolerances)
     problems = [f"{name}: {message}" for name, message in failures.items()]
     return problems + [f"regression: {line}" for line in regressions(baseline, rows)]
 

@@ -1,16 +1,53 @@
 """A committed baseline: results must not get worse than it by more than a tolerance."""
 
+import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from emgs_jax.io.files import atomic_write
+from emgs_jax.report.results import Estimate
 from emgs_jax.report.tables import Row
 
 GATE_FORMAT = 1
+_DEVIATIONS = 4.0  # of what rounding does to a mean: a baseline is compared with on other machines
+_FEWEST_PAIRS = 5
+
+
+def rounding_tolerances(
+    tolerances: Mapping[str, Mapping[str, Any]],
+    estimates: Iterable[Estimate],
+    rounded: Iterable[Estimate],
+    num_seeds: int,
+) -> dict[str, dict[str, Any]]:
+    """Widen tolerances to what rounding alone may do to a mean over `num_seeds` seeds.
+
+    Seeds differ far more from each other than one of them does from itself on another machine, and a baseline is
+    compared with the same seeds: so it is the differences, job by job, whose root mean square counts.
+
+    Args:
+        tolerances: the least ones, as for `write_gate`.
+        estimates: of some seeds, better more than those of the baseline.
+        rounded: of the same jobs, computed by other instructions of the processor.
+        num_seeds: of the baseline.
+    """
+    again = {_job(item): item.values for item in rounded if item.kind == "ours"}
+    pairs = [(item.values, again[_job(item)]) for item in estimates if item.kind == "ours" and _job(item) in again]
+    if len(pairs) < _FEWEST_PAIRS:
+        raise ValueError(
+            f"{len(pairs)} results are there with both roundings, at least {_FEWEST_PAIRS} are needed for tolerances: "
+            "evaluate seeds=[0,1,2,3,4,5,6,7,8,9] into both folders"
+        )
+    found = {}
+    for key, rule in tolerances.items():
+        changes = [there[key] - here[key] for here, there in pairs if key in here and key in there]
+        square = sum(change**2 for change in changes) / max(len(changes), 1)
+        least = _DEVIATIONS * math.sqrt(square / num_seeds)
+        found[key] = {**rule, "tolerance": max(float(rule["tolerance"]), float(f"{least:.2g}"))}
+    return found
 
 
 def write_gate(path: str | os.PathLike, rows: Sequence[Row], tolerances: Mapping[str, Mapping[str, Any]]) -> None:
@@ -73,6 +110,10 @@ def regressions(baseline: Mapping[str, Any], rows: Sequence[Row]) -> list[str]:
                 allowed = f"{rule['direction']} is better, tolerance {tolerance:g}"
                 lines.append(f"{name}: {key} is {shown}, baseline {rule['value']:.6g} ({allowed})")
     return lines
+
+
+def _job(item: Estimate) -> tuple[str, str, str, str, int]:
+    return item.dataset, item.sequence, item.variant, item.protocol, item.seed
 
 
 def _name(row: Row) -> str:

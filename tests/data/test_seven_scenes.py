@@ -10,9 +10,17 @@ from scipy.spatial.transform import Rotation
 from written_scene import color_image, plane_depth, scene_pose
 
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.data.seven_scenes import T_COLOR_DEPTH, SevenScenes, register
+from emgs_jax.data.seven_scenes import SevenScenes, register
 
 REAL = "redkitchen/seq-01"
+T_COLOR_DEPTH = np.array(  # as published with kapture's 7-Scenes; the code's own constant would agree with itself
+    [
+        [0.99996518, 0.0026765127, -0.0079041012, -0.025558943],
+        [-0.0027409311, 0.99996303, -0.0081504521, 0.00010109636],
+        [0.0078819942, 0.0081718329, 0.99993555, 0.0020318322],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
 
 
 def load(root, **options):

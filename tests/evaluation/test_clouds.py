@@ -5,7 +5,16 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, register, voxel_downsample
+from emgs_jax.evaluation.clouds import (
+    PointCloud,
+    fuse_clouds,
+    read_cloud,
+    register,
+    transform_cloud,
+    voxel_downsample,
+)
+from emgs_jax.evaluation.trajectory import Alignment
+from emgs_jax.io.ply import save_points_ply
 
 
 def random_cloud(rng, n=400):
@@ -24,6 +33,30 @@ def test_points_of_a_voxel_become_their_mean_and_twice_is_once():
     again = voxel_downsample(small, 0.2)
     for name in ("points", "normals", "colors"):
         np.testing.assert_allclose(getattr(again, name), getattr(small, name), atol=1e-12)
+
+
+def test_a_voxels_normal_is_the_direction_of_the_mean_and_zero_where_the_sides_cancel():
+    rng = np.random.default_rng(7)
+    cloud = random_cloud(rng, 5000)
+    small = voxel_downsample(cloud, 0.2)
+    cells, inverse = np.unique(np.floor(cloud.points / 0.2), axis=0, return_inverse=True)
+    means = np.stack([cloud.normals[inverse.ravel() == cell].mean(0) for cell in range(len(cells))])
+    length = np.linalg.norm(means, axis=1, keepdims=True)
+    assert 0.01 < (length < 0.1).mean() < 0.5, "both kinds of voxels are there"
+    np.testing.assert_allclose(small.normals, np.where(length > 0.1, means / length, 0.0), rtol=0, atol=1e-12)
+    colors = np.stack([cloud.colors[inverse.ravel() == cell].mean(0) for cell in range(len(cells))])
+    np.testing.assert_allclose(small.colors, colors, rtol=0, atol=1e-12)
+
+
+def test_a_similarity_moves_the_points_and_only_turns_the_normals():
+    rng = np.random.default_rng(8)
+    cloud = random_cloud(rng)
+    move = Alignment(3.0, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
+    moved = transform_cloud(cloud, move)
+    tips = (move.apply(cloud.points + cloud.normals) - move.apply(cloud.points)) / 3.0
+    np.testing.assert_allclose(moved.points, move.apply(cloud.points), atol=1e-12)
+    np.testing.assert_allclose(moved.normals, tips, atol=1e-12)
+    np.testing.assert_array_equal(moved.colors, cloud.colors)
 
 
 def test_fusing_pieces_is_reducing_the_whole(monkeypatch):
@@ -56,8 +89,45 @@ def test_registration_takes_the_steps_of_open3ds_point_to_point_icp(num_steps):
     np.testing.assert_allclose(found.translation, expected[:3, 3], atol=1e-9)
 
 
-def test_registration_without_pairs_moves_nothing():
+def test_registration_with_less_than_three_pairs_moves_nothing():
     points = np.random.default_rng(6).uniform(size=(20, 3))
-    for target in (points + 100.0, points[:0]):
-        found = register(points, cKDTree(target), 0.1, 10)
+    few = np.concatenate([points[:2] + 0.01, points[2:] + 100.0])
+    for target in (points + 100.0, points[:0], few, few[1:]):
+        found = register(points, cKDTree(target), 0.03, 10)
         np.testing.assert_array_equal(found.apply(points), points)
+
+
+def test_a_cloud_that_is_read_keeps_its_normals_and_colours(tmp_path):
+    """Its normals are not those of planes through neighbours: they must come from the file."""
+    cloud = random_cloud(np.random.default_rng(9))
+    save_points_ply(tmp_path / "a.ply", cloud.points, cloud.normals, cloud.colors)
+    found = read_cloud(tmp_path / "a.ply", 12)
+    np.testing.assert_allclose(found.points, cloud.points, rtol=1e-6)
+    np.testing.assert_allclose(found.normals, cloud.normals, rtol=1e-6)
+    np.testing.assert_allclose(found.colors, cloud.colors, atol=0.5 / 255 + 1e-6)
+
+
+def test_a_cloud_without_normals_gets_those_of_planes_through_its_points(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    rng = np.random.default_rng(10)
+    across = np.array([0.6, 0.0, 0.8])
+    points = rng.uniform(-1, 1, (500, 3))
+    points -= np.outer(points @ across, across)
+    trimesh.PointCloud(points).export(tmp_path / "a.ply")
+    found = read_cloud(tmp_path / "a.ply", 12)
+    np.testing.assert_allclose(np.abs(found.normals @ across), 1.0, atol=1e-6)
+    assert not found.colors.any()
+
+
+def test_a_file_without_usable_points_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.ply does not exist"):
+        read_cloud(tmp_path / "none.ply", 12)
+    (tmp_path / "text.ply").write_text("no cloud")
+    with pytest.raises(ValueError, match=r"text\.ply has no points"):
+        read_cloud(tmp_path / "text.ply", 12)
+    o3d = pytest.importorskip("open3d")
+    points = np.zeros((5, 3))
+    points[1:3, 0] = np.nan, np.inf
+    o3d.io.write_point_cloud(str(tmp_path / "a.ply"), o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
+    with pytest.raises(ValueError, match=r"a\.ply: 2 of 5 points are not finite"):
+        read_cloud(tmp_path / "a.ply", 12)

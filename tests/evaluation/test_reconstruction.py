@@ -238,11 +238,14 @@ def test_icp_of_a_protocol_takes_back_a_small_motion_that_the_poses_do_not_show(
     small = Alignment(1.0, Rotation.from_rotvec([0.01, -0.01, 0.005]).as_matrix(), np.array([0.01, 0.0, -0.01]))
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, :3, 3] = rng.normal(size=(5, 3))
-    moved = transform_cloud(truth, small)
-    without = compare_clouds(moved, reference(truth, CONFIG), (poses, poses), CONFIG)
+    # The estimate has a frame and a size of its own.
+    rotation = Rotation.random(rng=rng).as_matrix()
+    away = Alignment(0.5, rotation, np.array([1.0, -2.0, 3.0]))
+    moved, estimated = transform_cloud(transform_cloud(truth, small), away), away.apply_to_poses(poses)
+    without = compare_clouds(moved, reference(truth, CONFIG), (estimated, poses), CONFIG)
     refined = dataclasses.replace(CONFIG, icp_distance_m=0.1, icp_voxel_m=1e-4)
     assert without["reconstruction/accuracy_m"] > 0.01
-    found = compare_clouds(moved, reference(truth, refined), (poses, poses), refined)
+    found = compare_clouds(moved, reference(truth, refined), (estimated, poses), refined)
     assert found["reconstruction/accuracy_m"] < 1e-9
 
 

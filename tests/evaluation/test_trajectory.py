@@ -185,18 +185,83 @@ def test_too_few_poses_or_no_motion_give_null_with_a_reason():
         trajectory_metrics(truth[:3], truth)
 
 
-def test_orientations_decide_what_positions_leave_open():
-    """A straight path leaves the roll open, a single pose everything but its own position."""
+def straight_path(rng, n=12):
+    poses = random_poses(rng, n)
+    poses[:, :3, 3] = np.outer(np.linspace(0.0, 2.0, n), [0.6, 0.8, 0.0]) + 1.0
+    return poses
+
+
+def inverse(alignment):
+    rotation = alignment.rotation.T
+    return Alignment(1 / alignment.scale, rotation, -rotation @ alignment.translation / alignment.scale)
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_on_a_straight_path_orientations_decide_the_roll_and_positions_the_scale(scale):
     rng = np.random.default_rng(6)
-    truth = random_poses(rng, 12)
-    truth[:, :3, 3] = np.outer(np.linspace(0.0, 2.0, 12), [0.6, 0.8, 0.0]) + 1.0
+    truth = straight_path(rng)
+    made = Alignment(scale, Rotation.random(rng=rng).as_matrix(), np.array([1.0, 2.0, 3.0]))
+    estimate = inverse(made).apply_to_poses(truth)
+    found, note = align_poses(estimate, truth, with_scale=True)
+    assert "straight path" in note
+    np.testing.assert_allclose(found.scale, scale, rtol=1e-9)
+    np.testing.assert_allclose(found.rotation, made.rotation, atol=1e-6)
+    np.testing.assert_allclose(found.apply(estimate[:, :3, 3]), truth[:, :3, 3], atol=1e-6)
+    rigid, _ = align_poses(estimate, truth, with_scale=False)
+    assert rigid.scale == 1.0
+    np.testing.assert_allclose(rigid.rotation, made.rotation, atol=1e-6)
+
+
+def test_wrong_orientations_do_not_turn_the_line_of_a_straight_path():
+    """All cameras are off by the same 20 degrees, about an axis that is not the line."""
+    rng = np.random.default_rng(8)
+    truth = straight_path(rng)
+    estimate = truth.copy()
+    estimate[:, :3, :3] = Rotation.from_euler("z", 20.0, degrees=True).as_matrix() @ truth[:, :3, :3]
+    found, _ = align_poses(estimate, truth, with_scale=True)
+    np.testing.assert_allclose(found.apply(estimate[:, :3, 3]), truth[:, :3, 3], atol=1e-4)
+
+
+def test_without_motion_orientations_decide_the_rotation_and_the_size_stays():
+    """One pose, two poses, and a camera that stands still in either of both paths."""
+    rng = np.random.default_rng(9)
+    truth = random_poses(rng, 6)
     made = Alignment(1.0, Rotation.random(rng=rng).as_matrix(), np.array([1.0, 2.0, 3.0]))
-    inverse = Alignment(1.0, made.rotation.T, -made.rotation.T @ made.translation)
-    for rows in (slice(None), slice(0, 1)):
-        found, note = align_poses(inverse.apply_to_poses(truth[rows]), truth[rows], with_scale=True)
-        assert note is not None
-        np.testing.assert_allclose(found.rotation, made.rotation, atol=1e-6)
-        np.testing.assert_allclose(found.translation, made.translation, atol=1e-6)
+    standing = truth.copy()
+    standing[:, :3, 3] = 1.0
+    for rows, true in ((slice(0, 1), truth), (slice(None), standing)):
+        found, note = align_poses(inverse(made).apply_to_poses(true[rows]), true[rows], with_scale=True)
+        assert "without enough motion" in note and found.scale == 1.0
+        np.testing.assert_allclose(found.rotation, made.rotation, atol=1e-9)
+        np.testing.assert_allclose(found.translation, made.translation, atol=1e-9)
+    for estimate, reference, rows in ((truth, standing, 6), (standing, truth, 6), (truth, 2.0 * truth, 2)):
+        found, note = align_poses(estimate[:rows], reference[:rows], with_scale=True)
+        assert "without enough motion" in note and found.scale == 1.0
+
+
+def test_aligned_poses_are_rigid_and_stand_where_their_positions_are_aligned_to():
+    rng = np.random.default_rng(10)
+    poses = random_poses(rng, 5)
+    made = Alignment(3.0, Rotation.random(rng=rng).as_matrix(), np.array([1.0, 2.0, 3.0]))
+    moved = made.apply_to_poses(poses)
+    np.testing.assert_allclose(moved[:, :3, 3], made.apply(poses[:, :3, 3]), rtol=1e-12)
+    np.testing.assert_allclose(moved[:, :3, :3], made.rotation @ poses[:, :3, :3], atol=1e-12)
+    np.testing.assert_array_equal(moved[:, 3], poses[:, 3])
+
+
+def test_relative_errors_do_not_depend_on_the_frame_of_either_path():
+    """Paths that turn: on a straight one that does not, motions in the world's axes are those in the camera's."""
+    rng = np.random.default_rng(11)
+    truth = random_poses(rng, 8)
+    np.testing.assert_allclose(rpe(random_poses(rng, 1)[0] @ truth, truth), (0.0, 0.0), atol=1e-9)
+    estimate = noisy(rng, truth, 0.1)
+    expected = rpe(estimate, truth)
+    np.testing.assert_allclose(rpe(estimate, random_poses(rng, 1)[0] @ truth), expected, rtol=1e-9)
+    motions = [np.linalg.inv(a) @ b for path in (truth, estimate) for a, b in zip(path, path[1:], strict=False)]
+    errors = [np.linalg.inv(true) @ found for true, found in zip(motions[:7], motions[7:], strict=True)]
+    angles = [np.degrees(Rotation.from_matrix(error[:3, :3]).magnitude()) for error in errors]
+    np.testing.assert_allclose(expected[0] ** 2, np.mean([error[:3, 3] @ error[:3, 3] for error in errors]), rtol=1e-9)
+    np.testing.assert_allclose(expected[1], np.sqrt(np.mean(np.square(angles))), rtol=1e-9)
 
 
 def test_pose_alignment_is_point_alignment_where_positions_suffice():

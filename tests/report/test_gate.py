@@ -2,10 +2,12 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import pytest
 
-from emgs_jax.report.gate import read_gate, regressions, write_gate
+from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
+from emgs_jax.report.results import Estimate
 from emgs_jax.report.tables import Row
 
 ATE, F1 = "trajectory/ate_sim3_m", "reconstruction/f1_20cm_percent"
@@ -21,8 +23,8 @@ def a_row(ate=0.05, f1=90.0, **changes):
 @pytest.fixture
 def baseline(tmp_path):
     """As written from `a_row()` and read back."""
-    raw = dataclasses.replace(a_row(), kind="raw prior")
-    write_gate(tmp_path / "gate.yaml", [a_row(), raw], TOLERANCES)
+    raw = dataclasses.replace(a_row(ate=0.5, f1=10.0), kind="raw prior")
+    write_gate(tmp_path / "gate.yaml", [raw, a_row(), raw], TOLERANCES)
     return read_gate(tmp_path / "gate.yaml")
 
 
@@ -82,3 +84,26 @@ def test_a_file_that_is_no_baseline_is_refused_with_a_remedy(tmp_path, content):
         read_gate(tmp_path / "missing.yaml")
     with pytest.raises(ValueError, match="no result of ours"):
         write_gate(tmp_path / "new.yaml", [], TOLERANCES)
+
+
+def estimates(ates, f1s, kind="ours", variant="default"):
+    return [
+        Estimate(Path(), "tum", "xyz", variant, kind, seed, "simulated", True, "paper/sim3", None, {ATE: ate, F1: f1})
+        for seed, (ate, f1) in enumerate(zip(ates, f1s, strict=True))
+    ]
+
+
+def test_tolerances_are_four_deviations_of_what_rounding_does_to_the_mean_of_the_baselines_seeds():
+    """The seeds differ by metres, each from itself by 2 cm up or down: 4 · .02 / √4 = .04; F1 by nothing."""
+    first = estimates([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [50.0] * 6)
+    again = estimates([1.02, 1.98, 3.02, 3.98, 5.02, 5.98], [50.0] * 6)
+    noise = [*estimates([9.0] * 6, [9.0] * 6, "raw prior"), *estimates([9.0] * 6, [9.0] * 6, variant="paper")]
+    found = rounding_tolerances(TOLERANCES, [*noise, *first], [*reversed(again), *noise[:6]], num_seeds=4)
+    assert found == {ATE: {"direction": "lower", "tolerance": 0.04}, F1: TOLERANCES[F1]}
+    assert rounding_tolerances(TOLERANCES, first, first, 4) == TOLERANCES
+
+
+def test_tolerances_of_a_few_results_are_refused():
+    first = estimates([1.0] * 9, [50.0] * 9)
+    with pytest.raises(ValueError, match=r"4 results .* at least 5 .*evaluate seeds="):
+        rounding_tolerances(TOLERANCES, first, first[:4], 3)

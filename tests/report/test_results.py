@@ -58,6 +58,8 @@ def test_a_row_is_the_mean_over_sequences_and_its_spread_that_over_seeds(tmp_pat
     rows = average(read_estimates(tmp_path), each_sequence=False)
     ours, raw = of_kind(rows, "ours"), of_kind(rows, "raw prior")
     assert len(rows) == 2 and (ours.sequences, ours.seeds) == (("a", "b"), (0, 1))
+    assert set(ours.values) == {"trajectory/ate_sim3_m", "trajectory/ate_se3_m"}
+    assert set(raw.values) == {"trajectory/ate_sim3_m"}
     assert ours.values["trajectory/ate_sim3_m"] == 3.0
     assert ours.spreads["trajectory/ate_sim3_m"] == pytest.approx(2**0.5)
     assert raw.values["trajectory/ate_sim3_m"] == 30.0

@@ -47,6 +47,15 @@ def test_without_a_source_at_the_end_of_the_range_or_with_nothing_like_it_there_
     assert np.mean(estimate(gray, sources, overrides=(strict,))[INSIDE] > 0) > 0.9
 
 
+def test_a_plane_must_stand_out_by_the_margin():
+    gray, _ = plane_image(np.eye(4), 0.0)
+    sources = [plane_image(T, 0.0)[0] for T in POSES]
+    margins = {
+        margin: estimate(gray, sources, overrides=(f"prior.dense.depth.min_margin={margin}",)) for margin in (0, 9)
+    }
+    assert np.mean(margins[0][INSIDE] > 0) > 0.97 and not margins[9].any()
+
+
 def test_the_parabola_through_three_costs_has_its_minimum_where_the_cost_had_it():
     places = np.array([2.3, 1.6, 3.0, 0.0, 4.0])
     total = (np.arange(5.0) - places[:, None]) ** 2
@@ -81,6 +90,14 @@ def test_true_depths_of_other_views_agree_and_false_or_missing_ones_do_not():
     assert not agreeing(depth * (1 + 3 * tolerance), others, POSES)[INSIDE].any()
     assert not agreeing(depth, [np.zeros_like(depth)], [np.eye(4)]).any()
     assert not agreeing(np.zeros_like(depth), others, POSES).any()
+
+
+@pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
+def test_views_agree_within_a_share_of_the_depth_whatever_its_unit(size):
+    depth = size * plane_image(np.eye(4), 0.4)[1]
+    tolerance = float(depth_config().max_depth_step)
+    for share, expected in ((0.8, 1), (1.2, 0)):
+        np.testing.assert_array_equal(agreeing(depth * (1 + share * tolerance), [depth], [np.eye(4)]), expected)
 
 
 def test_a_point_behind_or_beside_another_view_is_not_confirmed_by_it():

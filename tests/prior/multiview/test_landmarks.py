@@ -74,6 +74,58 @@ def test_matches_that_leave_the_epipolar_line_are_left_out(views):
     assert np.sum(rows_b < 10) <= 2  # a line may pass by chance
 
 
+def turned(descriptor, cosine, seed):
+    """A unit vector at an angle of a given cosine from another."""
+    across = np.random.default_rng(seed).normal(size=descriptor.shape)
+    across -= (across @ descriptor) * descriptor
+    return np.float32(cosine * descriptor + np.sqrt(1 - cosine**2) * across / np.linalg.norm(across))
+
+
+def with_keypoint(view, pixel, descriptor):
+    """The view with one more keypoint."""
+    return View(
+        np.vstack([view.pixels, pixel]), np.vstack([view.descriptors, descriptor]), np.append(view.landmark, NONE)
+    )
+
+
+@pytest.mark.parametrize("times", [0.95, 1.05])
+def test_a_match_is_distinct_if_its_distance_is_that_ratio_of_the_next_ones(times, views):
+    """Of the distances, not of their squares: |d|² = 2 - 2 cos."""
+    config = structure_config("prior.structure.matching.max_ratio=0.8").matching
+    a, b = views[:2]
+    place_b = int(np.flatnonzero(whose(b, a) == 0)[0])
+    b = with_keypoint(b, b.pixels[place_b] + 5.0, turned(a.descriptors[0], 1 - 0.1, 0))
+    b.descriptors[place_b] = turned(a.descriptors[0], 1 - 0.1 * (times * 0.8) ** 2, 1)
+    rows_a, _ = match(a, b, calibration(), config)
+    assert (0 in rows_a) == (times < 1)
+
+
+def test_of_two_keypoints_that_look_like_one_only_the_more_alike_is_matched(config, views):
+    a, b = views[:2]
+    twin = with_keypoint(a, a.pixels[3], turned(a.descriptors[3], 0.97, 2))
+    rows_a, rows_b = match(twin, b, calibration(), config)
+    assert 3 in rows_a and NUM_POINTS not in rows_a and len(set(rows_b)) == len(rows_b)
+
+
+def test_a_view_never_shows_a_landmark_twice(config, views):
+    """The landmark looks different in the two older views, and the new view has a keypoint like either."""
+    structure = structure_of(views[:1])
+    structure.views[1] = views[1]
+    link(structure, 1, config)
+    first, second, new = *views[:2], views[2]
+    number = first.landmark[0]
+    assert number != NONE
+    here = int(np.flatnonzero(whose(new, first) == 0)[0])
+    other_look = turned(first.descriptors[0], 0.6, 3)
+    second.descriptors[second.landmark == number] = other_look
+    structure.views[2] = with_keypoint(new, new.pixels[here], other_look)
+    link(structure, 2, config)
+    landmarks = structure.views[2].landmark
+    assert (landmarks == number).sum() == 1
+    shown = landmarks[landmarks != NONE]
+    assert len(set(shown)) == len(shown) > 0.9 * NUM_POINTS
+
+
 def test_too_few_keypoints_give_no_match(config):
     views = views_of(cloud(config.min_matches - 1), arc(2))
     assert not len(match(*views, calibration(), config)[0])

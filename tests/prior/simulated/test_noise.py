@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from emgs_jax.prior.simulated.noise import Stream, autoregressive, edge_band, smooth_field
+from emgs_jax.prior.simulated.noise import Stream, autoregressive, edge_band, rigid, smooth_field
 
 
 def test_another_process_gives_the_same_bits():
@@ -30,6 +30,14 @@ def test_another_process_gives_the_same_bits():
     }
     here = smooth_field((24, 32), 3.2, (1, 7, 2, 5), 0.7).tobytes() + autoregressive(1, 50, 0.9, 7).tobytes()
     assert outputs == {hashlib.sha256(here).hexdigest()}
+
+
+def test_a_motion_has_its_first_three_numbers_in_metres_and_the_others_in_radians():
+    T = rigid(np.array([1.0, -2.0, 3.0, 0.0, 0.0, 2.0]), 0.5, 0.1)
+    np.testing.assert_allclose(T[:3, 3], [0.5, -1.0, 1.5])
+    turn = [[math.cos(0.2), -math.sin(0.2), 0.0], [math.sin(0.2), math.cos(0.2), 0.0], [0.0, 0.0, 1.0]]
+    np.testing.assert_allclose(T[:3, :3], turn, atol=1e-12)
+    np.testing.assert_array_equal(T[3], [0.0, 0.0, 0.0, 1.0])
 
 
 def test_drift_is_stationary_with_unit_variance_and_its_autocorrelation_is_rho():

@@ -168,6 +168,28 @@ def test_70_percent_of_the_walks_variance_belongs_to_the_image_pair():
         assert np.corrcoef(error_a[half].ravel(), error_b[half].ravel())[0, 1] == pytest.approx(0.7, abs=0.07)
 
 
+def test_scale_and_window_error_drift_from_inference_to_inference():
+    """Stationary, and correlated by .9 to the power of the inferences between: neither constant nor fresh each time."""
+    drifts = []
+    for inference in (4, 5, 14):
+        window, frames = Window(inference, (0, 1), (1,), 1), straight_line(2)
+        rows = []
+        for seed in range(400):
+            prior = Simulated(seed=seed)
+            still = dict.fromkeys(["pair_translation", "pair_rotation", "pixel", "flying_share"], 0.0)
+            prior.standard = replace(prior.standard, **still, warp=(0.0, 0.0))
+            prediction = prior.predict(window, frames, (9.0, 9.0, 4.0, 3.0))
+            log_scale = math.log(prediction.points[0, 3, 4, 2] / 2.0)
+            error = errors(np.eye(4), prediction.T_anchor_view[1])
+            rows.append([log_scale / 0.03, *error[:3] / (0.015 * math.exp(log_scale)), *error[3:] / math.radians(0.5)])
+        drifts.append(np.array(rows))
+    for drift in drifts:
+        np.testing.assert_allclose(drift.std(axis=0), 1.0, atol=0.13)
+    for a, b, expected in ((0, 1, 0.9), (0, 2, 0.9**10)):
+        correlation = [np.corrcoef(drifts[a][:, k], drifts[b][:, k])[0, 1] for k in range(7)]
+        np.testing.assert_allclose(np.mean(correlation), expected, atol=0.05)
+
+
 @pytest.mark.parametrize("settings", [{"level": -0.1}, {"level": math.nan}, {"seed": -1}, {"feature_size": 0}])
 def test_settings_out_of_range_are_refused_by_name(settings):
     with pytest.raises(ValueError, match=f"prior.{next(iter(settings))}"):
@@ -191,9 +213,11 @@ def test_a_frame_without_usable_truth_is_named(room, change, message):
         Simulated(classes=room.classes).predict(Window(1, (0, 1, 2), (1, 2), 2), frames, room.intrinsics)
 
 
-def test_only_dense_views_need_depth(room):
+def test_the_depth_of_a_view_that_is_not_dense_is_not_needed_and_changes_nothing(room):
+    window = Window(1, (0, 1, 2), (0, 1), 1)
     frames = [room[0], room[1], replace(room[2], depth=None)]
-    Simulated().predict(Window(1, (0, 1, 2), (0, 1), 1), frames, room.intrinsics)
+    without = Simulated().predict(window, frames, room.intrinsics)
+    assert digest(without) == digest(ask(Simulated(), room, window))
 
 
 def test_a_data_set_without_ground_truth_is_refused_before_any_work(room):

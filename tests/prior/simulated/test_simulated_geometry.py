@@ -34,6 +34,77 @@ def test_log_depth_error_is_the_sum_of_warps_and_pixel_noise_and_scales_with_lev
     assert difference == pytest.approx(level * math.sqrt(0.01**2 + warps), rel=0.03)
 
 
+def log_errors(room, seeds, shape, inference=0, **standard):
+    """Log-depth errors (seeds, h, w) of one flat frame of another size, without scale and flying points."""
+    flat = [
+        replace(frame, depth=np.full(shape, 2, np.float32), image=np.zeros((*shape, 3), np.uint8), labels=None)
+        for frame in (room[0], room[1])
+    ]
+    found = []
+    for seed in seeds:
+        prior = Simulated(seed=seed)
+        prior.standard = replace(prior.standard, scale=0.0, flying_share=0.0, **standard)
+        window = Window(inference, (0, 1), (1,), 1)
+        found.append(np.log(prior.predict(window, flat, room.intrinsics).points[0, ..., 2] / 2))
+    return np.stack(found)
+
+
+@pytest.mark.parametrize("shape", [(40, 160), (160, 40)])
+def test_the_length_of_a_warp_follows_the_images_width(room, shape):
+    """64 px of 640: a tenth of the width, across and down, whatever the height."""
+    fields = log_errors(room, range(40), shape, warp=(0.03, 0.0), pixel=0.0)
+    length = 0.1 * shape[1]
+    for distance in (round(length / 2), round(length)):
+        expected = math.exp(-0.5 * (distance / length) ** 2)
+        across = np.mean(fields[:, :, distance:] * fields[:, :, :-distance])
+        down = np.mean(fields[:, distance:] * fields[:, :-distance])
+        np.testing.assert_allclose([across / 0.03**2, down / 0.03**2], expected, atol=0.13)
+
+
+def test_70_percent_of_a_warps_variance_belong_to_the_image_and_pixel_noise_to_the_inference(room):
+    """What an image does to a network it does every time; what is drawn anew is what fusing can average away."""
+    for standard, sigma, shared in (
+        ({"warp": (0.03, 0.0), "pixel": 0.0}, 0.03, 0.7),
+        ({"warp": (0.0, 0.01), "pixel": 0.0}, 0.01, 0.7),
+        ({"warp": (0.0, 0.0), "pixel": 0.02}, 0.02, 0.0),
+    ):
+        first, second = (log_errors(room, range(60), (40, 80), inference, **standard) for inference in (3, 4))
+        np.testing.assert_allclose([first.std(), second.std()], sigma, rtol=0.1)
+        np.testing.assert_allclose(np.mean(first * second) / sigma**2, shared, atol=0.1)
+
+
+def test_the_two_warps_are_independent(room):
+    """Of one length their variances add up; one stream for both would double the error."""
+    total = log_errors(room, range(60), (40, 80), warp=(0.02, 0.02), warp_length=(64.0, 64.0), pixel=0.0)
+    np.testing.assert_allclose(total.std(), 0.02 * math.sqrt(2), rtol=0.12)
+
+
+def test_other_points_fly_in_the_next_inference(room):
+    flying = []
+    for inference in (3, 4):
+        found = []
+        for seed in range(40):
+            prior = Simulated(seed=seed)
+            prior.standard = replace(prior.standard, scale=0.0, warp=(0.0, 0.0), pixel=0.0)
+            depth = ask(prior, room, Window(inference, (0, 1), (1,), 1)).points[0, ..., 2]
+            found.append((depth != room[1].depth)[edge_band(room[1].depth, 0.05)])
+        flying.append(np.stack(found))
+    assert np.corrcoef(flying[0].ravel(), flying[1].ravel())[0, 1] == pytest.approx(0.0, abs=0.05)
+
+
+def test_without_its_noise_the_confidence_is_the_stated_function_of_error_and_edge(room):
+    """1 + 4 exp(-min(error / .03, 2) - 1.5 at an edge): a point that flies far is no worse than one that is .06 off."""
+    prior = Simulated(seed=1)
+    prior.standard = replace(prior.standard, scale=0.0, confidence_noise=0.0)
+    prediction = ask(prior, room, Window(2, (0, 1), (1,), 1))
+    depth, valid = room[1].depth, room[1].depth > 0
+    error = np.abs(np.log(prediction.points[0, ..., 2][valid].astype(np.float64) / depth[valid]))
+    near_edge = edge_band(depth, 0.05)[valid]
+    expected = 1 + 4 * np.exp(-np.minimum(error / 0.03, 2.0) - 1.5 * near_edge)
+    np.testing.assert_allclose(prediction.confidence[0][valid], expected, rtol=1e-4)
+    assert (error > 0.1).sum() > 20 and (error < 0.02).sum() > 100
+
+
 def test_points_stay_on_the_rays_of_their_pixels(room):
     fx, fy, cx, cy = room.intrinsics
     points = ask(Simulated(level=2), room, Window(1, (0, 1, 2), (1, 2), 2)).points[0]

@@ -1,0 +1,93 @@
+"""A run that is made by hand: a map whose content is known, frames of every status, poses that all differ."""
+
+from types import SimpleNamespace
+
+import hydra
+import jax.numpy as jnp
+import numpy as np
+from scene import compose
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.evaluation.trajectory import Alignment
+from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.ops.camera import Camera
+from emgs_jax.running.record import FrameRecord
+
+STATUSES = ("initialization", "tracked", "degraded", "lost", "tracked", "tracked")
+
+
+def wall(low: float, high: float, num_free: int = 5) -> Gaussians:
+    """Gaussians on the plane z = 2 from x = low to x = high, 10 cm apart, facing z = 0; red is x / 20, green .25.
+
+    Every other of the first rows is free and holds what must never be seen.
+    """
+    x, y = np.meshgrid(np.arange(low + 0.05, high, 0.1), np.arange(-0.95, 1.0, 0.1), indexing="ij")
+    means = np.stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)], axis=1)
+    colors = np.stack([means[:, 0] / 20.0, np.full(x.size, 0.25), np.full(x.size, 0.5)], axis=1)
+    features = np.where(means[:, :1] < 0.5 * (low + high), [1.0, 0.0], [0.0, 1.0])
+    free = np.arange(num_free) * 2
+    position = np.setdiff1d(np.arange(num_free + len(means)), free)
+
+    def rows(values, poison):
+        out = np.full((len(means) + num_free, *values.shape[1:]), poison, np.float32)
+        out[position] = values
+        return jnp.asarray(out)
+
+    return Gaussians(
+        means=rows(means, 0.7),
+        covs=rows(np.broadcast_to(np.diag([4e-3, 4e-3, 1e-4]), (len(means), 3, 3)), 0.9),
+        colors=rows(colors, 0.9),
+        normals=rows(np.broadcast_to([0.0, 0.0, -1.0], means.shape), 0.9),
+        features=rows(features, -3.0),
+        valid=rows(np.ones(len(means)), 0.0) > 0,
+    )
+
+
+def poses_along(xs) -> np.ndarray:
+    """Cameras at these x that look at the wall, (n, 4, 4)."""
+    poses = np.tile(np.eye(4), (len(xs), 1, 1))
+    poses[:, 0, 3] = xs
+    return poses
+
+
+def random_poses(rng, count: int) -> np.ndarray:
+    """Poses (n, 4, 4) about the origin."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = Rotation.random(count, rng).as_matrix(), rng.normal(size=(count, 3))
+    return poses
+
+
+def random_similarity(rng, scale: float) -> Alignment:
+    return Alignment(scale, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
+
+
+def inverse(similarity: Alignment) -> Alignment:
+    rotation = similarity.rotation.T
+    return Alignment(1 / similarity.scale, rotation, -rotation @ similarity.translation / similarity.scale)
+
+
+def hand_run(poses, raw_poses, true_poses, statuses=STATUSES, gaussians=None) -> SimpleNamespace:
+    """A finished run, as far as reports look at it; frame i is number i, taken at 100 + i / 4 seconds."""
+    gaussians = wall(0.0, 1.0) if gaussians is None else gaussians
+    count = gaussians.valid.shape[0]
+    map = GaussianMap(gaussians, jnp.ones(count), jnp.ones(count, jnp.int32))
+    records = [
+        FrameRecord(index=i, name=f"{i}.png", timestamp=100.0 + i / 4, status=status)
+        for i, status in enumerate(statuses)
+    ]
+    return SimpleNamespace(
+        camera=Camera((24.0, 24.0), (11.5, 7.5), 24, 16),
+        config=SimpleNamespace(submap=SimpleNamespace(map_capacity=count)),
+        state=SimpleNamespace(map=map),
+        map=map,
+        records=records,
+        poses=[*poses],
+        raw_poses=[*raw_poses],
+        true_poses=[*true_poses],
+    )
+
+
+def densify_config(*overrides: str):
+    """How the wall becomes points."""
+    return hydra.utils.instantiate(compose("render.tile_size=8", "render.tile_capacity=256", *overrides).densify)

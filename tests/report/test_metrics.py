@@ -1,0 +1,216 @@
+"""metrics.json of runs that are made by hand; oracles: similarities that are known, counts and times by hand."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hand_run import STATUSES, densify_config, hand_run, inverse, poses_along, random_poses, random_similarity, wall
+from scene import evaluation_config
+
+from emgs_jax.data.base import Frame
+from emgs_jax.evaluation.clouds import PointCloud, transform_cloud
+from emgs_jax.evaluation.reconstruction import compare_clouds, reference
+from emgs_jax.evaluation.segmentation import LabelledPoints
+from emgs_jax.evaluation.trajectory import trajectory_metrics
+from emgs_jax.report.metrics import (
+    Scorer,
+    describe,
+    new_scorer,
+    score_map,
+    score_prior,
+    score_settings,
+    seconds_per_frame,
+    spent,
+)
+from emgs_jax.running.dense import center_cloud
+from emgs_jax.running.record import FrameRecord
+
+CLASSES = ("wall", "floor")
+NUM_FRAMES = len(STATUSES)
+LOST = STATUSES.index("lost")
+
+
+def box_cloud(rng, count=500):
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return PointCloud(rng.uniform(-3, 3, (count, 3)), normals, rng.uniform(size=(count, 3)))
+
+
+class Scene:
+    """The truth, and an estimate and a raw prior that are it in frames and scales of their own."""
+
+    def __init__(self, *overrides: str) -> None:
+        rng = np.random.default_rng(0)
+        self.cloud, self.poses = box_cloud(rng), random_poses(rng, NUM_FRAMES)
+        self.ours, self.raw = random_similarity(rng, 0.5), random_similarity(rng, 1.25)  # estimate -> truth
+        self.config = evaluation_config(*overrides)
+        self.labels = LabelledPoints(self.cloud.points, (self.cloud.points[:, 0] > 0).astype(int), CLASSES)
+
+    def scorer(self) -> Scorer:
+        return Scorer(None, self.config, reference(self.cloud, self.config), self.labels, None)
+
+    def run(self, **changes):
+        run = hand_run(inverse(self.ours).apply_to_poses(self.poses), self.raw_poses(), self.poses)
+        for name, value in changes.items():
+            setattr(run, name, value)
+        return run
+
+    def raw_poses(self):
+        return inverse(self.raw).apply_to_poses(self.poses)
+
+    def score(self, run, labels=None):
+        dense = transform_cloud(self.cloud, inverse(self.ours))
+        few = PointCloud(dense.points[::2], dense.normals[::2], dense.colors[::2])
+        return score_map(run, dense, few, labels, self.scorer())
+
+
+def test_an_estimate_that_is_the_truth_in_another_frame_and_size_has_no_error():
+    scene = Scene()
+    metrics = scene.score(scene.run())
+    for key in ("trajectory/ate_sim3_m", "reconstruction/accuracy_m", "reconstruction/completion_m"):
+        np.testing.assert_allclose(metrics[key], 0.0, atol=1e-9, err_msg=key)
+    np.testing.assert_allclose(metrics["trajectory/scale"], 0.5)
+    assert metrics["trajectory/num_frames"] == NUM_FRAMES
+    prior = score_prior(scene.run(), transform_cloud(scene.cloud, inverse(scene.raw)), scene.scorer())
+    assert all(key.startswith("raw_prior/") for key in prior)
+    np.testing.assert_allclose(prior["raw_prior/reconstruction/accuracy_m"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(prior["raw_prior/trajectory/scale"], 1.25)
+
+
+def test_lost_frames_pay_for_their_poses_and_frames_without_a_true_pose_are_not_compared():
+    """The lost frame is 3 m off; leaving it out, as some tools do, would hide the loss of tracking."""
+    scene = Scene()
+    run = scene.run()
+    run.poses[LOST] = run.poses[LOST].copy()
+    run.poses[LOST][:3, 3] += 3.0
+    whole = scene.score(run)
+    expected = trajectory_metrics(np.stack(run.poses), scene.poses)
+    assert {key: whole[key] for key in expected} == expected
+    assert whole["trajectory/ate_sim3_m"] > 0.3
+    run.true_poses[LOST] = None
+    without = scene.score(run)
+    assert without["trajectory/num_frames"] == NUM_FRAMES - 1
+    np.testing.assert_allclose(without["trajectory/ate_sim3_m"], 0.0, atol=1e-9)
+
+
+def test_without_any_true_pose_nothing_is_scored():
+    scene = Scene()
+    run = scene.run(true_poses=[None] * NUM_FRAMES)
+    assert scene.score(run) == score_prior(run, scene.cloud, scene.scorer()) == {}
+
+
+@pytest.mark.parametrize(("alignment", "other"), [("sim3", "se3"), ("se3", "sim3")])
+def test_the_dense_map_is_also_compared_under_the_other_alignment(alignment, other):
+    scene = Scene(f"evaluation.alignment={alignment}")
+    run, dense = scene.run(), transform_cloud(scene.cloud, inverse(scene.ours))
+    metrics = scene.score(run)
+    poses = np.stack(run.poses), scene.poses
+    for name, prefix in ((alignment, "reconstruction/"), (other, f"reconstruction_{other}/")):
+        config = dataclasses.replace(scene.config, alignment=name)
+        expected = compare_clouds(dense, scene.scorer().truth, poses, config)
+        found = {prefix + key.removeprefix("reconstruction/"): value for key, value in expected.items()}
+        assert {key: metrics[key] for key in found} == found
+    errors = {
+        name: metrics[f"reconstruction{suffix}/accuracy_m"] for name, suffix in ((alignment, ""), (other, f"_{other}"))
+    }
+    assert errors["sim3"] < 1e-9 < 0.1 < errors["se3"], "half the size is an error only where the scale counts"
+
+
+def test_the_centres_are_compared_as_they_are():
+    scene = Scene()
+    metrics = scene.score(scene.run())
+    assert metrics["reconstruction_centers/num_points"] == len(scene.cloud.points[::2])
+    np.testing.assert_allclose(metrics["reconstruction_centers/accuracy_m"], 0.0, atol=1e-9)
+    assert metrics["reconstruction_centers/completion_m"] > 0.1, "every other point is missing"
+    assert metrics["reconstruction_centers/alignment_note"] is None
+
+
+def test_labels_of_the_centres_are_compared_where_the_alignment_puts_the_centres():
+    scene = Scene()
+    centers = inverse(scene.ours).apply(scene.cloud.points[::2])
+    labels = LabelledPoints(centers, scene.labels.labels[::2], CLASSES)
+    metrics = scene.score(scene.run(), labels)
+    assert metrics["segmentation/accuracy_percent"] > 90  # the other half takes a neighbour's label
+    swapped = scene.score(scene.run(), dataclasses.replace(labels, classes=CLASSES[::-1]))
+    assert swapped["segmentation/accuracy_percent"] < 10
+    assert not any(key.startswith("segmentation/") for key in scene.score(scene.run()))
+
+
+class Room:
+    """Three frames of a plane with labels; the last sees what no other does."""
+
+    name, sequence, size, intrinsics, classes = "room", "one", (8, 6), (8.0, 8.0, 3.5, 2.5), CLASSES
+    has_ground_truth, skipped, kept = True, {3: "truncated"}, (0, 1, 2)
+
+    def __len__(self):
+        return 3
+
+    def __getitem__(self, index):
+        image, labels = np.zeros((6, 8, 3), np.uint8), np.full((6, 8), index % 2, np.int32)
+        return Frame(index, 0.0, "f", image, np.full((6, 8), 2.0, np.float32), poses_along([4.0 * index])[0], labels)
+
+
+def test_the_truth_is_that_of_every_frame_and_its_labels_where_the_prior_has_classes():
+    prior = SimpleNamespace(feature_names=CLASSES)
+    scorer = new_scorer(Room(), evaluation_config(), prior)
+    for x in (0.0, 4.0, 8.0):
+        assert (np.abs(scorer.truth.cloud.points[:, 0] - x) < 1.2).sum() == 48
+    np.testing.assert_allclose(scorer.truth.cloud.points[:, 2], 2.0)
+    np.testing.assert_array_equal(scorer.labels.labels, np.abs(scorer.labels.points[:, 0] - 4.0) < 1.2)
+    assert new_scorer(Room(), evaluation_config(), SimpleNamespace(feature_names=())).labels is None
+    blind = Room()
+    blind.has_ground_truth = False
+    assert len(new_scorer(blind, evaluation_config(), prior).truth.cloud) == 0
+
+
+def records(*rows):
+    return [FrameRecord(i, "f", 0.0, status, seconds=s, compile_seconds=c) for i, (status, s, c) in enumerate(rows)]
+
+
+def test_a_run_is_described_by_its_counts():
+    run = hand_run(*[poses_along(np.zeros(NUM_FRAMES))] * 3)
+    run.records[1] = dataclasses.replace(run.records[1], overflow=3)
+    run.records[4] = dataclasses.replace(run.records[4], overflow=4)
+    metrics = describe(run, Room())
+    counts = {"tracked": 3, "degraded": 1, "lost": 1, "initialization": 1, "skipped": 1, "overflow": 7}
+    assert {name: metrics[f"frames/{name}"] for name in counts} == counts
+    assert metrics["map/num_gaussians"] == int(run.state.map.gaussians.valid.sum())
+    assert metrics["map/capacity"] == len(run.state.map.gaussians.valid) > metrics["map/num_gaussians"]
+
+
+def test_seconds_a_frame_are_those_of_steps_that_compiled_nothing():
+    start = ("initialization", 50.0, 40.0)
+    assert seconds_per_frame(records(start, ("tracked", 30.0, 29.0), ("tracked", 2.0, 0.0), ("lost", 4.0, 0.0))) == 3.0
+    assert seconds_per_frame(records(start, ("tracked", 30.0, 29.0), ("tracked", 9.0, 6.0))) == 2.0
+    assert seconds_per_frame(records(start)) == 10.0
+    assert seconds_per_frame([]) is None
+
+
+def test_phases_compilation_and_the_whole_are_named_seconds():
+    metrics = spent(SimpleNamespace(phases={"map": 3.0}, compile_seconds=2.0, total_seconds=7.0))
+    assert metrics.pop("memory/peak_mb") > 10
+    assert metrics == {"time/map_seconds": 3.0, "time/compile_seconds": 2.0, "time/total_seconds": 7.0}
+
+
+@pytest.mark.slow
+def test_settings_that_share_a_data_set_get_the_metrics_that_each_gets_by_itself():
+    """Two walls, of which the second ends half way: what the first frames see is the same, the rest is missing."""
+    true_poses, shifted = poses_along(np.linspace(0.5, 3.5, NUM_FRAMES)), poses_along(np.linspace(0.5, 9.5, NUM_FRAMES))
+    runs = [hand_run(true_poses, shifted, true_poses, gaussians=wall(-1.0, high, 5)) for high in (5.0, 2.0)]
+    truth = center_cloud(runs[0])
+    scorer = Scorer(
+        Room(), evaluation_config(), reference(truth, evaluation_config()), None, SimpleNamespace(feature_names=())
+    )
+    config = densify_config()
+    found = score_settings(runs, truth, [config, config], scorer, 2)
+    alone = [score_settings([run], truth, [config], scorer, 1)[0] for run in runs]
+    assert found == alone
+    whole, half = found
+    assert whole["reconstruction/accuracy_m"] < 0.05 and half["reconstruction/accuracy_m"] < 0.05
+    assert half["reconstruction/completion_m"] > 5 * whole["reconstruction/completion_m"]
+    assert whole["raw_prior/reconstruction/accuracy_m"] == half["raw_prior/reconstruction/accuracy_m"]
+    assert not any(key.startswith("time/") for key in whole) and whole["frames/lost"] == 1
+    blind = hand_run(true_poses, shifted, [None] * NUM_FRAMES, gaussians=wall(-1.0, 5.0))
+    (counts,) = score_settings([blind], truth, [config], scorer, 1)
+    assert not any(key.startswith(("trajectory/", "raw_prior/")) for key in counts)

@@ -1,0 +1,116 @@
+"""The files of a run; oracles: other programs' readers, a wall whose every property is known."""
+
+import numpy as np
+import pytest
+import trimesh
+from hand_run import STATUSES, densify_config, hand_run, poses_along, random_poses, wall
+
+from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.evaluation.segmentation import LabelledPoints
+from emgs_jax.io.map_file import load_map_npz
+from emgs_jax.io.trajectory import load_trajectory_tum
+from emgs_jax.report.run_files import save_outputs, save_progress
+from emgs_jax.running.dense import DenseMap
+
+NUM_FRAMES = len(STATUSES)
+
+
+def finished(true_poses=None, gaussians=None):
+    poses = poses_along(np.linspace(0.0, 1.0, NUM_FRAMES))
+    true_poses = [None] * NUM_FRAMES if true_poses is None else true_poses
+    return hand_run(poses, poses_along(np.full(NUM_FRAMES, 9.0)), true_poses, gaussians=gaussians)
+
+
+def dense_of(run) -> DenseMap:
+    """Two points, one of them without a class."""
+    points = np.array([[0.1, 0.2, 2.0], [0.4, -0.3, 2.0]])
+    cloud = PointCloud(points, np.array([[0.0, 0.0, -1.0]] * 2), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+    return DenseMap(cloud, LabelledPoints(points, np.array([1, -1]), ("floor", "wall")))
+
+
+def vertices(path):
+    return trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]
+
+
+def test_the_progress_is_the_map_bit_for_bit_and_our_poses_at_the_frames_times(tmp_path):
+    run = finished()
+    rng = np.random.default_rng(0)
+    run.poses[:] = random_poses(rng, NUM_FRAMES)
+    save_progress(tmp_path, run)
+    times, poses = load_trajectory_tum(tmp_path / "trajectory.txt")
+    np.testing.assert_array_equal(times, [record.timestamp for record in run.records])
+    np.testing.assert_allclose(poses, np.stack(run.poses), atol=5e-9)  # nine digits are written
+    loaded = load_map_npz(tmp_path / "map.npz", type(run.state.map))
+    for name in ("means", "covs", "colors", "normals", "features", "valid"):
+        np.testing.assert_array_equal(getattr(loaded.gaussians, name), getattr(run.state.map.gaussians, name))
+
+
+def test_before_there_is_a_map_nothing_is_written(tmp_path):
+    run = finished()
+    run.state = run.map = None
+    save_progress(tmp_path, run)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_map_ply_holds_the_gaussians_in_use_as_they_are_drawn(tmp_path):
+    """The covariances are those that close the surface, the opacity is the drawing's."""
+    run = finished()
+    config = densify_config("render.covariance_scale=2.25", "render.opacity=0.75", "densify.opacity=0.1")
+    assert save_outputs(tmp_path, run, dense_of(run), config, "a wall") == []
+    gaussians = run.state.map.gaussians
+    valid = np.asarray(gaussians.valid)
+    rows = vertices(tmp_path / "map.ply")
+    assert len(rows["x"]) == valid.sum() < len(valid)
+    found = np.stack([np.ravel(rows[axis]) for axis in "xyz"], axis=1)
+    np.testing.assert_array_equal(found, np.asarray(gaussians.means)[valid])
+    scales = np.sort(np.stack([np.ravel(rows[f"scale_{i}"]) for i in range(3)], axis=1))
+    std = 1.5 * np.sqrt([1e-4, 4e-3, 4e-3])
+    np.testing.assert_allclose(np.exp(scales), np.broadcast_to(std, scales.shape), rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-np.ravel(rows["opacity"]))), 0.75, rtol=1e-6)
+    np.testing.assert_array_equal(np.ravel(rows["nz"]), -1.0)
+    red = 0.5 + 0.28209479177387814 * np.ravel(rows["f_dc_0"])
+    np.testing.assert_allclose(20.0 * red, found[:, 0], atol=1e-5)
+
+
+def test_points_ply_is_the_dense_cloud_with_its_classes(tmp_path):
+    run = finished()
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    rows, dense = vertices(tmp_path / "points.ply"), dense_of(run)
+    np.testing.assert_allclose(np.stack([np.ravel(rows[axis]) for axis in "xyz"], 1), dense.cloud.points, rtol=1e-6)
+    np.testing.assert_array_equal(np.ravel(rows["nz"]), -1.0)
+    np.testing.assert_array_equal(np.ravel(rows["red"]), [255, 0])
+    np.testing.assert_array_equal(np.ravel(rows["label"]), [1, -1])
+    assert b"comment label 0 floor\ncomment label 1 wall\n" in (tmp_path / "points.ply").read_bytes()
+    save_outputs(tmp_path, run, DenseMap(dense.cloud), densify_config(), "a wall")
+    assert "label" not in vertices(tmp_path / "points.ply").dtype.names
+
+
+def test_the_mesh_is_the_wall_seen_from_the_cameras_side(tmp_path):
+    run = finished()
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    mesh = trimesh.load(tmp_path / "mesh.ply")
+    np.testing.assert_allclose(mesh.vertices[:, 2], 2.0, atol=0.02)
+    towards = np.average(mesh.face_normals[:, 2], weights=mesh.area_faces)
+    assert towards < -0.95, f"the faces' mean normal is {towards:+.2f} along the view"
+    assert 1.0 < mesh.area < 3.0  # 1 m x 2 m, and its rim
+
+
+def test_what_could_not_be_made_is_named(tmp_path):
+    run = finished(gaussians=wall(0.0, 0.2))  # 40 Gaussians
+    (note,) = save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    assert note.startswith("no mesh.ply: 40 points") and not (tmp_path / "mesh.ply").exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"map.ply", "points.ply", "overview.png"}
+
+
+@pytest.mark.parametrize("num_unknown", [0, 1, NUM_FRAMES])
+def test_the_overview_shows_the_true_path_where_all_of_it_is_known(num_unknown, tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    truth = [None] * num_unknown + [*poses_along(np.linspace(0.0, 1.0, NUM_FRAMES) + 0.3)][num_unknown:]
+    run = finished(truth)
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    image = cv2.imread(str(tmp_path / "overview.png"))[..., ::-1].astype(int)
+    share = {
+        name: np.all(np.abs(image - color) <= 8, axis=-1).mean()
+        for name, color in (("estimate", (228, 87, 46)), ("truth", (27, 153, 139)))
+    }
+    assert share["estimate"] > 1e-4 and (share["truth"] > 1e-4) == (num_unknown == 0)

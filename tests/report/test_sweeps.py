@@ -1,0 +1,120 @@
+"""The files of a sweep; oracles: rows written by hand, the colours of the picture, what a resumed sweep holds."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from emgs_jax.report import sweeps
+from emgs_jax.report.sweeps import SweepResults, draw, read_sweep, table, write_csv
+
+ATE, F1 = "trajectory/ate_sim3_m", "reconstruction/f1_5cm_percent"
+PROVENANCE = {"data": {"name": "room"}, "prior": {"name": "simulated", "settings": {"seed": 0}}, "config": {"a": 1}}
+AXES = {"slam.em.noise": [0.5, 1.0], "slam.em.min_std": [0.01, 0.02, 0.03]}
+
+
+def grid():
+    """ATE 1 … 6 cm, F1 10 … 60 %; the last one has no F1."""
+    rows = []
+    for i, noise in enumerate(AXES["slam.em.noise"]):
+        for j, std in enumerate(AXES["slam.em.min_std"]):
+            number = 3 * i + j + 1
+            row = {"slam.em.noise": noise, "slam.em.min_std": std, ATE: number / 100}
+            rows.append(row if number == 6 else row | {F1: 10.0 * number})
+    return rows
+
+
+def test_the_best_of_each_column_is_bold_low_errors_and_high_scores():
+    lines = [[text.strip() for text in line.split("|")[1:-1]] for line in table(grid(), list(AXES)).splitlines()]
+    assert lines[0] == [*AXES, "ATE [cm]", "F1@.05 [%]"]
+    assert lines[2] == ["0.5", "0.01", "**1.00**", "10.0"]
+    assert lines[6] == ["1.0", "0.02", "5.00", "**50.0**"]
+    assert lines[7] == ["1.0", "0.03", "6.00", "–"]
+    assert sum(text.startswith("**") for line in lines for text in line) == 2
+
+
+def drawn(monkeypatch, tmp_path, rows, axes):
+    """The arguments with which the picture is drawn."""
+    calls = []
+    monkeypatch.setattr(sweeps, "draw_heat_maps", lambda *arguments: calls.append(arguments))
+    reason = draw(tmp_path / "map.png", rows, axes, "a sweep")
+    return reason, calls
+
+
+def test_the_picture_has_the_value_of_each_setting_at_its_place(monkeypatch, tmp_path):
+    reason, ((_, maps, rows, columns, title),) = drawn(monkeypatch, tmp_path, grid(), AXES)
+    assert reason is None and title == "a sweep"
+    assert rows == ("slam.em.noise", ["0.5", "1.0"]) and columns == ("slam.em.min_std", ["0.01", "0.02", "0.03"])
+    ate, f1 = maps
+    np.testing.assert_allclose(ate.values, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_allclose(f1.values, [[10, 20, 30], [40, 50, np.nan]])
+    assert ate.is_lower_better and not f1.is_lower_better
+
+
+def test_other_axes_are_averaged_and_named(monkeypatch, tmp_path):
+    rows = [row | {"slam.window_size": size, ATE: row[ATE] * size} for row in grid() for size in (1, 3)]
+    axes = AXES | {"slam.window_size": [1, 3]}
+    _, ((_, maps, _, _, title),) = drawn(monkeypatch, tmp_path, rows, axes)
+    np.testing.assert_allclose(maps[0].values, 2.0 * np.array([[1, 2, 3], [4, 5, 6]]))
+    assert title == "a sweep, means over slam.window_size"
+
+
+def test_without_two_axes_or_without_truth_there_is_no_picture_but_a_reason(monkeypatch, tmp_path):
+    reason, calls = drawn(monkeypatch, tmp_path, grid(), {"slam.em.noise": [0.5, 1.0], "slam.em.min_std": [0.01]})
+    assert "two axes" in reason and not calls
+    blind = [{name: row[name] for name in AXES} for row in grid()]
+    reason, calls = drawn(monkeypatch, tmp_path, blind, AXES)
+    assert "no ground truth" in reason and not calls
+
+
+def test_brighter_is_better_in_the_picture_of_either_kind_of_metric(tmp_path):
+    """The same numbers as an error and as a score: the bright end is the other one."""
+    cv2 = pytest.importorskip("cv2")
+    light = {}
+    for key in (ATE, F1):
+        rows = [{name: row[name] for name in AXES} | {key: number} for number, row in enumerate(grid())]
+        assert draw(tmp_path / "map.png", rows, AXES, "") is None
+        image = cv2.imread(str(tmp_path / "map.png"))
+        colored = image.max(axis=-1).astype(int) - image.min(axis=-1) > 60
+        ys, xs = np.nonzero(colored)
+        top, bottom, left, right = ys.min(), ys.max(), xs.min(), xs.max()
+        height, width = (bottom - top) // 8, (right - left) // 12
+        light[key] = [
+            image[rows_, columns].mean()
+            for rows_, columns in (
+                (slice(top + 2, top + height), slice(left + 2, left + width)),
+                (slice(bottom - height, bottom - 2), slice(right - width, right - 2)),
+            )
+        ]
+    assert light[ATE][0] > light[ATE][1] + 20 and light[F1][1] > light[F1][0] + 20
+
+
+def test_results_are_there_again_when_a_sweep_goes_on_and_rows_come_in_the_order_asked_for(tmp_path):
+    first, second = {"slam.em.noise": 0.5}, {"slam.em.noise": 1.0}
+    results = SweepResults(tmp_path, PROVENANCE)
+    assert first not in results
+    results.add([first, second], [{ATE: 0.1}, {ATE: float("nan")}])
+    again = SweepResults(tmp_path, PROVENANCE)
+    assert first in again and second in again and {"slam.em.noise": 2.0} not in again
+    assert again.rows([second, first]) == [
+        {"setting": 0, "slam.em.noise": 1.0, ATE: None},
+        {"setting": 1, "slam.em.noise": 0.5, ATE: 0.1},
+    ]
+    assert read_sweep(tmp_path / "sweep.json")["provenance"] == PROVENANCE
+
+
+@pytest.mark.parametrize("key", PROVENANCE)
+def test_sweeps_of_other_data_priors_or_settings_are_not_mixed(key, tmp_path):
+    SweepResults(tmp_path, PROVENANCE).add([{"a": 1}], [{ATE: 0.1}])
+    changed = json.loads(json.dumps(PROVENANCE))
+    changed[key] |= {"more": 7}
+    with pytest.raises(ValueError, match=rf"sweep.json holds a sweep with {key}.more None, and this one has 7"):
+        SweepResults(tmp_path, changed)
+
+
+def test_a_metric_that_a_setting_lacks_is_empty_in_the_csv(tmp_path):
+    write_csv(tmp_path / "sweep.csv", grid())
+    lines = list(csv.DictReader((tmp_path / "sweep.csv").open()))
+    assert [line[F1] for line in lines] == ["10.0", "20.0", "30.0", "40.0", "50.0", ""]
+    assert [float(line[ATE]) for line in lines] == [row[ATE] for row in grid()]

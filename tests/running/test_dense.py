@@ -1,0 +1,97 @@
+"""The map as points; oracle: a coloured wall of which every camera sees a part that no other sees."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hand_run import STATUSES, densify_config, hand_run, poses_along, wall
+
+from emgs_jax.evaluation.segmentation import LabelledPoints
+from emgs_jax.running.dense import center_cloud, dense_map, label_centers
+
+XS = 1.0 + 3.0 * np.arange(len(STATUSES))  # of the cameras, which see one metre to each side
+LENGTH = XS[-1] + 2.0
+
+
+class Pictures:
+    """A data set whose images have one colour each, the frame's number."""
+
+    def __getitem__(self, index):
+        return SimpleNamespace(image=np.full((16, 24, 3), index, np.uint8))
+
+
+@pytest.fixture(scope="module")
+def run():
+    """The raw prior would look between the cameras, where no frame looks."""
+    poses = poses_along(XS)
+    return hand_run(poses, poses_along(XS + 1.5), poses, gaussians=wall(0.0, LENGTH))
+
+
+@pytest.fixture(scope="module")
+def labels():
+    """Centres of two classes: near the wall's two ends."""
+    points = np.array([[0.0, 0.0, 2.0], [LENGTH, 0.0, 2.0]])
+    return LabelledPoints(points, np.array([1, 0]), ("right", "left"))
+
+
+@pytest.fixture(scope="module")
+def dense(run, labels):
+    return dense_map(run, Pictures(), densify_config(), 0.01, labels, num_pictures=3)
+
+
+def test_every_frame_that_is_not_lost_adds_what_its_own_pose_sees_of_the_map(dense):
+    seen = {status: 0 for status in STATUSES}
+    for x, status in zip(XS, STATUSES, strict=True):
+        count = (np.abs(dense.cloud.points[:, 0] - x) < 1.1).sum()
+        assert (count > 200) == (status != "lost"), f"{count} points of a frame that is {status}"
+        seen[status] += count
+    assert sum(seen.values()) == len(dense.cloud), "nothing is seen from elsewhere"
+    assert seen["lost"] == 0
+
+
+def test_the_points_are_the_walls_with_its_normals_and_colours(dense):
+    points, normals, colors = dense.cloud.points, dense.cloud.normals, dense.cloud.colors
+    np.testing.assert_allclose(points[:, 2], 2.0, atol=2e-3)  # a pixel's mean depth, of float32 at 2 m
+    np.testing.assert_allclose(normals, np.broadcast_to([0.0, 0.0, -1.0], normals.shape), atol=1e-5)
+    np.testing.assert_allclose(20.0 * colors[:, 0], points[:, 0], atol=0.1)  # the spacing of the Gaussians
+    np.testing.assert_allclose(colors[:, 1:], np.broadcast_to([0.25, 0.5], (len(colors), 2)), atol=1e-5)
+
+
+def test_pictures_are_of_frames_spread_evenly_over_those_that_are_not_lost(dense):
+    assert [picture["title"] for picture in dense.pictures] == ["frame 0", "frame 2", "frame 5"]
+    for picture, row in zip(dense.pictures, (0, 2, 5), strict=True):
+        assert (picture["image"] == row).all()
+        middle = picture["rendered_color"][8, 12, 0]
+        np.testing.assert_allclose(20.0 * middle, XS[row], atol=0.2)
+        np.testing.assert_allclose(picture["rendered_depth"][picture["valid"]], 2.0, atol=2e-3)
+
+
+def test_points_and_pictures_take_the_label_of_the_nearest_centre(dense, labels):
+    assert dense.labels.classes == labels.classes and dense.labels.points is dense.cloud.points
+    np.testing.assert_array_equal(dense.labels.labels, dense.cloud.points[:, 0] < LENGTH / 2)
+    for picture, label in zip(dense.pictures, (1, 1, 0), strict=True):
+        np.testing.assert_array_equal(picture["labels"], np.where(picture["valid"], label, -1))
+
+
+def test_without_labels_and_without_a_frame_that_is_known_there_is_nothing_to_show(run):
+    lost = hand_run(run.poses, run.raw_poses, run.true_poses, ["lost"] * len(STATUSES), run.state.map.gaussians)
+    nothing = dense_map(lost, Pictures(), densify_config(), 0.01)
+    assert len(nothing.cloud) == 0 and nothing.pictures == [] and nothing.labels is None
+
+
+def test_centres_are_the_means_of_the_rows_in_use(run):
+    cloud = center_cloud(run)
+    assert len(cloud) == 20 * round(10 * LENGTH)
+    np.testing.assert_allclose(cloud.points[:, 2], 2.0)
+    np.testing.assert_allclose(20.0 * cloud.colors[:, 0], cloud.points[:, 0], atol=1e-5)
+    np.testing.assert_array_equal(cloud.normals, np.broadcast_to([0.0, 0.0, -1.0], cloud.points.shape))
+    assert cloud.points.dtype == np.float64
+
+
+def test_each_centre_has_the_class_whose_text_its_feature_is(run):
+    prior = SimpleNamespace(feature_names=("left", "right"), text_features=np.eye(2, dtype=np.float32))
+    labels = label_centers(run, prior)
+    np.testing.assert_array_equal(labels.points, center_cloud(run).points)
+    np.testing.assert_array_equal(labels.labels, labels.points[:, 0] > LENGTH / 2)
+    assert labels.classes == ("left", "right")
+    assert label_centers(run, SimpleNamespace(feature_names=(), text_features=None)) is None
