@@ -558,8 +558,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/running/dense.py",
-        "to_se3(run.poses[row])",
-        "to_se3(run.raw_poses[row])",
+        "[run.poses[row] for row in rows]",
+        "[run.raw_poses[row] for row in rows]",
         DENSE,
         "the map is rendered from the raw prior's poses",
     ),
@@ -818,7 +818,7 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/prior/recorded.py",
-        'asked = range(max(missing, default=-1) + 1) if getattr(prior, "is_sequential", False) else missing',
+        "asked = range(max(missing, default=-1) + 1) if prior.is_sequential else missing",
         "asked = missing",
         RECORDED,
         "a sequential prior is resumed without its past",
