@@ -124,6 +124,7 @@ STAGES = [
         ("    valid &= jnp.any(normals != 0, axis=-1)\n", "", "points without a normal stay valid"),
         ("config.max_depth_step * inverse_depth)", "config.max_depth_step)", "a depth step in absolute units"),
         ("count > len(taps) / 5", "count > len(taps) / 9", "a normal from a nearly empty window"),
+        ("moments[..., 0] - count * mean[..., 0] ** 2", "moments[..., 0]", "second moments about the pixel"),
         ("xx * yy - xy * xy\n", "xx * yy\n", "the determinant without its mixed term"),
         ("radius + 1, spacing) for dx", "radius + 1) for dx", "every row of the window"),
         (
@@ -203,6 +204,9 @@ STAGES = [
         ("gaussians.valid & jnp.any", "jnp.any", "free rows have a class"),
     ),
     *own("slam", "test_slam")(
+        ("SlamState(map, aligned, T), info", "SlamState(map, trusted, T), info", "a rejected frame is no previous one"),
+        ("view = downscale(camera, thin)", "view = camera", "the full camera for the thinned rows"),
+        ("cluster(rest, order, spacing(thin, config.fit)", "cluster(rest, order, spacing(1, config.fit)", "λ in rows"),
         ("aligned.valid & localization.is_tracked", "aligned.valid", "a frame that is not tracked is mapped"),
         ("trusted.valid & ~is_fused", "trusted.valid", "fused points become Gaussians, too"),
         ("(trusted.points - T.translation())", "trusted.points", "the noise along rays from the world's origin"),

@@ -174,6 +174,19 @@ def color_gradient(k, means, normals, colors, valid, num_neighbours):
     return np.linalg.pinv(moments + ridge, rcond=1e-6) @ offsets.T @ (light[rows] - light[k])
 
 
+def normal_of_window(points, valid, row, column, taps, max_depth_step):
+    """Normal of a pixel's least-squares plane: 1/z = a x + b y + c along the rays (x, y, 1) of its valid neighbours."""
+    equations, inverse = [], 1 / points[row, column, 2]
+    for y, x in ((row + dy, column + dx) for dy in taps for dx in taps):
+        if 0 <= y < points.shape[0] and 0 <= x < points.shape[1] and valid[y, x]:
+            near = 1 / points[y, x, 2]
+            if abs(near - inverse) <= max_depth_step * inverse:
+                equations.append([*(points[y, x] * near), near])
+    equations = np.array(equations)
+    slopes = np.linalg.lstsq(equations[:, :3], equations[:, 3], rcond=None)[0]
+    return -slopes / np.linalg.norm(slopes)
+
+
 def matched(points, normals, noise, g, gates):
     """Row of every point's Gaussian, nearest under Σ + ν ν', and whether the two agree; `g` holds valid rows only."""
     widened = g["covs"] + (noise[:, :, None] * noise[:, None])[:, None]

@@ -55,6 +55,7 @@ def test_the_first_state_holds_the_last_view_as_it_is_in_the_world(state, window
     np.testing.assert_allclose(state.previous.points, expected.points, atol=1e-6)  # roundings
     assert max(pose_error(state.T_world_previous, path_pose(FRAME - 1))) < 1e-6
     assert state.map.gaussians.valid.sum() == 3 * 768 // (8 * 3)
+    np.testing.assert_allclose(state.map.weight[state.map.gaussians.valid].sum(), 3 * 768 / 8, rtol=1e-5)  # of λ points
 
 
 def test_an_exact_prediction_is_tracked_and_its_points_are_fused_or_become_gaussians(state, stepped):
@@ -121,6 +122,8 @@ def test_a_frame_that_is_not_tracked_leaves_the_map_bit_for_bit(state, camera, s
     assert not info.localization.is_tracked and info.localization.reason > 0
     assert info.em.num_fused == 0 and info.em.num_points == 0 and info.refinement.num_fresh == 0
     assert_same(new.map, state.map)
+    # What is not to be mapped may still be what the next frame's coarse pose needs.
+    assert new.previous.valid.all() if loss == "rejected" else not new.previous.valid.any()
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((new, info.T_world_camera, info.T_world_newest)))
 
 
