@@ -206,7 +206,7 @@ STAGES = [
     *own("slam", "test_slam")(
         ("SlamState(map, aligned, T), info", "SlamState(map, trusted, T), info", "a rejected frame is no previous one"),
         ("view = downscale(camera, thin)", "view = camera", "the full camera for the thinned rows"),
-        ("cluster(rest, order, spacing(thin, config.fit)", "cluster(rest, order, spacing(1, config.fit)", "λ in rows"),
+        ("camera, thin), spacing(thin, config.fit)", "camera, thin), spacing(1, config.fit)", "λ in rows"),
         ("aligned.valid & localization.is_tracked", "aligned.valid", "a frame that is not tracked is mapped"),
         ("trusted.valid & ~is_fused", "trusted.valid", "fused points become Gaussians, too"),
         ("(trusted.points - T.translation())", "trusted.points", "the noise along rays from the world's origin"),
