@@ -21,6 +21,15 @@ def sequence(camera):
     return [FirstWindow(views, stack_poses(poses)), *steps]
 
 
+def assert_close(a, b):
+    """vmap adds in another order: sums over some hundred points, so some hundred roundings of the largest value."""
+    a, b = np.asarray(a), np.asarray(b)
+    if a.dtype.kind != "f":
+        np.testing.assert_array_equal(a, b)
+    elif a.size:
+        np.testing.assert_allclose(a, b, rtol=0, atol=256 * np.finfo(np.float32).eps * np.abs(b).max())
+
+
 @pytest.mark.slow
 def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_one_is_full(sequence, camera):
     configs, roomy = (
@@ -37,8 +46,8 @@ def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_
         count, mine = int(state.map.gaussians.valid.sum()), jax.tree.map(lambda leaf, i=i: leaf[i], states)
         assert int(mine.map.gaussians.valid.sum()) == count
         for a, b in zip(jax.tree.leaves(mine.map), jax.tree.leaves(state.map), strict=True):
-            np.testing.assert_allclose(a[:count], b[:count], atol=1e-5)
-        np.testing.assert_allclose(mine.T_world_previous.wxyz_xyz, state.T_world_previous.wxyz_xyz, atol=1e-5)
+            assert_close(a[:count], b[:count])
+        assert_close(mine.T_world_previous.wxyz_xyz, state.T_world_previous.wxyz_xyz)
     assert states.map.weight.shape == (3, 512)
     for step in range(2):
         fused = [int(alone[2 * i + step].em.num_fused) for i in range(3)]
