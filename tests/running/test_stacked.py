@@ -35,6 +35,15 @@ def sequence(camera):
     ]
 
 
+def assert_close(a, b):
+    """vmap adds in another order: sums over some hundred points, so some hundred roundings of the largest value."""
+    a, b = np.asarray(a), np.asarray(b)
+    if a.dtype.kind != "f":
+        np.testing.assert_array_equal(a, b)
+    elif a.size:
+        np.testing.assert_allclose(a, b, rtol=0, atol=256 * np.finfo(np.float32).eps * np.abs(b).max())
+
+
 @pytest.mark.slow
 def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_one_is_full(sequence, camera):
     configs, roomy = (
@@ -55,8 +64,8 @@ def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_
         count = int(run.map.gaussians.valid.sum())
         assert int(mine.map.gaussians.valid.sum()) == count and mine.map.weight.shape == (512,)
         for a, b in zip(jax.tree.leaves(mine.map), jax.tree.leaves(run.map), strict=True):
-            np.testing.assert_allclose(a[:count], b[:count], atol=1e-5)
-        np.testing.assert_allclose(mine.poses, run.poses, atol=1e-5)
+            assert_close(a[:count], b[:count])
+        np.testing.assert_allclose(mine.poses, run.poses, atol=1e-5)  # m; roundings of the steps before
         assert [record.fused for record in mine.records] == [record.fused for record in run.records]
         assert [record.index for record in mine.records] == list(range(FRAME + 2))
     for step in range(FRAME, FRAME + 2):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from stereo_scene import arc, cloud, matrix, similarity_error, small_camera, structure_config, structure_of, views_of
 
-from emgs_jax.prior.multiview.incremental import extend, initialize
+from emgs_jax.prior.multiview.incremental import _drop, _tracks, extend, initialize
 from emgs_jax.prior.multiview.landmarks import NONE, forget, link
 
 pytestmark = pytest.mark.slow  # compiling the solver takes ten seconds
@@ -108,3 +108,41 @@ def test_a_view_without_landmarks_is_left_out_and_the_others_are_not_changed_by_
     assert sorted(structure.placed()) == [0, 1, 2, 4, 5]
     positions = np.stack([view.T_ref_view[:3, 3] for view in structure.placed().values()])
     assert similarity_error(positions, poses[[0, 1, 2, 4, 5], :3, 3]) < 0.01
+
+
+def seen_by(*counts):
+    """A structure of four views in which landmark i is shown by the first `counts[i]` views, at pixel (i, view)."""
+    views = views_of(cloud(len(counts)), arc(4))
+    for frame, view in enumerate(views):
+        view.landmark = np.where(frame < np.array(counts), np.arange(len(counts)), NONE)
+        view.pixels = np.column_stack([np.arange(len(counts)), np.full(len(counts), frame)]).astype(float)
+        view.T_ref_view = np.eye(4)
+    structure = structure_of(views)
+    structure.points = np.arange(len(counts))[:, None] + np.zeros(3)
+    return structure
+
+
+def test_the_landmarks_that_most_views_see_take_part_in_the_refinement():
+    structure = seen_by(2, 4, 1, 3, 2)
+    config = structure_config("prior.structure.max_landmarks=3")
+    ids, tracks = _tracks(structure, [0, 1, 2, 3], 5, config)
+    np.testing.assert_array_equal(ids, [1, 3, 0])  # one view alone says nothing of its landmark
+    expected = np.arange(5)[:, None] < np.array([4, 3, 2])
+    np.testing.assert_array_equal(tracks.is_seen, expected)
+    for view, column in np.argwhere(expected):
+        np.testing.assert_array_equal(tracks.pixels[view, column], [ids[column], view])
+
+
+def test_observations_that_do_not_fit_are_dropped_and_landmarks_that_fewer_than_two_views_still_show():
+    structure = seen_by(4, 2, 3)
+    limit = CONFIG.matching.max_reprojection_error
+    error = np.zeros((4, 3))
+    error[0, 0] = 2 * limit  # three views remain
+    error[1, 1] = np.inf  # one view remains
+    error[:2, 2] = 1.1 * limit  # one view remains
+    _drop(structure, [0, 1, 2, 3], np.arange(3), error, CONFIG)
+    np.testing.assert_array_equal(np.isnan(structure.points[:, 0]), [False, True, True])
+    shown = np.stack([view.landmark for view in structure.views.values()])
+    np.testing.assert_array_equal(shown[:, 0], [NONE, 0, 0, 0])
+    np.testing.assert_array_equal(shown[:, 1], [1, NONE, NONE, NONE])
+    np.testing.assert_array_equal(shown[:, 2], [NONE, NONE, 2, NONE])

@@ -49,6 +49,12 @@ def test_a_blob_is_detected_at_its_centre_with_pixel_centres_at_integers(config)
         assert np.linalg.norm(found - center, axis=1).min() < 0.06
 
 
+def test_descriptors_are_unit_so_that_their_product_is_a_cosine(config):
+    found = detect(np.uint8(np.random.default_rng(0).uniform(0, 255, (96, 128))), config)
+    assert len(found.descriptors) > 5 and found.descriptors.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1.0, rtol=1e-5)
+
+
 def test_a_blank_image_has_no_keypoint_and_no_match(config, views):
     blank = detect(np.full((48, 64), 128, np.uint8), config)
     assert blank.pixels.shape == (0, 2) and blank.descriptors.shape == (0, 128) and blank.landmark.shape == (0,)

@@ -104,6 +104,8 @@ def test_an_answer_obeys_the_protocol(room, answered):
         got = {name: (getattr(answer, name).dtype, getattr(answer, name).shape) for name in expected}
         assert got == expected
         assert answer.confidence.min() >= 1 and not answer.points[~answer.mask].any()
+        confirmed = 1 + compose(*SMALL).prior.dense.min_agreeing
+        assert answer.mask.any() and (answer.confidence[answer.mask] >= confirmed).all()
         x, y, z = np.moveaxis(answer.points, -1, 0)
         z_or_1 = np.where(answer.mask, z, 1)
         assert (z_or_1 > 0).all()

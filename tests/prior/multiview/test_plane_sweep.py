@@ -73,6 +73,19 @@ def test_the_view_itself_confirms_every_plane_at_no_cost():
     assert not cost.any()
 
 
+def test_the_sources_that_agree_best_decide_and_those_that_do_not_see_the_point_have_no_say():
+    """Two good sources and two of noise; oracle: each by itself, and the mean of the two that cost least."""
+    gray, depth = plane_image(np.eye(4), 0.0)
+    planes = jnp.asarray([1 / 4.0, 1 / depth.mean(), 1 / 1.2], jnp.float32)
+    noise = np.random.default_rng(0).uniform(size=(2, *gray.shape)).astype(np.float32)
+    sources = [noise[0], *(plane_image(T, 0.0)[0] for T in POSES[1:3]), noise[1]]
+    one, two = (depth_config(f"prior.dense.depth.sweep.num_best={count}").sweep for count in (1, 2))
+    each = [costs(gray, [image], [T], [True], planes, one) for image, T in zip(sources, POSES, strict=True)]
+    together = costs(gray, sources, POSES, [True] * 4, planes, two)
+    np.testing.assert_allclose(together, np.sort(each, axis=0)[:2].mean(axis=0), rtol=1e-6)
+    assert np.median(together[8:-8, 8:-8, 1]) < 0.1
+
+
 def test_a_source_that_does_not_count_is_not_read_and_nowhere_costs_the_same():
     config = depth_config().sweep
     gray, _ = plane_image(np.eye(4), 0.0)
