@@ -66,6 +66,18 @@ def test_queries_that_are_not_asked_change_nothing_for_the_others():
     np.testing.assert_allclose(distances, expected, rtol=1e-4)
 
 
+def test_a_block_that_looks_at_few_groups_first_looks_on_until_all_k_are_found(monkeypatch):
+    """Two groups of 32 a turn, and sixteen neighbours: the nearest is found at once, the last often much later."""
+    monkeypatch.setattr("emgs_jax.ops.neighbours.NUM_NEAR", 1)
+    rng = np.random.default_rng(9)
+    points, queries = (rng.uniform(-1, 1, (count, 3)).astype(np.float32) for count in (600, 1280))
+    rows, found = jax.jit(lambda *arrays: knn(*arrays, 16))(queries, points, np.ones(600, bool))  # a trace of its own
+    assert np.asarray(found).all()
+    distances = np.linalg.norm(points[rows] - queries[:, None], axis=-1)
+    expected = reference.knn(queries, points, np.ones(600, bool), 16)
+    np.testing.assert_allclose(distances, expected, rtol=600 * 2.0**-23)  # of `smallest`, as above
+
+
 def test_an_accelerator_which_looks_at_all_points_in_one_turn_finds_the_same(monkeypatch):
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *operands, default, **_: default(*operands))
     rng = np.random.default_rng(8)
