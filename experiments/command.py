@@ -44,10 +44,15 @@ def command(
     return decorate
 
 
+def overrides_of(arguments: list[str]) -> list[str]:
+    """The words that are no option of Hydra, such as -m, and no value of one, such as job of --cfg job."""
+    return [text for text in arguments if "=" in text and not text.startswith("-")]
+
+
 def check_arguments(name: str, arguments: list[str]) -> None:
     """Raise ValueError with near names where an override names no key or option."""
     try:
-        parsed = OverridesParser.create().parse_overrides([text for text in arguments if not text.startswith("-")])
+        parsed = OverridesParser.create().parse_overrides(overrides_of(arguments))
     except HydraException:
         return  # Hydra shows the place
     overrides = [first_of_sweep(override) for override in parsed if not override.key_or_group.startswith("hydra")]

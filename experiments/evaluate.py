@@ -23,7 +23,7 @@ from emgs_jax.report.results import is_finished, read_estimates, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
 from emgs_jax.running.configure import compose, message_of
 
-from .command import command
+from .command import command, overrides_of
 from .run import run
 
 ERROR_FILE = "error.txt"
@@ -72,11 +72,8 @@ def _quoted(text: str) -> str:
 def delegated(arguments: Sequence[str]) -> list[str]:
     """The arguments with those that are no key of conf/evaluate.yaml, such as `prior=recorded`, in `overrides`."""
     own = {*compose("suite=smoke", name="evaluate"), "hydra"}
-    is_own = [
-        text.startswith("-") or re.split(r"[=./@]", text.lstrip("+~"), maxsplit=1)[0] in own for text in arguments
-    ]
-    rest = [text for text, mine in zip(arguments, is_own, strict=True) if not mine]
-    kept = [text for text, mine in zip(arguments, is_own, strict=True) if mine]
+    rest = [text for text in overrides_of(arguments) if re.split(r"[=./@]", text.lstrip("+~"))[0] not in own]
+    kept = [text for text in arguments if text not in rest]
     if rest and any(text.startswith("overrides=") for text in kept):
         raise ValueError(
             f"{rest[0]} is for the runs: write it into overrides=[…], or all of those as words of their own"

@@ -160,11 +160,14 @@ def keys_of(config: DictConfig) -> set[str]:
 
 def near(key: str, known: Sequence[str]) -> str:
     """Words that name what `key` may have meant."""
-    last = key.rsplit(".", 1)[-1]
-    ends = {name: name.rsplit(".", 1)[-1] for name in known}
+    known = [name for name in known if not name.rpartition(".")[2].startswith("_")]
+    parent, _, last = key.rpartition(".")
+    ends = {name: name.rpartition(".")[2] for name in known}
+    siblings = [name for name in known if name == f"{parent}.{ends[name]}"]
     similar = difflib.get_close_matches(last, set(ends.values()), 5)
-    found = [name for name in known if ends[name] == last] + difflib.get_close_matches(key, known, 5)
-    found += [name for end in similar for name in known if ends[name] == end]
+    found = [name for name in known if ends[name] == last] + difflib.get_close_matches(key, siblings, 5)
+    found += [name for end in similar for name in siblings if ends[name] == end] or siblings[:5]
+    found += difflib.get_close_matches(key, known, 5) + [name for name in known if ends[name] in similar]
     found = list(dict.fromkeys(found))[:5]
     return f"near names: {', '.join(found)}" if found else f"the keys are {', '.join(known)}"
 

@@ -20,6 +20,7 @@ from experiments.command import check_arguments
         (["slam.em.max_mahalanobis=3"], r"is no key of the config; near names: slam\.em\.max_mahalanobis_sq"),
         (["slam.refinement.render.opacity=0.3"], r"near names: .*\brender\.opacity"),
         (["dataset=tum", "dataset.num_frames=3"], r"dataset\.num_frames is no key of the config"),
+        (["prior.nothing=2"], r"near names: prior\.classes, prior\.feature_size, prior\.level, prior\.seed"),
         (["slam.em=paper"], r"one of its options \(default, paper\) with slam/em=paper$"),
         (["slam.em=papre"], r"one of its options \(default, paper\) with slam/em=default$"),
         (["render=bright"], "render=bright is no option of render: there are default"),
@@ -45,8 +46,9 @@ def test_a_word_in_the_place_of_a_group_is_an_error_for_every_group():
 
 def test_the_arguments_of_a_multirun_are_checked_and_those_of_hydra_are_left_to_it():
     check_arguments("config", ["-m", "slam.em.noise=0,1", "prior=simulated,multiview_stereo", "hydra.run.dir=x"])
-    with pytest.raises(ValueError, match=r"slam\.em\.nose is no key"):
-        check_arguments("config", ["-m", "slam.em.nose=0,1"])
+    for option in (["-m"], ["--cfg", "job"]):
+        with pytest.raises(ValueError, match=r"slam\.em\.nose is no key"):
+            check_arguments("config", [*option, "slam.em.nose=0,1"])
 
 
 def test_the_help_of_a_run_lists_every_choice():

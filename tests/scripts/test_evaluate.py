@@ -205,6 +205,7 @@ def test_words_that_are_no_key_of_an_evaluation_go_to_its_runs_as_they_are():
     """Written into overrides=[…] by hand they had to be quoted twice."""
     words = ["prior=recorded", "prior.folder='my predictions/${dataset.sequence}'", "dataset.size=[160,120]"]
     own = ["suite=tum", "-m", "suite.root=it", "hydra/launcher=joblib", "+variants.wide={slam.window_size:7}"]
+    assert experiments.evaluate.delegated(["--cfg", "job", *own]) == ["--cfg", "job", *own]
     arguments = experiments.evaluate.delegated([*words[:1], *own, *words[1:]])
     assert arguments[:-1] == own and experiments.evaluate.delegated(own) == own
     given = [text for text in arguments if text[0] != "-" and not text.startswith(("hydra", "suite.root"))]
