@@ -140,7 +140,7 @@ def step(
     """Integrate one frame: localise, select, E-step, M-step, refine, insert (the paper's pipeline figure).
 
     Called as it is, each line is an executable of its own, so that a larger map compiles the look-up and the insertion
-    anew and not the work on the submap; inside another jit or vmap all of it is one.
+    anew and not the work on the submap; inside another jit or vmap all of it is one, which rounds differently.
 
     Args:
         state: of the last step.

@@ -4,7 +4,6 @@ import json
 import time
 from types import SimpleNamespace
 
-import hydra
 import numpy as np
 import pytest
 import reference
@@ -51,7 +50,8 @@ def test_the_array_form_of_em_is_what_the_equations_say_point_by_point():
     g, points = gaussian_arrays(30, 0), gaussian_arrays(200, 1)
     points["points"] = points.pop("means")
     update = baselines.em(g, points, np.zeros((200, 3)), config)
-    expected, is_fused = reference.e_step(points["points"], points["normals"], points["features"], g, config)
+    seen = points["points"], points["normals"], points["features"], np.zeros((200, 3)), np.ones(200, bool)
+    expected, is_fused, _ = reference.e_step(*seen, g, config)
     dense = np.zeros_like(expected)
     np.put_along_axis(dense, update.rows, update.responsibilities, axis=1)
     np.testing.assert_allclose(dense, expected, atol=1e-10)
@@ -71,11 +71,8 @@ def test_compositing_without_tiles_is_the_reference_pixel_by_pixel():
     g["means"][:, 2] += 3.0
     camera = SimpleNamespace(focal=[20.0, 23.0], center=[11.5, 8.25], width=24, height=18)
     config = RenderConfig(8, 32, 4, opacity=0.8, covariance_scale=1.5, blur=0.3, radius=2.5, min_alpha=0.1)
-    expected, _, _ = reference.render(g, g["colors"], np.eye(4), camera, config)
-    drawn = [
-        reference.splat(m, c, np.eye(4), camera.focal, camera.center, 1.5, 0.3)[:2]
-        for m, c in zip(g["means"], g["covs"], strict=True)
-    ]
+    expected, *_ = reference.render(g, g["colors"], np.eye(4), camera, config)
+    drawn = [reference.splat(m, c, np.eye(4), camera, 1.5, 0.3)[:2] for m, c in zip(g["means"], g["covs"], strict=True)]
     splats = {
         "means": np.stack([mean for mean, _ in drawn]),
         "precisions": np.linalg.inv(np.stack([cov for _, cov in drawn])),
@@ -146,5 +143,5 @@ def test_the_tables_hold_every_part_and_unknown_parts_are_refused(tmp_path):
         experiments.benchmark.benchmark(benchmark_config("parts=[speed]"), tmp_path)
     with pytest.raises(ValueError, match="4 frames"):
         load(benchmark_config("dataset.stop=3"))
-    with pytest.raises(hydra.errors.ConfigCompositionException):
+    with pytest.raises(ValueError, match="benchmark.turns is no key"):
         benchmark_config("benchmark.turns=3")
