@@ -1,0 +1,162 @@
+"""Public functions of the core with arguments of small fixed shapes, for tests of what JAX makes of them."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scene import (
+    observe_room,
+    path_pose,
+    pose,
+    predict_room,
+    random_gaussians,
+    random_observation,
+    slam_config,
+    stack_poses,
+)
+
+from emgs_jax import em, gaussian_map, gaussians, initialization, localization
+from emgs_jax import observation as obs
+from emgs_jax.ops import camera as cam
+from emgs_jax.ops import clustering, linalg, neighbours
+from emgs_jax.ops.pytree import stack
+from emgs_jax.refinement import refine
+from emgs_jax.registration import icp, rigid
+from emgs_jax.render import composite, densify, project
+
+CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
+CONFIG = slam_config("slam.submap.map_capacity=48", "slam.submap.submap_capacity=32", "render.tile_capacity=32")
+ONE = jnp.ones(())
+
+
+def map_of(seed: int) -> gaussian_map.GaussianMap:
+    return gaussian_map.GaussianMap(random_gaussians(32, seed, 2), jnp.ones(32), jnp.ones(32, jnp.int32))
+
+
+def prediction_of(seed: int) -> obs.Prediction:
+    return predict_room(2 + seed, CAMERA, num_features=2)
+
+
+def previous_of(seed: int) -> obs.Observation:
+    """Some millimetres off, as predictions are: at a pair that fits exactly the distance has no gradient."""
+    T = path_pose(1 + seed)
+    world = obs.transform(T, observe_room(T, CAMERA, 2), ONE)
+    noise = 0.005 * jnp.asarray(np.random.default_rng(seed).normal(size=world.points.shape), jnp.float32)
+    return eqx.tree_at(lambda o: o.points, world, world.points + noise)
+
+
+def image_of(seed: int):
+    """A slanted plane, so that every window determines its normal."""
+    rays = cam.rays(CAMERA, cam.pixel_grid(CAMERA))
+    plane = rays / (1.0 - (0.02 + 0.01 * seed) * rays[..., :1])
+    features = jnp.full((12, 16, 2), 0.5**0.5)
+    return plane, 0.3 + 0.1 * jnp.abs(plane), features, jnp.ones((12, 16)), jnp.ones((12, 16), bool)
+
+
+def coarse_of(seed: int) -> localization.CoarsePose:
+    T = path_pose(2 + seed)
+    return localization.CoarsePose(T, T, ONE, ONE * 0.02, ONE * 2.0, jnp.asarray(True))
+
+
+def estep_of(seed: int) -> em.EStep:
+    rows = jnp.asarray(np.random.default_rng(seed).integers(0, 32, (40, 3)))
+    return em.EStep(rows, jnp.full((40, 3), 1 / 3, jnp.float32), jnp.ones(40, bool))
+
+
+def points(seed: int):
+    return random_observation(40, seed, 2)
+
+
+def close(seed: int):
+    """Points on the map, so that EM fuses them."""
+    g = random_gaussians(32, seed, 2)
+    return obs.Observation(g.means + 0.01, g.colors, g.normals, g.features, jnp.ones(32), g.valid)
+
+
+NOISE = jnp.full((40, 3), 0.02)
+MASK, ORDER = jnp.arange(40) % 3 > 0, jnp.arange(40)
+# name: (verb of one item, its arguments by seed)
+VERBS = {
+    "safe_normalize": (linalg.safe_normalize, lambda s: (points(s).points,)),
+    "inverse_3x3": (linalg.inverse_3x3, lambda s: (random_gaussians(9, s).covs,)),
+    "whitening": (linalg.whitening, lambda s: (random_gaussians(9, s).covs,)),
+    "tangent_basis": (linalg.tangent_basis, lambda s: (points(s).normals,)),
+    "principal_axes": (linalg.principal_axes_2x2, lambda s: (random_gaussians(9, s).covs[:, :2, :2],)),
+    "project": (lambda p: cam.project(CAMERA, p), lambda s: (points(s).points,)),
+    "unproject": (lambda d: cam.unproject(CAMERA, d), lambda s: (jnp.full((12, 16), 1.0 + s),)),
+    "observe": (lambda *x: obs.observe(*x, CONFIG.observation), image_of),
+    "transform": (obs.transform, lambda s: (path_pose(s), points(s), ONE * 1.1)),
+    "knn": (lambda q, p: neighbours.knn(q, p, MASK, 3), lambda s: (points(s + 5).points, points(s).points)),
+    "compact_rows": (lambda m: neighbours.compact_rows(m, 20), lambda s: (jnp.roll(MASK, s),)),
+    "strided_seeds": (lambda m: clustering.strided_seeds(m, ORDER, 4, 10), lambda s: (jnp.roll(MASK, s),)),
+    "kmeans": (
+        lambda p, c: clustering.kmeans(p, MASK, c, MASK[:8], 2),
+        lambda s: (points(s).points, points(s).points[:8]),
+    ),
+    "fit_to_points": (
+        lambda c, o: gaussians.fit_to_points(c, jnp.ones(6, bool), o, CONFIG.fit),
+        lambda s: (points(s).points[:6] + 0.01, points(s)),
+    ),
+    "cluster": (lambda o: gaussians.cluster(o, ORDER, 8, CONFIG.fit), lambda s: (points(s),)),
+    "blend": (gaussians.blend, lambda s: (random_gaussians(9, s), random_gaussians(9, s + 5), jnp.full(9, 0.3), ONE)),
+    "update_average": (
+        lambda m, g, e: gaussian_map.update_average(m, g, e, CONFIG.em.average),
+        lambda s: (map_of(s), random_gaussians(32, s + 5, 2), jnp.linspace(0.0, 1.0, 32)),
+    ),
+    "select_submap": (
+        lambda m, o: gaussian_map.select_submap(m, (o,), CONFIG.submap),
+        lambda s: (map_of(s), points(s)),
+    ),
+    "insert": (gaussian_map.insert, lambda s: (map_of(s), random_gaussians(9, s, 2), jnp.ones(9))),
+    "fit_rigid": (rigid.fit_rigid, lambda s: (points(s).points, points(s + 5).points, jnp.ones(40))),
+    "icp": (
+        lambda o, g, T: icp.icp(o, g, T, (ONE * 0.02, ONE * 0.01), CONFIG.localization.icp),
+        lambda s: (obs.transform(path_pose(s).inverse(), close(s), ONE), random_gaussians(32, s, 2), path_pose(s)),
+    ),
+    "initialize": (
+        lambda v, T: initialization.initialize(v, T, CAMERA, 1, CONFIG.fit),
+        lambda s: (
+            stack([observe_room(path_pose(i + s), CAMERA, 2) for i in (0, 1)]),
+            stack_poses([path_pose(s), path_pose(1 + s)]),
+        ),
+    ),
+    "localize_coarse": (
+        lambda p, o, T: localization.localize_coarse(p, o, T, CAMERA, CONFIG.localization),
+        lambda s: (prediction_of(s), previous_of(s), path_pose(1 + s)),
+    ),
+    "localize_fine": (
+        lambda o, g, c: localization.localize_fine(o, g, c, CONFIG.localization),
+        lambda s: (observe_room(path_pose(2 + s), CAMERA, 2), random_gaussians(32, s, 2), coarse_of(s)),
+    ),
+    "m_step": (
+        lambda g, o, e: em.m_step(g, o, e, CONFIG.em),
+        lambda s: (random_gaussians(32, s, 2), points(s), estep_of(s)),
+    ),
+    "em_update": (lambda m, o: em.em_update(m, o, NOISE[:32], CONFIG.em), lambda s: (map_of(s), close(s))),
+    "project_gaussians": (
+        lambda g, T: project.project_gaussians(g, T, CAMERA, ONE, ONE),
+        lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),
+    ),
+    "render": (
+        lambda g, T: composite.render(g, g.colors, T, CAMERA, CONFIG.refinement.render),
+        lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),
+    ),
+    "densify": (
+        lambda g, T: densify.densify(
+            g, T, CAMERA, densify.DensifyConfig(0.9, 0.3, 0.05, 0.75, CONFIG.refinement.render)
+        ),
+        lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),
+    ),
+    "refine": (
+        lambda m, g, T: refine(m, g, T, CAMERA, CONFIG.refinement),
+        lambda s: (map_of(s), random_gaussians(9, s + 5, 2), pose(translation=(0.1 * s, 0, 0))),
+    ),
+}
+# These end where a solver or a gate decides, or sum many terms.
+LOOSE = {"render", "icp", "localize_coarse", "localize_fine", "refine", "densify", "initialize"}
+# The solver has a while loop, which has no reverse mode; forward mode must be finite.
+FORWARD = {"icp", "localize_fine"}
+
+
+def numbers(tree):
+    return [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
