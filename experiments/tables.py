@@ -29,7 +29,6 @@ COLUMNS = (
     Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 1, True),
     *(column._replace(digits=1) for column in MAIN[1:]),
 )
-SHOWN = (*COLUMNS, Column("time/seconds_per_frame", "s a frame", 1.0, 2, True))
 
 
 def evaluations(config: Mapping[str, Any], table: str) -> Iterator[Settings]:
@@ -93,10 +92,10 @@ def _table(estimates: Sequence[Estimate], titles: Mapping[str, str]) -> str:
     rows = sorted(average(estimates, each_sequence=True), key=lambda row: list(titles).index(row.dataset))
     lines = []
     for row in rows:
-        numbers = [(row.values.get(key), row.spreads.get(key), factor, digits) for key, _, factor, digits, _ in SHOWN]
+        numbers = [(row.values.get(key), row.spreads.get(key), factor, digits) for key, _, factor, digits, _ in COLUMNS]
         name = titles[row.dataset] + ("" if row.variant == "default" else f", {row.variant}")
         lines.append([name, row.kind, str(len(row.seeds)), *(cell(*number) for number in numbers)])
-    return markdown(["data, setting", "", "runs", *(column.title for column in SHOWN)], lines)
+    return markdown(["data, setting", "", "runs", *(column.title for column in COLUMNS)], lines)
 
 
 def _better(estimates: Sequence[Estimate]) -> str:
