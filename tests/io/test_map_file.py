@@ -18,6 +18,7 @@ class Leaves(eqx.Module):
     means: Float[Array, "n 3"]
     features: Float[Array, "n f"]
     valid: Bool[Array, " n"]
+    model: str = eqx.field(static=True, default="dino")
 
 
 class Map(eqx.Module):
@@ -35,7 +36,7 @@ class Other(eqx.Module):
 
 def a_map(n=5, f=2):
     means = jnp.asarray(np.random.default_rng(0).normal(size=(n, 3)), jnp.float32).at[0, 0].set(jnp.nan)
-    gaussians = Leaves(means, jnp.ones((n, f), jnp.float16), jnp.arange(n) % 2 == 0)
+    gaussians = Leaves(means, jnp.ones((n, f), jnp.float16), jnp.arange(n) % 2 == 0, "clip")
     return Map(gaussians, jnp.full(n, -0.0), jnp.asarray(3, jnp.int32), n)
 
 

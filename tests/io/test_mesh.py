@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+import trimesh
 
 from emgs_jax.io.mesh import save_mesh_ply
 
@@ -38,3 +39,29 @@ def test_a_mesh_that_cannot_be_made_gives_a_reason_and_no_file(tmp_path):
     many = np.full((100, 3), np.nan)
     assert "0 points" in save_mesh_ply(path, many, many, many)
     assert os.listdir(tmp_path) == []
+
+
+def sphere(count: int = 3000) -> np.ndarray:
+    normals = np.random.default_rng(4).normal(size=(count, 3))
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def test_a_vertex_has_the_colour_of_the_point_next_to_it(tmp_path):
+    normals = sphere()
+    save_mesh_ply(
+        tmp_path / "mesh.ply", 2.0 * normals, normals, np.where(normals[:, :1] > 0, [1.0, 0, 0], [0, 0, 1.0]), 6
+    )
+    mesh = trimesh.load(tmp_path / "mesh.ply")
+    red, clear = np.asarray(mesh.visual.vertex_colors)[:, 0] == 255, np.abs(mesh.vertices[:, 0]) > 0.2  # two spacings
+    assert clear.sum() > 100
+    np.testing.assert_array_equal(red[clear], mesh.vertices[clear, 0] > 0)
+
+
+def test_a_point_that_flew_far_away_does_not_make_the_cells_coarse(tmp_path):
+    """The solver's grid spans all points: with depth 6 and a point at 200 m a cell would be wider than the sphere."""
+    normals = sphere()
+    points, directions = np.vstack([2.0 * normals, [[200.0, 0, 0]]]), np.vstack([normals, [[1.0, 0, 0]]])
+    assert save_mesh_ply(tmp_path / "mesh.ply", points, directions, np.ones_like(points), depth=6) is None
+    mesh = trimesh.load(tmp_path / "mesh.ply")
+    assert len(mesh.vertices) > 500
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 2.0, atol=0.08)

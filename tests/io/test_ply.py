@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
@@ -63,3 +64,10 @@ def test_written_points_are_read_by_trimesh_and_open3d(tmp_path):
     cloud = o3d.io.read_point_cloud(str(tmp_path / "points.ply"))
     np.testing.assert_allclose(np.asarray(cloud.normals), normals, rtol=1e-6)
     np.testing.assert_allclose(np.asarray(cloud.colors), colors / 255.0, atol=1e-9)
+
+
+def test_colours_are_rounded_to_the_nearest_of_256_and_those_out_of_range_to_the_ends(tmp_path):
+    colors = np.array([[0.999, 0.5, 0.001], [1.3, -0.2, np.nan], [254.6 / 255, 254.4 / 255, 1.0]])
+    save_points_ply(tmp_path / "points.ply", np.zeros((3, 3)), np.zeros((3, 3)), colors)
+    found = np.asarray(trimesh.load(tmp_path / "points.ply").colors)[:, :3]
+    np.testing.assert_array_equal(found, [[255, 128, 0], [255, 0, 0], [255, 254, 255]])

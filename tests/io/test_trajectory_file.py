@@ -16,6 +16,8 @@ def test_a_trajectory_comes_back_with_unit_quaternions_in_tum_order(tmp_path):
     times, loaded = load_trajectory_tum(tmp_path / "trajectory.txt")
     np.testing.assert_allclose(times, stamps, rtol=0, atol=1e-6)
     np.testing.assert_allclose(loaded, poses, atol=5e-9)
+    rows = np.loadtxt(tmp_path / "trajectory.txt")
+    assert (rows[:, 7] >= 0).all() and (Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, 3] < 0).any()
     quarter = np.eye(4)
     quarter[:3, :3], quarter[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [1, 2, 3]
     save_trajectory_tum(tmp_path / "trajectory.txt", [0.5], quarter[None])
