@@ -3,10 +3,11 @@
 import os
 from pathlib import Path
 
-from emgs_jax.running.compilation import cache_folder
+from emgs_jax.running.compilation import MAX_BYTES, cache_folder
 
 # Before JAX is imported, and for the processes that tests start: most of the time of the tests is compilation.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder()))
+os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(MAX_BYTES))  # else it forgets what commands keep there
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
