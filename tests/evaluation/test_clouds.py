@@ -74,7 +74,9 @@ def test_fusing_pieces_is_reducing_the_whole(monkeypatch):
 
 @pytest.mark.parametrize("num_steps", [1, 4])
 def test_registration_takes_the_steps_of_open3ds_point_to_point_icp(num_steps):
-    registration = pytest.importorskip("open3d").pipelines.registration
+    import open3d as o3d
+
+    registration = o3d.pipelines.registration
     import open3d as o3d
 
     rng = np.random.default_rng(5)
@@ -108,7 +110,8 @@ def test_a_cloud_that_is_read_keeps_its_normals_and_colours(tmp_path):
 
 
 def test_a_cloud_without_normals_gets_those_of_planes_through_its_points(tmp_path):
-    trimesh = pytest.importorskip("trimesh")
+    import trimesh
+
     rng = np.random.default_rng(10)
     across = np.array([0.6, 0.0, 0.8])
     points = rng.uniform(-1, 1, (500, 3))
@@ -125,7 +128,8 @@ def test_a_file_without_usable_points_is_named(tmp_path):
     (tmp_path / "text.ply").write_text("no cloud")
     with pytest.raises(ValueError, match=r"text\.ply has no points"):
         read_cloud(tmp_path / "text.ply", 12)
-    o3d = pytest.importorskip("open3d")
+    import open3d as o3d
+
     points = np.zeros((5, 3))
     points[1:3, 0] = np.nan, np.inf
     o3d.io.write_point_cloud(str(tmp_path / "a.ply"), o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))

@@ -212,7 +212,8 @@ def test_a_cloud_is_aligned_by_the_poses_with_scale_or_without():
 
 
 def test_distances_are_those_of_open3d_as_mean_and_as_clipped_rmse():
-    o3d = pytest.importorskip("open3d")
+    import open3d as o3d
+
     rng = np.random.default_rng(8)
     estimate, truth = random_cloud(rng, 900), random_cloud(rng, 700)
     there, back = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(c.points)) for c in (estimate, truth))
@@ -269,7 +270,9 @@ def test_a_protocol_compares_a_random_choice_of_points_that_is_the_same_each_tim
 
 @pytest.mark.skipif(not REPLICA.exists(), reason="the shared Replica sequence is not here")
 def test_the_ground_truth_of_replica_lies_on_its_mesh_with_its_normals():
-    cv2, o3d = pytest.importorskip("cv2"), pytest.importorskip("open3d")
+    import cv2
+    import open3d as o3d
+
     poses = np.loadtxt(REPLICA / "office0_from_mesh" / "traj.txt").reshape(-1, 4, 4)
     frames = []
     for index in (0, 90):

@@ -3,14 +3,14 @@
 import os
 
 import numpy as np
-import pytest
 import trimesh
 
 from emgs_jax.io.mesh import save_mesh_ply
 
 
 def test_a_mesh_of_an_open_sphere_lies_on_it_stays_open_and_is_the_same_twice(tmp_path):
-    trimesh = pytest.importorskip("trimesh")
+    import trimesh
+
     rng = np.random.default_rng(4)
     normals = rng.normal(size=(3000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

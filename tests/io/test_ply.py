@@ -1,7 +1,6 @@
 """Oracles: other programs' readers, and covariances from the written parameters."""
 
 import numpy as np
-import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
@@ -43,7 +42,8 @@ def test_the_header_of_the_gaussians_is_the_layout_of_common_viewers(tmp_path):
 
 
 def test_labels_are_a_property_of_the_points_and_the_header_names_the_classes(tmp_path):
-    trimesh = pytest.importorskip("trimesh")
+    import trimesh
+
     points = np.arange(9.0).reshape(3, 3)
     points[1] = np.nan  # left out, with its label
     save_points_ply(tmp_path / "p.ply", points, points, np.zeros((3, 3)), np.array([4, 5, -1]), ("wall", "sofä"))
@@ -54,7 +54,9 @@ def test_labels_are_a_property_of_the_points_and_the_header_names_the_classes(tm
 
 
 def test_written_points_are_read_by_trimesh_and_open3d(tmp_path):
-    trimesh, o3d = pytest.importorskip("trimesh"), pytest.importorskip("open3d")
+    import open3d as o3d
+    import trimesh
+
     rng = np.random.default_rng(3)
     points, normals, colors = rng.normal(size=(30, 3)), rng.normal(size=(30, 3)), rng.integers(0, 256, (30, 3))
     assert save_points_ply(tmp_path / "points.ply", points, normals, colors / 255.0) == 30
