@@ -1,6 +1,7 @@
 """Shared by all tests of the core: shapes and types checked at every call, one small config, one small camera."""
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 
 from emgs_jax.running.compilation import MAX_BYTES, cache_folder
@@ -10,6 +11,12 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder()))
 os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(MAX_BYTES))  # else it forgets what commands keep there
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
+# Likewise: small arrays need no thorough compilation, and an oracle holds for any. Flags of the user come last and win.
+QUICK = ["--xla_backend_optimization_level=0"]
+if tuple(map(int, version("jaxlib").split(".")[:2])) <= (0, 10):  # XLA ends the process at a flag that it does not know
+    QUICK.append("--xla_cpu_use_fusion_emitters=false")
+os.environ["XLA_FLAGS"] = " ".join([*QUICK, os.environ.get("XLA_FLAGS", "")])
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

@@ -94,12 +94,12 @@ class Stack:
                 for run in self._runs:
                     record_lost(run, given)
             case FirstWindow() as first:
-                self._states, self._configs = start(first, camera, self._configs, jitted_init_states)
+                self._states, self._configs = start(first, camera, self._configs, init_states)
                 self.hand_out()
                 for run in self._runs:
                     record_start(run, given, spent(given, timer, len(self._runs)))
             case Prediction() as prediction:
-                stepped = advance(self._states, prediction, camera, self._configs, jitted_step_states)
+                stepped = advance(self._states, prediction, camera, self._configs, step_states)
                 self._states, infos, self._configs = stepped[0], jax.device_get(stepped[1]), stepped[2]
                 for position, run in enumerate(self._runs):
                     record_step(run, given, _item(infos, position), spent(given, timer, len(self._runs)))
@@ -124,9 +124,5 @@ def init_states(
 def step_states(
     states: SlamState, prediction: Prediction, camera: Camera, configs: SlamConfig
 ) -> tuple[SlamState, StepInfo]:
-    """`slam.step` for s stacked states and configs, which all see one prediction."""
+    """`slam.step` for s stacked states and configs, which all see one prediction; its executables, each under vmap."""
     return eqx.filter_vmap(lambda state, config: step(state, prediction, camera, config))(states, configs)
-
-
-jitted_init_states = eqx.filter_jit(init_states)
-jitted_step_states = eqx.filter_jit(step_states)

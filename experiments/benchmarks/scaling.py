@@ -17,7 +17,7 @@ from emgs_jax.running.stacked import step_states
 from emgs_jax.slam import step
 
 from .data import Data, enlarged, first_state, load
-from .timing import Candidate, Timing, compare, executable, interleaved
+from .timing import Candidate, Timing, called, compare, interleaved
 
 FAR = 50.0  # m between copies of the map: none of them is in the submap
 
@@ -25,11 +25,11 @@ FAR = 50.0  # m between copies of the map: none of them is in the submap
 def time_settings(data: Data, counts: Sequence[int], repetitions: int) -> Iterator[Timing]:
     """A step of many settings: stacked with vmap, and the step's own executable in turn and on all cores at once."""
     state, config = first_state(data)
-    one = executable(step, state, data.prediction, data.camera, config)
+    one = called(step, state, data.prediction, data.camera, config)
     for count in counts:
         gates = config.em.max_mahalanobis_sq * jnp.linspace(0.5, 2.0, count)
         configs = [eqx.tree_at(lambda c: c.em.max_mahalanobis_sq, config, gate) for gate in gates]
-        stacked = executable(step_states, stack([state] * count), data.prediction, data.camera, stack(configs))
+        stacked = called(step_states, stack([state] * count), data.prediction, data.camera, stack(configs))
 
         def single(config: Any) -> Any:
             return jax.block_until_ready(one.verb(state, data.prediction, data.camera, config))
@@ -67,7 +67,7 @@ def time_growth(
             large = replace(slam, submap=replace(slam.submap, map_capacity=capacity))
             whole = eqx.tree_at(lambda s: s.map, state, map)
             name = f"{size[0]}x{size[1]}, {count} Gaussians"
-            candidates[name] = executable(step, whole, data.prediction, data.camera, large)
+            candidates[name] = called(step, whole, data.prediction, data.camera, large)
             candidates[name].facts["submap_overflow"] = int(candidates[name].call()[1].overflow.submap)
         yield from compare(interleaved("growth", candidates, repetitions), _reference(candidates, size, counts))
 

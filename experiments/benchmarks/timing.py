@@ -57,15 +57,27 @@ def executable(verb: Callable, *arguments: Any) -> Candidate:
     return Candidate(call, seconds, {"memory_mb": used / 2**20}, compiled)
 
 
+def called(verb: Callable, *arguments: Any) -> Candidate:
+    """`verb` as users call it: its first call compiles, and what that takes longer than a second one is compilation."""
+    call = lambda: jax.block_until_ready(verb(*arguments))  # noqa: E731
+    first, second = _seconds(call), _seconds(call)
+    return Candidate(call, max(first - second, 0.0), {}, verb)
+
+
+def _seconds(call: Callable) -> float:
+    begin = time.perf_counter()
+    call()
+    return time.perf_counter() - begin
+
+
 def interleaved(part: str, candidates: Mapping[str, Candidate], repetitions: int) -> list[Timing]:
     """Time all candidates in turns, after one turn that does not count."""
     seconds: dict[str, list[float]] = {name: [] for name in candidates}
     for repetition in range(repetitions + 1):
         for name, candidate in candidates.items():
-            begin = time.perf_counter()
-            candidate.call()
+            taken = _seconds(candidate.call)
             if repetition > 0:
-                seconds[name].append(time.perf_counter() - begin)
+                seconds[name].append(taken)
     return [Timing(part, name, seconds[name], c.compile_seconds, dict(c.facts)) for name, c in candidates.items()]
 
 
