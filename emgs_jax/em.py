@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
-from emgs_jax.gaussians import Gaussians
+from emgs_jax.gaussians import Gaussians, has_feature
 from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import (
     Entries,
@@ -136,11 +136,12 @@ def _explain(
     ray, normals = (jnp.unstack(vectors[:, None], axis=-1) for vectors in (config.noise * noise, points.normals))
     distance_sq, log_growth = widened_distance_sq(gather_entries(triangles, rows), offsets, ray)
     normal_cos = dot(gather_entries(gaussians.normals, rows), normals)
-    # Features are unit vectors, so their product is the cosine; with width 0 the term must vanish.
+    # Features are unit vectors, so their product is the cosine; without one of them the term must vanish.
     feature_gap = 0.0
     if gaussians.features.shape[-1]:
         feature = jnp.unstack(points.features[:, None], axis=-1)
-        feature_gap = dot(gather_entries(gaussians.features, rows), feature) - 1.0
+        both = has_feature(points.features)[:, None] & has_feature(gaussians.features)[rows]
+        feature_gap = jnp.where(both, dot(gather_entries(gaussians.features, rows), feature) - 1.0, 0.0)
     log_det_term = -config.determinant_weight * (logdets[rows] + log_growth)
     log_joint = -0.5 * distance_sq + log_det_term
     log_joint += config.normal_weight * (normal_cos - 1.0) + config.feature_weight * feature_gap

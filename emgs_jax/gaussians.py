@@ -81,7 +81,8 @@ def fit_to_points(
     weights = jax.nn.softmax(-0.5 * dot(white, white), axis=-1, where=found)
     mean_feature = jnp.einsum("km,kmf->kf", weights, near.features)
     # The medoid: features are never averaged, since a mean of two meanings has none.
-    closeness = jnp.where(found, jnp.einsum("kmf,kf->km", near.features, mean_feature), -jnp.inf)
+    is_known = found & has_feature(near.features)
+    closeness = jnp.where(is_known, jnp.einsum("kmf,kf->km", near.features, mean_feature), -jnp.inf)
     medoid = jnp.argmax(closeness, axis=-1)
     fitted = Gaussians(
         means=centers,
@@ -142,6 +143,11 @@ def blend(old: Gaussians, new: Gaussians, gain: Float[Array, "n"], moment_matche
             safe_normalize(old.normals + weight * (new.normals - old.normals)),
         ),
     )
+
+
+def has_feature(features: Float[Array, "*b f"]) -> Bool[Array, "*b"]:
+    """False where a feature is missing (zero), which then says neither yes nor no."""
+    return jnp.any(features != 0, axis=-1)
 
 
 def intensity(colors: Float[Array, "*b 3"]) -> Float[Array, "*b"]:

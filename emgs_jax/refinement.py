@@ -7,13 +7,13 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
-from emgs_jax.gaussians import Gaussians
+from emgs_jax.gaussians import Gaussians, has_feature
 from emgs_jax.ops.camera import Camera, nearest_pixel
 from emgs_jax.ops.linalg import inverse_2x2, mahalanobis_sq, outer, safe_normalize
 from emgs_jax.ops.neighbours import knn
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import static, traced, where_rows
-from emgs_jax.render.composite import RenderConfig, Rendering, render_splats, splats_of
+from emgs_jax.ops.pytree import choice, static, take_rows, traced, where_rows
+from emgs_jax.render.composite import RenderConfig, Rendering, render_splats, splat_depth, splats_of
 from emgs_jax.render.project import Splats
 
 
@@ -26,6 +26,9 @@ class RefinementConfig(eqx.Module):
         front_margin: fraction of the depth by which a candidate may lie in front of the map and still be merged; 0 as
             printed (R6).
         back_margin: likewise behind it; `inf` as printed.
+        depth_condition: where a candidate has to lie within the margins: of the rendered depth at its own `pixel`
+            (printed); or there and of each Gaussian's plane, so that `pairs` never join two sides of a depth edge.
+        min_normal_cos: a pair whose normals differ more does not merge; `-inf` as printed.
         max_splat_std: pixels of the rendered image; a wider candidate is scattered points, not a surface, and is
             dropped; `inf` as printed.
         render: how both sets are drawn.
@@ -36,6 +39,8 @@ class RefinementConfig(eqx.Module):
     max_mahalanobis_sq_2d: Float[Array, "*b"] = traced()
     front_margin: Float[Array, "*b"] = traced()
     back_margin: Float[Array, "*b"] = traced()
+    depth_condition: Float[Array, "*b"] = choice("pixel", "pairs")
+    min_normal_cos: Float[Array, "*b"] = traced()
     max_splat_std: Float[Array, "*b"] = traced()
     render: RenderConfig
     average: AverageConfig
@@ -66,6 +71,25 @@ def match_on_image(
     return rows, mahalanobis_sq(offsets, inverse_2x2(covs)), found
 
 
+def show_one_surface(
+    old: Gaussians,
+    candidates: Gaussians,
+    map_splats: Splats,
+    candidate_splats: Splats,
+    rows: Int[Array, "g k"],
+    config: RefinementConfig,
+) -> Bool[Array, "g k"]:
+    """Pairs whose normals agree, the candidate within the margins of the Gaussian's plane at the candidate's pixel."""
+
+    def plane_depth(rows: Int[Array, "k"], pixel: Float[Array, "2"]) -> Float[Array, "k"]:
+        return splat_depth(take_rows(map_splats, rows), pixel[None], config.render)[:, 0]
+
+    gap = candidate_splats.depth[:, None] / jax.vmap(plane_depth)(rows, candidate_splats.means) - 1.0
+    is_near = (gap >= -config.front_margin) & (gap <= config.back_margin) | (config.depth_condition < 1)
+    normal_cos = jnp.einsum("gkd,gd->gk", old.normals[rows], candidates.normals)
+    return is_near & (normal_cos >= config.min_normal_cos)
+
+
 def merge_weights(
     old: Gaussians,
     candidates: Gaussians,
@@ -79,7 +103,8 @@ def merge_weights(
     omega = jax.nn.softmax(-0.5 * distance_sq, axis=-1, where=some)
     if old.features.shape[-1]:
         cosine = jnp.einsum("gkf,gf->gk", old.features[rows], candidates.features)
-        omega = omega * jnp.maximum(cosine, 0.0)  # opposite meanings do not merge
+        both = has_feature(candidates.features)[:, None] & has_feature(old.features)[rows]
+        omega = omega * jnp.where(both, jnp.maximum(cosine, 0.0), 1.0)  # opposite meanings do not merge
     is_match = found & (candidates.valid & on_surface)[:, None] & (distance_sq < config.max_mahalanobis_sq_2d)
     return jnp.where(is_match, omega, 0.0)
 
@@ -126,7 +151,8 @@ def refine(
     """Merge candidates with the map where both show the same surface; the rest is fresh.
 
     A candidate on a pixel without map depth is fresh. Otherwise it merges with those of its K_2D closest map Gaussians
-    that pass the distance gate, unless it lies in front of the map (or behind it) by more than the margin.
+    that show the same surface and pass the distance gate, unless it lies in front of the map (or behind it) by more
+    than the margin.
 
     Args:
         submap: what is seen, world frame.
@@ -150,10 +176,11 @@ def refine(
     own_depth = depth_at(rendering, map_splats, camera)
     reach = config.render.radius * map_splats.depth_std
     visible = map_splats.valid & (own_depth > 0) & (map_splats.depth <= own_depth + reach)
-    match = match_on_image(map_splats, candidate_splats, visible, config)
+    rows, distance_sq, found = match_on_image(map_splats, candidate_splats, visible, config)
+    found &= show_one_surface(old, candidates, map_splats, candidate_splats, rows, config)
     relative = candidate_splats.depth / jnp.where(map_depth > 0, map_depth, 1.0) - 1.0
     on_surface = (map_depth > 0) & (relative >= -config.front_margin) & (relative <= config.back_margin)
-    omega, rows = merge_weights(old, candidates, match, on_surface, config), match[0]
+    omega = merge_weights(old, candidates, (rows, distance_sq, found), on_surface, config)
 
     averaged = average_candidates(candidates, rows, omega, old)
     evidence = jnp.zeros(old.valid.shape[0]).at[rows].max(omega)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from emgs_jax.gaussians import Gaussians
+from emgs_jax.gaussians import Gaussians, has_feature
 from emgs_jax.ops.linalg import safe_normalize
 from emgs_jax.ops.precision import full_precision
 
@@ -26,5 +26,5 @@ def classify(gaussians: Gaussians, text_features: Float[Array, "c f"]) -> Int[Ar
             f"text_features must be (classes, {gaussians.features.shape[-1]}) like the map's features, "
             f"got {tuple(text_features.shape)}: embed the classes with the model that made the map's features"
         )
-    has_feature = gaussians.valid & jnp.any(gaussians.features != 0, axis=-1)
-    return jnp.where(has_feature, jnp.argmax(similarities(gaussians, text_features), axis=-1), -1)
+    is_known = gaussians.valid & has_feature(gaussians.features)
+    return jnp.where(is_known, jnp.argmax(similarities(gaussians, text_features), axis=-1), -1)

@@ -54,7 +54,7 @@ def log_joint(point, normal, feature, noise, g, rows, config):
         determinant.append(-float(config.determinant_weight) * np.linalg.slogdet(cov)[1])
         value = -0.5 * distances_sq[-1] + determinant[-1]
         value += float(config.normal_weight) * (g["normals"][k] @ normal - 1.0)
-        if len(feature):
+        if feature.any() and g["features"][k].any():  # a missing one is zero, and says nothing
             value += float(config.feature_weight) * (g["features"][k] @ feature - 1.0)
         joint.append(value)
     return np.array(joint), np.array(determinant), np.array(distances_sq)
@@ -241,9 +241,18 @@ def splat(mean, cov, pose, camera, scale, blur):
     return pixel, jacobian @ camera_cov @ jacobian.T + blur * np.eye(2), point, camera_cov
 
 
+def plane_depth(pixel, point, normal, reach, camera):
+    """Depth at a pixel of the plane through a camera-frame point, kept within `reach` of the point's own."""
+    ray = np.append((pixel - np.asarray(camera.center, float)) / np.asarray(camera.focal, float), 1.0)
+    # In inverse depth: beyond its horizon a plane is infinitely far, not behind the camera.
+    # A plane that is seen at a grazing angle (cosine below .1) has its mean's depth everywhere.
+    is_grazing = abs(normal @ point) <= 0.1 * np.linalg.norm(point)
+    inverse = 1 / point[2] if is_grazing else (normal @ ray) / (normal @ point)
+    return 1 / np.clip(inverse, 1 / (point[2] + reach), 1 / max(point[2] - reach, 0.1 * point[2]))
+
+
 def render(g, values, pose, camera, config):
     """Every Gaussian at every pixel, nearest first, no tiles: values, alpha, mean and standard deviation of depth."""
-    focal, center = np.asarray(camera.focal, float), np.asarray(camera.center, float)
     shape = camera.height, camera.width
     light, image, alpha, depth = np.ones(shape), np.zeros((*shape, values.shape[1])), np.zeros(shape), np.zeros(shape)
     depth_sq, scale, radius = np.zeros(shape), float(config.covariance_scale), float(config.radius)
@@ -260,12 +269,7 @@ def render(g, values, pose, camera, config):
                 if distance_sq > radius**2:
                     continue
                 weight = light[row, column] * float(config.opacity) * np.exp(-0.5 * distance_sq)
-                ray = np.array([(column - center[0]) / focal[0], (row - center[1]) / focal[1], 1.0])
-                # In inverse depth: beyond its horizon a plane is infinitely far, not behind the camera.
-                # A plane that is seen at a grazing angle (cosine below .1) has its mean's depth everywhere.
-                is_grazing = abs(normal @ point) <= 0.1 * np.linalg.norm(point)
-                inverse = 1 / point[2] if is_grazing else (normal @ ray) / (normal @ point)
-                z = 1 / np.clip(inverse, 1 / (point[2] + reach), 1 / max(point[2] - reach, 0.1 * point[2]))
+                z = plane_depth(np.array([column, row]), point, normal, reach, camera)
                 image[row, column] += weight * values[k]
                 depth[row, column] += weight * z
                 depth_sq[row, column] += weight * z**2
@@ -278,7 +282,7 @@ def render(g, values, pose, camera, config):
 
 def refine(g, weight, candidates, pose, camera, config):
     """Eq. 5 and 6: {row: (mean, cov, normal, colour, weight)} of the map Gaussians that change, and who is fresh."""
-    scale, blur = float(config.render.covariance_scale), float(config.render.blur)
+    scale, blur, radius = (float(x) for x in (config.render.covariance_scale, config.render.blur, config.render.radius))
     _, _, depth, _ = render(g, g["colors"], pose, camera, config.render)
 
     def seen(h):
@@ -288,24 +292,35 @@ def refine(g, weight, candidates, pose, camera, config):
                 pixel, cov_2d, point, cov = splat(h["means"][k], h["covs"][k], pose, camera, scale, blur)
                 column, row = np.round(pixel).astype(int)
                 is_inside = 0 <= column < camera.width and 0 <= row < camera.height
-                found[k] = pixel, cov_2d, point[2], np.sqrt(cov[2, 2]), depth[row, column] if is_inside else 0.0
+                found[k] = pixel, cov_2d, point, np.sqrt(cov[2, 2]), depth[row, column] if is_inside else 0.0
         return found
 
     known = seen(g)
-    visible = [k for k, (*_, z, std, d) in known.items() if d > 0 and z <= d + float(config.render.radius) * std]
+    visible = [k for k, (*_, point, std, d) in known.items() if d > 0 and point[2] <= d + radius * std]
     shares, is_fresh = {}, np.array(candidates["valid"])
-    for j, (pixel, cov_2d, z, _, d) in seen(candidates).items():
+    is_within = lambda z, d: -config.front_margin <= z / d - 1 <= config.back_margin  # noqa: E731
+
+    def agree(j, k, pixel, z):
+        """One surface: alike normals, and with `pairs` the candidate near the plane of the map's Gaussian."""
+        _, _, point, std, _ = known[k]
+        plane = plane_depth(pixel, point, pose[:3, :3].T @ g["normals"][k], radius * std, camera)
+        is_alike = g["normals"][k] @ candidates["normals"][j] >= config.min_normal_cos
+        return is_alike and (config.depth_condition == 0 or is_within(z, plane))
+
+    for j, (pixel, cov_2d, (*_, z), _, d) in seen(candidates).items():
         if np.sqrt(np.trace(cov_2d) / scale) > config.max_splat_std:
             is_fresh[j] = False
             continue
-        if d == 0 or not -config.front_margin <= z / d - 1 <= config.back_margin:
+        if d == 0 or not is_within(z, d):
             continue
         nearest = sorted(visible, key=lambda k, at=pixel: np.linalg.norm(known[k][0] - at))[: config.num_candidates]
+        nearest = [k for k in nearest if agree(j, k, pixel, z)]
         offsets = [known[k][0] - pixel for k in nearest]
         distances_sq = [o @ np.linalg.inv(known[k][1] + cov_2d) @ o for k, o in zip(nearest, offsets, strict=True)]
         exponent = np.exp(-0.5 * np.array(distances_sq))
         for k, distance_sq, omega in zip(nearest, distances_sq, exponent / exponent.sum(), strict=True):
-            omega *= max(g["features"][k] @ candidates["features"][j], 0.0) if g["features"].shape[1] else 1.0
+            features = g["features"][k], candidates["features"][j]
+            omega *= max(np.dot(*features), 0.0) if all(f.any() for f in features) else 1.0
             if distance_sq < config.max_mahalanobis_sq_2d and omega > 0:
                 shares.setdefault(k, []).append((j, omega))
                 is_fresh[j] = False

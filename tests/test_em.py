@@ -149,6 +149,30 @@ def test_features_of_width_zero_are_as_good_as_a_zero_weight(opened):
     np.testing.assert_allclose(without.responsibilities, unweighted.responsibilities, atol=1e-6)
 
 
+@pytest.mark.parametrize("missing", ["points", "gaussians"])
+def test_a_missing_feature_says_nothing(paper, missing):
+    """Every other point or Gaussian without a feature: there the term is 0, elsewhere what it was."""
+    config = changed(paper, max_mahalanobis_sq=60.0, max_log_gap=20.0)
+    points, gaussians = POINTS, GAUSSIANS
+    blank = lambda x: x.features * (jnp.arange(x.valid.shape[0]) % 2)[:, None]  # noqa: E731
+    if missing == "points":
+        points = eqx.tree_at(lambda o: o.features, points, blank(points))
+    else:
+        gaussians = eqx.tree_at(lambda g: g.features, gaussians, blank(gaussians))
+    step, best = estep(gaussians, points, QUIET, config)
+    known, _ = estep(GAUSSIANS, POINTS, QUIET, config)
+    without, best_without = estep(GAUSSIANS, POINTS, QUIET, changed(config, feature_weight=0.0))
+    expected, is_fused, joint = reference.e_step(
+        *arrays(points), np.asarray(QUIET), np.ones(M, bool), as_numpy(gaussians), config
+    )
+    np.testing.assert_array_equal(step.is_fused, is_fused)
+    np.testing.assert_allclose(dense(step), expected, atol=1e-3)  # exponents near 60 lose 1e-5 each in float32
+    if missing == "points":
+        np.testing.assert_allclose(best[::2], best_without[::2], atol=1e-5)
+        assert_same(*(jax.tree.map(lambda x: x[1::2], s) for s in (step, known)))
+    assert 0 < is_fused.sum() < M
+
+
 def test_noise_along_the_ray_widens_the_gaussian_by_its_outer_product():
     offsets = jnp.asarray(np.random.default_rng(0).normal(size=(M, 5, 3)) * 0.2, jnp.float32)
     covs = np.asarray(random_gaussians(M * 5).covs, float).reshape(M, 5, 3, 3)

@@ -281,6 +281,16 @@ def test_a_tracked_frame_is_nearer_to_the_truth_and_its_points_are_in_the_world(
     np.testing.assert_allclose([info.step_m, info.step_rad], step, atol=1e-4)
 
 
+def test_depths_that_repeat_exactly_do_not_hold_a_wrong_pose(camera, submap, lenient):
+    """A prior that keeps the depth of an image repeats it to the bit, which says nothing of the pose between two."""
+    settings = at(lenient, "icp.prior_information", 30.0)
+    coarse = coarse_of(nudged(camera), camera, settings)
+    coarse = eqx.tree_at(lambda c: c.repeat_rms, coarse, jnp.zeros(()))
+    T, _, info = fine_step(nudged(camera).current, submap, coarse, settings)
+    assert info.is_tracked
+    assert pose_error(T, path_pose(FRAME))[0] < 0.6 * pose_error(coarse.T_world_camera, path_pose(FRAME))[0]
+
+
 def small_prediction(camera):
     """A prediction that is 4 % too small, which no coarse scale mends."""
     return predict_room(FRAME, camera, scale=0.96)
@@ -348,14 +358,15 @@ def test_an_empty_submap_is_too_few_points_that_agree(camera, submap, lenient):
     assert_same(T, coarse.T_world_camera)
 
 
-def test_a_single_untextured_wall_does_not_determine_the_pose(camera, submap, lenient, config):
+@pytest.mark.parametrize("residual", [0, 1, 2])
+def test_a_single_untextured_wall_does_not_determine_the_pose(camera, submap, lenient, config, residual):
     """With the configured limit; the room's other walls and all colour are taken away."""
     wall = submap.normals[:, 2] < -0.99
     flat = wall, jnp.full((192, 3), 0.5), jnp.tile(jnp.array([0.0, 0, -1]), (192, 1))
     plain = eqx.tree_at(lambda g: (g.valid, g.colors, g.normals), submap, flat)
     prediction = predict_room(FRAME, camera)
     grey = eqx.tree_at(lambda p: p.current.colors, prediction, jnp.full((768, 3), 0.5))
-    settings = at(at(lenient, "min_eigenvalue", config().localization.min_eigenvalue), "icp.residual", 0)
+    settings = at(at(lenient, "min_eigenvalue", config().localization.min_eigenvalue), "icp.residual", residual)
     coarse, T, _, info = fine_of(grey, plain, camera, settings)
     assert int(info.reason) & 16 and not info.is_tracked
     assert_same(T, coarse.T_world_camera)

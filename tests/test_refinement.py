@@ -97,6 +97,7 @@ def test_two_candidates_on_one_gaussian_count_as_much_as_the_better_of_them(sett
 READINGS = {
     "printed": {"back_margin": np.inf, "max_mahalanobis_sq_2d": 4.6, "average.gain": 0.0},
     "default": {"back_margin": 0.1, "front_margin": 0.1, "max_splat_std": 3.0, "average.gain": 1.0},
+    "pairs": {"depth_condition": 1.0, "back_margin": 0.03, "front_margin": 0.02, "min_normal_cos": 0.95},
     "narrow": {"max_mahalanobis_sq_2d": 1.0, "back_margin": 0.1, "front_margin": 0.05, "average.forgetting": 0.7},
 }
 
@@ -152,6 +153,52 @@ def test_the_margins_say_how_far_in_front_and_behind_may_still_merge(settings, c
         config = at(at(settings, "front_margin", front), "back_margin", back)
         _, fresh, info = run(config, camera, discs((0.02, 0.0, z)))
         assert info.num_merged == expected and fresh.valid.sum() == 1 - expected, (z, front, back)
+
+
+def test_candidates_beside_a_depth_edge_do_not_move_what_is_before_them(settings, camera):
+    """A front at 1 m that ends at x = 0, a wall at 3 m behind it, and exact candidates of the wall beside the edge.
+
+    The depth at a candidate's own pixel is the wall's, but its nearest splats are those of the front: as printed they
+    merge.
+    """
+    front = [(x, y, 1.0) for x in np.arange(-0.6, 0.0, 0.1) for y in np.arange(-0.4, 0.41, 0.1)]
+    wall = [(x, y, 3.0) for x in np.arange(0.1, 1.6, 0.3) for y in np.arange(-1.2, 1.21, 0.3)]
+    covs = jnp.concatenate([discs(front, 0.05).covs, discs(wall, 0.15).covs])
+    old = eqx.tree_at(lambda g: g.covs, discs(front + wall), covs)
+    new = discs([(x, 0.0, 3.0) for x in (0.1, 0.2, 0.3, 0.4, 0.5)], std=0.1)
+    is_front = np.arange(len(front) + len(wall)) < len(front)
+
+    def moved(config):
+        merged, _, info = run(config, camera, new, old)
+        return np.linalg.norm(merged.gaussians.means - old.means, axis=1)[is_front].max(), int(info.num_merged)
+
+    printed, _ = moved(at(settings, "max_mahalanobis_sq_2d", 9.0))
+    assert printed > 0.1
+    paired = at(at(at(settings, "max_mahalanobis_sq_2d", 9.0), "depth_condition", 1.0), "front_margin", 0.1)
+    distance, num_merged = moved(at(paired, "back_margin", 0.1))
+    assert distance == 0 and num_merged > 0
+
+
+def test_pairs_whose_normals_differ_do_not_merge(settings, camera):
+    turned = eqx.tree_at(lambda g: g.normals, discs((0.02, 0, 2.0)), jnp.array([[0.8, 0.0, -0.6]]))
+    for least, expected in ((0.5, 1), (0.7, 0), (-np.inf, 1)):
+        _, _, info = run(at(settings, "min_normal_cos", least), camera, turned)
+        assert info.num_merged == expected
+
+
+@pytest.mark.parametrize("missing", ["candidate", "map"])
+def test_where_a_feature_is_missing_it_says_nothing(settings, camera, missing):
+    """As if both were the same: unlabelled pixels are no other surface."""
+    old, new = discs(GRID), discs((0.02, 0.01, 2.01))
+    expected, _, _ = run(settings, camera, new, old)
+    nothing = jnp.zeros((1 if missing == "candidate" else len(GRID), 2))
+    if missing == "candidate":
+        new = eqx.tree_at(lambda g: g.features, new, nothing)
+    else:
+        old = eqx.tree_at(lambda g: g.features, old, nothing)
+    merged, _, info = run(settings, camera, new, old)
+    assert info.num_merged == 1
+    np.testing.assert_array_equal(merged.gaussians.means, expected.gaussians.means)
 
 
 def test_the_distance_gate_is_on_the_squared_distance_under_both_covariances(settings, camera):

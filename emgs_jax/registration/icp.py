@@ -1,5 +1,7 @@
 """ICP against Gaussians as one Levenberg–Marquardt solve."""
 
+from typing import TypeAlias
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,8 +17,9 @@ from emgs_jax.ops.neighbours import knn
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, static, traced
 from emgs_jax.registration.matching import Candidates, Matches, Surface, match, surface_of
-from emgs_jax.registration.rigid import median
+from emgs_jax.registration.rigid import robust_std
 
+Noise: TypeAlias = tuple[Float[Array, ""], Float[Array, ""]]  # of the coarse pose in m, and of the depth over itself
 RESIDUALS = ("colored", "distribution", "colored+distribution")
 COLORED, DISTRIBUTION = 0, 1
 
@@ -30,6 +33,8 @@ class IcpConfig(eqx.Module):
             the Gaussian's covariance; or `colored+distribution`: offset and intensity difference.
         color_std: standard deviation of intensity.
         noise: factor on the points' noise along their viewing rays, which widens every Gaussian for them.
+        max_misfit: m; a point farther from its Gaussian's plane shows something else, and says nothing of the noise;
+            0 takes the noise as it is given.
         max_mahalanobis_sq: a point farther from all its neighbours than this is no inlier.
         min_normal_cos: nor one whose normal differs more from its Gaussian's.
         num_effective: how many independent measurements the points are worth: their errors are correlated.
@@ -48,6 +53,7 @@ class IcpConfig(eqx.Module):
     residual: Float[Array, "*b"] = choice(*RESIDUALS)
     color_std: Float[Array, "*b"] = traced()
     noise: Float[Array, "*b"] = traced()
+    max_misfit: Float[Array, "*b"] = traced()
     max_mahalanobis_sq: Float[Array, "*b"] = traced()
     min_normal_cos: Float[Array, "*b"] = traced()
     num_effective: Float[Array, "*b"] = traced()
@@ -68,8 +74,9 @@ class IcpInfo(eqx.Module):
         num_inliers: points with a Gaussian that passes the gates.
         inlier_fraction: of the points that take part.
         residual: m; root mean square distance of the inliers to their Gaussians' planes.
-        misfit: m; the same distance of all points, as 1.4826 times the median, a robust standard deviation.
-        min_eigenvalue: smallest eigenvalue of the data's Hessian per effective point (1/m² and 1/rad²).
+        misfit: m; how far the points are from the map: `robust_std` of the same distance within `max_misfit`.
+        min_eigenvalue: smallest eigenvalue of what planes and colours say of the pose, per effective point (1/m² and
+            1/rad²). Offsets from means do not count: the mean of a Gaussian is no landmark of its surface.
         num_steps: of all solves.
         is_converged: False where the last solve reached `max_steps` or failed.
     """
@@ -87,30 +94,23 @@ class _Problem(eqx.Module):
     """What stays the same while the pose moves; lengths in metres."""
 
     source: Observation  # camera frame
-    rays: Float[Array, "p 3"]  # noise of every point along its viewing ray, camera frame
     surface: Surface
     T_world_coarse: jaxlie.SE3
+    rays: Float[Array, "p 3"]  # noise of every point along its viewing ray, camera frame
     scale_std: Float[Array, ""]
     prior: Float[Array, "7"]  # 1 / standard deviation of xi and of the scale's parameter
 
 
 def _pose_problem(
-    source: Observation,
-    target: Gaussians,
-    T_world_coarse: jaxlie.SE3,
-    noise: tuple[Float[Array, ""], Float[Array, ""]],
-    config: IcpConfig,
-    white: Whitening | None,
+    source: Observation, surface: Surface, T_world_coarse: jaxlie.SE3, noise: Noise, config: IcpConfig
 ) -> _Problem:
     pose_noise, depth_noise = noise
-    stride = max(source.valid.shape[0] // config.num_points, 1)
-    source = jax.tree.map(lambda leaf: leaf[::stride], source)
     prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack([pose_noise, depth_noise]), 3)
     return _Problem(
         source=source,
-        rays=config.noise * depth_noise * source.points,
-        surface=surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, white),
+        surface=surface,
         T_world_coarse=T_world_coarse,
+        rays=config.noise * depth_noise * source.points,
         scale_std=config.scale_noise * depth_noise,
         prior=jnp.append(prior, 1.0),
     )
@@ -128,23 +128,37 @@ def _search(y: Float[Array, "7"], problem: _Problem, config: IcpConfig) -> Candi
     return knn(transform(T, problem.source, scale).points, target.means, target.valid, config.num_neighbours)
 
 
+def _match(y: Float[Array, "7"], candidates: Candidates, problem: _Problem, config: IcpConfig) -> Matches:
+    """The Gaussian of every point at y."""
+    T, scale = _pose(y, problem)
+    placed, noise = transform(T, problem.source, scale), problem.rays @ T.rotation().as_matrix().T
+    return match(placed, noise, candidates, problem.surface, (config.max_mahalanobis_sq, config.min_normal_cos))
+
+
+def _distances(
+    y: Float[Array, "7"], matches: Matches, problem: _Problem, config: IcpConfig
+) -> tuple[Float[Array, "p"], Float[Array, ""]]:
+    """Of every point to the plane of its Gaussian, in metres, and their robust standard deviation."""
+    T, scale = _pose(y, problem)
+    placed = transform(T, problem.source, scale)
+    distance = jnp.sum((placed.points - matches.means) * matches.normals, axis=-1)
+    return distance, robust_std(distance, placed.valid & (jnp.abs(distance) <= config.max_misfit))
+
+
 def _residuals(
     y: Float[Array, "7"], args: tuple[Candidates, _Problem, IcpConfig]
-) -> tuple[tuple[Float[Array, "p 5"], Float[Array, "7"]], tuple[Matches, Float[Array, "p 5 7"]]]:
-    """Rows of every point and of the prior, in standard deviations; beside them the matches and the rows' derivative.
+) -> tuple[tuple[Float[Array, "p 5"], Float[Array, "7"]], Matches]:
+    """Rows of every point and of the prior, in standard deviations; beside them the matches.
 
     The matches carry no gradient. The derivative is made here, once, and the solver gets rows that are linear in y:
     otherwise each of its uses of the derivative would be compiled, and computed, anew.
     """
     candidates, problem, config = args
     fixed = jax.lax.stop_gradient(y)
-    T, scale = _pose(fixed, problem)
-    placed, noise = transform(T, problem.source, scale), problem.rays @ T.rotation().as_matrix().T
-    gates = config.max_mahalanobis_sq, config.min_normal_cos
-    matches = jax.lax.stop_gradient(match(placed, noise, candidates, problem.surface, gates))
+    matches = jax.lax.stop_gradient(_match(fixed, candidates, problem, config))
     jacobian = jax.lax.stop_gradient(jax.jacfwd(_rows)(fixed, matches, problem, config))
     rows = _rows(fixed, matches, problem, config) + jacobian @ (y - fixed)
-    return (rows, problem.prior * y), (matches, jacobian)
+    return (rows, problem.prior * y), matches
 
 
 def _rows(y: Float[Array, "7"], matches: Matches, problem: _Problem, config: IcpConfig) -> Float[Array, "p 5"]:
@@ -178,7 +192,7 @@ def icp(
     source: Observation,
     target: Gaussians,
     T_world_coarse: jaxlie.SE3,
-    noise: tuple[Float[Array, ""], Float[Array, ""]],
+    noise: Noise,
     config: IcpConfig,
     white: Whitening | None = None,
 ) -> tuple[jaxlie.SE3, Float[Array, ""], IcpInfo]:
@@ -188,6 +202,9 @@ def icp(
     as `num_effective` independent ones. The prior holds xi at 0 with `prior_information`, and the scale s of the
     points about the camera at 1 with `scale_noise`: the predictions of one call share an error of scale, and only the
     map remembers the scale of the calls before.
+
+    `noise` is a lower bound: where the points do not fit the map at the coarse pose as well as that, the pose and the
+    depths are worth no more than they fit. A prior may repeat itself exactly and still err.
 
     Args:
         source: points to align, camera frame.
@@ -200,36 +217,60 @@ def icp(
     Returns:
         T_world_camera, the scale, and what the solve found.
     """
-    problem = _pose_problem(source, target, T_world_coarse, noise, config, white)
+    stride = max(source.valid.shape[0] // config.num_points, 1)
+    source = jax.tree.map(lambda leaf: leaf[::stride], source)
+    surface = surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, white)
     # Seven unknowns: on a CPU the normal equations take a fraction of a QR of all rows.
     solver = optx.LevenbergMarquardt(
         rtol=config.tolerance, atol=config.tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
     )
 
-    def search_and_solve(y: Float[Array, "7"], _: None) -> tuple[Float[Array, "7"], tuple]:
-        args = _search(y, problem, config), problem, config
+    def search_and_solve(carry: tuple[Float[Array, "7"], Noise], is_first: Bool[Array, ""]) -> tuple[tuple, tuple]:
+        y, noise = carry
+        problem = _pose_problem(source, surface, T_world_coarse, noise, config)
+        candidates = _search(y, problem, config)
+        misfit = _distances(y, _match(y, candidates, problem, config), problem, config)[1]
+        factor = jnp.where(is_first, jnp.maximum(misfit / noise[0], 1.0), 1.0)
+        noise = noise[0] * factor, noise[1] * factor
+        args = candidates, _pose_problem(source, surface, T_world_coarse, noise, config), config
         solution = optx.least_squares(
             _residuals, solver, y, args, has_aux=True, max_steps=config.max_steps, throw=False
         )
         y = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, y)
         # Not `solution.aux`, which lags one accepted step behind.
-        return y, (solution.state.aux, solution.stats["num_steps"], solution.result == optx.RESULTS.successful)
+        is_converged = solution.result == optx.RESULTS.successful
+        return (y, noise), (solution.state.aux, solution.stats["num_steps"], is_converged)
 
-    y, rounds = jax.lax.scan(search_and_solve, jnp.zeros(7), length=config.num_searches)
-    (matches, jacobian), _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
+    start = jnp.zeros(7), noise
+    (y, noise), rounds = jax.lax.scan(search_and_solve, start, jnp.arange(config.num_searches) == 0)
+    matches, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
+    problem = _pose_problem(source, surface, T_world_coarse, noise, config)
     T, scale = _pose(y, problem)
-    placed = transform(T, problem.source, scale)
+    distance, misfit = _distances(y, matches, problem, config)
     num_inliers = jnp.sum(matches.is_inlier)
-    distance = jnp.sum((placed.points - matches.means) * matches.normals, axis=-1)
-    jacobian = jacobian.reshape(-1, 7)[:, :6]
-    hessian = jacobian.T @ jacobian / jnp.maximum(config.num_effective, 1.0)
     info = IcpInfo(
         num_inliers=num_inliers,
-        inlier_fraction=num_inliers / jnp.maximum(jnp.sum(placed.valid), 1),
+        inlier_fraction=num_inliers / jnp.maximum(jnp.sum(source.valid), 1),
         residual=jnp.sqrt(jnp.sum(jnp.where(matches.is_inlier, distance, 0.0) ** 2) / jnp.maximum(num_inliers, 1)),
-        misfit=1.4826 * median(jnp.abs(distance), placed.valid),
-        min_eigenvalue=jnp.linalg.eigvalsh(hessian)[0],
+        misfit=misfit,
+        min_eigenvalue=jnp.linalg.eigvalsh(_information(T, scale, matches, problem, config))[0],
         num_steps=jnp.sum(rounds[1]),
         is_converged=is_converged,
     )
     return T, scale, info
+
+
+def _information(
+    T: jaxlie.SE3, scale: Float[Array, ""], matches: Matches, problem: _Problem, config: IcpConfig
+) -> Float[Array, "6 6"]:
+    """What planes and colours of the inliers say of the pose, per point: Σ j j' / p with j = (a, x × a) / std.
+
+    a is the normal, or the gradient of the intensity, and x the point, both in the camera's axes.
+    """
+    points, to_camera = scale * problem.source.points, T.rotation().as_matrix()
+    normals, gradients = matches.normals @ to_camera, matches.gradients @ to_camera
+    has_color = config.residual != DISTRIBUTION
+    axes = jnp.concatenate([normals / matches.plane_std[:, None], has_color * gradients / config.color_std])
+    rows = jnp.concatenate([axes, jnp.cross(jnp.concatenate([points, points]), axes)], axis=-1)
+    rows = jnp.where(jnp.concatenate([matches.is_inlier] * 2)[:, None], rows, 0.0)
+    return rows.T @ rows / jnp.maximum(jnp.sum(problem.source.valid), 1)

@@ -26,7 +26,7 @@ class Splats(eqx.Module):
     means: Float[Array, "n 2"]  # pixels
     covs: Float[Array, "n 2 2"]  # pixels²
     precisions: Float[Array, "n 2 2"]  # 1/pixels²
-    depth: Float[Array, "n"]  # camera-space z of the mean, m
+    depth: Float[Array, "n"]  # camera-space z of the mean, m; 1 where invalid, for finite gradients
     depth_std: Float[Array, "n"]  # standard deviation of z over the Gaussian, m
     inverse_depth: Float[Array, "n"]  # 1/m
     depth_slope: Float[Array, "n 2"]  # 1/m per pixel
@@ -74,7 +74,7 @@ def project_gaussians(
         means=means,
         covs=covs_2d,
         precisions=inverse_2x2(covs_2d),
-        depth=depth,
+        depth=z,
         depth_std=jnp.sqrt(jnp.maximum(covs[:, 2, 2], 1e-12)),
         inverse_depth=1.0 / z,
         depth_slope=jnp.where((is_flat & valid)[:, None], slope, 0.0),

@@ -132,6 +132,17 @@ def test_invalid_rows_change_no_pixel(camera, render_config, image, poison):
     assert_images_equal(draw(padded, padded.colors, T, camera, render_config), image, 2e-5)  # order of sums
 
 
+def test_a_free_row_where_the_camera_is_leaves_the_gradient_of_the_pose_finite(camera, render_config):
+    """Free rows are at the origin; a camera there is at depth 0 of them."""
+    free = eqx.tree_at(lambda g: (g.valid, g.means), GAUSSIANS, (jnp.arange(24) > 3, GAUSSIANS.means.at[:4].set(0.0)))
+
+    def total(shift):
+        drawn = render(free, free.colors, pose(translation=shift), camera, render_config)
+        return jnp.sum(drawn.values) + jnp.sum(drawn.depth) + jnp.sum(drawn.depth_std)
+
+    assert jnp.all(jnp.isfinite(jax.grad(total)(jnp.zeros(3))))
+
+
 def test_a_nearer_gaussian_hides_what_is_behind_it(camera, render_config):
     config = at(render_config, "opacity", 1.0)
     near, far = single((0.0, 0.0, 1.0), (0, 0, -1), 0.3), single((0.0, 0.0, 2.0), (0, 0, -1), 0.6)
