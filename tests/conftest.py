@@ -1,6 +1,7 @@
 """Shared by all tests of the core: shapes and types checked at every call, one small config, one small camera."""
 
 import os
+from collections import Counter
 from importlib.metadata import version
 from pathlib import Path
 
@@ -28,6 +29,12 @@ CHECKED = [path for path in sorted(PACKAGE.rglob("*.py")) if "from jaxtyping imp
 install_import_hook(
     [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in CHECKED], "beartype.beartype"
 )
+
+
+def pytest_collection_modifyitems(items):
+    """Files with most slow tests first: a long one at the end would leave the other processes without work."""
+    num_slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -num_slow[item.path])
 
 
 @pytest.fixture(scope="session")
