@@ -302,7 +302,7 @@ def test_many_points_are_taken_in_parts_which_changes_no_sum(opened, monkeypatch
     step_parts, best_parts = in_parts(e_step)(GAUSSIANS, POINTS, NOISE, opened)
     new_parts, total_parts = in_parts(m_step)(GAUSSIANS, POINTS, step_parts, opened)
     np.testing.assert_array_equal(step_parts.rows, step.rows)
-    np.testing.assert_allclose(best_parts, best, rtol=1e-6)
+    np.testing.assert_allclose(best_parts, best, rtol=1e-6, atol=1e-5)  # sums of terms near 50
     np.testing.assert_allclose(total_parts, total, atol=1e-5)  # roundings, here and below
     for name in ("means", "covs", "normals", "colors"):
         np.testing.assert_allclose(getattr(new_parts, name), getattr(new, name), atol=1e-5)

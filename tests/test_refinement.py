@@ -97,7 +97,7 @@ def test_two_candidates_on_one_gaussian_count_as_much_as_the_better_of_them(sett
 READINGS = {
     "printed": {"back_margin": np.inf, "max_mahalanobis_sq_2d": 4.6, "average.gain": 0.0},
     "default": {"back_margin": 0.1, "front_margin": 0.1, "max_splat_std": 3.0, "average.gain": 1.0},
-    "pairs": {"depth_condition": 1.0, "back_margin": 0.03, "front_margin": 0.02, "min_normal_cos": 0.95},
+    "pairs": {"depth_condition": 1.0, "back_margin": 0.1, "front_margin": 0.05, "min_normal_cos": 0.9},
     "narrow": {"max_mahalanobis_sq_2d": 1.0, "back_margin": 0.1, "front_margin": 0.05, "average.forgetting": 0.7},
 }
 

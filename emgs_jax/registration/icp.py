@@ -1,5 +1,6 @@
 """ICP against Gaussians as one Levenberg–Marquardt solve."""
 
+from collections.abc import Callable
 from typing import TypeAlias
 
 import equinox as eqx
@@ -17,9 +18,10 @@ from emgs_jax.ops.neighbours import knn
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, static, traced
 from emgs_jax.registration.matching import Candidates, Matches, Surface, match, surface_of
-from emgs_jax.registration.rigid import robust_std
+from emgs_jax.registration.rigid import median
 
-Noise: TypeAlias = tuple[Float[Array, ""], Float[Array, ""]]  # of the coarse pose in m, and of the depth over itself
+Noise: TypeAlias = tuple[Float[Array, ""], Float[Array, ""]]  # standard deviations in m, and in rad or over the depth
+_Carry: TypeAlias = tuple[Float[Array, "7"], Noise, Float[Array, ""]]  # unknowns, noise of the coarse pose, of depths
 RESIDUALS = ("colored", "distribution", "colored+distribution")
 COLORED, DISTRIBUTION = 0, 1
 
@@ -74,7 +76,8 @@ class IcpInfo(eqx.Module):
         num_inliers: points with a Gaussian that passes the gates.
         inlier_fraction: of the points that take part.
         residual: m; root mean square distance of the inliers to their Gaussians' planes.
-        misfit: m; how far the points are from the map: `robust_std` of the same distance within `max_misfit`.
+        misfit: m; the same distance of all points within `max_misfit`, as 1.4826 times the median, a robust standard
+            deviation; 0 without any.
         min_eigenvalue: smallest eigenvalue of what planes and colours say of the pose, per effective point (1/m² and
             1/rad²). Offsets from means do not count: the mean of a Gaussian is no landmark of its surface.
         num_steps: of all solves.
@@ -102,10 +105,14 @@ class _Problem(eqx.Module):
 
 
 def _pose_problem(
-    source: Observation, surface: Surface, T_world_coarse: jaxlie.SE3, noise: Noise, config: IcpConfig
+    source: Observation,
+    surface: Surface,
+    T_world_coarse: jaxlie.SE3,
+    pose_noise: Noise,
+    depth_noise: Float[Array, ""],
+    config: IcpConfig,
 ) -> _Problem:
-    pose_noise, depth_noise = noise
-    prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack([pose_noise, depth_noise]), 3)
+    prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack(pose_noise), 3)
     return _Problem(
         source=source,
         surface=surface,
@@ -138,11 +145,12 @@ def _match(y: Float[Array, "7"], candidates: Candidates, problem: _Problem, conf
 def _distances(
     y: Float[Array, "7"], matches: Matches, problem: _Problem, config: IcpConfig
 ) -> tuple[Float[Array, "p"], Float[Array, ""]]:
-    """Of every point to the plane of its Gaussian, in metres, and their robust standard deviation."""
+    """Of every point to the plane of its Gaussian, in metres, and the misfit."""
     T, scale = _pose(y, problem)
     placed = transform(T, problem.source, scale)
     distance = jnp.sum((placed.points - matches.means) * matches.normals, axis=-1)
-    return distance, robust_std(distance, placed.valid & (jnp.abs(distance) <= config.max_misfit))
+    is_near = placed.valid & (jnp.abs(distance) <= config.max_misfit)
+    return distance, jnp.where(jnp.any(is_near), 1.4826 * median(jnp.abs(distance), is_near), 0.0)
 
 
 def _residuals(
@@ -187,6 +195,29 @@ def _rows(y: Float[Array, "7"], matches: Matches, problem: _Problem, config: Icp
     return share * jnp.where(valid[:, None], rows, 0.0)
 
 
+def _search_and_solve(
+    carry: _Carry, is_first: Bool[Array, ""], problem_of: Callable[..., _Problem], noise: Noise, config: IcpConfig
+) -> tuple[_Carry, tuple[Matches, Int[Array, ""], Bool[Array, ""]]]:
+    """Look up the Gaussians near every point, see how well the points fit them, and solve for y from there."""
+    y, pose_noise, depth_noise = carry
+    problem = problem_of(pose_noise, depth_noise)
+    candidates = _search(y, problem, config)
+    _, misfit = _distances(y, _match(y, candidates, problem, config), problem, config)
+    factor = jnp.maximum(misfit / noise[0], 1.0)
+    worse = jnp.where(is_first, factor, 1.0)  # y is the coarse pose at first
+    pose_noise, depth_noise = (pose_noise[0] * worse, pose_noise[1] * worse), noise[1] * factor
+    # Seven unknowns: on a CPU the normal equations take a fraction of a QR of all rows.
+    solver = optx.LevenbergMarquardt(
+        rtol=config.tolerance, atol=config.tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
+    )
+    args = candidates, problem_of(pose_noise, depth_noise), config
+    solution = optx.least_squares(_residuals, solver, y, args, has_aux=True, max_steps=config.max_steps, throw=False)
+    y = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, y)
+    is_converged = solution.result == optx.RESULTS.successful
+    # Not `solution.aux`, which lags one accepted step behind.
+    return (y, pose_noise, depth_noise), (solution.state.aux, solution.stats["num_steps"], is_converged)
+
+
 @full_precision
 def icp(
     source: Observation,
@@ -203,8 +234,9 @@ def icp(
     points about the camera at 1 with `scale_noise`: the predictions of one call share an error of scale, and only the
     map remembers the scale of the calls before.
 
-    `noise` is a lower bound: where the points do not fit the map at the coarse pose as well as that, the pose and the
-    depths are worth no more than they fit. A prior may repeat itself exactly and still err.
+    `noise` is a lower bound. Where the points do not fit the map at the coarse pose as well as that, the coarse pose is
+    worth no more than they fit there, and the depths no more than they fit where they are looked up: a prior may repeat
+    itself exactly and still err.
 
     Args:
         source: points to align, camera frame.
@@ -220,31 +252,17 @@ def icp(
     stride = max(source.valid.shape[0] // config.num_points, 1)
     source = jax.tree.map(lambda leaf: leaf[::stride], source)
     surface = surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, white)
-    # Seven unknowns: on a CPU the normal equations take a fraction of a QR of all rows.
-    solver = optx.LevenbergMarquardt(
-        rtol=config.tolerance, atol=config.tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
-    )
 
-    def search_and_solve(carry: tuple[Float[Array, "7"], Noise], is_first: Bool[Array, ""]) -> tuple[tuple, tuple]:
-        y, noise = carry
-        problem = _pose_problem(source, surface, T_world_coarse, noise, config)
-        candidates = _search(y, problem, config)
-        misfit = _distances(y, _match(y, candidates, problem, config), problem, config)[1]
-        factor = jnp.where(is_first, jnp.maximum(misfit / noise[0], 1.0), 1.0)
-        noise = noise[0] * factor, noise[1] * factor
-        args = candidates, _pose_problem(source, surface, T_world_coarse, noise, config), config
-        solution = optx.least_squares(
-            _residuals, solver, y, args, has_aux=True, max_steps=config.max_steps, throw=False
-        )
-        y = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, y)
-        # Not `solution.aux`, which lags one accepted step behind.
-        is_converged = solution.result == optx.RESULTS.successful
-        return (y, noise), (solution.state.aux, solution.stats["num_steps"], is_converged)
+    def problem_of(pose_noise: Noise, depth_noise: Float[Array, ""]) -> _Problem:
+        return _pose_problem(source, surface, T_world_coarse, pose_noise, depth_noise, config)
 
-    start = jnp.zeros(7), noise
-    (y, noise), rounds = jax.lax.scan(search_and_solve, start, jnp.arange(config.num_searches) == 0)
+    def search_and_solve(carry: _Carry, is_first: Bool[Array, ""]) -> tuple[_Carry, tuple]:
+        return _search_and_solve(carry, is_first, problem_of, noise, config)
+
+    start = jnp.zeros(7), noise, noise[1]
+    (y, pose_noise, depth_noise), rounds = jax.lax.scan(search_and_solve, start, jnp.arange(config.num_searches) == 0)
     matches, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
-    problem = _pose_problem(source, surface, T_world_coarse, noise, config)
+    problem = problem_of(pose_noise, depth_noise)
     T, scale = _pose(y, problem)
     distance, misfit = _distances(y, matches, problem, config)
     num_inliers = jnp.sum(matches.is_inlier)

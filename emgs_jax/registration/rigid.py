@@ -33,25 +33,6 @@ def median(values: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, "
     return jnp.where(count > 0, ordered[jnp.maximum(count - 1, 0) // 2], 1.0)
 
 
-def robust_std(values: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
-    """Standard deviation about 0 of the valid values, whatever the larger part of them is; 0 without any.
-
-    1.4826 times the median of |values|, taken again over what lies within 2.5 standard deviations until it settles.
-    The start, from the smallest fifth, holds with three quarters of outliers, where the median of all breaks down at a
-    half (Rousseeuw and Leroy, "Robust regression and outlier detection", 1987).
-    """
-    count = jnp.sum(valid)
-    ordered = jnp.sort(jnp.where(valid, jnp.abs(values), jnp.inf))
-
-    def again(std: Float[Array, ""], _: None) -> tuple[Float[Array, ""], None]:
-        near = jnp.searchsorted(ordered, 2.5 * std, side="right")
-        return 1.4826 * ordered[jnp.maximum(jnp.minimum(near, count) - 1, 0) // 2], None
-
-    start = ordered[jnp.maximum(count - 1, 0) // 5] / 0.2533  # of a Gaussian, a fifth lies within .2533
-    std, _ = jax.lax.scan(again, start, length=8)
-    return jnp.where(count > 0, std, 0.0)
-
-
 @full_precision
 def fit_rigid(
     source: Float[Array, "p 3"], target: Float[Array, "p 3"], weights: Float[Array, "p"]
