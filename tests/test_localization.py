@@ -76,6 +76,18 @@ def test_a_known_scale_is_found_and_the_chain_with_it(wide, printed, kind, readi
     assert result.repeat_rms < 1e-3  # what the scale explains is no disagreement; 10 % of 2 m are not 1 mm
 
 
+def test_a_ratio_is_not_moved_by_wrong_depths_and_a_fit_is(wide, printed):
+    """A fifth of the previous image was seen half as far again: the median does not mind, least squares do."""
+    previous, is_bad = world(FRAME - 1, wide), jnp.arange(80 * 64)[:, None] % 5 == 0
+    from_camera = previous.points - path_pose(FRAME - 1).translation()
+    bad = eqx.tree_at(lambda o: o.points, previous, previous.points + jnp.where(is_bad, 0.5 * from_camera, 0.0))
+    ratio, fit = (
+        coarse_of(predict_room(FRAME, wide, scale=0.9), wide, at(printed, "coarse_scale", SCALES[kind]), bad).scale
+        for kind in ("ratio", "estimated")
+    )
+    assert abs(ratio - 1 / 0.9) < 0.001 < 0.01 < abs(fit - 1 / 0.9)
+
+
 def test_the_printed_form_estimates_no_scale_and_memory_dampens_it(wide, printed):
     prediction = predict_room(FRAME, wide, scale=0.9)
     assert coarse_of(prediction, wide, printed).scale == 1
