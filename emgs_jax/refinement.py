@@ -71,6 +71,14 @@ def match_on_image(
     return rows, mahalanobis_sq(offsets, inverse_2x2(covs)), found
 
 
+def within_margins(
+    depth: Float[Array, "*g"], surface: Float[Array, "*g"], config: RefinementConfig
+) -> Bool[Array, "*g"]:
+    """Whether a depth is the surface's, or in front of it or behind it by no more than the margins."""
+    relative = depth / surface - 1.0
+    return (relative >= -config.front_margin) & (relative <= config.back_margin)
+
+
 def show_one_surface(
     old: Gaussians,
     candidates: Gaussians,
@@ -84,8 +92,9 @@ def show_one_surface(
     def plane_depth(rows: Int[Array, "k"], pixel: Float[Array, "2"]) -> Float[Array, "k"]:
         return splat_depth(take_rows(map_splats, rows), pixel[None], config.render)[:, 0]
 
-    gap = candidate_splats.depth[:, None] / jax.vmap(plane_depth)(rows, candidate_splats.means) - 1.0
-    is_near = (gap >= -config.front_margin) & (gap <= config.back_margin) | (config.depth_condition < 1)
+    planes = jax.vmap(plane_depth)(rows, candidate_splats.means)
+    depth = jnp.broadcast_to(candidate_splats.depth[:, None], planes.shape)
+    is_near = within_margins(depth, planes, config) | (config.depth_condition < 1)
     normal_cos = jnp.einsum("gkd,gd->gk", old.normals[rows], candidates.normals)
     return is_near & (normal_cos >= config.min_normal_cos)
 
@@ -178,8 +187,8 @@ def refine(
     visible = map_splats.valid & (own_depth > 0) & (map_splats.depth <= own_depth + reach)
     rows, distance_sq, found = match_on_image(map_splats, candidate_splats, visible, config)
     found &= show_one_surface(old, candidates, map_splats, candidate_splats, rows, config)
-    relative = candidate_splats.depth / jnp.where(map_depth > 0, map_depth, 1.0) - 1.0
-    on_surface = (map_depth > 0) & (relative >= -config.front_margin) & (relative <= config.back_margin)
+    has_depth = map_depth > 0
+    on_surface = has_depth & within_margins(candidate_splats.depth, jnp.where(has_depth, map_depth, 1.0), config)
     omega = merge_weights(old, candidates, (rows, distance_sq, found), on_surface, config)
 
     averaged = average_candidates(candidates, rows, omega, old)
