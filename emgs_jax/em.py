@@ -179,20 +179,27 @@ def support(gaussians: Gaussians, points: Observation, step: EStep, config: EmCo
     return jnp.min(both, axis=-1)
 
 
+def precision(noise: Float[Array, "m 3"], config: EmConfig) -> Float[Array, "m"]:
+    """What a point is worth beside an exact one: min_std² / (min_std² + |ν|²) in (0, 1], 1 for all where ν = 0."""
+    return config.min_std**2 / (config.min_std**2 + config.noise**2 * jnp.sum(noise**2, axis=-1))
+
+
 def m_step(
-    gaussians: Gaussians, points: Observation, step: EStep, config: EmConfig
+    gaussians: Gaussians, points: Observation, weights: Float[Array, "m"], step: EStep, config: EmConfig
 ) -> tuple[Gaussians, Float[Array, "n"]]:
     """Responsibility-weighted mean, covariance about it, normal and colour of the points of every Gaussian.
+
+    A point counts r_ik times its weight, see `precision`.
 
     Returns:
         The new parameters (the old ones where no point is), and the total responsibility Σ_i r_ik.
     """
     add = lambda sums, part: (_add_statistics(sums, gaussians.means, *part), None)  # noqa: E731
-    nothing = jnp.zeros((gaussians.valid.shape[0], 16))
-    sums, _ = jax.lax.scan(add, nothing, split_rows((points, step), MAX_POINTS))
+    nothing = jnp.zeros((gaussians.valid.shape[0], 17))
+    sums, _ = jax.lax.scan(add, nothing, split_rows((points, weights, step), MAX_POINTS))
     total = sums[:, 0]
     has_points = total > config.min_responsibility
-    mean = sums[:, 1:] / jnp.where(has_points, total, 1.0)[:, None]
+    mean = sums[:, 2:] / jnp.where(has_points, sums[:, 1], 1.0)[:, None]
     rows, columns = jnp.triu_indices(3)
     second = jnp.zeros((total.shape[0], 3, 3)).at[:, rows, columns].set(mean[:, 3:9])
     second = second.at[:, columns, rows].set(mean[:, 3:9])
@@ -210,17 +217,22 @@ def m_step(
 
 
 def _add_statistics(
-    sums: Float[Array, "n 16"], means: Float[Array, "n 3"], points: Observation, step: EStep
-) -> Float[Array, "n 16"]:
-    """Add Σ r (1, offset, upper triangle of offset offset', normal, colour) over the points of every Gaussian."""
+    sums: Float[Array, "n 17"],
+    means: Float[Array, "n 3"],
+    points: Observation,
+    weights: Float[Array, "m"],
+    step: EStep,
+) -> Float[Array, "n 17"]:
+    """Add Σ r and Σ r w (1, offset, upper triangle of offset offset', normal, colour) over every Gaussian's points."""
     r = step.responsibilities
+    weighted = r * weights[:, None]
     # Offsets from the old means: second moments of world coordinates would cancel in float32.
     offsets = points.points[:, None] - means[step.rows]
     rows, columns = jnp.triu_indices(3)
     products = offsets[..., rows] * offsets[..., columns]
     others = jnp.broadcast_to(jnp.concatenate([points.normals, points.colors], axis=-1)[:, None], (*r.shape, 6))
     statistics = jnp.concatenate([jnp.ones_like(r)[..., None], offsets, products, others], axis=-1)
-    return sums.at[step.rows].add(r[..., None] * statistics)
+    return sums.at[step.rows].add(jnp.concatenate([r[..., None], weighted[..., None] * statistics], axis=-1))
 
 
 @full_precision
@@ -240,7 +252,7 @@ def em_update(
     """
     gaussians = submap.gaussians
     step, best = e_step(gaussians, aligned, noise, config, white)
-    new, total = m_step(gaussians, aligned, step, config)
+    new, total = m_step(gaussians, aligned, precision(noise, config), step, config)
     evidence = jnp.where(total > 0, support(gaussians, aligned, step, config), 0.0)
     updated, gain = update_average(submap, new, evidence, config.average)
     num_fused = jnp.sum(step.is_fused)

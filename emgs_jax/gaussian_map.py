@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import Gaussians, blend, empty_gaussians
 from emgs_jax.observation import Observation
@@ -18,11 +18,14 @@ class GaussianMap(eqx.Module):
         gaussians: world frame.
         weight: what eq. 4 keeps per Gaussian: α_{t-1} for the printed gain, the accumulated support for `count` (R4).
         num_updates: how often EM or refinement fused something into it, at most twice a frame.
+        existence: log-odds of there being what it stands for. A positive one is confirmed; any other is tentative: it
+            is fused into, but neither aligned against nor exported.
     """
 
     gaussians: Gaussians
     weight: Float[Array, "*b n"]
     num_updates: Int[Array, "*b n"]
+    existence: Float[Array, "*b n"]
 
 
 class AverageConfig(eqx.Module):
@@ -58,7 +61,18 @@ class SubmapConfig(eqx.Module):
 
 def empty_map(capacity: int, num_features: int) -> GaussianMap:
     """A map without a Gaussian."""
-    return GaussianMap(empty_gaussians(capacity, num_features), jnp.zeros(capacity), jnp.zeros(capacity, jnp.int32))
+    nothing = jnp.zeros(capacity)
+    return GaussianMap(empty_gaussians(capacity, num_features), nothing, jnp.zeros(capacity, jnp.int32), nothing)
+
+
+def confirmed(map: GaussianMap) -> Gaussians:
+    """The Gaussians with only the confirmed ones valid."""
+    return eqx.tree_at(lambda g: g.valid, map.gaussians, map.gaussians.valid & (map.existence > 0))
+
+
+def without(map: GaussianMap, is_gone: Bool[Array, "n"]) -> GaussianMap:
+    """The map with free rows in the place of some."""
+    return where_rows(is_gone, empty_map(is_gone.shape[0], map.gaussians.features.shape[-1]), map)
 
 
 def update_average(
@@ -78,7 +92,7 @@ def update_average(
     gain = jnp.where(has_evidence, evidence / jnp.where(has_evidence, kept, 1.0), 0.0)
     weight = jnp.where(has_evidence, jnp.where(config.gain > 0, kept, gain), map.weight)
     blended = where_rows(has_evidence, blend(map.gaussians, new, gain, config.blend), map.gaussians)
-    return GaussianMap(blended, weight, map.num_updates + has_evidence), gain
+    return GaussianMap(blended, weight, map.num_updates + has_evidence, map.existence), gain
 
 
 def select_submap(
@@ -109,9 +123,9 @@ def write_back(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> 
 
 
 def insert(
-    map: GaussianMap, fresh: Gaussians, weight: Float[Array, "g"]
+    map: GaussianMap, fresh: Gaussians, weight: Float[Array, "g"], existence: Float[Array, ""]
 ) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""]]:
-    """Write the valid rows of `fresh` into free rows of the map.
+    """Write the valid rows of `fresh` into free rows of the map, all with the same log-odds of existence.
 
     Returns:
         The map, how many were inserted, and how many found no free row.
@@ -122,7 +136,7 @@ def insert(
     free = jnp.pad(free, (0, num_fresh - free.shape[0]), constant_values=map.weight.shape[0])
     is_free = jnp.pad(is_free, (0, num_fresh - is_free.shape[0]))
     targets = jnp.where(exists & is_free, free, map.weight.shape[0])
-    new = GaussianMap(fresh, weight, jnp.ones(num_fresh, jnp.int32))
+    new = GaussianMap(fresh, weight, jnp.ones(num_fresh, jnp.int32), jnp.broadcast_to(existence, weight.shape))
     overflow = jnp.sum(exists & ~is_free)
     return put_rows(map, targets, take_rows(new, sources)), jnp.sum(exists & is_free), overflow
 

@@ -6,12 +6,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.observation import Observation
+from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import kmeans, strided_seeds
 from emgs_jax.ops.linalg import dot, inverse_2x2, outer, safe_normalize, tangent_basis, whiten, whitening
 from emgs_jax.ops.neighbours import knn
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, take_rows, traced, where_rows
 
+MIN_ROWS = 4  # fewer have no covariance
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 
@@ -42,7 +44,8 @@ class FitConfig(eqx.Module):
     """How points become Gaussians.
 
     Args:
-        points_per_gaussian: λ, in pixels of the full image; a new Gaussian stands for so many.
+        points_per_gaussian: λ, in pixels of an image of 640 × 480; a new Gaussian stands for so many. An image of
+            another size is cut into as many pieces, but none of fewer than MIN_ROWS points.
         num_fit_neighbours: M of eq. 1 (R10).
         num_kmeans_iterations: of Lloyd's algorithm.
         min_std: m; floor of a Gaussian's standard deviation in every direction.
@@ -54,9 +57,10 @@ class FitConfig(eqx.Module):
     min_std: Float[Array, "*b"] = traced()
 
 
-def spacing(thin: int, config: FitConfig) -> int:
-    """Rows of a thinned observation that make one Gaussian: λ pixels of the full image."""
-    return max(config.points_per_gaussian // thin**2, 1)
+def spacing(camera: Camera, thin: int, config: FitConfig) -> int:
+    """Rows of a thinned observation that make one Gaussian, which are λ pixels of an image of 640 × 480."""
+    share = camera.width * camera.height / (640 * 480)
+    return max(round(config.points_per_gaussian * share / thin**2), MIN_ROWS)
 
 
 @full_precision

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from emgs_jax.gaussians import FitConfig, Gaussians, cluster, spacing
 from emgs_jax.observation import Observation, transform
-from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.precision import full_precision
 
@@ -35,7 +35,7 @@ def initialize(
     Args:
         views: camera frames, v views of p points each.
         T_world_views: the prior's poses, which are the map's by construction.
-        camera: of the thinned rows.
+        camera: of the full images.
         thin: the observations' thinning.
         config: λ and how points become Gaussians.
 
@@ -43,6 +43,6 @@ def initialize(
         The Gaussians, their number of points in units of λ, and the views in the world frame.
     """
     num_views = views.valid.shape[0]
-    world, merged, order = merge(views, T_world_views, camera)
-    gaussians, weight = cluster(merged, order, spacing(thin, config) * num_views, config)
+    world, merged, order = merge(views, T_world_views, downscale(camera, thin))
+    gaussians, weight = cluster(merged, order, spacing(camera, thin, config) * num_views, config)
     return gaussians, weight * num_views, world

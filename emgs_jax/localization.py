@@ -13,6 +13,7 @@ from emgs_jax.ops.linalg import Whitening
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
 from emgs_jax.registration.icp import IcpConfig, IcpInfo, icp
+from emgs_jax.registration.noise import confidence_levels
 from emgs_jax.registration.rigid import (
     MIN_PAIRS,
     fit_rigid,
@@ -32,6 +33,8 @@ REASONS = (
     "the geometry does not determine the pose",
 )
 
+LEAST_NOISE = 5e-4  # of the depth
+
 
 class LocalizationConfig(eqx.Module):
     """The coarse step's reading (R7, R8), the fine step (R9) and what a pose must pass.
@@ -43,14 +46,14 @@ class LocalizationConfig(eqx.Module):
         coarse_scale: `none` (printed), `ratio` (median ratio of the depths that were predicted twice) or
             `estimated` (similarity fit).
         scale_memory: power on the estimated scale; below 1 it is pulled towards the prior's own.
-        max_pair_distance: m; farther points are no pair.
+        max_pair_distance: fraction of the depth; farther points are no pair.
         anchor_noise: of `fused`: variance of the prior's own pose near the anchor, over that of the chain.
         anchor_range: m; of `fused`: distance from the anchor at which its standard deviation has doubled.
         icp: the fine step.
         min_inlier_fraction: of the points, below which the fine pose is not accepted.
-        max_residual: m; root mean square distance to the map's planes.
-        max_step_m: between the coarse and the fine pose.
-        max_step_rad: likewise.
+        max_residual: root mean square distance to the map's planes, as a fraction of the depth.
+        max_step: between the coarse and the fine pose, as a fraction of the mean depth.
+        max_step_rad: likewise, rad.
         min_eigenvalue: of the Hessian, see `IcpInfo`.
     """
 
@@ -63,7 +66,7 @@ class LocalizationConfig(eqx.Module):
     icp: IcpConfig
     min_inlier_fraction: Float[Array, "*b"] = traced()
     max_residual: Float[Array, "*b"] = traced()
-    max_step_m: Float[Array, "*b"] = traced()
+    max_step: Float[Array, "*b"] = traced()
     max_step_rad: Float[Array, "*b"] = traced()
     min_eigenvalue: Float[Array, "*b"] = traced()
 
@@ -76,7 +79,7 @@ class CoarsePose(eqx.Module):
         T_world_newest: temporary pose of the newest image (the current one's where there is none).
         scale: by which this prediction is multiplied about its cameras' origins.
         repeat_rms: m; disagreement of the two predictions of the previous image, after alignment.
-        mean_depth: m; of the previous image.
+        mean_depth: m; of the previous image, scaled.
         is_usable: False where the prediction has no valid point or pose.
     """
 
@@ -98,6 +101,7 @@ class LocalizationInfo(eqx.Module):
         scale: of this prediction.
         repeat_rms: see `CoarsePose`.
         depth_noise: of the points, as a fraction of their depth: how much they differ from the map.
+        noise: likewise of each point, as those of its level of confidence do, in the order of the rows.
         step_m: between the coarse and the fine pose.
         step_rad: likewise.
         icp: of the fine step.
@@ -109,6 +113,7 @@ class LocalizationInfo(eqx.Module):
     scale: Float[Array, ""]
     repeat_rms: Float[Array, ""]
     depth_noise: Float[Array, ""]
+    noise: Float[Array, "p"]
     step_m: Float[Array, ""]
     step_rad: Float[Array, ""]
     icp: IcpInfo
@@ -145,7 +150,8 @@ def _pairs_via_previous(
     seen = transform(T_previous_current, current, scale)
     pixels, depth = project(camera, seen.points)
     match, inside = nearest_pixel(pixels, (camera.height, camera.width))
-    is_close = jnp.linalg.norm(seen.points - scale * now.points[match], axis=-1) <= config.max_pair_distance
+    distance = jnp.linalg.norm(seen.points - scale * now.points[match], axis=-1)
+    is_close = distance <= config.max_pair_distance * depth
     via = inside & (depth > 0) & is_close & (now.valid & previous.valid)[match] & current.valid
     return previous.points[match], via
 
@@ -194,7 +200,9 @@ def localize_coarse(
     repeat_sq = jnp.sum((scale * now.points @ rotation.T + origin - previous.points) ** 2, axis=-1)
     # 1.4826 makes the median absolute deviation a standard deviation (Gaussian errors).
     # Without a pair nothing is known, and the pairing distance stands in.
-    repeat_rms = 1.4826 * jnp.sqrt(jnp.where(jnp.any(paired), median(repeat_sq, paired), config.max_pair_distance**2))
+    mean_depth = scale * median(now.points[:, 2], now.valid)
+    unknown_sq = (config.max_pair_distance * mean_depth) ** 2
+    repeat_rms = 1.4826 * jnp.sqrt(jnp.where(jnp.any(paired), median(repeat_sq, paired), unknown_sq))
     is_finite = jnp.all(jnp.isfinite(coarse.wxyz_xyz))
     coarse = jaxlie.SE3(jnp.where(is_finite, coarse.wxyz_xyz, T_world_previous.wxyz_xyz))
     newest = coarse @ T_current_newest
@@ -206,7 +214,7 @@ def localize_coarse(
         T_world_newest=newest,
         scale=scale,
         repeat_rms=repeat_rms,
-        mean_depth=median(now.points[:, 2], now.valid),
+        mean_depth=mean_depth,
         is_usable=is_usable,
     )
 
@@ -232,9 +240,9 @@ def localize_fine(
         T_world_camera, the observation in the world frame, and the outcome.
     """
     scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
-    # The coarse pose is as good as two predictions of one image agree; a millimetre keeps the solve well scaled.
-    noise_m = jnp.maximum(coarse.repeat_rms, 1e-3)
-    noise = noise_m, noise_m / coarse.mean_depth
+    # The coarse pose is as good as two predictions of one image agree; the least keeps the solve well scaled.
+    depth_noise = jnp.maximum(coarse.repeat_rms / coarse.mean_depth, LEAST_NOISE)
+    noise = depth_noise * coarse.mean_depth, depth_noise
     fine, scale, info = icp(scaled, submap, coarse.T_world_camera, noise, config.icp, white)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     step_m, step_rad = jnp.linalg.norm(step[:3]), jnp.linalg.norm(step[3:])
@@ -243,7 +251,7 @@ def localize_fine(
             ~coarse.is_usable,
             ~(info.inlier_fraction >= config.min_inlier_fraction),
             ~(info.residual <= config.max_residual),
-            ~((step_m <= config.max_step_m) & (step_rad <= config.max_step_rad)),
+            ~((step_m <= config.max_step * coarse.mean_depth) & (step_rad <= config.max_step_rad)),
             ~(info.min_eigenvalue >= config.min_eigenvalue),
         ]
     )
@@ -262,7 +270,8 @@ def localize_fine(
             reason=bits,
             scale=scale,
             repeat_rms=coarse.repeat_rms,
-            depth_noise=info.misfit / coarse.mean_depth,
+            depth_noise=info.misfit,
+            noise=info.misfit_of_levels[confidence_levels(current.confidence, current.valid)],
             step_m=step_m,
             step_rad=step_rad,
             icp=info,

@@ -9,10 +9,12 @@ import jaxlie
 from jaxtyping import Array, Float, Int
 
 from emgs_jax.em import EmConfig, EmInfo, em_update
+from emgs_jax.existence import ExistenceConfig, join_layers, judge
 from emgs_jax.gaussian_map import (
     AverageConfig,
     GaussianMap,
     SubmapConfig,
+    confirmed,
     empty_map,
     insert,
     select_submap,
@@ -26,7 +28,7 @@ from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.linalg import Whitening, whitening
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import static
+from emgs_jax.ops.pytree import static, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
 from emgs_jax.registration.rigid import pose_row
 
@@ -44,6 +46,7 @@ class SlamConfig(eqx.Module):
         localization: coarse and fine.
         em: E- and M-step.
         refinement: on the image plane.
+        existence: what later frames say of a Gaussian.
     """
 
     window_size: int = static()
@@ -54,6 +57,7 @@ class SlamConfig(eqx.Module):
     localization: LocalizationConfig
     em: EmConfig
     refinement: RefinementConfig
+    existence: ExistenceConfig
 
     def __check_init__(self) -> None:
         if self.initialization not in ("merged", "incremental"):
@@ -115,7 +119,7 @@ def init_state(
         The state, and how many Gaussians did not fit into the map's capacity.
     """
     thin = config.observation.thin
-    gaussians, weight, world = initialize(views, T_world_views, downscale(camera, thin), thin, config.fit)
+    gaussians, weight, world = initialize(views, T_world_views, camera, thin, config.fit)
     return _first_state(gaussians, weight, world, T_world_views, config)
 
 
@@ -124,7 +128,9 @@ def _first_state(
     gaussians: Gaussians, weight: Float[Array, "g"], world: Observation, T_world_views: jaxlie.SE3, config: SlamConfig
 ) -> tuple[SlamState, Int[Array, ""]]:
     empty = empty_map(config.submap.map_capacity, world.features.shape[-1])
-    map, _, overflow = insert(empty, gaussians, _first_weight(weight, config.em.average))
+    # There is nothing else to align the second frame with, so the first window confirms itself.
+    existence = jnp.maximum(config.existence.birth, config.existence.hit)
+    map, _, overflow = insert(empty, gaussians, _first_weight(weight, config.em.average), existence)
     previous = jax.tree.map(lambda leaf: leaf[-1], world)
     return SlamState(map, previous, pose_row(T_world_views, -1)), overflow
 
@@ -152,11 +158,12 @@ def step(
     thin, last = config.observation.thin, (state.previous, state.T_world_previous)
     coarse, guess = call(_approach, prediction, *last, camera, thin, config.localization)
     submap, white, rows, submap_overflow = call(_select, state.map, (state.previous, guess), config.submap)
-    T, aligned, localization = call(_place, prediction.current, submap.gaussians, coarse, config.localization, white)
+    T, aligned, localization = call(_place, prediction.current, submap, coarse, config.localization, white)
     submap, rest, em = call(_fuse, submap, white, aligned, T, localization, config.em)
-    candidates, weight = call(cluster, rest, call(_order, camera, thin), spacing(thin, config.fit), config.fit)
+    candidates, weight = call(cluster, rest, call(_order, camera, thin), spacing(camera, thin, config.fit), config.fit)
     submap, fresh, refinement = call(_refine, submap, candidates, T, camera, thin, config.refinement)
-    map, count, map_overflow = call(_store, state.map, submap, rows, fresh, weight, config.em.average)
+    look = aligned, T, localization
+    map, count, map_overflow = call(_store, state.map, submap, rows, fresh, weight, look, camera, config)
 
     info = StepInfo(
         T_world_camera=T,
@@ -193,7 +200,12 @@ def _select(
     return submap, whitening(submap.gaussians.covs), rows, overflow
 
 
-_place = eqx.filter_jit(localize_fine)
+@eqx.filter_jit
+def _place(
+    current: Observation, submap: GaussianMap, coarse: CoarsePose, config: LocalizationConfig, white: Whitening
+) -> tuple[jaxlie.SE3, Observation, LocalizationInfo]:
+    """The fine pose, against what is confirmed."""
+    return localize_fine(current, confirmed(submap), coarse, config, white)
 
 
 @eqx.filter_jit
@@ -207,7 +219,7 @@ def _fuse(
 ) -> tuple[GaussianMap, Observation, EmInfo]:
     """Fuse the points of a frame that is tracked; returns those that no Gaussian explains."""
     trusted = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & localization.is_tracked)
-    noise = localization.depth_noise * (trusted.points - T.translation())
+    noise = localization.noise[:, None] * (trusted.points - T.translation())
     submap, is_fused, em = em_update(submap, trusted, noise, config, white)
     return submap, eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~is_fused), em
 
@@ -237,8 +249,21 @@ def _store(
     rows: Int[Array, "s"],
     fresh: Gaussians,
     weight: Float[Array, "g"],
-    config: AverageConfig,
+    look: tuple[Observation, jaxlie.SE3, LocalizationInfo],
+    camera: Camera,
+    config: SlamConfig,
 ) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""]]:
-    """The map with the submap written back and the fresh Gaussians in free rows, their count, and what did not fit."""
-    map, _, overflow = insert(write_back(map, submap, rows), fresh, _first_weight(weight, config))
+    """The map with the submap written back, judged by this look, and the fresh Gaussians in free rows.
+
+    Returns:
+        The map, the number of its Gaussians, and how many did not fit.
+    """
+    aligned, T, localization = look
+    trusted = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & localization.is_tracked)
+    view, noise = downscale(camera, config.observation.thin), localization.depth_noise
+    map, is_seen = judge(write_back(map, submap, rows), trusted, T, view, noise, config.existence)
+    is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
+    submap = join_layers(take_rows(map, rows), is_seen, T, noise, config.existence)
+    first_weight = _first_weight(weight, config.em.average)
+    map, _, overflow = insert(write_back(map, submap, rows), fresh, first_weight, config.existence.birth)
     return map, jnp.sum(map.gaussians.valid), overflow

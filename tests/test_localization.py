@@ -260,7 +260,7 @@ def lenient(config):
     for name, value in {
         "min_inlier_fraction": 0.0,
         "max_residual": np.inf,
-        "max_step_m": np.inf,
+        "max_step": np.inf,
         "max_step_rad": np.inf,
         "min_eigenvalue": -np.inf,
         "icp.prior_information": 0.0,
@@ -342,7 +342,7 @@ def test_a_scale_that_is_accepted_is_that_of_the_points_and_one_that_is_not_is_d
         1 / 0.96, abs=0.015
     )  # points meet centres of sparse Gaussians
     np.testing.assert_allclose(aligned.points, transform(T, prediction.current, info.scale).points, atol=1e-5)
-    _, T, aligned, info = fine_of(prediction, submap, camera, at(settings, "max_step_m", 0.0))
+    _, T, aligned, info = fine_of(prediction, submap, camera, at(settings, "max_step", 0.0))
     assert not info.is_tracked and info.scale == 1
     np.testing.assert_allclose(aligned.points, transform(T, prediction.current, jnp.ones(())).points, atol=1e-5)
 
@@ -352,7 +352,7 @@ def test_a_scale_that_is_accepted_is_that_of_the_points_and_one_that_is_not_is_d
     [
         (1, "min_inlier_fraction", 1.01),
         (2, "max_residual", 0.0),
-        (3, "max_step_m", 1e-6),
+        (3, "max_step", 1e-6),
         (3, "max_step_rad", 1e-6),
         (4, "min_eigenvalue", 1e12),
     ],

@@ -18,10 +18,9 @@ from emgs_jax.ops.neighbours import knn
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, static, traced
 from emgs_jax.registration.matching import Candidates, Matches, Surface, match, surface_of
-from emgs_jax.registration.rigid import median
+from emgs_jax.registration.noise import confidence_levels, noise_of_levels, num_independent, robust_std
 
 Noise: TypeAlias = tuple[Float[Array, ""], Float[Array, ""]]  # standard deviations in m, and in rad or over the depth
-_Carry: TypeAlias = tuple[Float[Array, "7"], Noise, Float[Array, ""]]  # unknowns, noise of the coarse pose, of depths
 RESIDUALS = ("colored", "distribution", "colored+distribution")
 COLORED, DISTRIBUTION = 0, 1
 
@@ -35,11 +34,10 @@ class IcpConfig(eqx.Module):
             the Gaussian's covariance; or `colored+distribution`: offset and intensity difference.
         color_std: standard deviation of intensity.
         noise: factor on the points' noise along their viewing rays, which widens every Gaussian for them.
-        max_misfit: m; a point farther from its Gaussian's plane shows something else, and says nothing of the noise;
-            0 takes the noise as it is given.
+        max_misfit: fraction of the depth; a point farther from its Gaussian's plane shows something else, and says
+            nothing of the noise; 0 takes the noise as it is given.
         max_mahalanobis_sq: a point farther from all its neighbours than this is no inlier.
         min_normal_cos: nor one whose normal differs more from its Gaussian's.
-        num_effective: how many independent measurements the points are worth: their errors are correlated.
         prior_information: of the coarse pose, in units of one effective point as noisy as the coarse step shows;
             0 = no prior, the printed form.
         scale_noise: standard deviation of the logarithm of the scale about the coarse step's, in units of the points'
@@ -58,7 +56,6 @@ class IcpConfig(eqx.Module):
     max_misfit: Float[Array, "*b"] = traced()
     max_mahalanobis_sq: Float[Array, "*b"] = traced()
     min_normal_cos: Float[Array, "*b"] = traced()
-    num_effective: Float[Array, "*b"] = traced()
     prior_information: Float[Array, "*b"] = traced()
     scale_noise: Float[Array, "*b"] = traced()
     num_points: int = static()
@@ -75,9 +72,11 @@ class IcpInfo(eqx.Module):
     Args:
         num_inliers: points with a Gaussian that passes the gates.
         inlier_fraction: of the points that take part.
-        residual: m; root mean square distance of the inliers to their Gaussians' planes.
-        misfit: m; the same distance of all points within `max_misfit`, as 1.4826 times the median, a robust standard
+        residual: root mean square distance of the inliers to their Gaussians' planes, as a fraction of their depth.
+        misfit: the same fraction of all points within `max_misfit`, as 1.4826 times the median, a robust standard
             deviation; 0 without any.
+        misfit_of_levels: likewise of the points in each of the `confidence_levels`.
+        num_effective: how many independent measurements the points are worth, see `num_independent`.
         min_eigenvalue: smallest eigenvalue of what planes and colours say of the pose, per effective point (1/m² and
             1/rad²). Offsets from means do not count: the mean of a Gaussian is no landmark of its surface.
         num_steps: of all solves.
@@ -88,9 +87,22 @@ class IcpInfo(eqx.Module):
     inlier_fraction: Float[Array, ""]
     residual: Float[Array, ""]
     misfit: Float[Array, ""]
+    misfit_of_levels: Float[Array, "l"]
+    num_effective: Float[Array, ""]
     min_eigenvalue: Float[Array, ""]
     num_steps: Int[Array, ""]
     is_converged: Bool[Array, ""]
+
+
+class _Uncertainty(eqx.Module):
+    """What the coarse pose, the points' depths and all points together are worth."""
+
+    pose: Noise
+    depth: Float[Array, "p"]  # as a fraction
+    num_effective: Float[Array, ""]
+
+
+_Carry: TypeAlias = tuple[Float[Array, "7"], _Uncertainty]
 
 
 class _Problem(eqx.Module):
@@ -100,32 +112,36 @@ class _Problem(eqx.Module):
     surface: Surface
     T_world_coarse: jaxlie.SE3
     rays: Float[Array, "p 3"]  # noise of every point along its viewing ray, camera frame
-    scale_std: Float[Array, ""]
-    prior: Float[Array, "7"]  # 1 / standard deviation of xi and of the scale's parameter
+    scale_unit: Float[Array, ""]  # of the scale's logarithm, which is the seventh unknown
+    prior: Float[Array, "7"]  # 1 / standard deviation of the unknowns
+    weight: Float[Array, ""]  # of a point
 
 
 def _pose_problem(
     source: Observation,
     surface: Surface,
     T_world_coarse: jaxlie.SE3,
-    pose_noise: Noise,
-    depth_noise: Float[Array, ""],
+    scale_unit: Float[Array, ""],
+    uncertainty: _Uncertainty,
     config: IcpConfig,
 ) -> _Problem:
-    prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack(pose_noise), 3)
+    prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack(uncertainty.pose), 3)
+    # Everything of a call errs with its scale, so the scale is held by the depths' common noise.
+    common = jnp.sqrt(jnp.mean(uncertainty.depth**2))
     return _Problem(
         source=source,
         surface=surface,
         T_world_coarse=T_world_coarse,
-        rays=config.noise * depth_noise * source.points,
-        scale_std=config.scale_noise * depth_noise,
-        prior=jnp.append(prior, 1.0),
+        rays=config.noise * uncertainty.depth[:, None] * source.points,
+        scale_unit=config.scale_noise * scale_unit,
+        prior=jnp.append(prior, scale_unit / common),
+        weight=uncertainty.num_effective / jnp.maximum(jnp.sum(source.valid), 1),
     )
 
 
 def _pose(y: Float[Array, "7"], problem: _Problem) -> tuple[jaxlie.SE3, Float[Array, ""]]:
-    """T_world_coarse exp(xi), and the scale exp(scale_std · y_6)."""
-    return problem.T_world_coarse @ jaxlie.SE3.exp(y[:6]), jnp.exp(problem.scale_std * y[6])
+    """T_world_coarse exp(xi), and the scale exp(scale_unit · y_6)."""
+    return problem.T_world_coarse @ jaxlie.SE3.exp(y[:6]), jnp.exp(problem.scale_unit * y[6])
 
 
 def _search(y: Float[Array, "7"], problem: _Problem, config: IcpConfig) -> Candidates:
@@ -144,13 +160,13 @@ def _match(y: Float[Array, "7"], candidates: Candidates, problem: _Problem, conf
 
 def _distances(
     y: Float[Array, "7"], matches: Matches, problem: _Problem, config: IcpConfig
-) -> tuple[Float[Array, "p"], Float[Array, ""]]:
-    """Of every point to the plane of its Gaussian, in metres, and the misfit."""
+) -> tuple[Float[Array, "p"], Bool[Array, "p"]]:
+    """Of every point to the plane of its Gaussian, as a fraction of its depth, and which show the same surface."""
     T, scale = _pose(y, problem)
     placed = transform(T, problem.source, scale)
-    distance = jnp.sum((placed.points - matches.means) * matches.normals, axis=-1)
-    is_near = placed.valid & (jnp.abs(distance) <= config.max_misfit)
-    return distance, jnp.where(jnp.any(is_near), 1.4826 * median(jnp.abs(distance), is_near), 0.0)
+    depth = jnp.where(placed.valid, scale * problem.source.points[:, 2], 1.0)
+    distance = jnp.sum((placed.points - matches.means) * matches.normals, axis=-1) / depth
+    return distance, placed.valid & (jnp.abs(distance) <= config.max_misfit)
 
 
 def _residuals(
@@ -191,31 +207,56 @@ def _rows(y: Float[Array, "7"], matches: Matches, problem: _Problem, config: Icp
         axis=-1,
     )
     valid = placed.valid
-    share = jnp.sqrt(config.num_effective / jnp.maximum(jnp.sum(valid), 1))
-    return share * jnp.where(valid[:, None], rows, 0.0)
+    return jnp.sqrt(problem.weight) * jnp.where(valid[:, None], rows, 0.0)
+
+
+def _observed(
+    y: Float[Array, "7"], matches: Matches, problem: _Problem, noise: Noise, config: IcpConfig
+) -> tuple[_Uncertainty, Float[Array, "p"], tuple[Float[Array, ""], Float[Array, "l"]]]:
+    """What the points' distances from their Gaussians say of the uncertainty, of which `noise` is the least.
+
+    Returns:
+        The uncertainty, the distances as fractions of the depth, and their spread: of all points, and of each level.
+    """
+    source = problem.source
+    distance, is_near = _distances(y, matches, problem, config)
+    levels = confidence_levels(source.confidence, source.valid)
+    misfit, of_levels = robust_std(distance, is_near), noise_of_levels(distance, is_near, levels)
+    depth = jnp.maximum(of_levels, noise[1])[levels]
+    factor = jnp.maximum(misfit / noise[1], 1.0)
+    uncertainty = _Uncertainty(
+        pose=(noise[0] * factor, noise[1] * factor),
+        depth=depth,
+        num_effective=num_independent(distance / depth, source.points, is_near),
+    )
+    return uncertainty, distance, (misfit, of_levels)
 
 
 def _search_and_solve(
-    carry: _Carry, is_first: Bool[Array, ""], problem_of: Callable[..., _Problem], noise: Noise, config: IcpConfig
+    carry: _Carry,
+    is_first: Bool[Array, ""],
+    problem_of: Callable[[_Uncertainty], _Problem],
+    noise: Noise,
+    config: IcpConfig,
 ) -> tuple[_Carry, tuple[Matches, Int[Array, ""], Bool[Array, ""]]]:
     """Look up the Gaussians near every point, see how well the points fit them, and solve for y from there."""
-    y, pose_noise, depth_noise = carry
-    problem = problem_of(pose_noise, depth_noise)
+    y, before = carry
+    problem = problem_of(before)
     candidates = _search(y, problem, config)
-    _, misfit = _distances(y, _match(y, candidates, problem, config), problem, config)
-    factor = jnp.maximum(misfit / noise[0], 1.0)
-    worse = jnp.where(is_first, factor, 1.0)  # y is the coarse pose at first
-    pose_noise, depth_noise = (pose_noise[0] * worse, pose_noise[1] * worse), noise[1] * factor
+    seen, _, _ = _observed(y, _match(y, candidates, problem, config), problem, noise, config)
+    # y is the coarse pose at first, and only then do the distances say what that is worth.
+    pose = jax.tree.map(lambda now, then: jnp.where(is_first, now, then), seen.pose, before.pose)
+    uncertainty = _Uncertainty(pose=pose, depth=seen.depth, num_effective=seen.num_effective)
     # Seven unknowns: on a CPU the normal equations take a fraction of a QR of all rows.
     solver = optx.LevenbergMarquardt(
         rtol=config.tolerance, atol=config.tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
     )
-    args = candidates, problem_of(pose_noise, depth_noise), config
+    args = candidates, problem_of(uncertainty), config
     solution = optx.least_squares(_residuals, solver, y, args, has_aux=True, max_steps=config.max_steps, throw=False)
     y = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, y)
     is_converged = solution.result == optx.RESULTS.successful
     # Not `solution.aux`, which lags one accepted step behind.
-    return (y, pose_noise, depth_noise), (solution.state.aux, solution.stats["num_steps"], is_converged)
+    return (y, uncertainty), (solution.state.aux, solution.stats["num_steps"], is_converged)
 
 
 @full_precision
@@ -253,24 +294,27 @@ def icp(
     source = jax.tree.map(lambda leaf: leaf[::stride], source)
     surface = surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, white)
 
-    def problem_of(pose_noise: Noise, depth_noise: Float[Array, ""]) -> _Problem:
-        return _pose_problem(source, surface, T_world_coarse, pose_noise, depth_noise, config)
+    def problem_of(uncertainty: _Uncertainty) -> _Problem:
+        return _pose_problem(source, surface, T_world_coarse, noise[1], uncertainty, config)
 
     def search_and_solve(carry: _Carry, is_first: Bool[Array, ""]) -> tuple[_Carry, tuple]:
         return _search_and_solve(carry, is_first, problem_of, noise, config)
 
-    start = jnp.zeros(7), noise, noise[1]
-    (y, pose_noise, depth_noise), rounds = jax.lax.scan(search_and_solve, start, jnp.arange(config.num_searches) == 0)
+    given = _Uncertainty(pose=noise, depth=jnp.full(source.valid.shape, noise[1]), num_effective=jnp.ones(()))
+    is_first = jnp.arange(config.num_searches) == 0
+    (y, uncertainty), rounds = jax.lax.scan(search_and_solve, (jnp.zeros(7), given), is_first)
     matches, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
-    problem = problem_of(pose_noise, depth_noise)
+    problem = problem_of(uncertainty)
     T, scale = _pose(y, problem)
-    distance, misfit = _distances(y, matches, problem, config)
+    seen, distance, (misfit, misfit_of_levels) = _observed(y, matches, problem, noise, config)
     num_inliers = jnp.sum(matches.is_inlier)
     info = IcpInfo(
         num_inliers=num_inliers,
         inlier_fraction=num_inliers / jnp.maximum(jnp.sum(source.valid), 1),
         residual=jnp.sqrt(jnp.sum(jnp.where(matches.is_inlier, distance, 0.0) ** 2) / jnp.maximum(num_inliers, 1)),
         misfit=misfit,
+        misfit_of_levels=misfit_of_levels,
+        num_effective=seen.num_effective,
         min_eigenvalue=jnp.linalg.eigvalsh(_information(T, scale, matches, problem, config))[0],
         num_steps=jnp.sum(rounds[1]),
         is_converged=is_converged,

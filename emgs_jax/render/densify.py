@@ -9,7 +9,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, unproject
 from emgs_jax.ops.linalg import safe_normalize
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import traced, where_rows
+from emgs_jax.ops.pytree import traced
 from emgs_jax.render.composite import (
     RenderConfig,
     Rendering,
@@ -17,6 +17,7 @@ from emgs_jax.render.composite import (
     blend_weights,
     draw_tiles,
     rendering_of,
+    splat_alpha,
     splats_of,
     weighted_sums,
 )
@@ -27,19 +28,13 @@ class DensifyConfig(eqx.Module):
     """Which pixels become points.
 
     Args:
-        opacity: of every Gaussian here. Low, so that a depth is the mean of the layers that noise left in a surface;
-            with the refinement's opacity the nearest layer alone would count, which is too near.
+        surface_depth: fraction of the depth; splats within it of the front belong to one surface.
         min_alpha: a pixel with less coverage has no depth.
-        max_depth_spread: a pixel whose splats differ in depth by more than this fraction mixes two surfaces. It shows
-            the dominant one: the splats within this fraction of the median depth,
-        min_layer_share: which must carry at least this share of the pixel's weight.
-        render: how the map is drawn.
+        render: how the front is found.
     """
 
-    opacity: Float[Array, "*b"] = traced()
+    surface_depth: Float[Array, "*b"] = traced()
     min_alpha: Float[Array, "*b"] = traced()
-    max_depth_spread: Float[Array, "*b"] = traced()
-    min_layer_share: Float[Array, "*b"] = traced()
     render: RenderConfig
 
 
@@ -56,34 +51,39 @@ class DenseView(eqx.Module):
 
 @full_precision
 def densify(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, config: DensifyConfig) -> DenseView:
-    """Render depth, normals and colours of the map from one pose and back-project every pixel that has a depth."""
+    """Render depth, normals and colours of the map from one pose and back-project every pixel that has a depth.
+
+    The front of a pixel is the weighted median of its splats' depths as they are rendered, that is nearly opaque. What
+    lies within `surface_depth` of it is one surface, whose layers are averaged by how near the pixel is to each splat's
+    centre, whichever comes first: the nearest layer alone would be too near, and what is behind shines through nothing.
+    """
     values = jnp.concatenate([gaussians.colors, gaussians.normals], axis=-1)
-    soft = eqx.tree_at(lambda r: (r.opacity, r.min_alpha), config.render, (config.opacity, config.min_alpha))
+    drawn = eqx.tree_at(lambda r: r.min_alpha, config.render, config.min_alpha)
 
     def blend(splats: Splats, values: Array, pixels: Array, render: RenderConfig) -> tuple[Sums, Sums]:
         weights, depth = blend_weights(splats, pixels, render)
-        layer = jnp.where(in_dominant_layer(weights, depth, config.max_depth_spread), weights, 0.0)
-        return weighted_sums(weights, depth, values), weighted_sums(layer, depth, values)
+        nearness = splat_alpha(splats, pixels, render)
+        surface = jnp.where(in_front_surface(weights, depth, config.surface_depth), nearness, 0.0)
+        return weighted_sums(weights, depth, values), weighted_sums(surface, depth, values)
 
-    splats = splats_of(gaussians, T_world_camera, camera, soft)
-    (whole, layer), overflow = draw_tiles(splats, values, camera, soft, blend)
-    rendering = rendering_of(*whole, overflow, soft)
-    is_mixed = rendering.depth_std > config.max_depth_spread * rendering.depth
-    values_sum, weight, depth_sum, _ = where_rows(is_mixed, layer, whole)
-    weight = jnp.maximum(weight, 1e-6)
-    depth = jnp.where(rendering.depth > 0, depth_sum / weight, 0.0)
-    is_dominant = layer[1] >= config.min_layer_share * whole[1]
+    splats = splats_of(gaussians, T_world_camera, camera, drawn)
+    (whole, surface), overflow = draw_tiles(splats, values, camera, drawn, blend)
+    rendering = rendering_of(*whole, overflow, drawn)
+    values_sum, weight, depth_sum, _ = surface
+    valid = (rendering.depth > 0) & (weight > 0)
+    weight = jnp.where(valid, weight, 1.0)
+    depth = jnp.where(valid, depth_sum / weight, 0.0)
     return DenseView(
         points=unproject(camera, depth) @ T_world_camera.rotation().as_matrix().T + T_world_camera.translation(),
         normals=safe_normalize(values_sum[..., 3:]),
         colors=values_sum[..., :3] / weight[..., None],
         depth=depth,
-        valid=(rendering.depth > 0) & (is_dominant | ~is_mixed),
+        valid=valid,
         rendering=rendering,
     )
 
 
-def in_dominant_layer(
+def in_front_surface(
     weights: Float[Array, "c q"], depth: Float[Array, "c q"], reach: Float[Array, ""]
 ) -> Bool[Array, "c q"]:
     """Which splats of every pixel, nearest first, lie within a fraction `reach` of their weighted median depth."""

@@ -22,6 +22,7 @@ from emgs_jax.evaluation.reconstruction import (
 )
 from emgs_jax.evaluation.segmentation import LabelledPoints, compare_labels, label_cells, true_labels
 from emgs_jax.evaluation.trajectory import trajectory_metrics
+from emgs_jax.gaussian_map import confirmed
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.provenance import RAW_PRIOR, prefixed
@@ -146,7 +147,8 @@ def score_settings(
 def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     """Size of the map, how many frames came to what, time and memory."""
     counts = Counter(record.status for record in run.records)
-    metrics: Metrics = {"map/num_gaussians": int(np.asarray(run.state.map.gaussians.valid).sum())}
+    metrics: Metrics = {"map/num_gaussians": int(np.asarray(confirmed(run.state.map).valid).sum())}
+    metrics["map/num_tentative"] = int(np.asarray(run.state.map.gaussians.valid).sum()) - metrics["map/num_gaussians"]
     metrics["map/capacity"] = run.config.submap.map_capacity
     metrics |= {f"frames/{status}": counts[status] for status in STATUSES}
     metrics["frames/skipped"] = len(dataset.skipped)

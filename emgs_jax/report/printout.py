@@ -17,7 +17,7 @@ REMEDIES = dict(
             "the predictions differ from the map; take frames closer together (dataset.stride=…), or accept more "
             "(slam.localization.max_residual=…)",
             "take frames closer together (dataset.stride=…), or trust the prior's pose less "
-            "(slam.localization.icp.prior_information=…, slam.localization.max_step_m=…)",
+            "(slam.localization.icp.prior_information=…, slam.localization.max_step=…)",
             "the images show too little, such as one wall; take frames with more of the scene in view",
         ),
         strict=True,

@@ -5,6 +5,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from emgs_jax.gaussian_map import confirmed
 from emgs_jax.io.map_file import save_map_npz
 from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
@@ -25,7 +26,7 @@ def save_progress(folder: Path, run: MappingRun) -> None:
 
 def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: DensifyConfig, title: str) -> list[str]:
     """Write the files that show the map; returns what could not be made, and why."""
-    gaussians = jax.device_get(run.state.map.gaussians)
+    gaussians = jax.device_get(confirmed(run.state.map))
     valid = gaussians.valid
     # As drawn: the covariances are those that close the surface.
     covs = gaussians.covs[valid] * float(config.render.covariance_scale)

@@ -13,6 +13,7 @@ import numpy as np
 from emgs_jax.data.base import Dataset
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.evaluation.segmentation import LabelledPoints, transfer_labels
+from emgs_jax.gaussian_map import confirmed
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.running.convert import to_se3
@@ -75,9 +76,10 @@ def _drawn_ahead(run: MappingRun, rows: list[int], config: DensifyConfig) -> Ite
     """The views of frames on the host; the next is being drawn while one is looked at."""
     pending: DenseView | None = None
     poses = to_se3(np.reshape([run.poses[row] for row in rows], (-1, 4, 4)))
+    gaussians = confirmed(run.state.map)
     for position in range(len(rows)):
         pose = jaxlie.SE3(poses.wxyz_xyz[position])
-        view = _densify(run.state.map.gaussians, pose, run.camera, config)
+        view = _densify(gaussians, pose, run.camera, config)
         drawing = eqx.tree_at(lambda view: view.rendering, view, None)  # nobody looks at it, so it is not fetched
         if pending is not None:
             yield jax.device_get(pending)
@@ -87,19 +89,19 @@ def _drawn_ahead(run: MappingRun, rows: list[int], config: DensifyConfig) -> Ite
 
 
 def center_cloud(run: MappingRun) -> PointCloud:
-    """The Gaussians' means with their normals and colours."""
-    gaussians = jax.device_get(run.state.map.gaussians)
+    """The confirmed Gaussians' means with their normals and colours."""
+    gaussians = jax.device_get(confirmed(run.state.map))
     rows = (gaussians.means, gaussians.normals, gaussians.colors)
     return PointCloud(*(values[gaussians.valid].astype(np.float64) for values in rows))
 
 
 def label_centers(run: MappingRun, prior: Prior) -> LabelledPoints | None:
-    """The Gaussians' means with the class whose text is closest to their feature; None without features or classes.
+    """The confirmed Gaussians' means with the class of the text closest to their feature; None without either.
 
     Raises:
         ValueError: the embeddings' width differs from the features'.
     """
-    gaussians = run.state.map.gaussians
+    gaussians = confirmed(run.state.map)
     if not prior.feature_names or not gaussians.features.shape[-1]:
         return None
     labels = np.asarray(classify(gaussians, jnp.asarray(prior.text_features, jnp.float32)))

@@ -39,7 +39,7 @@ class FrameRecord:
         true_pose: None where unknown.
         newest_pose: temporary pose of the next frame.
         inliers: points that agree with the map.
-        residual: of these to the map's planes, m.
+        residual: of these to the map's planes, as a fraction of their depth.
         scale: by which the prediction was multiplied.
         depth_noise: how much the points differ from the map, as a fraction of their depth.
         step_m: between the coarse and the fine pose.

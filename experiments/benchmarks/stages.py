@@ -43,12 +43,12 @@ def time_stages(data: Data, repetitions: int) -> list[Timing]:
     submap, rows, _ = stage("submap", select_submap, state.map, clouds, config.submap)
     fine = prediction.current, submap.gaussians, coarse, config.localization
     T, aligned, localization = stage("localize, fine", localize_fine, *fine)
-    noise = localization.depth_noise * (aligned.points - T.translation())
+    noise = localization.noise[:, None] * (aligned.points - T.translation())
     steps, _ = stage("E-step", e_step, submap.gaussians, aligned, noise, config.em)
     stage("M-step", m_step, submap.gaussians, aligned, steps, config.em)
     rest = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & ~steps.is_fused)
     order = morton_order(camera.height, camera.width)
-    candidates_new, weight = stage("new Gaussians", cluster, rest, order, spacing(thin, config.fit), config.fit)
+    candidates_new, weight = stage("new Gaussians", cluster, rest, order, spacing(camera, thin, config.fit), config.fit)
     submap, fresh, _ = stage("refine", refine, submap, candidates_new, T, camera, config.refinement)
     drawn = submap.gaussians, submap.gaussians.colors, T, camera, config.refinement.render
     stage("render", render, *drawn)

@@ -1,0 +1,176 @@
+"""Existence: what later frames say of a Gaussian. It is confirmed or seen through, and two layers become one."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.gaussian_map import GaussianMap, without
+from emgs_jax.gaussians import Gaussians, blend, has_feature
+from emgs_jax.observation import Observation
+from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
+from emgs_jax.ops.linalg import inverse_3x3, mahalanobis_sq, outer
+from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.precision import full_precision
+from emgs_jax.ops.pytree import static, take_rows, traced, where_rows
+
+
+class ExistenceConfig(eqx.Module):
+    """How much a look says, and when two Gaussians say the same.
+
+    Args:
+        birth: log-odds of a new Gaussian. At 0 it is tentative until another frame sees it; above, as printed, it is
+            not.
+        hit: log-odds that a look adds which finds the Gaussian where it is expected.
+        miss: log-odds that a look takes away which sees through it.
+        max_log_odds: which no number of looks exceeds, so that a change of mind takes a bounded number of them.
+        refuted: log-odds below which a Gaussian is removed; `-inf` never, as printed.
+        num_std: standard deviations of the depth between a Gaussian and what is seen that say nothing.
+        min_cos: between its normal and the ray; a flatter look says nothing.
+        num_neighbours: nearest seen Gaussians among which another layer of the same surface is looked for.
+        max_mahalanobis_sq: between two layers, the look's noise along the normal included; 0 joins none, as printed.
+        min_normal_cos: between their normals.
+    """
+
+    birth: Float[Array, "*b"] = traced()
+    hit: Float[Array, "*b"] = traced()
+    miss: Float[Array, "*b"] = traced()
+    max_log_odds: Float[Array, "*b"] = traced()
+    refuted: Float[Array, "*b"] = traced()
+    num_std: Float[Array, "*b"] = traced()
+    min_cos: Float[Array, "*b"] = traced()
+    num_neighbours: int = static()
+    max_mahalanobis_sq: Float[Array, "*b"] = traced()
+    min_normal_cos: Float[Array, "*b"] = traced()
+
+
+def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -> Float[Array, "2 p"]:
+    """Nearest and farthest depth z (m) among each pixel and its eight neighbours; NaN where the pixel itself has none.
+
+    A pose that is wrong by a pixel must not show what is behind a thin pole.
+    """
+    rotation = T_world_camera.rotation().as_matrix()
+    depth = ((view.points - T_world_camera.translation()) @ rotation)[:, 2].reshape(camera.height, camera.width)
+    valid = view.valid.reshape(depth.shape)
+
+    def least(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
+        return jax.lax.reduce_window(jnp.where(valid, depth, jnp.inf), jnp.inf, jax.lax.min, (3, 3), (1, 1), "SAME")
+
+    return jnp.where(valid, jnp.stack([least(depth), -least(-depth)]), jnp.nan).reshape(2, -1)
+
+
+@full_precision
+def judge(
+    map: GaussianMap,
+    view: Observation,
+    T_world_camera: jaxlie.SE3,
+    camera: Camera,
+    depth_noise: Float[Array, ""],
+    config: ExistenceConfig,
+) -> tuple[GaussianMap, Bool[Array, "n"]]:
+    """Log-odds of every Gaussian after one more look at it; what is refuted becomes a free row.
+
+    With d the depths that the frame shows round the Gaussian's pixel, z its own and
+    σ² = (depth_noise · z)² + n'Σn, it is seen where min d - kσ <= z <= max d + kσ, and seen through where
+    z < min d - kσ. What is behind is occluded, which says nothing.
+
+    Args:
+        map: all Gaussians, world frame.
+        view: the frame as it was aligned, world frame; a frame that is not tracked has no valid row.
+        T_world_camera: its pose.
+        camera: of its rows.
+        depth_noise: of its points, as a fraction of their depth.
+        config: how much a look says.
+
+    Returns:
+        The map, and which Gaussians were seen.
+    """
+    gaussians, rotation = map.gaussians, T_world_camera.rotation().as_matrix()
+    rays = gaussians.means - T_world_camera.translation()
+    pixels, depth = project(camera, rays @ rotation)
+    index, inside = nearest_pixel(pixels, (camera.height, camera.width))
+    nearest, farthest = depth_range(view, T_world_camera, camera)[:, index]
+    variance = jnp.einsum("ni,nij,nj->n", gaussians.normals, gaussians.covs, gaussians.normals)
+    reach = config.num_std * jnp.sqrt((depth_noise * depth) ** 2 + variance)
+    is_steep = jnp.abs(_inner(gaussians.normals, rays)) >= config.min_cos * jnp.linalg.norm(rays, axis=-1)
+    is_looked_at = gaussians.valid & inside & (depth > NEAREST_DEPTH) & is_steep
+    is_seen = is_looked_at & (depth >= nearest - reach) & (depth <= farthest + reach)
+    is_seen_through = is_looked_at & (depth < nearest - reach)
+
+    change = config.hit * is_seen - config.miss * is_seen_through
+    existence = jnp.clip(map.existence + change, -config.max_log_odds, config.max_log_odds)
+    existence = jnp.where(change == 0, map.existence, existence)
+    judged = eqx.tree_at(lambda m: m.existence, map, existence)
+    return without(judged, existence < config.refuted), is_seen
+
+
+@full_precision
+def join_layers(
+    map: GaussianMap,
+    is_seen: Bool[Array, "n"],
+    T_world_camera: jaxlie.SE3,
+    depth_noise: Float[Array, ""],
+    config: ExistenceConfig,
+) -> GaussianMap:
+    """Make one of every two Gaussians of a surface that a look cannot tell apart and that are each other's nearest.
+
+    Means, covariances, colours and normals are averaged by the Gaussians' weights. The covariance grows by the spread
+    of the means along the surface only: a wall does not become thicker by being two layers.
+
+    Args:
+        map: of which the submap is enough.
+        is_seen: Gaussians that may be joined.
+        T_world_camera: of the look.
+        depth_noise: as a fraction of the depth.
+        config: gates.
+    """
+    partner, is_pair = nearest_layers(map.gaussians, is_seen, T_world_camera, depth_noise, config)
+    old, other, rows = map.gaussians, take_rows(map, partner), jnp.arange(partner.shape[0])
+    is_heavier = (map.weight > other.weight) | ((map.weight == other.weight) & (rows < partner))
+    share = other.weight / jnp.maximum(map.weight + other.weight, jnp.finfo(jnp.float32).tiny)
+    mean = blend(old, other.gaussians, share, jnp.zeros(()))
+    difference = other.gaussians.means - old.means
+    along = difference - _inner(difference, mean.normals)[:, None] * mean.normals
+    spread = (share * (1.0 - share))[:, None, None] * outer(along)
+    joined = GaussianMap(
+        gaussians=eqx.tree_at(lambda g: g.covs, mean, mean.covs + spread),
+        weight=map.weight + other.weight,
+        num_updates=map.num_updates + other.num_updates,
+        existence=jnp.maximum(map.existence, other.existence),
+    )
+    map = where_rows(is_pair & is_heavier, joined, map)
+    return without(map, is_pair & ~is_heavier)
+
+
+def nearest_layers(
+    gaussians: Gaussians,
+    is_seen: Bool[Array, "n"],
+    T_world_camera: jaxlie.SE3,
+    depth_noise: Float[Array, ""],
+    config: ExistenceConfig,
+) -> tuple[Int[Array, "n"], Bool[Array, "n"]]:
+    """The nearest other layer of every Gaussian, and whether it is that one's nearest, too.
+
+    The squared distance of the means is taken under Σ_a + Σ_b + ν²nn', where ν is the noise of the look along the
+    normal n of the Gaussian that asks.
+    """
+    count = is_seen.shape[0]
+    rows, found = knn(gaussians.means, gaussians.means, is_seen, config.num_neighbours, is_seen)
+    near = take_rows(gaussians, rows)
+    noise = depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - T_world_camera.translation()))
+    covs = gaussians.covs + (noise**2)[:, None, None] * outer(gaussians.normals)
+    distance_sq = mahalanobis_sq(near.means - gaussians.means[:, None], inverse_3x3(covs[:, None] + near.covs))
+    found &= is_seen[:, None] & (rows != jnp.arange(count)[:, None]) & (distance_sq < config.max_mahalanobis_sq)
+    found &= _inner(near.normals, gaussians.normals[:, None]) >= config.min_normal_cos
+    has_both = has_feature(near.features) & has_feature(gaussians.features)[:, None]
+    found &= ~has_both | (_inner(near.features, gaussians.features[:, None]) > 0)
+    distance_sq = jnp.where(found, distance_sq, jnp.inf)
+    nearest = jnp.argmin(distance_sq, axis=-1)[:, None]
+    partner = jnp.take_along_axis(rows, nearest, axis=-1)[:, 0]
+    has_layer = jnp.any(found, axis=-1)
+    return partner, has_layer & has_layer[partner] & (partner[partner] == jnp.arange(count))
+
+
+def _inner(first: Float[Array, "*b d"], second: Float[Array, "*#b d"]) -> Float[Array, "*b"]:
+    return jnp.sum(first * second, axis=-1)

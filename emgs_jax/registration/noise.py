@@ -1,0 +1,67 @@
+"""How wrong points are, from the points themselves: by what their prior says of them, and how many say the same."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.registration.rigid import MIN_PAIRS, median
+
+NUM_LEVELS = 8  # of confidence
+NUM_CELLS = 8  # along each side of the image, whose errors are compared
+
+
+def confidence_levels(confidence: Float[Array, "p"], valid: Bool[Array, "p"]) -> Int[Array, "p"]:
+    """The eighth of the valid points in which a point's confidence lies, 0 the lowest.
+
+    Only the order counts, since networks mean different things by their numbers. Equal confidences have equal levels:
+    a constant one says nothing, and all points have level 0.
+    """
+    ordered = jnp.sort(jnp.where(valid, confidence, jnp.inf))
+    below = jnp.searchsorted(ordered, confidence, side="left")
+    return jnp.clip(NUM_LEVELS * below // jnp.maximum(jnp.sum(valid), 1), 0, NUM_LEVELS - 1)
+
+
+def robust_std(errors: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
+    """1.4826 times the median absolute error, the standard deviation of Gaussian errors; 0 without any."""
+    return jnp.where(jnp.any(valid), 1.4826 * median(jnp.abs(errors), valid), 0.0)
+
+
+def noise_of_levels(
+    errors: Float[Array, "p"], valid: Bool[Array, "p"], levels: Int[Array, "p"]
+) -> Float[Array, "{NUM_LEVELS}"]:
+    """Standard deviation of the errors in every level of confidence; that of all points where a level has too few.
+
+    So a confidence that is wrong about its points is found out by their errors.
+    """
+    chosen = valid & (levels == jnp.arange(NUM_LEVELS)[:, None])
+    found = jax.vmap(robust_std, (None, 0))(errors, chosen)
+    return jnp.where(jnp.sum(chosen, axis=1) >= MIN_PAIRS, found, robust_std(errors, valid))
+
+
+def num_independent(
+    errors: Float[Array, "p"], points: Float[Array, "p 3"], valid: Bool[Array, "p"]
+) -> Float[Array, ""]:
+    """How many independent measurements the points are worth, whose errors are alike where they are near each other.
+
+    The image is cut into cells. The variance of the cells' mean errors is that of all errors where the points of a cell
+    err alike, and falls with their number where they do not: cells · var(errors) / var(means), between the number of
+    cells and that of points. Without any valid point it is that of cells.
+
+    Args:
+        errors: in standard deviations.
+        points: camera frame.
+        valid: which count.
+    """
+    plane = points[:, :2] / jnp.where(valid, points[:, 2], 1.0)[:, None]
+    low = jnp.min(jnp.where(valid[:, None], plane, jnp.inf), axis=0)
+    high = jnp.max(jnp.where(valid[:, None], plane, -jnp.inf), axis=0)
+    places = jnp.clip((plane - low) / jnp.maximum(high - low, 1e-6) * NUM_CELLS, 0, NUM_CELLS - 1).astype(jnp.int32)
+    cells = jnp.where(valid, places[:, 0] * NUM_CELLS + places[:, 1], NUM_CELLS**2)
+    nothing = jnp.zeros(NUM_CELLS**2)
+    count, total = (nothing.at[cells].add(values, mode="drop") for values in (jnp.ones_like(errors), errors))
+    num_points, num_cells = jnp.sum(count), jnp.sum(count > 0)
+    of_means = jnp.sum(total**2 / jnp.maximum(count, 1.0)) / jnp.maximum(num_points, 1.0)
+    of_errors = jnp.sum(jnp.where(valid, errors, 0.0) ** 2) / jnp.maximum(num_points, 1.0)
+    ratio = of_errors / jnp.where(of_means > 0, of_means, 1.0)
+    found = jnp.clip(num_cells * ratio, num_cells, num_points)
+    return jnp.where(num_points > 0, found, NUM_CELLS**2)
