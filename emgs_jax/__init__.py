@@ -39,7 +39,8 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows
     from emgs_jax.prior.recorded import Recorded, record
     from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
-    from emgs_jax.registration.icp import IcpConfig, IcpInfo, icp
+    from emgs_jax.registration.icp import IcpInfo, icp
+    from emgs_jax.registration.problem import IcpConfig
     from emgs_jax.render.composite import RenderConfig, Rendering
     from emgs_jax.render.composite import render as render_gaussians
     from emgs_jax.render.densify import DensifyConfig, densify

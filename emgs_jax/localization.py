@@ -12,8 +12,9 @@ from emgs_jax.ops.camera import Camera, nearest_pixel, project
 from emgs_jax.ops.linalg import Whitening
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
-from emgs_jax.registration.icp import IcpConfig, IcpInfo, icp
+from emgs_jax.registration.icp import IcpInfo, icp
 from emgs_jax.registration.noise import confidence_levels
+from emgs_jax.registration.problem import IcpConfig
 from emgs_jax.registration.rigid import (
     MIN_PAIRS,
     fit_rigid,

@@ -71,7 +71,7 @@ def hand_run(poses, raw_poses, true_poses, statuses=STATUSES, gaussians=None) ->
     """A finished run, as far as reports look at it; frame i is number i, taken at 100 + i / 4 seconds."""
     gaussians = wall(0.0, 1.0) if gaussians is None else gaussians
     count = gaussians.valid.shape[0]
-    map = GaussianMap(gaussians, jnp.ones(count), jnp.ones(count, jnp.int32))
+    map = GaussianMap(gaussians, jnp.ones(count), jnp.ones(count, jnp.int32), jnp.ones(count))
     records = [
         FrameRecord(index=i, name=f"{i}.png", timestamp=100.0 + i / 4, status=status)
         for i, status in enumerate(statuses)

@@ -15,6 +15,7 @@ from emgs_jax.observation import Observation, Prediction
 from emgs_jax.ops.camera import Camera
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
+# λ is 8 pixels of an image of 32 × 24, or 32 of one of 64 × 48.
 SMALL = (
     *(
         "slam.observation.thin=1",
@@ -22,7 +23,7 @@ SMALL = (
         "slam.observation.normal_spacing=1",
         "slam.window_size=3",
     ),
-    *("slam.fit.points_per_gaussian=8", "slam.fit.num_fit_neighbours=8", "slam.fit.num_kmeans_iterations=2"),
+    *("slam.fit.points_per_gaussian=3200", "slam.fit.num_fit_neighbours=8", "slam.fit.num_kmeans_iterations=2"),
     *("slam.submap.map_capacity=256", "slam.submap.submap_capacity=192", "slam.em.num_neighbours=6"),
     *("render.tile_size=8", "render.tile_capacity=192", "render.covariance_scale=2.0", "render.radius=3.0"),
     "slam.localization.icp.num_points=256",

@@ -18,7 +18,7 @@ POINTS, GAUSSIANS = random_observation(M, num_features=F), random_gaussians(N, n
 QUIET = jnp.zeros((M, 3))
 NOISE = jnp.asarray(np.random.default_rng(5).normal(size=(M, 3)) * 0.1, jnp.float32)
 estep, mstep, supported, em = (eqx.filter_jit(f) for f in (e_step, m_step, support, em_update))
-MAP = GaussianMap(GAUSSIANS, jnp.ones(N), jnp.ones(N, jnp.int32))
+MAP = GaussianMap(GAUSSIANS, jnp.ones(N), jnp.ones(N, jnp.int32), jnp.ones(N))
 
 PAPER = ("slam/em=paper",)
 OPEN = {"min_normal_cos": -1.0, "max_mahalanobis_sq": np.inf, "max_log_gap": np.inf, "noise": 0.0}

@@ -19,6 +19,7 @@ from scene import (
 
 from emgs_jax.gaussians import blend, cluster, color_gradients, empty_gaussians, fit_to_points, intensity, spacing
 from emgs_jax.observation import transform
+from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import morton_order
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
@@ -104,9 +105,18 @@ def test_fitting_moves_with_a_rigid_motion(fit_config):
         np.testing.assert_allclose(a, b, atol=3e-4)  # float32 inverses of covariances; coordinates of 2 m
 
 
-def test_one_gaussian_stands_for_lambda_pixels_of_the_full_image(config):
-    for thin, expected in ((1, 128), (2, 32), (4, 8), (16, 1)):
-        assert spacing(thin, config("slam.fit.points_per_gaussian=128").fit) == expected
+def test_an_image_is_cut_into_as_many_pieces_whatever_its_size(config):
+    chosen = config("slam.fit.points_per_gaussian=128").fit
+    for width, height, thin, expected in (
+        (640, 480, 1, 128),
+        (640, 480, 4, 8),
+        (320, 240, 1, 32),
+        (320, 240, 2, 8),
+        (640, 240, 2, 16),  # half of the image has half of the pieces' pixels
+        (160, 120, 1, 8),
+        (160, 120, 2, 4),  # two rows would have no covariance
+    ):
+        assert spacing(Camera([1.0, 1.0], [0.0, 0.0], width, height), thin, chosen) == expected
 
 
 def test_clustering_a_room_gives_thin_gaussians_on_its_walls(fit_config, camera):

@@ -38,7 +38,7 @@ GRID = [(x, y, 2.0) for x in np.arange(-0.6, 0.61, 0.3) for y in np.arange(-0.6,
 
 def map_of(gaussians) -> GaussianMap:
     count = gaussians.valid.shape[0]
-    return GaussianMap(gaussians, jnp.ones(count), jnp.ones(count, jnp.int32))
+    return GaussianMap(gaussians, jnp.ones(count), jnp.ones(count, jnp.int32), jnp.ones(count))
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +126,10 @@ def test_a_refinement_equals_equations_5_and_6_one_candidate_at_a_time(settings,
         (features[count:].at[0].set(-features[0]), new.covs * size, colors, normals),
     )
     weight = jnp.linspace(0.5, 3.0, count)
-    map, T = GaussianMap(old, weight, jnp.ones(count, jnp.int32)), pose((0.02, -0.03, 0.01), (0.05, -0.02, 0.1))
+    map, T = (
+        GaussianMap(old, weight, jnp.ones(count, jnp.int32), jnp.ones(count)),
+        pose((0.02, -0.03, 0.01), (0.05, -0.02, 0.1)),
+    )
     merged, fresh, info = refined(map, new, T, camera, config)
     arrays = as_numpy(old), np.asarray(weight, float), as_numpy(new), np.asarray(T.as_matrix(), float)
     rows, is_fresh = reference.refine(*arrays, camera, config)

@@ -30,7 +30,7 @@ ONE = jnp.ones(())
 
 
 def map_of(seed: int) -> gaussian_map.GaussianMap:
-    return gaussian_map.GaussianMap(random_gaussians(32, seed, 2), jnp.ones(32), jnp.ones(32, jnp.int32))
+    return gaussian_map.GaussianMap(random_gaussians(32, seed, 2), jnp.ones(32), jnp.ones(32, jnp.int32), jnp.ones(32))
 
 
 def prediction_of(seed: int) -> obs.Prediction:
@@ -129,7 +129,7 @@ VERBS = {
         lambda s: (observe_room(path_pose(2 + s), CAMERA, 2), random_gaussians(32, s, 2), coarse_of(s)),
     ),
     "m_step": (
-        lambda g, o, e: em.m_step(g, o, e, CONFIG.em),
+        lambda g, o, e: em.m_step(g, o, jnp.ones(40), e, CONFIG.em),
         lambda s: (random_gaussians(32, s, 2), points(s), estep_of(s)),
     ),
     "em_update": (lambda m, o: em.em_update(m, o, NOISE[:32], CONFIG.em), lambda s: (map_of(s), close(s))),

@@ -41,7 +41,7 @@ def time_em(data: Data, num_gaussians: int, repetitions: int) -> list[Timing]:
 
     def both(gaussians: Gaussians, points: Observation, noise: jax.Array, config: Any) -> Any:
         found, _ = e_step(gaussians, points, noise, config)
-        return found, m_step(gaussians, points, found, config)
+        return found, m_step(gaussians, points, jnp.ones(points.valid.shape), found, config)
 
     ours = executable(both, gaussians, points, noise, config)
     theirs = (_host(gaussians), _host(points), np.asarray(noise), config)
@@ -73,7 +73,7 @@ def time_icp(data: Data, offset: tuple[float, float], repetitions: int) -> list[
     # Coloured residuals only, without a prior on the pose or a scale, and never done before the last step.
     config = eqx.tree_at(lambda c: (c.residual, c.prior_information, c.scale_noise), config, (jnp.zeros(()),) * 3)
     _, reference = view(data, 0)
-    count = reference.valid.shape[0] * data.config.observation.thin**2 // data.config.fit.points_per_gaussian
+    count = reference.valid.shape[0] // spacing(data.camera, data.config.observation.thin, data.config.fit)
     target = gaussians_of(data, 3 * count // 4)
     stride = max(reference.valid.shape[0] // config.num_points, 1)
     cases = [_icp_case(data, row, offset) for row in range(1, len(data.true_poses))]

@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from emgs_jax.em import e_step, m_step
+from emgs_jax.em import e_step, m_step, precision
 from emgs_jax.gaussian_map import insert, select_submap, write_back
 from emgs_jax.gaussians import cluster, spacing
 from emgs_jax.localization import localize_coarse, localize_fine
@@ -45,13 +45,15 @@ def time_stages(data: Data, repetitions: int) -> list[Timing]:
     T, aligned, localization = stage("localize, fine", localize_fine, *fine)
     noise = localization.noise[:, None] * (aligned.points - T.translation())
     steps, _ = stage("E-step", e_step, submap.gaussians, aligned, noise, config.em)
-    stage("M-step", m_step, submap.gaussians, aligned, steps, config.em)
+    stage("M-step", m_step, submap.gaussians, aligned, precision(noise, config.em), steps, config.em)
     rest = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & ~steps.is_fused)
     order = morton_order(camera.height, camera.width)
     candidates_new, weight = stage("new Gaussians", cluster, rest, order, spacing(camera, thin, config.fit), config.fit)
     submap, fresh, _ = stage("refine", refine, submap, candidates_new, T, camera, config.refinement)
     drawn = submap.gaussians, submap.gaussians.colors, T, camera, config.refinement.render
     stage("render", render, *drawn)
-    stage("insert", lambda m, s, r, f, w: insert(write_back(m, s, r), f, w), state.map, submap, rows, fresh, weight)
+    stage(
+        "insert", lambda m, s, r, f, w: insert(write_back(m, s, r), f, w, 0.0), state.map, submap, rows, fresh, weight
+    )
     candidates["whole step"] = called(step, state, prediction, data.camera, config)
     return interleaved("stages", candidates, repetitions)

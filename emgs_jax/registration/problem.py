@@ -1,0 +1,190 @@
+"""What ICP minimises: the distances of points from Gaussians, in standard deviations, and the prior of the pose."""
+
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from emgs_jax.gaussians import intensity
+from emgs_jax.observation import Observation, transform
+from emgs_jax.ops.linalg import whiten, widen
+from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.pytree import choice, static, traced
+from emgs_jax.registration.matching import Candidates, Matches, Surface, match
+
+Noise: TypeAlias = tuple[Float[Array, ""], Float[Array, ""]]  # standard deviations in m, and in rad or over the depth
+RESIDUALS = ("colored", "distribution", "colored+distribution")
+COLORED, DISTRIBUTION = 0, 1
+
+
+class IcpConfig(eqx.Module):
+    """Terms, gates and limits of the solve (R9).
+
+    Args:
+        residual: `colored` (printed): distance to the Gaussian's plane and intensity difference (Park et al.,
+            "Colored point cloud registration revisited", ICCV 2017); `distribution`: offset from the mean, whitened by
+            the Gaussian's covariance; or `colored+distribution`: offset and intensity difference.
+        color_std: standard deviation of intensity.
+        noise: factor on the points' noise along their viewing rays, which widens every Gaussian for them.
+        max_misfit: fraction of the depth; a point farther from its Gaussian's plane shows something else, and says
+            nothing of the noise; 0 takes the noise as it is given.
+        max_mahalanobis_sq: a point farther from all its neighbours than this is no inlier.
+        min_normal_cos: nor one whose normal differs more from its Gaussian's.
+        prior_information: of the coarse pose, in units of one effective point as noisy as the coarse step shows;
+            0 = no prior, the printed form.
+        scale_noise: standard deviation of the logarithm of the scale about the coarse step's, in units of the points'
+            depth noise; 0 = no scale (printed).
+        num_points: how many points take part.
+        num_searches: how often the Gaussians near every point are looked up, each time with a solve after it.
+        num_neighbours: Gaussians near a point, which every step of a solve compares.
+        num_color_neighbours: Gaussians from which a Gaussian's intensity gradient is fitted.
+        max_steps: of every solve.
+        tolerance: relative and absolute, of the solver.
+    """
+
+    residual: Float[Array, "*b"] = choice(*RESIDUALS)
+    color_std: Float[Array, "*b"] = traced()
+    noise: Float[Array, "*b"] = traced()
+    max_misfit: Float[Array, "*b"] = traced()
+    max_mahalanobis_sq: Float[Array, "*b"] = traced()
+    min_normal_cos: Float[Array, "*b"] = traced()
+    prior_information: Float[Array, "*b"] = traced()
+    scale_noise: Float[Array, "*b"] = traced()
+    num_points: int = static()
+    num_searches: int = static()
+    num_neighbours: int = static()
+    num_color_neighbours: int = static()
+    max_steps: int = static()
+    tolerance: float = static()
+
+
+class Uncertainty(eqx.Module):
+    """What the coarse pose, the points' depths and all points together are worth."""
+
+    pose: Noise
+    depth: Float[Array, "p"]  # as a fraction
+    num_effective: Float[Array, ""]
+
+
+class Problem(eqx.Module):
+    """What stays the same while the pose moves; lengths in metres."""
+
+    source: Observation  # camera frame
+    surface: Surface
+    T_world_coarse: jaxlie.SE3
+    rays: Float[Array, "p 3"]  # noise of every point along its viewing ray, camera frame
+    scale_unit: Float[Array, ""]  # of the scale's logarithm, which is the seventh unknown
+    prior: Float[Array, "7"]  # 1 / standard deviation of the unknowns
+    weight: Float[Array, ""]  # of a point
+
+
+def pose_problem(
+    source: Observation,
+    surface: Surface,
+    T_world_coarse: jaxlie.SE3,
+    scale_unit: Float[Array, ""],
+    uncertainty: Uncertainty,
+    config: IcpConfig,
+) -> Problem:
+    prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack(uncertainty.pose), 3)
+    # Everything of a call errs with its scale, so the scale is held by the depths' common noise.
+    common = jnp.sqrt(jnp.mean(uncertainty.depth**2))
+    return Problem(
+        source=source,
+        surface=surface,
+        T_world_coarse=T_world_coarse,
+        rays=config.noise * uncertainty.depth[:, None] * source.points,
+        scale_unit=config.scale_noise * scale_unit,
+        prior=jnp.append(prior, scale_unit / common),
+        weight=uncertainty.num_effective / jnp.maximum(jnp.sum(source.valid), 1),
+    )
+
+
+def pose_of(y: Float[Array, "7"], problem: Problem) -> tuple[jaxlie.SE3, Float[Array, ""]]:
+    """T_world_coarse exp(xi), and the scale exp(scale_unit · y_6)."""
+    return problem.T_world_coarse @ jaxlie.SE3.exp(y[:6]), jnp.exp(problem.scale_unit * y[6])
+
+
+def candidates_at(y: Float[Array, "7"], problem: Problem, config: IcpConfig) -> Candidates:
+    """The Gaussians near every point, placed by the unknowns y."""
+    T, scale = pose_of(y, problem)
+    target = problem.surface.gaussians
+    return knn(transform(T, problem.source, scale).points, target.means, target.valid, config.num_neighbours)
+
+
+def matches_at(y: Float[Array, "7"], candidates: Candidates, problem: Problem, config: IcpConfig) -> Matches:
+    """The Gaussian of every point at y."""
+    T, scale = pose_of(y, problem)
+    placed, noise = transform(T, problem.source, scale), problem.rays @ T.rotation().as_matrix().T
+    return match(placed, noise, candidates, problem.surface, (config.max_mahalanobis_sq, config.min_normal_cos))
+
+
+def distances(
+    y: Float[Array, "7"], matches: Matches, problem: Problem, config: IcpConfig
+) -> tuple[Float[Array, "p"], Bool[Array, "p"]]:
+    """Of every point to the plane of its Gaussian, as a fraction of its depth, and which show the same surface."""
+    T, scale = pose_of(y, problem)
+    placed = transform(T, problem.source, scale)
+    depth = jnp.where(placed.valid, scale * problem.source.points[:, 2], 1.0)
+    distance = jnp.sum((placed.points - matches.means) * matches.normals, axis=-1) / depth
+    return distance, placed.valid & (jnp.abs(distance) <= config.max_misfit)
+
+
+def residuals(
+    y: Float[Array, "7"], args: tuple[Candidates, Problem, IcpConfig]
+) -> tuple[tuple[Float[Array, "p 5"], Float[Array, "7"]], Matches]:
+    """Rows of every point and of the prior, in standard deviations; beside them the matches.
+
+    The matches carry no gradient. The derivative is made here, once, and the solver gets rows that are linear in y:
+    otherwise each of its uses of the derivative would be compiled, and computed, anew.
+    """
+    candidates, problem, config = args
+    fixed = jax.lax.stop_gradient(y)
+    matches = jax.lax.stop_gradient(matches_at(fixed, candidates, problem, config))
+    jacobian = jax.lax.stop_gradient(jax.jacfwd(rows_of)(fixed, matches, problem, config))
+    rows = rows_of(fixed, matches, problem, config) + jacobian @ (y - fixed)
+    return (rows, problem.prior * y), matches
+
+
+def rows_of(y: Float[Array, "7"], matches: Matches, problem: Problem, config: IcpConfig) -> Float[Array, "p 5"]:
+    """Plane, colour and whitened offset of every point for given matches, in standard deviations."""
+    T, scale = pose_of(y, problem)
+    placed = transform(T, problem.source, scale)
+    offset = placed.points - matches.means
+    plane = jnp.sum(offset * matches.normals, axis=-1) / matches.plane_std
+    light = matches.light + jnp.sum(matches.gradients * offset, axis=-1)
+    shade = (light - intensity(placed.colors)) / config.color_std
+    triangle, noise, entries = (jnp.unstack(rows, axis=-1) for rows in (matches.triangle, matches.noise, offset))
+    white = jnp.stack(widen(whiten(triangle, entries), noise), axis=-1)
+    # A point beyond the gate costs what it would at the gate and pulls nowhere.
+    edge = jnp.sqrt(config.max_mahalanobis_sq)
+    is_inlier = matches.is_inlier[:, None]
+    rows = jnp.concatenate(
+        [
+            (config.residual == COLORED) * jnp.where(is_inlier, plane[:, None], edge),
+            (config.residual != DISTRIBUTION) * jnp.where(is_inlier, jnp.clip(shade, -edge, edge)[:, None], edge),
+            (config.residual != COLORED) * jnp.where(is_inlier, white, edge / jnp.sqrt(3.0)),
+        ],
+        axis=-1,
+    )
+    valid = placed.valid
+    return jnp.sqrt(problem.weight) * jnp.where(valid[:, None], rows, 0.0)
+
+
+def information(
+    T: jaxlie.SE3, scale: Float[Array, ""], matches: Matches, problem: Problem, config: IcpConfig
+) -> Float[Array, "6 6"]:
+    """What planes and colours of the inliers say of the pose, per point: Σ j j' / p with j = (a, x × a) / std.
+
+    a is the normal, or the gradient of the intensity, and x the point, both in the camera's axes.
+    """
+    points, to_camera = scale * problem.source.points, T.rotation().as_matrix()
+    normals, gradients = matches.normals @ to_camera, matches.gradients @ to_camera
+    has_color = config.residual != DISTRIBUTION
+    axes = jnp.concatenate([normals / matches.plane_std[:, None], has_color * gradients / config.color_std])
+    rows = jnp.concatenate([axes, jnp.cross(jnp.concatenate([points, points]), axes)], axis=-1)
+    rows = jnp.where(jnp.concatenate([matches.is_inlier] * 2)[:, None], rows, 0.0)
+    return rows.T @ rows / jnp.maximum(jnp.sum(problem.source.valid), 1)
