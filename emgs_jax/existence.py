@@ -72,8 +72,8 @@ def judge(
     """Log-odds of every Gaussian after one more look at it; what is refuted becomes a free row.
 
     With d the depths that the frame shows round the Gaussian's pixel, z its own and
-    σ² = (depth_noise · z)² + n'Σn, it is seen where min d - kσ <= z <= max d + kσ, and seen through where
-    z < min d - kσ. What is behind is occluded, which says nothing.
+    σ² = (depth_noise · z)² + n'Σn, it is seen where |z - min d| <= kσ or |z - max d| <= kσ, and seen through where
+    z < min d - kσ. What is behind is occluded, and what is between, at an edge, may be either: that says nothing.
 
     Args:
         map: all Gaussians, world frame.
@@ -95,7 +95,7 @@ def judge(
     reach = config.num_std * jnp.sqrt((depth_noise * depth) ** 2 + variance)
     is_steep = jnp.abs(_inner(gaussians.normals, rays)) >= config.min_cos * jnp.linalg.norm(rays, axis=-1)
     is_looked_at = gaussians.valid & inside & (depth > NEAREST_DEPTH) & is_steep
-    is_seen = is_looked_at & (depth >= nearest - reach) & (depth <= farthest + reach)
+    is_seen = is_looked_at & (jnp.minimum(jnp.abs(depth - nearest), jnp.abs(depth - farthest)) <= reach)
     is_seen_through = is_looked_at & (depth < nearest - reach)
 
     change = config.hit * is_seen - config.miss * is_seen_through
@@ -157,7 +157,7 @@ def nearest_layers(
     """
     count = is_seen.shape[0]
     rows, found = knn(gaussians.means, gaussians.means, is_seen, config.num_neighbours, is_seen)
-    near = take_rows(gaussians, rows)
+    near = jax.tree.map(lambda leaf: leaf[rows], gaussians)
     noise = depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - T_world_camera.translation()))
     covs = gaussians.covs + (noise**2)[:, None, None] * outer(gaussians.normals)
     distance_sq = mahalanobis_sq(near.means - gaussians.means[:, None], inverse_3x3(covs[:, None] + near.covs))

@@ -26,9 +26,7 @@ def robust_std(errors: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Arra
     return jnp.where(jnp.any(valid), 1.4826 * median(jnp.abs(errors), valid), 0.0)
 
 
-def noise_of_levels(
-    errors: Float[Array, "p"], valid: Bool[Array, "p"], levels: Int[Array, "p"]
-) -> Float[Array, "{NUM_LEVELS}"]:
+def noise_of_levels(errors: Float[Array, "p"], valid: Bool[Array, "p"], levels: Int[Array, "p"]) -> Float[Array, "l"]:
     """Standard deviation of the errors in every level of confidence; that of all points where a level has too few.
 
     So a confidence that is wrong about its points is found out by their errors.

@@ -11,7 +11,7 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.em import e_step, m_step
-from emgs_jax.gaussians import Gaussians
+from emgs_jax.gaussians import Gaussians, spacing
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.camera import downscale
 from emgs_jax.ops.pytree import take_rows

@@ -48,12 +48,12 @@ def time_stages(data: Data, repetitions: int) -> list[Timing]:
     stage("M-step", m_step, submap.gaussians, aligned, precision(noise, config.em), steps, config.em)
     rest = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & ~steps.is_fused)
     order = morton_order(camera.height, camera.width)
-    candidates_new, weight = stage("new Gaussians", cluster, rest, order, spacing(camera, thin, config.fit), config.fit)
+    num_rows = spacing(data.camera, thin, config.fit)
+    candidates_new, weight = stage("new Gaussians", cluster, rest, order, num_rows, config.fit)
     submap, fresh, _ = stage("refine", refine, submap, candidates_new, T, camera, config.refinement)
     drawn = submap.gaussians, submap.gaussians.colors, T, camera, config.refinement.render
     stage("render", render, *drawn)
-    stage(
-        "insert", lambda m, s, r, f, w: insert(write_back(m, s, r), f, w, 0.0), state.map, submap, rows, fresh, weight
-    )
+    add = lambda m, s, r, f, w: insert(write_back(m, s, r), f, w, jnp.zeros(()))  # noqa: E731
+    stage("insert", add, state.map, submap, rows, fresh, weight)
     candidates["whole step"] = called(step, state, prediction, data.camera, config)
     return interleaved("stages", candidates, repetitions)
