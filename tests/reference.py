@@ -80,9 +80,12 @@ def e_step(points, normals, features, noise, valid, g, config):
     return responsibilities, is_fused, best
 
 
-def m_step(responsibilities, points, normals, colors, k, min_std):
-    """Mean, covariance about it, normal and colour of the points of Gaussian k, weighted by their responsibility."""
-    share = responsibilities[:, k] / responsibilities[:, k].sum()
+def m_step(responsibilities, points, normals, colors, k, min_std, noise=0.0):
+    """Mean, covariance about it, normal and colour of the points of Gaussian k, weighted by their responsibility.
+
+    Of two points the one with the larger `noise` (m) counts less, as the variances of floor and noise together say."""
+    share = responsibilities[:, k] / (min_std**2 + np.square(noise))
+    share = share / share.sum()
     mean = share @ points
     cov = (share[:, None] * (points - mean)).T @ (points - mean) + min_std**2 * np.eye(3)
     normal = share @ normals
@@ -131,7 +134,8 @@ def em_update(points, normals, features, colors, noise, valid, g, weight, config
     r, is_fused, best = e_step(points, normals, features, noise, valid, g, config)
     kind, changed = ("printed", "normalized")[int(config.support)], {}
     for k in np.flatnonzero(r.sum(axis=0) > float(config.min_responsibility)):
-        new = m_step(r, points, normals, colors, k, float(config.min_std))
+        along = float(config.noise) * np.linalg.norm(noise, axis=1)
+        new = m_step(r, points, normals, colors, k, float(config.min_std), along)
         delta = support(r, points, g["means"][k], g["covs"][k], g["normals"][k], k, kind)
         if delta > 0:
             gain, kept = gain_and_weight(weight[k], delta, config.average)
@@ -201,14 +205,14 @@ def registered(points, normals, light, noise, g, gradients, config, pose_std):
     """The translation that ICP's cost asks for where rotation and scale are held, for matches that do not change.
 
     Rows of a point: distance to the plane (`colored`) or whitened offset (`distribution`), and its intensity. All
-    points together weigh as much as `num_effective`, against the prior's information over the coarse pose's variance.
+    points together weigh as much as 64, for nothing is known of how alike their errors are, against the prior's information over the coarse pose's variance.
     """
     residual = ("colored", "distribution", "colored+distribution")[int(config.residual)]
     rows, is_inlier = matched(
         points, normals, noise, g, (float(config.max_mahalanobis_sq), float(config.min_normal_cos))
     )
     hessian, force = float(config.prior_information) / pose_std**2 * np.eye(3), np.zeros(3)
-    share = float(config.num_effective) / len(points)
+    share = 64.0 / len(points)
     for i in np.flatnonzero(is_inlier):
         k, nu = rows[i], noise[i]
         offset, normal, gradient = points[i] - g["means"][k], g["normals"][k], gradients[k]

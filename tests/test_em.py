@@ -188,12 +188,16 @@ def test_noise_along_the_ray_widens_the_gaussian_by_its_outer_product():
 
 def test_the_m_step_equals_weighted_statistics(opened):
     step, _ = estep(GAUSSIANS, POINTS, QUIET, opened)
-    new, total = mstep(GAUSSIANS, POINTS, step, opened)
+    noise = jnp.linspace(0.0, 0.03, M)
+    weights = float(opened.min_std) ** 2 / (float(opened.min_std) ** 2 + noise**2)
+    new, total = mstep(GAUSSIANS, POINTS, weights, step, opened)
     r = dense(step)
     np.testing.assert_allclose(total, r.sum(0), atol=1e-5)  # sums of up to 60 shares
     points, normals, _ = arrays(POINTS)
     for k in np.flatnonzero(r.sum(0) > 1e-3):
-        expected = reference.m_step(r, points, normals, np.asarray(POINTS.colors, float), k, float(opened.min_std))
+        expected = reference.m_step(
+            r, points, normals, np.asarray(POINTS.colors, float), k, float(opened.min_std), noise
+        )
         actual = new.means[k], new.covs[k], new.normals[k], new.colors[k]
         for a, b in zip(actual, expected, strict=True):
             np.testing.assert_allclose(a, b, atol=2e-4)  # float32 shares divided by totals down to 1e-3
@@ -203,7 +207,7 @@ def test_one_hot_responsibilities_give_the_clusters_mean_and_covariance(opened):
     assignment = np.random.default_rng(3).integers(0, 4, M)
     rows = jnp.stack([jnp.asarray(assignment), jnp.full(M, 7)], axis=1)
     step = EStep(rows, jnp.tile(jnp.array([1.0, 0.0]), (M, 1)), jnp.ones(M, bool))
-    new, total = mstep(GAUSSIANS, POINTS, step, opened)
+    new, total = mstep(GAUSSIANS, POINTS, jnp.ones(M), step, opened)
     points = np.asarray(POINTS.points, float)
     for k in range(4):
         own = points[assignment == k]
@@ -280,7 +284,7 @@ def test_support_equals_the_reference_for_tilted_gaussians(opened, kind):
 def test_the_update_is_estep_mstep_support_and_average_in_a_row(opened):
     """Eq. 4 with α_0 = 1: α = δ / (1 + δ), applied to mean, covariance (linear), colour and normal."""
     step, _ = estep(GAUSSIANS, POINTS, QUIET, opened)
-    new, total = mstep(GAUSSIANS, POINTS, step, opened)
+    new, total = mstep(GAUSSIANS, POINTS, jnp.ones(M), step, opened)
     delta = np.where(np.asarray(total) > 0, supported(GAUSSIANS, POINTS, step, opened), 0)
     alpha = delta / (1 + delta)
     updated, is_fused, info = em(MAP, POINTS, QUIET, opened)
@@ -296,11 +300,11 @@ def test_the_update_is_estep_mstep_support_and_average_in_a_row(opened):
 @pytest.mark.slow  # compiles both steps anew
 def test_many_points_are_taken_in_parts_which_changes_no_sum(opened, monkeypatch):
     step, best = estep(GAUSSIANS, POINTS, NOISE, opened)
-    new, total = mstep(GAUSSIANS, POINTS, step, opened)
+    new, total = mstep(GAUSSIANS, POINTS, jnp.ones(M), step, opened)
     monkeypatch.setattr("emgs_jax.em.MAX_POINTS", 13)  # five parts, the last with fewer points
     in_parts = lambda function: eqx.filter_jit(lambda *arguments: function(*arguments))  # noqa: E731
     step_parts, best_parts = in_parts(e_step)(GAUSSIANS, POINTS, NOISE, opened)
-    new_parts, total_parts = in_parts(m_step)(GAUSSIANS, POINTS, step_parts, opened)
+    new_parts, total_parts = in_parts(m_step)(GAUSSIANS, POINTS, jnp.ones(M), step_parts, opened)
     np.testing.assert_array_equal(step_parts.rows, step.rows)
     np.testing.assert_allclose(best_parts, best, rtol=1e-6, atol=1e-5)  # sums of terms near 50
     np.testing.assert_allclose(total_parts, total, atol=1e-5)  # roundings, here and below

@@ -234,7 +234,8 @@ def test_without_enough_pairs_the_priors_own_pose_stands_in_for_the_chain(wide, 
     printed_result = coarse_of(blind, wide, at(printed, "coarse", COARSE["via_previous"]))
     assert max(pose_error(printed_result.T_world_camera, path_pose(FRAME))) < (2e-3 if count < 16 else 0.1)
     if count == 0:  # nothing is known, and the largest distance of a pair stands in
-        assert result.repeat_rms == pytest.approx(1.4826 * float(printed.max_pair_distance), rel=1e-5)
+        unknown = float(printed.max_pair_distance * result.mean_depth)
+        assert result.repeat_rms == pytest.approx(1.4826 * unknown, rel=1e-5)
     assert np.isfinite(result.mean_depth)
 
 
@@ -314,7 +315,7 @@ def small_prediction(camera):
 def test_the_fine_step_is_icp_of_the_scaled_points_with_the_noise_of_the_coarse_pose(
     camera, submap, lenient, repeat_rms, coarse_scale
 ):
-    """Metres for the pose, at least a millimetre, and the same over the depth of the image for the points."""
+    """Metres for the pose, at least a 2000th of the depth, and the same over that depth for the points."""
     settings = at(at(lenient, "icp.prior_information", 30.0), "icp.scale_noise", 1.0)
     coarse = coarse_of(nudged(camera), camera, settings)
     known = jnp.asarray(repeat_rms), jnp.asarray(coarse_scale)
@@ -322,13 +323,14 @@ def test_the_fine_step_is_icp_of_the_scaled_points_with_the_noise_of_the_coarse_
     current = small_prediction(camera).current
     T, aligned, info = fine_step(current, submap, coarse, settings)
     scaled = eqx.tree_at(lambda o: o.points, current, coarse_scale * current.points)
-    noise = jnp.maximum(coarse.repeat_rms, 1e-3)
+    noise = jnp.maximum(coarse.repeat_rms, 5e-4 * coarse.mean_depth)
     arguments = scaled, submap, coarse.T_world_camera, (noise, noise / coarse.mean_depth), settings.icp
     expected, scale, found = eqx.filter_jit(icp)(*arguments)
     # Another program rounds in another order; the solver stops within its tolerance.
     assert max(pose_error(T, expected)) < 1e-4
     np.testing.assert_allclose(info.scale, coarse_scale * scale, rtol=1e-4)
-    np.testing.assert_allclose(info.depth_noise, found.misfit / coarse.mean_depth, rtol=1e-2)
+    np.testing.assert_allclose(info.depth_noise, found.misfit, rtol=1e-2)
+    np.testing.assert_allclose(info.noise, jnp.full(info.noise.shape, found.misfit), rtol=1e-2)  # equal confidences
     moved = transform(T, current, info.scale)
     np.testing.assert_allclose(aligned.points, moved.points, atol=1e-5)
     assert info.is_tracked and info.repeat_rms == coarse.repeat_rms
