@@ -11,8 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.evaluation.clouds import PointCloud
-from emgs_jax.evaluation.reconstruction import EvaluationConfig, raw_prior_cloud
+from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import describe, new_scorer, score_map, score_prior, spent
@@ -23,6 +22,7 @@ from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import build_dataset, build_prior
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
 from emgs_jax.running.drive import map_frames, show_record
+from emgs_jax.running.gathering import RawPrior, gather
 from emgs_jax.running.record import FrameRecord, MappingRun, new_run, to_line
 
 from .command import command
@@ -36,18 +36,18 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             prior = build_prior(config, dataset)
             slam, evaluation, densify = (instantiate(config[name]) for name in ("slam", "evaluation", "densify"))
         session = new_run(dataset, slam, clock)
-        raw_cloud = _map(session, dataset, prior, evaluation, folder)
+        raw = _map(session, dataset, prior, evaluation, folder)
         save_progress(folder, session)
         with clock.phase("densify"):
             labels = label_centers(session, prior)
-            dense = dense_map(session, dataset, densify, evaluation.voxel_m, labels)
+            dense = dense_map(session, dataset, densify, evaluation, labels)
         with clock.phase("export"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
             notes = save_outputs(folder, session, dense, densify, title)
         with clock.phase("evaluate"):
             scorer = new_scorer(dataset, evaluation, prior)
             metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
-            metrics |= score_prior(session, raw_cloud, scorer)
+            metrics |= dense.rendering | score_prior(session, raw, scorer)
         metrics |= describe(session, dataset) | spent(clock) | prior.report()
     settings = OmegaConf.to_container(config, resolve=True)
     metrics["provenance"] = provenance(settings, dataset, prior.provenance)
@@ -59,8 +59,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
 
 def _map(
     session: MappingRun, dataset: ReadableFrames, prior: Prior, evaluation: EvaluationConfig, folder: Path
-) -> PointCloud:
-    """Map all frames and log each; returns the raw prior's cloud. What an interrupted run has is written."""
+) -> RawPrior:
+    """Map all frames and log each; returns what the prior alone says. What an interrupted run has is written."""
     with FrameLog(folder / "frames.jsonl") as log, tqdm(total=len(dataset), unit="frame", desc="mapping") as bar:
 
         def on_record(record: FrameRecord) -> None:
@@ -72,7 +72,7 @@ def _map(
             log.append(to_line(FrameRecord(index, None, None, "skipped", reason)))
         try:
             with session.clock.phase("raw_prior"):
-                return raw_prior_cloud(map_frames(session, dataset, prior), evaluation)
+                return gather(map_frames(session, dataset, prior), evaluation, dataset.has_ground_truth)
         except BaseException:
             with contextlib.suppress(OSError, ValueError):  # the first error is the one to show
                 save_progress(folder, session)

@@ -282,7 +282,7 @@ MUTANTS = (
     ),
     # report
     Mutant(
-        "emgs_jax/report/metrics.py",
+        "emgs_jax/running/record.py",
         "for pose, true in zip(poses, run.true_poses, strict=True) if true is not None]",
         "for pose, true, record in zip(poses, run.true_poses, run.records, strict=True)"
         ' if true is not None and record.status != "lost"]',
@@ -291,22 +291,22 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/report/metrics.py",
-        "_known(run, run.poses), scorer.truth",
-        "_known(run, run.raw_poses), scorer.truth",
+        "with_truth(run, run.poses), scorer.truth",
+        "with_truth(run, run.raw_poses), scorer.truth",
         METRICS,
         "ours is scored with the raw prior's poses",
     ),
     Mutant(
         "emgs_jax/report/metrics.py",
-        "poses = _known(run, run.raw_poses)",
-        "poses = _known(run, run.poses)",
+        "poses = with_truth(run, run.raw_poses)",
+        "poses = with_truth(run, run.poses)",
         METRICS,
         "the raw prior is scored with our poses",
     ),
     Mutant(
         "emgs_jax/report/metrics.py",
-        "compare_clouds(cloud, scorer.truth, poses, scorer.evaluation)",
-        "compare_clouds(cloud, scorer.truth, _known(run, run.poses), scorer.evaluation)",
+        "score_cloud(raw.cloud, poses, scorer)",
+        "score_cloud(raw.cloud, with_truth(run, run.poses), scorer)",
         METRICS,
         "the raw prior's cloud is aligned by our poses",
     ),

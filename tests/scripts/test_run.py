@@ -33,8 +33,18 @@ TRAJECTORY = [
     "num_frames",
 ]
 RECONSTRUCTION = ["accuracy_m", "completion_m", *ERRORS, *NORMALS, "num_points", "alignment_note"]
+RENDERING = [
+    "coverage_percent",
+    "worst_coverage_percent",
+    "depth_l1_m",
+    "depth_within_5_percent",
+    "psnr_db",
+    "num_frames",
+]
 COMPARED = [f"trajectory/{name}" for name in TRAJECTORY] + [f"reconstruction/{name}" for name in RECONSTRUCTION]
 PHASES = ("setup", "load", "predict", "map", "raw_prior", "densify", "export", "evaluate", "compile", "total")
+COMPARED += [f"reconstruction_icp/{name}" for name in RECONSTRUCTION]
+COMPARED += [f"rendering/{name}" for name in RENDERING]
 KEYS = {
     *COMPARED,
     *(f"raw_prior/{name}" for name in COMPARED),
