@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, register, transform_cloud, voxel_downsample
-from emgs_jax.evaluation.trajectory import align_poses
+from emgs_jax.evaluation.trajectory import Alignment, align_poses
 
 _BAND_ROWS = 40  # of an image whose normals are fitted at a time: what is computed in between stays in the cache
 
@@ -75,10 +75,19 @@ def posed_cloud(
     points: np.ndarray, mask: np.ndarray, image: np.ndarray, T_world_camera: np.ndarray, config: EvaluationConfig
 ) -> PointCloud:
     """Turn a camera-frame point map (h, w, 3) with its image, uint8 (h, w, 3), into a cloud in the world."""
+    return posed(camera_cloud(points, mask, image, config), T_world_camera)
+
+
+def camera_cloud(points: np.ndarray, mask: np.ndarray, image: np.ndarray, config: EvaluationConfig) -> PointCloud:
+    """The same in the frame of the camera."""
     mask = mask & np.isfinite(points).all(-1)
     normals = window_normals(points, mask, config)[mask].astype(np.float64)
-    world = points[mask].astype(np.float64) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    return PointCloud(world, normals @ T_world_camera[:3, :3].T, image[mask] / 255.0)
+    return PointCloud(points[mask].astype(np.float64), normals, image[mask] / 255.0)
+
+
+def posed(cloud: PointCloud, T_world_camera: np.ndarray) -> PointCloud:
+    """A cloud in the frame of a camera, in the world."""
+    return transform_cloud(cloud, Alignment(1.0, T_world_camera[:3, :3], T_world_camera[:3, 3]))
 
 
 def ground_truth_cloud(

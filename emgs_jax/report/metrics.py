@@ -28,7 +28,7 @@ from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.provenance import RAW_PRIOR, prefixed
 from emgs_jax.running.clock import Clock, peak_memory_mb
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
-from emgs_jax.running.gathering import RawPrior
+from emgs_jax.running.gathering import Baselines, RawPrior
 from emgs_jax.running.record import FrameRecord, MappingRun, with_truth
 
 Metrics = dict[str, Any]
@@ -126,6 +126,29 @@ def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
         rendered.add(row, raw.depths[row], None)
     metrics = trajectory_metrics(*poses) | score_cloud(raw.cloud, poses, scorer) | rendered.metrics()
     return prefixed(metrics, RAW_PRIOR)
+
+
+def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer: Scorer) -> Metrics:
+    """Reconstruction and rendering metrics of every baseline, aligned by the poses that it was built at.
+
+    Rendered is each frame whose pose is known: at our poses those that are not lost, at the prior's those with points.
+    """
+    is_known = [record.status != "lost" for record in run.records]
+    metrics: Metrics = {}
+    for fusions, poses, rows, kind in (
+        (baselines.raw, run.raw_poses, [raw.depths[row].any() for row in range(len(raw.depths))], "raw"),
+        (baselines.ours, run.poses, is_known, "ours"),
+    ):
+        compared = with_truth(run, poses)
+        if compared is None:
+            return {}
+        for name, fusion in fusions.items():
+            rendered, draw = Rendered(scorer.dataset, compared, scorer.evaluation), fusion.renderer()
+            for row in np.flatnonzero(rows):
+                rendered.add(int(row), *draw(poses[row]))
+            found = score_cloud(fusion.cloud(), compared, scorer) | rendered.metrics()
+            metrics |= prefixed(found, f"baseline_{name}_{kind}/")
+    return metrics
 
 
 def score_settings(
