@@ -222,8 +222,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/evaluation/baselines.py",
-        "[[fx, 0.0, cx + 0.5], [0.0, fy, cy + 0.5], [0.0, 0.0, 1.0]]",
-        "[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]",
+        "np.array([[fx, 0.0, cx + 0.5], [0.0, fy, cy + 0.5], [0.0, 0.0, 1.0]])",
+        "np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])",
         BASELINES,
         "the TSDF is half a pixel off",
     ),

@@ -149,13 +149,15 @@ class _Tsdf:
             return
         fx, fy, cx, cy = self._pinhole.intrinsics
         # Open3D takes the pixel in which a voxel falls, with pixel centres at halves.
-        matrix = self._tensor([[fx, 0.0, cx + 0.5], [0.0, fy, cy + 0.5], [0.0, 0.0, 1.0]])
-        camera = matrix, self._tensor(np.linalg.inv(self._shifted(T_world_camera)))
-        images = [self._o3d.t.geometry.Image(self._o3d.core.Tensor(image)) for image in (depth, _floats(view.image))]
-        config = self._config
-        limits = 1.0, float(2.0 * depth.max()), config.truncation_m / config.voxel_m
-        blocks = self._grid.compute_unique_block_coordinates(images[0], *camera, *limits)
-        self._grid.integrate(blocks, *images, *camera, *limits)
+        matrix = np.array([[fx, 0.0, cx + 0.5], [0.0, fy, cy + 0.5], [0.0, 0.0, 1.0]])
+        T_camera_world = self._tensor(np.linalg.inv(self._shifted(T_world_camera)))
+        limits = 1.0, float(2.0 * depth.max()), self._config.truncation_m / self._config.voxel_m
+        # It makes room for every fourth pixel only, between which small images have no blocks: each pixel is four here.
+        dense = self._image(depth.repeat(4, axis=0).repeat(4, axis=1))
+        larger = self._tensor(np.diag([4.0, 4.0, 1.0]) @ matrix)
+        blocks = self._grid.compute_unique_block_coordinates(dense, larger, T_camera_world, *limits)
+        images = self._image(depth), self._image(view.image.astype(np.float32) / 255.0)
+        self._grid.integrate(blocks, *images, self._tensor(matrix), T_camera_world, *limits)
 
     def cloud(self) -> PointCloud:
         if not self._grid.hashmap().size():
@@ -196,6 +198,9 @@ class _Tsdf:
         moved[:3, 3] += self._shift
         return moved
 
+    def _image(self, values: np.ndarray) -> Any:
+        return self._o3d.t.geometry.Image(self._o3d.core.Tensor(np.ascontiguousarray(values)))
+
     def _tensor(self, values: Any) -> Any:
         return self._o3d.core.Tensor(np.asarray(values, np.float64))
 
@@ -230,10 +235,6 @@ def draw_points(cloud: PointCloud, T_world_camera: np.ndarray, pinhole: Pinhole,
 
 def _nothing(pinhole: Pinhole) -> Image:
     return np.zeros((pinhole.height, pinhole.width)), np.zeros((pinhole.height, pinhole.width, 3))
-
-
-def _floats(image: np.ndarray) -> np.ndarray:
-    return image.astype(np.float32) / 255.0
 
 
 def _require_positive(name: str, **values: float) -> None:
