@@ -98,7 +98,7 @@ def test_baselines_are_compared_at_the_poses_that_they_were_built_at(gathered):
         # A TSDF ends before the border of its views, here one of 8 rows.
         assert metrics[f"baseline_{name}_ours/rendering/coverage_percent"] == pytest.approx(40.0, abs=6.0)
         assert metrics[f"baseline_{name}_ours/rendering/depth_l1_m"] < 1e-3
-        assert metrics[f"baseline_{name}_raw/rendering/coverage_percent"] == pytest.approx(80.0, abs=12.0)
+        assert metrics[f"baseline_{name}_raw/rendering/coverage_percent"] == pytest.approx(80.0, abs=20.0)
         # Of the frames that the prior sees one has the true size.
         assert metrics[f"baseline_{name}_raw/rendering/depth_within_5_percent"] == pytest.approx(20.0, abs=4.0)
         assert metrics[f"baseline_{name}_ours/rendering/psnr_db"] > 40.0
