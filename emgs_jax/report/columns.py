@@ -25,14 +25,14 @@ MAIN = (
     Column("reconstruction/normals_abs_cos_percent", "normals [%]", 1.0, 1, False),
 )
 
-PLACED = (  # by its points
+PLACED = (  # by their points
     Column("reconstruction_icp/accuracy_m", "ICP: accuracy [cm]", 100.0, 2, True),
-    Column("reconstruction_icp/completion_m", "completion [cm]", 100.0, 2, True),
-    Column("reconstruction_icp/f1_20cm_percent", "F1@.2 [%]", 1.0, 1, False),
-    Column("reconstruction_icp/f1_5cm_percent", "F1@.05 [%]", 1.0, 1, False),
-    Column("reconstruction_icp/normals_abs_cos_percent", "normals [%]", 1.0, 1, False),
+    Column("reconstruction_icp/completion_m", "ICP: completion [cm]", 100.0, 2, True),
+    Column("reconstruction_icp/f1_20cm_percent", "ICP: F1@.2 [%]", 1.0, 1, False),
+    Column("reconstruction_icp/f1_5cm_percent", "ICP: F1@.05 [%]", 1.0, 1, False),
+    Column("reconstruction_icp/normals_abs_cos_percent", "ICP: normals [%]", 1.0, 1, False),
 )
-RENDERED = (  # at its own poses
+RENDERED = (  # at their own poses
     Column("rendering/coverage_percent", "coverage [%]", 1.0, 1, False),
     Column("rendering/worst_coverage_percent", "at worst [%]", 1.0, 1, False),
     Column("rendering/depth_l1_m", "depth error [cm]", 100.0, 2, True),
