@@ -101,6 +101,20 @@ def test_the_labels_of_the_points_are_the_true_ones_where_prior_and_features_are
 
 
 @pytest.mark.slow
+def test_baselines_stand_beside_ours_and_change_nothing_else(tmp_path):
+    """The exact prior at its own poses has no error but the size of a voxel; at 64 pixels a view is coarse."""
+    metrics = experiments.run.run(compose("prior.level=0", "baseline=all"), tmp_path)
+    prefixes = [f"baseline_{name}_{kind}/" for name in ("voxel", "tsdf") for kind in ("raw", "ours")]
+    keys = [key for key in COMPARED if not key.startswith("trajectory/")]
+    assert set(metrics) == KEYS | {prefix + key for prefix in prefixes for key in keys}
+    for prefix in prefixes:
+        assert metrics[f"{prefix}reconstruction/accuracy_m"] < 0.05
+        assert metrics[f"{prefix}rendering/coverage_percent"] > 80.0
+    same = [key for key in KEYS if key.startswith(("trajectory/", "reconstruction", "rendering/"))]
+    assert {key: metrics[key] for key in same} == {key: exact_run()[1][key] for key in same}
+
+
+@pytest.mark.slow
 def test_the_phases_account_for_the_time():
     metrics = exact_run()[1]
     parts = sum(metrics[f"time/{name}_seconds"] for name in PHASES if name not in ("compile", "total"))
