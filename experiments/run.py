@@ -11,18 +11,18 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.evaluation.clouds import PointCloud
-from emgs_jax.evaluation.reconstruction import EvaluationConfig, raw_prior_cloud
+from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog
 from emgs_jax.prior.base import Prior
-from emgs_jax.report.metrics import describe, new_scorer, score_map, score_prior, spent
+from emgs_jax.report.metrics import describe, new_scorer, score_baselines, score_map, score_prior, spent
 from emgs_jax.report.printout import frame_lines
 from emgs_jax.report.provenance import print_metrics_table, provenance, write_metrics
 from emgs_jax.report.run_files import save_outputs, save_progress
 from emgs_jax.running.clock import Clock
-from emgs_jax.running.configure import build_dataset, build_prior
+from emgs_jax.running.configure import baseline_configs, build_dataset, build_prior
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
 from emgs_jax.running.drive import map_frames, show_record
+from emgs_jax.running.gathering import Baselines, RawPrior, gather
 from emgs_jax.running.record import FrameRecord, MappingRun, new_run, to_line
 
 from .command import command
@@ -36,18 +36,20 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             prior = build_prior(config, dataset)
             slam, evaluation, densify = (instantiate(config[name]) for name in ("slam", "evaluation", "densify"))
         session = new_run(dataset, slam, clock)
-        raw_cloud = _map(session, dataset, prior, evaluation, folder)
+        baselines = Baselines(baseline_configs(config), session, dataset)
+        raw = _map(session, dataset, prior, baselines, evaluation, folder)
         save_progress(folder, session)
         with clock.phase("densify"):
             labels = label_centers(session, prior)
-            dense = dense_map(session, dataset, densify, evaluation.voxel_m, labels)
+            dense = dense_map(session, dataset, densify, evaluation, labels)
         with clock.phase("export"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
             notes = save_outputs(folder, session, dense, densify, title)
         with clock.phase("evaluate"):
             scorer = new_scorer(dataset, evaluation, prior)
             metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
-            metrics |= score_prior(session, raw_cloud, scorer)
+            metrics |= dense.rendering | score_prior(session, raw, scorer)
+            metrics |= score_baselines(session, baselines, raw, scorer)
         metrics |= describe(session, dataset) | spent(clock) | prior.report()
     settings = OmegaConf.to_container(config, resolve=True)
     metrics["provenance"] = provenance(settings, dataset, prior.provenance)
@@ -58,9 +60,14 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
 
 
 def _map(
-    session: MappingRun, dataset: ReadableFrames, prior: Prior, evaluation: EvaluationConfig, folder: Path
-) -> PointCloud:
-    """Map all frames and log each; returns the raw prior's cloud. What an interrupted run has is written."""
+    session: MappingRun,
+    dataset: ReadableFrames,
+    prior: Prior,
+    baselines: Baselines,
+    evaluation: EvaluationConfig,
+    folder: Path,
+) -> RawPrior:
+    """Map all frames and log each; returns what the prior alone says. What an interrupted run has is written."""
     with FrameLog(folder / "frames.jsonl") as log, tqdm(total=len(dataset), unit="frame", desc="mapping") as bar:
 
         def on_record(record: FrameRecord) -> None:
@@ -72,7 +79,7 @@ def _map(
             log.append(to_line(FrameRecord(index, None, None, "skipped", reason)))
         try:
             with session.clock.phase("raw_prior"):
-                return raw_prior_cloud(map_frames(session, dataset, prior), evaluation)
+                return gather(map_frames(session, dataset, prior), evaluation, dataset.has_ground_truth, baselines)
         except BaseException:
             with contextlib.suppress(OSError, ValueError):  # the first error is the one to show
                 save_progress(folder, session)

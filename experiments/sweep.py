@@ -20,7 +20,6 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.evaluation.reconstruction import raw_prior_cloud
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.report.metrics import Metrics, Scorer, new_scorer, score_settings
@@ -28,6 +27,7 @@ from emgs_jax.report.provenance import provenance
 from emgs_jax.report.sweeps import SweepResults, draw, table, write_csv
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import build_dataset, build_prior
+from emgs_jax.running.gathering import gather
 from emgs_jax.running.record import new_run
 from emgs_jax.running.stacked import map_together, programs
 
@@ -51,6 +51,8 @@ class Work:
 
 def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
     """Map and score every setting of `config.axes` that `folder` has not; returns a flat row for each."""
+    if config.baseline:
+        raise ValueError("baseline= is for run and evaluate: a sweep compares settings, and no baseline has them")
     axes = read_axes(config)
     grid = variants(config, axes)
     for note in notes(config, axes):
@@ -132,9 +134,9 @@ def _bar(dataset: ReadableFrames, chunks: Sequence[Sequence[Variant]]) -> tqdm:
 def _map_and_score(work: Work, chunk: Sequence[Variant], bar: tqdm) -> list[Metrics]:
     runs = [new_run(work.dataset, variant.slam, work.clock, lambda record: bar.update()) for variant in chunk]
     views = map_together(runs, work.dataset, work.prior, work.at_once, work.num_threads)
-    raw_cloud = raw_prior_cloud(views, work.scorer.evaluation)
+    raw = gather(views, work.scorer.evaluation, work.dataset.has_ground_truth)
     densify = [variant.densify for variant in chunk]
-    return score_settings(runs, raw_cloud, densify, work.scorer, work.num_threads)
+    return score_settings(runs, raw, densify, work.scorer, work.num_threads)
 
 
 @command("sweep")

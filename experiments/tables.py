@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import emgs_jax
 from emgs_jax.io.files import atomic_write
-from emgs_jax.report.columns import MAIN, Column, cell, markdown
+from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, cell, markdown
 from emgs_jax.report.provenance import git_revision
 from emgs_jax.report.results import METRICS_FILE, Estimate, estimates_of, read_metrics
 from emgs_jax.report.tables import average
@@ -27,7 +27,7 @@ Settings = Mapping[str, Any]  # a resolved conf/evaluate.yaml
 COLUMNS = (
     MAIN[0]._replace(title="ATE Sim(3) [cm]", digits=1),
     Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 1, True),
-    *(column._replace(digits=1) for column in MAIN[1:]),
+    *(column._replace(digits=1) for column in (*MAIN[1:], *PLACED, *RENDERED)),
 )
 
 

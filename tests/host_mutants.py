@@ -4,6 +4,9 @@ from mutant import Mutant
 
 TRAJECTORY = ("tests/evaluation/test_trajectory.py",)
 CLOUDS = ("tests/evaluation/test_clouds.py",)
+BASELINES = ("tests/evaluation/test_baselines.py",)
+RENDERING = ("tests/evaluation/test_rendering.py",)
+GATHERING = ("tests/running/test_gathering.py",)
 RECONSTRUCTION = ("tests/evaluation/test_reconstruction.py", "tests/evaluation/test_normals.py")
 SEGMENTATION = ("tests/evaluation/test_segmentation.py",)
 METRICS = ("tests/report/test_metrics.py",)
@@ -177,17 +180,73 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/evaluation/reconstruction.py",
-        "world = points[mask].astype(np.float64) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]",
-        "world = points[mask].astype(np.float64) @ T_world_camera[:3, :3] + T_world_camera[:3, 3]",
+        "Alignment(1.0, T_world_camera[:3, :3], T_world_camera[:3, 3])",
+        "Alignment(1.0, T_world_camera[:3, :3].T, T_world_camera[:3, 3])",
         RECONSTRUCTION,
         "points turn the other way",
     ),
     Mutant(
         "emgs_jax/evaluation/reconstruction.py",
-        "normals @ T_world_camera[:3, :3].T, image[mask]",
-        "normals, image[mask]",
+        "if config.icp_distance_m > 0:",
+        "if True:",
         RECONSTRUCTION,
-        "normals stay in the camera",
+        "every protocol has ICP",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/rendering.py",
+        "within = float(np.sum(error <= _TOLERANCE * true[is_covered]) / len(true))",
+        "within = float(np.mean(error <= _TOLERANCE * true[is_covered]))",
+        RENDERING,
+        "what is not rendered does not count as wrong",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/rendering.py",
+        "scale * depth[is_known]",
+        "depth[is_known]",
+        RENDERING,
+        "depth keeps the scale of the estimate",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/rendering.py",
+        "for row in sorted(set(range(len(self._dataset))) - set(self._scores)):",
+        "for row in ():",
+        RENDERING,
+        "lost frames are left out of the coverage",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/baselines.py",
+        "motion = Alignment(scale, ",
+        "motion = Alignment(1.0, ",
+        BASELINES,
+        "voxels take no scale",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/baselines.py",
+        "np.array([[fx, 0.0, cx + 0.5], [0.0, fy, cy + 0.5], [0.0, 0.0, 1.0]])",
+        "np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])",
+        BASELINES,
+        "the TSDF is half a pixel off",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/baselines.py",
+        "np.argsort(-z[rows], kind=",
+        "np.argsort(z[rows], kind=",
+        BASELINES,
+        "the farthest point is drawn",
+    ),
+    Mutant(
+        "emgs_jax/running/gathering.py",
+        "fusion.add(view, record.pose, 1.0 if record.scale is None else record.scale)",
+        "fusion.add(view, T_world_camera, 1.0 if record.scale is None else record.scale)",
+        GATHERING,
+        "a baseline at our poses stands at the prior's",
+    ),
+    Mutant(
+        "emgs_jax/running/gathering.py",
+        '("tracked", "initialization")',
+        '("tracked", "degraded", "initialization")',
+        GATHERING,
+        "a baseline takes frames that the map did not take",
     ),
     Mutant(
         "emgs_jax/evaluation/reconstruction.py",
@@ -282,7 +341,7 @@ MUTANTS = (
     ),
     # report
     Mutant(
-        "emgs_jax/report/metrics.py",
+        "emgs_jax/running/record.py",
         "for pose, true in zip(poses, run.true_poses, strict=True) if true is not None]",
         "for pose, true, record in zip(poses, run.true_poses, run.records, strict=True)"
         ' if true is not None and record.status != "lost"]',
@@ -291,22 +350,22 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/report/metrics.py",
-        "_known(run, run.poses), scorer.truth",
-        "_known(run, run.raw_poses), scorer.truth",
+        "with_truth(run, run.poses), scorer.truth",
+        "with_truth(run, run.raw_poses), scorer.truth",
         METRICS,
         "ours is scored with the raw prior's poses",
     ),
     Mutant(
         "emgs_jax/report/metrics.py",
-        "poses = _known(run, run.raw_poses)",
-        "poses = _known(run, run.poses)",
+        "poses = with_truth(run, run.raw_poses)",
+        "poses = with_truth(run, run.poses)",
         METRICS,
         "the raw prior is scored with our poses",
     ),
     Mutant(
         "emgs_jax/report/metrics.py",
-        "compare_clouds(cloud, scorer.truth, poses, scorer.evaluation)",
-        "compare_clouds(cloud, scorer.truth, _known(run, run.poses), scorer.evaluation)",
+        "score_cloud(raw.cloud, poses, scorer)",
+        "score_cloud(raw.cloud, with_truth(run, run.poses), scorer)",
         METRICS,
         "the raw prior's cloud is aligned by our poses",
     ),
@@ -452,8 +511,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/report/results.py",
-        "key.startswith(RAW_PRIOR) == (prefix == RAW_PRIOR)",
-        "key.startswith(prefix)",
+        "if prefix_of(key) == prefix}",
+        "if key.startswith(prefix)}",
         RESULTS,
         "our rows carry the raw prior's metrics",
     ),

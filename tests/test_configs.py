@@ -15,8 +15,9 @@ from emgs_jax.slam import SlamConfig
 
 ROOT = CONF.parent
 # Studies and suites hold no class; tests/scripts composes them.
-UNTYPED = {CONF, CONF / "experiment", CONF / "experiment_on", CONF / "suite", CONF / "baseline", CONF / "sweep"}
-GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent not in UNTYPED)
+UNTYPED = {CONF, CONF / "experiment", CONF / "experiment_on", CONF / "suite", CONF / "sweep"}
+GATE = CONF / "baseline" / "smoke.yaml"  # results to compare with, no option
+GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent not in UNTYPED and path != GATE)
 
 
 def group_and_option(path: Path) -> tuple[str, str]:

@@ -57,23 +57,39 @@ def transform_cloud(cloud: PointCloud, alignment: Alignment) -> PointCloud:
     return PointCloud(alignment.apply(cloud.points), cloud.normals @ alignment.rotation.T, cloud.colors)
 
 
-def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
-    """Average all points that share a voxel [m] of the world grid, however they are spread over the clouds.
+class VoxelGrid:
+    """Averages all points that share a voxel [m] of the world grid, however they are spread over the clouds.
 
     Rows come out ordered by cell, so the result is deterministic; points that are not finite are dropped.
     """
-    tables: list[tuple[np.ndarray, np.ndarray]] = []  # cells of the clouds; the first may hold many of them
+
+    def __init__(self, voxel: float) -> None:
+        self._voxel = voxel
+        self._tables: list[tuple[np.ndarray, np.ndarray]] = []  # cells of the clouds; the first may hold many of them
+
+    def add(self, cloud: PointCloud) -> None:
+        """Add the points of a cloud."""
+        self._tables.append(_cells(cloud, self._voxel))
+        if sum(len(keys) for keys, _ in self._tables[1:]) > max(_MERGE_ROWS, len(self._tables[0][0])):
+            self._tables = [_merge(self._tables)]
+
+    def cloud(self) -> PointCloud:
+        """The mean of each occupied voxel so far."""
+        empty = (np.empty(0, np.int64), np.empty((0, 10)))
+        _, sums = self._tables[0] if len(self._tables) == 1 else _merge([empty, *self._tables])
+        means = sums[:, :9] / sums[:, 9:]
+        length = np.linalg.norm(means[:, 3:6], axis=1, keepdims=True)
+        # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
+        normals = np.where(length > 0.1, means[:, 3:6] / np.maximum(length, 0.1), 0.0)
+        return PointCloud(means[:, :3], normals, means[:, 6:9])
+
+
+def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
+    """Average the points of all clouds as a `VoxelGrid` does."""
+    grid = VoxelGrid(voxel)
     for cloud in clouds:
-        tables.append(_cells(cloud, voxel))
-        if sum(len(keys) for keys, _ in tables[1:]) > max(_MERGE_ROWS, len(tables[0][0])):
-            tables = [_merge(tables)]
-    empty = (np.empty(0, np.int64), np.empty((0, 10)))
-    _, sums = tables[0] if len(tables) == 1 else _merge([empty, *tables])
-    means = sums[:, :9] / sums[:, 9:]
-    length = np.linalg.norm(means[:, 3:6], axis=1, keepdims=True)
-    # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
-    normals = np.where(length > 0.1, means[:, 3:6] / np.maximum(length, 0.1), 0.0)
-    return PointCloud(means[:, :3], normals, means[:, 6:9])
+        grid.add(cloud)
+    return grid.cloud()
 
 
 def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, register, transform_cloud, voxel_downsample
-from emgs_jax.evaluation.trajectory import align_poses
+from emgs_jax.evaluation.trajectory import Alignment, align_poses
 
 _BAND_ROWS = 40  # of an image whose normals are fitted at a time: what is computed in between stays in the cache
 
@@ -24,6 +24,7 @@ class EvaluationConfig:
     max_distance_m: float  # longer distances count as this long; F1 does not change
     max_depth_m: float  # true depth farther away is left out
     icp_distance_m: float  # ICP after the alignment takes pairs within this distance; 0 = no ICP
+    placement_icp_m: float  # likewise for reconstruction_icp/…, whatever the protocol does
     icp_voxel_m: float
     icp_max_steps: int
     voxel_m: float
@@ -42,7 +43,7 @@ class EvaluationConfig:
         for name, choices in (("alignment", ("sim3", "se3")), ("statistic", ("mean", "rmse"))):
             if getattr(self, name) not in choices:
                 raise ValueError(f"evaluation.{name} must be {' or '.join(choices)}, got {getattr(self, name)!r}")
-        for name in ("voxel_m", "icp_voxel_m", "max_distance_m", "max_depth_m"):
+        for name in ("voxel_m", "icp_voxel_m", "placement_icp_m", "max_distance_m", "max_depth_m"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"evaluation.{name} must be positive, got {getattr(self, name)}")
 
@@ -74,17 +75,19 @@ def posed_cloud(
     points: np.ndarray, mask: np.ndarray, image: np.ndarray, T_world_camera: np.ndarray, config: EvaluationConfig
 ) -> PointCloud:
     """Turn a camera-frame point map (h, w, 3) with its image, uint8 (h, w, 3), into a cloud in the world."""
+    return posed(camera_cloud(points, mask, image, config), T_world_camera)
+
+
+def camera_cloud(points: np.ndarray, mask: np.ndarray, image: np.ndarray, config: EvaluationConfig) -> PointCloud:
+    """The same in the frame of the camera."""
     mask = mask & np.isfinite(points).all(-1)
     normals = window_normals(points, mask, config)[mask].astype(np.float64)
-    world = points[mask].astype(np.float64) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    return PointCloud(world, normals @ T_world_camera[:3, :3].T, image[mask] / 255.0)
+    return PointCloud(points[mask].astype(np.float64), normals, image[mask] / 255.0)
 
 
-def raw_prior_cloud(
-    views: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]], config: EvaluationConfig
-) -> PointCloud:
-    """Accumulate what a prior says, without any mapping; of each view (points, mask, image, T_world_camera)."""
-    return fuse_clouds((posed_cloud(*view, config) for view in views), config.voxel_m)
+def posed(cloud: PointCloud, T_world_camera: np.ndarray) -> PointCloud:
+    """A cloud in the frame of a camera, in the world."""
+    return transform_cloud(cloud, Alignment(1.0, T_world_camera[:3, :3], T_world_camera[:3, 3]))
 
 
 def ground_truth_cloud(
@@ -109,19 +112,18 @@ class Reference:
     Args:
         cloud: averaged per voxel.
         tree: of its points.
-        icp_tree: of the points that ICP takes; None where the protocol has none.
+        icp_tree: of the points that ICP takes.
     """
 
     cloud: PointCloud
     tree: cKDTree
-    icp_tree: cKDTree | None
+    icp_tree: cKDTree
 
 
 def reference(truth: PointCloud, config: EvaluationConfig) -> Reference:
-    """Prepare a true cloud for comparisons under `config`, with either alignment."""
+    """Prepare a true cloud for comparisons under `config`, with either alignment and with or without ICP."""
     cloud = voxel_downsample(truth, config.voxel_m)
-    icp_tree = cKDTree(voxel_downsample(truth, config.icp_voxel_m).points) if config.icp_distance_m > 0 else None
-    return Reference(cloud, _tree(cloud.points), icp_tree)
+    return Reference(cloud, _tree(cloud.points), cKDTree(voxel_downsample(truth, config.icp_voxel_m).points))
 
 
 def compare_clouds(
@@ -138,11 +140,11 @@ def align_cloud(
     """Bring the estimate's cloud into the frame of the truth; what the poses left open is noted, see `align_poses`.
 
     The alignment is that of the poses, estimated and true (n, 4, 4). ICP, where the protocol has it, then moves the
-    cloud rigidly.
+    cloud rigidly: the scale stays that of the poses.
     """
     alignment, note = align_poses(*poses, with_scale=config.alignment == "sim3")
     aligned = transform_cloud(cloud, alignment)
-    if truth.icp_tree is not None:
+    if config.icp_distance_m > 0:
         source = voxel_downsample(aligned, config.icp_voxel_m).points
         aligned = transform_cloud(
             aligned, register(source, truth.icp_tree, config.icp_distance_m, config.icp_max_steps)

@@ -25,6 +25,21 @@ MAIN = (
     Column("reconstruction/normals_abs_cos_percent", "normals [%]", 1.0, 1, False),
 )
 
+PLACED = (  # by their points
+    Column("reconstruction_icp/accuracy_m", "ICP: accuracy [cm]", 100.0, 2, True),
+    Column("reconstruction_icp/completion_m", "ICP: completion [cm]", 100.0, 2, True),
+    Column("reconstruction_icp/f1_20cm_percent", "ICP: F1@.2 [%]", 1.0, 1, False),
+    Column("reconstruction_icp/f1_5cm_percent", "ICP: F1@.05 [%]", 1.0, 1, False),
+    Column("reconstruction_icp/normals_abs_cos_percent", "ICP: normals [%]", 1.0, 1, False),
+)
+RENDERED = (  # at their own poses
+    Column("rendering/coverage_percent", "coverage [%]", 1.0, 1, False),
+    Column("rendering/worst_coverage_percent", "at worst [%]", 1.0, 1, False),
+    Column("rendering/depth_l1_m", "depth error [cm]", 100.0, 2, True),
+    Column("rendering/depth_within_5_percent", "within 5 % [%]", 1.0, 1, False),
+    Column("rendering/psnr_db", "PSNR [dB]", 1.0, 1, False),
+)
+
 
 def cell(mean: float | None, spread: float | None, factor: float, digits: int, sign: str = "") -> str:
     """Mean ± spread as text; a dash where there is no mean, NaN included. `sign="+"` writes it of positive ones too."""

@@ -20,6 +20,7 @@ from emgs_jax.evaluation.reconstruction import (
     reconstruction_metrics,
     reference,
 )
+from emgs_jax.evaluation.rendering import Rendered
 from emgs_jax.evaluation.segmentation import LabelledPoints, compare_labels, label_cells, true_labels
 from emgs_jax.evaluation.trajectory import trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
@@ -28,7 +29,8 @@ from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.provenance import RAW_PRIOR, prefixed
 from emgs_jax.running.clock import Clock, peak_memory_mb
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
-from emgs_jax.running.record import FrameRecord, MappingRun
+from emgs_jax.running.gathering import Baselines, RawPrior
+from emgs_jax.running.record import FrameRecord, MappingRun, with_truth
 
 Metrics = dict[str, Any]
 STATUSES = ("tracked", "degraded", "lost", "initialization")
@@ -79,8 +81,8 @@ def score_map(
 ) -> Metrics:
     """Trajectory, reconstruction and segmentation metrics of the map; empty without any true pose.
 
-    The dense map is compared as the protocol says, under the other alignment as `reconstruction_<alignment>/…`, and
-    the plain centres as `reconstruction_centers/…`.
+    The dense map is compared as the protocol says, under the other alignment as `reconstruction_<alignment>/…`,
+    placed by its points as `reconstruction_icp/…`, and the plain centres as `reconstruction_centers/…`.
 
     Args:
         run: finished.
@@ -89,11 +91,11 @@ def score_map(
         labels: of the centres, row by row.
         scorer: the truth.
     """
-    if all(pose is None for pose in run.true_poses):
+    poses, truth, config = with_truth(run, run.poses), scorer.truth, scorer.evaluation
+    if poses is None:
         return {}
-    poses, truth, config = _known(run, run.poses), scorer.truth, scorer.evaluation
     other = replace(config, alignment="se3" if config.alignment == "sim3" else "sim3")
-    metrics = trajectory_metrics(*poses) | compare_clouds(dense, truth, poses, config)
+    metrics = trajectory_metrics(*poses) | score_cloud(dense, poses, scorer)
     metrics |= _renamed(compare_clouds(dense, truth, poses, other), f"reconstruction_{other.alignment}/")
     aligned, note = align_cloud(centers, truth, poses, config)
     found = reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
@@ -103,18 +105,56 @@ def score_map(
     return metrics
 
 
-def score_prior(run: MappingRun, cloud: PointCloud, scorer: Scorer) -> Metrics:
-    """The same metrics, but for segmentation, of the raw prior, whose points are `cloud`."""
-    if all(pose is None for pose in run.true_poses):
+def score_cloud(cloud: PointCloud, poses: tuple[np.ndarray, np.ndarray], scorer: Scorer) -> Metrics:
+    """Reconstruction metrics of a cloud as the protocol says, and placed by its points as `reconstruction_icp/…`.
+
+    The second placement begins with the first and moves the cloud rigidly onto the truth (ICP): an almost straight path
+    leaves the rotation about itself open, and then the first one says more about that than about the cloud.
+    """
+    config = scorer.evaluation
+    by_points = replace(config, icp_distance_m=config.placement_icp_m)
+    placed = _renamed(compare_clouds(cloud, scorer.truth, poses, by_points), "reconstruction_icp/")
+    return compare_clouds(cloud, scorer.truth, poses, config) | placed
+
+
+def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
+    """Trajectory, reconstruction and rendering metrics of the raw prior, whose rendering is its depth of each frame."""
+    poses = with_truth(run, run.raw_poses)
+    if poses is None:
         return {}
-    poses = _known(run, run.raw_poses)
-    metrics = trajectory_metrics(*poses) | compare_clouds(cloud, scorer.truth, poses, scorer.evaluation)
+    rendered = Rendered(scorer.dataset, poses, scorer.evaluation)
+    for row in range(len(raw.depths)):
+        rendered.add(row, raw.depths[row], None)
+    metrics = trajectory_metrics(*poses) | score_cloud(raw.cloud, poses, scorer) | rendered.metrics()
     return prefixed(metrics, RAW_PRIOR)
+
+
+def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer: Scorer) -> Metrics:
+    """Reconstruction and rendering metrics of every baseline, aligned by the poses that it was built at.
+
+    Rendered is each frame whose pose is known: at our poses those that are not lost, at the prior's those with points.
+    """
+    is_known = [record.status != "lost" for record in run.records]
+    metrics: Metrics = {}
+    for fusions, poses, rows, kind in (
+        (baselines.raw, run.raw_poses, [raw.depths[row].any() for row in range(len(raw.depths))], "raw"),
+        (baselines.ours, run.poses, is_known, "ours"),
+    ):
+        compared = with_truth(run, poses)
+        if compared is None:
+            return {}
+        for name, fusion in fusions.items():
+            rendered, draw = Rendered(scorer.dataset, compared, scorer.evaluation), fusion.renderer()
+            for row in np.flatnonzero(rows):
+                rendered.add(int(row), *draw(poses[row]))
+            found = score_cloud(fusion.cloud(), compared, scorer) | rendered.metrics()
+            metrics |= prefixed(found, f"baseline_{name}_{kind}/")
+    return metrics
 
 
 def score_settings(
     runs: Sequence[MappingRun],
-    raw_cloud: PointCloud,
+    raw: RawPrior,
     densify: Sequence[DensifyConfig],
     scorer: Scorer,
     num_threads: int,
@@ -123,7 +163,7 @@ def score_settings(
 
     Args:
         runs: that share data set, prior and protocol.
-        raw_cloud: the prior's points, the same for all.
+        raw: what the prior alone says, the same for all.
         densify: of each run.
         scorer: the truth.
         num_threads: runs that are scored side by side.
@@ -133,12 +173,12 @@ def score_settings(
         counts = {k: v for k, v in describe(run, scorer.dataset).items() if not k.startswith("time/")}
         if all(pose is None for pose in run.true_poses):
             return counts
-        dense = dense_map(run, scorer.dataset, config, scorer.evaluation.voxel_m, num_pictures=0).cloud
+        dense = dense_map(run, scorer.dataset, config, scorer.evaluation, num_pictures=0)
         labels = label_centers(run, scorer.prior)
-        return score_map(run, dense, center_cloud(run), labels, scorer) | counts
+        return score_map(run, dense.cloud, center_cloud(run), labels, scorer) | dense.rendering | counts
 
     with ThreadPoolExecutor(num_threads) as threads:
-        shared = threads.submit(score_prior, runs[0], raw_cloud, scorer)
+        shared = threads.submit(score_prior, runs[0], raw, scorer)
         found = [score(runs[0], densify[0])]  # by itself: what it compiles is there for the others
         found += threads.map(score, runs[1:], densify[1:])
     return [metrics | shared.result() for metrics in found]
@@ -169,13 +209,6 @@ def seconds_per_frame(records: list[FrameRecord]) -> float | None:
     steps = [record for record in records if record.status != "initialization"] or records
     steady = [record.seconds for record in steps if record.compile_seconds == 0]
     return float(np.mean(steady or [record.seconds - record.compile_seconds for record in steps])) if steps else None
-
-
-def _known(run: MappingRun, poses: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """`poses` and the true ones (n, 4, 4), of the frames whose true pose is known."""
-    pairs = [(pose, true) for pose, true in zip(poses, run.true_poses, strict=True) if true is not None]
-    ours, truth = zip(*pairs, strict=True)
-    return np.stack(ours), np.stack(truth).astype(np.float64)
 
 
 def _renamed(metrics: Metrics, prefix: str) -> Metrics:

@@ -4,7 +4,7 @@ import importlib.metadata
 import os
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,19 @@ import jax
 from emgs_jax.data.base import Dataset
 from emgs_jax.io.files import write_json
 from emgs_jax.prior.base import Provenance
-from emgs_jax.report.columns import MAIN, cell
+from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, cell
 
 RESULT_FORMAT = 1  # of metrics.json; another one is refused where results are read
 RAW_PRIOR = "raw_prior/"  # prefix of the same metrics for the prior without any mapping
+ROWS = {  # prefix of the metrics of an estimate -> what it is
+    "": "ours",
+    RAW_PRIOR: "raw prior",
+    "baseline_voxel_raw/": "voxel, raw poses",
+    "baseline_voxel_ours/": "voxel, our poses",
+    "baseline_tsdf_raw/": "TSDF, raw poses",
+    "baseline_tsdf_ours/": "TSDF, our poses",
+}
 _GROUPS = ("trajectory/", "reconstruction/", "segmentation/", "map/", "time/")
-_ROWS = (("", "ours"), (RAW_PRIOR, "raw prior"))
 _PACKAGES = {
     "jax": ("jax",),
     "jaxlib": ("jaxlib",),
@@ -66,28 +73,42 @@ def prefixed(metrics: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 
 
 def write_metrics(path: str | os.PathLike, metrics: Mapping[str, Any]) -> None:
-    """Write metrics.json: ours, then the raw prior's, then everything else; NaN and infinities become null."""
+    """Write metrics.json: ours, the raw prior's, the baselines', everything else; NaN and infinities become null."""
     write_json(path, {key: metrics[key] for key in sorted(metrics, key=_rank)})
 
 
 def print_metrics_table(metrics: Mapping[str, Any]) -> str:
-    """Lay out the main metrics, one row for the map and one for the raw prior; `–` where there is no value."""
+    """Lay out the main metrics, one row for the map, the raw prior and each baseline; `–` where there is no value.
+
+    Below are the same rows placed by their points (ICP), and what is rendered of them at their own poses.
+    """
+    tables = [_laid_out(metrics, columns) for columns in (MAIN, (*PLACED, *RENDERED))]
+    return "\n\n".join(table for table in tables if table)
+
+
+def prefix_of(key: str) -> str:
+    """The prefix in `ROWS` of a metric's key."""
+    return next((prefix for prefix in ROWS if prefix and key.startswith(prefix)), "")
+
+
+def _laid_out(metrics: Mapping[str, Any], columns: Sequence[Column]) -> str:
     is_simulated = metrics.get("provenance", {}).get("simulated", False)
-    lines = [["simulated" if is_simulated else "", *(column.title for column in MAIN)]]
-    for prefix, name in _ROWS:
-        if any(prefix + column.key in metrics for column in MAIN):
-            values = [(metrics.get(prefix + key), None, factor, digits) for key, _, factor, digits, _ in MAIN]
+    lines = [["simulated" if is_simulated else "", *(column.title for column in columns)]]
+    for prefix, name in ROWS.items():
+        if any(prefix + column.key in metrics for column in columns):
+            values = [(metrics.get(prefix + key), None, factor, digits) for key, _, factor, digits, _ in columns]
             lines.append([name, *(cell(*value) for value in values)])
+    if len(lines) == 1:
+        return ""
     widths = [max(map(len, texts)) for texts in zip(*lines, strict=True)]
     rows = ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines]
     return "\n".join([rows[0], "─" * max(map(len, rows)), *rows[1:]])
 
 
 def _rank(key: str) -> tuple[int, int]:
-    is_raw = key.startswith(RAW_PRIOR)
-    name = key.removeprefix(RAW_PRIOR)
+    name = key.removeprefix(prefix_of(key))
     group = next((rank for rank, prefix in enumerate(_GROUPS) if name.startswith(prefix)), len(_GROUPS))
-    return (1 if is_raw else 2 if "/" not in key else 0), group
+    return (list(ROWS).index(prefix_of(key)) if "/" in key else len(ROWS)), group
 
 
 def _version(names: tuple[str, ...]) -> str | None:

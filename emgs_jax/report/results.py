@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from emgs_jax.io.files import jsonable
-from emgs_jax.report.provenance import RAW_PRIOR, RESULT_FORMAT
+from emgs_jax.report.provenance import RESULT_FORMAT, ROWS, prefix_of
 
 METRICS_FILE = "metrics.json"
 _PLACES = ("dataset.root", "compilation_cache")  # say where things are, not what is computed
@@ -15,14 +15,14 @@ _PLACES = ("dataset.root", "compilation_cache")  # say where things are, not wha
 
 @dataclass(frozen=True)
 class Estimate:
-    """What was compared with the truth in one run: the map, or what the prior alone says.
+    """What was compared with the truth in one run: the map, what the prior alone says, or a baseline.
 
     Args:
         folder: of the result.
         dataset: name of the data set.
         sequence: name of its sequence.
         variant: name of the overrides, or of another system.
-        kind: "ours", "raw prior", or "scored" for another system.
+        kind: "ours", "raw prior", another one of `ROWS`, or "scored" for another system.
         seed: of the prior.
         prior: name of the prior; None for another system.
         is_simulated: made from the ground truth.
@@ -88,17 +88,16 @@ def read_estimates(out: Path) -> list[Estimate]:
 
 
 def estimates_of(path: Path) -> list[Estimate]:
-    """What one result holds: ours and the raw prior, or another system."""
+    """What one result holds: ours, the raw prior and baselines, or another system."""
     metrics = read_metrics(path)
-    found = [_estimate(path.parent, metrics, "ours" if metrics["provenance"]["prior"] else "scored", "")]
-    if any(key.startswith(RAW_PRIOR) for key in metrics):
-        found.append(_estimate(path.parent, metrics, "raw prior", RAW_PRIOR))
-    return found
+    kinds = ROWS | {"": "ours" if metrics["provenance"]["prior"] else "scored"}
+    there = {"", *map(prefix_of, metrics)}
+    return [_estimate(path.parent, metrics, kind, prefix) for prefix, kind in kinds.items() if prefix in there]
 
 
 def _estimate(folder: Path, metrics: dict[str, Any], kind: str, prefix: str) -> Estimate:
     block = metrics["provenance"]
-    own = {key: value for key, value in metrics.items() if key.startswith(RAW_PRIOR) == (prefix == RAW_PRIOR)}
+    own = {key: value for key, value in metrics.items() if prefix_of(key) == prefix}
     return Estimate(
         folder=folder,
         dataset=block["data"]["name"],

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from emgs_jax.report.columns import DASH, MAIN, Column, cell, markdown
+from emgs_jax.report.columns import DASH, MAIN, PLACED, RENDERED, Column, cell, markdown
 from emgs_jax.report.results import Estimate
 
 _PAPER_DATASETS = {"seven_scenes": "7-Scenes", "tum": "TUM"}
@@ -24,6 +24,8 @@ _COLUMNS = (
     MAIN[0]._replace(title="ATE Sim(3) [cm]"),
     Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True),
     *MAIN[1:],
+    *PLACED,
+    *RENDERED,
     Column("trajectory/scale_percent", "scale [%]", 1.0, 1, False),
     Column("time/seconds_per_frame", "s a frame", 1.0, 2, True),
 )

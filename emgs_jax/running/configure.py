@@ -27,6 +27,7 @@ from emgs_jax.prior.base import Prior
 from emgs_jax.prior.featured import Featured, Requeried
 
 if TYPE_CHECKING:
+    from emgs_jax.evaluation.baselines import BaselineConfig
     from emgs_jax.evaluation.reconstruction import EvaluationConfig
     from emgs_jax.render.densify import DensifyConfig
     from emgs_jax.slam import SlamConfig
@@ -184,6 +185,14 @@ def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
     prior = attach_features(config.features, dataset, instantiate(config.prior, **known))
     prior.check(dataset, config.slam.window_size)
     return prior
+
+
+def baseline_configs(config: DictConfig) -> dict[str, "BaselineConfig"]:
+    """The baselines of a config by name; raises ValueError where an option of the group is none."""
+    for name, node in config.baseline.items():
+        if not isinstance(node, DictConfig) or "_target_" not in node:
+            raise ValueError(f"baseline.{name} is no baseline: choose baseline=voxel, tsdf, all or none")
+    return {str(name): instantiate(node) for name, node in config.baseline.items()}
 
 
 def attach_features(config: DictConfig, dataset: ReadableFrames, prior: Prior) -> Prior:

@@ -12,12 +12,14 @@ import numpy as np
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
+from emgs_jax.evaluation.reconstruction import EvaluationConfig
+from emgs_jax.evaluation.rendering import Rendered
 from emgs_jax.evaluation.segmentation import LabelledPoints, transfer_labels
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.running.convert import to_se3
-from emgs_jax.running.record import MappingRun
+from emgs_jax.running.record import MappingRun, with_truth
 from emgs_jax.semantics import classify
 
 _densify = eqx.filter_jit(densify)
@@ -31,18 +33,20 @@ class DenseMap:
         cloud: a point per pixel of every frame whose pose is known, averaged per voxel.
         labels: class of each of its points; None without classes.
         pictures: what the overview shows of some frames.
+        rendering: `rendering_metrics` of the views that the cloud is made from; empty without truth.
     """
 
     cloud: PointCloud
     labels: LabelledPoints | None = None
     pictures: list[dict[str, Any]] = field(default_factory=list)
+    rendering: dict[str, float | int | None] = field(default_factory=dict)
 
 
 def dense_map(
     run: MappingRun,
     dataset: Dataset,
     config: DensifyConfig,
-    voxel: float,
+    evaluation: EvaluationConfig,
     centers: LabelledPoints | None = None,
     num_pictures: int = 4,
 ) -> DenseMap:
@@ -50,26 +54,29 @@ def dense_map(
 
     Args:
         run: finished.
-        dataset: for the images in the pictures.
+        dataset: for the images in the pictures, and the truth.
         config: what becomes a point.
-        voxel: m; points of one voxel are averaged.
+        evaluation: points of one of its voxels are averaged, and views are compared with the truth under it.
         centers: of the `label_centers`, whose nearest one labels a point.
         num_pictures: frames that are shown, evenly spread.
     """
     known = [row for row, record in enumerate(run.records) if record.status != "lost"]
     shown = {known[int(i)] for i in np.linspace(0, len(known) - 1, num_pictures)} if known else set()
     pictures: list[dict[str, Any]] = []
+    rendered = Rendered(dataset, with_truth(run, run.poses), evaluation)
 
     def clouds() -> Iterator[PointCloud]:
         for row, view in zip(known, _drawn_ahead(run, known, config), strict=True):
             if row in shown:
                 pictures.append(_picture(run, dataset, row, view) | _label_image(view, centers))
+            rendered.add(row, np.where(view.valid, view.depth, 0.0), view.colors)
             yield PointCloud(
                 *(rows[view.valid].astype(np.float64) for rows in (view.points, view.normals, view.colors))
             )
 
-    cloud = fuse_clouds(clouds(), voxel)
-    return DenseMap(cloud, None if centers is None else _labelled(centers, cloud.points), pictures)
+    cloud = fuse_clouds(clouds(), evaluation.voxel_m)
+    labels = None if centers is None else _labelled(centers, cloud.points)
+    return DenseMap(cloud, labels, pictures, rendered.metrics())
 
 
 def _drawn_ahead(run: MappingRun, rows: list[int], config: DensifyConfig) -> Iterator[DenseView]:

@@ -201,6 +201,15 @@ def _described(info: StepInfo) -> dict[str, Any]:
     }
 
 
+def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """`poses` and the true ones (n, 4, 4), of the frames whose true pose is known; None if that is no frame."""
+    pairs = [(pose, true) for pose, true in zip(poses, run.true_poses, strict=True) if true is not None]
+    if not pairs:
+        return None
+    estimate, truth = zip(*pairs, strict=True)
+    return np.stack(estimate), np.stack(truth).astype(np.float64)
+
+
 def to_line(record: FrameRecord) -> dict[str, Any]:
     """A line of frames.jsonl: poses as tx, ty, tz (m), qx, qy, qz, qw."""
     line = dict(vars(record))

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
-from emgs_jax.evaluation.clouds import PointCloud, transform_cloud
+from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, transform_cloud
 from emgs_jax.evaluation.reconstruction import (
     compare_clouds,
     ground_truth_cloud,
-    raw_prior_cloud,
+    posed_cloud,
     reconstruction_metrics,
     reference,
 )
@@ -182,7 +182,7 @@ def test_the_prior_of_true_points_is_the_ground_truth_and_moves_with_the_poses()
     no_truth = Frame(1, 1.0, "g", frame.image)
     truth = ground_truth_cloud([frame, no_truth], INTRINSICS, CONFIG)
     view = (backproject(frame.depth, INTRINSICS), frame.depth > 0, frame.image, frame.T_world_camera)
-    raw = raw_prior_cloud([view], CONFIG)
+    raw = fuse_clouds([posed_cloud(*view, CONFIG)], CONFIG.voxel_m)
     np.testing.assert_array_equal(raw.points, truth.points)
     np.testing.assert_allclose(truth.colors, 0.2)
     # In the camera's frame the points lie on the plane again.

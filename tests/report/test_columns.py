@@ -2,7 +2,7 @@
 
 import pytest
 
-from emgs_jax.report.columns import DASH, MAIN, cell, markdown
+from emgs_jax.report.columns import DASH, MAIN, PLACED, RENDERED, cell, markdown
 
 
 @pytest.mark.parametrize(
@@ -22,11 +22,17 @@ def test_a_cell_is_mean_and_spread_in_one_unit(arguments, text):
     assert cell(*arguments) == text
 
 
-def test_metres_are_shown_in_centimetres_and_less_of_them_is_better_and_percents_as_they_are():
-    for column in MAIN:
+def test_metres_are_shown_in_centimetres_and_less_of_them_is_better_and_the_rest_as_it_is():
+    units = {"m": "[cm]", "percent": "[%]", "db": "[dB]"}
+    for column in (*MAIN, *PLACED, *RENDERED):
         is_length = column.key.endswith("_m")
         assert (column.factor, column.is_lower_better) == ((100.0, True) if is_length else (1.0, False)), column.key
-        assert column.title.endswith("[cm]" if is_length else "[%]")
+        assert column.title.endswith(units[column.key.rpartition("_")[2]])
+
+
+def test_no_two_columns_of_a_table_have_one_title():
+    titles = [column.title for column in (*MAIN, *PLACED, *RENDERED)]
+    assert len(set(titles)) == len(titles)
 
 
 def test_a_table_is_markdown():

@@ -126,6 +126,19 @@ def test_another_system_is_no_run_of_ours(tmp_path):
     assert "| scored, mast3r_slam | measured | paper/sim3 |" in full_table([row])
 
 
+def test_baselines_are_rows_beside_ours_with_their_own_metrics(tmp_path):
+    folder = write_result(tmp_path, 1.0)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics |= {"baseline_voxel_raw/rendering/psnr_db": 20.0, "baseline_tsdf_ours/rendering/psnr_db": 21.0}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    rows = {item.kind: item.values for item in read_estimates(tmp_path)}
+    assert list(rows) == ["ours", "raw prior", "voxel, raw poses", "TSDF, our poses"]
+    assert rows["voxel, raw poses"] == {"rendering/psnr_db": 20.0}
+    assert rows["TSDF, our poses"] == {"rendering/psnr_db": 21.0}
+    assert "rendering/psnr_db" not in {*rows["ours"], *rows["raw prior"]}
+    assert "| TSDF, our poses, default |" in full_table(average(read_estimates(tmp_path), each_sequence=True))
+
+
 def test_the_csv_has_a_line_per_estimate_that_names_what_it_is_of(tmp_path):
     write_result(tmp_path, 0.5)
     ours, raw = csv.DictReader(io.StringIO(to_csv(read_estimates(tmp_path))))

@@ -5,7 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from hand_run import STATUSES, densify_config, hand_run, poses_along, wall
+from scene import evaluation_config
 
+from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
 
@@ -15,6 +17,8 @@ LENGTH = XS[-1] + 2.0
 
 class Pictures:
     """A data set whose images have one colour each, the frame's number."""
+
+    has_ground_truth = False
 
     def __getitem__(self, index):
         return SimpleNamespace(image=np.full((16, 24, 3), index, np.uint8))
@@ -36,7 +40,7 @@ def labels():
 
 @pytest.fixture(scope="module")
 def dense(run, labels):
-    return dense_map(run, Pictures(), densify_config(), 0.01, labels, num_pictures=3)
+    return dense_map(run, Pictures(), densify_config(), evaluation_config(), labels, num_pictures=3)
 
 
 def test_every_frame_that_is_not_lost_adds_what_its_own_pose_sees_of_the_map(dense):
@@ -66,6 +70,41 @@ def test_pictures_are_of_frames_spread_evenly_over_those_that_are_not_lost(dense
         np.testing.assert_allclose(picture["rendered_depth"][picture["valid"]], 2.0, atol=2e-3)
 
 
+class Truth:
+    """What the frames of the wall would be if it were twice as large and gray."""
+
+    has_ground_truth = True
+
+    def __len__(self):
+        return len(STATUSES)
+
+    def __getitem__(self, index):
+        image = np.full((16, 24, 3), 51 * index, np.uint8)
+        return Frame(index, 0.0, "f", image, np.full((16, 24), 4.0, np.float32))
+
+
+def test_the_views_are_compared_with_their_frames_at_the_size_of_the_alignment_and_lost_ones_are_empty(run, dense):
+    """Coverage is that of the points: the wall fills every view, a sixth of which is lost."""
+    larger = np.stack(run.poses)
+    larger[:, :3, 3] *= 2.0
+    compared = hand_run(run.poses, run.raw_poses, larger, gaussians=run.state.map.gaussians)
+    found = dense_map(compared, Truth(), densify_config(), evaluation_config(), num_pictures=0)
+    np.testing.assert_array_equal(found.cloud.points, dense.cloud.points)
+    metrics = found.rendering
+    assert metrics["rendering/num_frames"] == len(STATUSES) and metrics["rendering/worst_coverage_percent"] == 0.0
+    np.testing.assert_allclose(metrics["rendering/coverage_percent"], 100.0 * 5 / 6, atol=0.5)
+    np.testing.assert_allclose(metrics["rendering/depth_within_5_percent"], metrics["rendering/coverage_percent"])
+    assert metrics["rendering/depth_l1_m"] < 2 * 2e-3  # as of the points
+    gray = np.arange(len(STATUSES)) / 5
+    errors = [
+        [(x / 20 - value) ** 2, (0.25 - value) ** 2, (0.5 - value) ** 2]
+        for x, value, status in zip(XS, gray, STATUSES, strict=True)
+        if status != "lost"
+    ]
+    np.testing.assert_allclose(metrics["rendering/psnr_db"], -10 * np.log10(np.mean(errors)), atol=0.05)
+    assert dense.rendering == {}, "nobody knows the truth"
+
+
 def test_points_and_pictures_take_the_label_of_the_nearest_centre(dense, labels):
     assert dense.labels.classes == labels.classes and dense.labels.points is dense.cloud.points
     np.testing.assert_array_equal(dense.labels.labels, dense.cloud.points[:, 0] < LENGTH / 2)
@@ -75,7 +114,7 @@ def test_points_and_pictures_take_the_label_of_the_nearest_centre(dense, labels)
 
 def test_without_labels_and_without_a_frame_that_is_known_there_is_nothing_to_show(run):
     lost = hand_run(run.poses, run.raw_poses, run.true_poses, ["lost"] * len(STATUSES), run.state.map.gaussians)
-    nothing = dense_map(lost, Pictures(), densify_config(), 0.01)
+    nothing = dense_map(lost, Pictures(), densify_config(), evaluation_config())
     assert len(nothing.cloud) == 0 and nothing.pictures == [] and nothing.labels is None
 
 

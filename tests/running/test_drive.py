@@ -14,6 +14,7 @@ from tiny_run import NUM_FRAMES, WINDOW_SIZE, EditedPrior, at_inference, compose
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import ground_truth_cloud
 from emgs_jax.io.map_file import load_map_npz
+from emgs_jax.io.spool import Spool
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import new_scorer, score_map, score_prior
@@ -21,6 +22,7 @@ from emgs_jax.report.run_files import save_outputs, save_progress
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.dense import dense_map
 from emgs_jax.running.drive import map_frames
+from emgs_jax.running.gathering import RawPrior
 from emgs_jax.running.inputs import inputs, predictions
 from emgs_jax.running.record import new_run
 
@@ -189,21 +191,24 @@ def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
     blind = new_run(dataset(), session.config)
     blind.state, blind.records = session.state, [replace(record, true_pose=None) for record in session.records]
     config = hydra.utils.instantiate(compose().densify)
-    dense = dense_map(blind, dataset(), config, voxel=0.02)
+    protocol = hydra.utils.instantiate(compose().evaluation)
+    dense = dense_map(blind, dataset(), config, protocol)
     assert len(dense.cloud) > 1000 and len(dense.pictures) == 4
     assert save_outputs(tmp_path, blind, dense, config, "blind") == []
     names = {"map.ply", "points.ply", "mesh.ply", "overview.png"}
     assert {path.name for path in tmp_path.iterdir()} == names
-    scorer = new_scorer(dataset(), hydra.utils.instantiate(compose().evaluation), EditedPrior())
-    assert score_map(blind, dense.cloud, dense.cloud, None, scorer) == score_prior(blind, dense.cloud, scorer) == {}
+    scorer = new_scorer(dataset(), protocol, EditedPrior())
+    raw = RawPrior(dense.cloud, Spool())
+    assert score_map(blind, dense.cloud, dense.cloud, None, scorer) == score_prior(blind, raw, scorer) == {}
+    assert dense.rendering == {}
 
 
 @pytest.mark.slow
 def test_the_densified_cloud_of_an_exact_run_lies_on_the_true_surfaces():
     """Within the size of a Gaussian: 8 points of about 3 cm spacing."""
     session, _ = exact()
-    dense = dense_map(session, dataset(), hydra.utils.instantiate(compose().densify), voxel=0.01)
     protocol = hydra.utils.instantiate(compose().evaluation)
+    dense = dense_map(session, dataset(), hydra.utils.instantiate(compose().densify), protocol)
     truth = ground_truth_cloud(list(dataset()), dataset().intrinsics, protocol)
     distance, _ = cKDTree(truth.points).query(dense.cloud.points)
     assert np.median(distance) < 0.03

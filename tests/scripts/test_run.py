@@ -33,8 +33,18 @@ TRAJECTORY = [
     "num_frames",
 ]
 RECONSTRUCTION = ["accuracy_m", "completion_m", *ERRORS, *NORMALS, "num_points", "alignment_note"]
+RENDERING = [
+    "coverage_percent",
+    "worst_coverage_percent",
+    "depth_l1_m",
+    "depth_within_5_percent",
+    "psnr_db",
+    "num_frames",
+]
 COMPARED = [f"trajectory/{name}" for name in TRAJECTORY] + [f"reconstruction/{name}" for name in RECONSTRUCTION]
 PHASES = ("setup", "load", "predict", "map", "raw_prior", "densify", "export", "evaluate", "compile", "total")
+COMPARED += [f"reconstruction_icp/{name}" for name in RECONSTRUCTION]
+COMPARED += [f"rendering/{name}" for name in RENDERING]
 KEYS = {
     *COMPARED,
     *(f"raw_prior/{name}" for name in COMPARED),
@@ -88,6 +98,20 @@ def test_the_labels_of_the_points_are_the_true_ones_where_prior_and_features_are
     assert set(np.unique(points["label"])) <= set(range(len(names)))
     is_floor = points["label"] == names.index("floor")
     assert is_floor.sum() > 100 and np.abs(points["z"][is_floor]).mean() < 0.1  # the room stands on z = 0
+
+
+@pytest.mark.slow
+def test_baselines_stand_beside_ours_and_change_nothing_else(tmp_path):
+    """The exact prior at its own poses has no error but the size of a voxel; at 64 pixels a view is coarse."""
+    metrics = experiments.run.run(compose("prior.level=0", "baseline=all"), tmp_path)
+    prefixes = [f"baseline_{name}_{kind}/" for name in ("voxel", "tsdf") for kind in ("raw", "ours")]
+    keys = [key for key in COMPARED if not key.startswith("trajectory/")]
+    assert set(metrics) == KEYS | {prefix + key for prefix in prefixes for key in keys}
+    for prefix in prefixes:
+        assert metrics[f"{prefix}reconstruction/accuracy_m"] < 0.05
+        assert metrics[f"{prefix}rendering/coverage_percent"] > 80.0
+    same = [key for key in KEYS if key.startswith(("trajectory/", "reconstruction", "rendering/"))]
+    assert {key: metrics[key] for key in same} == {key: exact_run()[1][key] for key in same}
 
 
 @pytest.mark.slow

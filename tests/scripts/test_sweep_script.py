@@ -113,6 +113,11 @@ def test_a_grid_that_is_none_is_refused():
         read_axes(compose(AXES, "grid=random", name="sweep"))
 
 
+def test_baselines_are_no_part_of_a_sweep(tmp_path):
+    with pytest.raises(ValueError, match="baseline= is for run and evaluate"):
+        experiments.sweep.sweep(compose("baseline=voxel", name="sweep"), tmp_path)
+
+
 def test_an_infinite_value_is_text_in_the_results():
     config = compose("axes={slam.em.max_log_gap:[8.0,inf]}", name="sweep")
     grid = variants(config, read_axes(config))

@@ -20,7 +20,7 @@ ONE_COMMIT = {"revision": "0123456789abcdef", "dirty": False}
 
 
 def written(folder: Path, seed: int, git: dict | None = ONE_COMMIT, ours: float = 0.02, raw: float = 0.03) -> Path:
-    """A result of the built-in room: every length is `ours` metres, every percentage 100 times that."""
+    """A result of the built-in room: every length is `ours` metres, every other number 100 times that."""
     values = {column.key: 1.0 if column.factor == 100.0 else 100.0 for column in COLUMNS}
     metrics = {key: ours * unit for key, unit in values.items()}
     metrics |= prefixed({key: raw * unit for key, unit in values.items()}, RAW_PRIOR)
@@ -44,8 +44,8 @@ def test_rows_are_mean_and_deviation_over_the_seeds_and_the_map_is_counted_again
     text = block(paths, {"synthetic": "room"})
     rows = [cells(line) for line in text.splitlines() if line.startswith("| room")]
     assert rows == [
-        ["room", "ours", "2", *["3.0 ± 1.4"] * 7],
-        ["room", "raw prior", "2", *["3.0 ± 0.0"] * 7],
+        ["room", "ours", "2", *["3.0 ± 1.4"] * len(COLUMNS)],
+        ["room", "raw prior", "2", *["3.0 ± 0.0"] * len(COLUMNS)],
     ]
     counts = next(line for line in text.splitlines() if line.startswith("Runs of 2"))
     assert counts.count(" 1,") + counts.count(" 1.") == len(COLUMNS)

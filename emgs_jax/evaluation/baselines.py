@@ -1,0 +1,243 @@
+"""What one would do with predictions instead of mapping: average their points per voxel, or fuse their depth (TSDF).
+
+Both take views as they come, hold no view afterwards, and are compared like the map: their cloud, and what is rendered
+of it. Lengths are those of the poses, so a voxel or a truncation of 2 cm is one only where these are metric: with a
+prior whose scale is .5 it is 4 cm of the world.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from emgs_jax.data.backprojection import backproject
+from emgs_jax.evaluation.clouds import PointCloud, VoxelGrid, transform_cloud
+from emgs_jax.evaluation.trajectory import Alignment
+
+Image = tuple[np.ndarray, np.ndarray]  # camera-space z (h, w), 0 where there is none, and RGB in [0, 1], (h, w, 3)
+Draw = Callable[[np.ndarray], Image]  # from the pose T_world_camera (4, 4)
+
+
+@dataclass(frozen=True)
+class View:
+    """What a prior predicts of one frame, in the frame of its camera and its own lengths.
+
+    Args:
+        depth: camera-space z (h, w), 0 where there is none.
+        image: RGB, uint8 (h, w, 3).
+        cloud: the points with their normals.
+    """
+
+    depth: np.ndarray
+    image: np.ndarray
+    cloud: PointCloud
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """Of all frames: fx, fy, cx, cy with pixel centres at integers, and the image's size."""
+
+    intrinsics: tuple[float, float, float, float]
+    width: int
+    height: int
+
+
+class Fusion(Protocol):
+    """A reconstruction that grows by views."""
+
+    def add(self, view: View, T_world_camera: np.ndarray, scale: float) -> None:
+        """Add a view at a pose; `scale` brings its lengths to those of the pose."""
+        ...
+
+    def cloud(self) -> PointCloud:
+        """What there is so far, with normals towards the cameras."""
+        ...
+
+    def renderer(self) -> Draw:
+        """Draws what there is so far."""
+        ...
+
+
+@dataclass(frozen=True)
+class VoxelConfig:
+    """The mean of all points of each voxel.
+
+    Args:
+        voxel_m: its side, in the lengths of the poses.
+        max_footprint_px: a point is drawn as the square that its voxel covers, but at most so far to each side: what
+            lies just before the camera would fill the image.
+    """
+
+    voxel_m: float
+    max_footprint_px: int
+
+    def __post_init__(self) -> None:
+        _require_positive("voxel", voxel_m=self.voxel_m, max_footprint_px=self.max_footprint_px)
+
+    def start(self, pinhole: Pinhole) -> Fusion:
+        """Without any view."""
+        return _Voxels(self, pinhole)
+
+
+@dataclass(frozen=True)
+class TsdfConfig:
+    """A truncated signed distance field (Curless and Levoy 1996), fused by Open3D on the CPU.
+
+    Behind a depth edge the field of the front surface is written into free space as far as the truncation reaches, and
+    surfaces nearer to each other than that disturb each other.
+
+    Args:
+        voxel_m: side of a voxel, in the lengths of the poses.
+        truncation_m: distance at which the field ends, likewise; a few voxels, and more than the noise of the depth.
+        min_views: that must have seen a place.
+    """
+
+    voxel_m: float
+    truncation_m: float
+    min_views: int
+
+    def __post_init__(self) -> None:
+        _require_positive("tsdf", voxel_m=self.voxel_m, truncation_m=self.truncation_m, min_views=self.min_views)
+        if self.truncation_m < self.voxel_m:
+            raise ValueError(
+                f"baseline.tsdf.truncation_m={self.truncation_m} is less than one voxel ({self.voxel_m}): no surface "
+                "would be found; take some voxels"
+            )
+
+    def start(self, pinhole: Pinhole) -> Fusion:
+        """Without any view."""
+        return _Tsdf(self, pinhole)
+
+
+BaselineConfig = VoxelConfig | TsdfConfig
+
+
+class _Voxels:
+    def __init__(self, config: VoxelConfig, pinhole: Pinhole) -> None:
+        self._config, self._pinhole, self._grid = config, pinhole, VoxelGrid(config.voxel_m)
+
+    def add(self, view: View, T_world_camera: np.ndarray, scale: float) -> None:
+        motion = Alignment(scale, T_world_camera[:3, :3], T_world_camera[:3, 3])
+        self._grid.add(transform_cloud(view.cloud, motion))
+
+    def cloud(self) -> PointCloud:
+        return self._grid.cloud()
+
+    def renderer(self) -> Draw:
+        cloud = self.cloud()
+        return lambda T: draw_points(cloud, T, self._pinhole, self._config.voxel_m, self._config.max_footprint_px)
+
+
+class _Tsdf:
+    _BLOCK, _BLOCKS = 8, 2000  # voxels a side, and blocks to begin with: there is more memory where it is needed
+    # In voxels. Open3D finds no surface where the field is exactly 0 at a voxel, as for a wall at a round distance.
+    _SHIFT = 0.37
+
+    def __init__(self, config: TsdfConfig, pinhole: Pinhole) -> None:
+        import open3d as o3d  # slow to import, and only these baselines need it
+
+        self._o3d, self._config, self._pinhole = o3d, config, pinhole
+        names, kinds, widths = ("tsdf", "weight", "color"), (o3d.core.float32,) * 3, ((1), (1), (3))
+        self._shift = self._SHIFT * config.voxel_m
+        self._threshold = config.min_views - 0.5  # the weight, a count of views, has to be above it
+        self._grid = o3d.t.geometry.VoxelBlockGrid(names, kinds, widths, config.voxel_m, self._BLOCK, self._BLOCKS)
+
+    def add(self, view: View, T_world_camera: np.ndarray, scale: float) -> None:
+        depth = (scale * view.depth).astype(np.float32)
+        if not depth.any():
+            return
+        fx, fy, cx, cy = self._pinhole.intrinsics
+        # Open3D takes the pixel in which a voxel falls, with pixel centres at halves.
+        matrix = np.array([[fx, 0.0, cx + 0.5], [0.0, fy, cy + 0.5], [0.0, 0.0, 1.0]])
+        T_camera_world = self._tensor(np.linalg.inv(self._shifted(T_world_camera)))
+        limits = 1.0, float(2.0 * depth.max()), self._config.truncation_m / self._config.voxel_m
+        # It makes room for every fourth pixel only, between which small images have no blocks: each pixel is four here.
+        dense = self._image(depth.repeat(4, axis=0).repeat(4, axis=1))
+        larger = self._tensor(np.diag([4.0, 4.0, 1.0]) @ matrix)
+        blocks = self._grid.compute_unique_block_coordinates(dense, larger, T_camera_world, *limits)
+        images = self._image(depth), self._image(view.image.astype(np.float32) / 255.0)
+        self._grid.integrate(blocks, *images, self._tensor(matrix), T_camera_world, *limits)
+
+    def cloud(self) -> PointCloud:
+        if not self._grid.hashmap().size():
+            return PointCloud(*[np.zeros((0, 3))] * 3)
+        found = self._grid.extract_point_cloud(self._threshold).point
+        rows = [found[name].numpy().astype(np.float64) for name in ("positions", "normals", "colors")]
+        rows[0] -= self._shift
+        order = np.lexsort(rows[0].T)  # threads find them in any order
+        return PointCloud(*(values[order] for values in rows))
+
+    def renderer(self) -> Draw:
+        if not self._grid.hashmap().size():
+            return lambda T: _nothing(self._pinhole)
+        mesh = self._grid.extract_triangle_mesh(self._threshold)
+        if not len(mesh.triangle.indices):
+            return lambda T: _nothing(self._pinhole)
+        scene = self._o3d.t.geometry.RaycastingScene()
+        scene.add_triangles(mesh)
+        triangles, colors = mesh.triangle.indices.numpy(), mesh.vertex.colors.numpy()
+
+        def draw(T_world_camera: np.ndarray) -> Image:
+            pinhole, T_world_camera = self._pinhole, self._shifted(T_world_camera)
+            rays = backproject(np.ones((pinhole.height, pinhole.width)), pinhole.intrinsics) @ T_world_camera[:3, :3].T
+            origins = np.broadcast_to(T_world_camera[:3, 3], rays.shape)
+            hits = scene.cast_rays(self._o3d.core.Tensor(np.concatenate([origins, rays], -1).astype(np.float32)))
+            depth = hits["t_hit"].numpy()  # of rays whose camera-space z is 1
+            is_hit = np.isfinite(depth)
+            u, v = np.moveaxis(hits["primitive_uvs"].numpy()[is_hit], -1, 0)
+            corners = colors[triangles[hits["primitive_ids"].numpy()[is_hit]]]
+            blended = np.zeros((*depth.shape, 3))
+            blended[is_hit] = np.einsum("nc,ncd->nd", np.stack([1.0 - u - v, u, v], 1), corners)
+            return np.where(is_hit, depth, 0.0), blended
+
+        return draw
+
+    def _shifted(self, T_world_camera: np.ndarray) -> np.ndarray:
+        moved = np.array(T_world_camera, np.float64)
+        moved[:3, 3] += self._shift
+        return moved
+
+    def _image(self, values: np.ndarray) -> Any:
+        return self._o3d.t.geometry.Image(self._o3d.core.Tensor(np.ascontiguousarray(values)))
+
+    def _tensor(self, values: Any) -> Any:
+        return self._o3d.core.Tensor(np.asarray(values, np.float64))
+
+
+def draw_points(cloud: PointCloud, T_world_camera: np.ndarray, pinhole: Pinhole, side: float, max_px: int) -> Image:
+    """Draw points as squares parallel to the image, as large as a voxel of this side; the nearest one wins.
+
+    Reaches ceil(half the side in pixels) pixels to each side of the point's own: a point may lie anywhere in its voxel.
+    """
+    fx, fy, cx, cy = pinhole.intrinsics
+    points = (cloud.points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    z = np.where(points[:, 2] > 0, points[:, 2], 1.0)
+    u, v = fx * points[:, 0] / z + cx, fy * points[:, 1] / z + cy
+    reach = np.ceil(np.clip(0.5 * side * max(fx, fy) / z, 0.0, max_px))
+    inside = (u > -reach - 0.5) & (u < pinhole.width + reach) & (v > -reach - 0.5) & (v < pinhole.height + reach)
+    rows = np.flatnonzero((points[:, 2] > 0) & inside)
+    rows = rows[np.argsort(-z[rows], kind="stable")]  # the nearest is written last
+    u, v, reach = (np.rint(values[rows]).astype(np.int64) for values in (u, v, reach))
+    nearest = np.full((pinhole.height, pinhole.width), -1)
+    for ring in range(int(reach.max(initial=0)) + 1):  # squares round the own pixels, from there outwards
+        order = np.flatnonzero(reach >= ring)
+        steps = range(-ring, ring + 1)
+        for dy, dx in ((dy, dx) for dy in steps for dx in steps if max(abs(dy), abs(dx)) == ring):
+            y, x = v[order] + dy, u[order] + dx
+            drawn = (y >= 0) & (y < pinhole.height) & (x >= 0) & (x < pinhole.width)
+            np.maximum.at(nearest, (y[drawn], x[drawn]), order[drawn])
+    is_drawn, found = nearest >= 0, rows[nearest] if len(rows) else np.zeros_like(nearest)
+    if not is_drawn.any():
+        return _nothing(pinhole)
+    return np.where(is_drawn, z[found], 0.0), np.where(is_drawn[..., None], cloud.colors[found], 0.0)
+
+
+def _nothing(pinhole: Pinhole) -> Image:
+    return np.zeros((pinhole.height, pinhole.width)), np.zeros((pinhole.height, pinhole.width, 3))
+
+
+def _require_positive(name: str, **values: float) -> None:
+    for key, value in values.items():
+        if not value > 0:
+            raise ValueError(f"baseline.{name}.{key} must be positive, got {value}")

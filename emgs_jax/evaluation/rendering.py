@@ -1,0 +1,118 @@
+"""How well depth and colours that are rendered from the poses of a run agree with its frames."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.evaluation.reconstruction import EvaluationConfig
+from emgs_jax.evaluation.trajectory import align_poses
+
+_TOLERANCE = 0.05  # of the true depth; it is in the name of the metric
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """What was rendered of one frame, against the frame. Shares are of the pixels whose true depth is known.
+
+    Args:
+        coverage: share with a rendered depth.
+        within: share whose rendered depth is within 5 % of the truth.
+        depth_l1: mean absolute error of the depth, m; None where nothing is covered.
+        squared_error: of the colours, RGB in [0, 1], summed over the covered pixels and channels.
+        num_colors: how many numbers that are; 0 where no colours were rendered.
+    """
+
+    coverage: float
+    within: float
+    depth_l1: float | None = None
+    squared_error: float = 0.0
+    num_colors: int = 0
+
+
+class Rendered:
+    """Compares what is rendered of one estimate with the frames of a data set, one view after the other.
+
+    Args:
+        dataset: with the images and the true depth.
+        poses: of the estimate and the true ones (n, 4, 4), for the scale; None: nothing is compared.
+        config: the protocol.
+    """
+
+    def __init__(self, dataset: Dataset, poses: tuple[np.ndarray, np.ndarray] | None, config: EvaluationConfig) -> None:
+        self._dataset, self._max_depth = dataset, config.max_depth_m
+        self._scale = depth_scale(poses, config) if poses is not None and dataset.has_ground_truth else None
+        self._scores: dict[int, ViewScore | None] = {}
+
+    def add(self, row: int, depth: np.ndarray | None, colors: np.ndarray | None) -> None:
+        """Add a frame of the data set; the rest as for `score_view`."""
+        if self._scale is not None:
+            self._scores[row] = score_view(self._dataset[row], depth, colors, self._scale, self._max_depth)
+
+    def metrics(self) -> dict[str, float | int | None]:
+        """`rendering_metrics` of the data set, where frames that were not added are lost; empty without truth."""
+        if self._scale is None:
+            return {}
+        for row in sorted(set(range(len(self._dataset))) - set(self._scores)):
+            self.add(row, None, None)
+        return rendering_metrics(self._scores.values())
+
+
+def depth_scale(poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig) -> float:
+    """Factor from the lengths of an estimate to metres, by its poses and the true ones (n, 4, 4); 1 for se3."""
+    return align_poses(*poses, with_scale=config.alignment == "sim3")[0].scale
+
+
+def score_view(
+    frame: Frame, depth: np.ndarray | None, colors: np.ndarray | None, scale: float, max_depth: float
+) -> ViewScore | None:
+    """Compare what was rendered from the estimated pose of a frame with the frame; None without any true depth.
+
+    Args:
+        frame: with its true depth, which counts where it is above 0 and not beyond `max_depth`.
+        depth: rendered camera-space z (h, w) in the lengths of the estimate, 0 where there is none; None for a frame
+            whose pose is lost: nothing of it is covered.
+        colors: rendered RGB in [0, 1], (h, w, 3); None where there are none.
+        scale: `depth_scale` of the estimate.
+        max_depth: m.
+    """
+    if frame.depth is None:
+        return None
+    is_known = (frame.depth > 0) & (frame.depth <= max_depth)
+    if not is_known.any():
+        return None
+    if depth is None:
+        return ViewScore(0.0, 0.0)
+    true, found = frame.depth[is_known].astype(np.float64), scale * depth[is_known].astype(np.float64)
+    is_covered = np.isfinite(found) & (found > 0)
+    error = np.abs(found - true)[is_covered]
+    score = {"squared_error": 0.0, "num_colors": 0}
+    if colors is not None:
+        difference = colors[is_known][is_covered].astype(np.float64) - frame.image[is_known][is_covered] / 255.0
+        score = {"squared_error": float(np.sum(difference**2)), "num_colors": difference.size}
+    within = float(np.sum(error <= _TOLERANCE * true[is_covered]) / len(true))
+    return ViewScore(float(is_covered.mean()), within, float(error.mean()) if len(error) else None, **score)
+
+
+def rendering_metrics(views: Iterable[ViewScore | None]) -> dict[str, float | int | None]:
+    """Means over the frames with true depth; flat keys, metres, percent and dB. What is not defined is None.
+
+    A lost frame counts as covered nowhere. `rendering/depth_within_5_percent` is a share of all pixels with true depth,
+    so a pixel that was not rendered counts as not within; `rendering/depth_l1_m` is about the rendered ones only, and
+    frames without any are left out of its mean. The PSNR is that of the mean squared error over the covered pixels of
+    all frames together.
+    """
+    views = [view for view in views if view is not None]
+    errors = [view.depth_l1 for view in views if view.depth_l1 is not None]
+    num_colors, squares = sum(view.num_colors for view in views), sum(view.squared_error for view in views)
+    coverage = [100.0 * view.coverage for view in views]
+    psnr = 10.0 * np.log10(num_colors / max(squares, 1e-12 * num_colors)) if num_colors else None
+    return {
+        "rendering/coverage_percent": float(np.mean(coverage)) if views else None,
+        "rendering/worst_coverage_percent": min(coverage, default=None),
+        "rendering/depth_l1_m": float(np.mean(errors)) if errors else None,
+        "rendering/depth_within_5_percent": 100.0 * float(np.mean([v.within for v in views])) if views else None,
+        "rendering/psnr_db": None if psnr is None else float(psnr),
+        "rendering/num_frames": len(views),
+    }

@@ -1,0 +1,74 @@
+"""What streams by while a sequence is mapped, gathered for comparison: what the prior alone says, and baselines."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from emgs_jax.data.base import Dataset
+from emgs_jax.evaluation.baselines import BaselineConfig, Fusion, Pinhole, View
+from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, posed
+from emgs_jax.io.spool import Spool
+from emgs_jax.running.inputs import RawView
+from emgs_jax.running.record import MappingRun
+
+
+@dataclass(frozen=True)
+class RawPrior:
+    """What the prior alone says of a sequence.
+
+    Args:
+        cloud: its points at its poses, averaged per voxel.
+        depths: camera-space z of each frame (h, w), in the prior's own lengths; 0 where it says none.
+    """
+
+    cloud: PointCloud
+    depths: Spool
+
+
+class Baselines:
+    """Every baseline twice: from the prior's views at the prior's own poses, and at ours.
+
+    At ours it takes what the map took: frames that are tracked or that the map was made from, each prediction in the
+    size that it was given there. So what is different is the fusion alone.
+
+    Args:
+        configs: by name.
+        run: that is growing.
+        dataset: for the camera.
+    """
+
+    def __init__(self, configs: Mapping[str, BaselineConfig], run: MappingRun, dataset: Dataset) -> None:
+        pinhole = Pinhole(dataset.intrinsics, *dataset.size)
+        self.raw: dict[str, Fusion] = {name: config.start(pinhole) for name, config in configs.items()}
+        self.ours: dict[str, Fusion] = {name: config.start(pinhole) for name, config in configs.items()}
+        self._run = run
+
+    def add(self, row: int, view: View, T_world_camera: np.ndarray) -> None:
+        """Add the frame of a record, with its pose as the prior says it."""
+        record = self._run.records[row]
+        for fusion in self.raw.values():
+            fusion.add(view, T_world_camera, 1.0)
+        if record.status in ("tracked", "initialization"):
+            for fusion in self.ours.values():
+                fusion.add(view, record.pose, 1.0 if record.scale is None else record.scale)
+
+
+def gather(
+    views: Iterable[RawView], evaluation: EvaluationConfig, keeps_depths: bool, baselines: Baselines | None = None
+) -> RawPrior:
+    """Take all views of a sequence, one after the other; depths are of use where the truth is known."""
+    depths = Spool()
+
+    def clouds() -> Iterator[PointCloud]:
+        for row, (points, mask, image, pose) in enumerate(views):
+            depth = np.where(mask & np.isfinite(points[..., 2]), points[..., 2], 0.0).astype(np.float32)
+            cloud = camera_cloud(points, mask, image, evaluation)
+            if keeps_depths:
+                depths.append(depth)
+            if baselines is not None:
+                baselines.add(row, View(depth, image, cloud), pose)
+            yield posed(cloud, pose)
+
+    return RawPrior(fuse_clouds(clouds(), evaluation.voxel_m), depths)

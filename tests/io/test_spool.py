@@ -1,0 +1,18 @@
+"""Arrays in a temporary file; oracle: themselves."""
+
+import numpy as np
+
+from emgs_jax.io.spool import Spool
+
+
+def test_arrays_come_back_in_any_order_as_they_were_and_more_can_follow():
+    spool, arrays = Spool(), [np.arange(6, dtype=np.float32).reshape(2, 3), np.zeros((0, 2)), np.array([[True]])]
+    for array in arrays[:2]:
+        spool.append(array)
+    np.testing.assert_array_equal(spool[0], arrays[0])
+    spool.append(arrays[2])
+    assert len(spool) == 3
+    for row in (2, 0, 1):
+        found = spool[row]
+        np.testing.assert_array_equal(found, arrays[row])
+        assert found.dtype == arrays[row].dtype and found.shape == arrays[row].shape

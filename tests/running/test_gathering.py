@@ -1,0 +1,106 @@
+"""What is gathered while a run grows; oracle: a wall at z = 2 that the prior sees in a place and size of its own."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hand_run import poses_along
+from scene import evaluation_config
+
+from emgs_jax.data.backprojection import backproject
+from emgs_jax.data.base import Frame
+from emgs_jax.evaluation.baselines import TsdfConfig, VoxelConfig
+from emgs_jax.evaluation.reconstruction import ground_truth_cloud, reference
+from emgs_jax.report.metrics import Scorer, score_baselines
+from emgs_jax.running.gathering import Baselines, gather
+from emgs_jax.running.inputs import RawView
+from emgs_jax.running.record import FrameRecord
+
+INTRINSICS, SHAPE = (24.0, 24.0, 11.5, 7.5), (16, 24)
+STATUSES = ("initialization", "tracked", "degraded", "lost", "tracked")
+SCALES = (None, 2.0, 3.0, 3.0, 2.0)
+WALL = 2.01  # the middle of a voxel
+XS = 4.0 * np.arange(len(STATUSES))  # every camera sees a metre to each side, that no other sees
+CONFIGS = {"voxel": VoxelConfig(0.02, 8), "tsdf": TsdfConfig(0.02, 0.08, 1)}
+
+
+class Walls:
+    """The frames, with the truth."""
+
+    name, sequence, size, intrinsics, has_ground_truth = "walls", "one", SHAPE[::-1], INTRINSICS, True
+
+    def __len__(self):
+        return len(STATUSES)
+
+    def __getitem__(self, row):
+        image = np.full((*SHAPE, 3), 51, np.uint8)
+        return Frame(row, 0.0, "f", image, np.full(SHAPE, WALL, np.float32), poses_along(XS)[row])
+
+
+@pytest.fixture(scope="module")
+def gathered():
+    """The prior's depths are what the map's scales make of the truth, its poses two metres above ours."""
+    ours, raw = poses_along(XS), poses_along(XS)
+    raw[:, 1, 3] += 2.0
+    records = [
+        FrameRecord(row, "f", 0.0, status, pose=ours[row], scale=scale)
+        for row, (status, scale) in enumerate(zip(STATUSES, SCALES, strict=True))
+    ]
+    run = SimpleNamespace(records=[], poses=ours, raw_poses=raw, true_poses=list(ours))
+    baselines = Baselines(CONFIGS, run, Walls())
+
+    def views():
+        for row, record in enumerate(records):
+            run.records.append(record)  # as `map_frames` does: a frame's record is there before its view
+            points = backproject(np.full(SHAPE, WALL / (SCALES[row] or 1.0)), INTRINSICS)
+            yield RawView(points, np.full(SHAPE, row != 4), Walls()[row].image, raw[row])
+
+    return run, baselines, gather(views(), evaluation_config(), True, baselines)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_at_our_poses_is_what_the_map_took_where_and_as_large_as_the_map_took_it(gathered, name):
+    """The last tracked frame has no valid point, the degraded and the lost one are not fused."""
+    cloud = gathered[1].ours[name].cloud()
+    seen = [(np.abs(cloud.points[:, 0] - x) < 1.5).sum() for x in XS]
+    assert [count > 100 for count in seen] == [True, True, False, False, False]
+    np.testing.assert_allclose(cloud.points[:, 2], WALL, atol=1e-5)
+    assert np.abs(cloud.points[:, 1]).max() < 1.0
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_at_the_priors_poses_is_all_that_the_prior_says_in_its_own_size(gathered, name):
+    cloud = gathered[1].raw[name].cloud()
+    for x, scale in zip(XS[:4], SCALES[:4], strict=True):
+        rows = np.abs(cloud.points[:, 0] - x) < 1.5
+        assert rows.sum() > 50
+        np.testing.assert_allclose(cloud.points[rows, 2], WALL / (scale or 1.0), atol=1e-5)
+    assert np.abs(cloud.points[:, 1] - 2.0).max() < 1.0 and (cloud.points[:, 0] < XS[3] + 1.5).all()
+
+
+def test_the_raw_priors_depths_are_zero_where_it_says_nothing_and_are_kept_where_they_are_of_use(gathered):
+    depths = gathered[2].depths
+    assert len(depths) == len(STATUSES) and not depths[4].any()
+    np.testing.assert_allclose(depths[1], WALL / 2.0, rtol=1e-6)
+    assert len(gather([], evaluation_config(), False).depths) == 0
+
+
+def test_baselines_are_compared_at_the_poses_that_they_were_built_at(gathered):
+    """Ours has a view of five exact, and one more of the degraded frame if it were there; the prior's is too small."""
+    run, baselines, raw = gathered
+    config = evaluation_config("evaluation.alignment=se3")
+    truth = reference(ground_truth_cloud([Walls()[row] for row in (0, 1)], INTRINSICS, config), config)
+    metrics = score_baselines(run, baselines, raw, Scorer(Walls(), config, truth, None, None))
+    for name in CONFIGS:
+        assert metrics[f"baseline_{name}_ours/reconstruction/accuracy_m"] < 0.05
+        assert metrics[f"baseline_{name}_ours/reconstruction_icp/f1_20cm_percent"] > 95.0
+        assert metrics[f"baseline_{name}_raw/reconstruction/accuracy_m"] > 0.5
+        # A TSDF ends before the border of its views, here one of 8 rows.
+        assert metrics[f"baseline_{name}_ours/rendering/coverage_percent"] == pytest.approx(40.0, abs=6.0)
+        assert metrics[f"baseline_{name}_ours/rendering/depth_l1_m"] < 1e-3
+        assert metrics[f"baseline_{name}_raw/rendering/coverage_percent"] == pytest.approx(80.0, abs=20.0)
+        # Of the frames that the prior sees one has the true size.
+        assert metrics[f"baseline_{name}_raw/rendering/depth_within_5_percent"] == pytest.approx(20.0, abs=4.0)
+        assert metrics[f"baseline_{name}_ours/rendering/psnr_db"] > 40.0
+    run.true_poses = [None] * len(STATUSES)
+    assert score_baselines(run, baselines, raw, Scorer(Walls(), config, truth, None, None)) == {}
