@@ -30,7 +30,8 @@ GRID = 200  # steps of 1.2 %
 ESSENTIAL_SCALE = 0.05  # difference of the singular values, relative, beyond which a pair counts as an outlier
 MIN_PAIRS = 20  # single pairs scatter by tens of percent; only their sum counts
 MAX_SPREAD = 0.05  # of the focal length
-NUM_STEPS, STEP = 30, 1e-6  # of the joint fit; finite differences of log f and of angles
+NUM_STEPS, MIN_GAIN = 50, 1e-4  # of the joint fit: it ends where a step takes off less of the cost, relative
+DIFFERENCE = 1e-6  # of log f and of angles, for derivatives
 
 
 @dataclass(frozen=True)
@@ -40,11 +41,13 @@ class Pair:
     Args:
         pixels: matches that fit F, (2, m, 2).
         F: fundamental matrix (3, 3), pixels[1]ᵀ F pixels[0] = 0.
+        stretch: number of the piece of the sequence that they are from: what disturbs one pair disturbs the others.
         T: motion with a unit translation, (3, 4), x_1 = R x_0 + t; None before it is known.
     """
 
     pixels: np.ndarray
     F: np.ndarray
+    stretch: int
     T: np.ndarray | None = None
 
 
@@ -73,7 +76,7 @@ def estimate_focal_length(count: int, read: Callable[[int], UInt8[np.ndarray, "_
         ValueError: too little parallax, or images that fit many focal lengths.
     """
     chosen = choose_pairs(count)
-    views, width = {}, 0
+    views, width, size = {}, 1, (1, 1)
     for index in sorted({index for pair in chosen for index in pair}):
         image = read(index)
         if image is not None:
@@ -81,8 +84,10 @@ def estimate_focal_length(count: int, read: Callable[[int], UInt8[np.ndarray, "_
             small = shrink(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
             size = small.shape[1::-1]
             views[index] = keypoints(small)
-    matched = [match(views[a], views[b]) for a, b in chosen if a in views and b in views]
-    pairs = [pair for pixels in matched if (pair := two_views(pixels, size)) is not None]
+    pairs = []
+    for (a, b), stretch in chosen.items():
+        if a in views and b in views and (pair := two_views(match(views[a], views[b]), size, stretch)) is not None:
+            pairs.append(pair)
     found = fit_focal_length(pairs, size)
     scale = width / size[0]
     quartiles = found.quartiles[0] * scale, found.quartiles[1] * scale
@@ -91,11 +96,11 @@ def estimate_focal_length(count: int, read: Callable[[int], UInt8[np.ndarray, "_
     )
 
 
-def choose_pairs(count: int) -> list[tuple[int, int]]:
-    """Pairs of images: within stretches that are spread evenly over all `count`."""
+def choose_pairs(count: int) -> dict[tuple[int, int], int]:
+    """Pairs of images, and the stretch that each is from; stretches are spread evenly over all `count`."""
     starts = np.unique(np.linspace(0, max(count - 1 - OFFSETS[-1], 0), NUM_STRETCHES).round().astype(int)).tolist()
-    stretches = ([start + offset for offset in OFFSETS if start + offset < count] for start in starts)
-    return sorted({pair for stretch in stretches for pair in combinations(stretch, 2)})
+    stretches = [[start + offset for offset in OFFSETS if start + offset < count] for start in starts]
+    return {pair: number for number, stretch in enumerate(stretches) for pair in combinations(stretch, 2)}
 
 
 def shrink(gray: UInt8[np.ndarray, "_ _"]) -> UInt8[np.ndarray, "_ _"]:
@@ -130,7 +135,7 @@ def match(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) ->
     return np.stack([a[0][rows], b[0][nearest[rows]]])
 
 
-def two_views(pixels: Float[np.ndarray, "2 m 2"], size: tuple[int, int]) -> Pair | None:
+def two_views(pixels: Float[np.ndarray, "2 m 2"], size: tuple[int, int], stretch: int = 0) -> Pair | None:
     """The matches that fit one fundamental matrix (MAGSAC++), where it is well determined; else None."""
     if pixels.shape[1] < MIN_MATCHES:
         return None
@@ -146,7 +151,7 @@ def two_views(pixels: Float[np.ndarray, "2 m 2"], size: tuple[int, int]) -> Pair
     if np.median(np.linalg.norm(pixels[1] - pixels[0], axis=-1)) < MIN_FLOW * size[0]:
         return None
     _, planar = cv2.findHomography(*pixels, cv2.USAC_MAGSAC, 2 * MAX_EPIPOLAR_ERROR, None, 2000, 0.9999)
-    return None if planar is not None and planar.mean() > MAX_PLANAR else Pair(pixels, F)
+    return None if planar is not None and planar.mean() > MAX_PLANAR else Pair(pixels, F, stretch)
 
 
 def fit_focal_length(pairs: list[Pair], size: tuple[int, int]) -> FocalLength:
@@ -165,8 +170,8 @@ def fit_focal_length(pairs: list[Pair], size: tuple[int, int]) -> FocalLength:
     value, spread = refine_focal_length(pairs, float(focals[best]), center)
     if not (focals[0] < value < focals[-1] and spread < MAX_SPREAD * value):
         raise ValueError(
-            f"the focal length cannot be estimated: {len(pairs)} pairs of images fit {value / size[0]:.2f} of the width "
-            f"no better than others (standard deviation {100 * spread / value:.0f} %); {remedy}"
+            f"the focal length cannot be estimated: {len(pairs)} pairs of images fit many of them (standard deviation "
+            f"{100 * spread / value:.0f} %); {remedy}"
         )
     lower, upper = np.quantile(focals[costs.argmin(axis=1)], [0.25, 0.75])
     return FocalLength(value, spread, (float(lower), float(upper)), len(pairs), 0)
@@ -190,7 +195,8 @@ def refine_focal_length(pairs: list[Pair], focal: float, center: Float[np.ndarra
     """Value and standard deviation: the least robust epipolar error over poses of all pairs and one focal length.
 
     Levenberg-Marquardt; the five numbers of each pair are eliminated, so pair i pulls at log f with b_i and holds it
-    with a_i. The deviation is that of the sum of pulls, sqrt(Σ b²) / Σ a: it needs no law of the matches' noise.
+    with a_i. The deviation is that of the sum of pulls b of whole stretches, sqrt(Σ b²) / Σ a: it needs no law of the
+    matches' noise, and what is wrong in all pairs of a stretch counts once.
     """
     pairs = [with_motion(pair, focal, center) for pair in pairs]
     damping, systems = 1e-3, [normal_equations(pair, focal, center) for pair in pairs]
@@ -199,13 +205,15 @@ def refine_focal_length(pairs: list[Pair], focal: float, center: Float[np.ndarra
         step = float(np.clip(-sum(b for _, b, *_ in eliminated) / sum(a for a, *_ in eliminated), -0.2, 0.2))
         moved = [moved_by(pair, solve(step)) for pair, (_, _, solve) in zip(pairs, eliminated, strict=True)]
         tried = [normal_equations(pair, focal * np.exp(step), center) for pair in moved]
-        if sum(cost for cost, *_ in tried) > sum(cost for cost, *_ in systems):
+        before, after = sum(cost for cost, *_ in systems), sum(cost for cost, *_ in tried)
+        if after > before:
             damping *= 10
             continue
         pairs, systems, focal, damping = moved, tried, focal * np.exp(step), damping / 3
-        if abs(step) < STEP:
+        if before - after <= MIN_GAIN * before:
             break
     held, pulls = np.array([eliminate(A, b, 0.0)[:2] for _, A, b in systems]).T
+    pulls = np.bincount([pair.stretch for pair in pairs], pulls)
     return float(focal), float(focal * np.sqrt((pulls**2).sum()) / held.sum())
 
 
@@ -223,9 +231,9 @@ def normal_equations(
 ) -> tuple[float, Float[np.ndarray, "6 6"], Float[np.ndarray, " 6"]]:
     """Robust cost (Cauchy), Gauss-Newton matrix and gradient in log f and five numbers of the motion."""
     residuals = sampson(pair, focal, center)
-    moved = [sampson(pair, focal * np.exp(STEP), center)]
-    moved += [sampson(moved_by(pair, STEP * axis), focal, center) for axis in np.eye(5)]
-    jacobian = (np.stack(moved, axis=-1) - residuals[:, None]) / STEP
+    moved = [sampson(pair, focal * np.exp(DIFFERENCE), center)]
+    moved += [sampson(moved_by(pair, DIFFERENCE * axis), focal, center) for axis in np.eye(5)]
+    jacobian = (np.stack(moved, axis=-1) - residuals[:, None]) / DIFFERENCE
     weights = 1 / (1 + (residuals / MAX_EPIPOLAR_ERROR) ** 2)
     cost = -np.log(weights).sum() * MAX_EPIPOLAR_ERROR**2
     weighted = jacobian * weights[:, None]
@@ -266,5 +274,3 @@ def describe(found: FocalLength) -> str:
         f"estimated from {found.num_pairs} pairs of {found.num_images} images: focal length {found.value:.1f} px, "
         f"standard deviation {found.spread:.1f}; half of the single pairs say {lower:.0f} to {upper:.0f}"
     )
-
-
