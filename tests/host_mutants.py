@@ -42,6 +42,10 @@ READING = ("tests/data/test_reading.py", "tests/data/test_layouts.py")
 READABLE = ("tests/data/test_readable.py",)
 IMAGES = ("tests/data/test_images.py", "tests/data/test_layouts.py")
 REPLICA = ("tests/data/test_replica.py", "tests/data/test_layouts.py")
+INTRINSICS = (
+    *("tests/data/test_intrinsics.py", "tests/data/test_calibration_files.py", "tests/data/test_focal_length.py"),
+    "tests/data/test_tum.py",
+)
 SEVEN_SCENES = ("tests/data/test_seven_scenes.py", "tests/data/test_layouts.py")
 TUM = ("tests/data/test_tum.py", "tests/data/test_layouts.py")
 SYNTHETIC = ("tests/data/test_synthetic.py",)
@@ -1361,18 +1365,46 @@ MUTANTS = (
         "any depth image is near enough in time",
     ),
     Mutant(
-        "emgs_jax/data/tum.py",
-        "cv2.remap(raw, *self._maps, cv2.INTER_NEAREST)",
-        "cv2.remap(raw, *self._maps, cv2.INTER_LINEAR)",
-        TUM,
+        "emgs_jax/data/intrinsics.py",
+        "cv2.remap(depth, *self.maps, cv2.INTER_NEAREST)",
+        "cv2.remap(depth, *self.maps, cv2.INTER_LINEAR)",
+        INTRINSICS,
         "undistorted depth between two surfaces",
     ),
     Mutant(
         "emgs_jax/data/tum.py",
-        "raw = raw if self._maps is None else cv2.remap(",
-        "raw = raw if True else cv2.remap(",
-        TUM,
+        "reading.resize_nearest(self._lens.straighten_depth(raw), self.size)",
+        "reading.resize_nearest(raw, self.size)",
+        INTRINSICS,
         "depth stays distorted",
+    ),
+    Mutant(
+        "emgs_jax/data/calibration_files.py",
+        'return fx, fy, values["cx"] - 0.5, values["cy"] - 0.5',
+        'return fx, fy, values["cx"], values["cy"]',
+        INTRINSICS,
+        "COLMAP's corner taken for the centre of a pixel",
+    ),
+    Mutant(
+        "emgs_jax/data/intrinsics.py",
+        "focal = millimetres / DIAGONAL_35_MM * math.hypot(w, h)",
+        "focal = millimetres / 36 * w",
+        INTRINSICS,
+        "35 mm film measured by its width",
+    ),
+    Mutant(
+        "emgs_jax/data/focal_length.py",
+        "return None if planar is not None and planar.mean() > MAX_PLANAR else Pair(pixels, F, stretch)",
+        "return Pair(pixels, F, stretch)",
+        INTRINSICS,
+        "a plane or a rotation tells a focal length",
+    ),
+    Mutant(
+        "emgs_jax/data/focal_length.py",
+        "tried = [normal_equations(pair, focal * np.exp(step), center) for pair in moved]",
+        "tried = [normal_equations(pair, focal, center) for pair in moved]",
+        INTRINSICS,
+        "the joint fit moves the poses only",
     ),
     Mutant(
         "emgs_jax/data/tum.py",

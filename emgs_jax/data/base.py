@@ -1,7 +1,8 @@
 """What a data set gives: frames in order, their calibration and, where it is known, the truth."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -41,6 +42,7 @@ class Dataset(Protocol):
     sequence: str  # e.g. "redkitchen/seq-01"
     size: tuple[int, int]  # (width, height) of every frame
     intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels at `size`, pixel centres at integers
+    calibration: Mapping[str, Any]  # where `intrinsics` are from, plain values for metrics.json; `note` if worth a line
     classes: tuple[str, ...]  # names of the labels; empty without semantics
     has_ground_truth: bool  # depth and poses are there
 

@@ -1,4 +1,4 @@
-"""A folder of images or a video file with known intrinsics; no ground truth, so no metrics."""
+"""A folder of images or a video file; no ground truth, so no metrics."""
 
 import math
 import re
@@ -11,7 +11,8 @@ from jaxtyping import UInt8
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
-from emgs_jax.data.reading import Number, Size
+from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens
+from emgs_jax.data.reading import Size
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv")
@@ -26,7 +27,8 @@ class Images:
         sequence: folder or file below root; None = root itself.
         start, stop, stride: which of the images that are there, in natural order of their names.
         size: (width, height) of the frames given out; another aspect than the images' is allowed (fx and fy follow).
-        intrinsics: fx, fy, cx, cy of the images on disk, required.
+        intrinsics: required. fx, fy, cx, cy in pixels of the images on disk, where they are distorted followed by k1,
+            k2, p1, p2 and maybe k3; or a calibration file, "exif" or "estimate", see `intrinsics.find_lens`.
     """
 
     name = "images"
@@ -41,13 +43,13 @@ class Images:
         stop: int | None = None,
         stride: int = 1,
         size: Sequence[int] = (320, 240),
-        intrinsics: Sequence[Number] | None = None,
+        intrinsics: Given | None = None,
     ) -> None:
         path = reading.find_sequence(root, "." if sequence is None else sequence, LAYOUT, "your own recording")
         if intrinsics is None:
             raise ValueError(
-                f"dataset.intrinsics is not set: give dataset.intrinsics=[fx,fy,cx,cy] in pixels of the images in "
-                f"{path}; for an unknown camera, fx = fy = .8 times the width and the centre of the image are a start"
+                f"dataset.intrinsics is not set for {path}: give {ALTERNATIVES}; where none of them is at hand, "
+                "fx = fy = .8 times the width and the centre of the image are a start"
             )
         self._source = Video(path) if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() else Folder(path)
         self._chosen = reading.select(self._source.count, start, stop, stride, f"{path} ({LAYOUT})")
@@ -55,8 +57,13 @@ class Images:
         self._raw_size = raw_size
         self.sequence = path.name if sequence is None else str(sequence)
         self.size = reading.check_size(size)
-        raw = reading.check_intrinsics(intrinsics, raw_size)
-        self.intrinsics = reading.resize_intrinsics(raw, raw_size, self.size)
+        self._lens = find_lens(intrinsics, self._pictures())
+        self.calibration = self._lens.about
+        self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, raw_size, self.size)
+
+    def _pictures(self) -> Pictures:
+        files = [] if isinstance(self._source, Video) else [self._source.file(row) for row in self._chosen]
+        return Pictures(self._raw_size, len(self), lambda index: self._source.read(self._chosen[index]), files)
 
     def __len__(self) -> int:
         return len(self._chosen)
@@ -66,7 +73,7 @@ class Images:
         row = self._chosen[index]
         image = self._source.read(row)
         reading.check_raw_size(image, self._raw_size, self._source.label(row))
-        image = reading.resize_color(image, self.size)
+        image = reading.resize_color(self._lens.straighten(image), self.size)
         return Frame(index, self._source.timestamp(row), self._source.label(row), image)
 
     def fingerprint(self) -> str:
@@ -74,6 +81,7 @@ class Images:
             "dataset": self.name,
             "size": self.size,
             "intrinsics": self.intrinsics,
+            **({} if self._lens.maps is None else {"lens": self.calibration["distortion"]}),
             "frames": (self._chosen.start, self._chosen.stop, self._chosen.step),
         }
         files = {self._source.file(row) for row in self._chosen}

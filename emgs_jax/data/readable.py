@@ -31,7 +31,7 @@ class ReadableFrames:
             raise ValueError(f"on_bad_frame must be error or skip, got {on_bad_frame!r}")
         self._dataset = dataset
         self.name, self.sequence, self.size = dataset.name, dataset.sequence, dataset.size
-        self.intrinsics, self.classes = dataset.intrinsics, dataset.classes
+        self.intrinsics, self.calibration, self.classes = dataset.intrinsics, dataset.calibration, dataset.classes
         self.has_ground_truth = dataset.has_ground_truth
         indices = range(len(dataset))
         self.skipped = _unreadable(dataset, progress(indices)) if on_bad_frame == "skip" else {}

@@ -81,14 +81,18 @@ def check_depth_scale(depth_scale: Number) -> float:
     return float(depth_scale)
 
 
-def check_intrinsics(intrinsics: Sequence[Number], raw_size: Size) -> Intrinsics:
-    """`intrinsics` as four numbers that fit an image of raw_size."""
+def check_intrinsics(
+    intrinsics: str | Sequence[Number], raw_size: Size, what: str = "dataset.intrinsics"
+) -> Intrinsics:
+    """`intrinsics` as four numbers that fit an image of raw_size; `what` names them in errors."""
+    if isinstance(intrinsics, str):
+        raise ValueError(f"{what} must be [fx, fy, cx, cy] in pixels for this data set, got {intrinsics!r}")
     values = tuple(float(v) for v in intrinsics)
     if len(values) != 4 or not np.isfinite(values).all() or min(values[:2]) <= 0:
-        raise ValueError(f"dataset.intrinsics must be [fx, fy, cx, cy] in pixels, got {list(intrinsics)}")
+        raise ValueError(f"{what} must be [fx, fy, cx, cy] in pixels, focal lengths above 0, got {list(intrinsics)}")
     if not (0 <= values[2] < raw_size[0] and 0 <= values[3] < raw_size[1]):
         raise ValueError(
-            f"dataset.intrinsics {list(values)} has its principal point outside of the {raw_size[0]}x{raw_size[1]} "
+            f"{what} {list(values)} has its principal point outside of the {raw_size[0]}x{raw_size[1]} "
             "images: give [fx, fy, cx, cy] at the size of the images on disk, not at dataset.size"
         )
     return values

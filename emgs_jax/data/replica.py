@@ -7,6 +7,7 @@ from pathlib import Path
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.intrinsics import Given, find_lens, pictures_of
 from emgs_jax.data.reading import Intrinsics, Number, Size
 
 LAYOUT = "root/{cam_params.json, SCENE/{traj.txt, results/{frame000000.jpg, depth000000.png}}}"
@@ -21,7 +22,7 @@ class Replica:
         sequence: "office0".
         start, stop, stride: which of the images that are there, in order.
         size: (width, height) of the frames given out.
-        intrinsics: fx, fy, cx, cy of the images on disk; None = those of cam_params.json.
+        intrinsics: of the images on disk, as `Images` takes them; None = those of cam_params.json.
         depth_scale: raw units per metre; None = that of cam_params.json.
     """
 
@@ -37,7 +38,7 @@ class Replica:
         stop: int | None = None,
         stride: int = 10,
         size: Sequence[int] = (320, 180),
-        intrinsics: Sequence[Number] | None = None,
+        intrinsics: Given | None = None,
         depth_scale: Number | None = None,
     ) -> None:
         self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
@@ -46,10 +47,12 @@ class Replica:
         self._images = [images[i] for i in chosen]
         self._poses = read_rows(self._folder / "traj.txt", self._images)
         self._raw_size, calibration, scale = read_calibration(Path(str(root)).expanduser() / "cam_params.json")
-        raw = reading.check_intrinsics(calibration if intrinsics is None else intrinsics, self._raw_size)
+        given = calibration if intrinsics is None else intrinsics
+        self._lens = find_lens(given, pictures_of(self._images, self._raw_size))
+        self.calibration = self._lens.about
         self.sequence = str(sequence)
         self.size = reading.check_size(size)
-        self.intrinsics = reading.resize_intrinsics(raw, self._raw_size, self.size)
+        self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
         self._depth_scale = reading.check_depth_scale(scale if depth_scale is None else depth_scale)
 
     def __len__(self) -> int:
@@ -58,8 +61,9 @@ class Replica:
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
         path = self._images[index]
-        image = reading.read_color(path, self._raw_size)
+        image = self._lens.straighten(reading.read_color(path, self._raw_size))
         depth = reading.read_depth(depth_path(path), self._depth_scale, self._raw_size)
+        depth = self._lens.straighten_depth(depth)
         pose = reading.as_pose(self._poses[index], f"{self._folder / 'traj.txt'}, row {number_of(path)} (from 0),")
         image, depth = reading.resize_color(image, self.size), reading.resize_nearest(depth, self.size)
         return Frame(index, float(number_of(path)), str(path), image, depth, pose)

@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32
 from emgs_jax.data import reading
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
+from emgs_jax.data.intrinsics import Given, find_lens, pictures_of
 from emgs_jax.data.reading import Intrinsics, Number, Size
 
 LAYOUT = "root/SCENE/seq-XX/frame-000000.{color.png or color.jpg, depth.png, pose.txt}"
@@ -38,7 +39,7 @@ class SevenScenes:
         sequence: "SCENE/seq-XX".
         start, stop, stride: which of the images that are there, in order.
         size: (width, height) of the frames given out.
-        intrinsics: fx, fy, cx, cy of the 640x480 colour images; None = 525 when registered, else 585.
+        intrinsics: of the 640x480 colour images, as `Images` takes them; None = 525 when registered, else 585.
         depth_scale: raw units per metre.
         register_depth: warp depth into the colour camera and give its pose; else depth and pose are the depth camera's.
     """
@@ -55,7 +56,7 @@ class SevenScenes:
         stop: int | None = None,
         stride: int = 10,
         size: Sequence[int] = (320, 240),
-        intrinsics: Sequence[Number] | None = None,
+        intrinsics: Given | None = None,
         depth_scale: Number = 1000.0,
         register_depth: bool = True,
     ) -> None:
@@ -68,8 +69,15 @@ class SevenScenes:
         self._depth_scale = reading.check_depth_scale(depth_scale)
         self._register = bool(register_depth)
         default = COLOR_INTRINSICS if register_depth else DEPTH_INTRINSICS
-        raw = reading.check_intrinsics(default if intrinsics is None else intrinsics, RAW_SIZE)
-        self.intrinsics = reading.resize_intrinsics(raw, RAW_SIZE, self.size)
+        given = default if intrinsics is None else intrinsics
+        self._lens = find_lens(given, pictures_of(self._images, RAW_SIZE))
+        if self._lens.maps is not None and not self._register:
+            raise ValueError(
+                "dataset.intrinsics with distortion is the colour camera's, but with dataset.register_depth=false the "
+                "depth is another camera's, which it does not straighten: set dataset.register_depth=true"
+            )
+        self.calibration = self._lens.about
+        self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, RAW_SIZE, self.size)
 
     def __len__(self) -> int:
         return len(self._images)
@@ -77,7 +85,7 @@ class SevenScenes:
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
         path = self._images[index]
-        image = reading.resize_color(reading.read_color(path, RAW_SIZE), self.size)
+        image = reading.resize_color(self._lens.straighten(reading.read_color(path, RAW_SIZE)), self.size)
         pose_path = sibling(path, "pose.txt")
         pose = reading.as_pose(reading.read_text(pose_path), pose_path)  # T_world_depth
         depth = reading.read_depth(sibling(path, "depth.png"), self._depth_scale, RAW_SIZE)

@@ -51,6 +51,7 @@ class Synthetic:
         w, h = self.size
         default = (FOCAL_PER_WIDTH * w, FOCAL_PER_WIDTH * w, (w - 1) / 2, (h - 1) / 2)
         self.intrinsics = reading.check_intrinsics(default if intrinsics is None else intrinsics, self.size)
+        self.calibration = {"source": "rendered", "size": [w, h], "intrinsics": [*self.intrinsics], "distortion": []}
         rng = np.random.default_rng(seed)
         self.parts, room_size = room.build_room(rng)  # (class, mesh in the world) of every object
         self._labels = np.array([self.classes.index(name) for name, _ in self.parts], np.int32)

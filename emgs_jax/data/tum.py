@@ -4,14 +4,14 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
-from emgs_jax.data.reading import Intrinsics, Number, Size
+from emgs_jax.data.intrinsics import ALTERNATIVES, Given, find_lens, pictures_of
+from emgs_jax.data.reading import Intrinsics, Number
 
 LAYOUT = "root/SEQUENCE/{rgb.txt, depth.txt, groundtruth.txt, rgb/, depth/}"
 SOURCE = "TUM RGB-D benchmark, project page of the Computer Vision Group of TU Munich"
@@ -40,8 +40,8 @@ class Tum:
         sequence: "rgbd_dataset_freiburg1_desk"; freiburg1, 2 and 3 in the name choose the calibration.
         start, stop, stride: which of the images in rgb.txt, in order of time.
         size: (width, height) of the frames given out.
-        intrinsics: fx, fy, cx, cy of the images on disk; None = the benchmark's calibration.
-        distortion: k1, k2, p1, p2, k3 that goes with `intrinsics`; None = the images are undistorted.
+        intrinsics: of the images on disk, as `Images` takes them; None = the benchmark's calibration.
+        distortion: k1, k2, p1, p2, k3 that goes with four numbers of `intrinsics`; None = what those say themselves.
         depth_scale: raw units per metre.
         max_time_difference: seconds between a colour image and its depth image or pose.
     """
@@ -57,7 +57,7 @@ class Tum:
         stop: int | None = None,
         stride: int = 10,
         size: Sequence[int] = (320, 240),
-        intrinsics: Sequence[Number] | None = None,
+        intrinsics: Given | None = None,
         distortion: Sequence[Number] | None = None,
         depth_scale: Number = 5000.0,
         max_time_difference: Number = 0.02,
@@ -73,13 +73,11 @@ class Tum:
             raise ValueError(f"dataset.max_time_difference must be seconds, 0 or more, got {max_time_difference}")
         self._depths, self._poses = self._associate(float(max_time_difference))
         self.has_ground_truth = self._depths is not None and self._poses is not None
-        raw, bent = find_calibration(self.sequence, intrinsics, distortion)
+        given = find_calibration(self.sequence, intrinsics, distortion)
         self._raw_size = RAW_SIZE if intrinsics is None else reading.first_size(self._images, self._folder)
-        raw = reading.check_intrinsics(raw, self._raw_size)
-        self._maps = None
-        if bent is not None:
-            raw, self._maps = undistortion(raw, bent, self._raw_size)
-        self.intrinsics = reading.resize_intrinsics(raw, self._raw_size, self.size)
+        self._lens = find_lens(given, pictures_of(self._images, self._raw_size))
+        self.calibration = self._lens.about
+        self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
 
     def _associate(self, tolerance: float) -> tuple[list[Path | None] | None, list[list[str] | None] | None]:
         """Per image in use the depth file and the words of the pose nearest in time; None where there is no list."""
@@ -106,13 +104,11 @@ class Tum:
             depth = np.zeros((h, w), np.float32)
             if self._depths[index] is not None:
                 raw = reading.read_depth(self._depths[index], self._depth_scale, self._raw_size)
-                raw = raw if self._maps is None else cv2.remap(raw, *self._maps, cv2.INTER_NEAREST)
-                depth = reading.resize_nearest(raw, self.size)
+                depth = reading.resize_nearest(self._lens.straighten_depth(raw), self.size)
         if self._poses is not None and self._poses[index] is not None:
             pose = as_transform(self._poses[index], self._folder / "groundtruth.txt")
-        if self._maps is not None:
-            image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR)
-        return Frame(index, float(self._times[index]), str(path), reading.resize_color(image, self.size), depth, pose)
+        image = reading.resize_color(self._lens.straighten(image), self.size)
+        return Frame(index, float(self._times[index]), str(path), image, depth, pose)
 
     def fingerprint(self) -> str:
         lists = [self._folder / name for name in ("rgb.txt", "depth.txt", "groundtruth.txt")]
@@ -121,7 +117,7 @@ class Tum:
             "dataset": self.name,
             "size": self.size,
             "intrinsics": self.intrinsics,
-            "undistorted": self._maps is not None,
+            "undistorted": self._lens.maps is not None,
             "depth_scale": self._depth_scale,
             "depths": [p and p.name for p in self._depths or ()],
             "poses": self._poses,
@@ -178,35 +174,22 @@ def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def find_calibration(
-    sequence: str, intrinsics: Sequence[Number] | None, distortion: Sequence[Number] | None
-) -> tuple[Sequence[Number], tuple[float, ...] | None]:
-    """Intrinsics and distortion of the images on disk: as given, else the benchmark's by the sequence's name."""
+def find_calibration(sequence: str, intrinsics: Given | None, distortion: Sequence[Number] | None) -> Given:
+    """What is known of the images on disk: as given, else the benchmark's by the sequence's name."""
     if intrinsics is None:
         if distortion is not None:
             raise ValueError("dataset.distortion needs the dataset.intrinsics that it was calibrated with")
-        for key, calibration in CALIBRATIONS.items():
+        for key, (calibration, bent) in CALIBRATIONS.items():
             if key in sequence.lower():
-                return calibration
-        raise ValueError(
-            f"{sequence} names no calibration (freiburg1, freiburg2 or freiburg3): give "
-            "dataset.intrinsics=[fx,fy,cx,cy] at the size of the images on disk and, where they are distorted, "
-            "dataset.distortion=[k1,k2,p1,p2,k3]"
-        )
+                return (*calibration, *(bent or ()))
+        raise ValueError(f"{sequence} names no calibration (freiburg1, freiburg2 or freiburg3): give {ALTERNATIVES}")
     if distortion is None:
-        return intrinsics, None
+        return intrinsics
     bent = tuple(float(v) for v in distortion)
     if len(bent) != 5 or not np.isfinite(bent).all():
         raise ValueError(f"dataset.distortion must be [k1, k2, p1, p2, k3], got {list(distortion)}")
-    return intrinsics, bent
-
-
-def undistortion(
-    intrinsics: Intrinsics, distortion: tuple[float, ...], size: Size
-) -> tuple[Intrinsics, tuple[np.ndarray, np.ndarray]]:
-    """New intrinsics whose view lies wholly inside of the distorted image, and the cv2.remap tables that lead there."""
-    fx, fy, cx, cy = intrinsics
-    old, bent = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(distortion)
-    new, _ = cv2.getOptimalNewCameraMatrix(old, bent, size, alpha=0, newImgSize=size, centerPrincipalPoint=True)
-    maps = cv2.initUndistortRectifyMap(old, bent, None, new, size, cv2.CV_32FC1)
-    return (float(new[0, 0]), float(new[1, 1]), float(new[0, 2]), float(new[1, 2])), maps
+    if isinstance(intrinsics, str) or len(intrinsics) != 4:
+        raise ValueError(
+            "dataset.distortion goes with dataset.intrinsics=[fx,fy,cx,cy] only: put it behind them or into the file"
+        )
+    return (*intrinsics, *bent)

@@ -46,7 +46,12 @@ def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -
         "protocol": config.get("evaluation", {}).get("protocol"),
         "simulated": prior.is_simulated,
         "prior": {"name": prior.name, "settings": prior.settings},
-        "data": {"name": dataset.name, "sequence": dataset.sequence, "fingerprint": dataset.fingerprint()},
+        "data": {
+            "name": dataset.name,
+            "sequence": dataset.sequence,
+            "fingerprint": dataset.fingerprint(),
+            "camera": dict(dataset.calibration),
+        },
         "seed": prior.settings.get("seed", 0),
         "git": git_revision(Path(__file__).resolve().parents[2]),
         "versions": {"python": platform.python_version()} | {k: _version(names) for k, names in _PACKAGES.items()},

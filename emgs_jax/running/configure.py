@@ -176,6 +176,8 @@ def near(key: str, known: Sequence[str]) -> str:
 def build_dataset(config: DictConfig) -> ReadableFrames:
     """The data set of a config, without unreadable frames where it says so."""
     dataset = instantiate(config.dataset)
+    if "note" in dataset.calibration:
+        tqdm.write(f"intrinsics {dataset.calibration['note']}")
     return ReadableFrames(dataset, config.on_bad_frame, partial(tqdm, desc="checking", unit="frame"))
 
 

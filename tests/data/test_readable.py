@@ -14,6 +14,7 @@ class Damaged:
 
     name, sequence, size, classes, has_ground_truth = "damaged", "one", (4, 3), (), False
     intrinsics = (4.0, 4.0, 1.5, 1.0)
+    calibration = {"source": "numbers"}
 
     def __init__(self, *bad: int) -> None:
         self.bad, self.reads = bad, []

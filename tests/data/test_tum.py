@@ -6,7 +6,8 @@ import pytest
 from written_scene import plane_depth, scene_pose
 
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.data.tum import CALIBRATIONS, Tum, nearest_rows, undistortion
+from emgs_jax.data.intrinsics import undistortion
+from emgs_jax.data.tum import CALIBRATIONS, Tum, nearest_rows
 
 SEQUENCE = "rgbd_dataset_freiburg3_plane"
 

@@ -32,7 +32,7 @@ METRICS = {
 
 
 class ADataset:
-    name, sequence = "synthetic", "room-0"
+    name, sequence, calibration = "synthetic", "room-0", {"source": "rendered"}
 
     def fingerprint(self):
         return "abc123"
@@ -47,7 +47,8 @@ def test_provenance_names_protocol_config_data_seed_code_and_machine():
     block = a_provenance(True)
     assert (block["protocol"], block["seed"], block["simulated"]) == ("paper", 7, True)
     assert block["config"] == {"evaluation": {"protocol": "paper"}}
-    assert block["data"] == {"name": "synthetic", "sequence": "room-0", "fingerprint": "abc123"}
+    camera = {"source": "rendered"}
+    assert block["data"] == {"name": "synthetic", "sequence": "room-0", "fingerprint": "abc123", "camera": camera}
     assert block["prior"] == {"name": "simulated", "settings": {"level": 1, "seed": 7}}
     versions = block["versions"]
     assert set(versions) == {"python", "jax", "jaxlib", "numpy", "optimistix", "equinox", "open3d", "cv2", "emgs_jax"}

@@ -1,0 +1,232 @@
+"""What `dataset.intrinsics` may be (numbers, a calibration file, exif, estimate), and images made straight by it."""
+
+import math
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+from PIL import ExifTags, Image
+
+from emgs_jax.data import reading
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.calibration_files import Calibration, read_calibration
+from emgs_jax.data.focal_length import describe, estimate_focal_length
+from emgs_jax.data.reading import Intrinsics, Number, Size
+
+Given = str | Sequence[Number]  # dataset.intrinsics
+DIAGONAL_35_MM = 43.27  # of 36 mm x 24 mm; cameras scale by the diagonal, whatever their aspect (COLMAP's rule)
+MAX_BORDER = 2.0  # pixels that the straight view may look beyond: OpenCV fits it to a few points of the border
+MIN_VIEW = 0.1  # of the image's area; a lens that leaves less has other coefficients
+MAX_ASPECT_CHANGE = 0.02  # between the picture that the camera took and the file
+ALTERNATIVES = (
+    "dataset.intrinsics=[fx,fy,cx,cy] in pixels of the images on disk (then k1,k2,p1,p2 and maybe k3 of the lens), "
+    "a calibration file, exif or estimate"
+)
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """The images in use, of one camera.
+
+    Args:
+        size: (width, height) on disk.
+        count: how many.
+        read: RGB image 0..count-1 as it is on disk; raises BadFrameError.
+        files: their files; empty for a video.
+    """
+
+    size: Size
+    count: int
+    read: Callable[[int], UInt8[np.ndarray, "_ _ 3"]]
+    files: Sequence[Path] = ()
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How images become those of a pinhole camera.
+
+    Args:
+        intrinsics: fx, fy, cx, cy of the straight images, which have the size of those on disk.
+        maps: tables of cv2.remap; None where the images are straight.
+        about: where the intrinsics come from, plain values for metrics.json.
+    """
+
+    intrinsics: Intrinsics
+    maps: tuple[np.ndarray, np.ndarray] | None
+    about: Mapping[str, Any]
+
+    def straighten(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        """The image without distortion, interpolated."""
+        return image if self.maps is None else cv2.remap(image, *self.maps, cv2.INTER_LINEAR)
+
+    def straighten_depth(self, depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+        """Depth that is registered to the distorted image, without distortion; nearest, as depths must not be mixed."""
+        return depth if self.maps is None else cv2.remap(depth, *self.maps, cv2.INTER_NEAREST)
+
+
+def pictures_of(files: Sequence[Path], size: Size) -> Pictures:
+    """Image files of one size."""
+    return Pictures(size, len(files), lambda index: reading.read_color(files[index], size), files)
+
+
+def find_lens(given: Given, pictures: Pictures) -> Lens:
+    """The camera that `dataset.intrinsics` names.
+
+    Raises:
+        ValueError: numbers, file, EXIF or images do not tell a camera, or one of another size; or the distortion leaves
+            nothing of the image.
+        FileNotFoundError: no such calibration file.
+    """
+    about: dict[str, Any] = {"source": "numbers"}
+    if not isinstance(given, str):
+        what, camera = "dataset.intrinsics", from_numbers(given)
+    elif given == "exif":
+        what, camera = "dataset.intrinsics=exif", from_exif(pictures)
+        about = {"source": given, "note": f"from EXIF: focal length {camera.intrinsics[0]:.1f} px"}
+    elif given == "estimate":
+        what = "dataset.intrinsics=estimate"
+        camera, about = from_images(pictures)
+    else:
+        path = Path(given).expanduser()
+        what, camera = str(path), read_calibration(path)
+        about = {"source": path.name, "note": f"from {path.name}: {[round(v, 2) for v in camera.intrinsics]}"}
+    check_image_size(camera, pictures.size, what)
+    raw = reading.check_intrinsics(camera.intrinsics, pictures.size, what)
+    about |= {"size": [*pictures.size], "intrinsics": [*raw], "distortion": [*camera.distortion]}
+    if not any(camera.distortion):
+        return Lens(raw, None, about)
+    straight, maps = undistortion(raw, camera.distortion, pictures.size, what)
+    return Lens(straight, maps, about)
+
+
+def from_numbers(given: Sequence[Number]) -> Calibration:
+    """fx, fy, cx, cy, and where there is distortion k1, k2, p1, p2 and maybe k3."""
+    values = tuple(float(value) for value in given)
+    if len(values) not in (4, 8, 9) or not np.isfinite(values).all():
+        raise ValueError(
+            "dataset.intrinsics must be [fx, fy, cx, cy], or [fx, fy, cx, cy, k1, k2, p1, p2(, k3)] for images with "
+            f"distortion, all finite; got {list(given)}"
+        )
+    return Calibration(values[:4], values[4:])
+
+
+def from_exif(pictures: Pictures) -> Calibration:
+    """The focal length that the camera wrote into every image as that of 35 mm film, with the centre in the middle.
+
+    The diagonal, and so the focal length in pixels, is the same however the orientation tag turns the image.
+    """
+    if not pictures.files:
+        raise ValueError(f"dataset.intrinsics=exif needs image files, a video has no EXIF: give {ALTERNATIVES}")
+    found: dict[float | None, Path] = {}
+    for path in pictures.files:
+        try:
+            found.setdefault(exif_focal_length(path, pictures.size), path)
+        except (OSError, SyntaxError, struct.error):  # Pillow's for a damaged image, whose turn comes when it is read
+            continue
+    if not found or None in found:
+        path = found.get(None, pictures.files[0])
+        raise ValueError(
+            f"dataset.intrinsics=exif: {path} has no EXIF FocalLengthIn35mmFilm (tag 41989), which is lost when images "
+            f"are edited or cut from a video: give {ALTERNATIVES}"
+        )
+    if len(found) > 1:
+        each = ", ".join(f"{value:g} mm in {path.name}" for value, path in found.items())
+        raise ValueError(
+            f"dataset.intrinsics=exif: the images were taken with several focal lengths ({each}): take those of one"
+        )
+    (millimetres,) = found
+    (w, h) = pictures.size
+    focal = millimetres / DIAGONAL_35_MM * math.hypot(w, h)
+    return Calibration((focal, focal, (w - 1) / 2, (h - 1) / 2))
+
+
+def exif_focal_length(path: Path, size: Size) -> float | None:
+    """FocalLengthIn35mmFilm in millimetres, None where it is absent or 0 (unknown); ValueError for a cropped image."""
+    with Image.open(path) as image:
+        tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    try:
+        value = float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm, 0))
+        taken = [float(tags.get(tag, 0)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    if min(taken) > 0 and abs(max(taken) / min(taken) * min(size) / max(size) - 1) > MAX_ASPECT_CHANGE:
+        raise ValueError(
+            f"dataset.intrinsics=exif: {path} was taken with {taken[0]:.0f}x{taken[1]:.0f} and cut to "
+            f"{size[0]}x{size[1]}, so its EXIF is of another view: give {ALTERNATIVES}"
+        )
+    return value if math.isfinite(value) and value > 0 else None
+
+
+def from_images(pictures: Pictures) -> tuple[Calibration, dict[str, Any]]:
+    """The focal length that fits the images themselves, with the centre in the middle, and what it rests on."""
+
+    def read(index: int) -> np.ndarray | None:
+        try:
+            image = pictures.read(index)
+        except BadFrameError:
+            return None
+        return image if image.shape[1::-1] == tuple(pictures.size) else None
+
+    found = estimate_focal_length(pictures.count, read)
+    (w, h) = pictures.size
+    about = {
+        "source": "estimate",
+        "note": describe(found),
+        "focal_px": found.value,
+        "focal_deviation_px": found.spread,
+        "focal_quartiles_px": [*found.quartiles],
+        "num_pairs": found.num_pairs,
+        "num_images": found.num_images,
+    }
+    return Calibration((found.value, found.value, (w - 1) / 2, (h - 1) / 2)), about
+
+
+def check_image_size(camera: Calibration, size: Size, what: str) -> None:
+    """ValueError where a calibration is for images of another size."""
+    if camera.size is None or camera.size == tuple(size):
+        return
+    (w, h), (width, height) = camera.size, size
+    reason = "give the calibration of these images, or these images in that size"
+    if (w, h) == (height, width):
+        reason = "they are turned, maybe by their EXIF orientation; calibrate the images as they are shown"
+    raise ValueError(f"{what} is for images of {w}x{h}, but the images are {width}x{height}: {reason}")
+
+
+def undistortion(
+    intrinsics: Intrinsics, distortion: Sequence[float], size: Size, what: str = "dataset.intrinsics"
+) -> tuple[Intrinsics, tuple[np.ndarray, np.ndarray]]:
+    """New intrinsics whose view lies wholly inside of the distorted image, and the cv2.remap tables that lead there.
+
+    Raises:
+        ValueError: there is no such view: the coefficients fold the image, or leave less than MIN_VIEW of it.
+    """
+    fx, fy, cx, cy = intrinsics
+    old, bent = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(distortion)
+    new, _ = cv2.getOptimalNewCameraMatrix(old, bent, size, alpha=0, newImgSize=size, centerPrincipalPoint=True)
+    # OpenCV answers nonsense where no pixel is left: a view that is mirrored, not finite, or of what no pixel shows.
+    share = 0.0
+    if np.isfinite(new).all() and min(new[0, 0], new[1, 1]) > 0:
+        maps = cv2.initUndistortRectifyMap(old, bent, None, new, size, cv2.CV_32FC1)
+        share = _seen_share(maps, size)
+    if share < MIN_VIEW:
+        raise ValueError(
+            f"{what}: the distortion {[*distortion]} leaves {100 * share:.0f} % of the {size[0]}x{size[1]} image: "
+            "check order (k1, k2, p1, p2, k3) and signs; a fisheye lens has another model, undistort its images before"
+        )
+    return (float(new[0, 0]), float(new[1, 1]), float(new[0, 2]), float(new[1, 2])), maps
+
+
+def _seen_share(maps: tuple[np.ndarray, np.ndarray], size: Size) -> float:
+    """Share of the distorted image that the straight view shows; 0 where it looks beyond or sees something twice."""
+    x, y = maps
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        return 0.0
+    is_inside = min(x.min(), y.min()) >= -MAX_BORDER
+    is_inside &= x.max() <= size[0] - 1 + MAX_BORDER and y.max() <= size[1] - 1 + MAX_BORDER
+    is_folded = (np.diff(x, axis=1) <= 0).any() or (np.diff(y, axis=0) <= 0).any()
+    return float(np.ptp(x) * np.ptp(y) / (size[0] * size[1])) if is_inside and not is_folded else 0.0

@@ -1,0 +1,166 @@
+"""Calibration files of other programs, written as those programs write them."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from emgs_jax.data.calibration_files import read_calibration
+
+K = (500.5, 502.25, 319.0, 241.5)  # pixel centres at integers, as OpenCV
+LENS = (0.1, -0.2, 0.001, -0.002, 0.05)
+CORNER = f"{K[2] + 0.5} {K[3] + 0.5}"  # COLMAP's and nerfstudio's 0, 0 is the corner of the image
+TRANSFORMS = {
+    "fl_x": K[0],
+    "fl_y": K[1],
+    "cx": K[2] + 0.5,
+    "cy": K[3] + 0.5,
+    "w": 640,
+    "h": 480,
+    "camera_model": "OPENCV",
+    "frames": [{"file_path": "images/1.png", "transform_matrix": np.eye(4).tolist()}],
+}
+ROS = """image_width: 640
+image_height: 480
+camera_name: narrow
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [500.5, 0, 319.0, 0, 502.25, 241.5, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [0.1, -0.2, 1e-3, -0.002, 0.05]
+"""
+ORB = "%YAML:1.0\nCamera.type: PinHole\n" + "".join(
+    f"Camera.{key}: {value}\n"
+    for key, value in zip(
+        ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "width", "height"), (*K, *LENS, 640, 480), strict=True
+    )
+)
+PLAIN = dict(zip(("fx", "fy", "cx", "cy"), K, strict=True)) | {"width": 640, "height": 480}
+MAST3R = f"width: 640\nheight: 480\n# a comment\ncalibration: {[*K, *LENS]}\n"
+FILES = {
+    "cameras.txt": (f"# Camera list\n1 PINHOLE 640 480 500.5 502.25 {CORNER}\n", ()),
+    "opencv/cameras.txt": (f"1 OPENCV 640 480 500.5 502.25 {CORNER} .1 -.2 .001 -.002\n", LENS[:4]),
+    "transforms.json": (json.dumps(TRANSFORMS), ()),
+    "lens/transforms.json": (
+        json.dumps(TRANSFORMS | dict(zip(("k1", "k2", "p1", "p2"), LENS, strict=False))),
+        LENS[:4],
+    ),
+    "camera_info.yaml": (ROS, LENS),
+    "orb.yaml": (ORB, LENS),
+    "intrinsics.yaml": (MAST3R, LENS),
+    "straight/intrinsics.yaml": (f"width: 640\nheight: 480\ncalibration: {[*K]}\n", ()),
+    "vipe.json": (json.dumps(PLAIN), ()),
+}
+
+
+def write(folder, name, text):
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_format_names_the_same_camera(name, tmp_path):
+    text, lens = FILES[name]
+    camera = read_calibration(write(tmp_path, name, text))
+    np.testing.assert_allclose(camera.intrinsics, K, rtol=1e-12)
+    assert camera.size == (640, 480)
+    np.testing.assert_allclose(camera.distortion, lens, rtol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(1, 5), (5, 1), (1, 4), (1, 14)])
+def test_what_opencv_writes_is_read(shape, tmp_path):
+    lens, matrix = np.zeros(shape), np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
+    lens.flat[:5] = LENS if lens.size > 4 else LENS[:4]
+    path = tmp_path / "calibration.yml"
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for key, value in (("image_width", 640), ("image_height", 480), ("camera_matrix", matrix)):
+        file.write(key, value)
+    file.write("distortion_coefficients", lens)
+    file.release()
+    camera = read_calibration(path)
+    assert (camera.intrinsics, camera.size, camera.distortion) == (K, (640, 480), LENS[: min(lens.size, 5)])
+
+
+@pytest.mark.parametrize(
+    "line, focal, lens",
+    [
+        (f"SIMPLE_PINHOLE 640 480 500 {CORNER}", 500, ()),
+        (f"SIMPLE_RADIAL 640 480 500 {CORNER} .1", 500, (0.1, 0, 0, 0)),
+        (f"RADIAL 640 480 500 {CORNER} .1 -.2", 500, (0.1, -0.2, 0, 0)),
+    ],
+)
+def test_colmaps_models_with_one_focal_length(line, focal, lens, tmp_path):
+    camera = read_calibration(write(tmp_path, "cameras.txt", f"1 {line}\n2 {line}\n"))  # one camera, listed twice
+    assert camera.intrinsics == (focal, focal, *K[2:])
+    assert camera.distortion == lens
+
+
+@pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"])
+def test_other_models_of_colmap_are_refused_by_name(model, tmp_path):
+    with pytest.raises(ValueError, match=f"cameras.txt: the camera model {model} is not read.*image_undistorter"):
+        read_calibration(write(tmp_path, "cameras.txt", f"1 {model} 640 480 500 500 320 240 0 0 0 0 0 0 0 0\n"))
+
+
+WRONG = [
+    ("cameras.txt", "", "lines CAMERA_ID MODEL"),
+    ("cameras.txt", "1 PINHOLE 640 480 500 500 320\n", "PINHOLE has the parameters fx, fy, cx, cy, got 3"),
+    ("cameras.txt", "1 PINHOLE 640 480 500 nan 320 240\n", "fy must be a finite number, got 'nan'"),
+    ("cameras.txt", "1 PINHOLE 640.5 480 500 500 320 240\n", "width and height must be pixels"),
+    ("cameras.txt", "1 SIMPLE_PINHOLE 9 9 5 4 4\n2 SIMPLE_PINHOLE 9 9 6 4 4\n", "2 different cameras: leave the line"),
+    ("cameras.bin", "\x01", "model_converter"),
+    ("camera.xml", "<a/>", "none of the calibration files that are known: COLMAP"),
+    ("transforms.json", "{", "damaged or no json"),
+    ("transforms.json", "[1]", "must hold keys and values"),
+    ("transforms.json", '{"a": 1}', "has none of the keys"),
+    ("transforms.json", '{"fl_x": 1, "fl_y": 1, "cx": 1, "cy": 1, "h": 3}', "has no w: add"),
+    ("transforms.json", json.dumps(TRANSFORMS | {"k7": 1}), "unknown keys: k7.*remove"),
+    ("transforms.json", json.dumps(TRANSFORMS | {"k4": 1}), "with k4 is not read"),
+    ("transforms.json", json.dumps(TRANSFORMS | {"camera_model": "OPENCV_FISHEYE"}), "OPENCV_FISHEYE is not read"),
+    ("transforms.json", json.dumps(TRANSFORMS | {"is_fisheye": True}), "FISHEYE is not read"),
+    ("transforms.json", json.dumps(TRANSFORMS | {"frames": [{"fl_x": 3}]}), "a camera for each frame"),
+    ("transforms.json", json.dumps(TRANSFORMS | {"fl_x": True}), "fl_x must be a finite number"),
+    ("info.yaml", ROS.replace("image_height: 480\n", ""), "has no image_height: add"),
+    ("info.yaml", ROS.replace("plumb_bob", "equidistant"), "equidistant is not read"),
+    ("info.yaml", ROS.replace("camera_name", "lens_name"), "unknown keys: lens_name"),
+    ("info.yaml", ROS.replace("0, 502.25", "2, 502.25"), "camera_matrix must be fx 0 cx"),
+    (
+        "info.yaml",
+        ROS.replace("[0.1, -0.2, 1e-3, -0.002, 0.05]", "[0.1, .inf, 0, 0]"),
+        "distortion_coefficients must be a",
+    ),
+    ("info.yaml", ROS.replace("[0.1, -0.2, 1e-3, -0.002, 0.05]", "[0.1, 1, 0]"), "3 distortion coefficients are no k1"),
+    ("info.yaml", ROS.replace("0.05]", "0.05, 1, 0, 0]"), "8 distortion coefficients are no k1"),
+    ("info.yaml", ROS.split("distortion_model")[0], "has no distortion_coefficients: add"),
+    ("info.yaml", "a: [1", "damaged or no yaml"),
+    ("info.yaml", "!!python/object/apply:os.getcwd []", "damaged or no yaml"),
+    ("orb.yaml", ORB.replace("PinHole", "KannalaBrandt8"), "KannalaBrandt8 is not read"),
+    ("orb.yaml", ORB.replace("Camera.width: 640\n", ""), "has no Camera.width: add"),
+    ("orb.yaml", ORB + "Camera2.fx: 3\n", "more than one camera"),
+    ("intrinsics.yaml", MAST3R.replace("width", "widht"), "unknown keys: widht"),
+    (
+        "intrinsics.yaml",
+        "width: 640\nheight: 480\ncalibration: [1, 2, 3]\n",
+        "calibration must be fx, fy, cx, cy.*got 3",
+    ),
+    ("intrinsics.yaml", "width: 640\nheight: 480\ncalibration: pinhole\n", r"calibration must have data: \[numbers\]"),
+    ("vipe.json", json.dumps(PLAIN | {"fx": None}), "fx must be a finite number"),
+    ("vipe.json", json.dumps(PLAIN | {"k6": 0.1}), "unknown keys: k6"),
+]
+
+
+@pytest.mark.parametrize("name, text, message", WRONG)
+def test_what_cannot_be_read_names_the_file_the_key_and_the_remedy(name, text, message, tmp_path):
+    with pytest.raises(ValueError, match=f"(?s){name}.*{message}"):
+        read_calibration(write(tmp_path, name, text))
+
+
+def test_a_missing_file_says_what_it_may_be(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.json cannot be read; it may be COLMAP"):
+        read_calibration(tmp_path / "none.json")
