@@ -205,14 +205,15 @@ def registered(points, normals, light, noise, g, gradients, config, pose_std):
     """The translation that ICP's cost asks for where rotation and scale are held, for matches that do not change.
 
     Rows of a point: distance to the plane (`colored`) or whitened offset (`distribution`), and its intensity. All
-    points together weigh as much as 64, for nothing is known of how alike their errors are, against the prior's information over the coarse pose's variance.
+    points together weigh as much as 16, for nothing is known of how alike their errors are, against the prior's
+    information over the coarse pose's variance.
     """
     residual = ("colored", "distribution", "colored+distribution")[int(config.residual)]
     rows, is_inlier = matched(
         points, normals, noise, g, (float(config.max_mahalanobis_sq), float(config.min_normal_cos))
     )
     hessian, force = float(config.prior_information) / pose_std**2 * np.eye(3), np.zeros(3)
-    share = 64.0 / len(points)
+    share = 16.0 / len(points)
     for i in np.flatnonzero(is_inlier):
         k, nu = rows[i], noise[i]
         offset, normal, gradient = points[i] - g["means"][k], g["normals"][k], gradients[k]

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.registration.rigid import MIN_PAIRS, median
 
 NUM_LEVELS = 8  # of confidence
-NUM_CELLS = 8  # along each side of the image, whose errors are compared
+NUM_CELLS = 4  # along each side of the image, whose errors are compared; few, for errors may be alike over much of it
 
 
 def confidence_levels(confidence: Float[Array, "p"], valid: Bool[Array, "p"]) -> Int[Array, "p"]:

@@ -22,6 +22,7 @@ from scene import (
 from emgs_jax.gaussians import Gaussians, color_gradients, fit_to_points
 from emgs_jax.observation import Observation, transform
 from emgs_jax.registration.icp import icp
+from emgs_jax.registration.noise import NUM_CELLS
 
 pytestmark = pytest.mark.slow  # the solver compiles for 10 s; the quick subset has test_localization
 RESIDUALS = {"colored": 0, "distribution": 1, "colored+distribution": 2}
@@ -147,11 +148,11 @@ def test_points_and_prior_share_the_offset_by_their_information(small, residual,
 
 
 def test_the_coarse_poses_own_noise_is_in_metres(small):
-    """A wall half a sigma away: t = d A / (A + B) with A = 64 / σ², B = information / pose_std²."""
+    """A wall half a sigma away: t = d A / (A + B) with A = 16 / σ², B = information / pose_std²."""
     settings = at(small, "residual", RESIDUALS["colored"])
     for pose_std in (0.01, 0.02, 0.05):
         xi, _, _ = solved(points_of((0, 0, 2.01)), WALL, settings, pose_std)
-        points, prior = 60 / 0.02**2, 30 / pose_std**2
+        points, prior = NUM_CELLS**2 / 0.02**2, 30 / pose_std**2
         assert_as_stated(xi, [0, 0, -0.01 * points / (points + prior)])
 
 
@@ -161,7 +162,7 @@ def test_the_noise_of_depth_holds_the_rotation_in_radians(small):
     walls = gaussians_of([(1, 0, 2.01), (-1, 0, 1.99)], (0.3, 0.3, 0.02))
     for depth_noise in (0.005, 0.01):
         xi, _, _ = solved(points_of([(1, 0, 2), (-1, 0, 2)]), walls, settings, 1e-4, depth_noise)
-        points, prior = 60 / 0.02**2, 30 / depth_noise**2
+        points, prior = NUM_CELLS**2 / 0.02**2, 30 / depth_noise**2
         expected = -0.01 * points / (points + prior)
         np.testing.assert_allclose(xi[3:], [0, expected, 0], atol=0.01 * abs(expected))  # sin θ for θ = 1e-2
 
@@ -177,7 +178,7 @@ def test_the_scale_is_held_in_units_of_the_depth_noise(small):
             1e-3,
             0.01,
         )
-        s, points = scale_noise * 0.01, 60 / 0.02**2
+        s, points = scale_noise * 0.01, NUM_CELLS**2 / 0.02**2
         expected = s * (2 * s * points * 0.01) / (1 + (2 * s) ** 2 * points)
         assert np.log(scale) == pytest.approx(expected, rel=0.02)  # exp(s y) is linear up to s y = 5e-3
 
@@ -206,7 +207,7 @@ def test_a_point_that_no_gaussian_explains_pulls_nowhere_but_counts_unless_it_is
     settings = at(small, "residual", RESIDUALS["colored"])
     points = points_of([(0, 0, 2.01), point], normals=[TOWARDS, normal], valid=[True, valid])
     xi, _, info = solved(points, WALL, settings)
-    data, prior = 60 / 0.02**2 / (2 if valid else 1), 30 / POSE_STD**2
+    data, prior = NUM_CELLS**2 / 0.02**2 / (2 if valid else 1), 30 / POSE_STD**2
     assert_as_stated(xi, [0, 0, -0.01 * data / (data + prior)])
     assert info.num_inliers == 8 and info.inlier_fraction == (0.5 if valid else 1.0)
 
@@ -255,7 +256,8 @@ def test_the_info_says_what_the_points_at_the_held_pose_look_like(small):
 
 def test_a_pose_is_held_no_harder_than_the_points_fit_the_map_there(small):
     """A coarse pose that claims 1 mm, and points that say 3 cm: the offset is shared as by one that claims 3 cm."""
-    points = points_of([(0, 0, 2.03)])
+    spread = np.linspace(-0.3, 0.3, NUM_CELLS)
+    points = points_of([(x, y, 2.03) for x in spread for y in spread])  # errors that are all alike, one for each cell
     settings = at(small, "residual", RESIDUALS["colored"])
     misfit = 1.4826 * 0.03 / 2.03  # of the depth
     claimed = 1e-3 / 2.03
