@@ -44,8 +44,8 @@ class FitConfig(eqx.Module):
     """How points become Gaussians.
 
     Args:
-        points_per_gaussian: λ, in pixels of an image of 640 × 480; a new Gaussian stands for so many. An image of
-            another size is cut into as many pieces, but none of fewer than MIN_ROWS points.
+        points_per_gaussian: λ, in pixels of an image of 518 × 392, the paper's; a new Gaussian stands for so many. An
+            image of another size is cut into as many pieces, but none of fewer than MIN_ROWS points.
         num_fit_neighbours: M of eq. 1 (R10).
         num_kmeans_iterations: of Lloyd's algorithm.
         min_std: m; floor of a Gaussian's standard deviation in every direction.
@@ -58,8 +58,8 @@ class FitConfig(eqx.Module):
 
 
 def spacing(camera: Camera, thin: int, config: FitConfig) -> int:
-    """Rows of a thinned observation that make one Gaussian, which are λ pixels of an image of 640 × 480."""
-    share = camera.width * camera.height / (640 * 480)
+    """Rows of a thinned observation that make one Gaussian, which are λ pixels of an image of 518 × 392."""
+    share = camera.width * camera.height / (518 * 392)
     return max(round(config.points_per_gaussian * share / thin**2), MIN_ROWS)
 
 

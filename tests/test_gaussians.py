@@ -108,13 +108,12 @@ def test_fitting_moves_with_a_rigid_motion(fit_config):
 def test_an_image_is_cut_into_as_many_pieces_whatever_its_size(config):
     chosen = config("slam.fit.points_per_gaussian=128").fit
     for width, height, thin, expected in (
-        (640, 480, 1, 128),
-        (640, 480, 4, 8),
-        (320, 240, 1, 32),
-        (320, 240, 2, 8),
-        (640, 240, 2, 16),  # half of the image has half of the pieces' pixels
-        (160, 120, 1, 8),
-        (160, 120, 2, 4),  # two rows would have no covariance
+        (518, 392, 1, 128),
+        (518, 392, 4, 8),
+        (259, 196, 1, 32),
+        (259, 196, 2, 8),
+        (518, 196, 2, 16),  # half of the image has half of the pieces' pixels
+        (130, 98, 2, 4),  # two rows would have no covariance
     ):
         assert spacing(Camera([1.0, 1.0], [0.0, 0.0], width, height), thin, chosen) == expected
 

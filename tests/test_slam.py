@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow  # one compilation of the whole step is half a min
 # Every second row and column of the full images is kept, which are those of `camera`; 32 of their pixels make 8 rows.
 FULL = Camera([40.0, 46.0], [29.0, 24.5], 64, 48)
 # The whole map, so that the axis-aligned voxels choose the same Gaussians in every frame.
-WHOLE = ("slam.submap.margin=100", "slam.observation.thin=2", "slam.fit.points_per_gaussian=3200")
+WHOLE = ("slam.submap.margin=100", "slam.observation.thin=2", "slam.fit.points_per_gaussian=2116")
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ NUM_FRAMES, WINDOW_SIZE = 6, 3
 TINY = (
     *("dataset.size=[64,48]", "dataset.num_frames=40", f"dataset.stop={NUM_FRAMES}"),
     *("slam.observation.thin=1", "slam.observation.normal_radius=1", "slam.observation.normal_spacing=1"),
-    *("slam.fit.points_per_gaussian=800", "slam.fit.num_fit_neighbours=8", "slam.fit.num_kmeans_iterations=2"),
+    *("slam.fit.points_per_gaussian=529", "slam.fit.num_fit_neighbours=8", "slam.fit.num_kmeans_iterations=2"),
     *("slam.submap.map_capacity=1024", "slam.submap.submap_capacity=1024", "slam.em.num_neighbours=6"),
     *("render.tile_size=16", "render.tile_capacity=192", "slam.localization.icp.num_points=512"),
     f"slam.window_size={WINDOW_SIZE}",

@@ -105,7 +105,7 @@ def test_em_agrees_with_numpy_and_scipy_on_the_same_points():
 
 @pytest.mark.slow
 def test_both_registrations_find_the_pose_of_exact_views():
-    config = benchmark_config("prior.level=0", "slam.fit.points_per_gaussian=4", "dataset.num_frames=100")
+    config = benchmark_config("prior.level=0", "slam.fit.points_per_gaussian=264", "dataset.num_frames=100")
     for timing in time_icp(load(config), (0.08, 0.04), 1):  # starts 8 cm and 2.3 degrees away
         assert timing.facts["translation_error_cm"][0] < 2.0, timing.name  # pixels are 5 cm apart
         assert timing.facts["rotation_error_deg"][0] < 0.6, timing.name
