@@ -218,10 +218,15 @@ def _fuse(
     config: EmConfig,
 ) -> tuple[GaussianMap, Observation, EmInfo]:
     """Fuse the points of a frame that is tracked; returns those that no Gaussian explains."""
-    trusted = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & localization.is_tracked)
+    trusted = _trusted(aligned, localization)
     noise = localization.noise[:, None] * (trusted.points - T.translation())
     submap, is_fused, em = em_update(submap, trusted, noise, config, white)
     return submap, eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~is_fused), em
+
+
+def _trusted(aligned: Observation, localization: LocalizationInfo) -> Observation:
+    """The frame without a valid row where it is not tracked."""
+    return eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & localization.is_tracked)
 
 
 @eqx.filter_jit
@@ -259,9 +264,9 @@ def _store(
         The map, the number of its Gaussians, and how many did not fit.
     """
     aligned, T, localization = look
-    trusted = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & localization.is_tracked)
-    view, noise = downscale(camera, config.observation.thin), localization.depth_noise
-    map, is_seen = judge(write_back(map, submap, rows), trusted, T, view, noise, config.existence)
+    thinned, noise = downscale(camera, config.observation.thin), localization.depth_noise
+    trusted = _trusted(aligned, localization)
+    map, is_seen = judge(write_back(map, submap, rows), trusted, T, thinned, noise, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
     submap = join_layers(take_rows(map, rows), is_seen, T, noise, config.existence)
     first_weight = _first_weight(weight, config.em.average)

@@ -73,19 +73,27 @@ REGISTRATION = [
         ),
         ("points.valid & is_near", "is_near", "invalid points are inliers"),
     ),
-    *own("registration/icp", "registration/test_icp")(
-        ("jnp.stack(pose_noise), 3)", "jnp.stack(pose_noise[::-1]), 3)", "metres for radians"),
+    *own("registration/noise", "registration/test_noise")(
+        ('side="left"', 'side="right"', "equal confidences are the highest"),
+        ("jnp.where(valid, confidence, jnp.inf)", "confidence", "invalid points are ranked, too"),
+        ("1.4826 * median", "median", "the misfit is no standard deviation"),
+        (">= MIN_PAIRS, found, ", ">= 0, found, ", "two points make a level"),
+        ("jnp.clip(num_cells * ratio, num_cells, num_points)", "num_cells * ratio", "more measurements than points"),
+        ("total**2 / jnp.maximum(count, 1.0)", "total**2", "the sum of a cell for its mean"),
+        ("jnp.where(num_points > 0, found, NUM_CELLS**2)", "found", "no point, no weight"),
+    ),
+    *own("registration/problem", "registration/test_icp")(
+        ("jnp.stack(uncertainty.pose), 3)", "jnp.stack(uncertainty.pose[::-1]), 3)", "metres for radians"),
         (
-            "config.num_effective / jnp.maximum(jnp.sum(valid), 1)",
-            "1 / jnp.maximum(jnp.sum(valid), 1)",
+            "uncertainty.num_effective / jnp.maximum(jnp.sum(source.valid), 1)",
+            "1 / jnp.maximum(jnp.sum(source.valid), 1)",
             "points as one",
         ),
-        ("config.noise * depth_noise * source", "depth_noise * source", "the factor on the points' noise is dropped"),
-        ("scale_std=config.scale_noise * depth_noise", "scale_std=config.scale_noise", "scale in absolute units"),
+        ("config.noise * uncertainty.depth", "uncertainty.depth", "the factor on the points' noise is dropped"),
+        ("scale_unit=config.scale_noise * scale_unit", "scale_unit=config.scale_noise", "scale in absolute units"),
         ("jnp.sqrt(config.prior_information) /", "config.prior_information /", "information for its root"),
-        ("1.4826 * median", "median", "the misfit is no standard deviation"),
         ("jnp.abs(distance) <= config.max_misfit", "jnp.abs(distance) >= 0", "what is far away counts as noise"),
-        ("jnp.maximum(misfit / noise[0], 1.0)", "1.0", "a pose is held however badly it fits"),
+        ("matches.normals, axis=-1) / depth", "matches.normals, axis=-1)", "distances in metres"),
         ("jnp.cross(jnp.concatenate([points, points]), axes)", "axes", "turning tells what moving tells"),
         ("normals / matches.plane_std[:, None]", "normals", "information without its unit"),
         ("jnp.clip(shade, -edge, edge)", "shade", "an intensity pulls however different it is"),
@@ -96,7 +104,11 @@ REGISTRATION = [
         ),
         ("problem.rays @ T.rotation().as_matrix().T", "problem.rays", "rays stay in the camera's frame"),
         ("(config.residual != COLORED) * jnp", "1.0 * jnp", "`colored` with the offset"),
-        ("_search(y, problem, config)", "_search(0.0 * y, problem, config)", "the search never follows the points"),
+    ),
+    *own("registration/icp", "registration/test_icp")(
+        ("candidates_at(y, problem, config)", "candidates_at(0.0 * y, problem, config)", "it never follows the points"),
+        ("jnp.maximum(misfit / noise[1], 1.0)", "1.0", "a pose is held however badly it fits"),
+        ("jnp.maximum(of_levels, noise[1])[levels]", "of_levels[levels]", "`noise` is no lower bound"),
     ),
 ]
 
@@ -104,15 +116,27 @@ STAGES = [
     *own("localization", "test_localization")(
         ("anchor_noise * reach**2", "anchor_noise * reach", "the anchor's deviation for its variance"),
         ("coarse.scale * jnp.where(is_tracked, scale, 1.0)", "coarse.scale", "the accepted scale is dropped"),
-        ("info.misfit / coarse.mean_depth", "info.misfit", "the depth's noise in metres"),
+        (
+            "misfit_of_levels[confidence_levels(current.confidence, current.valid)]",
+            "misfit_of_levels[0]",
+            "one for all",
+        ),
         (
             "scale_translation(raw_current.inverse() @ pose_row(views, 2), scale)",
             "raw_current.inverse() @ pose_row(views, 2)",
             "the newest pose without its scale",
         ),
-        ("noise_m, noise_m / coarse.mean_depth", "noise_m, noise_m", "metres for a fraction of the depth"),
-        ("jnp.maximum(coarse.repeat_rms, 1e-3)", "coarse.repeat_rms", "a coarse pose without any noise"),
-        (" <= config.max_pair_distance\n", " <= jnp.inf\n", "pairs however far apart"),
+        (
+            "depth_noise * coarse.mean_depth, depth_noise",
+            "depth_noise, depth_noise",
+            "a fraction of the depth for metres",
+        ),
+        (
+            "jnp.maximum(coarse.repeat_rms / coarse.mean_depth, LEAST_NOISE)",
+            "coarse.repeat_rms / coarse.mean_depth",
+            "none",
+        ),
+        ("<= config.max_pair_distance * depth", "<= jnp.inf", "pairs however far apart"),
         ("** config.scale_memory", "", "the memory of the scale is not used"),
         ("1.4826 * jnp.sqrt", "jnp.sqrt", "the disagreement is no standard deviation"),
         ("aligned.valid & coarse.is_usable", "aligned.valid", "a lost frame's points count"),
@@ -160,7 +184,11 @@ STAGES = [
     ),
     *own("initialization", "test_initialization")(
         ("weight * num_views", "weight", "weights of one view"),
-        ("spacing(thin, config) * num_views", "spacing(thin, config)", "as many Gaussians for every view"),
+        (
+            "spacing(camera, thin, config) * num_views",
+            "spacing(camera, thin, config)",
+            "as many Gaussians for every view",
+        ),
         ("transform(T, view, jnp.ones(()))", "transform(T.inverse(), view, jnp.ones(()))", "poses the wrong way round"),
     ),
     *own("em", "test_em")(
@@ -206,6 +234,31 @@ STAGES = [
         ("is_near & (normal_cos >= config.min_normal_cos)", "is_near", "pairs that face different ways"),
         ("jnp.where(both, jnp.maximum(cosine, 0.0), 1.0)", "jnp.maximum(cosine, 0.0)", "no feature, no merging"),
     ),
+    *own("existence", "test_existence")(
+        ("jax.lax.min, (3, 3)", "jax.lax.min, (1, 1)", "the pixel alone"),
+        ("(depth < nearest - reach)", "(depth < farthest - reach)", "an edge shows what is behind"),
+        ("& is_steep", "", "grazing looks count"),
+        (
+            "config.num_std * jnp.sqrt((depth_noise * depth) ** 2 + variance)",
+            "config.num_std * jnp.sqrt(variance)",
+            "no noise",
+        ),
+        (
+            "jnp.clip(map.existence + change, -config.max_log_odds, config.max_log_odds)",
+            "map.existence + change",
+            "no limit",
+        ),
+        ("existence < config.refuted", "existence < 0.0", "one look refutes"),
+        (
+            "share * (1.0 - share))[:, None, None] * outer(along)",
+            "share * (1.0 - share))[:, None, None] * outer(difference)",
+            "thicker",
+        ),
+        ("partner[partner] == jnp.arange(count)", "partner >= 0", "whom nobody chose"),
+        ("(rows != jnp.arange(count)[:, None])", "True", "with itself"),
+        (">= config.min_normal_cos", ">= -1.0", "both sides of a panel"),
+        ("(noise**2)[:, None, None]", "noise[:, None, None]", "a deviation for a variance"),
+    ),
     *own("semantics", "test_semantics")(
         ("safe_normalize(gaussians.features) @", "gaussians.features @", "features by their length"),
         ("gaussians.valid & has_feature", "has_feature", "free rows have a class"),
@@ -213,11 +266,21 @@ STAGES = [
     *own("slam", "test_slam")(
         ("SlamState(map, aligned, T), info", "SlamState(map, trusted, T), info", "a rejected frame is no previous one"),
         ("view = downscale(camera, thin)", "view = camera", "the full camera for the thinned rows"),
-        ("camera, thin), spacing(thin, config.fit)", "camera, thin), spacing(1, config.fit)", "λ in rows"),
+        (
+            "camera, thin), spacing(camera, thin, config.fit)",
+            "camera, thin), spacing(camera, 1, config.fit)",
+            "λ in rows",
+        ),
         ("aligned.valid & localization.is_tracked", "aligned.valid", "a frame that is not tracked is mapped"),
         ("trusted.valid & ~is_fused", "trusted.valid", "fused points become Gaussians, too"),
         ("(trusted.points - T.translation())", "trusted.points", "the noise along rays from the world's origin"),
-        ("insert(write_back(map, submap, rows), fresh", "insert(map, fresh", "the submap is not put back"),
+        ("judge(write_back(map, submap, rows)", "judge(map", "the submap is not put back"),
+        (
+            "localize_fine(current, confirmed(submap)",
+            "localize_fine(current, submap.gaussians",
+            "tentative ones are aligned against",
+        ),
+        ("insert(write_back(map, submap, rows), fresh", "insert(map, fresh", "layers are not joined"),
         (
             "jnp.where(config.gain > 0, weight, 1.0)",
             "jnp.ones_like(weight)",
@@ -252,16 +315,19 @@ RENDER = [
         ("alpha >= jnp.maximum(config.min_alpha", "alpha >= jnp.maximum(0.0", "any coverage has a depth"),
     ),
     *own("render/densify", "render/test_densify")(
-        ("(config.opacity, config.min_alpha)", "(config.render.opacity, config.min_alpha)", "the refinement's opacity"),
         (
-            "(config.opacity, config.min_alpha)",
-            "(config.opacity, config.render.min_alpha)",
+            "config.render, config.min_alpha)",
+            "config.render, config.render.min_alpha)",
             "the refinement's coverage",
+        ),
+        (
+            "config.surface_depth), nearness, 0.0)",
+            "config.surface_depth), weights, 0.0)",
+            "the first layer weighs most",
         ),
         ("reach * middle", "reach", "a layer in metres"),
         ("0.5 * weights.sum(0)", "0.25 * weights.sum(0)", "the first quartile for the median"),
-        ("config.min_layer_share * whole[1]", "config.min_layer_share", "the share of light, not of weight"),
-        ("values_sum[..., :3] / weight", "values_sum[..., :3] / whole[1]", "a layer's colour by the whole weight"),
+        ("values_sum[..., :3] / weight", "values_sum[..., :3] / whole[1]", "a surface's colour by the whole weight"),
     ),
     *own("render/project", "render/test_project")(
         ("jnp.clip(means, low, high)", "means", "unbounded Jacobians outside the image"),

@@ -89,6 +89,7 @@ def pose_problem(
     uncertainty: Uncertainty,
     config: IcpConfig,
 ) -> Problem:
+    """What the uncertainty makes of points and map; `scale_unit` is the depth noise that the seventh unknown counts."""
     prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack(uncertainty.pose), 3)
     # Everything of a call errs with its scale, so the scale is held by the depths' common noise.
     common = jnp.sqrt(jnp.mean(uncertainty.depth**2))

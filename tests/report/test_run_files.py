@@ -55,7 +55,7 @@ def test_before_there_is_a_map_nothing_is_written(tmp_path):
 def test_map_ply_holds_the_gaussians_in_use_as_they_are_drawn(tmp_path):
     """The covariances are those that close the surface, the opacity is the drawing's."""
     run = finished()
-    config = densify_config("render.covariance_scale=2.25", "render.opacity=0.75", "densify.opacity=0.1")
+    config = densify_config("render.covariance_scale=2.25", "render.opacity=0.75")
     assert save_outputs(tmp_path, run, dense_of(run), config, "a wall") == []
     gaussians = run.state.map.gaussians
     valid = np.asarray(gaussians.valid)
