@@ -47,7 +47,7 @@ class RefinementConfig(eqx.Module):
 
 
 class RefinementInfo(eqx.Module):
-    """Counts of one refinement; `overflow` is the number of splats that found their tile full."""
+    """Counts of one refinement; `overflow` is that of the rendering."""
 
     num_candidates: Int[Array, ""]
     num_merged: Int[Array, ""]

@@ -8,10 +8,12 @@ import pytest
 import reference
 from scene import as_numpy, assert_same, at, move_gaussians, pose, random_gaussians, random_observation
 
-from emgs_jax.em import EStep, e_step, em_update, m_step, support, widened_distance_sq
+from emgs_jax.em import EStep, e_step, em_update, m_step, precision, support, widened_distance_sq
 from emgs_jax.gaussian_map import GaussianMap
-from emgs_jax.observation import transform
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.linalg import whitening
+from emgs_jax.registration.noise import confidence_levels, noise_of_levels
 
 M, N, F = 60, 40, 3
 POINTS, GAUSSIANS = random_observation(M, num_features=F), random_gaussians(N, num_features=F)
@@ -348,3 +350,58 @@ def test_an_empty_submap_fuses_nothing_and_stays_finite(paper):
     updated, is_fused, info = em(empty, POINTS, QUIET, paper)
     assert not is_fused.any() and info.mean_log_joint == 0
     assert_same(updated, empty)
+
+
+# How much a point counts.
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_precision_is_the_share_of_the_floor_in_a_points_variance(paper, noise):
+    config = changed(paper, noise=noise, min_std=0.01)
+    found = precision(jnp.array([[0.0, 0, 0], [0.006, 0, 0.008], [0, 0.1, 0]]), config)
+    np.testing.assert_allclose(found, [1, 0.5, 1 / 101] if noise else [1, 1, 1], rtol=1e-6)
+
+
+def noisy_wall(seed: int):
+    """A wall of Gaussians 2 m away, and points that see it: one half errs by 1 % of the depth, the other by 6 %."""
+    rng = np.random.default_rng(seed)
+    x, y = (a.reshape(-1) for a in np.meshgrid(np.arange(-0.4, 0.41, 0.2), np.arange(-0.4, 0.41, 0.2)))
+    count, size = len(x), 2000
+    towards = lambda n: jnp.tile(jnp.array([0.0, 0, -1]), (n, 1))  # noqa: E731
+    gaussians = Gaussians(
+        means=jnp.asarray(np.stack([x, y, 2.0 + 0 * x], 1), jnp.float32),
+        covs=jnp.tile(jnp.diag(jnp.array([0.06**2, 0.06**2, 0.01**2])), (count, 1, 1)),
+        colors=jnp.full((count, 3), 0.5, jnp.float32),
+        normals=towards(count),
+        features=jnp.zeros((count, 0)),
+        valid=jnp.ones(count, bool),
+    )
+    is_good = np.arange(size) % 2 > 0
+    error = np.where(is_good, 0.01, 0.06) * rng.normal(size=size)
+    rays = np.stack([*rng.uniform(-0.25, 0.25, (2, size)), np.ones(size)], 1)
+    points = jnp.asarray(rays * (2.0 * (1 + error))[:, None], jnp.float32)
+    ones = jnp.ones(size)
+    colors = jnp.full((size, 3), 0.5, jnp.float32)
+    seen = Observation(points, colors, towards(size), jnp.zeros((size, 0)), ones, ones > 0)
+    return gaussians, seen, jnp.asarray(error, jnp.float32), jnp.asarray(is_good)
+
+
+def error_of(claim, config, seed: int) -> float:
+    """Root mean square distance of the new means from the wall, for a confidence of each half of the points."""
+    gaussians, seen, error, is_good = noisy_wall(seed)
+    levels = confidence_levels(jnp.where(is_good, *claim), seen.valid)
+    noise = noise_of_levels(error, seen.valid, levels)[levels]
+    step, _ = estep(gaussians, seen, noise[:, None] * seen.points, config)
+    new, total = mstep(gaussians, seen, precision(noise[:, None] * seen.points, config), step, config)
+    return float(jnp.sqrt(jnp.mean(jnp.where(total > 0, new.means[:, 2] - 2.0, 0.0) ** 2)))
+
+
+def test_confidence_makes_a_map_better_and_a_wrong_one_not_worse(config):
+    """Another law than the simulator's: two levels. Claims are (of the good half, of the bad half)."""
+    chosen = config().em
+    errors = {
+        name: np.mean([error_of(claim, chosen, seed) for seed in range(8)])
+        for name, claim in {"honest": (5.0, 1.5), "none": (3.0, 3.0), "wrong": (1.5, 5.0)}.items()
+    }
+    assert errors["honest"] < 0.85 * errors["none"]
+    assert errors["wrong"] < 1.02 * errors["none"]

@@ -15,13 +15,13 @@ from scene import (
     stack_poses,
 )
 
-from emgs_jax import em, gaussian_map, gaussians, initialization, localization
+from emgs_jax import em, existence, gaussian_map, gaussians, initialization, localization
 from emgs_jax import observation as obs
 from emgs_jax.ops import camera as cam
 from emgs_jax.ops import clustering, linalg, neighbours
 from emgs_jax.ops.pytree import stack
 from emgs_jax.refinement import refine
-from emgs_jax.registration import icp, rigid
+from emgs_jax.registration import icp, noise, rigid
 from emgs_jax.render import composite, densify, project
 
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
@@ -107,7 +107,7 @@ VERBS = {
         lambda m, o: gaussian_map.select_submap(m, (o,), CONFIG.submap),
         lambda s: (map_of(s), points(s)),
     ),
-    "insert": (gaussian_map.insert, lambda s: (map_of(s), random_gaussians(9, s, 2), jnp.ones(9))),
+    "insert": (gaussian_map.insert, lambda s: (map_of(s), random_gaussians(9, s, 2), jnp.ones(9), ONE)),
     "fit_rigid": (rigid.fit_rigid, lambda s: (points(s).points, points(s + 5).points, jnp.ones(40))),
     "icp": (
         lambda o, g, T: icp.icp(o, g, T, (ONE * 0.02, ONE * 0.01), CONFIG.localization.icp),
@@ -142,10 +142,20 @@ VERBS = {
         lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),
     ),
     "densify": (
-        lambda g, T: densify.densify(
-            g, T, CAMERA, densify.DensifyConfig(0.9, 0.3, 0.05, 0.75, CONFIG.refinement.render)
-        ),
+        lambda g, T: densify.densify(g, T, CAMERA, densify.DensifyConfig(0.05, 0.3, CONFIG.refinement.render)),
         lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),
+    ),
+    "judge": (
+        lambda m, o, T: existence.judge(m, o, T, CAMERA, ONE * 0.02, CONFIG.existence),
+        lambda s: (map_of(s), random_observation(192, s, 2), pose(translation=(0.1 * s, 0, 0))),
+    ),
+    "join_layers": (
+        lambda m, T: existence.join_layers(m, jnp.arange(32) % 3 > 0, T, ONE * 0.1, CONFIG.existence),
+        lambda s: (map_of(s), pose(translation=(0.1 * s, 0, 0))),
+    ),
+    "num_independent": (
+        lambda e, p: noise.num_independent(e, p, jnp.arange(40) % 3 > 0),
+        lambda s: (points(s).colors[:, 0], points(s).points),
     ),
     "refine": (
         lambda m, g, T: refine(m, g, T, CAMERA, CONFIG.refinement),

@@ -16,6 +16,7 @@ from emgs_jax.ops.pytree import fill_rows, static, take_rows, traced
 from emgs_jax.render.project import Splats, project_gaussians
 from emgs_jax.render.tiles import assign_tiles, tile_corners
 
+OPAQUE = 0.99  # coverage of a pixel behind which nothing changes it by more than a hundredth
 NUM_SIZES = 3  # programs for tiles of the capacity, half and a quarter of it, which most tiles of a map do not exceed
 Tile: TypeAlias = tuple[Array, Array, Array]  # corner, rows of its splats, which of them exist
 Sums: TypeAlias = tuple[Float[Array, "q v"], Float[Array, "q"], Float[Array, "q"], Float[Array, "q"]]
@@ -26,7 +27,7 @@ class RenderConfig(eqx.Module):
 
     Args:
         tile_size: pixels along a tile's side.
-        tile_capacity: splats that one tile can hold; more are counted in `Rendering.overflow`.
+        tile_capacity: splats that one tile can hold, the nearest; `Rendering.overflow` counts those that are missed.
         tile_batch: tiles that are drawn at once, which bounds the memory.
         opacity: of every Gaussian at its centre (the paper's constant opacity).
         covariance_scale: factor on the covariances, so that neighbouring Gaussians close the surface.
@@ -53,7 +54,8 @@ class Rendering(eqx.Module):
         alpha: coverage in [0, 1].
         depth: expected camera-space z in metres; 0 where alpha is below `min_alpha`.
         depth_std: standard deviation in metres of the depth over the splats of a pixel: large where two surfaces mix.
-        overflow: splats that were not drawn because their tile was full, summed over the tiles.
+        overflow: splats that were not drawn because their tile was full, summed over the tiles in which something is
+            seen behind the nearest; where every pixel is opaque they are hidden.
     """
 
     values: Float[Array, "h w c"]
@@ -138,11 +140,11 @@ def draw_tiles(
     camera: Camera,
     config: RenderConfig,
     blend: Callable[..., PyTree[Array]],
-) -> tuple[PyTree[Array], Int[Array, ""]]:
+) -> tuple[PyTree[Array], Int[Array, "t"]]:
     """Images (h, w, ...) of what `blend`, a function like `composite`, gives for the splats of every tile.
 
     Returns:
-        The images, and how many splats found their tile full.
+        The images, and how many splats found each tile full.
     """
     corners = tile_corners(camera, config.tile_size)
     rows, exists, overflow = assign_tiles(splats, corners, config.tile_size, config.tile_capacity, config.radius)
@@ -157,7 +159,7 @@ def draw_tiles(
         return blend(near, near_values, corner + inside, config)
 
     tiles = _map_by_fill(draw, (corners, rows, exists), min(config.tile_batch, corners.shape[0]))
-    return jax.tree.map(lambda x: _assemble(x, camera, config.tile_size), tiles), jnp.sum(overflow)
+    return jax.tree.map(lambda x: _assemble(x, camera, config.tile_size), tiles), overflow
 
 
 def _map_by_fill(draw: Callable[[Tile], PyTree[Array]], tiles: Tile, batch_size: int) -> PyTree[Array]:
@@ -190,16 +192,25 @@ def rendering_of(
     alpha: Float[Array, "h w"],
     depth_sum: Float[Array, "h w"],
     depth_sq_sum: Float[Array, "h w"],
-    overflow: Int[Array, ""],
+    overflow: Int[Array, "t"],
     config: RenderConfig,
 ) -> Rendering:
-    """The means behind the images of `composite`."""
+    """The means behind the images of `composite`; `overflow` is of every tile."""
     is_covered = alpha >= jnp.maximum(config.min_alpha, 1e-6)
     total = jnp.where(is_covered, alpha, 1.0)
     depth = jnp.where(is_covered, depth_sum / total, 0.0)
     variance = jnp.maximum(depth_sq_sum / total - depth**2, 1e-12)
     depth_std = jnp.where(is_covered, jnp.sqrt(variance), 0.0)
-    return Rendering(values_sum, alpha, depth, depth_std, overflow)
+    return Rendering(values_sum, alpha, depth, depth_std, _seen_overflow(overflow, alpha, config.tile_size))
+
+
+def _seen_overflow(overflow: Int[Array, "t"], alpha: Float[Array, "h w"], tile_size: int) -> Int[Array, ""]:
+    """The overflow of the tiles that have a pixel which is not opaque."""
+    height, width = alpha.shape
+    rows, columns = -(-height // tile_size), -(-width // tile_size)
+    beyond = (0, rows * tile_size - height), (0, columns * tile_size - width)
+    pixels = jnp.pad(alpha, beyond, constant_values=1.0).reshape(rows, tile_size, columns, tile_size)
+    return jnp.sum(jnp.where(jnp.min(pixels, axis=(1, 3)).reshape(-1) < OPAQUE, overflow, 0))
 
 
 def _assemble(tiles: Float[Array, "t q *c"], camera: Camera, tile_size: int) -> Float[Array, "h w *c"]:

@@ -162,6 +162,17 @@ def test_a_full_tile_is_counted(camera, config):
     assert overflow(seen) == 0 and overflow(seen - 1) == 1
 
 
+@pytest.mark.parametrize(("opacity", "is_seen"), [(0.9, False), (0.1, True)])
+def test_what_a_full_tile_hides_is_not_counted(camera, config, opacity, is_seen):
+    """24 discs that fill the image, of which a tile draws 8: behind them is 1e-8 of the light, or .43 of it."""
+    small = at(config("render.tile_capacity=8", "render.tile_size=32").refinement.render, "opacity", opacity)
+    discs = [single((0.0, 0.0, 1.0 + 0.05 * i), (0, 0, -1), 30.0) for i in range(24)]
+    many = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *discs)
+    drawn = draw(many, many.colors, pose(), camera, small)
+    assert (np.asarray(drawn.alpha) > 0.99).all() != is_seen
+    assert drawn.overflow == (16 if is_seen else 0)
+
+
 def test_an_empty_map_is_a_black_image_without_depth(camera, render_config):
     nothing = eqx.tree_at(lambda g: g.valid, GAUSSIANS, jnp.zeros(24, bool))
     rendering = draw(nothing, GAUSSIANS.colors, T, camera, render_config)
