@@ -81,7 +81,8 @@ def test_every_frame_has_one_record_with_its_true_pose_where_the_prior_is_exact(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "damage", [{"points": np.nan}, {"mask": False}, {"T_anchor_view": np.nan}, {"points": np.nan, "confidence": np.nan}]
+    "damage",
+    [{"points": np.nan}, {"mask": False}, {"T_anchor_view": np.nan}, {"confidence": np.nan}, {"confidence": 0.0}],
 )
 def test_a_prediction_without_a_valid_point_or_pose_marks_its_frame_and_leaves_the_map_bit_identical(damage):
     session, maps = map_tiny(dataset(), EditedPrior(at_inference(2, **damage)))
