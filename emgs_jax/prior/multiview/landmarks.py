@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from emgs_jax.prior.multiview.lens import Lens, straight
+
 NONE = -1  # a keypoint without a landmark
 
 
@@ -41,7 +43,7 @@ class View:
     """What is known of one image.
 
     Args:
-        pixels: (n, 2) float64 of the keypoints.
+        pixels: (n, 2) float64 of the keypoints, where a pinhole camera sees them.
         descriptors: (n, 128) float32, unit.
         landmark: (n,) the landmark of each keypoint, or NONE.
         T_ref_view: camera -> reference (4, 4); None while it is not placed.
@@ -55,11 +57,19 @@ class View:
 
 @dataclass
 class Structure:
-    """Views by frame index, and landmarks: `points` (l, 3) in the reference frame, NaN where not triangulated."""
+    """Views by frame index, and landmarks: `points` (l, 3) in the reference frame, NaN where not triangulated.
+
+    `distortion` is that of the lens, as far as it has been measured.
+    """
 
     K: np.ndarray
     views: dict[int, View] = field(default_factory=dict)
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    distortion: float = 0.0
+
+    def lens(self) -> Lens:
+        """What the images were taken with."""
+        return Lens(self.K.diagonal()[:2], self.K[:2, 2], self.distortion)
 
     def placed(self) -> dict[int, View]:
         """The views that have a pose, by frame."""
@@ -83,6 +93,13 @@ def detect(gray: np.ndarray, config: MatchingConfig) -> View:
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
     pixels = np.array([point.pt for point in keypoints])
     return View(pixels, np.sqrt(descriptors / total), np.full(len(pixels), NONE))
+
+
+def straighten(structure: Structure, distortion: float) -> None:
+    """Move the keypoints of a structure whose images were taken to have no distortion to where a pinhole sees them."""
+    structure.distortion = distortion
+    for view in structure.views.values():
+        view.pixels = straight(view.pixels, structure.lens())
 
 
 def match(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, np.ndarray]:

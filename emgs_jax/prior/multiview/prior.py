@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate_depth
 from emgs_jax.prior.multiview.incremental import StructureConfig, extend, initialize
 from emgs_jax.prior.multiview.landmarks import Structure, View, calibration, detect, forget, link
+from emgs_jax.prior.multiview.lens import as_shown, points_shown, rectify, straight
 
 jitted_depth = eqx.filter_jit(estimate_depth)
 jitted_agreeing = eqx.filter_jit(count_agreeing)
@@ -69,12 +69,17 @@ class MultiviewStereo(Prior):
         settings = {"structure": _values(structure), "dense": _values(dense)}
         self.provenance = Provenance("multiview_stereo", {"version": 1} | settings)
         self._next = 0
+        self._structure = Structure(np.eye(3))
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Raise ValueError where a window has too few images to confirm a depth."""
         least = 1 + max(self._dense_config.min_agreeing, 1)
         if window_size < least:
             raise ValueError(f"multiview_stereo compares at least {least} images, got slam.window_size={window_size}")
+
+    def report(self) -> dict[str, float]:
+        """`prior/distortion`: k of the lens, as it was measured."""
+        return {"prior/distortion": self._structure.distortion}
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Poses of all views and depth of `window.dense`; a view that cannot be placed has NaN and no valid point."""
@@ -92,8 +97,10 @@ class MultiviewStereo(Prior):
                 self._add(frame)
         place_views = extend if self._has_begun else initialize
         place_views(self._structure, self._camera, self._num_views, self._structure_config)
-        self._has_begun |= bool(self._structure.placed())
-        return self._answer(window, intrinsics)
+        if not self._has_begun and self._structure.placed():
+            self._has_begun, lens = True, self._structure.lens()
+            self._grays = {frame: rectify(gray, lens) for frame, gray in self._grays.items()}
+        return self._answer(window)
 
     def _begin(self, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
         height, width = frames[0].image.shape[:2]
@@ -119,19 +126,22 @@ class MultiviewStereo(Prior):
                 f"{frame.name} has size {gray.shape[::-1]}, the window's first image "
                 f"{(self._camera.width, self._camera.height)}: give dataset.size=[width,height]"
             )
-        self._grays[frame.index] = np.float32(gray) / 255.0
-        self._structure.views[frame.index] = detect(gray, self._structure_config.matching)
+        view, lens = detect(gray, self._structure_config.matching), self._structure.lens()
+        view.pixels = straight(view.pixels, lens)
+        self._grays[frame.index] = rectify(np.float32(gray) / 255.0, lens)
+        self._structure.views[frame.index] = view
         link(self._structure, frame.index, self._structure_config.matching)
 
-    def _answer(self, window: Window, intrinsics: Sequence[float]) -> PriorPrediction:
-        views = [self._structure.views[frame] for frame in window.views]
+    def _answer(self, window: Window) -> PriorPrediction:
+        views, lens = [self._structure.views[frame] for frame in window.views], self._structure.lens()
         for frame in window.dense:
             if frame not in self._depths or not self._depths[frame].any():  # it may have been placed since
                 self._depths[frame] = self._depth(frame)
-        confidence = np.stack([self._confidence(frame) for frame in window.dense])
-        depth = np.stack([self._depths[frame] for frame in window.dense])
+        confidence = np.stack([as_shown(self._confidence(frame), lens) for frame in window.dense])
+        confidence = np.maximum(confidence, 1.0)
+        depth = np.stack([as_shown(self._depths[frame], lens) for frame in window.dense])
         mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_agreeing)
-        points = backproject(np.where(mask, depth, 0.0), intrinsics).astype(np.float32)
+        points = points_shown(np.where(mask, depth, 0.0), lens).astype(np.float32)
         features = np.zeros((*mask.shape, 0), np.float16)
         T_anchor_view = np.full((len(views), 4, 4), np.nan)
         T_anchor_view[0] = np.eye(4)  # also where it is not known
