@@ -1000,7 +1000,7 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/prior/multiview/prior.py",
-        "mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_agreeing)",
+        "mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_support)",
         "mask = depth > 0",
         MULTIVIEW,
         "unconfirmed depths are used",

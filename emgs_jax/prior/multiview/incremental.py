@@ -20,6 +20,7 @@ from emgs_jax.prior.multiview.landmarks import (
     Structure,
     View,
     place,
+    refind,
     relative_pose,
     straighten,
     triangulate,
@@ -73,10 +74,14 @@ def initialize(structure: Structure, camera: Camera, num_views: int, config: Str
 
 
 def extend(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> None:
-    """Place the views that are not placed yet, as far as they can be, and refine the window."""
-    for view in structure.views.values():
-        if view.T_ref_view is None and place(structure, view, config.matching):
-            triangulate(structure, config.matching)
+    """Place the views that are not placed yet, as far as they can be, and refine the window.
+
+    What shows none of the window's landmarks is looked for among those that were left behind.
+    """
+    for find in (place, refind):
+        for view in structure.views.values():
+            if view.T_ref_view is None and find(structure, view, config.matching):
+                triangulate(structure, config.matching)
     frames = sorted(structure.placed())
     # A short window refines its two newest views too; it takes two others to hold the scale.
     num_fixed = min(config.num_fixed, len(frames) - 2)

@@ -107,7 +107,7 @@ def test_later_views_keep_the_frame_and_scale_while_old_ones_and_their_landmarks
         elif frame >= NUM_VIEWS:
             extend(structure, small_camera(), MOST_VIEWS, CONFIG)
             found[frame] = structure.views[frame].T_ref_view
-            forget(structure, [k for k in structure.views if 0 < k < frame - most + 2])
+            forget(structure, [k for k in structure.views if 0 < k < frame - most + 2], CONFIG.matching)
         assert len(structure.points) <= NUM_POINTS
     assert all(T is not None for T in found.values())
     positions = np.stack([found[frame][:3, 3] for frame in range(len(views))])
