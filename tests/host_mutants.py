@@ -26,6 +26,7 @@ FEATURED = ("tests/prior/test_featured.py",)
 BUNDLE = ("tests/prior/multiview/test_bundle_adjustment.py",)
 DEPTH = ("tests/prior/multiview/test_depth.py",)
 INCREMENTAL = ("tests/prior/multiview/test_incremental.py",)
+LENS = ("tests/prior/multiview/test_lens.py",)
 LANDMARKS = ("tests/prior/multiview/test_landmarks.py",)
 PLANE_SWEEP = ("tests/prior/multiview/test_plane_sweep.py",)
 SEMI_GLOBAL = ("tests/prior/multiview/test_semi_global.py",)
@@ -916,8 +917,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/prior/multiview/bundle_adjustment.py",
-        "xi = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, start)",
-        "xi = start",
+        "xi, lens = (jnp.where(is_finite, found, 0.0) for found in solution)",
+        "xi, lens = (0.0 * found for found in solution)",
         BUNDLE,
         "poses stay where they start",
     ),
@@ -927,6 +928,41 @@ MUTANTS = (
         "for _ in range(0):",
         BUNDLE,
         "points take a single step",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/lens.py",
+        "return pixels + distortion *",
+        "return pixels - distortion *",
+        LENS,
+        "distortion of the wrong sign",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/depth.py",
+        "jax.nn.softmax(-total / temperature, axis=-1)",
+        "jax.nn.softmax(-total, axis=-1)",
+        DEPTH,
+        "the temperature of the spread is one",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/landmarks.py",
+        "kept[view.landmark[rows]] = True",
+        "kept[view.landmark[rows]] = False",
+        LANDMARKS,
+        "a landmark is remembered once for every view",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/incremental.py",
+        "for find in (place, refind):",
+        "for find in (place,):",
+        MULTIVIEW,
+        "a known place is not found again",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/incremental.py",
+        "            straighten(structure, float(distortion))",
+        "            straighten(structure, 0.0)",
+        INCREMENTAL,
+        "the lens is measured, and forgotten",
     ),
     Mutant(
         "emgs_jax/prior/multiview/depth.py",
@@ -1063,7 +1099,7 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/prior/multiview/prior.py",
-        "mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_agreeing)",
+        "mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_support)",
         "mask = depth > 0",
         MULTIVIEW,
         "unconfirmed depths are used",

@@ -10,6 +10,7 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.multiview.depth import DepthConfig
 from emgs_jax.prior.multiview.incremental import StructureConfig
 from emgs_jax.prior.multiview.landmarks import NONE, Structure, View
+from emgs_jax.prior.multiview.lens import Lens
 
 FOCAL, CENTER, SIZE = (55.0, 53.0), (30.5, 24.25), (64, 48)
 SMALL = ("prior.dense.depth.sweep.num_planes=24",)
@@ -44,6 +45,11 @@ def matrix(rotation=(0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0)) -> np.ndarray:
 
 def calibration() -> np.ndarray:
     return np.array([[FOCAL[0], 0, CENTER[0]], [0, FOCAL[1], CENTER[1]], [0, 0, 1]])
+
+
+def small_lens(distortion: float) -> Lens:
+    """`small_camera` with a lens."""
+    return Lens(np.array(FOCAL), np.array(CENTER), distortion)
 
 
 def plane_image(T_world_camera: np.ndarray, slope: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -21,6 +21,7 @@ class DepthConfig(eqx.Module):
         semi_global: its aggregation.
         max_cost: of the best plane, before aggregation.
         min_margin: by which the aggregated cost of any plane that is not next to the best must exceed the best's.
+        temperature: aggregated cost above the best's at which a plane is 1/e as plausible.
         median_radius: half the side of the window whose median replaces a depth: removes speckle, keeps edges.
         max_depth_step: two views agree where their depths differ by at most this fraction.
     """
@@ -29,6 +30,7 @@ class DepthConfig(eqx.Module):
     semi_global: SemiGlobalConfig
     max_cost: Float[Array, "*b"] = traced()
     min_margin: Float[Array, "*b"] = traced()
+    temperature: Float[Array, "*b"] = traced()
     median_radius: int = static()
     max_depth_step: Float[Array, "*b"] = traced()
 
@@ -43,6 +45,13 @@ def _between_planes(total: Float[Array, "h w d"], best: Array) -> Float[Array, "
     is_bent = curvature > 0
     offset = 0.5 * (before - after) / jnp.where(is_bent, curvature, 1.0)
     return jnp.where(is_bent, jnp.clip(offset, -0.5, 0.5), 0.0)
+
+
+def _spread(total: Float[Array, "h w d"], best: Array, temperature: Float[Array, ""]) -> Float[Array, "h w"]:
+    """Root mean square distance, in planes, of the plausible planes from the best: flat or repeated costs give many."""
+    plausible = jax.nn.softmax(-total / temperature, axis=-1)
+    distance = jnp.arange(total.shape[-1]) - best[..., None]
+    return jnp.sqrt(jnp.sum(plausible * distance**2, axis=-1))
 
 
 def _median(depth: Float[Array, "h w"], radius: int) -> Float[Array, "h w"]:
@@ -63,8 +72,11 @@ def estimate_depth(
     depth_range: Float[Array, "2"],
     camera: Camera,
     config: DepthConfig,
-) -> Float[Array, "h w"]:
-    """Depth z (m) of every pixel; 0 where no plane stands out or the best is the first or last.
+) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """Depth z (m) of every pixel, 0 where no plane stands out or the best is the first or last; and its spread.
+
+    The spread is how far plausible planes lie from the best, in planes. A plane is a step of 1/z, so the same spread
+    is a larger share of the depth where the surface is far or the baseline short.
 
     Args:
         gray: the view, in [0, 1].
@@ -85,7 +97,8 @@ def estimate_depth(
     valid = (runner_up - jnp.min(total, axis=-1) >= config.min_margin) & (matched <= config.max_cost)
     valid &= (best > 0) & (best < planes.shape[0] - 1)
     inverse = planes[0] + (best + _between_planes(total, best)) * (planes[1] - planes[0])
-    return _median(jnp.where(valid, 1.0 / inverse, 0.0), config.median_radius)
+    depth = _median(jnp.where(valid, 1.0 / inverse, 0.0), config.median_radius)
+    return depth, _spread(total, best, config.temperature)
 
 
 @full_precision

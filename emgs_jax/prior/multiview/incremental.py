@@ -13,8 +13,18 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.ops.camera import Camera
-from emgs_jax.prior.multiview.bundle_adjustment import BundleConfig, Tracks, adjust
-from emgs_jax.prior.multiview.landmarks import NONE, MatchingConfig, Structure, View, place, relative_pose, triangulate
+from emgs_jax.prior.multiview.bundle_adjustment import BundleConfig, Tracks, Unknowns, adjust
+from emgs_jax.prior.multiview.landmarks import (
+    NONE,
+    MatchingConfig,
+    Structure,
+    View,
+    place,
+    refind,
+    relative_pose,
+    straighten,
+    triangulate,
+)
 
 jitted_adjust = eqx.filter_jit(adjust)
 
@@ -29,6 +39,8 @@ class StructureConfig:
         max_landmarks: that take part in the refinement; those that most views see.
         num_fixed: at most, the oldest views of a window, which hold the frame and scale of the ones before.
         num_rounds: of refinement; observations that do not fit are dropped after each.
+        distortion_std: what the radial distortion of the lens is expected to be, as k of x (1 + k |x|²) with x on the
+            plane z = 1; it is measured in the first window. 0 = the images have none.
         median_depth: m; what the median landmark of the first view is taken for: images alone do not tell the scale.
     """
 
@@ -37,6 +49,7 @@ class StructureConfig:
     max_landmarks: int
     num_fixed: int
     num_rounds: int
+    distortion_std: float
     median_depth: float
 
 
@@ -52,6 +65,8 @@ def initialize(structure: Structure, camera: Camera, num_views: int, config: Str
         reference = placed[min(placed)]
         # Two views alone are confirmed by nothing.
         if len(placed) > 2 and structure.known(reference).sum() >= config.matching.min_matches:
+            if config.distortion_std > 0:
+                refine(structure, camera, num_views, [a], config, config.distortion_std)
             _normalize(structure, reference, config)
             return True
     _reset(structure)
@@ -59,10 +74,14 @@ def initialize(structure: Structure, camera: Camera, num_views: int, config: Str
 
 
 def extend(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> None:
-    """Place the views that are not placed yet, as far as they can be, and refine the window."""
-    for view in structure.views.values():
-        if view.T_ref_view is None and place(structure, view, config.matching):
-            triangulate(structure, config.matching)
+    """Place the views that are not placed yet, as far as they can be, and refine the window.
+
+    What shows none of the window's landmarks is looked for among those that were left behind.
+    """
+    for find in (place, refind):
+        for view in structure.views.values():
+            if view.T_ref_view is None and find(structure, view, config.matching):
+                triangulate(structure, config.matching)
     frames = sorted(structure.placed())
     # A short window refines its two newest views too; it takes two others to hold the scale.
     num_fixed = min(config.num_fixed, len(frames) - 2)
@@ -70,9 +89,20 @@ def extend(structure: Structure, camera: Camera, num_views: int, config: Structu
         refine(structure, camera, num_views, frames[:num_fixed], config)
 
 
-def refine(structure: Structure, camera: Camera, num_views: int, fixed: list[int], config: StructureConfig) -> None:
-    """Bundle adjustment of all placed views; drops what does not fit and triangulates what now does."""
-    for _ in range(config.num_rounds):
+def refine(
+    structure: Structure,
+    camera: Camera,
+    num_views: int,
+    fixed: list[int],
+    config: StructureConfig,
+    distortion_std: float = 0.0,
+) -> None:
+    """Bundle adjustment of all placed views; drops what does not fit and triangulates what now does.
+
+    With a `distortion_std` the lens is measured in the first round, and keypoints move to where a pinhole sees them.
+    """
+    for count in range(config.num_rounds):
+        is_measured = distortion_std > 0 and count == 0
         frames = sorted(structure.placed())
         ids, tracks = _tracks(structure, frames, num_views, config)
         poses = np.tile(np.eye(4), (num_views, 1, 1))
@@ -80,11 +110,11 @@ def refine(structure: Structure, camera: Camera, num_views: int, fixed: list[int
         points = np.zeros((config.max_landmarks, 3))
         points[: len(ids)] = structure.points[ids]
         is_fixed = np.array([frame in fixed for frame in frames] + [True] * (num_views - len(frames)))
-        T, points, error = jitted_adjust(
+        T, points, distortion, error = jitted_adjust(
             jaxlie.SE3.from_matrix(jnp.asarray(poses, jnp.float32)),
             jnp.asarray(points, jnp.float32),
             tracks,
-            jnp.asarray(is_fixed),
+            Unknowns(jnp.asarray(is_fixed), jnp.asarray(distortion_std * is_measured, jnp.float32)),
             camera,
             config.bundle,
         )
@@ -93,6 +123,8 @@ def refine(structure: Structure, camera: Camera, num_views: int, fixed: list[int
         for row, frame in enumerate(frames):
             if frame not in fixed:
                 structure.views[frame].T_ref_view = poses[row]
+        if is_measured:
+            straighten(structure, float(distortion))
         _drop(structure, frames, ids, error, config)
         triangulate(structure, config.matching)
 

@@ -6,6 +6,9 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from emgs_jax.prior.multiview.lens import Lens, straight
+from emgs_jax.prior.multiview.memory import Memory, recognize, remember, without
+
 NONE = -1  # a keypoint without a landmark
 
 
@@ -21,6 +24,8 @@ class MatchingConfig:
         max_reprojection_error: of an observation that fits its landmark.
         min_matches: that a pair of images, or an image and the landmarks, must have.
         min_parallax_rad: between the rays of a landmark, as the root of the rays' smallest variance.
+        min_refound: landmarks that a view which shows none of its neighbours' must find again to be placed by them.
+        max_remembered: landmarks that no view of the window shows any more; the oldest go.
     """
 
     num_features: int
@@ -30,6 +35,8 @@ class MatchingConfig:
     max_reprojection_error: float
     min_matches: int
     min_parallax_rad: float
+    min_refound: int
+    max_remembered: int
 
     def __post_init__(self) -> None:
         if self.min_matches < 6:
@@ -41,7 +48,7 @@ class View:
     """What is known of one image.
 
     Args:
-        pixels: (n, 2) float64 of the keypoints.
+        pixels: (n, 2) float64 of the keypoints, where a pinhole camera sees them.
         descriptors: (n, 128) float32, unit.
         landmark: (n,) the landmark of each keypoint, or NONE.
         T_ref_view: camera -> reference (4, 4); None while it is not placed.
@@ -55,11 +62,20 @@ class View:
 
 @dataclass
 class Structure:
-    """Views by frame index, and landmarks: `points` (l, 3) in the reference frame, NaN where not triangulated."""
+    """Views by frame index, and landmarks: `points` (l, 3) in the reference frame, NaN where not triangulated.
+
+    `distortion` is that of the lens, as far as it has been measured.
+    """
 
     K: np.ndarray
     views: dict[int, View] = field(default_factory=dict)
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    distortion: float = 0.0
+    memory: Memory = field(default_factory=Memory)
+
+    def lens(self) -> Lens:
+        """What the images were taken with."""
+        return Lens(self.K.diagonal()[:2], self.K[:2, 2], self.distortion)
 
     def placed(self) -> dict[int, View]:
         """The views that have a pose, by frame."""
@@ -83,6 +99,13 @@ def detect(gray: np.ndarray, config: MatchingConfig) -> View:
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
     pixels = np.array([point.pt for point in keypoints])
     return View(pixels, np.sqrt(descriptors / total), np.full(len(pixels), NONE))
+
+
+def straighten(structure: Structure, distortion: float) -> None:
+    """Move the keypoints of a structure whose images were taken to have no distortion to where a pinhole sees them."""
+    structure.distortion = distortion
+    for view in structure.views.values():
+        view.pixels = straight(view.pixels, structure.lens())
 
 
 def match(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -132,13 +155,19 @@ def link(structure: Structure, frame: int, config: MatchingConfig) -> None:
     structure.points = np.concatenate([structure.points, np.full((count - len(structure.points), 3), np.nan)])
 
 
-def forget(structure: Structure, frames: Sequence[int]) -> None:
-    """Drop the views of these frames, and the landmarks that no other view shows; the others are renumbered."""
-    for frame in frames:
-        del structure.views[frame]
+def forget(structure: Structure, frames: Sequence[int], config: MatchingConfig) -> None:
+    """Drop these views; landmarks that no other view shows go to the memory, the others are renumbered."""
+    leaving = [structure.views.pop(frame) for frame in frames]
     used = np.zeros(len(structure.points), bool)
     for view in structure.views.values():
         used[view.landmark[view.landmark >= 0]] = True
+    kept = used.copy()
+    for view in leaving:
+        rows = np.flatnonzero(structure.known(view))
+        rows = rows[~kept[view.landmark[rows]]]
+        kept[view.landmark[rows]] = True
+        points, descriptors = structure.points[view.landmark[rows]], view.descriptors[rows]
+        structure.memory = remember(structure.memory, points, descriptors, config.max_remembered)
     number = np.append(np.where(used, np.cumsum(used) - 1, NONE), NONE)  # of NONE, the last: NONE
     for view in structure.views.values():
         view.landmark = number[view.landmark]
@@ -182,26 +211,53 @@ def unit_rays(pixels: np.ndarray, K: np.ndarray) -> np.ndarray:
 
 
 def place(structure: Structure, view: View, config: MatchingConfig) -> bool:
-    """Give a view the pose that fits the landmarks which it sees (PnP with MAGSAC++); False without enough of them."""
+    """Give a view the pose that fits the landmarks which it sees; False without enough of them."""
     known = structure.known(view)
-    if known.sum() < config.min_matches:
+    found = _pose_of(
+        structure.points[view.landmark[known]], view.pixels[known], structure.K, config.min_matches, config
+    )
+    if found is not None:
+        view.T_ref_view = found[0]
+    return found is not None
+
+
+def refind(structure: Structure, view: View, config: MatchingConfig) -> bool:
+    """Likewise with landmarks of the memory, which become landmarks of the view again."""
+    rows, keypoints = recognize(structure.memory, view.descriptors, config.max_ratio)
+    points = structure.memory.points[rows]
+    found = _pose_of(points, view.pixels[keypoints], structure.K, config.min_refound, config)
+    if found is None:
         return False
-    points, pixels = structure.points[view.landmark[known]], view.pixels[known]
+    view.T_ref_view, inliers = found
+    rows, keypoints, points = rows[inliers], keypoints[inliers], points[inliers]
+    is_new = view.landmark[keypoints] == NONE
+    view.landmark[keypoints[is_new]] = len(structure.points) + np.arange(is_new.sum())
+    structure.points = np.concatenate([structure.points, np.full((is_new.sum(), 3), np.nan)])
+    structure.points[view.landmark[keypoints]] = points
+    structure.memory = without(structure.memory, rows)
+    return True
+
+
+def _pose_of(
+    points: np.ndarray, pixels: np.ndarray, K: np.ndarray, least: int, config: MatchingConfig
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """T_ref_view from points (n, 3) at pixels (n, 2) (PnP with MAGSAC++), and the rows that fit; None for few."""
+    if len(points) < least:
+        return None
     params = cv2.UsacParams()
     params.threshold, params.confidence, params.maxIterations = config.max_reprojection_error, 0.9999, 2000
     params.score, params.sampler = cv2.SCORE_METHOD_MAGSAC, cv2.SAMPLING_UNIFORM
     params.loMethod, params.randomGeneratorState = cv2.LOCAL_OPTIM_SIGMA, 0
     found, _, rotation, translation, inliers = cv2.solvePnPRansac(
-        points.reshape(-1, 1, 3), pixels.reshape(-1, 1, 2), structure.K.copy(), None, params=params
+        points.reshape(-1, 1, 3), pixels.reshape(-1, 1, 2), K.copy(), None, params=params
     )
-    if not found or inliers is None or len(inliers) < config.min_matches:
-        return False
+    if not found or inliers is None or len(inliers) < least:
+        return None
     rows = inliers.ravel()
-    rotation, translation = cv2.solvePnPRefineLM(points[rows], pixels[rows], structure.K, None, rotation, translation)
+    rotation, translation = cv2.solvePnPRefineLM(points[rows], pixels[rows], K, None, rotation, translation)
     T_view_ref = np.eye(4)
     T_view_ref[:3, :3], T_view_ref[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
-    view.T_ref_view = np.linalg.inv(T_view_ref)
-    return True
+    return np.linalg.inv(T_view_ref), rows
 
 
 def triangulate(structure: Structure, config: MatchingConfig) -> None:

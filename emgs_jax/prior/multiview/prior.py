@@ -2,10 +2,19 @@
 
 Structure from motion of the window gives the poses, a plane sweep against some of the other views the depth. What was
 found for an image (keypoints, matches, depth) is kept while the image is in the window, so the windows of a sequence
-must be asked for in order. The frame is that of the first image that could be placed (image 0, unless the camera rests
-at first), and the scale that of its window, which is fixed by `median_depth`; images alone do not tell it.
+must be asked for in order. The confidence of a depth is
+
+    1 + n exp(-spread / tolerated_spread),
+
+n the views whose own depth confirms it, `spread` how far plausible planes of its cost curve lie from the best (see
+`estimate_depth`): 1 where nothing is known, more the smaller the expected error is.
+
+The frame is that of the first image that could be placed (image 0, unless the camera rests at first), and the scale
+that of its window, which is fixed by `median_depth`; images alone do not tell it. The radial distortion of the lens is
+measured in that window too: points lie on the rays of the lens then, not on those of the pinhole.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
@@ -16,13 +25,13 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate_depth
 from emgs_jax.prior.multiview.incremental import StructureConfig, extend, initialize
 from emgs_jax.prior.multiview.landmarks import Structure, View, calibration, detect, forget, link
+from emgs_jax.prior.multiview.lens import as_shown, points_shown, rectify, straight
 
 jitted_depth = eqx.filter_jit(estimate_depth)
 jitted_agreeing = eqx.filter_jit(count_agreeing)
@@ -37,7 +46,8 @@ class DenseConfig:
         num_sources: views that it is matched against.
         best_parallax_rad: between the rays of a landmark, beyond which more is no better.
         num_checks: views whose depth is compared with it.
-        min_agreeing: of these must confirm a depth.
+        tolerated_spread: planes, see `estimate_depth`; more discounts what the other views confirm by e.
+        min_support: number of other views, discounted so, that must confirm a depth: it is the confidence above 1.
         depth_margin: the range of depths that is tried goes beyond the landmarks' by this factor.
     """
 
@@ -45,7 +55,8 @@ class DenseConfig:
     num_sources: int
     best_parallax_rad: float
     num_checks: int
-    min_agreeing: int
+    tolerated_spread: float
+    min_support: float
     depth_margin: float
 
 
@@ -67,14 +78,19 @@ class MultiviewStereo(Prior):
     def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:
         self._structure_config, self._dense_config = structure, dense
         settings = {"structure": _values(structure), "dense": _values(dense)}
-        self.provenance = Provenance("multiview_stereo", {"version": 1} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 2} | settings)
         self._next = 0
+        self._structure = Structure(np.eye(3))
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Raise ValueError where a window has too few images to confirm a depth."""
-        least = 1 + max(self._dense_config.min_agreeing, 1)
+        least = 1 + max(math.ceil(self._dense_config.min_support), 1)
         if window_size < least:
             raise ValueError(f"multiview_stereo compares at least {least} images, got slam.window_size={window_size}")
+
+    def report(self) -> dict[str, float]:
+        """`prior/distortion`: k of the lens, as it was measured."""
+        return {"prior/distortion": self._structure.distortion}
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Poses of all views and depth of `window.dense`; a view that cannot be placed has NaN and no valid point."""
@@ -92,8 +108,10 @@ class MultiviewStereo(Prior):
                 self._add(frame)
         place_views = extend if self._has_begun else initialize
         place_views(self._structure, self._camera, self._num_views, self._structure_config)
-        self._has_begun |= bool(self._structure.placed())
-        return self._answer(window, intrinsics)
+        if not self._has_begun and self._structure.placed():
+            self._has_begun, lens = True, self._structure.lens()
+            self._grays = {frame: rectify(gray, lens) for frame, gray in self._grays.items()}
+        return self._answer(window)
 
     def _begin(self, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
         height, width = frames[0].image.shape[:2]
@@ -103,12 +121,14 @@ class MultiviewStereo(Prior):
         self._has_begun = False
         self._grays: dict[int, np.ndarray] = {}
         self._depths: dict[int, np.ndarray] = {}
+        self._spreads: dict[int, np.ndarray] = {}
         # A later window sees the anchor, the FIFO, the current and the newest image.
         self._num_views = len(frames) + 3
 
     def _forget(self, window: Window) -> None:
-        forget(self._structure, [frame for frame in self._structure.views if frame not in window.views])
-        for known in (self._grays, self._depths):
+        gone = [frame for frame in self._structure.views if frame not in window.views]
+        forget(self._structure, gone, self._structure_config.matching)
+        for known in (self._grays, self._depths, self._spreads):
             for frame in [frame for frame in known if frame not in window.views]:
                 del known[frame]
 
@@ -119,19 +139,22 @@ class MultiviewStereo(Prior):
                 f"{frame.name} has size {gray.shape[::-1]}, the window's first image "
                 f"{(self._camera.width, self._camera.height)}: give dataset.size=[width,height]"
             )
-        self._grays[frame.index] = np.float32(gray) / 255.0
-        self._structure.views[frame.index] = detect(gray, self._structure_config.matching)
+        view, lens = detect(gray, self._structure_config.matching), self._structure.lens()
+        view.pixels = straight(view.pixels, lens)
+        self._grays[frame.index] = rectify(np.float32(gray) / 255.0, lens)
+        self._structure.views[frame.index] = view
         link(self._structure, frame.index, self._structure_config.matching)
 
-    def _answer(self, window: Window, intrinsics: Sequence[float]) -> PriorPrediction:
-        views = [self._structure.views[frame] for frame in window.views]
+    def _answer(self, window: Window) -> PriorPrediction:
+        views, lens = [self._structure.views[frame] for frame in window.views], self._structure.lens()
         for frame in window.dense:
             if frame not in self._depths or not self._depths[frame].any():  # it may have been placed since
-                self._depths[frame] = self._depth(frame)
-        confidence = np.stack([self._confidence(frame) for frame in window.dense])
-        depth = np.stack([self._depths[frame] for frame in window.dense])
-        mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_agreeing)
-        points = backproject(np.where(mask, depth, 0.0), intrinsics).astype(np.float32)
+                self._depths[frame], self._spreads[frame] = self._depth(frame)
+        confidence = np.stack([as_shown(self._confidence(frame), lens) for frame in window.dense])
+        confidence = np.maximum(confidence, 1.0)
+        depth = np.stack([as_shown(self._depths[frame], lens) for frame in window.dense])
+        mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_support)
+        points = points_shown(np.where(mask, depth, 0.0), lens).astype(np.float32)
         features = np.zeros((*mask.shape, 0), np.float16)
         T_anchor_view = np.full((len(views), 4, 4), np.nan)
         T_anchor_view[0] = np.eye(4)  # also where it is not known
@@ -140,34 +163,33 @@ class MultiviewStereo(Prior):
                 T_anchor_view[row] = view.T_ref_view
         return PriorPrediction(window, T_anchor_view, points, confidence, mask, features)
 
-    def _depth(self, frame: int) -> np.ndarray:
-        """Depth (h, w) of a view, 0 where it is not known."""
+    def _depth(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Depth (h, w) of a view, 0 where it is not known, and its spread."""
         view, nothing = self._structure.views[frame], np.zeros_like(self._grays[frame])
         sources = self._sources(frame)
         if not sources:
-            return nothing
+            return nothing, nothing
         known = self._structure.known(view)
         T_view_ref = np.linalg.inv(view.T_ref_view)
         z = self._structure.points[view.landmark[known]] @ T_view_ref[2, :3] + T_view_ref[2, 3]
         z = z[z > 0]
         if not len(z):
-            return nothing
+            return nothing, nothing
         margin = self._dense_config.depth_margin
         depth_range = np.float32([np.percentile(z, 1) / margin, np.percentile(z, 99) * margin])
         count = self._dense_config.num_sources
         is_used = np.arange(count) < len(sources)
         sources = (sources * count)[:count]
-        return np.asarray(
-            jitted_depth(
-                jnp.asarray(self._grays[frame]),
-                jnp.asarray(np.stack([self._grays[other] for other in sources])),
-                self._relative(sources, frame),
-                jnp.asarray(is_used),
-                jnp.asarray(depth_range),
-                self._camera,
-                self._dense_config.depth,
-            )
+        depth, spread = jitted_depth(
+            jnp.asarray(self._grays[frame]),
+            jnp.asarray(np.stack([self._grays[other] for other in sources])),
+            self._relative(sources, frame),
+            jnp.asarray(is_used),
+            jnp.asarray(depth_range),
+            self._camera,
+            self._dense_config.depth,
         )
+        return np.asarray(depth), np.asarray(spread)
 
     def _sources(self, frame: int) -> list[int]:
         """The placed views that show most of the view's landmarks under most parallax, best first."""
@@ -189,7 +211,7 @@ class MultiviewStereo(Prior):
         return float(np.minimum(sine / best, 1.0).sum())
 
     def _confidence(self, frame: int) -> np.ndarray:
-        """One more than the number of views that confirm each depth."""
+        """One more than the views that confirm each depth, discounted by its spread."""
         placed, count = self._structure.placed(), self._dense_config.num_checks
         others = sorted((o for o in self._depths if o in placed and o != frame), key=lambda o: abs(o - frame))[:count]
         if frame not in placed or not others:
@@ -204,7 +226,9 @@ class MultiviewStereo(Prior):
             self._camera,
             self._dense_config.depth,
         )
-        return 1.0 + np.asarray(agreeing, np.float32)
+        return 1.0 + np.asarray(agreeing) * np.exp(
+            -self._spreads[frame] / np.float32(self._dense_config.tolerated_spread)
+        )
 
     def _relative(self, others: Sequence[int], frame: int) -> jaxlie.SE3:
         """T_other_frame of several views."""

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 from stereo_scene import arc, cloud, matrix, projected, small_camera, structure_config
 
-from emgs_jax.prior.multiview.bundle_adjustment import Tracks, adjust
+from emgs_jax.prior.multiview.bundle_adjustment import Tracks, Unknowns, adjust
 
 pytestmark = pytest.mark.slow  # compiling the solver takes ten seconds
 NUM_VIEWS, NUM_POINTS = 4, 24
@@ -30,7 +30,7 @@ def solve(poses, points, pixels, is_seen=None, is_fixed=(True, True, False, Fals
         jaxlie.SE3.from_matrix(jnp.asarray(poses, jnp.float32)),
         jnp.asarray(points, jnp.float32),
         Tracks(jnp.asarray(pixels, jnp.float32), jnp.asarray(is_seen)),
-        jnp.asarray(is_fixed),
+        Unknowns(jnp.asarray(is_fixed), jnp.zeros(())),
         small_camera(),
         config,
     )
@@ -55,7 +55,8 @@ def pose_errors(T, poses):
 def test_exact_tracks_give_back_the_poses_and_points(scene):
     poses, points, pixels = scene
     start, moved = disturbed(poses, points)
-    T, found, error = solve(start, moved, pixels)
+    T, found, distortion, error = solve(start, moved, pixels)
+    assert distortion == 0
     before = pose_errors(jaxlie.SE3.from_matrix(jnp.asarray(start, jnp.float32)), poses)
     assert before[2:].min() > 0.01, "the two views that are free start centimetres and degrees away"
     assert pose_errors(T, poses).max() < 1e-3
@@ -66,7 +67,7 @@ def test_exact_tracks_give_back_the_poses_and_points(scene):
 def test_fixed_views_stay_bit_for_bit(scene):
     poses, points, pixels = scene
     start, moved = disturbed(poses, points)
-    T, _, _ = solve(start, moved, pixels)
+    T, *_ = solve(start, moved, pixels)
     before = jaxlie.SE3.from_matrix(jnp.asarray(start, jnp.float32)).wxyz_xyz
     assert np.array_equal(T.wxyz_xyz[:2], before[:2])
     assert not np.array_equal(T.wxyz_xyz[2:], before[2:])
@@ -82,7 +83,7 @@ def test_eliminating_the_points_gives_the_solution_of_the_whole_problem(scene):
 
     dense = least_squares(lambda x: cauchy(*unpack(x), pixels), np.concatenate([np.zeros(12), points.ravel()]))
     true_poses, true_points = unpack(dense.x)
-    T, found, _ = solve(poses, points, pixels)
+    T, found, *_ = solve(poses, points, pixels)
     loss = (cauchy(np.asarray(T.as_matrix(), float), np.asarray(found, float), pixels) ** 2).sum()
     assert loss == pytest.approx(2 * dense.cost, rel=2e-3)
     np.testing.assert_allclose(T.as_matrix(), true_poses, atol=2e-3)
@@ -100,8 +101,8 @@ def test_an_outlier_moves_the_poses_far_less_than_it_would_least_squares(scene):
     poses, points, pixels = scene
     wrong = pixels.copy()
     wrong[2, 5] += (30.0, -20.0)
-    robust, _, error = solve(poses, points, wrong)
-    plain, _, _ = solve(poses, points, wrong, pixel_std=300.0)  # the loss is quadratic below it
+    robust, _, _, error = solve(poses, points, wrong)
+    plain, *_ = solve(poses, points, wrong, pixel_std=300.0)  # the loss is quadratic below it
     moved = pose_errors(robust, poses).max(axis=0)
     assert (moved < 0.1 * pose_errors(plain, poses).max(axis=0)).all()
     assert moved.max() < 5e-3
@@ -115,8 +116,8 @@ def test_what_no_view_sees_stays_and_what_is_not_seen_is_not_read(scene):
     is_seen[3] = False  # a view that sees no landmark
     start, moved = disturbed(poses, points)
     poisoned = np.where(is_seen[..., None], pixels, np.nan)
-    T, found, error = solve(start, moved, pixels, is_seen)
-    assert eqx.tree_equal((T, found, error), solve(start, moved, poisoned, is_seen))
+    T, found, distortion, error = solve(start, moved, pixels, is_seen)
+    assert eqx.tree_equal((T, found, distortion, error), solve(start, moved, poisoned, is_seen))
     np.testing.assert_array_equal(found[7], np.float32(moved[7]))
     np.testing.assert_array_equal(T.wxyz_xyz[3], jaxlie.SE3.from_matrix(jnp.asarray(start[3], jnp.float32)).wxyz_xyz)
     assert np.isinf(np.asarray(error)[~is_seen]).all() and np.isfinite(np.asarray(error)[is_seen]).all()
@@ -128,6 +129,6 @@ def test_a_point_behind_a_view_is_no_observation_of_it(scene):
     points[0, 2] = -1.0
     is_seen = np.ones(pixels.shape[:2], bool)
     is_seen[1:, 0] = False
-    _, found, error = solve(poses, points, pixels, is_seen)
+    _, found, _, error = solve(poses, points, pixels, is_seen)
     np.testing.assert_array_equal(found[0], np.float32(points[0]))
     assert np.isinf(error[0, 0])

@@ -8,7 +8,7 @@ import pytest
 import scipy.ndimage
 from stereo_scene import depth_config, matrix, plane_image, small_camera
 
-from emgs_jax.prior.multiview.depth import _between_planes, _median, count_agreeing, estimate_depth
+from emgs_jax.prior.multiview.depth import _between_planes, _median, _spread, count_agreeing, estimate_depth
 
 POSES = [matrix(translation=t) for t in ((0.2, 0, 0), (-0.2, 0, 0), (0, 0.2, 0), (0, -0.2, 0))]
 INSIDE = np.s_[8:-8, 8:-8]
@@ -22,7 +22,7 @@ def relative(poses) -> jaxlie.SE3:
 def estimate(gray, sources, is_used=(True,) * 4, near=1.2, far=5.0, overrides=()):
     depth_range = jnp.asarray([near, far], jnp.float32)
     arrays = jnp.asarray(gray), jnp.asarray(np.stack(sources)), relative(POSES), jnp.asarray(is_used)
-    return np.asarray(jitted_depth(*arrays, depth_range, small_camera(), depth_config(*overrides)))
+    return np.asarray(jitted_depth(*arrays, depth_range, small_camera(), depth_config(*overrides))[0])
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.4])
@@ -64,6 +64,30 @@ def test_the_parabola_through_three_costs_has_its_minimum_where_the_cost_had_it(
     np.testing.assert_allclose(best[:3] + np.asarray(offset)[0, :3], places[:3], atol=1e-6)
     assert np.abs(offset).max() <= 0.5
     np.testing.assert_array_equal(_between_planes(jnp.ones((1, 1, 5)), jnp.full((1, 1), 2)), 0.0)
+
+
+def test_the_spread_is_the_distance_of_plausible_planes():
+    total = np.full((1, 4, 9), 2.0)
+    total[0, 0, 3] = 0  # one plane stands out
+    total[0, 1, 2:5] = 0  # a flat minimum: two of three are a plane away
+    total[0, 2, [1, 7]] = 0  # repeated texture: half of it is six planes away
+    total[0, 3, [1, 7]] = 0, 0.05  # likewise, a temperature above the best
+    best = jnp.asarray([[3, 3, 1, 1]])
+    expected = [0, np.sqrt(2 / 3), np.sqrt(36 / 2), np.sqrt(36 / (1 + np.e))]
+    np.testing.assert_allclose(
+        _spread(jnp.asarray(total, jnp.float32), best, jnp.asarray(0.05))[0], expected, atol=1e-4
+    )
+
+
+def test_a_wall_without_texture_is_uncertain_and_a_painted_one_is_not():
+    gray, _ = plane_image(np.eye(4), 0.0)
+    sources = np.stack([plane_image(T, 0.0)[0] for T in POSES])
+    found = {}
+    for name, contrast in (("painted", 1.0), ("bare", 1e-3)):
+        images = jnp.asarray(0.5 + contrast * (gray - 0.5)), jnp.asarray(0.5 + contrast * (sources - 0.5))
+        rest = jnp.asarray((True,) * 4), jnp.asarray([1.2, 5.0]), small_camera(), depth_config()
+        found[name] = np.median(np.asarray(jitted_depth(*images, relative(POSES), *rest)[1])[INSIDE])
+    assert found["painted"] < 1.0 and found["bare"] > 4.0
 
 
 def test_the_median_is_scipys_and_keeps_holes():

@@ -2,10 +2,21 @@
 
 import numpy as np
 import pytest
-from stereo_scene import arc, cloud, matrix, similarity_error, small_camera, structure_config, structure_of, views_of
+from stereo_scene import (
+    arc,
+    cloud,
+    matrix,
+    similarity_error,
+    small_camera,
+    small_lens,
+    structure_config,
+    structure_of,
+    views_of,
+)
 
 from emgs_jax.prior.multiview.incremental import _drop, _tracks, extend, initialize
 from emgs_jax.prior.multiview.landmarks import NONE, forget, link
+from emgs_jax.prior.multiview.lens import distort
 
 pytestmark = pytest.mark.slow  # compiling the solver takes ten seconds
 NUM_POINTS, NUM_VIEWS, MOST_VIEWS = 90, 6, 10
@@ -51,6 +62,22 @@ def test_the_first_view_is_the_reference_and_its_median_landmark_has_the_given_d
     assert np.median(depth) == pytest.approx(CONFIG.median_depth)
 
 
+@pytest.mark.parametrize("distortion", [-0.2, 0.0])
+def test_the_lens_is_measured_in_the_first_window(distortion):
+    """Symptom: on 7-Scenes (k = -.03) structure and path had scales 6 % apart."""
+    truth, errors = arc(NUM_VIEWS), []
+    for expected in (0.5, 0.0):  # distortion_std
+        structure = linked(truth, noise=0.0)
+        for view in structure.views.values():
+            view.pixels = distort(view.pixels, small_lens(distortion))
+        config = structure_config("prior.structure.num_fixed=3", f"prior.structure.distortion_std={expected}")
+        assert initialize(structure, small_camera(), MOST_VIEWS, config)
+        poses = np.stack([structure.views[frame].T_ref_view for frame in range(NUM_VIEWS)])
+        errors.append(np.abs(poses[:, :3, :3] - truth[:, :3, :3]).max())
+        assert structure.distortion == pytest.approx(distortion if expected else 0.0, abs=0.05)
+    assert errors[0] < 0.5 * errors[1] or distortion == 0 and errors[0] < 2e-3
+
+
 def test_without_parallax_the_first_window_is_refused():
     turning = np.stack([matrix((0.0, 0.02 * i, 0.0)) for i in range(NUM_VIEWS)])
     structure = linked(turning)
@@ -80,7 +107,7 @@ def test_later_views_keep_the_frame_and_scale_while_old_ones_and_their_landmarks
         elif frame >= NUM_VIEWS:
             extend(structure, small_camera(), MOST_VIEWS, CONFIG)
             found[frame] = structure.views[frame].T_ref_view
-            forget(structure, [k for k in structure.views if 0 < k < frame - most + 2])
+            forget(structure, [k for k in structure.views if 0 < k < frame - most + 2], CONFIG.matching)
         assert len(structure.points) <= NUM_POINTS
     assert all(T is not None for T in found.values())
     positions = np.stack([found[frame][:3, 3] for frame in range(len(views))])

@@ -12,9 +12,11 @@ from emgs_jax.prior.multiview.landmarks import (
     link,
     match,
     place,
+    refind,
     relative_pose,
     triangulate,
 )
+from emgs_jax.prior.multiview.memory import Memory, remember
 
 NUM_POINTS = 60
 
@@ -161,13 +163,69 @@ def test_forgetting_views_keeps_the_tracks_and_points_of_the_others(config, view
     structure.views[3].landmark[:] = NONE
     view = structure.views[2]
     before = np.where(view.landmark >= 0, view.landmark, -5)
-    forget(structure, [0, 1])
+    forget(structure, [0, 1], config)
     assert sorted(structure.views) == [2, 3]
     assert len(structure.points) == np.sum(before >= 0)  # those of views 0 and 1 only are gone
     assert (view.landmark[:5] == NONE).all() and (structure.views[3].landmark == NONE).all()
     has = view.landmark >= 0
     np.testing.assert_array_equal(has, before >= 0)
     np.testing.assert_array_equal(structure.points[view.landmark[has], 0], before[has])
+
+
+def after_a_loss(config, num_known=NUM_POINTS):
+    """A structure whose placed views were forgotten with `num_known` landmarks, and the true poses."""
+    poses, points = arc(4), cloud(NUM_POINTS)
+    structure = structure_of(views_of(points, poses))
+    for frame in (0, 1):
+        view = structure.views[frame]
+        order = whose(view, structure.views[0])
+        view.landmark, view.T_ref_view = np.where(order < num_known, order, NONE), poses[frame]
+    # Landmark i is keypoint i of view 0.
+    seen = projected(poses[0], points)
+    structure.points = points[np.linalg.norm(seen - structure.views[0].pixels[:, None], axis=2).argmin(axis=1)]
+    forget(structure, [0, 1], config)
+    return structure, poses
+
+
+def test_a_view_after_a_loss_is_placed_by_what_was_left_behind_and_shows_it_again(config):
+    """Symptom: on a walk of 187 frames the first 68 were mapped, the last 119 lost."""
+    structure, poses = after_a_loss(config)
+    view = structure.views[2]
+    assert not structure.placed() and len(structure.memory.points) == NUM_POINTS
+    assert not place(structure, view, config) and refind(structure, view, config)
+    np.testing.assert_allclose(view.T_ref_view, poses[2], atol=1e-4)
+    known = structure.known(view)
+    assert known.sum() + len(structure.memory.points) == NUM_POINTS and known.mean() > 0.9
+    shown = projected(poses[2], structure.points[view.landmark[known]])
+    np.testing.assert_allclose(shown, view.pixels[known], atol=1e-3)
+
+
+def test_tracks_of_other_lost_views_get_the_points_that_one_finds_again(config):
+    structure, poses = after_a_loss(config)
+    link(structure, 3, config)  # views 2 and 3 see each other, without a position
+    assert not place(structure, structure.views[3], config)
+    assert refind(structure, structure.views[2], config) and place(structure, structure.views[3], config)
+    np.testing.assert_allclose(structure.views[3].T_ref_view, poses[3], atol=1e-3)
+
+
+def test_an_unknown_place_or_too_few_landmarks_place_nothing(config):
+    structure, _ = after_a_loss(config, num_known=config.min_refound - 1)
+    before = structure.views[2].landmark.copy()
+    assert not refind(structure, structure.views[2], config)
+    structure, _ = after_a_loss(config)
+    rng = np.random.default_rng(0)
+    structure.views[2].pixels[:] = rng.permutation(structure.views[2].pixels)  # looks alike, lies elsewhere
+    assert not refind(structure, structure.views[2], config)
+    assert structure.views[2].T_ref_view is None
+    np.testing.assert_array_equal(structure.views[2].landmark, before)
+
+
+def test_the_memory_is_bounded_and_keeps_the_newest():
+    descriptors, memory = np.eye(128, dtype=np.float32), Memory()
+    for step in range(3):
+        memory = remember(memory, np.full((50, 3), step), descriptors[:50], 120)
+    np.testing.assert_array_equal(memory.points[:, 0], np.repeat([0, 1, 2], [20, 50, 50]))
+    assert len(memory.descriptors) == 120
 
 
 def placed_structure(poses, points, seen_by):
