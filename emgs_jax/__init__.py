@@ -14,10 +14,12 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.data.base import BadFrameError, Dataset, Frame
     from emgs_jax.em import EmConfig, EmInfo, em_update
     from emgs_jax.evaluation.reconstruction import EvaluationConfig
+    from emgs_jax.existence import ExistenceConfig, join_layers, judge
     from emgs_jax.gaussian_map import (
         AverageConfig,
         GaussianMap,
         SubmapConfig,
+        confirmed,
         empty_map,
         grow,
         insert,
@@ -60,8 +62,9 @@ _HOMES = {
     "evaluation.reconstruction": ("EvaluationConfig",),
     "gaussian_map": (
         *("AverageConfig", "GaussianMap", "SubmapConfig"),
-        *("empty_map", "grow", "insert", "select_submap", "write_back"),
+        *("confirmed", "empty_map", "grow", "insert", "select_submap", "write_back"),
     ),
+    "existence": ("ExistenceConfig", "join_layers", "judge"),
     "gaussians": ("FitConfig", "Gaussians", "cluster", "fit_to_points"),
     "initialization": ("initialize",),
     "io.map_file": ("load_map", "save_map"),
@@ -71,7 +74,8 @@ _HOMES = {
     "prior.base": ("Prior", "PriorPrediction", "Provenance", "Window", "windows"),
     "prior.recorded": ("Recorded", "record"),
     "refinement": ("RefinementConfig", "RefinementInfo", "refine"),
-    "registration.icp": ("IcpConfig", "IcpInfo", "icp"),
+    "registration.icp": ("IcpInfo", "icp"),
+    "registration.problem": ("IcpConfig",),
     "render.composite": ("RenderConfig", "Rendering", "render_gaussians"),
     "render.densify": ("DensifyConfig", "densify"),
     "running.compilation": ("use_compilation_cache",),

@@ -195,6 +195,13 @@ class Room:
         return Frame(index, 0.0, "f", image, np.full((6, 8), 2.0, np.float32), poses_along([4.0 * index])[0], labels)
 
 
+class Dark(Room):
+    """The same frames without depth."""
+
+    def __getitem__(self, index):
+        return dataclasses.replace(super().__getitem__(index), depth=None)
+
+
 def test_the_truth_is_that_of_every_frame_and_its_labels_where_the_prior_has_classes():
     prior = SimpleNamespace(feature_names=CLASSES)
     scorer = new_scorer(Room(), evaluation_config(), prior)
@@ -245,7 +252,7 @@ def test_settings_that_share_a_data_set_get_the_metrics_that_each_gets_by_itself
     truth = center_cloud(runs[0])
     raw = RawPrior(truth, Spool())
     scorer = Scorer(
-        Room(), evaluation_config(), reference(truth, evaluation_config()), None, SimpleNamespace(feature_names=())
+        Dark(), evaluation_config(), reference(truth, evaluation_config()), None, SimpleNamespace(feature_names=())
     )
     config = densify_config()
     found = score_settings(runs, raw, [config, config], scorer, 2)
