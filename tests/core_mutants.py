@@ -73,7 +73,7 @@ REGISTRATION = [
         ),
         ("points.valid & is_near", "is_near", "invalid points are inliers"),
     ),
-    *own("registration/noise", "registration/test_noise")(
+    *own("registration/noise", "registration/test_uncertainty")(
         ('side="left"', 'side="right"', "equal confidences are the highest"),
         ("jnp.where(valid, confidence, jnp.inf)", "confidence", "invalid points are ranked, too"),
         ("1.4826 * median", "median", "the misfit is no standard deviation"),

@@ -24,7 +24,7 @@ from experiments.command import check_arguments
         (["slam.em=paper"], r"one of its options \(default, paper\) with slam/em=paper$"),
         (["slam.em=papre"], r"one of its options \(default, paper\) with slam/em=default$"),
         (["render=bright"], "render=bright is no option of render: there are default"),
-        (["slam=paper"], r"slam is chosen by its parts: slam/em=…, slam/fit=…"),
+        (["slam=paper"], r"slam is chosen by its parts: slam/em=…, slam/existence=…, slam/fit=…"),
         (["dataset=kitti"], "dataset=kitti is no option of dataset: there are images, replica, seven_scenes"),
         (["slam/em=paper,nothing"], "slam/em=paper,nothing is no option"),
     ],
