@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import GaussianMap, without
 from emgs_jax.gaussians import Gaussians, blend, has_feature
-from emgs_jax.observation import Observation
+from emgs_jax.observation import Observation, depth_in
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.linalg import inverse_3x3, mahalanobis_sq, outer
 from emgs_jax.ops.neighbours import knn
@@ -50,8 +50,7 @@ def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -
 
     A pose that is wrong by a pixel must not show what is behind a thin pole.
     """
-    rotation = T_world_camera.rotation().as_matrix()
-    depth = ((view.points - T_world_camera.translation()) @ rotation)[:, 2].reshape(camera.height, camera.width)
+    depth = depth_in(T_world_camera, view).reshape(camera.height, camera.width)
     valid = view.valid.reshape(depth.shape)
 
     def least(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:

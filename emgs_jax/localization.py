@@ -7,7 +7,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.observation import Observation, Prediction, transform
+from emgs_jax.observation import Observation, Prediction, depth_in, transform
 from emgs_jax.ops.camera import Camera, nearest_pixel, project
 from emgs_jax.ops.linalg import Whitening
 from emgs_jax.ops.precision import full_precision
@@ -125,8 +125,7 @@ def _repeat_scale(
 ) -> Float[Array, ""]:
     """Scale of this prediction relative to the map, from the image that was predicted twice (R8)."""
     depth_now = now.points[:, 2]
-    depth_before = ((before.points - T_world_previous.translation()) @ T_world_previous.rotation().as_matrix())[:, 2]
-    ratio = median(depth_before / jnp.where(paired, depth_now, 1.0), paired)
+    ratio = median(depth_in(T_world_previous, before) / jnp.where(paired, depth_now, 1.0), paired)
     _, similarity = fit_rigid(now.points, before.points, paired.astype(jnp.float32))
     scale = jnp.stack([jnp.ones(()), ratio, similarity])[config.coarse_scale.astype(jnp.int32)]
     return jnp.where(jnp.isfinite(scale) & (scale > 0.1), scale, 1.0) ** config.scale_memory

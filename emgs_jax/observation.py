@@ -172,6 +172,11 @@ def observe(
     return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), image)
 
 
+def depth_in(T_world_camera: jaxlie.SE3, observation: Observation) -> Float[Array, "p"]:
+    """Camera-space z (m) of world-frame points."""
+    return ((observation.points - T_world_camera.translation()) @ T_world_camera.rotation().as_matrix())[:, 2]
+
+
 @full_precision
 def transform(T_target_source: jaxlie.SE3, observation: Observation, scale: Float[Array, ""]) -> Observation:
     """Scale the points about the source's origin, then move points and normals to the target frame."""
