@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
         empty_map,
         grow,
         insert,
+        new_map,
         select_submap,
         write_back,
     )
@@ -55,6 +56,7 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.running.record import FrameRecord, MappingRun, new_run
     from emgs_jax.semantics import classify
     from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
+    from emgs_jax.splitting import SplittingConfig, split
 
 _HOMES = {
     "data.base": ("BadFrameError", "Dataset", "Frame"),
@@ -62,7 +64,7 @@ _HOMES = {
     "evaluation.reconstruction": ("EvaluationConfig",),
     "gaussian_map": (
         *("AverageConfig", "GaussianMap", "SubmapConfig"),
-        *("confirmed", "empty_map", "grow", "insert", "select_submap", "write_back"),
+        *("confirmed", "empty_map", "grow", "insert", "new_map", "select_submap", "write_back"),
     ),
     "existence": ("ExistenceConfig", "join_layers", "judge"),
     "gaussians": ("FitConfig", "Gaussians", "cluster", "fit_to_points"),
@@ -87,6 +89,7 @@ _HOMES = {
     "running.record": ("FrameRecord", "MappingRun", "new_run"),
     "semantics": ("classify",),
     "slam": ("Overflow", "SlamConfig", "SlamState", "StepInfo", "init_state", "step"),
+    "splitting": ("SplittingConfig", "split"),
 }
 _OWN_NAMES = {"render_gaussians": "render"}  # in its file; `emgs_jax.render` is a folder
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

@@ -242,13 +242,13 @@ def em_update(
     noise: Float[Array, "m 3"],
     config: EmConfig,
     white: Whitening | None = None,
-) -> tuple[GaussianMap, Bool[Array, "m"], EmInfo]:
+) -> tuple[GaussianMap, EStep, EmInfo]:
     """One incremental EM step: fuse the points of `aligned` (world frame) that the submap explains.
 
     `noise` is the standard deviation of each point along its viewing ray, a vector in metres; `white` as in `e_step`.
 
     Returns:
-        The updated submap, which points were fused, and counts. Without any fused point the submap is unchanged.
+        The updated submap, what explains which point, and counts. Without any fused point the submap is unchanged.
     """
     gaussians = submap.gaussians
     step, best = e_step(gaussians, aligned, noise, config, white)
@@ -262,4 +262,4 @@ def em_update(
         num_updated=jnp.sum(gain > 0),
         mean_log_joint=jnp.sum(jnp.where(step.is_fused, best, 0.0)) / jnp.maximum(num_fused, 1),
     )
-    return updated, step.is_fused, info
+    return updated, step, info

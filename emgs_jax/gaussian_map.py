@@ -65,6 +65,12 @@ def empty_map(capacity: int, num_features: int) -> GaussianMap:
     return GaussianMap(empty_gaussians(capacity, num_features), nothing, jnp.zeros(capacity, jnp.int32), nothing)
 
 
+def new_map(gaussians: Gaussians, weight: Float[Array, "n"], existence: Float[Array, ""]) -> GaussianMap:
+    """A map of Gaussians that are new, all with the same log-odds of existence."""
+    num_updates = jnp.ones(weight.shape, jnp.int32)
+    return GaussianMap(gaussians, weight, num_updates, jnp.broadcast_to(existence, weight.shape))
+
+
 def confirmed(map: GaussianMap) -> Gaussians:
     """The Gaussians with only the confirmed ones valid."""
     return eqx.tree_at(lambda g: g.valid, map.gaussians, map.gaussians.valid & (map.existence > 0))
@@ -122,21 +128,18 @@ def write_back(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> 
     return put_rows(map, rows, submap)
 
 
-def insert(
-    map: GaussianMap, fresh: Gaussians, weight: Float[Array, "g"], existence: Float[Array, ""]
-) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""]]:
-    """Write the valid rows of `fresh` into free rows of the map, all with the same log-odds of existence.
+def insert(map: GaussianMap, new: GaussianMap) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""]]:
+    """Write the valid rows of `new` into free rows of the map.
 
     Returns:
         The map, how many were inserted, and how many found no free row.
     """
-    num_fresh = fresh.valid.shape[0]
-    sources, exists, _ = compact_rows(fresh.valid, num_fresh)
-    free, is_free, _ = compact_rows(~map.gaussians.valid, min(num_fresh, map.weight.shape[0]))
-    free = jnp.pad(free, (0, num_fresh - free.shape[0]), constant_values=map.weight.shape[0])
-    is_free = jnp.pad(is_free, (0, num_fresh - is_free.shape[0]))
-    targets = jnp.where(exists & is_free, free, map.weight.shape[0])
-    new = GaussianMap(fresh, weight, jnp.ones(num_fresh, jnp.int32), jnp.broadcast_to(existence, weight.shape))
+    num_new, num_rows = new.weight.shape[0], map.weight.shape[0]
+    sources, exists, _ = compact_rows(new.gaussians.valid, num_new)
+    free, is_free, _ = compact_rows(~map.gaussians.valid, min(num_new, num_rows))
+    free = jnp.pad(free, (0, num_new - free.shape[0]), constant_values=num_rows)
+    is_free = jnp.pad(is_free, (0, num_new - is_free.shape[0]))
+    targets = jnp.where(exists & is_free, free, num_rows)
     overflow = jnp.sum(exists & ~is_free)
     return put_rows(map, targets, take_rows(new, sources)), jnp.sum(exists & is_free), overflow
 

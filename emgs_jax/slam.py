@@ -17,6 +17,7 @@ from emgs_jax.gaussian_map import (
     confirmed,
     empty_map,
     insert,
+    new_map,
     select_submap,
     write_back,
 )
@@ -31,6 +32,7 @@ from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
 from emgs_jax.registration.rigid import pose_row
+from emgs_jax.splitting import SplittingConfig, split
 
 
 class SlamConfig(eqx.Module):
@@ -45,6 +47,7 @@ class SlamConfig(eqx.Module):
         submap: what a step works on, and capacities.
         localization: coarse and fine.
         em: E- and M-step.
+        splitting: of Gaussians that are too coarse for a nearer view.
         refinement: on the image plane.
         existence: what later frames say of a Gaussian.
     """
@@ -56,6 +59,7 @@ class SlamConfig(eqx.Module):
     submap: SubmapConfig
     localization: LocalizationConfig
     em: EmConfig
+    splitting: SplittingConfig
     refinement: RefinementConfig
     existence: ExistenceConfig
 
@@ -130,7 +134,7 @@ def _first_state(
     empty = empty_map(config.submap.map_capacity, world.features.shape[-1])
     # There is nothing else to align the second frame with, so the first window confirms itself.
     existence = jnp.maximum(config.existence.birth, config.existence.hit)
-    map, _, overflow = insert(empty, gaussians, _first_weight(weight, config.em.average), existence)
+    map, _, overflow = insert(empty, new_map(gaussians, _first_weight(weight, config.em.average), existence))
     previous = jax.tree.map(lambda leaf: leaf[-1], world)
     return SlamState(map, previous, pose_row(T_world_views, -1)), overflow
 
@@ -159,11 +163,13 @@ def step(
     coarse, guess = call(_approach, prediction, *last, camera, thin, config.localization)
     submap, white, rows, submap_overflow = call(_select, state.map, (state.previous, guess), config.submap)
     T, aligned, localization = call(_place, prediction.current, submap, coarse, config.localization, white)
-    submap, rest, em = call(_fuse, submap, white, aligned, T, localization, config.em)
-    candidates, weight = call(cluster, rest, call(_order, camera, thin), spacing(camera, thin, config.fit), config.fit)
+    rows_each = spacing(camera, thin, config.fit)
+    place = aligned, T, localization
+    submap, rest, em, halves = call(_fuse, submap, white, *place, rows_each, config.em, config.splitting)
+    candidates, weight = call(cluster, rest, call(_order, camera, thin), rows_each, config.fit)
     submap, fresh, refinement = call(_refine, submap, candidates, T, camera, thin, config.refinement)
-    look = aligned, T, localization
-    map, count, map_overflow = call(_store, state.map, submap, rows, fresh, weight, look, camera, config)
+    new = fresh, weight, halves
+    map, count, map_overflow = call(_store, state.map, submap, rows, new, place, camera, config)
 
     info = StepInfo(
         T_world_camera=T,
@@ -215,13 +221,20 @@ def _fuse(
     aligned: Observation,
     T: jaxlie.SE3,
     localization: LocalizationInfo,
+    spacing: int,
     config: EmConfig,
-) -> tuple[GaussianMap, Observation, EmInfo]:
-    """Fuse the points of a frame that is tracked; returns those that no Gaussian explains."""
+    splitting: SplittingConfig,
+) -> tuple[GaussianMap, Observation, EmInfo, GaussianMap]:
+    """Fuse the points of a frame that is tracked, and split what they show to be too coarse.
+
+    Returns:
+        The submap, the points that no Gaussian explains, counts, and the second halves of what was split.
+    """
     trusted = _trusted(aligned, localization)
     noise = localization.noise[:, None] * (trusted.points - T.translation())
-    submap, is_fused, em = em_update(submap, trusted, noise, config, white)
-    return submap, eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~is_fused), em
+    submap, explained, em = em_update(submap, trusted, noise, config, white)
+    submap, halves = split(submap, trusted, noise, (explained.rows, explained.responsibilities), spacing, splitting)
+    return submap, eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~explained.is_fused), em, halves
 
 
 def _trusted(aligned: Observation, localization: LocalizationInfo) -> Observation:
@@ -252,23 +265,23 @@ def _store(
     map: GaussianMap,
     submap: GaussianMap,
     rows: Int[Array, "s"],
-    fresh: Gaussians,
-    weight: Float[Array, "g"],
-    look: tuple[Observation, jaxlie.SE3, LocalizationInfo],
+    new: tuple[Gaussians, Float[Array, "g"], GaussianMap],
+    place: tuple[Observation, jaxlie.SE3, LocalizationInfo],
     camera: Camera,
     config: SlamConfig,
 ) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""]]:
-    """The map with the submap written back, judged by this look, and the fresh Gaussians in free rows.
+    """The map with the submap written back, judged by this look; fresh Gaussians and second halves in free rows.
 
     Returns:
         The map, the number of its Gaussians, and how many did not fit.
     """
-    aligned, T, localization = look
+    (aligned, T, localization), (fresh, weight, halves) = place, new
     thinned, noise = downscale(camera, config.observation.thin), localization.depth_noise
     trusted = _trusted(aligned, localization)
     map, is_seen = judge(write_back(map, submap, rows), trusted, T, thinned, noise, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
     submap = join_layers(take_rows(map, rows), is_seen, T, noise, config.existence)
-    first_weight = _first_weight(weight, config.em.average)
-    map, _, overflow = insert(write_back(map, submap, rows), fresh, first_weight, config.existence.birth)
+    born = new_map(fresh, _first_weight(weight, config.em.average), config.existence.birth)
+    born = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), born, halves)
+    map, _, overflow = insert(write_back(map, submap, rows), born)
     return map, jnp.sum(map.gaussians.valid), overflow

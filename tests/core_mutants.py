@@ -280,7 +280,7 @@ STAGES = [
             "localize_fine(current, submap.gaussians",
             "tentative ones are aligned against",
         ),
-        ("insert(write_back(map, submap, rows), fresh", "insert(map, fresh", "layers are not joined"),
+        ("insert(write_back(map, submap, rows), born", "insert(map, born", "layers are not joined"),
         (
             "jnp.where(config.gain > 0, weight, 1.0)",
             "jnp.ones_like(weight)",

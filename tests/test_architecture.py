@@ -15,10 +15,10 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # From the bottom: a room imports rooms to its left and itself, never one to its right.
 CORE_ROOMS = (
     *("ops", "observation", "gaussians", "gaussian_map", "registration", "render"),
-    *("initialization", "localization", "em", "refinement", "existence", "semantics", "slam"),
+    *("initialization", "localization", "em", "splitting", "refinement", "existence", "semantics", "slam"),
 )
 HOST = ("io", "data", "features", "prior", "evaluation", "running", "report")
-STAGES = {"initialization", "localization", "em", "refinement", "existence", "semantics"}
+STAGES = {"initialization", "localization", "em", "splitting", "refinement", "existence", "semantics"}
 HOST_PACKAGES = {"numpy", "cv2", "open3d", "trimesh", "matplotlib", "scipy", "torch", "tqdm", "hydra", "omegaconf"}
 MAX_FUNCTION_LINES, MAX_FILE_LINES = 60, 300
 

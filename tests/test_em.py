@@ -19,7 +19,15 @@ M, N, F = 60, 40, 3
 POINTS, GAUSSIANS = random_observation(M, num_features=F), random_gaussians(N, num_features=F)
 QUIET = jnp.zeros((M, 3))
 NOISE = jnp.asarray(np.random.default_rng(5).normal(size=(M, 3)) * 0.1, jnp.float32)
-estep, mstep, supported, em = (eqx.filter_jit(f) for f in (e_step, m_step, support, em_update))
+estep, mstep, supported, updated_map = (eqx.filter_jit(f) for f in (e_step, m_step, support, em_update))
+
+
+def em(*arguments):
+    """The updated map, which points were fused, and counts."""
+    map, step, info = updated_map(*arguments)
+    return map, step.is_fused, info
+
+
 MAP = GaussianMap(GAUSSIANS, jnp.ones(N), jnp.ones(N, jnp.int32), jnp.ones(N))
 
 PAPER = ("slam/em=paper",)

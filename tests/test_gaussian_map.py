@@ -8,7 +8,16 @@ import pytest
 import reference
 from scene import assert_same, at, random_gaussians, random_observation
 
-from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert, select_submap, update_average, write_back
+from emgs_jax.gaussian_map import (
+    GaussianMap,
+    empty_map,
+    grow,
+    insert,
+    new_map,
+    select_submap,
+    update_average,
+    write_back,
+)
 from emgs_jax.gaussians import empty_gaussians
 
 update = eqx.filter_jit(update_average)
@@ -163,7 +172,7 @@ def with_holes(count, holes):
 def test_fresh_gaussians_fill_the_free_rows_in_order():
     map, fresh = with_holes(10, [2, 3, 7, 9]), random_gaussians(5, 9)
     fresh = eqx.tree_at(lambda g: g.valid, fresh, jnp.array([False, True, True, False, True]))
-    inserted, count, overflow = insert(map, fresh, jnp.arange(5.0), jnp.asarray(0.25))
+    inserted, count, overflow = insert(map, new_map(fresh, jnp.arange(5.0), jnp.asarray(0.25)))
     assert (count, overflow) == (3, 0)
     for row, source in ((2, 1), (3, 2), (7, 4)):
         np.testing.assert_array_equal(inserted.gaussians.means[row], fresh.means[source])
@@ -177,7 +186,7 @@ def test_fresh_gaussians_fill_the_free_rows_in_order():
 @pytest.mark.parametrize(("holes", "expected"), [([2], 2), ([], 3), ([1, 4], 1), ([0, 1, 4], 0)])
 def test_what_finds_no_free_row_is_counted_and_the_rest_is_kept(holes, expected):
     map, fresh = with_holes(6, holes or [99]), random_gaussians(3, 9)
-    inserted, count, overflow = insert(map, fresh, jnp.ones(3), jnp.ones(()))
+    inserted, count, overflow = insert(map, new_map(fresh, jnp.ones(3), jnp.ones(())))
     assert (count, overflow) == (3 - expected, expected)
     assert inserted.gaussians.valid.sum() == min(6, 6 - len(holes) + 3)
     kept = np.setdiff1d(np.arange(6), holes)
@@ -185,13 +194,13 @@ def test_what_finds_no_free_row_is_counted_and_the_rest_is_kept(holes, expected)
 
 
 def test_more_fresh_gaussians_than_rows_are_counted():
-    _, count, overflow = insert(empty_map(4, 0), random_gaussians(7), jnp.ones(7), jnp.ones(()))
+    _, count, overflow = insert(empty_map(4, 0), new_map(random_gaussians(7), jnp.ones(7), jnp.ones(())))
     assert (count, overflow) == (4, 3)
 
 
 def test_inserting_nothing_changes_no_bit():
     map = with_holes(6, [1, 3])
-    inserted, count, overflow = insert(map, empty_gaussians(4, 0), jnp.full(4, 7.0), jnp.ones(()))
+    inserted, count, overflow = insert(map, new_map(empty_gaussians(4, 0), jnp.full(4, 7.0), jnp.ones(())))
     assert_same(inserted, map)
     assert (count, overflow) == (0, 0)
 

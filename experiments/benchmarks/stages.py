@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from emgs_jax.em import e_step, m_step, precision
-from emgs_jax.gaussian_map import insert, select_submap, write_back
+from emgs_jax.gaussian_map import insert, new_map, select_submap, write_back
 from emgs_jax.gaussians import cluster, spacing
 from emgs_jax.localization import localize_coarse, localize_fine
 from emgs_jax.observation import observe, transform
@@ -53,7 +53,7 @@ def time_stages(data: Data, repetitions: int) -> list[Timing]:
     submap, fresh, _ = stage("refine", refine, submap, candidates_new, T, camera, config.refinement)
     drawn = submap.gaussians, submap.gaussians.colors, T, camera, config.refinement.render
     stage("render", render, *drawn)
-    add = lambda m, s, r, f, w: insert(write_back(m, s, r), f, w, jnp.zeros(()))  # noqa: E731
+    add = lambda m, s, r, f, w: insert(write_back(m, s, r), new_map(f, w, jnp.zeros(())))  # noqa: E731
     stage("insert", add, state.map, submap, rows, fresh, weight)
     candidates["whole step"] = called(step, state, prediction, data.camera, config)
     return interleaved("stages", candidates, repetitions)
