@@ -107,7 +107,10 @@ VERBS = {
         lambda m, o: gaussian_map.select_submap(m, (o,), CONFIG.submap),
         lambda s: (map_of(s), points(s)),
     ),
-    "insert": (gaussian_map.insert, lambda s: (map_of(s), random_gaussians(9, s, 2), jnp.ones(9), ONE)),
+    "insert": (
+        lambda m, g: gaussian_map.insert(m, gaussian_map.new_map(g, jnp.ones(9), ONE)),
+        lambda s: (map_of(s), random_gaussians(9, s, 2)),
+    ),
     "fit_rigid": (rigid.fit_rigid, lambda s: (points(s).points, points(s + 5).points, jnp.ones(40))),
     "icp": (
         lambda o, g, T: icp.icp(o, g, T, (ONE * 0.02, ONE * 0.01), CONFIG.localization.icp),
@@ -133,6 +136,10 @@ VERBS = {
         lambda s: (random_gaussians(32, s, 2), points(s), estep_of(s)),
     ),
     "em_update": (lambda m, o: em.em_update(m, o, NOISE[:32], CONFIG.em), lambda s: (map_of(s), close(s))),
+    "split": (
+        lambda m, o, e: splitting.split(m, o, NOISE, (e.rows, e.responsibilities), 1, CONFIG.splitting),
+        lambda s: (map_of(s), points(s), estep_of(s)),
+    ),
     "project_gaussians": (
         lambda g, T: project.project_gaussians(g, T, CAMERA, ONE, ONE),
         lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),

@@ -197,8 +197,8 @@ def compact_rows(mask: Bool[Array, "n"], capacity: int) -> tuple[Int[Array, "c"]
     Returns:
         The rows (n where there is none, which `put_rows` drops), which of them exist, and how many did not fit.
     """
-    ranks = jnp.cumsum(mask)
-    rows = jnp.searchsorted(ranks, jnp.arange(1, capacity + 1))
-    exists = jnp.arange(capacity) < ranks[-1]
-    overflow = jnp.maximum(ranks[-1] - capacity, 0)
+    count = jnp.sum(mask)
+    rows = jnp.searchsorted(jnp.cumsum(mask), jnp.arange(1, capacity + 1))
+    exists = jnp.arange(capacity) < count
+    overflow = jnp.maximum(count - capacity, 0)
     return jnp.where(exists, rows, mask.shape[0]), exists, overflow
