@@ -15,7 +15,7 @@ from emgs_jax.semantics import classify
 CALLS = VERBS | {"classify": (classify, lambda s: (random_gaussians(9, s, 2), jnp.eye(2)))}
 WITH_PRODUCTS = {
     *("transform", "fit_to_points", "cluster", "fit_rigid", "icp", "initialize", "localize_coarse", "localize_fine"),
-    *("em_update", "project_gaussians", "render", "densify", "refine", "judge", "join_layers", "classify"),
+    *("em_update", "split", "project_gaussians", "render", "densify", "refine", "judge", "join_layers", "classify"),
 }
 
 

@@ -15,7 +15,7 @@ from scene import (
     stack_poses,
 )
 
-from emgs_jax import em, existence, gaussian_map, gaussians, initialization, localization
+from emgs_jax import em, existence, gaussian_map, gaussians, initialization, localization, splitting
 from emgs_jax import observation as obs
 from emgs_jax.ops import camera as cam
 from emgs_jax.ops import clustering, linalg, neighbours
