@@ -135,6 +135,22 @@ def test_clustering_a_room_gives_thin_gaussians_on_its_walls(fit_config, camera)
     assert np.median(flat[on_wall]) < 1.2 * float(fit_config.min_std) ** 2
 
 
+def test_no_gaussian_spans_a_depth_edge_that_is_larger_than_it(fit_config):
+    """A pole of two pixels 1 m away, a wall at 3 m: there is no point between, and no Gaussian reaches across."""
+    y, x = np.divmod(np.arange(768), 32)
+    is_pole = (x == 15) | (x == 16)
+    depth = np.where(is_pole, 1.0, 3.0)
+    rays = np.stack([(x - 15.5) / 30, (y - 11.5) / 30, np.ones(768)], axis=-1)
+    points = random_observation(768)
+    points = eqx.tree_at(lambda o: o.points, points, jnp.asarray(rays * depth[:, None], jnp.float32))
+    gaussians, _ = eqx.filter_jit(cluster)(points, morton_order(24, 32), 8, fit_config)
+    z, std = gaussians.means[gaussians.valid, 2], jnp.sqrt(gaussians.covs[gaussians.valid, 2, 2])
+    is_on_pole = z < 2
+    assert len(z) > 90 and 4 <= is_on_pole.sum() <= 8
+    np.testing.assert_allclose(z, jnp.where(is_on_pole, 1.0, 3.0), atol=1e-5)
+    np.testing.assert_allclose(std, float(fit_config.min_std), rtol=1e-2)
+
+
 def test_a_gaussian_is_as_large_as_its_cluster_whatever_the_number_of_points_in_it(fit_config):
     """A cluster of n pixels of a plane with pitch a is about a disc of area n a², whose covariance has trace n a² / 2π.
 
