@@ -19,6 +19,8 @@ PROVENANCE = ("tests/report/test_provenance.py",)
 DENSE = ("tests/running/test_dense.py",)
 CONVERT = ("tests/running/test_convert.py",)
 NOISE = ("tests/prior/simulated/test_noise.py",)
+DRIFT = ("tests/prior/simulated/test_simulated_drift.py",)
+COVISIBILITY = ("tests/prior/simulated/test_covisibility.py",)
 SIMULATED = ("tests/prior/simulated/test_simulated.py", "tests/prior/simulated/test_simulated_geometry.py")
 WINDOWS = ("tests/prior/test_windows.py",)
 RECORDED = ("tests/prior/test_recorded.py",)
@@ -732,6 +734,55 @@ MUTANTS = (
         "(current, current - 1), current)",
         WINDOWS,
         "previous and current view swapped",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/noise.py",
+        "standard_normal(inference).sum()",
+        "standard_normal(inference + 1)[inference]",
+        DRIFT,
+        "the scale is drawn anew every time",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/prior.py",
+        "return shared >= noise.min_shared",
+        "return shared >= 0 * noise.min_shared",
+        DRIFT,
+        "version 2 holds every window",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/prior.py",
+        "rotation = max(rotation, self.level * noise.unheld_rotation)",
+        "rotation = self.level * noise.unheld_rotation",
+        DRIFT,
+        "far away an unseen anchor holds better than in version 1",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/prior.py",
+        "translation = max(translation, self.level * noise.unheld_translation * distance)",
+        "translation += self.level * noise.unheld_translation",
+        DRIFT,
+        "the drift does not grow with the distance",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/covisibility.py",
+        "return max(",
+        "return min(",
+        COVISIBILITY,
+        "a detail shares next to nothing with the view that shows it",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/covisibility.py",
+        "is_same = np.abs(seen - z[inside]) <= tolerance * z[inside]",
+        "is_same = seen - z[inside] <= tolerance * z[inside]",
+        COVISIBILITY,
+        "points behind a wall are shared",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/covisibility.py",
+        "inside = ahead & (column >= 0)",
+        "inside = (column >= 0)",
+        COVISIBILITY,
+        "what is behind the camera is shared",
     ),
     Mutant(
         "emgs_jax/prior/simulated/noise.py",
