@@ -114,6 +114,44 @@ def boxes(rng: np.random.Generator) -> list[Part]:
     return parts + moved(join("box", box((0.34, 0.3, 0.3), (0, 0, 0.4))), np.zeros(3), rng.uniform(-0.6, 0.6))
 
 
+def low_table(rng: np.random.Generator) -> list[Part]:
+    """Low table with a box and a ball on it."""
+    w, d = rng.uniform(0.9, 1.2), rng.uniform(0.5, 0.7)
+    parts = table(w, d, 0.45)
+    parts += moved(join("box", box((0.3, 0.22, 0.1), (0, 0, 0))), np.array([-w / 4, 0.0, 0.45]), rng.uniform(0, 3))
+    return parts + moved(sphere(0.09), np.array([w / 4, rng.uniform(-0.1, 0.1), 0.45]))
+
+
+def bed(rng: np.random.Generator) -> list[Part]:
+    """Bed whose head is at the wall, with a cushion."""
+    w, length = rng.uniform(1.2, 1.5), rng.uniform(1.95, 2.1)
+    head, foot = box((w, 0.06, 0.9), (0, 0.03, 0)), box((w, 0.06, 0.5), (0, length - 0.03, 0))
+    mattress = box((w - 0.04, length - 0.12, 0.3), (0, length / 2, 0.18))
+    return join("bed", head, foot, mattress) + join("box", box((0.6, 0.4, 0.12), (0, 0.3, 0.48)))
+
+
+def plant(rng: np.random.Generator) -> list[Part]:
+    """Pot with a stem and a crown of balls."""
+    h, r = rng.uniform(0.8, 1.1), rng.uniform(0.14, 0.17)
+    crown = [trimesh.creation.icosphere(subdivisions=3, radius=r) for _ in range(5)]
+    for turn, leaf in enumerate(crown):
+        leaf.apply_translation((0.7 * r * np.cos(1.9 * turn), 0.7 * r * np.sin(1.9 * turn), h + 0.4 * r * turn))
+    return join("plant", cylinder(0.17, 0.3, 0), cylinder(0.02, h - 0.3, 0.3), *crown)
+
+
+def ceiling_lamp(at: tuple[float, float], ceiling: float) -> list[Part]:
+    """Flat lamp under the ceiling at (x, y)."""
+    return moved(join("lamp", cylinder(0.25, 0.08, ceiling - 0.08)), np.array([*at, 0.0]))
+
+
+def closed_door(width: float, height: float) -> list[Part]:
+    """Door that nobody opens, in its frame."""
+    rails = [box((0.09, 0.05, height), (s * (width / 2 + 0.045), 0.025, 0)) for s in (-1, 1)]
+    lintel = box((width + 0.18, 0.05, 0.09), (0, 0.025, height))
+    panels = [box((width - 0.3, 0.04, height / 2 - 0.3), (0, 0.02, z)) for z in (0.15, height / 2 + 0.1)]
+    return join("door", box((width, 0.025, height), (0, 0.0125, 0)), lintel, *rails, *panels)
+
+
 def ball(rng: np.random.Generator) -> list[Part]:
     return sphere(rng.uniform(0.18, 0.28))
 
