@@ -61,7 +61,7 @@ class Apartment(RayCast):
     ) -> None:
         if seed < 0 or (num_frames is not None and num_frames < 1):
             raise ValueError(
-                "dataset.seed must be 0 or more and dataset.num_frames 1 or more, or null for 7 cm from frame to frame, "
+                "dataset.seed must be 0 or more and dataset.num_frames 1 or more, or null (7 cm from frame to frame), "
                 f"got {seed}, {num_frames}"
             )
         if walk not in WALKS:
@@ -122,7 +122,7 @@ def _twin(plan: Plan, lanes: Float[np.ndarray, "p 2"], rng: np.random.Generator)
     middle = moved(f.table_with_chairs(rng), np.array([*table_of(plan.twin, 0), 0.0]))
     parts = shell(plan.twin) + shell(plan.twin_bay) + lining(NORTH, (plan.twin_door, HALF_HALL + WALL))
     parts += furnish(plan.twin, [f.sofa, f.desk, f.shelf, f.cabinet, f.lamp, f.plant, *pictures], middle, lanes, rng)
-    return parts + furnish(plan.twin_bay, [_closed_door, *pictures], [], lanes, rng)
+    return parts + furnish(plan.twin_bay, [_closed_door, *pictures, *pictures], [], lanes, rng)
 
 
 def _bay(plan: Plan, rng: np.random.Generator) -> list[Part]:

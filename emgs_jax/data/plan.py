@@ -7,8 +7,8 @@
      study  │ bedroom │
 
 Living and dining room have a doorway between them, study and bedroom too, so that one can walk round. The hall goes
-past two rooms that are the same, `APART` from each other, as are the bays of the hall before them, and ends in the gallery, whose
-bays are all the same.
+past two rooms that are the same, `APART` metres from each other, as are the pieces of the hall before them, and ends in
+the gallery, whose bays are all the same.
 """
 
 from dataclasses import dataclass

@@ -6,13 +6,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-from emgs_jax.data.plan import BAY, HALF_HALL, NUM_BAYS, APART, Area, Plan, Point
+from emgs_jax.data.plan import APART, BAY, HALF_HALL, NUM_BAYS, Area, Plan, Point
 from emgs_jax.data.raycast import level_poses
 
 SPACING = 0.07  # metres from frame to frame on a straight line
 TURN = 0.9  # a turn by one radian takes as many frames as this many metres: one walks slower round a corner
 RADIUS = 0.9  # of the corners, metres
 AROUND = 1.3  # from the middle of a table to the route around it, along x and y
+LOOK_AHEAD = 0.5  # metres: one looks into a corner before one walks round it, not at the wall behind it
 STEP = 0.01  # metres between the points of a route before it is smoothed
 EYE_HEIGHT = 1.5
 SWAY = (  # of a hand-held camera: amplitude and wave lengths in metres walked, the short ones are steps
@@ -27,7 +28,7 @@ Corners = list[Point]
 
 
 def table_of(area: Area, side: int) -> Point:
-    """Where the table stands that a walk goes around: 2.1 m from the wall at the `side` (-1 west, 1 east), or midway."""
+    """Middle of the table that a walk goes around: 2.1 m from the wall at the `side` (-1 west, 1 east), or midway."""
     (x0, y0), (x1, _) = area.low, area.high
     x = {-1: x0 + 2.1, 0: (x0 + x1) / 2, 1: x1 - 2.1}[side]
     return x, y0 + 2.15
@@ -109,12 +110,14 @@ def carry(corners: Corners, num_frames: int | None, rng: np.random.Generator) ->
     ahead = np.gradient(line, axis=0)
     walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
-    yaw = gaussian_filter1d(heading, 0.3 / STEP, mode="nearest")
+    points = np.arange(len(line))
+    seen = np.interp(points + LOOK_AHEAD / STEP, points, heading)
+    yaw = gaussian_filter1d(seen, 0.3 / STEP, mode="nearest")
     effort = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(walked), TURN * np.diff(yaw)))])
     count = 1 + int(np.ceil(effort[-1] / SPACING)) if num_frames is None else num_frames
-    place = np.interp(np.linspace(0, effort[-1], count), effort, np.arange(len(line)))
+    place = np.interp(np.linspace(0, effort[-1], count), effort, points)
     x, y, yaw, walked, heading = (
-        np.interp(place, np.arange(len(line)), values) for values in (line[:, 0], line[:, 1], yaw, walked, heading)
+        np.interp(place, points, values) for values in (line[:, 0], line[:, 1], yaw, walked, heading)
     )
     sway = {name: _sway(walked, amplitude, lengths, rng) for name, amplitude, lengths in SWAY}
     x, y = x - np.sin(heading) * sway["sideways"], y + np.cos(heading) * sway["sideways"]
