@@ -52,6 +52,7 @@ INTRINSICS = (
 SEVEN_SCENES = ("tests/data/test_seven_scenes.py", "tests/data/test_layouts.py")
 TUM = ("tests/data/test_tum.py", "tests/data/test_layouts.py")
 SYNTHETIC = ("tests/data/test_synthetic.py",)
+APARTMENT = ("tests/data/test_apartment.py",)
 TEXT = ("tests/features/test_text.py",)
 TOKENS = ("tests/features/test_tokens.py",)
 PATCHES = ("tests/features/test_patches.py",)
@@ -1555,6 +1556,27 @@ MUTANTS = (
         "< 0, -normals, normals)",
         SYNTHETIC,
         "normals face away",
+    ),
+    Mutant(
+        "emgs_jax/data/looks.py",
+        "points = points - looks.origin[objects]",
+        "points = points + 0 * looks.origin[objects]",
+        APARTMENT,
+        "copies of an object look different",
+    ),
+    Mutant(
+        "emgs_jax/data/walks.py",
+        "[(plan.west, 0.0), *lap, *lap, (plan.west, 0.5)]",
+        "[(plan.west, 0.0), *lap, *lap[::-1], (plan.west, 0.5)]",
+        APARTMENT,
+        "the second lap is walked the other way round",
+    ),
+    Mutant(
+        "emgs_jax/data/furnishing.py",
+        " and _distance(lanes, box) > LANE",
+        "",
+        APARTMENT,
+        "furniture in the way",
     ),
     # features and stacked runs
     Mutant(
