@@ -68,10 +68,10 @@ class Apartment(RayCast):
             raise ValueError(f"dataset.walk must be one of {', '.join(WALKS)}, got {walk!r}")
         sequence = f"apartment{seed}_{walk}"
         of_plan, of_scene, of_walk = np.random.default_rng(seed).spawn(3)
-        plan = draw_plan(of_plan)
-        poses = carry(WALKS[walk](plan), num_frames, of_walk)
+        self.plan = draw_plan(of_plan)
+        poses = carry(WALKS[walk](self.plan), num_frames, of_walk)
         numbers = reading.select(len(poses), start, stop, stride, f"{self.name} {sequence}")
-        super().__init__(sequence, build_apartment(plan, of_scene), poses, numbers, size, intrinsics)
+        super().__init__(sequence, build_apartment(self.plan, of_scene), poses, numbers, size, intrinsics)
 
 
 def build_apartment(plan: Plan, rng: np.random.Generator) -> Scene:

@@ -11,9 +11,11 @@ past two rooms that are the same, `APART` metres from each other, as are the pie
 the gallery, whose bays are all the same.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 
 from emgs_jax.data.furniture import Part, box, join, moved
 
@@ -141,14 +143,16 @@ def _pieces(span: Point, doors: list[float]) -> list[tuple[Point, Point]]:
     return [(piece, heights[i % 2]) for i, piece in enumerate(zip(edges[:-1], edges[1:], strict=True))]
 
 
-def _corners(piece: tuple[Point, Point], across: list[float], axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high corner of a piece of wall along an axis."""
+def _corners(piece: tuple[Point, Point], across: list[float], axis: int) -> tuple[Sequence[float], Sequence[float]]:
+    """Lowest and highest corner of an (along, height) piece of a wall along an axis."""
     (begin, end), (bottom, top) = piece
-    low, high = (begin, across[0], bottom), (end, across[1], top)
-    order = [0, 1, 2] if axis == 0 else [1, 0, 2]
-    return np.array(low)[order], np.array(high)[order]
+    near, far = across
+    if axis == 0:
+        return (begin, near, bottom), (end, far, top)
+    return (near, begin, bottom), (far, end, top)
 
 
-def _slab(low, high):
-    low, high = np.asarray(low), np.asarray(high)
-    return box(high - low, (*(low + high)[:2] / 2, low[2]))
+def _slab(low: Sequence[float], high: Sequence[float]) -> trimesh.Trimesh:
+    """Box from its lowest to its highest corner."""
+    (x, y, z), (u, v, w) = low, high
+    return box((u - x, v - y, w - z), ((x + u) / 2, (y + v) / 2, z))

@@ -32,13 +32,8 @@ def surfaces(seed: int) -> o3d.t.geometry.RaycastingScene:
     return scene
 
 
-def plan_of(seed: int) -> Plan:
-    return draw_plan(np.random.default_rng(seed).spawn(3)[0])
-
-
-def rooms(seed: int) -> tuple[Area, ...]:
+def rooms(plan: Plan) -> tuple[Area, ...]:
     """The four of the laps, and a twin."""
-    plan = plan_of(seed)
     return plan.living, plan.dining, plan.study, plan.bedroom, plan.twin
 
 
@@ -86,7 +81,7 @@ def test_the_walker_keeps_clear_of_everything_and_goes_smoothly(walk, seed):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_the_rooms_are_of_different_sizes(seed):
-    sizes = np.array([np.subtract(room.high, room.low) for room in rooms(seed)])
+    sizes = np.array([np.subtract(room.high, room.low) for room in rooms(draw_plan(np.random.default_rng(seed)))])
     assert (sizes > 3.5).all()
     assert len(np.unique(sizes.prod(axis=1).round(2))) == 5
 
@@ -95,7 +90,7 @@ def test_the_rooms_are_of_different_sizes(seed):
 def test_every_room_is_furnished(seed):
     parts = apartment(seed=seed).parts
     middles = np.array([mesh.bounds.mean(axis=0)[:2] for _, mesh in parts])
-    for room in rooms(seed):
+    for room in rooms(apartment(seed=seed).plan):
         inside = np.flatnonzero((middles > room.low).all(axis=1) & (middles < room.high).all(axis=1))
         names = {parts[i][0] for i in inside}
         assert len(names - {"wall", "floor", "ceiling", "door", "picture"}) >= 3, names
@@ -103,7 +98,7 @@ def test_every_room_is_furnished(seed):
 
 def test_a_wall_has_two_sides_and_a_doorway_has_none():
     """From the middle of the doorway's height, west and east of the wall between living and dining room."""
-    plan = plan_of(0)
+    plan = apartment().plan
     x, y = plan.north_door
     sides, inward = np.array([[x - 0.4, 0, 1.2], [x + 0.4, 0, 1.2]]), np.array([[1.0, 0, 0], [-1.0, 0, 0]])
     distances, names = cast(0, sides + [0, y + 1.0, 0], inward)
@@ -116,7 +111,7 @@ def test_two_laps_go_through_four_rooms_and_the_second_sees_what_the_first_saw()
     path = poses("two_laps")
     half = len(path) // 2
     for lap in (path[:half], path[half:]):
-        for room in rooms(0)[:4]:
+        for room in rooms(apartment().plan)[:4]:
             assert ((lap[:, :2, 3] > room.low) & (lap[:, :2, 3] < room.high)).all(axis=1).sum() > 20
     gaps, rows = nearest(path[half:], path[:half])
     assert gaps.max() < 0.3
@@ -124,7 +119,7 @@ def test_two_laps_go_through_four_rooms_and_the_second_sees_what_the_first_saw()
 
 
 def test_the_figure_of_eight_crosses_the_doorway_both_ways_and_turns_as_much_left_as_right():
-    plan, path = plan_of(0), poses("figure_of_eight")
+    plan, path = apartment().plan, poses("figure_of_eight")
     at_door = np.linalg.norm(path[:, :2, 3] - plan.north_door, axis=1) < 0.2
     visits = np.split(np.flatnonzero(at_door), np.flatnonzero(np.diff(np.flatnonzero(at_door)) > 50) + 1)
     assert [np.sign(path[visit, 0, 2].mean()) for visit in visits] == [1, -1]  # eastward, then westward
