@@ -19,6 +19,8 @@ PROVENANCE = ("tests/report/test_provenance.py",)
 DENSE = ("tests/running/test_dense.py",)
 CONVERT = ("tests/running/test_convert.py",)
 NOISE = ("tests/prior/simulated/test_noise.py",)
+DRIFT = ("tests/prior/simulated/test_simulated_drift.py",)
+COVISIBILITY = ("tests/prior/simulated/test_covisibility.py",)
 SIMULATED = ("tests/prior/simulated/test_simulated.py", "tests/prior/simulated/test_simulated_geometry.py")
 WINDOWS = ("tests/prior/test_windows.py",)
 RECORDED = ("tests/prior/test_recorded.py",)
@@ -50,6 +52,7 @@ INTRINSICS = (
 SEVEN_SCENES = ("tests/data/test_seven_scenes.py", "tests/data/test_layouts.py")
 TUM = ("tests/data/test_tum.py", "tests/data/test_layouts.py")
 SYNTHETIC = ("tests/data/test_synthetic.py",)
+APARTMENT = ("tests/data/test_apartment.py",)
 TEXT = ("tests/features/test_text.py",)
 TOKENS = ("tests/features/test_tokens.py",)
 PATCHES = ("tests/features/test_patches.py",)
@@ -732,6 +735,55 @@ MUTANTS = (
         "(current, current - 1), current)",
         WINDOWS,
         "previous and current view swapped",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/noise.py",
+        "standard_normal(inference).sum()",
+        "standard_normal(inference + 1)[inference]",
+        DRIFT,
+        "the scale is drawn anew every time",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/prior.py",
+        "return shared >= noise.min_shared",
+        "return shared >= 0 * noise.min_shared",
+        DRIFT,
+        "version 2 holds every window",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/prior.py",
+        "rotation = max(rotation, self.level * noise.unheld_rotation)",
+        "rotation = self.level * noise.unheld_rotation",
+        DRIFT,
+        "far away an unseen anchor holds better than in version 1",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/prior.py",
+        "translation = max(translation, self.level * noise.unheld_translation * distance)",
+        "translation += self.level * noise.unheld_translation",
+        DRIFT,
+        "the drift does not grow with the distance",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/covisibility.py",
+        "return max(",
+        "return min(",
+        COVISIBILITY,
+        "a detail shares next to nothing with the view that shows it",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/covisibility.py",
+        "is_same = np.abs(seen - z[inside]) <= tolerance * z[inside]",
+        "is_same = seen - z[inside] <= tolerance * z[inside]",
+        COVISIBILITY,
+        "points behind a wall are shared",
+    ),
+    Mutant(
+        "emgs_jax/prior/simulated/covisibility.py",
+        "inside = ahead & (column >= 0)",
+        "inside = (column >= 0)",
+        COVISIBILITY,
+        "what is behind the camera is shared",
     ),
     Mutant(
         "emgs_jax/prior/simulated/noise.py",
@@ -1485,25 +1537,46 @@ MUTANTS = (
         "a video's frame cannot be read again",
     ),
     Mutant(
-        "emgs_jax/data/synthetic.py",
+        "emgs_jax/data/raycast.py",
         "default = (FOCAL_PER_WIDTH * w, FOCAL_PER_WIDTH * w, (w - 1) / 2, (h - 1) / 2)",
         "default = (FOCAL_PER_WIDTH * w, FOCAL_PER_WIDTH * w, w / 2, h / 2)",
         SYNTHETIC,
         "the centre by corners, not centres",
     ),
     Mutant(
-        "emgs_jax/data/synthetic.py",
+        "emgs_jax/data/raycast.py",
         "self._labels[objects]",
         "objects.astype(np.int32)",
         SYNTHETIC,
         "objects for classes",
     ),
     Mutant(
-        "emgs_jax/data/synthetic.py",
+        "emgs_jax/data/raycast.py",
         "> 0, -normals, normals)",
         "< 0, -normals, normals)",
         SYNTHETIC,
         "normals face away",
+    ),
+    Mutant(
+        "emgs_jax/data/looks.py",
+        "points = points - looks.origin[objects]",
+        "points = points + 0 * looks.origin[objects]",
+        APARTMENT,
+        "copies of an object look different",
+    ),
+    Mutant(
+        "emgs_jax/data/walks.py",
+        "[(plan.west, 0.0), *lap, *lap, (plan.west, 0.5)]",
+        "[(plan.west, 0.0), *lap, (plan.west, 0.5)]",
+        APARTMENT,
+        "one lap for two",
+    ),
+    Mutant(
+        "emgs_jax/data/furnishing.py",
+        " and _distance(lanes, box) > LANE",
+        "",
+        APARTMENT,
+        "furniture in the way",
     ),
     # features and stacked runs
     Mutant(

@@ -97,8 +97,7 @@ def prefix_of(key: str) -> str:
 
 
 def _laid_out(metrics: Mapping[str, Any], columns: Sequence[Column]) -> str:
-    is_simulated = metrics.get("provenance", {}).get("simulated", False)
-    lines = [["simulated" if is_simulated else "", *(column.title for column in columns)]]
+    lines = [[_label(metrics.get("provenance", {})), *(column.title for column in columns)]]
     for prefix, name in ROWS.items():
         if any(prefix + column.key in metrics for column in columns):
             values = [(metrics.get(prefix + key), None, factor, digits) for key, _, factor, digits, _ in columns]
@@ -108,6 +107,14 @@ def _laid_out(metrics: Mapping[str, Any], columns: Sequence[Column]) -> str:
     widths = [max(map(len, texts)) for texts in zip(*lines, strict=True)]
     rows = ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines]
     return "\n".join([rows[0], "─" * max(map(len, rows)), *rows[1:]])
+
+
+def _label(block: Mapping[str, Any]) -> str:
+    """What a table says first: nothing of measured numbers, of simulated ones that they are and in which version."""
+    if not block.get("simulated", False):
+        return ""
+    name = (block.get("prior") or {}).get("name", "")
+    return name if name.startswith("simulated v") else "simulated"
 
 
 def _rank(key: str) -> tuple[int, int]:

@@ -121,6 +121,10 @@ def test_the_table_shows_both_rows_and_says_what_is_simulated():
     metrics = METRICS | prefixed(METRICS, RAW_PRIOR) | {"raw_prior/trajectory/ate_sim3_m": 1.5}
     table = print_metrics_table(metrics | {"provenance": a_provenance(True)}).splitlines()
     assert table[0].split()[:3] == ["simulated", "ATE", "[cm]"]
+    later = a_provenance(True) | {"prior": {"name": "simulated v2", "settings": {}}}
+    assert print_metrics_table(metrics | {"provenance": later}).split()[:3] == ["simulated", "v2", "ATE"]
+    another = a_provenance(True) | {"prior": None}  # scored from files, not run by us
+    assert print_metrics_table(metrics | {"provenance": another}).split()[:2] == ["simulated", "ATE"]
     assert table[2].split() == ["ours", "4.12", "5.00", "–", "98.8", "–", "88.0"]
     assert table[3].split() == ["raw", "prior", "150.00", "5.00", "–", "98.8", "–", "88.0"]
     assert len({len(line) for line in table}) == 1

@@ -21,6 +21,7 @@ class Stream(IntEnum):
     CONFIDENCE = 5
     FEATURE = 6
     WARP = 7  # one for each correlation length: WARP, WARP + 1, …
+    SCALE = 100  # beyond all warps
 
 
 def normals(shape: tuple[int, ...], key: tuple[int, ...]) -> np.ndarray:
@@ -50,6 +51,14 @@ def autoregressive(seed: int, inference: int, correlation: float, size: int) -> 
     weights = correlation ** np.arange(inference, -1.0, -1.0)
     weights[1:] *= math.sqrt(1 - correlation**2)
     return (weights[:, None] * innovations).sum(axis=0)
+
+
+def random_walk(seed: int, inference: int) -> float:
+    """Return the state at `inference` of a random walk of standard normal steps that starts at 0 at inference 0.
+
+    Like `autoregressive`, a sum of the beginning of one stream.
+    """
+    return float(np.random.default_rng((seed, Stream.SCALE)).standard_normal(inference).sum())
 
 
 def rigid(xi: np.ndarray, translation: float, rotation: float) -> np.ndarray:

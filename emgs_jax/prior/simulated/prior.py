@@ -1,4 +1,4 @@
-"""The `simulated` prior, version 1: true depth and poses, disturbed the way that a feed-forward model disturbs them.
+"""The `simulated` prior: true depth and poses, disturbed the way that a feed-forward model disturbs them.
 
 How the disturbances of one inference are put together:
 
@@ -10,15 +10,19 @@ How the disturbances of one inference are put together:
   no disturbance is dropped there. (The other reading, expressing that window relative to its own disturbed view 0,
   would cancel the window's pose error.) Its geometry, where it is dense, is disturbed like that of any other view.
 - *Scale* multiplies every point and every translation of the inference.
+- *Version 2* is for walks. In version 1 the anchor holds every window, so nothing ever drifts. In version 2 it holds a
+  window only while it is seen: where its view and the window's middle view share less than 5 % of their points, the
+  window's pose error, the same draw as in version 1, is that of a model without a hold: 10 % of the distance per axis
+  and 5°, where version 1 is not larger. And the log-scale takes a random walk on top. All else is version 1.
 - *Depth.* Flying points first, then the product of the smooth warps and the pixel noise, all in the logarithm of the
   depth: it stays positive and a point stays on the ray of its pixel.
 
-Every random number is drawn from a generator seeded by (seed, stream, inference, frames), so one inference alone gives
-the same bits as a whole run.
+Every random number is drawn from a generator seeded by (seed, stream, inference, frames); what goes on over inferences
+is a sum of the beginning of one stream. So one inference alone gives the same bits as a whole run.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -28,15 +32,19 @@ from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.features.text import random_embeddings
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
+from emgs_jax.prior.simulated.covisibility import shared_points
 from emgs_jax.prior.simulated.noise import (
     Stream,
     autoregressive,
     edge_band,
     normals,
+    random_walk,
     rigid,
     shared_normals,
     smooth_field,
 )
+
+VERSIONS = (1, 2)
 
 
 @dataclass(frozen=True)
@@ -47,6 +55,12 @@ class Standard:
     window_translation: float = 0.015
     window_rotation: float = math.radians(0.5)
     autocorrelation: float = 0.9  # of scale and window pose, from one inference to the next
+    min_shared: float = 0.05  # version 2: of the points of anchor and middle view; with less the anchor has no hold
+    shared_tolerance: float = 0.05  # relative difference in depth of what counts as one point
+    shared_columns: int = 80  # points across the image that are looked at
+    unheld_translation: float = 0.1  # of the distance between anchor and middle camera
+    unheld_rotation: float = math.radians(5.0)
+    scale_walk: float = 0.003  # version 2: step of the log-scale from one inference to the next
     pair_translation: float = 0.01
     pair_rotation: float = math.radians(0.3)
     image_share: float = 0.7  # of the variance of walk and warp: belongs to the images; the rest to the inference
@@ -72,20 +86,32 @@ class Simulated(Prior):
         seed: a different one gives a different draw of all disturbances.
         feature_size: width f of the features, used where there are classes.
         classes: names of the data set's labels (`Dataset.classes`); without them features have width 0.
+        version: 1 = the anchor holds every window, so that nothing drifts; 2 = only windows that it shares points with.
     """
 
     def __init__(
-        self, level: float | int = 1.0, seed: int = 0, feature_size: int = 16, classes: Sequence[str] = ()
+        self,
+        level: float | int = 1.0,
+        seed: int = 0,
+        feature_size: int = 16,
+        classes: Sequence[str] = (),
+        version: int = 1,
     ) -> None:
+        if version not in VERSIONS:
+            raise ValueError(
+                f"prior.version must be 1 (no drift) or 2 (drifts beyond the anchor's view), got {version}"
+            )
         if not (math.isfinite(level) and level >= 0):
             raise ValueError(f"prior.level must be finite and at least 0 (0 is an exact prior), got {level}")
         if seed < 0 or feature_size < 1:
             raise ValueError(f"prior.seed must be ≥ 0 and prior.feature_size ≥ 1, got {seed} and {feature_size}")
-        self.level, self.seed, self.standard = float(level), int(seed), Standard()
+        self.level, self.seed, self.version, self.standard = float(level), int(seed), int(version), Standard()
         self.feature_names = tuple(classes)
         self.text_features = random_embeddings(self.feature_names, feature_size)
-        settings = {"version": 1, "level": self.level, "seed": self.seed, "feature_size": self.text_features.shape[1]}
-        self.provenance = Provenance("simulated", settings, is_simulated=True)
+        settings = {"version": self.version, "level": self.level, "seed": self.seed}
+        settings |= {"feature_size": self.text_features.shape[1]}
+        name = "simulated" if self.version == 1 else f"simulated v{self.version}"
+        self.provenance = Provenance(name, settings, is_simulated=True)
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Raise ValueError, before any work is done, where the data set has no truth to disturb."""
@@ -94,26 +120,47 @@ class Simulated(Prior):
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Disturb the truth of `frames` (in the order of `window.views`); see the module for how."""
-        by_index = check_frames(window, frames)
+        compared = () if self.version == 1 else (window.views[0], window.views[_middle(window)])
+        by_index = check_frames(window, frames, {*window.dense, *compared})
         drift = autoregressive(self.seed, window.inference, self.standard.autocorrelation, 7)
         scale = math.exp(self.level * self.standard.scale * drift[0])
-        T_anchor_view = self._poses(window, [frame.T_world_camera for frame in frames], drift[1:])
+        if self.version == 2:
+            scale *= math.exp(self.level * self.standard.scale_walk * random_walk(self.seed, window.inference))
+        is_held = self.version == 1 or self._is_held(frames[0], frames[_middle(window)], intrinsics)
+        T_anchor_view = self._poses(window, [frame.T_world_camera for frame in frames], drift[1:], is_held)
         T_anchor_view[:, :3, 3] *= scale
         views = [self._geometry(window.inference, by_index[index], intrinsics, scale) for index in window.dense]
         points, confidence, mask = (np.stack(parts) for parts in zip(*views, strict=True))
         features = np.stack([self._features(window.inference, by_index[index]) for index in window.dense])
         return PriorPrediction(window, T_anchor_view, points, confidence, mask, features)
 
-    def _poses(self, window: Window, truth: Sequence[np.ndarray], drift: np.ndarray) -> np.ndarray:
-        """Return the disturbed camera -> anchor poses (v, 4, 4), before the scale; `drift` (6,) has unit variance."""
+    def _is_held(self, anchor: Frame, middle: Frame, intrinsics: Sequence[float]) -> bool:
+        """Whether the anchor and the window's middle view share enough for the anchor to hold the window."""
+        noise = self.standard
+        shared = shared_points(anchor, middle, intrinsics, noise.shared_tolerance, noise.shared_columns)
+        return shared >= noise.min_shared
+
+    def _poses(self, window: Window, truth: Sequence[np.ndarray], drift: np.ndarray, is_held: bool) -> np.ndarray:
+        """Return the disturbed camera -> anchor poses (v, 4, 4), before the scale.
+
+        Args:
+            window: the question.
+            truth: T_world_camera of its views.
+            drift: (6,), of unit variance: the window's pose error.
+            is_held: by the anchor.
+        """
         noise, views = self.standard, window.views
         T_true = np.linalg.inv(np.asarray(truth[0], np.float64)) @ np.asarray(truth, np.float64)
         T_out = np.tile(np.eye(4), (len(views), 1, 1))
         if len(views) == 1:
             return T_out
-        middle = 1 + (len(views) - 1) // 2
-        reach = self.level * (1 + np.linalg.norm(T_true[middle, :3, 3]))
-        T_out[middle] = T_true[middle] @ rigid(drift, reach * noise.window_translation, reach * noise.window_rotation)
+        middle, distance = _middle(window), np.linalg.norm(T_true[_middle(window), :3, 3])
+        reach = self.level * (1 + distance)
+        translation, rotation = reach * noise.window_translation, reach * noise.window_rotation
+        if not is_held:
+            translation = max(translation, self.level * noise.unheld_translation * distance)
+            rotation = max(rotation, self.level * noise.unheld_rotation)
+        T_out[middle] = T_true[middle] @ rigid(drift, translation, rotation)
         for left in range(middle, len(views) - 1):
             T_out[left + 1] = T_out[left] @ self._pair(window, left, T_true)
         for left in range(middle - 1, 0, -1):
@@ -195,8 +242,19 @@ def _no_truth(what: str) -> str:
     return f"prior=simulated needs a data set with ground truth; use prior=recorded or another data set: {what}"
 
 
-def check_frames(window: Window, frames: Sequence[Frame]) -> dict[int, Frame]:
-    """Return the frames by index; raise ValueError naming the first one whose truth cannot be used."""
+def _middle(window: Window) -> int:
+    """Place in `window.views` of the middle of the views after the anchor; of a lone view its own."""
+    return min(1 + (len(window.views) - 1) // 2, len(window.views) - 1)
+
+
+def check_frames(window: Window, frames: Sequence[Frame], needed: Collection[int]) -> dict[int, Frame]:
+    """Return the frames by index; raise ValueError naming the first one whose truth cannot be used.
+
+    Args:
+        window: the question.
+        frames: of its views.
+        needed: indices of the frames whose depth is looked at.
+    """
     indices = tuple(frame.index for frame in frames)
     if indices != window.views:
         raise ValueError(f"frames must be those of window.views {window.views} in that order, got {indices}")
@@ -206,7 +264,7 @@ def check_frames(window: Window, frames: Sequence[Frame]) -> dict[int, Frame]:
             raise ValueError(_no_truth(f"{label} has no true pose"))
         if np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
             raise ValueError(f"the true pose of {label} must be a finite (4, 4) matrix: leave the frame out")
-        if frame.index in window.dense and depth is None:
+        if frame.index in needed and depth is None:
             raise ValueError(_no_truth(f"{label} has no depth"))
         if depth is not None and depth.shape != frame.image.shape[:2]:
             raise ValueError(

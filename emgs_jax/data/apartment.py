@@ -1,0 +1,138 @@
+"""A furnished apartment to walk through, ray-cast: long walks, loops and what is easily mistaken for a loop."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from emgs_jax.data import furniture, reading, room
+from emgs_jax.data.furnishing import at_wall, furnish
+from emgs_jax.data.furniture import Part, moved
+from emgs_jax.data.looks import copied, draw_looks
+from emgs_jax.data.plan import (
+    APART,
+    BAY,
+    EAST,
+    HALF_HALL,
+    HEIGHT,
+    NORTH,
+    NUM_BAYS,
+    WALL,
+    WEST,
+    Plan,
+    draw_plan,
+    lining,
+    shell,
+)
+from emgs_jax.data.raycast import RayCast, Scene
+from emgs_jax.data.reading import Number
+from emgs_jax.data.walks import RADIUS, WALKS, carry, rounded, table_of
+
+Copies = list[Float[np.ndarray, " 3"]]  # where the copies of a group of objects stand, from where it was built
+
+
+class Apartment(RayCast):
+    """Six furnished rooms, a hall and a gallery, walked through at eye level: 7 cm a frame, less round a corner.
+
+    Args:
+        seed: rooms, furniture and colours, the same for every walk.
+        walk: two_laps through four rooms; figure_of_eight through a doorway; out_and_back, which sees everything from
+            the other side; twin_rooms, two that look alike; corridor, which looks the same every 3 m.
+        num_frames: images along the walk, which stays the same; None = 7 cm apart, some 280 to 560.
+        start, stop, stride: which of these images.
+        size: (width, height).
+        intrinsics: fx, fy, cx, cy at `size`; None = .82 times the width and the centre.
+    """
+
+    name = "apartment"
+    classes = (*room.CLASSES, "door", "bed", "plant")
+    version = 1
+
+    def __init__(
+        self,
+        seed: int = 0,
+        walk: str = "two_laps",
+        num_frames: int | None = None,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        size: Sequence[int] = (320, 240),
+        intrinsics: Sequence[Number] | None = None,
+    ) -> None:
+        if seed < 0 or (num_frames is not None and num_frames < 1):
+            raise ValueError(
+                "dataset.seed must be 0 or more and dataset.num_frames 1 or more, or null (7 cm from frame to frame), "
+                f"got {seed}, {num_frames}"
+            )
+        if walk not in WALKS:
+            raise ValueError(f"dataset.walk must be one of {', '.join(WALKS)}, got {walk!r}")
+        sequence = f"apartment{seed}_{walk}"
+        of_plan, of_scene, of_walk = np.random.default_rng(seed).spawn(3)
+        self.plan = draw_plan(of_plan)
+        poses = carry(WALKS[walk](self.plan), num_frames, of_walk)
+        numbers = reading.select(len(poses), start, stop, stride, f"{self.name} {sequence}")
+        super().__init__(sequence, build_apartment(self.plan, of_scene), poses, numbers, size, intrinsics)
+
+
+def build_apartment(plan: Plan, rng: np.random.Generator) -> Scene:
+    """All objects and their looks; what stands more than once looks the same each time."""
+    lanes = np.concatenate([rounded(walk(plan), RADIUS) for walk in WALKS.values()])
+    groups: list[tuple[list[Part], Copies]] = [
+        (_rooms(plan, lanes, rng), [np.zeros(3)]),
+        (_twin(plan, lanes, rng), [np.array([shift, 0.0, 0.0]) for shift in (0.0, APART)]),
+        (_bay(plan, rng), [np.array([0.0, shift, 0.0]) for shift in BAY * np.arange(NUM_BAYS)]),
+    ]
+    parts, rows, shifts, first = [], [], [], 0
+    for group, copies in groups:
+        for shift in copies:
+            parts += moved(group, shift)
+            rows += range(first, first + len(group))
+            shifts += [shift] * len(group)
+        first += len(group)
+    looks = draw_looks([part for group, _ in groups for part in group], rng)
+    return Scene(parts, copied(looks, np.array(rows), np.array(shifts)))
+
+
+def _rooms(plan: Plan, lanes: Float[np.ndarray, "p 2"], rng: np.random.Generator) -> list[Part]:
+    """Everything that is there once."""
+    f, pictures = furniture, [furniture.picture] * 4
+    dining = moved(f.table_with_chairs(rng), np.array([*table_of(plan.dining, 1), 0.0]))
+    living = moved(f.low_table(rng), np.array([*table_of(plan.living, -1), 0.0]), np.pi / 2)
+    inside = {
+        plan.living: ([f.sofa, f.shelf, f.cabinet, f.plant, f.lamp, *pictures], living),
+        plan.dining: ([f.cabinet, f.shelf, f.sofa, f.plant, f.ball, *pictures], dining),
+        plan.study: ([f.desk, f.shelf, f.shelf, f.boxes, f.lamp, f.ball, *pictures], []),
+        plan.bedroom: ([f.bed, f.cabinet, f.desk, f.lamp, f.plant, f.boxes, *pictures], []),
+        plan.hall: ([f.shelf, f.shelf, *pictures], []),
+        plan.corner: ([f.picture, f.picture], []),
+        plan.end: ([f.plant, f.picture], []),
+    }
+    parts = [part for area in inside for part in shell(area)]
+    for area, (pieces, middle) in inside.items():
+        parts += furnish(area, pieces, middle, lanes, rng)
+    middle = HALF_HALL + WALL
+    doorways = [(EAST, plan.north_door), (EAST, plan.south_door)]
+    doorways += [(NORTH, (x, y)) for x in (plan.west, plan.east) for y in (middle, -middle)]
+    return parts + [part for wall, at in doorways for part in lining(wall, at)]
+
+
+def _twin(plan: Plan, lanes: Float[np.ndarray, "p 2"], rng: np.random.Generator) -> list[Part]:
+    """The western twin room and the hall before it."""
+    f, pictures = furniture, [furniture.picture] * 4
+    middle = moved(f.table_with_chairs(rng), np.array([*table_of(plan.twin, 0), 0.0]))
+    parts = shell(plan.twin) + shell(plan.twin_bay) + lining(NORTH, (plan.twin_door, HALF_HALL + WALL))
+    parts += furnish(plan.twin, [f.sofa, f.desk, f.shelf, f.cabinet, f.lamp, f.plant, *pictures], middle, lanes, rng)
+    return parts + furnish(plan.twin_bay, [_closed_door, *pictures, *pictures], [], lanes, rng)
+
+
+def _bay(plan: Plan, rng: np.random.Generator) -> list[Part]:
+    """The first bay of the gallery: a closed door, a picture opposite and a lamp above."""
+    x, y = (plan.bay.low[0] + plan.bay.high[0]) / 2, (plan.bay.low[1] + plan.bay.high[1]) / 2
+    walls = rng.permutation([EAST, WEST]).tolist()
+    parts = shell(plan.bay) + at_wall(_closed_door(rng), plan.bay, walls[0], 0.5)
+    parts += at_wall(furniture.picture(rng), plan.bay, walls[1], 0.5)
+    return parts + furniture.ceiling_lamp((x, y), HEIGHT)
+
+
+def _closed_door(rng: np.random.Generator) -> list[Part]:
+    return furniture.closed_door(rng.uniform(0.85, 0.95), rng.uniform(2.0, 2.1))
