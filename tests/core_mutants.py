@@ -40,7 +40,7 @@ OPS = [
     *own("ops/neighbours", "ops/test_neighbours")(
         ("distance_sq[-1] <= nearest_sq", "distance_sq[0] <= nearest_sq", "the search ends with the nearest"),
         ("jnp.where(valid[:, None], points, jnp.inf)[order]", "points[order]", "invalid points are neighbours"),
-        ("jnp.maximum(ranks[-1] - capacity, 0)", "ranks[-1] - capacity", "free places count as a negative overflow"),
+        ("jnp.maximum(count - capacity, 0)", "count - capacity", "free places count as a negative overflow"),
     ),
     *own("ops/pytree", "ops/test_pytree")(
         ('set(value, mode="drop")', 'set(value, mode="clip")', "a row past the end overwrites the last"),
@@ -259,6 +259,16 @@ STAGES = [
         (">= config.min_normal_cos", ">= -1.0", "both sides of a panel"),
         ("(noise**2)[:, None, None]", "noise[:, None, None]", "a deviation for a variance"),
     ),
+    *own("splitting", "test_splitting")(
+        ("jnp.any(responsibilities > 0, axis=-1)", "responsibilities[:, 0] >= 0", "points that nothing explains"),
+        ("count >= config.min_points * spacing", "count >= spacing", "a view from as far"),
+        ("height_sq - height**2 >", "height_sq >", "an offset of all points"),
+        ("(noise_sq + config.min_std**2)", "config.min_std**2", "what is within the noise"),
+        ("covs - 2 / jnp.pi * outer(step)", "covs - outer(step)", "a covariance without its spread"),
+        ("covs, 0.5 * map.weight)", "covs, map.weight)", "the weight twice"),
+        ("exists &= variance >= config.min_std**2", "", "halves of a floor"),
+        (")[..., 0]\n    axes =", ")[..., 1]\n    axes =", "across the shorter axis"),
+    ),
     *own("semantics", "test_semantics")(
         ("safe_normalize(gaussians.features) @", "gaussians.features @", "features by their length"),
         ("gaussians.valid & has_feature", "has_feature", "free rows have a class"),
@@ -267,8 +277,8 @@ STAGES = [
         ("SlamState(map, aligned, T), info", "SlamState(map, trusted, T), info", "a rejected frame is no previous one"),
         ("view = downscale(camera, thin)", "view = camera", "the full camera for the thinned rows"),
         (
-            "camera, thin), spacing(camera, thin, config.fit)",
-            "camera, thin), spacing(camera, 1, config.fit)",
+            "rows_each = spacing(camera, thin, config.fit)",
+            "rows_each = spacing(camera, 1, config.fit)",
             "λ in rows",
         ),
         ("aligned.valid & localization.is_tracked", "aligned.valid", "a frame that is not tracked is mapped"),

@@ -6,7 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from emgs_jax.em import e_step, m_step, precision
-from emgs_jax.gaussian_map import insert, new_map, select_submap, write_back
+from emgs_jax.existence import join_layers, judge
+from emgs_jax.gaussian_map import confirmed, insert, new_map, select_submap, write_back
 from emgs_jax.gaussians import cluster, spacing
 from emgs_jax.localization import localize_coarse, localize_fine
 from emgs_jax.observation import observe, transform
@@ -15,6 +16,7 @@ from emgs_jax.ops.clustering import morton_order
 from emgs_jax.refinement import refine
 from emgs_jax.render.composite import render
 from emgs_jax.slam import step
+from emgs_jax.splitting import split
 
 from .data import Data, first_state
 from .timing import Candidate, Timing, called, executable, interleaved
@@ -41,18 +43,24 @@ def time_stages(data: Data, repetitions: int) -> list[Timing]:
     guess = transform(coarse.T_world_camera, prediction.current, coarse.scale)
     clouds = state.previous, guess
     submap, rows, _ = stage("submap", select_submap, state.map, clouds, config.submap)
-    fine = prediction.current, submap.gaussians, coarse, config.localization
+    fine = prediction.current, confirmed(submap), coarse, config.localization
     T, aligned, localization = stage("localize, fine", localize_fine, *fine)
     noise = localization.noise[:, None] * (aligned.points - T.translation())
     steps, _ = stage("E-step", e_step, submap.gaussians, aligned, noise, config.em)
     stage("M-step", m_step, submap.gaussians, aligned, precision(noise, config.em), steps, config.em)
+    num_rows = spacing(data.camera, thin, config.fit)
+    explained = steps.rows, steps.responsibilities
+    stage("split", split, submap, aligned, noise, explained, num_rows, config.splitting)
     rest = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & ~steps.is_fused)
     order = morton_order(camera.height, camera.width)
-    num_rows = spacing(data.camera, thin, config.fit)
     candidates_new, weight = stage("new Gaussians", cluster, rest, order, num_rows, config.fit)
     submap, fresh, _ = stage("refine", refine, submap, candidates_new, T, camera, config.refinement)
     drawn = submap.gaussians, submap.gaussians.colors, T, camera, config.refinement.render
     stage("render", render, *drawn)
+    look = T, camera, localization.depth_noise, config.existence
+    _, is_seen = stage("judge", judge, state.map, aligned, *look)
+    seen = is_seen[jnp.minimum(rows, is_seen.shape[0] - 1)]
+    stage("join layers", join_layers, submap, seen, T, localization.depth_noise, config.existence)
     add = lambda m, s, r, f, w: insert(write_back(m, s, r), new_map(f, w, jnp.zeros(())))  # noqa: E731
     stage("insert", add, state.map, submap, rows, fresh, weight)
     candidates["whole step"] = called(step, state, prediction, data.camera, config)
