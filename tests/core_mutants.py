@@ -282,7 +282,7 @@ STAGES = [
             "λ in rows",
         ),
         ("aligned.valid & localization.is_tracked", "aligned.valid", "a frame that is not tracked is mapped"),
-        ("trusted.valid & ~is_fused", "trusted.valid", "fused points become Gaussians, too"),
+        ("trusted.valid & ~explained.is_fused", "trusted.valid", "fused points become Gaussians, too"),
         ("(trusted.points - T.translation())", "trusted.points", "the noise along rays from the world's origin"),
         ("judge(write_back(map, submap, rows)", "judge(map", "the submap is not put back"),
         (
