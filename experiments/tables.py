@@ -99,20 +99,25 @@ def _table(estimates: Sequence[Estimate], titles: Mapping[str, str]) -> str:
 
 
 def _better(estimates: Sequence[Estimate]) -> str:
-    """For each setting and metric, in how many runs ours is better than the raw prior."""
+    """For each setting, other estimate and metric, in how many runs ours is better."""
     variants: dict[str, dict[Path, dict[str, Estimate]]] = {}
     for item in estimates:
         variants.setdefault(item.variant, {}).setdefault(item.folder, {})[item.kind] = item
     lines = []
     for variant, runs in variants.items():
-        counts = ", ".join(f"{column.title.split(' [')[0]} {_count(runs.values(), column)}" for column in COLUMNS)
-        lines.append(f"Runs of {len(runs)} in which ours is better than the raw prior ({variant}): {counts}.")
+        for kind in dict.fromkeys(kind for run in runs.values() for kind in run if kind != "ours"):
+            counts = [(column.title.split(" [")[0], _count(runs.values(), kind, column)) for column in COLUMNS]
+            shown = ", ".join(f"{title} {count}" for title, count in counts if count is not None)
+            lines.append(f"Runs of {len(runs)} in which ours is better than {kind} ({variant}): {shown}.")
     return "\n\n".join(lines)
 
 
-def _count(runs: Iterable[Mapping[str, Estimate]], column: Column) -> int:
+def _count(runs: Iterable[Mapping[str, Estimate]], kind: str, column: Column) -> int | None:
+    """None where one of the two has no such value in any run."""
+    pairs = [[run[name].values.get(column.key) for name in ("ours", kind)] for run in runs if kind in run]
+    pairs = [pair for pair in pairs if None not in pair]
     sign = 1 if column.is_lower_better else -1
-    return sum(sign * (run["ours"].values[column.key] - run["raw prior"].values[column.key]) < 0 for run in runs)
+    return sum(sign * (ours - other) < 0 for ours, other in pairs) if pairs else None
 
 
 def write_blocks(page: Path, blocks: Mapping[str, str]) -> None:
