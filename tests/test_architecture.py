@@ -17,7 +17,7 @@ CORE_ROOMS = (
     *("ops", "observation", "gaussians", "gaussian_map", "registration", "render"),
     *("initialization", "localization", "em", "splitting", "refinement", "existence", "semantics", "slam"),
 )
-HOST = ("io", "data", "features", "prior", "evaluation", "running", "report")
+HOST = ("io", "data", "features", "keypoints", "graph", "prior", "evaluation", "running", "report")
 STAGES = {"initialization", "localization", "em", "splitting", "refinement", "existence", "semantics"}
 HOST_PACKAGES = {"numpy", "cv2", "open3d", "trimesh", "matplotlib", "scipy", "torch", "tqdm", "hydra", "omegaconf"}
 MAX_FUNCTION_LINES, MAX_FILE_LINES = 60, 300
