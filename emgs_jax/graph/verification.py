@@ -11,7 +11,7 @@ from enum import StrEnum
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from emgs_jax.graph.appearance import Keyframe, unit_descriptors
 from emgs_jax.graph.two_views import (
@@ -103,7 +103,7 @@ class Neighbour:
 
     Args:
         T_candidate_neighbour: camera neighbour -> camera candidate, in units of the candidate's inference.
-        log_ratio: log of the candidate's unit over the neighbour's (σ_neighbour - σ_candidate); 0 where both are metric.
+        log_ratio: σ_neighbour - σ_candidate, where a length of an inference times e^σ is metric; 0 where both are.
     """
 
     keyframe: Keyframe
