@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float16, Float32, Int, UInt8
 
 from emgs_jax.keypoints import sift
 
@@ -27,6 +27,7 @@ class AppearanceConfig:
         min_contrast: of a keypoint (SIFT).
         max_depth_step: between the depths of the four pixels around a keypoint, relative to the smallest; where it is
             larger a depth between them would lie on no surface.
+        grid: columns and rows of the depths that are kept.
         num_words: of the vocabulary.
         max_training: descriptors that it is trained on.
         num_iterations: of k-means.
@@ -41,6 +42,7 @@ class AppearanceConfig:
     num_features: int
     min_contrast: float
     max_depth_step: float
+    grid: tuple[int, int]
     num_words: int
     max_training: int
     num_iterations: int
@@ -60,7 +62,7 @@ class AppearanceConfig:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """What is kept of an image to know its place again; some 75 kB with 500 keypoints.
+    """What is kept of an image to know its place again; some 85 kB with 500 keypoints and 80 by 60 depths.
 
     Args:
         frame: its number.
@@ -69,6 +71,7 @@ class Keyframe:
         points: of the keypoints in the camera's own frame, units of its own inference; NaN without depth.
         intrinsics: fx, fy, cx, cy in pixels.
         size: width and height of the image.
+        depths: z at the centres of the cells of a regular grid over the image, units of the inference; 0 without depth.
     """
 
     frame: int
@@ -77,6 +80,7 @@ class Keyframe:
     points: Float32[np.ndarray, "n 3"]
     intrinsics: tuple[float, float, float, float]
     size: tuple[int, int]
+    depths: Float16[np.ndarray, "y x"]
 
 
 @dataclass(frozen=True)
@@ -125,7 +129,20 @@ def describe(
     pixels, descriptors = np.float32(pixels[: config.num_features]), descriptors[: config.num_features]
     as_bytes = np.uint8(np.clip(np.round(BYTES_PER_UNIT * descriptors), 0, 255))
     at_pixels = _interpolated(points, mask, pixels, config.max_depth_step)
-    return Keyframe(frame, pixels, as_bytes, at_pixels, tuple(map(float, intrinsics)), image.shape[1::-1])
+    depths = _sampled(np.where(mask, points[..., 2], 0.0), config.grid)
+    return Keyframe(frame, pixels, as_bytes, at_pixels, tuple(map(float, intrinsics)), mask.shape[::-1], depths)
+
+
+def grid_pixels(size: tuple[int, int], grid: tuple[int, int]) -> tuple[Int[np.ndarray, " x"], Int[np.ndarray, " y"]]:
+    """The pixels nearest to the centres of a grid's columns and rows over an image of this width and height."""
+    x, y = (np.int64((np.arange(cells) + 0.5) * pixels / cells) for cells, pixels in zip(grid, size, strict=True))
+    return x, y
+
+
+def _sampled(depth: np.ndarray, grid: tuple[int, int]) -> Float16[np.ndarray, "y x"]:
+    """Depth (h, w) at the centres of a grid."""
+    x, y = grid_pixels(depth.shape[::-1], grid)
+    return np.float16(depth[np.ix_(y, x)])
 
 
 def _interpolated(
