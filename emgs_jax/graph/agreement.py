@@ -1,7 +1,9 @@
 """Do loops fit each other, and what the graph knows already?
 
-By appearance two rooms that are furnished alike are one place, and all loops between them agree on the same correction.
-Only what the path says can refuse them: that the camera did not go back to where it was, as far as that is known.
+By appearance two rooms that are furnished alike are one place, and all loops between them agree on one correction. Where
+any two keyframes that it brings together see through each other's surfaces, as at the end of the hall before the rooms,
+it is wrong as a whole, also where nothing is seen of that. Where there is no such view, only the path is left: that the
+camera cannot have come back, as far as that is known.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,6 +26,7 @@ class AgreementConfig:
         max_distance: between where they put one query.
         max_turn_deg: likewise.
         min_others: loops, each of another query, that a loop needs.
+        max_contradicted: queries whose loops are contradicted and imply the same correction, whenever they were.
     """
 
     max_query_gap: int
@@ -31,6 +34,7 @@ class AgreementConfig:
     max_distance: float
     max_turn_deg: float
     min_others: int
+    max_contradicted: int
 
 
 def is_consistent(innovation: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], num_std: float) -> bool:
@@ -57,28 +61,39 @@ def is_consistent(innovation: Float[np.ndarray, " d"], covariance: Float[np.ndar
 
 def agreeing(
     loops: Sequence[LoopMeasurement],
+    contradicted: Sequence[LoopMeasurement],
     poses: Mapping[int, Float[np.ndarray, "4 4"]],
     log_scales: Mapping[int, float],
     config: AgreementConfig,
 ) -> Bool[np.ndarray, " n"]:
     """Which loops have enough others, of nearby queries to nearby candidates, that imply the same correction.
 
-    A false match of repeating texture is alone, or one of many that all say something else. Where a whole place repeats
-    they agree: see the top of this file.
+    And not more than a few contradicted ones: see the top of this file. A false match of repeating texture is alone, or
+    one of many that all say something else.
 
     Args:
+        contradicted: `VerifyInfo.contradicted` of those that were refused.
         poses: T_world_camera of every frame of a loop, as they are now.
         log_scales: σ of these: a length of the inference times e^σ is one of the map.
     """
-    implied = {id(loop): poses[loop.a] @ rescaled(loop.Z_a_b, np.exp(log_scales[loop.a])) for loop in loops}
+
+    def implied(loop: LoopMeasurement) -> Float[np.ndarray, "4 4"]:
+        return poses[loop.a] @ rescaled(loop.Z_a_b, np.exp(log_scales[loop.a]))
 
     def says_the_same(one: LoopMeasurement, other: LoopMeasurement) -> bool:
-        if abs(one.b - other.b) > config.max_query_gap or abs(one.a - other.a) > config.max_candidate_gap:
-            return False
         # The correction of the other, T_implied T_now⁻¹, applied to this query.
-        corrected = implied[id(other)] @ np.linalg.inv(poses[other.b]) @ poses[one.b]
-        distance, turn = gap_between(corrected, implied[id(one)])
+        corrected = implied(other) @ np.linalg.inv(poses[other.b]) @ poses[one.b]
+        distance, turn = gap_between(corrected, implied(one))
         return distance <= config.max_distance and turn <= config.max_turn_deg
 
-    supporters = [{other.b for other in loops if other.b != one.b and says_the_same(one, other)} for one in loops]
-    return np.array([len(queries) >= config.min_others for queries in supporters], bool)
+    def is_near(one: LoopMeasurement, other: LoopMeasurement) -> bool:
+        return abs(one.b - other.b) <= config.max_query_gap and abs(one.a - other.a) <= config.max_candidate_gap
+
+    def is_agreed(loop: LoopMeasurement) -> bool:
+        others = {
+            other.b for other in loops if other.b != loop.b and is_near(loop, other) and says_the_same(loop, other)
+        }
+        against = {other.b for other in contradicted if says_the_same(loop, other)}
+        return len(others) >= config.min_others and len(against) <= config.max_contradicted
+
+    return np.array([is_agreed(loop) for loop in loops], bool)

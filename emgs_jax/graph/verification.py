@@ -1,100 +1,42 @@
-"""Is a candidate the query's place, and where exactly is the one camera from the other? Gates, the cheap ones first.
+"""Is a candidate the query's place? Two keyframes that show the same, others that say so too, and none that objects.
 
-What passes all gates may still be wrong: two rooms that are furnished alike, or a corridor that repeats, are the same
-place to everything that looks at these images only. What tells them apart is in `agreement`.
+What passes all gates may still be wrong: by appearance two rooms that are furnished alike are one place. What tells them
+apart is in `agreement`.
 """
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
-from emgs_jax.graph.appearance import Keyframe, unit_descriptors
-from emgs_jax.graph.two_views import (
-    MAD_TO_STD,
-    Pairs,
-    RefineConfig,
-    Similarity,
-    gap_between,
-    log_ratios,
-    refine,
-    rescaled,
-)
-from emgs_jax.keypoints.poses import calibration, essential, pose_of
-from emgs_jax.keypoints.sift import mutual
-
-MIN_POSE = 6  # points that a pose needs
-
-
-class Gate(StrEnum):
-    """What refuses a candidate, in the order in which it is asked."""
-
-    MATCHES = "matches"  # too few that fit an essential matrix
-    MATCH_SHARE = "match_share"  # too many that do not
-    POSE = "pose"  # too few points of the one fit the image of the other
-    POSES_DISAGREE = "poses_disagree"  # found from the points of the one, and of the other
-    HULL = "hull"  # seen in a small part of an image
-    COLLINEAR = "collinear"
-    SMALL = "small"  # all on one small object
-    DEPTHS = "depths"  # their ratios scatter
-    SCALE = "scale"  # not that of a metric prior
-    NEIGHBOURS = "neighbours"  # too few of the candidate's neighbours were verified
-    NEIGHBOURS_DISAGREE = "neighbours_disagree"
+from emgs_jax.graph.alignment import Aligned, AlignmentConfig, Gate, RefusedError, align, require
+from emgs_jax.graph.appearance import Keyframe
+from emgs_jax.graph.contradiction import contradicted_share
+from emgs_jax.graph.two_views import gap_between, rescaled
 
 
 @dataclass(frozen=True)
 class VerificationConfig:
-    """Thresholds of the gates; lengths in units of the candidate's inference, errors in pixels.
+    """Thresholds beyond those of two keyframes; lengths in units of the candidate's inference.
 
     Args:
-        max_ratio: distance to the best descriptor over that to the second.
-        max_epipolar_error: of a match that fits the essential matrix.
-        min_matches: that fit it.
-        min_match_share: of all mutual matches.
-        max_reprojection_error: of a point that fits a pose.
-        min_pose_points: that fit, in either direction.
-        max_pose_gap: between the poses of the two directions, times the median depth.
-        max_pose_turn_deg: between these.
-        min_hull: of the points in either image, share of its area.
-        min_flatness: second standard deviation of the points over the first: 0 on a line.
-        min_extent: between the 5 % and the 95 % quantile along one of the axes.
-        max_depth_scatter: standard deviation of the points' log depth ratio (from the MAD).
-        scale_std: of the prior's log-scale; the ratio of two may be 3 √2 times that. Infinite without a metric prior.
+        alignment: of query and candidate, and of query and each neighbour.
         min_neighbours: of the candidate that must be verified too.
         max_neighbour_gap, max_neighbour_distance: the camera may be elsewhere by this times the median depth plus this.
         max_neighbour_turn_deg: between the poses by way of candidate and neighbour.
-        refine: the final pose.
+        max_contradicted: share of the surface that both show which stands where the other looks through.
+        contradiction_margin: share of the depth by which it must be in the way.
     """
 
-    max_ratio: float
-    max_epipolar_error: float
-    min_matches: int
-    min_match_share: float
-    max_reprojection_error: float
-    min_pose_points: int
-    max_pose_gap: float
-    max_pose_turn_deg: float
-    min_hull: float
-    min_flatness: float
-    min_extent: float
-    max_depth_scatter: float
-    scale_std: float
+    alignment: AlignmentConfig
     min_neighbours: int
     max_neighbour_gap: float
     max_neighbour_distance: float
     max_neighbour_turn_deg: float
-    refine: RefineConfig
-
-    def __post_init__(self) -> None:
-        if min(self.min_matches, self.min_pose_points) < MIN_POSE:
-            raise ValueError(
-                f"min_matches and min_pose_points must be {MIN_POSE} or more, which a pose needs; "
-                f"got {self.min_matches}, {self.min_pose_points}"
-            )
+    max_contradicted: float
+    contradiction_margin: float
 
 
 @dataclass(frozen=True)
@@ -139,22 +81,13 @@ class VerifyInfo:
     Args:
         refused_by: the first gate that it did not pass; None if accepted.
         measured: what that gate compares with its threshold; NaN if accepted.
+        contradicted: what was measured, if it is wrong by what the cameras see and not by what matches: evidence against
+            all loops that imply the same correction.
     """
 
     refused_by: Gate | None = None
     measured: float = float("nan")
-
-
-class _RefusedError(Exception):
-    def __init__(self, gate: Gate, measured: float) -> None:
-        self.info = VerifyInfo(gate, float(measured))
-
-
-@dataclass(frozen=True)
-class _Aligned:
-    similarity: Similarity
-    num_inliers: int
-    median_depth: float  # of the inliers, a's units
+    contradicted: LoopMeasurement | None = None
 
 
 def verify(
@@ -166,14 +99,18 @@ def verify(
         neighbours: keyframes just before and after the candidate, which know their place from it without the query.
     """
     try:
-        found = _align(candidate, query, config)
+        found = align(candidate, query, config.alignment)
         _check_neighbours(found, query, neighbours, config)
-    except _RefusedError as refused:
-        return None, refused.info
+    except RefusedError as refused:
+        return None, VerifyInfo(refused.gate, refused.measured)
     similarity = found.similarity
     sqrt_info = np.linalg.cholesky(np.linalg.inv(similarity.covariance)).T
     pose, log_ratio = similarity.T_a_b, similarity.log_ratio
-    return LoopMeasurement(candidate.frame, query.frame, pose, log_ratio, sqrt_info, found.num_inliers), VerifyInfo()
+    loop = LoopMeasurement(candidate.frame, query.frame, pose, log_ratio, sqrt_info, found.num_inliers)
+    share = contradicted_share(candidate, query, similarity, config.contradiction_margin)
+    if share > config.max_contradicted:
+        return None, VerifyInfo(Gate.CONTRADICTED, share, loop)
+    return loop, VerifyInfo()
 
 
 def tally(infos: Iterable[VerifyInfo]) -> dict[str, int]:
@@ -182,116 +119,20 @@ def tally(infos: Iterable[VerifyInfo]) -> dict[str, int]:
     return {gate.value: counts[gate] for gate in Gate} | {"accepted": counts[None]}
 
 
-def _require(gate: Gate, passes: bool, measured: float) -> None:
-    if not passes:
-        raise _RefusedError(gate, measured)
-
-
-def _align(a: Keyframe, b: Keyframe, config: VerificationConfig) -> _Aligned:
-    """All gates that ask two keyframes only, and the similarity between them."""
-    pairs = _matched(a, b, config)
-    T_a_b, by_points_of_a = _posed(pairs.points_a, pairs.pixels_b, pairs.K_b, config)
-    T_b_a, by_points_of_b = _posed(pairs.points_b, pairs.pixels_a, pairs.K_a, config)
-    in_a, in_b = np.isfinite(pairs.points_a[:, 2]), np.isfinite(pairs.points_b[:, 2])
-    # A point that fits in one direction only has a wrong depth in the other.
-    fits = (by_points_of_a | ~in_a) & (by_points_of_b | ~in_b) & (in_a | in_b)
-    both = pairs.rows(fits & in_a & in_b)
-    _require(Gate.POSE, len(both.pixels_a) >= MIN_POSE, len(both.pixels_a))
-    log_ratio = float(np.median(np.log(_depths(T_a_b, both.points_a) / both.points_b[:, 2])))
-    median_depth = float(np.median(both.points_a[:, 2]))
-    _check_poses(T_a_b, rescaled(np.linalg.inv(T_b_a), np.exp(log_ratio)), median_depth, config)
-    _check_spread(pairs.rows(fits), both.points_a, a.size, b.size, config)
-    _check_scale(both, T_a_b, log_ratio, config)
-    similarity = refine(pairs.rows(fits), T_a_b, log_ratio, config.refine)
-    return _Aligned(similarity, int(fits.sum()), median_depth)
-
-
-def _matched(a: Keyframe, b: Keyframe, config: VerificationConfig) -> Pairs:
-    """Mutual matches that fit one essential matrix."""
-    rows_a, rows_b = mutual(unit_descriptors(a), unit_descriptors(b), config.max_ratio)
-    _require(Gate.MATCHES, len(rows_a) >= config.min_matches, len(rows_a))
-    pairs = Pairs(
-        *(np.float64(array) for array in (a.pixels[rows_a], b.pixels[rows_b], a.points[rows_a], b.points[rows_b])),
-        *(calibration(keyframe.intrinsics) for keyframe in (a, b)),
-    )
-    # In the pixels of one camera: the essential matrix is of two that are alike.
-    as_a = (pairs.pixels_b - pairs.K_b[:2, 2]) / pairs.K_b.diagonal()[:2] * pairs.K_a.diagonal()[:2] + pairs.K_a[:2, 2]
-    _, mask = essential(pairs.pixels_a, as_a, pairs.K_a, config.max_epipolar_error)
-    inliers = np.zeros(len(rows_a), bool) if mask is None else mask.ravel() > 0
-    _require(Gate.MATCHES, inliers.sum() >= config.min_matches, inliers.sum())
-    _require(Gate.MATCH_SHARE, inliers.mean() >= config.min_match_share, inliers.mean())
-    return pairs.rows(inliers)
-
-
-def _posed(
-    points: Float[np.ndarray, "n 3"], pixels: Float[np.ndarray, "n 2"], K: np.ndarray, config: VerificationConfig
-) -> tuple[Float[np.ndarray, "4 4"], np.ndarray]:
-    """T_points_camera of the camera that sees the points at the pixels, and which of them (n,) fit."""
-    known = np.flatnonzero(np.isfinite(points[:, 2]))
-    found = pose_of(points[known], pixels[known], K, MIN_POSE, config.max_reprojection_error)
-    count = 0 if found is None else len(found[1])
-    _require(Gate.POSE, count >= config.min_pose_points, count)
-    T, rows = found
-    fits = np.zeros(len(points), bool)
-    fits[known[rows]] = True
-    return T, fits
-
-
-def _depths(T_a_b: Float[np.ndarray, "4 4"], points_a: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Of points of frame a, seen by camera b."""
-    return (points_a - T_a_b[:3, 3]) @ T_a_b[:3, 2]
-
-
-def _check_poses(one: np.ndarray, other: np.ndarray, median_depth: float, config: VerificationConfig) -> None:
-    distance, turn = gap_between(one, other)
-    _require(Gate.POSES_DISAGREE, distance <= config.max_pose_gap * median_depth, distance)
-    _require(Gate.POSES_DISAGREE, turn <= config.max_pose_turn_deg, turn)
-
-
-def _check_spread(
-    pairs: Pairs,
-    points: Float[np.ndarray, "n 3"],
-    size_a: tuple[int, int],
-    size_b: tuple[int, int],
-    config: VerificationConfig,
-) -> None:
-    """Points that are close together, or on a line, leave the pose open."""
-    share = min(_hull_share(pairs.pixels_a, size_a), _hull_share(pairs.pixels_b, size_b))
-    _require(Gate.HULL, share >= config.min_hull, share)
-    centred = points - points.mean(axis=0)
-    _, spread, axes = np.linalg.svd(centred, full_matrices=False)
-    flatness = spread[1] / max(spread[0], np.finfo(float).tiny)
-    _require(Gate.COLLINEAR, flatness >= config.min_flatness, flatness)
-    extent = np.ptp(np.quantile(centred @ axes.T, [0.05, 0.95], axis=0), axis=0).max()
-    _require(Gate.SMALL, extent >= config.min_extent, extent)
-
-
-def _hull_share(pixels: Float[np.ndarray, "n 2"], size: tuple[int, int]) -> float:
-    """Area of the convex hull over that of the image."""
-    return cv2.contourArea(cv2.convexHull(np.float32(pixels))) / (size[0] * size[1])
-
-
-def _check_scale(both: Pairs, T_a_b: np.ndarray, log_ratio: float, config: VerificationConfig) -> None:
-    ratios = log_ratios(both, T_a_b, log_ratio)
-    scatter = MAD_TO_STD * np.median(np.abs(ratios - np.median(ratios)))
-    _require(Gate.DEPTHS, scatter <= config.max_depth_scatter, scatter)
-    _require(Gate.SCALE, abs(log_ratio) <= 3 * np.sqrt(2) * config.scale_std, log_ratio)
-
-
 def _check_neighbours(
-    found: _Aligned, query: Keyframe, neighbours: Sequence[Neighbour], config: VerificationConfig
+    found: Aligned, query: Keyframe, neighbours: Sequence[Neighbour], config: VerificationConfig
 ) -> None:
     """Every neighbour that is verified alone must put the query where the candidate does; enough of them must be."""
     verified = 0
     for neighbour in neighbours:
         try:
-            similarity = _align(neighbour.keyframe, query, config).similarity
-        except _RefusedError:
+            similarity = align(neighbour.keyframe, query, config.alignment).similarity
+        except RefusedError:
             continue
         T_neighbour_query = rescaled(similarity.T_a_b, np.exp(neighbour.log_ratio))
         distance, turn = gap_between(neighbour.T_candidate_neighbour @ T_neighbour_query, found.similarity.T_a_b)
         allowed = config.max_neighbour_gap * found.median_depth + config.max_neighbour_distance
-        _require(Gate.NEIGHBOURS_DISAGREE, distance <= allowed, distance)
-        _require(Gate.NEIGHBOURS_DISAGREE, turn <= config.max_neighbour_turn_deg, turn)
+        require(Gate.NEIGHBOURS_DISAGREE, distance <= allowed, distance)
+        require(Gate.NEIGHBOURS_DISAGREE, turn <= config.max_neighbour_turn_deg, turn)
         verified += 1
-    _require(Gate.NEIGHBOURS, verified >= config.min_neighbours, verified)
+    require(Gate.NEIGHBOURS, verified >= config.min_neighbours, verified)

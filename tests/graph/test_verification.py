@@ -10,8 +10,8 @@ from loop_scene import (
     SIZE,
     appearance_config,
     keyframe,
-    loops_config,
     looks,
+    loops_config,
     matrix,
     neighbours_of,
     room,
@@ -21,11 +21,11 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.apartment import Apartment
 from emgs_jax.data.backprojection import backproject
-from emgs_jax.data.plan import APART
 from emgs_jax.graph.agreement import agreeing, is_consistent
+from emgs_jax.graph.alignment import Gate
 from emgs_jax.graph.appearance import Keyframe, describe
 from emgs_jax.graph.two_views import gap_between, rescaled
-from emgs_jax.graph.verification import Gate, LoopMeasurement, Neighbour, VerifyInfo, tally, verify
+from emgs_jax.graph.verification import LoopMeasurement, Neighbour, VerifyInfo, tally, verify
 
 CANDIDATE = matrix((0, 10, 0), (0.1, 0.0, 0.2))
 QUERY = matrix((3, -4, 2), (0.4, 0.1, -0.1))
@@ -69,7 +69,7 @@ def test_lengths_are_those_of_the_candidates_inference_and_the_ratio_is_its_unit
 
 
 def test_a_prior_without_a_metric_may_have_any_ratio():
-    loop, _ = measured(scale_a=0.5, scale_b=2.0, overrides=("scale_std=.inf",))
+    loop, _ = measured(scale_a=0.5, scale_b=2.0, overrides=("alignment.scale_std=.inf",))
     np.testing.assert_allclose(loop.log_ratio, np.log(0.25), atol=1e-5)
     np.testing.assert_allclose(loop.Z_a_b, rescaled(TRUTH, 0.5), atol=2e-5)
 
@@ -135,7 +135,7 @@ def test_blank_images_are_refused():
 def test_matches_most_of_which_no_motion_explains_are_refused():
     a = keyframe(room(600), CANDIDATE, 3)
     b = with_wrong(keyframe(room(600), QUERY, 500), 0.8)
-    result = verify(b, a, [], verification_config("min_matches=20"))
+    result = verify(b, a, [], verification_config("alignment.min_matches=20"))
     assert_refused(result, Gate.MATCH_SHARE)
 
 
@@ -168,13 +168,13 @@ def test_points_near_a_line_are_refused():
     rng = np.random.default_rng(0)
     along = np.linspace(-1.2, 1.2, 200)
     rail = np.column_stack([along, 0.6 * along, 2.6 + 0.9 * along]) + rng.uniform(-0.02, 0.02, (200, 3))
-    assert_refused(measured(rail, overrides=("min_hull=0.0",)), Gate.COLLINEAR)
+    assert_refused(measured(rail, overrides=("alignment.min_hull=0.0",)), Gate.COLLINEAR)
 
 
 def test_points_of_one_small_object_are_refused():
     box = np.array([0.1, 0.05, 0.9]) + np.random.default_rng(0).uniform(-0.1, 0.1, (300, 3))
     query = matrix((1, -2, 0), (0.15, 0.02, 0.25))
-    assert_refused(measured(box, query, overrides=("min_hull=0.0",)), Gate.SMALL)
+    assert_refused(measured(box, query, overrides=("alignment.min_hull=0.0",)), Gate.SMALL)
 
 
 def test_depths_that_are_noise_are_refused():
@@ -215,7 +215,7 @@ def test_refusals_are_counted_by_name_in_the_order_of_the_gates():
 
 def test_fewer_points_than_a_pose_needs_are_refused_in_the_config():
     with pytest.raises(Exception, match="6 or more"):
-        verification_config("min_pose_points=5")
+        verification_config("alignment.min_pose_points=5")
 
 
 # -------------------------------------------------------------------------------------------------------- agreement
@@ -264,19 +264,19 @@ def test_loops_that_imply_one_correction_agree_and_one_that_does_not_is_alone(lo
     poses, scales, loop = drifted_path(log_scale)
     config = loops_config()["agreement"]
     loops = [loop(0, 501), loop(2, 503), loop(5, 506, matrix((0, 0, 0), (0.5, 0, 0))), loop(7, 508)]
-    np.testing.assert_array_equal(agreeing(loops, poses, scales, config), [True, True, False, True])
+    np.testing.assert_array_equal(agreeing(loops, [], poses, scales, config), [True, True, False, True])
     turned = [loop(0, 501), loop(2, 503), loop(7, 508, matrix((0, 6, 0)))]
-    assert not agreeing(turned, poses, scales, config).any()
-    assert agreeing([], poses, scales, config).shape == (0,)
+    assert not agreeing(turned, [], poses, scales, config).any()
+    assert agreeing([], [], poses, scales, config).shape == (0,)
 
 
 def test_loops_of_one_query_are_one_witness_and_distant_ones_none():
     poses, scales, loop = drifted_path()
     config = loops_config("agreement.max_query_gap=4")["agreement"]
-    assert not agreeing([loop(0, 501), loop(1, 501), loop(2, 501), loop(3, 503)], poses, scales, config).any()
+    assert not agreeing([loop(0, 501), loop(1, 501), loop(2, 501), loop(3, 503)], [], poses, scales, config).any()
     far = [loop(0, 500), loop(1, 501), loop(2, 511)]
-    assert not agreeing(far, poses, scales, config).any()
-    assert agreeing([*far[:2], loop(2, 502)], poses, scales, config).all()
+    assert not agreeing(far, [], poses, scales, config).any()
+    assert agreeing([*far[:2], loop(2, 502)], [], poses, scales, config).all()
 
 
 # ------------------------------------------------------------------------------------------------------- apartment
