@@ -1,9 +1,9 @@
 """Do loops fit each other, and what the graph knows already?
 
-By appearance two rooms that are furnished alike are one place, and all loops between them agree on one correction. Where
-any two keyframes that it brings together see through each other's surfaces, as at the end of the hall before the rooms,
-it is wrong as a whole, also where nothing is seen of that. Where there is no such view, only the path is left: that the
-camera cannot have come back, as far as that is known.
+By appearance two rooms that are furnished alike are one place, and all loops between them agree on one correction. If
+there are keyframes that it brings together and that see through each other's surfaces, as at the end of the hall before
+the rooms, it is wrong as a whole, also between keyframes that see nothing of that. Without such a view only the path is
+left: that the camera cannot have come back, as far as that is known.
 """
 
 from collections.abc import Mapping, Sequence
@@ -90,9 +90,8 @@ def agreeing(
         return abs(one.b - other.b) <= config.max_query_gap and abs(one.a - other.a) <= config.max_candidate_gap
 
     def is_agreed(loop: LoopMeasurement) -> bool:
-        others = {
-            other.b for other in loops if other.b != loop.b and is_near(loop, other) and says_the_same(loop, other)
-        }
+        near = [other for other in loops if other.b != loop.b and is_near(loop, other)]
+        others = {other.b for other in near if says_the_same(loop, other)}
         against = {other.b for other in contradicted if says_the_same(loop, other)}
         return len(others) >= config.min_others and len(against) <= config.max_contradicted
 

@@ -1,4 +1,4 @@
-"""Where one keyframe's camera is from another's, if they show the same: gates that ask these two only, cheap ones first."""
+"""Where one keyframe's camera is from another's, if they show the same: gates that ask these two, cheap ones first."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -115,7 +115,7 @@ class Aligned:
 def require(gate: Gate, passes: bool, measured: float) -> None:
     """Raise RefusedError where a gate is not passed."""
     if not passes:
-        raise _RefusedError(gate, measured)
+        raise RefusedError(gate, measured)
 
 
 def align(a: Keyframe, b: Keyframe, config: AlignmentConfig) -> Aligned:

@@ -1,7 +1,7 @@
 """Is a candidate the query's place? Two keyframes that show the same, others that say so too, and none that objects.
 
-What passes all gates may still be wrong: by appearance two rooms that are furnished alike are one place. What tells them
-apart is in `agreement`.
+What passes all gates may still be wrong: by appearance two rooms that are furnished alike are one place. What tells
+them apart is in `agreement`.
 """
 
 from collections import Counter
@@ -81,8 +81,8 @@ class VerifyInfo:
     Args:
         refused_by: the first gate that it did not pass; None if accepted.
         measured: what that gate compares with its threshold; NaN if accepted.
-        contradicted: what was measured, if it is wrong by what the cameras see and not by what matches: evidence against
-            all loops that imply the same correction.
+        contradicted: what was measured, where all matches are right and yet it is wrong: evidence against all loops that
+            imply the same correction.
     """
 
     refused_by: Gate | None = None
