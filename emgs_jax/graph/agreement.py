@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.sparse.csgraph import connected_components
 from scipy.stats import chi2, norm
 
 from emgs_jax.graph.two_views import gap_between, rescaled
@@ -26,7 +27,7 @@ class AgreementConfig:
         max_distance: between where they put one query.
         max_turn_deg: likewise.
         min_others: loops, each of another query, that a loop needs.
-        max_contradicted: queries whose loops are contradicted and imply the same correction, whenever they were.
+        max_contradicted: queries of contradicted loops, among all that agree one after the other.
     """
 
     max_query_gap: int
@@ -68,31 +69,41 @@ def agreeing(
 ) -> Bool[np.ndarray, " n"]:
     """Which loops have enough others, of nearby queries to nearby candidates, that imply the same correction.
 
-    And not more than a few contradicted ones: see the top of this file. A false match of repeating texture is alone, or
-    one of many that all say something else.
+    A false match of repeating texture is alone, or one of many that all say something else. Loops that agree one after
+    the other are one statement, however far the path drifts in the meantime, and fall together if it is contradicted:
+    see the top of this file.
 
     Args:
         contradicted: `VerifyInfo.contradicted` of those that were refused.
         poses: T_world_camera of every frame of a loop, as they are now.
         log_scales: σ of these: a length of the inference times e^σ is one of the map.
     """
+    every = [*loops, *contradicted]
+    if not every:
+        return np.zeros(0, bool)
+    agree = np.array([[_agree(one, other, poses, log_scales, config) for other in every] for one in every])
+    agree &= agree.T
+    _, group = connected_components(agree, directed=False)
+    queries, is_evidence = np.array([loop.b for loop in every]), np.arange(len(every)) < len(loops)
 
-    def implied(loop: LoopMeasurement) -> Float[np.ndarray, "4 4"]:
-        return poses[loop.a] @ rescaled(loop.Z_a_b, np.exp(log_scales[loop.a]))
-
-    def says_the_same(one: LoopMeasurement, other: LoopMeasurement) -> bool:
-        # The correction of the other, T_implied T_now⁻¹, applied to this query.
-        corrected = implied(other) @ np.linalg.inv(poses[other.b]) @ poses[one.b]
-        distance, turn = gap_between(corrected, implied(one))
-        return distance <= config.max_distance and turn <= config.max_turn_deg
-
-    def is_near(one: LoopMeasurement, other: LoopMeasurement) -> bool:
-        return abs(one.b - other.b) <= config.max_query_gap and abs(one.a - other.a) <= config.max_candidate_gap
-
-    def is_agreed(loop: LoopMeasurement) -> bool:
-        near = [other for other in loops if other.b != loop.b and is_near(loop, other)]
-        others = {other.b for other in near if says_the_same(loop, other)}
-        against = {other.b for other in contradicted if says_the_same(loop, other)}
+    def is_accepted(row: int) -> bool:
+        others = set(queries[agree[row] & is_evidence]) - {queries[row]}
+        against = set(queries[(group == group[row]) & ~is_evidence])
         return len(others) >= config.min_others and len(against) <= config.max_contradicted
 
-    return np.array([is_agreed(loop) for loop in loops], bool)
+    return np.array([is_accepted(row) for row in range(len(loops))], bool)
+
+
+def _agree(
+    one: LoopMeasurement,
+    other: LoopMeasurement,
+    poses: Mapping[int, Float[np.ndarray, "4 4"]],
+    log_scales: Mapping[int, float],
+    config: AgreementConfig,
+) -> bool:
+    """Are two loops near each other, and does the correction of the other, T_implied T_now⁻¹, fit this query?"""
+    if abs(one.b - other.b) > config.max_query_gap or abs(one.a - other.a) > config.max_candidate_gap:
+        return False
+    implied, by_other = (poses[loop.a] @ rescaled(loop.Z_a_b, np.exp(log_scales[loop.a])) for loop in (one, other))
+    distance, turn = gap_between(by_other @ np.linalg.inv(poses[other.b]) @ poses[one.b], implied)
+    return distance <= config.max_distance and turn <= config.max_turn_deg

@@ -81,7 +81,7 @@ class VerifyInfo:
     Args:
         refused_by: the first gate that it did not pass; None if accepted.
         measured: what that gate compares with its threshold; NaN if accepted.
-        contradicted: what was measured, where all matches are right and yet it is wrong: evidence against all loops that
+        contradicted: what was measured, where all matches fit and yet it is wrong: evidence against all loops that
             imply the same correction.
     """
 
