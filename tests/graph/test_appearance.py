@@ -153,25 +153,29 @@ def test_a_place_that_was_never_seen_has_no_candidate_although_something_is_alwa
     assert all(propose(database, row, config) == [] for row in range(40))
 
 
-def test_candidates_are_old_apart_in_time_and_few():
-    database, config = walk(55, lap=40)
-    generous = dataclasses.replace(config, quantile=0.0, num_neighbours=54, num_candidates=3)
-    rng = np.random.default_rng(0)
-    vectors = np.float32(np.abs(database.vectors + 0.02 * rng.normal(size=database.vectors.shape)))  # none is 0 or less
-    database = dataclasses.replace(database, vectors=vectors)
-    found = propose(database, 54, generous)
-    frames = [database.keyframes[one.row].frame for one in found]
-    assert len(found) == 3 and frames[0] == 14 and max(frames) <= 34
-    assert min(abs(a - b) for i, a in enumerate(frames) for b in frames[:i]) > 6
-    assert [one.score for one in found] == sorted((one.score for one in found), reverse=True)
-    near = propose(database, 54, dataclasses.replace(generous, suppressed_gap=0))
-    assert {one.row for one in near} == {13, 14, 15}
+def alike(frames, cosines):
+    """A database of keyframes with these cosines with the last, which is 1."""
+    vectors = np.float32([[cosine, np.sqrt(1 - cosine**2)] for cosine in cosines])
+    keyframes = tuple(as_keyframe(frame, [0]) for frame in frames)
+    return Database(keyframes, np.zeros((1, 128), np.float32), vectors, len(frames))
+
+
+def test_candidates_are_old_apart_in_time_few_and_the_most_alike_first():
+    frames = [0, 4, 10, 40, 44, 52, 80, 90, 100]
+    database = alike(frames, [0.6, 0.7, 0.5, 0.8, 0.9, 0.4, 0.95, 0.3, 1.0])
+    words = ("min_gap=30", "num_neighbours=1", "quantile=0.0", "num_candidates=2")
+
+    def proposed(suppressed_gap):
+        found = propose(database, 8, appearance_config(*words, f"suppressed_gap={suppressed_gap}"))
+        return [frames[one.row] for one in found]
+
+    assert proposed(0) == [44, 40]  # not 80, which is too new
+    assert proposed(4) == [44, 4]
+    assert proposed(60) == [44]
 
 
 def test_the_threshold_is_that_quantile_of_the_similarity_to_the_last_neighbours():
-    vectors = np.float32([[0.7, np.sqrt(1 - 0.49)], [0.6, 0.8], [0.5, np.sqrt(0.75)], [0.9, np.sqrt(0.19)], [1, 0]])
-    keyframes = tuple(as_keyframe(frame, [0]) for frame in (0, 100, 197, 198, 200))
-    database = Database(keyframes, np.zeros((1, 128), np.float32), vectors, 5)
+    database = alike((0, 100, 197, 198, 200), (0.7, 0.6, 0.5, 0.9, 1.0))
     config = appearance_config("num_neighbours=2", "quantile=0.5", "min_gap=50")
     assert propose(database, 4, config) == [Candidate(0, pytest.approx(0.7))]  # (.5 + .9) / 2 lets .7 pass, not .6
     assert propose(database, 4, dataclasses.replace(config, quantile=0.6)) == []

@@ -24,7 +24,8 @@ from emgs_jax.data.backprojection import backproject
 from emgs_jax.graph.agreement import agreeing, is_consistent
 from emgs_jax.graph.alignment import Gate
 from emgs_jax.graph.appearance import Keyframe, describe
-from emgs_jax.graph.two_views import gap_between, rescaled
+from emgs_jax.graph.contradiction import contradicted_share
+from emgs_jax.graph.two_views import Similarity, gap_between, rescaled
 from emgs_jax.graph.verification import LoopMeasurement, Neighbour, VerifyInfo, tally, verify
 
 CANDIDATE = matrix((0, 10, 0), (0.1, 0.0, 0.2))
@@ -279,18 +280,81 @@ def test_loops_of_one_query_are_one_witness_and_distant_ones_none():
     assert agreeing([*far[:2], loop(2, 502)], [], poses, scales, config).all()
 
 
+def test_a_statement_that_is_contradicted_falls_with_all_that_agree_one_after_the_other():
+    """Also where the path has drifted so far in the meantime that the last correction is not the first."""
+    poses, scales, loop = drifted_path()
+    step = matrix((0, 0.5, 0), (0.04, 0, 0))
+    poses = {frame: T @ np.linalg.matrix_power(step, max(frame - 500, 0)) for frame, T in poses.items()}
+    config = loops_config("agreement.max_query_gap=2", "agreement.max_candidate_gap=2")["agreement"]
+    loops = [loop(frame, 500 + frame) for frame in range(2, 12)]
+    against = [loop(frame, 500 + frame) for frame in (0, 1)]
+    assert agreeing(loops, [], poses, scales, config).all()
+    assert not agreeing(loops, against, poses, scales, config).any()
+    assert agreeing(loops, against[:1], poses, scales, config).all()  # one may be something that was moved
+    elsewhere = [loop(frame, 500 + frame, matrix((0, 0, 0), (0.5, 0, 0))) for frame in (0, 1)]
+    assert agreeing(loops, elsewhere, poses, scales, config).all()
+
+
+# ---------------------------------------------------------------------------------------------------- contradiction
+
+
+def showing(depths, scale=1.0):
+    """A keyframe of which only the depths matter."""
+    return dataclasses.replace(keyframe(room(), np.eye(4)), depths=np.float16(scale * depths))
+
+
+def at(T, log_ratio=0.0):
+    return Similarity(T, log_ratio, np.eye(7))
+
+
+def test_a_wall_where_the_other_looks_through_is_a_contradiction_in_both_orders():
+    hall, shorter = np.full((24, 32), 6.0), np.full((24, 32), 6.0)
+    shorter[6:18, 8:24] = 4.0  # a quarter of the image
+    a, b = showing(hall), showing(shorter)
+    np.testing.assert_allclose(contradicted_share(a, b, at(np.eye(4)), 0.15), 0.25)
+    np.testing.assert_allclose(contradicted_share(b, a, at(np.eye(4)), 0.15), 0.25)
+    assert contradicted_share(a, b, at(np.eye(4)), 0.4) == 0.0  # within the margin
+    assert contradicted_share(a, a, at(np.eye(4)), 0.15) == 0.0
+    assert contradicted_share(a, showing(0 * hall), at(np.eye(4)), 0.15) == 0.0
+
+
+def test_depths_are_compared_in_one_unit_and_from_one_place():
+    wall = np.full((24, 32), 6.0)
+    a, b = showing(wall), showing(wall - 2.0, 2.0)  # 2 m nearer, in half metres
+    assert contradicted_share(a, b, at(matrix((0, 0, 0), (0, 0, 2.0)), -np.log(2)), 0.15) == 0.0
+    assert contradicted_share(a, b, at(np.eye(4), -np.log(2)), 0.15) == 1.0
+    assert contradicted_share(a, b, at(matrix((0, 0, 0), (0, 0, 2.0))), 0.15) > 0.9
+
+
+def test_what_hides_behind_something_else_is_no_contradiction():
+    """A pillar before a wall, seen from half a metre aside, where it hides another part of the wall."""
+
+    def seen_from(x):
+        across = (np.arange(64) * 5 + 2 - INTRINSICS[2]) / INTRINSICS[0]
+        pillar = np.abs(3.0 * across + x) < 0.4
+        return showing(np.tile(np.where(pillar, 3.0, 6.0), (48, 1)))
+
+    aside = matrix((0, 0, 0), (0.5, 0, 0))
+    assert contradicted_share(seen_from(0.0), seen_from(0.5), at(aside), 0.15) == 0.0
+    assert contradicted_share(seen_from(0.0), seen_from(0.5), at(np.eye(4)), 0.15) > 0.05
+
+
 # ------------------------------------------------------------------------------------------------------- apartment
 
 
 @cache
-def seen(walk, frame, size=(240, 180)):
+def walked(walk):
+    return Apartment(walk=walk, size=(160, 120))
+
+
+@cache
+def seen(walk, frame):
     """Keyframe with exact depth, and its true pose."""
-    data = Apartment(walk=walk, size=size)
+    data = walked(walk)
     shown = data[frame]
     points = backproject(shown.depth, data.intrinsics)
-    return describe(frame, shown.image, points, shown.depth > 0, data.intrinsics, appearance_config()), (
-        shown.T_world_camera
-    )
+    view = describe(frame, shown.image, points, shown.depth > 0, data.intrinsics, appearance_config())
+    return view, shown.T_world_camera
 
 
 def on_the_walk(walk, query, candidate):
@@ -301,9 +365,37 @@ def on_the_walk(walk, query, candidate):
     return verify(seen(walk, query)[0], a, neighbours, verification_config())
 
 
-def nearest(walk, query, frames, turned=0.0):
-    """The frame whose camera is closest to the query's place when turned by that many degrees."""
-    poses = Apartment(walk=walk)._poses
-    T = poses[query] @ matrix((0, turned, 0))
-    gaps = [gap_between(poses[frame], T) for frame in frames]
-    return frames[int(np.argmin([distance + np.radians(turn) for distance, turn in gaps]))]
+@pytest.mark.parametrize(("query", "candidate"), [(306, 24), (334, 48), (384, 96), (276, 6)])
+def test_a_place_of_the_first_lap_is_known_again_on_the_second(query, candidate):
+    loop, info = on_the_walk("two_laps", query, candidate)
+    assert loop is not None, info
+    truth = np.linalg.inv(seen("two_laps", candidate)[1]) @ seen("two_laps", query)[1]
+    distance, turn = gap_between(loop.Z_a_b, truth)
+    assert distance < 0.03 and turn < 1.0 and abs(loop.log_ratio) < 0.01
+
+
+@pytest.mark.parametrize(("query", "candidate"), [(366, 108), (396, 78)])
+def test_a_place_seen_from_the_other_side_is_refused(query, candidate):
+    assert_refused(on_the_walk("out_and_back", query, candidate), Gate.MATCHES)
+
+
+@pytest.mark.parametrize(("query", "candidate"), [(220, 24), (160, 96), (250, 48)])
+def test_other_rooms_are_refused(query, candidate):
+    assert_refused(on_the_walk("two_laps", query, candidate), Gate.MATCHES)
+
+
+def test_loops_from_one_twin_room_to_the_other_fall_with_what_is_seen_of_the_hall_before_them():
+    """By what is seen inside they are right, all with the same correction of 6 m; the hall ends too early."""
+    inside = [on_the_walk("twin_rooms", *pair)[0] for pair in ((312, 18), (324, 30), (336, 42))]
+    hall = [on_the_walk("twin_rooms", *pair)[1] for pair in ((300, 12), (306, 18))]
+    assert {info.refused_by for info in hall} == {Gate.CONTRADICTED}
+    poses = {frame: seen("twin_rooms", frame)[1] for frame in (12, 18, 30, 42, 300, 306, 312, 324, 336)}
+    scales, config = dict.fromkeys(poses, 0.0), loops_config()["agreement"]
+    for loop in inside:
+        error = np.linalg.inv(loop.Z_a_b) @ np.linalg.inv(poses[loop.a]) @ poses[loop.b]
+        np.testing.assert_allclose(np.linalg.norm(error[:3, 3]), APART, atol=0.03)
+        drift = np.diag([0.5, 0.5, 0.5, 0.1, 0.1, 0.1]) ** 2
+        innovation = np.append(error[:3, 3], Rotation.from_matrix(error[:3, :3]).as_rotvec())
+        assert not is_consistent(innovation, drift, 3.0)
+    assert agreeing(inside, [], poses, scales, config).all()
+    assert not agreeing(inside, [info.contradicted for info in hall], poses, scales, config).any()
