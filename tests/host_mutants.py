@@ -57,8 +57,67 @@ TEXT = ("tests/features/test_text.py",)
 TOKENS = ("tests/features/test_tokens.py",)
 PATCHES = ("tests/features/test_patches.py",)
 STACKED = ("tests/running/test_stacked.py",)
+APPEARANCE = ("tests/graph/test_appearance.py",)
+VERIFICATION = ("tests/graph/test_verification.py",)
 
 MUTANTS = (
+    # graph
+    Mutant(
+        "emgs_jax/graph/appearance.py",
+        "is_old = frames <= frames[row] - config.min_gap",
+        "is_old = frames < frames[row]",
+        APPEARANCE,
+        "the frames just before are loops",
+    ),
+    Mutant(
+        "emgs_jax/graph/appearance.py",
+        "    parts = _unit(parts)\n",
+        "",
+        APPEARANCE,
+        "a repeated texture outweighs the rest of the image",
+    ),
+    Mutant(
+        "emgs_jax/graph/alignment.py",
+        "rescaled(np.linalg.inv(T_b_a), np.exp(log_ratio))",
+        "rescaled(np.linalg.inv(T_b_a), np.exp(-log_ratio))",
+        VERIFICATION,
+        "the reverse pose is brought into the wrong unit",
+    ),
+    Mutant(
+        "emgs_jax/graph/verification.py",
+        "rescaled(similarity.T_a_b, np.exp(neighbour.log_ratio))",
+        "similarity.T_a_b",
+        VERIFICATION,
+        "a neighbour's lengths are taken for the candidate's",
+    ),
+    Mutant(
+        "emgs_jax/graph/verification.py",
+        "np.linalg.cholesky(np.linalg.inv(similarity.covariance)).T",
+        "np.linalg.cholesky(similarity.covariance).T",
+        VERIFICATION,
+        "the covariance is given as information",
+    ),
+    Mutant(
+        "emgs_jax/graph/contradiction.py",
+        "points[is_inside, 2] < (1 - margin) * shown",
+        "points[is_inside, 2] > (1 + margin) * shown",
+        VERIFICATION,
+        "what is hidden is a contradiction",
+    ),
+    Mutant(
+        "emgs_jax/graph/agreement.py",
+        "(group == group[row]) & ~is_evidence",
+        "agree[row] & ~is_evidence",
+        VERIFICATION,
+        "a contradiction does not reach what agrees with it one after the other",
+    ),
+    Mutant(
+        "emgs_jax/graph/agreement.py",
+        " - {queries[row]}",
+        "",
+        VERIFICATION,
+        "two loops of one query confirm each other",
+    ),
     # evaluation
     Mutant(
         "emgs_jax/evaluation/trajectory.py",

@@ -109,7 +109,7 @@ def refine(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float, conf
     stds = np.array([config.min_pixel_std, config.min_depth_std])
     floors = np.repeat([config.floor_translation, np.radians(config.floor_rotation_deg)], 3)
     floors = np.append(floors, config.floor_log_ratio)
-    for _ in range(3):
+    for _ in range(2):
         kinds = _kinds(pairs)
 
         def weighted(step, start=(T_a_b, log_ratio), std=stds[kinds]):
