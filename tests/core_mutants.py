@@ -274,7 +274,7 @@ STAGES = [
         ("gaussians.valid & has_feature", "has_feature", "free rows have a class"),
     ),
     *own("slam", "test_slam")(
-        ("SlamState(map, aligned, T), info", "SlamState(map, trusted, T), info", "a rejected frame is no previous one"),
+        ("SlamState(map, aligned, T, state.time + 1), info", "SlamState(map, trusted, T, state.time + 1), info", "a rejected frame is no previous one"),
         ("view = downscale(camera, thin)", "view = camera", "the full camera for the thinned rows"),
         (
             "rows_each = spacing(camera, thin, config.fit)",
@@ -302,8 +302,8 @@ STAGES = [
             "one frame late",
         ),
         (
-            "SlamState(map, aligned, T), info",
-            "SlamState(map, aligned, coarse.T_world_camera), info",
+            "SlamState(map, aligned, T, state.time + 1), info",
+            "SlamState(map, aligned, coarse.T_world_camera, state.time + 1), info",
             "the coarse pose stays",
         ),
         (

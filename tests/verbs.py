@@ -30,7 +30,7 @@ ONE = jnp.ones(())
 
 
 def map_of(seed: int) -> gaussian_map.GaussianMap:
-    return gaussian_map.GaussianMap(random_gaussians(32, seed, 2), jnp.ones(32), jnp.ones(32, jnp.int32), jnp.ones(32))
+    return gaussian_map.new_map(random_gaussians(32, seed, 2), jnp.ones(32), ONE, jnp.asarray(0))
 
 
 def prediction_of(seed: int) -> obs.Prediction:
@@ -108,7 +108,7 @@ VERBS = {
         lambda s: (map_of(s), points(s)),
     ),
     "insert": (
-        lambda m, g: gaussian_map.insert(m, gaussian_map.new_map(g, jnp.ones(9), ONE)),
+        lambda m, g: gaussian_map.insert(m, gaussian_map.new_map(g, jnp.ones(9), ONE, jnp.asarray(0))),
         lambda s: (map_of(s), random_gaussians(9, s, 2)),
     ),
     "fit_rigid": (rigid.fit_rigid, lambda s: (points(s).points, points(s + 5).points, jnp.ones(40))),
