@@ -35,7 +35,7 @@ class Edges(eqx.Module):
         a: row of the node whose inference measured.
         b: row of the node that was measured.
         Z_a_b: T_a⁻¹ T_b, its translation in the units of a's inference (the map's, times e^{−σ_a}).
-        log_ratio: measured σ_b − σ_a: log of the median of depth in a's inference over depth in b's, of the same points.
+        log_ratio: measured σ_b − σ_a: log of the median ratio of the same points' depths in a's inference and in b's.
         sqrt_info: W, with WᵀW the information of (translation, rotation, log-scale); a zero row is not measured.
         kind: WINDOW (the inference's own frames, odometry) or LOOP.
         valid: rows in use; the others may hold anything. An edge with a node that is not in use is not either.

@@ -87,7 +87,7 @@ def problem_of(graph: Graph, scale_std: float) -> Problem | str:
     if not used.any():
         return "no edge is in use"
     joined = _parts(graph, used)
-    used &= joined[np.asarray(edges.a) * used] & joined[np.asarray(edges.b) * used]
+    used = used & joined[np.asarray(edges.a) * used] & joined[np.asarray(edges.b) * used]
 
     n, e = _bucket(len(valid)), _bucket(int(used.sum()))
     still = np.tile([1.0, 0, 0, 0, 0, 0, 0], (n, 1))
