@@ -7,7 +7,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import take_rows, where_rows
+from emgs_jax.ops.pytree import take_rows
 from emgs_jax.registration.rigid import pose_row, scale_translation
 
 WINDOW, LOOP = 0, 1  # kinds of edges: only those of a loop may be wrong altogether
@@ -82,30 +82,33 @@ def _residual(ends: Nodes, edge: Edges) -> Float[Array, "7"]:
     return edge.sqrt_info @ jnp.append(error, ends.log_scale[1] - ends.log_scale[0] - edge.log_ratio)
 
 
-def _paired(graph: Graph) -> tuple[Nodes, Edges]:
-    """The two nodes of every edge (e 2), and the edges; neutral values where an edge is not in use."""
-    edges, used = graph.edges, edges_in_use(graph)
-    num_edges, dtype = edges.a.shape[0], graph.nodes.log_scale.dtype
-    ends = take_rows(graph.nodes, jnp.where(used[:, None], jnp.stack([edges.a, edges.b], -1), 0))
-    still = jnp.broadcast_to(jnp.asarray([1.0, 0, 0, 0, 0, 0, 0], dtype), (num_edges, 7))
-    poses = jnp.where(used[:, None, None], ends.T_world.wxyz_xyz, still[:, None])
-    ends = Nodes(jaxlie.SE3(poses), jnp.where(used[:, None], ends.log_scale, 0.0), ends.valid)
-    zeros = jnp.zeros_like(edges.log_ratio), jnp.zeros_like(edges.sqrt_info)
-    neutral = Edges(edges.a, edges.b, jaxlie.SE3(still), *zeros, edges.kind, edges.valid)
-    return ends, where_rows(used, edges, neutral)
+def _with_ends(nodes: Nodes, edge: Edges, used: Bool[Array, ""]) -> tuple[Nodes, Edges]:
+    """The two nodes of one edge, and the edge; neutral values where it is not in use."""
+    ends = take_rows(nodes, jnp.where(used, jnp.stack([edge.a, edge.b]), 0))
+    still = jnp.zeros_like(edge.Z_a_b.wxyz_xyz).at[0].set(1.0)
+    zeros = jnp.zeros_like(edge.log_ratio), jnp.zeros_like(edge.sqrt_info)
+    neutral_ends = Nodes(jaxlie.SE3(jnp.stack([still, still])), jnp.zeros_like(ends.log_scale), ends.valid)
+    neutral = eqx.tree_at(lambda e: (e.Z_a_b.wxyz_xyz, e.log_ratio, e.sqrt_info), edge, (still, *zeros))
+    return jax.tree.map(lambda x, y: jnp.where(used, x, y), (ends, edge), (neutral_ends, neutral))
 
 
 @full_precision
 def residuals(graph: Graph) -> Float[Array, "e 7"]:
     """Whitened residual of every edge, see `_residual`; 0 where an edge is not in use."""
-    return jax.vmap(_residual)(*_paired(graph))
+
+    def of_edge(edge: Edges, used: Bool[Array, ""]) -> Float[Array, "7"]:
+        return _residual(*_with_ends(graph.nodes, edge, used))
+
+    return jax.vmap(of_edge)(graph.edges, edges_in_use(graph))
 
 
 @full_precision
 def linearize(graph: Graph) -> tuple[Float[Array, "e 7"], Float[Array, "e 7 14"]]:
     """Residuals, and their derivatives by the steps of `move` of the nodes a and b; 0 where an edge is not in use."""
 
-    def of_edge(ends: Nodes, edge: Edges) -> tuple[Float[Array, "7"], Float[Array, "7 14"]]:
+    def of_edge(edge: Edges, used: Bool[Array, ""]) -> tuple[Float[Array, "7"], Float[Array, "7 14"]]:
+        ends, edge = _with_ends(graph.nodes, edge, used)
+
         def after(steps: Float[Array, "14"]) -> tuple[Float[Array, "7"], Float[Array, "7"]]:
             residual = _residual(move(ends, steps.reshape(2, DEGREES)), edge)
             return residual, residual
@@ -113,7 +116,7 @@ def linearize(graph: Graph) -> tuple[Float[Array, "e 7"], Float[Array, "e 7 14"]
         jacobian, residual = jax.jacfwd(after, has_aux=True)(jnp.zeros(2 * DEGREES, ends.log_scale.dtype))
         return residual, jacobian
 
-    return jax.vmap(of_edge)(*_paired(graph))
+    return jax.vmap(of_edge)(graph.edges, edges_in_use(graph))
 
 
 def robust(

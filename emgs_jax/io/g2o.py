@@ -22,8 +22,8 @@ ROUNDING = 1e-6
 def load_graph_g2o(path: str | os.PathLike, half_angles: bool = False) -> Graph:
     """Read nodes, in the order of the file, and edges; those between neighbours in it are WINDOW, all others LOOP.
 
-    Z of an edge `a b` is T_a⁻¹ T_b. Scales are not part of the format: log_scale is 0, the scale row not measured; solve
-    with scale_std = 0. Lines that begin with # or FIX are read over (the first node is the gauge).
+    Z of an edge `a b` is T_a⁻¹ T_b. Scales are not part of the format: log_scale is 0, the scale row not measured;
+    solve with scale_std = 0. Lines that begin with # or FIX are read over (the first node is the gauge).
 
     Args:
         path: the file.
@@ -91,7 +91,8 @@ def _roots(upper: np.ndarray, half_angles: bool, places: list[str]) -> np.ndarra
     if len(bad):
         raise ValueError(
             f"{places[bad[0]]}: the information is not positive semidefinite: "
-            "its 21 numbers are the upper triangle row by row, translation first")
+            "its 21 numbers are the upper triangle row by row, translation first"
+        )
     roots = np.zeros((len(upper), 7, 7))
     roots[:, :6, :6] = np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.transpose(0, 2, 1)
     return roots
