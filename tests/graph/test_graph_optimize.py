@@ -1,4 +1,4 @@
-"""The solver of the pose graph: graphs with a known optimum, symmetries, false loops, and graphs that it must refuse."""
+"""The solver of the pose graph: known optima, symmetries, false loops, and graphs that it must refuse."""
 
 import time
 from pathlib import Path
@@ -141,11 +141,11 @@ def test_an_edge_can_be_told_from_its_other_end():
     _, graph = noisy_laps(24, 6, 0)
     edges = graph.edges
     adjoint = jax.vmap(lambda T: jaxlie.SE3(T).adjoint())(edges.Z_a_b.inverse().wxyz_xyz)
-    roots = edges.sqrt_info.at[:, :6, :6].set(edges.sqrt_info[:, :6, :6] @ jnp.linalg.inv(adjoint))
+    roots = edges.sqrt_info.at[:, :6, :6].set(edges.sqrt_info[:, :6, :6] @ adjoint)
     back = Edges(edges.b, edges.a, edges.Z_a_b.inverse(), edges.log_ratio, roots, edges.kind, edges.valid)
     (found, info), (again, other) = optimize(graph, config()), optimize(Graph(graph.nodes, back), config())
-    np.testing.assert_allclose(poses(again), poses(found), atol=2e-3)  # Ad at Z, not at the solution
-    assert other.cost == pytest.approx(info.cost, rel=2e-2)
+    np.testing.assert_allclose(poses(again), poses(found), atol=1e-6)
+    assert other.cost == pytest.approx(info.cost, rel=1e-9)
 
 
 def test_an_edge_twice_at_half_its_information_is_the_edge(laps):
@@ -181,7 +181,7 @@ def test_the_first_node_in_use_stays(laps):
 def test_without_loops_a_chain_stays_bit_for_bit():
     """Also in float32, whose rounding leaves errors of its own."""
     truth = walk(40)
-    edges = measure(truth, window_pairs(40, (1,)), rng=np.random.default_rng(0))
+    edges = without_scale(measure(truth, window_pairs(40, (1,)), rng=np.random.default_rng(0)))
     graph = Graph(chain(truth, edges), edges)
     single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, graph)
     for given in (graph, single):
@@ -207,7 +207,7 @@ def test_float32_poses_are_solved_in_float64(laps):
 
 
 def test_a_triangle_closes_in_the_direction_of_its_edges():
-    """Z_a_b = T_a⁻¹ T_b: the third side, told from its end, agrees with the first two; told the other way it does not."""
+    """Z_a_b = T_a⁻¹ T_b: the third side, told from its end, agrees with the first two; the other way it does not."""
     truth = walk(3, laps=1.0)
     edges = without_scale(join(measure(truth, [(0, 1), (1, 2)]), measure(truth, [(2, 0)], LOOP)))
     given = disturb(truth, np.random.default_rng(0), 0.2 * (np.arange(7) < 6))
@@ -303,7 +303,7 @@ def test_parts_without_a_path_to_the_first_node_stay():
 
 def refused(graph: Graph, reason: str, **changes) -> None:
     nodes, info = optimize(graph, config(**changes))
-    assert nodes is graph.nodes and reason in info.reason and not info.converged
+    assert nodes is graph.nodes and reason in info.reason
 
 
 def test_what_is_not_finite_is_refused_by_row():
@@ -318,19 +318,18 @@ def test_what_is_not_finite_is_refused_by_row():
 
 
 def test_loops_that_contradict_the_window_are_refused_or_given_no_weight():
-    """Two loops between the same poses, metres apart: with the kernel neither counts much, without it no result does."""
-    truth, graph = noisy_laps(24, 0, 2)
+    """Two loops between the same poses, metres apart: the kernel lets neither count; without it nothing moves."""
+    truth = walk(24)
+    window = measure(truth, window_pairs(24), rng=np.random.default_rng(0))
+    shift = jaxlie.SE3.from_translation(jnp.asarray([[3.0, 0, 0], [-3.0, 0, 0]]))
     loops = measure(truth, [(0, 12), (0, 12)], LOOP)
-    shift = jnp.asarray([[0, 0, 0, 3.0, 0, 0], [0, 0, 0, -3.0, 0, 0]])
-    loops = without_scale(
-        eqx.tree_at(lambda e: e.Z_a_b, loops, loops.Z_a_b @ jaxlie.SE3.exp(jnp.roll(shift, 3, axis=1)))
-    )
-    both = Graph(graph.nodes, join(graph.edges, loops))
-    refused_graph = Graph(graph.nodes, join(graph.edges, jax.tree.map(lambda x: x[:1], loops)))
-    nodes, info = optimize(refused_graph, config(kernel=np.inf, max_misfit=25.0))
-    assert nodes is graph.nodes and "contradict" in info.reason
-    _, info = optimize(both, config(max_misfit=25.0))
-    assert not info.reason and (info.edge_weights[-2:] < 0.2).all()
+    loops = eqx.tree_at(lambda e: e.Z_a_b, loops, loops.Z_a_b @ shift)
+    graph = Graph(chain(truth, window), without_scale(join(window, loops)))
+    one = eqx.tree_at(lambda g: g.edges.valid, graph, graph.edges.valid.at[-1].set(False))
+    refused(one, "contradict", kernel=np.inf, max_misfit=25.0)
+    for given in (one, graph):
+        _, info = optimize(given, config(max_misfit=25.0))
+        assert not info.reason and (info.edge_weights[-2:] < 0.2)[np.asarray(given.edges.valid)[-2:]].all()
 
 
 def test_a_singular_graph_has_no_covariances():
@@ -349,7 +348,7 @@ def test_options_of_conf_are_configs_and_none_moves_nothing():
     on, off = (hydra.utils.instantiate(x) for x in (default, OmegaConf.merge(default, given)))
     assert isinstance(on, GraphConfig) and rmse(optimize(graph, on)[0], graph.nodes) > 0.01
     assert same(optimize(graph, off)[0], graph.nodes)
-    with pytest.raises(ValueError, match="given or spread"):
+    with pytest.raises(hydra.errors.InstantiationException, match="given or spread"):
         hydra.utils.instantiate(default, start="chordal")
 
 
