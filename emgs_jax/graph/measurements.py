@@ -57,6 +57,7 @@ class Graph(eqx.Module):
     edges: Edges
 
 
+@full_precision
 def move(nodes: Nodes, steps: Float[Array, "n 7"]) -> Nodes:
     """Right perturbation: T Exp(step) and σ + step, in the order translation, rotation, log-scale."""
     T = (nodes.T_world @ jaxlie.SE3.exp(steps[:, :6])).normalize()
