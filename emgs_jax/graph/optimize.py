@@ -50,12 +50,12 @@ class GraphConfig(eqx.Module):
 
 @dataclass(frozen=True)
 class GraphInfo:
-    """What an optimisation did.
+    """What an optimisation found, also where that is refused and the nodes stay.
 
     Args:
         reason: why the nodes are those that were given; empty: they moved, or there is nothing to gain.
         cost_before: Σρ over edges, and half the squared scale prior.
-        cost: likewise, of the nodes that come back.
+        cost: likewise, at the end.
         num_iterations: tried steps.
         converged: the last step gained next to nothing.
         edge_chi2: (e,) χ² of every edge at the end, unweighted; 0 where it is not in use.
