@@ -39,6 +39,7 @@ FILES = ("tests/io/test_files.py",)
 MAP_FILE = ("tests/io/test_map_file.py",)
 MESH = ("tests/io/test_mesh.py",)
 PLY = ("tests/io/test_ply.py",)
+G2O = ("tests/io/test_g2o.py",)
 TRAJECTORY_FILE = ("tests/io/test_trajectory_file.py",)
 BACKPROJECTION = ("tests/data/test_backprojection.py",)
 READING = ("tests/data/test_reading.py", "tests/data/test_layouts.py")
@@ -1234,6 +1235,15 @@ MUTANTS = (
         "height for width",
     ),
     # io
+    Mutant(
+        "emgs_jax/io/g2o.py",
+        "[6, 3, 4, 5, 0, 1, 2]",
+        "[3, 4, 5, 6, 0, 1, 2]",
+        G2O,
+        "quaternions with w first are read",
+    ),
+    Mutant("emgs_jax/io/g2o.py", "0.5 if half_angles", "2.0 if half_angles", G2O, "half angles are doubled"),
+    Mutant("emgs_jax/io/g2o.py", "[ids[name] for name in names]", "names", G2O, "names of vertices for their rows"),
     Mutant(
         "emgs_jax/io/trajectory.py",
         "Rotation.from_quat(rows[:, 4:])",
