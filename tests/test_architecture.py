@@ -19,7 +19,7 @@ CORE_ROOMS = (
 )
 # What is solved between frames, by SciPy; the core does not import it.
 HOST_FILES = {"graph.sparse", "graph.start", "graph.problem", "graph.optimize"}
-HOST = ("io", "data", "features", "prior", "evaluation", "running", "report")
+HOST = ("io", "data", "features", "keypoints", "loops", "prior", "evaluation", "running", "report")
 STAGES = {"initialization", "localization", "em", "splitting", "refinement", "existence", "semantics"}
 HOST_PACKAGES = {"numpy", "cv2", "open3d", "trimesh", "matplotlib", "scipy", "torch", "tqdm", "hydra", "omegaconf"}
 MAX_FUNCTION_LINES, MAX_FILE_LINES = 60, 300

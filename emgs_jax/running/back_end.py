@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from emgs_jax.graph.agreement import AgreementConfig, agreeing
-from emgs_jax.graph.appearance import AppearanceConfig, Database, describe, extend, propose
+from emgs_jax.loops.agreement import AgreementConfig, agreeing
+from emgs_jax.loops.appearance import AppearanceConfig, Database, describe, extend, propose
 from emgs_jax.graph.deform import deform, deform_view
 from emgs_jax.graph.measurements import LOOP, WINDOW, Edges, Graph, Nodes
 from emgs_jax.graph.optimize import GraphConfig, GraphInfo, optimize
-from emgs_jax.graph.two_views import gap_between, rescaled
-from emgs_jax.graph.verification import LoopMeasurement, Neighbour, VerificationConfig, VerifyInfo, verify
+from emgs_jax.loops.two_views import gap_between, rescaled
+from emgs_jax.loops.verification import LoopMeasurement, Neighbour, VerificationConfig, VerifyInfo, verify
 from emgs_jax.running.convert import to_se3
 from emgs_jax.slam import SlamState
 

@@ -1,4 +1,4 @@
-"""Points of the scene that several images show: detection, verified matches, tracks, poses from them (OpenCV)."""
+"""Points of the scene that several images show: verified matches, tracks, poses from them (OpenCV)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from emgs_jax.keypoints import sift
+from emgs_jax.keypoints.poses import essential, pose_of, unit_rays
 from emgs_jax.prior.multiview.lens import Lens, straight
-from emgs_jax.prior.multiview.memory import Memory, recognize, remember, without
+from emgs_jax.prior.multiview.memory import Memory, remember, without
 
 NONE = -1  # a keypoint without a landmark
 
@@ -89,16 +91,9 @@ class Structure:
 
 
 def detect(gray: np.ndarray, config: MatchingConfig) -> View:
-    """SIFT keypoints with the square roots of their normalised descriptors (Arandjelović and Zisserman, CVPR 2012)."""
-    detector = cv2.SIFT_create(
-        nfeatures=config.num_features, contrastThreshold=config.min_contrast, enable_precise_upscale=True
-    )
-    keypoints, descriptors = detector.detectAndCompute(gray, None)
-    if not keypoints:
-        return View(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros(0, int))
-    total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
-    pixels = np.array([point.pt for point in keypoints])
-    return View(pixels, np.sqrt(descriptors / total), np.full(len(pixels), NONE))
+    """The keypoints of an image (h, w) uint8, without landmarks and not placed."""
+    pixels, descriptors = sift.detect(gray, config.num_features, config.min_contrast)
+    return View(pixels, descriptors, np.full(len(pixels), NONE))
 
 
 def straighten(structure: Structure, distortion: float) -> None:
@@ -113,26 +108,14 @@ def match(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tuple[np.n
     none = np.zeros(0, int), np.zeros(0, int)
     if min(len(a.pixels), len(b.pixels)) < max(config.min_matches, 2):
         return none
-    similarity = a.descriptors @ b.descriptors.T
-    nearest = similarity.argmax(axis=1)
-    best, second = -np.partition(-similarity, 1, axis=1)[:, :2].T
-    # Of unit vectors |d|² = 2 - 2 cos.
-    is_distinct = 1 - best < config.max_ratio**2 * (1 - second)
-    is_mutual = similarity.argmax(axis=0)[nearest] == np.arange(len(nearest))
-    rows = np.flatnonzero(is_distinct & is_mutual)
+    rows, nearest = sift.mutual(a.descriptors, b.descriptors, config.max_ratio)
     if len(rows) < config.min_matches:
         return none
-    _, mask = _essential(a.pixels[rows], b.pixels[nearest[rows]], K, config)
+    _, mask = essential(a.pixels[rows], b.pixels[nearest], K, config.max_epipolar_error)
     if mask is None or mask.sum() < config.min_matches:
         return none
     inliers = mask.ravel().astype(bool)
-    return rows[inliers], nearest[rows[inliers]]
-
-
-def _essential(a: np.ndarray, b: np.ndarray, K: np.ndarray, config: MatchingConfig):
-    return cv2.findEssentialMat(
-        a, b, K, method=cv2.USAC_MAGSAC, prob=0.9999, threshold=config.max_epipolar_error, maxIters=2000
-    )
+    return rows[inliers], nearest[inliers]
 
 
 def link(structure: Structure, frame: int, config: MatchingConfig) -> None:
@@ -184,7 +167,7 @@ def relative_pose(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tu
     pixels_a, pixels_b = a.pixels[rows_a[has]], b.pixels[rows_b[has]]
     if len(pixels_a) < config.min_matches:
         return None
-    E, mask = _essential(pixels_a, pixels_b, K, config)
+    E, mask = essential(pixels_a, pixels_b, K, config.max_epipolar_error)
     if E is None or E.shape != (3, 3):
         return None
     count, R, t, mask = cv2.recoverPose(E, pixels_a, pixels_b, K, mask=mask)
@@ -198,24 +181,11 @@ def relative_pose(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tu
     return np.linalg.inv(T_b_a), float(count * np.median(parallax))
 
 
-def calibration(intrinsics: Sequence[float]) -> np.ndarray:
-    """The matrix K (3, 3) of fx, fy, cx, cy."""
-    fx, fy, cx, cy = intrinsics
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-
-
-def unit_rays(pixels: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Unit viewing directions (n, 3) of pixels (n, 2), camera frame."""
-    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
-
-
 def place(structure: Structure, view: View, config: MatchingConfig) -> bool:
     """Give a view the pose that fits the landmarks which it sees; False without enough of them."""
     known = structure.known(view)
-    found = _pose_of(
-        structure.points[view.landmark[known]], view.pixels[known], structure.K, config.min_matches, config
-    )
+    points, pixels = structure.points[view.landmark[known]], view.pixels[known]
+    found = pose_of(points, pixels, structure.K, config.min_matches, config.max_reprojection_error)
     if found is not None:
         view.T_ref_view = found[0]
     return found is not None
@@ -223,9 +193,10 @@ def place(structure: Structure, view: View, config: MatchingConfig) -> bool:
 
 def refind(structure: Structure, view: View, config: MatchingConfig) -> bool:
     """Likewise with landmarks of the memory, which become landmarks of the view again."""
-    rows, keypoints = recognize(structure.memory, view.descriptors, config.max_ratio)
+    # In the memory a point may be there twice, so a match is distinct among the view's keypoints only.
+    rows, keypoints = sift.mutual(structure.memory.descriptors, view.descriptors, config.max_ratio)
     points = structure.memory.points[rows]
-    found = _pose_of(points, view.pixels[keypoints], structure.K, config.min_refound, config)
+    found = pose_of(points, view.pixels[keypoints], structure.K, config.min_refound, config.max_reprojection_error)
     if found is None:
         return False
     view.T_ref_view, inliers = found
@@ -236,28 +207,6 @@ def refind(structure: Structure, view: View, config: MatchingConfig) -> bool:
     structure.points[view.landmark[keypoints]] = points
     structure.memory = without(structure.memory, rows)
     return True
-
-
-def _pose_of(
-    points: np.ndarray, pixels: np.ndarray, K: np.ndarray, least: int, config: MatchingConfig
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """T_ref_view from points (n, 3) at pixels (n, 2) (PnP with MAGSAC++), and the rows that fit; None for few."""
-    if len(points) < least:
-        return None
-    params = cv2.UsacParams()
-    params.threshold, params.confidence, params.maxIterations = config.max_reprojection_error, 0.9999, 2000
-    params.score, params.sampler = cv2.SCORE_METHOD_MAGSAC, cv2.SAMPLING_UNIFORM
-    params.loMethod, params.randomGeneratorState = cv2.LOCAL_OPTIM_SIGMA, 0
-    found, _, rotation, translation, inliers = cv2.solvePnPRansac(
-        points.reshape(-1, 1, 3), pixels.reshape(-1, 1, 2), K.copy(), None, params=params
-    )
-    if not found or inliers is None or len(inliers) < least:
-        return None
-    rows = inliers.ravel()
-    rotation, translation = cv2.solvePnPRefineLM(points[rows], pixels[rows], K, None, rotation, translation)
-    T_view_ref = np.eye(4)
-    T_view_ref[:3, :3], T_view_ref[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
-    return np.linalg.inv(T_view_ref), rows
 
 
 def triangulate(structure: Structure, config: MatchingConfig) -> None:

@@ -26,11 +26,12 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.keypoints.poses import calibration
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate_depth
 from emgs_jax.prior.multiview.incremental import StructureConfig, extend, initialize
-from emgs_jax.prior.multiview.landmarks import Structure, View, calibration, detect, forget, link
+from emgs_jax.prior.multiview.landmarks import Structure, View, detect, forget, link
 from emgs_jax.prior.multiview.lens import as_shown, points_shown, rectify, straight
 
 jitted_depth = eqx.filter_jit(estimate_depth)

@@ -1,0 +1,109 @@
+"""Do loops fit each other, and what the graph knows already?
+
+By appearance two rooms that are furnished alike are one place, and all loops between them agree on one correction. If
+there are keyframes that it brings together and that see through each other's surfaces, as at the end of the hall before
+the rooms, it is wrong as a whole, also between keyframes that see nothing of that. Without such a view only the path is
+left: that the camera cannot have come back, as far as that is known.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.sparse.csgraph import connected_components
+from scipy.stats import chi2, norm
+
+from emgs_jax.loops.two_views import gap_between, rescaled
+from emgs_jax.loops.verification import LoopMeasurement
+
+
+@dataclass(frozen=True)
+class AgreementConfig:
+    """When two loops say the same; gaps count frames, lengths are the map's.
+
+    Args:
+        max_query_gap, max_candidate_gap: between the queries and between the candidates of two loops.
+        max_distance: between where they put one query.
+        max_turn_deg: likewise.
+        min_others: loops, each of another query, that a loop needs.
+        max_contradicted: queries of contradicted loops, among all that agree one after the other.
+    """
+
+    max_query_gap: int
+    max_candidate_gap: int
+    max_distance: float
+    max_turn_deg: float
+    min_others: int
+    max_contradicted: int
+
+
+def is_consistent(innovation: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], num_std: float) -> bool:
+    """Is a loop within what the graph leaves open (innovationᵀ covariance⁻¹ innovation, a χ² of d)?
+
+    The threshold has the probability of `num_std` standard deviations of one number: 3 refuses .27 % of true loops.
+
+    Args:
+        innovation: Log(Z_a_b⁻¹ T_a_b) in the order translation, rotation; with the difference of the log-ratios, seven.
+        covariance: of the graph's own T_a_b, marginal, without this loop, plus that of the measurement. Too small a
+            covariance refuses true loops after a drift; with metres of it no loop can be refused here.
+
+    Raises:
+        ValueError: shapes differ, or the covariance is not positive definite.
+    """
+    if covariance.shape != (len(innovation), len(innovation)):
+        raise ValueError(f"covariance must be {(len(innovation),) * 2}, got {covariance.shape}")
+    try:
+        whitened = np.linalg.solve(np.linalg.cholesky(covariance), innovation)
+    except np.linalg.LinAlgError as error:
+        raise ValueError("covariance must be positive definite") from error
+    return bool(whitened @ whitened <= chi2.isf(2 * norm.sf(num_std), len(innovation)))
+
+
+def agreeing(
+    loops: Sequence[LoopMeasurement],
+    contradicted: Sequence[LoopMeasurement],
+    poses: Mapping[int, Float[np.ndarray, "4 4"]],
+    log_scales: Mapping[int, float],
+    config: AgreementConfig,
+) -> Bool[np.ndarray, " n"]:
+    """Which loops have enough others, of nearby queries to nearby candidates, that imply the same correction.
+
+    A false match of repeating texture is alone, or one of many that all say something else. Loops that agree one after
+    the other are one statement, however far the path drifts in the meantime, and fall together if it is contradicted:
+    see the top of this file.
+
+    Args:
+        contradicted: `VerifyInfo.contradicted` of those that were refused.
+        poses: T_world_camera of every frame of a loop, as they are now.
+        log_scales: σ of these: a length of the inference times e^σ is one of the map.
+    """
+    every = [*loops, *contradicted]
+    if not every:
+        return np.zeros(0, bool)
+    agree = np.array([[_agree(one, other, poses, log_scales, config) for other in every] for one in every])
+    agree &= agree.T
+    _, group = connected_components(agree, directed=False)
+    queries, is_evidence = np.array([loop.b for loop in every]), np.arange(len(every)) < len(loops)
+
+    def is_accepted(row: int) -> bool:
+        others = set(queries[agree[row] & is_evidence]) - {queries[row]}
+        against = set(queries[(group == group[row]) & ~is_evidence])
+        return len(others) >= config.min_others and len(against) <= config.max_contradicted
+
+    return np.array([is_accepted(row) for row in range(len(loops))], bool)
+
+
+def _agree(
+    one: LoopMeasurement,
+    other: LoopMeasurement,
+    poses: Mapping[int, Float[np.ndarray, "4 4"]],
+    log_scales: Mapping[int, float],
+    config: AgreementConfig,
+) -> bool:
+    """Are two loops near each other, and does the correction of the other, T_implied T_now⁻¹, fit this query?"""
+    if abs(one.b - other.b) > config.max_query_gap or abs(one.a - other.a) > config.max_candidate_gap:
+        return False
+    implied, by_other = (poses[loop.a] @ rescaled(loop.Z_a_b, np.exp(log_scales[loop.a])) for loop in (one, other))
+    distance, turn = gap_between(by_other @ np.linalg.inv(poses[other.b]) @ poses[one.b], implied)
+    return distance <= config.max_distance and turn <= config.max_turn_deg

@@ -1,0 +1,138 @@
+"""Is a candidate the query's place? Two keyframes that show the same, others that say so too, and none that objects.
+
+What passes all gates may still be wrong: by appearance two rooms that are furnished alike are one place. What tells
+them apart is in `agreement`.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from emgs_jax.loops.alignment import Aligned, AlignmentConfig, Gate, RefusedError, align, require
+from emgs_jax.loops.appearance import Keyframe
+from emgs_jax.loops.contradiction import contradicted_share
+from emgs_jax.loops.two_views import gap_between, rescaled
+
+
+@dataclass(frozen=True)
+class VerificationConfig:
+    """Thresholds beyond those of two keyframes; lengths in units of the candidate's inference.
+
+    Args:
+        alignment: of query and candidate, and of query and each neighbour.
+        min_neighbours: of the candidate that must be verified too.
+        max_neighbour_gap, max_neighbour_distance: the camera may be elsewhere by this times the median depth plus this.
+        max_neighbour_turn_deg: between the poses by way of candidate and neighbour.
+        max_contradicted: share of the surface that both show which stands where the other looks through.
+        contradiction_margin: share of the depth by which it must be in the way.
+    """
+
+    alignment: AlignmentConfig
+    min_neighbours: int
+    max_neighbour_gap: float
+    max_neighbour_distance: float
+    max_neighbour_turn_deg: float
+    max_contradicted: float
+    contradiction_margin: float
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """A keyframe near a candidate, and where it is known to be.
+
+    Args:
+        T_candidate_neighbour: camera neighbour -> camera candidate, in units of the candidate's inference.
+        log_ratio: σ_neighbour - σ_candidate, where a length of an inference times e^σ is metric; 0 where both are.
+    """
+
+    keyframe: Keyframe
+    T_candidate_neighbour: Float[np.ndarray, "4 4"]
+    log_ratio: float = 0.0
+
+
+@dataclass(frozen=True)
+class LoopMeasurement:
+    """An edge of the graph between a, the candidate, and b, the query.
+
+    Args:
+        a, b: their frames.
+        Z_a_b: camera b -> camera a, in units of a's inference.
+        log_ratio: σ_b - σ_a: log of the median ratio of a point's depth in a's inference over that in b's.
+        sqrt_info: W, upper triangular, with WᵀW the information of (translation, rotation, log-ratio) where the truth
+            is Z Exp(·).
+        num_inliers: points that fit in every direction in which they have a depth.
+    """
+
+    a: int
+    b: int
+    Z_a_b: Float[np.ndarray, "4 4"]
+    log_ratio: float
+    sqrt_info: Float[np.ndarray, "7 7"]
+    num_inliers: int
+
+
+@dataclass(frozen=True)
+class VerifyInfo:
+    """Why a candidate was refused.
+
+    Args:
+        refused_by: the first gate that it did not pass; None if accepted.
+        measured: what that gate compares with its threshold; NaN if accepted.
+        contradicted: what was measured, where all matches fit and yet it is wrong: evidence against all loops that
+            imply the same correction.
+    """
+
+    refused_by: Gate | None = None
+    measured: float = float("nan")
+    contradicted: LoopMeasurement | None = None
+
+
+def verify(
+    query: Keyframe, candidate: Keyframe, neighbours: Sequence[Neighbour], config: VerificationConfig
+) -> tuple[LoopMeasurement | None, VerifyInfo]:
+    """Measure where the query's camera is from the candidate's; None with the reason where it is not sure to be there.
+
+    Args:
+        neighbours: keyframes just before and after the candidate, which know their place from it without the query.
+    """
+    try:
+        found = align(candidate, query, config.alignment)
+        _check_neighbours(found, query, neighbours, config)
+    except RefusedError as refused:
+        return None, VerifyInfo(refused.gate, refused.measured)
+    similarity = found.similarity
+    sqrt_info = np.linalg.cholesky(np.linalg.inv(similarity.covariance)).T
+    pose, log_ratio = similarity.T_a_b, similarity.log_ratio
+    loop = LoopMeasurement(candidate.frame, query.frame, pose, log_ratio, sqrt_info, found.num_inliers)
+    share = contradicted_share(candidate, query, similarity, config.contradiction_margin)
+    if share > config.max_contradicted:
+        return None, VerifyInfo(Gate.CONTRADICTED, share, loop)
+    return loop, VerifyInfo()
+
+
+def tally(infos: Iterable[VerifyInfo]) -> dict[str, int]:
+    """How many candidates each gate refused, in the gates' order, and how many were `accepted`."""
+    counts = Counter(info.refused_by for info in infos)
+    return {gate.value: counts[gate] for gate in Gate} | {"accepted": counts[None]}
+
+
+def _check_neighbours(
+    found: Aligned, query: Keyframe, neighbours: Sequence[Neighbour], config: VerificationConfig
+) -> None:
+    """Every neighbour that is verified alone must put the query where the candidate does; enough of them must be."""
+    verified = 0
+    for neighbour in neighbours:
+        try:
+            similarity = align(neighbour.keyframe, query, config.alignment).similarity
+        except RefusedError:
+            continue
+        T_neighbour_query = rescaled(similarity.T_a_b, np.exp(neighbour.log_ratio))
+        distance, turn = gap_between(neighbour.T_candidate_neighbour @ T_neighbour_query, found.similarity.T_a_b)
+        allowed = config.max_neighbour_gap * found.median_depth + config.max_neighbour_distance
+        require(Gate.NEIGHBOURS_DISAGREE, distance <= allowed, distance)
+        require(Gate.NEIGHBOURS_DISAGREE, turn <= config.max_neighbour_turn_deg, turn)
+        verified += 1
+    require(Gate.NEIGHBOURS, verified >= config.min_neighbours, verified)

@@ -1,0 +1,230 @@
+"""Keyframes: what is kept of an image; and candidates: which earlier ones look alike, and alike enough."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from loop_scene import INTRINSICS, SIZE, appearance_config, looks
+
+from emgs_jax.loops.appearance import (
+    Candidate,
+    Database,
+    Keyframe,
+    describe,
+    extend,
+    propose,
+    summarize,
+    train,
+    unit_descriptors,
+)
+from emgs_jax.keypoints.sift import detect
+
+
+def picture(seed=0, size=SIZE):
+    """An RGB image full of blobs of all sizes."""
+    rng = np.random.default_rng(seed)
+    image = np.zeros((size[1], size[0], 3))
+    for cell in (4, 8, 16, 32):
+        coarse = rng.uniform(0, 60, (size[1] // cell + 1, size[0] // cell + 1, 3))
+        image += np.kron(coarse, np.ones((cell, cell, 1)))[: size[1], : size[0]]
+    return np.uint8(image)
+
+
+def ramp(size=SIZE):
+    """Camera-frame points of the plane z = 2 + x / 4, and a mask that is on."""
+    fx, fy, cx, cy = INTRINSICS
+    x, y = np.meshgrid((np.arange(size[0]) - cx) / fx, (np.arange(size[1]) - cy) / fy)
+    z = 2 / (1 - 0.25 * x)
+    return np.float32(np.stack([x * z, y * z, z], axis=-1)), np.ones(x.shape, bool)
+
+
+def described(seed=0, frame=0, config=None):
+    return describe(frame, picture(seed), *ramp(), INTRINSICS, config or appearance_config())
+
+
+def bytes_of(keyframe):
+    arrays = [value for value in vars(keyframe).values() if isinstance(value, np.ndarray)]
+    return sum(array.nbytes for array in arrays)
+
+
+def test_a_keyframe_takes_less_than_100_kB():
+    keyframe = described()
+    assert len(keyframe.pixels) == 500 and 70_000 < bytes_of(keyframe) < 100_000
+
+
+def test_points_lie_on_the_surface_below_the_keypoints():
+    keyframe = described()
+    assert np.isfinite(keyframe.points).all()
+    fx, fy, cx, cy = INTRINSICS
+    shown = keyframe.points[:, :2] / keyframe.points[:, 2:] * (fx, fy) + (cx, cy)
+    np.testing.assert_allclose(shown, keyframe.pixels, atol=2e-3)
+    np.testing.assert_allclose(keyframe.points[:, 2], 2 + keyframe.points[:, 0] / 4, atol=1e-3)
+
+
+def test_a_keypoint_without_depth_or_at_a_step_of_it_has_no_point():
+    points, mask = ramp()
+    mask[:, :100] = False
+    points[:, 200:] *= 1.2
+    keyframe = describe(0, picture(), points, mask, INTRINSICS, appearance_config())
+    x = keyframe.pixels[:, 0]
+    near_edge = (np.abs(x - 99.5) < 0.5) | (np.abs(x - 199.5) < 0.5)
+    is_known = np.isfinite(keyframe.points).all(axis=1)
+    np.testing.assert_array_equal(is_known, (x > 100) & ~near_edge)
+    assert 0.4 < is_known.mean() < 0.8
+
+
+def test_the_depth_grid_holds_the_depths_at_its_cells_and_0_where_there_is_none():
+    points, mask = ramp()
+    mask[:120] = False
+    keyframe = describe(0, picture(), points, mask, INTRINSICS, appearance_config("grid=[8,6]"))
+    assert keyframe.depths.shape == (6, 8) and (keyframe.depths[:3] == 0).all()
+    np.testing.assert_allclose(keyframe.depths[3:], np.tile(points[0, 20::40, 2], (3, 1)), rtol=1e-3)
+
+
+def test_descriptors_survive_as_bytes():
+    import cv2
+
+    config = appearance_config()
+    gray = cv2.cvtColor(picture(), cv2.COLOR_RGB2GRAY)
+    _, exact = detect(gray, config.num_features, config.min_contrast)
+    kept = unit_descriptors(described())
+    assert kept.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(kept, axis=1), 1.0, rtol=1e-5)
+    assert (kept * exact[: len(kept)]).sum(axis=1).min() > 0.9995
+
+
+def test_sizes_that_differ_are_refused():
+    points, mask = ramp()
+    with pytest.raises(ValueError, match="one height and width"):
+        describe(0, picture()[:-1], points, mask, INTRINSICS, appearance_config())
+    with pytest.raises(ValueError, match="one height and width"):
+        describe(0, picture(), points, mask[:-1], INTRINSICS, appearance_config())
+
+
+def test_vlad_is_the_normalised_root_of_normalised_residuals():
+    words = np.float32(np.eye(128)[:2])
+    descriptors = np.float32([[0.6, 0, 0.8, *np.zeros(125)], [0.8, 0, 0, 0.6, *np.zeros(124)]])
+    residual = (descriptors - words[0]).sum(axis=0)  # both belong to the first word
+    residual /= np.linalg.norm(residual)
+    expected = np.sign(residual) * np.sqrt(np.abs(residual))
+    expected /= np.linalg.norm(expected)
+    vector = summarize(descriptors, words)
+    np.testing.assert_allclose(vector[:128], expected, atol=1e-6)
+    assert (vector[128:] == 0).all()
+
+
+def test_a_repeated_texture_does_not_outweigh_the_rest():
+    """Each word counts once, whether one keypoint or a hundred belong to it."""
+    words = np.float32(np.eye(128)[:2])
+    near = np.float32([[0.8, 0, 0.6, *np.zeros(125)], [0, 0.8, 0, 0.6, *np.zeros(124)]])
+    once, often = summarize(near, words), summarize(near[[0, *[1] * 100]], words)
+    np.testing.assert_allclose(once, often, atol=1e-6)
+
+
+def as_keyframe(frame, rows, grid=(6, 8)):
+    """A keyframe that shows these of 2000 looks."""
+    rows = np.asarray(rows)
+    return Keyframe(
+        *(frame, np.zeros((len(rows), 2), np.float32), looks(2000)[rows], np.zeros((len(rows), 3), np.float32)),
+        *(INTRINSICS, SIZE, np.zeros(grid, np.float16)),
+    )
+
+
+def walk(num_frames, lap, step=10, count=150):
+    """A database of frames each of which shows what the last did but for 30 looks, and again after a lap."""
+    config = appearance_config("num_words=16", "min_gap=20", "suppressed_gap=6")
+    database = Database()
+    for frame in range(num_frames):
+        first = 30 * (frame % lap)
+        database = extend(database, as_keyframe(frame, (first + np.arange(count)) % 1800), config)
+    return database, config
+
+
+def test_the_place_of_a_lap_before_is_the_first_candidate():
+    database, config = walk(55, lap=40)
+    for row in (45, 50, 54):
+        best = propose(database, row, config)[0]
+        assert database.keyframes[best.row].frame == row - 40
+        np.testing.assert_allclose(best.score, 1.0, atol=1e-5)
+
+
+def test_a_place_that_was_never_seen_has_no_candidate_although_something_is_always_the_most_alike():
+    database, config = walk(40, lap=40)
+    assert all(propose(database, row, config) == [] for row in range(40))
+
+
+def test_candidates_are_old_apart_in_time_and_few():
+    database, config = walk(55, lap=40)
+    generous = dataclasses.replace(config, quantile=0.0, num_neighbours=54, num_candidates=3)
+    rng = np.random.default_rng(0)
+    vectors = np.float32(np.abs(database.vectors + 0.02 * rng.normal(size=database.vectors.shape)))  # none is 0 or less
+    database = dataclasses.replace(database, vectors=vectors)
+    found = propose(database, 54, generous)
+    frames = [database.keyframes[one.row].frame for one in found]
+    assert len(found) == 3 and frames[0] == 14 and max(frames) <= 34
+    assert min(abs(a - b) for i, a in enumerate(frames) for b in frames[:i]) > 6
+    assert [one.score for one in found] == sorted((one.score for one in found), reverse=True)
+    near = propose(database, 54, dataclasses.replace(generous, suppressed_gap=0))
+    assert {one.row for one in near} == {13, 14, 15}
+
+
+def test_the_threshold_is_that_quantile_of_the_similarity_to_the_last_neighbours():
+    vectors = np.float32([[0.7, np.sqrt(1 - 0.49)], [0.6, 0.8], [0.5, np.sqrt(0.75)], [0.9, np.sqrt(0.19)], [1, 0]])
+    keyframes = tuple(as_keyframe(frame, [0]) for frame in (0, 100, 197, 198, 200))
+    database = Database(keyframes, np.zeros((1, 128), np.float32), vectors, 5)
+    config = appearance_config("num_neighbours=2", "quantile=0.5", "min_gap=50")
+    assert propose(database, 4, config) == [Candidate(0, pytest.approx(0.7))]  # (.5 + .9) / 2 lets .7 pass, not .6
+    assert propose(database, 4, dataclasses.replace(config, quantile=0.6)) == []
+    assert len(propose(database, 4, dataclasses.replace(config, quantile=0.0))) == 2
+    assert propose(database, 0, config) == []
+
+
+def test_a_blank_image_has_a_keyframe_and_is_no_candidate():
+    points, mask = ramp()
+    blank = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
+    config = appearance_config("min_gap=1", "num_words=8")
+    database = Database()
+    for frame in range(4):
+        database = extend(database, describe(frame, blank, points, mask, INTRINSICS, config), config)
+    assert propose(database, 3, config) == [] and not len(database.words)
+    database = extend(database, dataclasses.replace(described(), frame=4), config)
+    database = extend(database, describe(5, blank, points, mask, INTRINSICS, config), config)
+    assert database.words.shape == (8, 128) and propose(database, 5, config) == []
+
+
+def test_words_are_trained_anew_when_there_are_twice_as_many_keyframes():
+    trained = []
+    config = appearance_config("num_words=16")
+    database = Database()
+    for frame in range(9):
+        database = extend(database, as_keyframe(frame, 30 * frame + np.arange(100)), config)
+        trained.append(database.num_trained)
+        assert database.vectors.shape == (frame + 1, 16 * 128)
+        np.testing.assert_array_equal(
+            database.vectors[0], summarize(unit_descriptors(database.keyframes[0]), database.words)
+        )
+    assert trained == [1, 2, 2, 4, 4, 4, 4, 8, 8]
+
+
+def test_it_is_the_same_each_time():
+    first, second = walk(20, lap=40)[0], walk(20, lap=40)[0]
+    np.testing.assert_array_equal(first.words, second.words)
+    np.testing.assert_array_equal(first.vectors, second.vectors)
+    one, other = described(), described()
+    np.testing.assert_array_equal(one.descriptors, other.descriptors)
+    np.testing.assert_array_equal(one.points, other.points)
+    sample = unit_descriptors(one)
+    assert not np.array_equal(train(sample, appearance_config()), train(sample, appearance_config("seed=1")))
+
+
+def test_keyframes_come_in_order():
+    config = appearance_config()
+    database = extend(Database(), as_keyframe(5, range(100)), config)
+    with pytest.raises(ValueError, match="must come after 5"):
+        extend(database, as_keyframe(5, range(100)), config)
+
+
+@pytest.mark.parametrize("words", ["quantile=1.5", "num_neighbours=0"])
+def test_values_without_meaning_are_refused(words):
+    with pytest.raises(Exception, match=words.split("=")[0]):
+        appearance_config(words)

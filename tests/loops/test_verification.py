@@ -1,0 +1,309 @@
+"""Loops between keyframes whose poses are known: what is measured, what every gate refuses, and what no gate can."""
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+from loop_scene import (
+    INTRINSICS,
+    SIZE,
+    appearance_config,
+    keyframe,
+    looks,
+    loops_config,
+    matrix,
+    neighbours_of,
+    room,
+    verification_config,
+)
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.data.apartment import Apartment
+from emgs_jax.data.backprojection import backproject
+from emgs_jax.loops.agreement import agreeing, is_consistent
+from emgs_jax.loops.alignment import Gate
+from emgs_jax.loops.appearance import Keyframe, describe
+from emgs_jax.loops.two_views import gap_between, rescaled
+from emgs_jax.loops.verification import LoopMeasurement, Neighbour, VerifyInfo, tally, verify
+
+CANDIDATE = matrix((0, 10, 0), (0.1, 0.0, 0.2))
+QUERY = matrix((3, -4, 2), (0.4, 0.1, -0.1))
+TRUTH = np.linalg.inv(CANDIDATE) @ QUERY
+
+
+def measured(points=None, query=QUERY, scale_a=1.0, scale_b=1.0, noise=0.0, overrides=()):
+    """`verify` of a query at frame 500 against a candidate at frame 3, both seeing the same points."""
+    points = room() if points is None else points
+    a = keyframe(points, CANDIDATE, 3, scale_a, noise)
+    b = keyframe(points, query, 500, scale_b, noise)
+    return verify(b, a, neighbours_of(points, CANDIDATE, scale_a), verification_config(*overrides))
+
+
+def assert_refused(result, gate):
+    loop, info = result
+    assert loop is None and info.refused_by == gate, info
+
+
+def test_the_pose_of_the_query_in_the_candidates_frame_is_exact():
+    loop, info = measured()
+    assert info.refused_by is None and np.isnan(info.measured)
+    assert (loop.a, loop.b) == (3, 500) and loop.num_inliers > 100
+    np.testing.assert_allclose(loop.Z_a_b, TRUTH, atol=1e-5)  # float32 points and pixels
+    assert abs(loop.log_ratio) < 1e-5
+
+
+def test_three_edges_around_a_triangle_close():
+    """An edge the wrong way round would not."""
+    poses = [CANDIDATE, QUERY, matrix((-2, 5, 0), (-0.1, 0.1, 0.1))]
+    views = [keyframe(room(), T, frame) for frame, T in enumerate(poses)]
+    config = verification_config("min_neighbours=0")
+    Z = [verify(views[b], views[a], [], config)[0].Z_a_b for a, b in ((0, 1), (1, 2), (2, 0))]
+    np.testing.assert_allclose(Z[0] @ Z[1] @ Z[2], np.eye(4), atol=2e-5)
+
+
+def test_lengths_are_those_of_the_candidates_inference_and_the_ratio_is_its_unit_over_the_querys():
+    loop, _ = measured(scale_a=1.05, scale_b=0.98)
+    np.testing.assert_allclose(loop.Z_a_b, rescaled(TRUTH, 1.05), atol=2e-5)
+    np.testing.assert_allclose(loop.log_ratio, np.log(1.05 / 0.98), atol=1e-5)
+
+
+def test_a_prior_without_a_metric_may_have_any_ratio():
+    loop, _ = measured(scale_a=0.5, scale_b=2.0, overrides=("alignment.scale_std=.inf",))
+    np.testing.assert_allclose(loop.log_ratio, np.log(0.25), atol=1e-5)
+    np.testing.assert_allclose(loop.Z_a_b, rescaled(TRUTH, 0.5), atol=2e-5)
+
+
+def with_wrong(view, share, seed=0):
+    """The same keyframe, the first of its keypoints elsewhere in the image."""
+    count = int(share * len(view.pixels))
+    pixels = view.pixels.copy()
+    pixels[:count] = np.random.default_rng(seed).uniform((0, 0), SIZE, (count, 2))
+    return dataclasses.replace(view, pixels=pixels)
+
+
+def test_wrong_matches_and_wrong_depths_do_not_move_the_pose():
+    a, b = keyframe(room(), CANDIDATE, 3), with_wrong(keyframe(room(), QUERY, 500), 0.3)
+    points = a.points.copy()
+    points[::5] *= 1.4
+    points[1::7] = np.nan
+    a = dataclasses.replace(a, points=points)
+    loop, _ = verify(b, a, neighbours_of(room(), CANDIDATE), verification_config())
+    distance, turn = gap_between(loop.Z_a_b, TRUTH)
+    assert distance < 2e-3 and turn < 0.05 and abs(loop.log_ratio) < 2e-3
+
+
+def test_the_stated_uncertainty_holds_the_error():
+    """Independent errors of 2 % of depth: the error must be within 3 of the standard deviations, which are not vast."""
+    points = room()
+    for frame in range(5):
+        a, b = (keyframe(points, T, 10 * frame + i, noise=0.02) for i, T in enumerate((CANDIDATE, QUERY)))
+        loop, _ = verify(b, a, [], verification_config("min_neighbours=0"))
+        error = np.linalg.inv(loop.Z_a_b) @ TRUTH
+        xi = np.concatenate([error[:3, 3], Rotation.from_matrix(error[:3, :3]).as_rotvec(), [-loop.log_ratio]])
+        assert np.linalg.norm(loop.sqrt_info @ xi) < np.sqrt(18.5)  # χ²₇(.99)
+        covariance = np.linalg.inv(loop.sqrt_info.T @ loop.sqrt_info)
+        std = np.sqrt(np.diag(covariance))
+        assert (std[:3] >= 0.01).all() and (std[3:6] >= np.radians(0.3)).all() and std[6] >= 0.005
+        assert (std[:3] < 0.05).all() and (std[3:6] < np.radians(1.5)).all() and std[6] < 0.03
+
+
+def test_it_is_the_same_each_time():
+    first, second = measured(noise=0.02), measured(noise=0.02)
+    np.testing.assert_array_equal(first[0].Z_a_b, second[0].Z_a_b)
+    np.testing.assert_array_equal(first[0].sqrt_info, second[0].sqrt_info)
+
+
+# ---------------------------------------------------------------------------------------------------- what is refused
+
+
+def test_another_place_has_too_few_matches():
+    b = keyframe(room(), QUERY, 500)
+    b = dataclasses.replace(b, descriptors=looks(300, 8)[: len(b.pixels)])
+    a = keyframe(room(), CANDIDATE, 3)
+    assert_refused(verify(b, a, [], verification_config()), Gate.MATCHES)
+
+
+def test_blank_images_are_refused():
+    nothing = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32)
+    blank = Keyframe(3, *nothing, INTRINSICS, SIZE, np.zeros((6, 8), np.float16))
+    other = keyframe(room(), QUERY, 500)
+    assert_refused(verify(other, blank, [], verification_config()), Gate.MATCHES)
+    assert_refused(verify(blank, other, [], verification_config()), Gate.MATCHES)
+
+
+def test_matches_most_of_which_no_motion_explains_are_refused():
+    a = keyframe(room(600), CANDIDATE, 3)
+    b = with_wrong(keyframe(room(600), QUERY, 500), 0.8)
+    result = verify(b, a, [], verification_config("alignment.min_matches=20"))
+    assert_refused(result, Gate.MATCH_SHARE)
+
+
+@pytest.mark.parametrize("blind", ["candidate", "query"])
+def test_points_are_needed_in_both_directions(blind):
+    a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
+    few = lambda view: np.where(np.arange(len(view.points))[:, None] < 15, view.points, np.nan)  # noqa: E731
+    if blind == "candidate":
+        a = dataclasses.replace(a, points=few(a))
+    else:
+        b = dataclasses.replace(b, points=few(b))
+    assert_refused(verify(b, a, [], verification_config()), Gate.POSE)
+
+
+def test_points_of_either_that_say_different_poses_are_refused():
+    """The query's points are right for a camera 60 cm aside, the candidate's for the camera that there is."""
+    a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
+    b = dataclasses.replace(b, points=b.points + np.float32([0.6, 0, 0]))
+    assert_refused(verify(b, a, [], verification_config()), Gate.POSES_DISAGREE)
+
+
+def test_points_in_a_corner_of_the_image_are_refused():
+    fx, fy, _, _ = INTRINSICS
+    far = room()
+    far[:, :2] *= 0.15
+    assert_refused(measured(far), Gate.HULL)
+
+
+def test_points_near_a_line_are_refused():
+    rng = np.random.default_rng(0)
+    along = np.linspace(-1.2, 1.2, 200)
+    rail = np.column_stack([along, 0.6 * along, 2.6 + 0.9 * along]) + rng.uniform(-0.02, 0.02, (200, 3))
+    assert_refused(measured(rail, overrides=("alignment.min_hull=0.0",)), Gate.COLLINEAR)
+
+
+def test_points_of_one_small_object_are_refused():
+    box = np.array([0.1, 0.05, 0.9]) + np.random.default_rng(0).uniform(-0.1, 0.1, (300, 3))
+    query = matrix((1, -2, 0), (0.15, 0.02, 0.25))
+    assert_refused(measured(box, query, overrides=("alignment.min_hull=0.0",)), Gate.SMALL)
+
+
+def test_depths_that_are_noise_are_refused():
+    # From one and the same place: no depth is wrong there by its reprojection.
+    assert_refused(measured(query=CANDIDATE, noise=0.15), Gate.DEPTHS)
+
+
+def test_a_scale_that_a_metric_prior_does_not_have_is_refused():
+    loop, info = measured(scale_b=1.3)
+    assert loop is None and info.refused_by == Gate.SCALE
+    np.testing.assert_allclose(info.measured, -np.log(1.3), atol=1e-4)
+    assert measured(scale_b=1.1)[0] is not None
+
+
+def test_a_candidate_whose_neighbours_are_not_verified_is_refused():
+    a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
+    one = neighbours_of(room(), CANDIDATE)[:1]
+    elsewhere = keyframe(room(), CANDIDATE @ matrix((0, 180, 0)), 901)
+    result = verify(b, a, [*one, Neighbour(elsewhere, matrix((0, 180, 0)))], verification_config())
+    assert_refused(result, Gate.NEIGHBOURS)
+    assert result[1].measured == 1
+
+
+@pytest.mark.parametrize("wrong", [matrix((0, 0, 0), (0.15, 0, 0)), matrix((0, 4, 0))])
+def test_neighbours_that_put_the_query_elsewhere_are_refused(wrong):
+    a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
+    first, second = neighbours_of(room(), CANDIDATE)
+    second = dataclasses.replace(second, T_candidate_neighbour=wrong @ second.T_candidate_neighbour)
+    assert_refused(verify(b, a, [first, second], verification_config()), Gate.NEIGHBOURS_DISAGREE)
+
+
+def test_refusals_are_counted_by_name_in_the_order_of_the_gates():
+    infos = [VerifyInfo(Gate.HULL, 0.05), VerifyInfo(), VerifyInfo(Gate.MATCHES, 3), VerifyInfo(Gate.HULL, 0.01)]
+    counts = tally(infos)
+    assert list(counts) == [*(gate.value for gate in Gate), "accepted"]
+    assert {name: count for name, count in counts.items() if count} == {"matches": 1, "hull": 2, "accepted": 1}
+
+
+def test_fewer_points_than_a_pose_needs_are_refused_in_the_config():
+    with pytest.raises(Exception, match="6 or more"):
+        verification_config("alignment.min_pose_points=5")
+
+
+# -------------------------------------------------------------------------------------------------------- agreement
+
+
+def test_an_innovation_is_measured_in_standard_deviations_of_its_dimension():
+    covariance = np.diag([0.04, 0.01, 0.01, 1e-4, 1e-4, 1e-4])
+    limit = np.sqrt(20.06)  # χ²₆ with the probability .9973 of three standard deviations
+    direction = np.array([0.2, 0, 0, 0, 0, 0.01]) / np.sqrt(2)
+    assert is_consistent(0.99 * limit * direction, covariance, 3.0)
+    assert not is_consistent(1.01 * limit * direction, covariance, 3.0)
+    assert is_consistent(np.array([2.99]), np.eye(1), 3.0) and not is_consistent(np.array([3.01]), np.eye(1), 3.0)
+
+
+def test_correlated_drift_is_open_only_in_its_own_direction():
+    along = np.array([1.0, 1.0]) / np.sqrt(2)
+    covariance = 1e-4 * np.eye(2) + 4.0 * np.outer(along, along)
+    assert is_consistent(3 * along, covariance, 3.0)
+    assert not is_consistent(0.5 * np.array([1.0, -1.0]), covariance, 3.0)
+
+
+def test_what_is_no_covariance_is_refused():
+    with pytest.raises(ValueError, match="positive definite"):
+        is_consistent(np.ones(2), np.diag([1.0, -1.0]), 3.0)
+    with pytest.raises(ValueError, match=r"\(6, 6\)"):
+        is_consistent(np.ones(6), np.eye(7), 3.0)
+
+
+def drifted_path(log_scale=0.0):
+    """Poses of a lap that ends 1 m and 20° off, and of 4 frames that come back; and the loops that say so."""
+    drift = matrix((0, 20, 0), (1.0, 0, 0.2))
+    truth = {frame: matrix((0, 0.5 * frame, 0), (0.1 * frame, 0, 0)) for frame in range(12)}
+    truth |= {500 + frame: matrix((0, 0.5 * frame + 1, 0), (0.1 * frame, 0.05, 0)) for frame in range(12)}
+    now = {frame: drift @ T if frame >= 500 else T for frame, T in truth.items()}
+    scales = dict.fromkeys(truth, log_scale)
+
+    def loop(a, b, wrong=None):
+        Z = rescaled(np.linalg.inv(truth[a]) @ truth[b], np.exp(-log_scale))
+        return LoopMeasurement(a, b, Z if wrong is None else wrong @ Z, 0.0, np.eye(7), 100)
+
+    return now, scales, loop
+
+
+@pytest.mark.parametrize("log_scale", [0.0, 0.3])
+def test_loops_that_imply_one_correction_agree_and_one_that_does_not_is_alone(log_scale):
+    poses, scales, loop = drifted_path(log_scale)
+    config = loops_config()["agreement"]
+    loops = [loop(0, 501), loop(2, 503), loop(5, 506, matrix((0, 0, 0), (0.5, 0, 0))), loop(7, 508)]
+    np.testing.assert_array_equal(agreeing(loops, [], poses, scales, config), [True, True, False, True])
+    turned = [loop(0, 501), loop(2, 503), loop(7, 508, matrix((0, 6, 0)))]
+    assert not agreeing(turned, [], poses, scales, config).any()
+    assert agreeing([], [], poses, scales, config).shape == (0,)
+
+
+def test_loops_of_one_query_are_one_witness_and_distant_ones_none():
+    poses, scales, loop = drifted_path()
+    config = loops_config("agreement.max_query_gap=4")["agreement"]
+    assert not agreeing([loop(0, 501), loop(1, 501), loop(2, 501), loop(3, 503)], [], poses, scales, config).any()
+    far = [loop(0, 500), loop(1, 501), loop(2, 511)]
+    assert not agreeing(far, [], poses, scales, config).any()
+    assert agreeing([*far[:2], loop(2, 502)], [], poses, scales, config).all()
+
+
+# ------------------------------------------------------------------------------------------------------- apartment
+
+
+@cache
+def seen(walk, frame, size=(240, 180)):
+    """Keyframe with exact depth, and its true pose."""
+    data = Apartment(walk=walk, size=size)
+    shown = data[frame]
+    points = backproject(shown.depth, data.intrinsics)
+    return describe(frame, shown.image, points, shown.depth > 0, data.intrinsics, appearance_config()), (
+        shown.T_world_camera
+    )
+
+
+def on_the_walk(walk, query, candidate):
+    """`verify` of two frames, with the keyframes 4 frames before and after the candidate."""
+    a, T_a = seen(walk, candidate)
+    near = [seen(walk, candidate + step) for step in (-4, 4)]
+    neighbours = [Neighbour(view, np.linalg.inv(T_a) @ T) for view, T in near]
+    return verify(seen(walk, query)[0], a, neighbours, verification_config())
+
+
+def nearest(walk, query, frames, turned=0.0):
+    """The frame whose camera is closest to the query's place when turned by that many degrees."""
+    poses = Apartment(walk=walk)._poses
+    T = poses[query] @ matrix((0, turned, 0))
+    gaps = [gap_between(poses[frame], T) for frame in frames]
+    return frames[int(np.argmin([distance + np.radians(turn) for distance, turn in gaps]))]
