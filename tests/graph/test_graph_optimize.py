@@ -302,6 +302,14 @@ def test_spreading_the_errors_first_keeps_true_loops_after_metres_of_drift():
     assert rmse(found, truth) < rmse(given, truth)
 
 
+def test_a_step_that_costs_more_is_not_taken():
+    """From far away, undamped: more steps never cost more, and some of them are refused."""
+    truth = walk(30, laps=1.0)
+    graph = Graph(disturb(truth, np.random.default_rng(0), np.full(7, 1.5)), measure(truth, window_pairs(30)))
+    costs = [optimize(graph, config(start="given", max_iterations=count))[1].cost for count in range(9)]
+    assert (np.diff(costs) <= 0).all() and (np.diff(costs) == 0).any() and costs[-1] < costs[0]
+
+
 def test_parts_without_a_path_to_the_first_node_stay():
     truth, graph = noisy_laps(24, 6, 1)
     given = disturb(truth, np.random.default_rng(0), 0.1 * (np.arange(7) < 6))
