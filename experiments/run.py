@@ -14,7 +14,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog
 from emgs_jax.prior.base import Prior
-from emgs_jax.report.metrics import describe, new_scorer, score_baselines, score_map, score_prior, spent
+from emgs_jax.report.metrics import describe, new_scorer, score_back_end, score_baselines, score_map, score_prior, spent
 from emgs_jax.report.printout import frame_lines
 from emgs_jax.report.provenance import print_metrics_table, provenance, write_metrics
 from emgs_jax.report.run_files import save_outputs, save_progress
@@ -50,7 +50,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
             metrics |= dense.rendering | score_prior(session, raw, scorer)
             metrics |= score_baselines(session, baselines, raw, scorer)
-        metrics |= describe(session, dataset) | spent(clock) | prior.report()
+        metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()
     settings = OmegaConf.to_container(config, resolve=True)
     metrics["provenance"] = provenance(settings, dataset, prior.provenance)
     write_metrics(folder / "metrics.json", metrics)

@@ -304,7 +304,11 @@ STAGES = [
         ("gaussians.valid & has_feature", "has_feature", "free rows have a class"),
     ),
     *own("slam", "test_slam")(
-        ("SlamState(map, aligned, T, state.time + 1), info", "SlamState(map, trusted, T, state.time + 1), info", "a rejected frame is no previous one"),
+        (
+            "SlamState(map, aligned, T, state.time + 1), info",
+            "SlamState(map, trusted, T, state.time + 1), info",
+            "a rejected frame is no previous one",
+        ),
         ("view = downscale(camera, thin)", "view = camera", "the full camera for the thinned rows"),
         (
             "rows_each = spacing(camera, thin, config.fit)",

@@ -194,13 +194,17 @@ def test_what_finds_no_free_row_is_counted_and_the_rest_is_kept(holes, expected)
 
 
 def test_more_fresh_gaussians_than_rows_are_counted():
-    _, count, overflow = insert(empty_map(4, 0), new_map(random_gaussians(7), jnp.ones(7), jnp.ones(()), jnp.asarray(0)))
+    _, count, overflow = insert(
+        empty_map(4, 0), new_map(random_gaussians(7), jnp.ones(7), jnp.ones(()), jnp.asarray(0))
+    )
     assert (count, overflow) == (4, 3)
 
 
 def test_inserting_nothing_changes_no_bit():
     map = with_holes(6, [1, 3])
-    inserted, count, overflow = insert(map, new_map(empty_gaussians(4, 0), jnp.full(4, 7.0), jnp.ones(()), jnp.asarray(0)))
+    inserted, count, overflow = insert(
+        map, new_map(empty_gaussians(4, 0), jnp.full(4, 7.0), jnp.ones(()), jnp.asarray(0))
+    )
     assert_same(inserted, map)
     assert (count, overflow) == (0, 0)
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scene import assert_same, at, random_gaussians
+from scene import assert_same, random_gaussians
 
 from emgs_jax.em import em_update
 from emgs_jax.gaussian_map import GaussianMap, insert, new_map
@@ -138,7 +138,9 @@ def test_it_is_cut_across_its_longer_axis_as_a_normal_distribution_is(settings):
     np.testing.assert_allclose(second.gaussians.means[0], [1 + samples.mean(), 2, 3], atol=2e-3)
     np.testing.assert_allclose(first.gaussians.means[0], [1 - samples.mean(), 2, 3], atol=2e-3)
     variance = samples.var() + float(settings.min_std) ** 2
-    np.testing.assert_allclose(second.gaussians.covs[0], np.diag([variance, 0.01, float(settings.min_std) ** 2]), atol=2e-4)
+    np.testing.assert_allclose(
+        second.gaussians.covs[0], np.diag([variance, 0.01, float(settings.min_std) ** 2]), atol=2e-4
+    )
 
 
 def test_what_is_hardly_wider_than_the_floor_stays_one(settings):

@@ -1,4 +1,4 @@
-"""The back end of a run: what the windows, the map and loops measure, the best poses for all of it, and a map that follows.
+"""The back end of a run: what windows, map and loops measure, the best poses for all of it, and a map that follows.
 
 Nodes are the frames from the first of the map on, in the order of `SlamState.time`.
 """
@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from emgs_jax.loops.agreement import AgreementConfig, agreeing
-from emgs_jax.loops.appearance import AppearanceConfig, Database, describe, extend, propose
 from emgs_jax.graph.deform import deform, deform_view
 from emgs_jax.graph.measurements import LOOP, WINDOW, Edges, Graph, Nodes
 from emgs_jax.graph.optimize import GraphConfig, GraphInfo, optimize
+from emgs_jax.loops.agreement import AgreementConfig, agreeing
+from emgs_jax.loops.appearance import AppearanceConfig, Database, describe, extend, propose
 from emgs_jax.loops.two_views import gap_between, rescaled
 from emgs_jax.loops.verification import LoopMeasurement, Neighbour, VerificationConfig, VerifyInfo, verify
 from emgs_jax.running.convert import to_se3
@@ -210,7 +210,7 @@ class BackEnd:
         return distance > self.config.min_correction or turn > self.config.min_correction_deg
 
     def close(self, state: SlamState, loops: Sequence[LoopMeasurement] = ()) -> SlamState:
-        """Solve with `loops` as edges, and move poses and map; where that is refused all stays, and they are no edges."""
+        """Solve with `loops` as edges, and move poses and map; if that is refused all stays, and they are no edges."""
         edges = [(loop.a, loop.b, loop.Z_a_b, loop.log_ratio, loop.sqrt_info, LOOP) for loop in loops]
         before = self.nodes()
         after, info = optimize(Graph(before, _stacked([*self.edges, *edges])), self.config.solver)
@@ -231,6 +231,13 @@ class BackEnd:
         poses = to_se3(np.stack([*self.poses, *[np.eye(4)] * (room - count)]))
         scales = jnp.asarray([*self.log_scales, *[0.0] * (room - count)], jnp.float32)
         return Nodes(poses, scales, jnp.arange(room) < count)
+
+
+def metric_graph(end: BackEnd) -> Graph:
+    """Poses and measurements in the map's scale, without scales of their own: what other solvers read."""
+    scaled = [(a, b, rescaled(Z, np.exp(end.log_scales[a])), 0.0, *rest) for a, b, Z, _, *rest in end.edges]
+    nodes = end.nodes()
+    return Graph(replace(nodes, log_scale=jnp.zeros_like(nodes.log_scale)), _stacked(scaled))
 
 
 def follow(state: SlamState, before: Nodes, after: Nodes, min_std: float) -> SlamState:

@@ -239,9 +239,7 @@ def _take_poses(run: MappingRun) -> None:
     """The back end's poses into the records of its frames, which are the last ones."""
     poses = run.back_end.poses
     first = len(run.records) - len(poses)
-    run.records[first:] = [
-        replace(record, pose=pose) for record, pose in zip(run.records[first:], poses, strict=True)
-    ]
+    run.records[first:] = [replace(record, pose=pose) for record, pose in zip(run.records[first:], poses, strict=True)]
 
 
 def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
