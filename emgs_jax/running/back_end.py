@@ -4,7 +4,7 @@ Nodes are the frames from the first of the map on, in the order of `SlamState.ti
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,39 +12,20 @@ import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from emgs_jax.graph.deform import deform, deform_view
-from emgs_jax.graph.measurements import LOOP, WINDOW, Edges, Graph, Nodes
+from emgs_jax.graph.measurements import Graph, Nodes
 from emgs_jax.graph.optimize import GraphConfig, GraphInfo, optimize
 from emgs_jax.loops.agreement import AgreementConfig, agreeing
 from emgs_jax.loops.appearance import AppearanceConfig, Database, describe, extend, propose
-from emgs_jax.loops.two_views import gap_between, rescaled
+from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement, Neighbour, VerificationConfig, VerifyInfo, verify
 from emgs_jax.running.convert import to_se3
+from emgs_jax.running.measuring import Edge, Look, NoiseConfig, loop_edge, map_edge, stacked, window_edges
 from emgs_jax.slam import SlamState
 
 _deform, _deform_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)
-
-
-@dataclass(frozen=True)
-class NoiseConfig:
-    """Standard deviations of what is measured, m, degrees and log-scale.
-
-    Args:
-        pair, pair_deg: of the relative pose of two neighbours in a window; those k apart: √k times.
-        anchor, anchor_deg: of the pose relative to the anchor, times 1 + the distance to it in metres. Its errors last
-            for many windows, so one window counts as less than its own error would say.
-        map, map_deg: of a frame placed in the map, relative to the frame of whose Gaussians it was placed by.
-        log_scale: of the ratio of two neighbours' scales.
-    """
-
-    pair: float
-    pair_deg: float
-    anchor: float
-    anchor_deg: float
-    map: float
-    map_deg: float
-    log_scale: float
 
 
 @dataclass(frozen=True)
@@ -58,7 +39,8 @@ class BackEndConfig:
         verification: of a candidate.
         agreement: of verified loops with each other.
         every: frames between keyframes.
-        min_correction, min_correction_deg: a loop that moves its query less says what is so already, and is left out.
+        max_known: χ² of a loop at the poses as they are, up to which it says what is so already and is left out.
+        min_frames: between two closures.
         solver: of the graph.
     """
 
@@ -68,28 +50,9 @@ class BackEndConfig:
     verification: VerificationConfig
     agreement: AgreementConfig
     every: int
-    min_correction: float
-    min_correction_deg: float
+    max_known: float
+    min_frames: int
     solver: GraphConfig
-
-
-@dataclass(frozen=True)
-class Look:
-    """What the back end takes of a frame, beside its pose.
-
-    Args:
-        frame: index in the data set.
-        image: RGB, uint8 (h, w, 3).
-        points: camera frame, m of its inference, (h, w, 3).
-        mask: of these, (h, w).
-        T_anchor_views: by frame index, the poses (4, 4) that its inference says; some may not be finite.
-    """
-
-    frame: int
-    image: np.ndarray
-    points: np.ndarray
-    mask: np.ndarray
-    T_anchor_views: Mapping[int, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -113,7 +76,7 @@ class BackEnd:
         log_scales: σ of their inferences, likewise.
         online: poses as they were when the frames were placed.
         frames: index in the data set of every node.
-        edges: rows of (a, b, Z (4, 4), log-ratio, sqrt_info (7, 7), kind).
+        edges: what was measured.
         database: keyframes; their `frame` is the node.
         verified: loops that passed every gate of two keyframes.
         contradicted: loops that something speaks against.
@@ -129,7 +92,7 @@ class BackEnd:
     log_scales: list[float] = field(default_factory=list)
     online: list[np.ndarray] = field(default_factory=list)
     frames: list[int] = field(default_factory=list)
-    edges: list[tuple] = field(default_factory=list)
+    edges: list[Edge] = field(default_factory=list)
     database: Database = field(default_factory=Database)
     verified: list[LoopMeasurement] = field(default_factory=list)
     contradicted: list[LoopMeasurement] = field(default_factory=list)
@@ -151,33 +114,31 @@ class BackEnd:
         self.online.append(self.poses[-1])
         self.log_scales.append(float(np.log(scale)))
         self.frames.append(look.frame)
-        self.edges += _window_edges(look, time, self)
+        noise = self.config.noise
+        self.edges += window_edges(look, time, self.log_scales, self.frames[0] == 0, self.config.offsets, noise)
         if origin is not None and origin < time:
             measured = np.linalg.inv(self.poses[time]) @ self.poses[origin]
-            measured[:3, 3] *= np.exp(-self.log_scales[time])
-            noise = self.config.noise
-            self.edges.append((time, origin, measured, 0.0, _weights(noise.map, noise.map_deg, np.inf), WINDOW))
+            self.edges.append(map_edge(time, origin, rescaled(measured, np.exp(-self.log_scales[time])), noise))
 
     def look_for_loops(self, look: Look) -> list[LoopMeasurement]:
-        """Describe the last node, and verify what it looks like; returns the loops that are new and agreed upon."""
-        time = len(self.poses) - 1
+        """Describe the last node, and verify what it looks like; returns the recent loops that are agreed upon."""
+        time, appearance = len(self.poses) - 1, self.config.appearance
         if time % self.config.every:
             return []
-        appearance = self.config.appearance
         keyframe = describe(time, look.image, look.points, look.mask, self.intrinsics, appearance)
         self.database = extend(self.database, keyframe, appearance)
         row = len(self.database.keyframes) - 1
         for candidate in propose(self.database, row, appearance):
             self._verify(row, candidate.row)
+        return self.agreed(since=time - self.config.agreement.max_query_gap)
+
+    def agreed(self, since: int = 0) -> list[LoopMeasurement]:
+        """Loops of queries from `since` on that others agree with and that are no edges yet."""
+        recent = [loop for loop in self.verified if loop.b >= since]
+        poses, log_scales = (dict(enumerate(values)) for values in (self.poses, self.log_scales))
+        yes = agreeing(recent, self.contradicted, poses, log_scales, self.config.agreement)
         known = {(loop.a, loop.b) for loop in self.accepted}
-        agreed = agreeing(
-            self.verified,
-            self.contradicted,
-            dict(enumerate(self.poses)),
-            dict(enumerate(self.log_scales)),
-            self.config.agreement,
-        )
-        return [loop for loop, yes in zip(self.verified, agreed, strict=True) if yes and (loop.a, loop.b) not in known]
+        return [loop for loop, ok in zip(recent, yes, strict=True) if ok and (loop.a, loop.b) not in known]
 
     def _verify(self, row: int, other: int) -> None:
         keyframes = self.database.keyframes
@@ -203,21 +164,29 @@ class BackEnd:
         else:
             self.verified.append(loop)
 
-    def is_needed(self, loop: LoopMeasurement) -> bool:
-        """Whether a loop says something that is not so already."""
-        implied = self.poses[loop.a] @ rescaled(loop.Z_a_b, np.exp(self.log_scales[loop.a]))
-        distance, turn = gap_between(self.poses[loop.b], implied)
-        return distance > self.config.min_correction or turn > self.config.min_correction_deg
+    def wants_to_close(self, loops: Sequence[LoopMeasurement]) -> bool:
+        """Whether some loop says what is not so, and the last closure is long enough ago."""
+        last = self.closures[-1].time if self.closures else -self.config.min_frames
+        is_due = len(self.poses) - 1 - last >= self.config.min_frames
+        return is_due and any(self.misfit(loop) > self.config.max_known for loop in loops)
+
+    def misfit(self, loop: LoopMeasurement) -> float:
+        """χ² of a loop at the poses and scales as they are."""
+        scale, other = self.log_scales[loop.a], self.log_scales[loop.b]
+        now = rescaled(np.linalg.inv(self.poses[loop.a]) @ self.poses[loop.b], np.exp(-scale))
+        error = np.linalg.inv(loop.Z_a_b) @ now
+        turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
+        return float(np.sum((loop.sqrt_info @ [*error[:3, 3], *turn, other - scale - loop.log_ratio]) ** 2))
 
     def close(self, state: SlamState, loops: Sequence[LoopMeasurement] = ()) -> SlamState:
         """Solve with `loops` as edges, and move poses and map; if that is refused all stays, and they are no edges."""
-        edges = [(loop.a, loop.b, loop.Z_a_b, loop.log_ratio, loop.sqrt_info, LOOP) for loop in loops]
+        edges = [*self.edges, *map(loop_edge, loops)]
         before = self.nodes()
-        after, info = optimize(Graph(before, _stacked([*self.edges, *edges])), self.config.solver)
+        after, info = optimize(Graph(before, stacked(edges)), self.config.solver)
         self.closures.append(Closure(len(self.poses) - 1, tuple(loops), info))
         if info.reason:
             return state
-        self.edges += edges
+        self.edges = edges
         self.accepted += loops
         count = len(self.poses)
         self.poses = list(np.asarray(after.T_world.as_matrix(), np.float64)[:count])
@@ -235,9 +204,11 @@ class BackEnd:
 
 def metric_graph(end: BackEnd) -> Graph:
     """Poses and measurements in the map's scale, without scales of their own: what other solvers read."""
-    scaled = [(a, b, rescaled(Z, np.exp(end.log_scales[a])), 0.0, *rest) for a, b, Z, _, *rest in end.edges]
+    scaled = [
+        edge._replace(Z_a_b=rescaled(edge.Z_a_b, np.exp(end.log_scales[edge.a])), log_ratio=0.0) for edge in end.edges
+    ]
     nodes = end.nodes()
-    return Graph(replace(nodes, log_scale=jnp.zeros_like(nodes.log_scale)), _stacked(scaled))
+    return Graph(replace(nodes, log_scale=jnp.zeros_like(nodes.log_scale)), stacked(scaled))
 
 
 def follow(state: SlamState, before: Nodes, after: Nodes, min_std: float) -> SlamState:
@@ -255,48 +226,6 @@ def _moved_pose(T: jaxlie.SE3, before: Nodes, after: Nodes, row: int) -> jaxlie.
     """The node's new pose; T itself, bit for bit, where the node stays."""
     old, new = before.T_world.wxyz_xyz[row], after.T_world.wxyz_xyz[row]
     return jaxlie.SE3(jnp.where(jnp.all(old == new), T.wxyz_xyz, new))
-
-
-def _weights(distance: float, turn_deg: float, log_scale: float) -> np.ndarray:
-    """(7, 7) square root of the information of independent errors; an infinite one is not measured."""
-    return np.diag(1.0 / np.array([distance] * 3 + [np.radians(turn_deg)] * 3 + [log_scale]))
-
-
-def _window_edges(look: Look, time: int, end: BackEnd) -> list[tuple]:
-    """What an inference says of its current frame and earlier ones of its window, and of the anchor."""
-    poses, noise = look.T_anchor_views, end.config.noise
-    here = poses.get(look.frame)
-    if here is None or not np.isfinite(here).all():
-        return []
-    edges = []
-    for offset in end.config.offsets:
-        there, row = poses.get(look.frame - offset), time - offset
-        if there is None or row < 0 or not np.isfinite(there).all():
-            continue
-        spread = np.sqrt(offset)
-        ratio = end.log_scales[row] - end.log_scales[time]
-        weights = _weights(spread * noise.pair, spread * noise.pair_deg, noise.log_scale if offset == 1 else np.inf)
-        edges.append((time, row, np.linalg.inv(here) @ there, ratio, weights, WINDOW))
-    anchor = poses.get(0)
-    if end.frames[0] == 0 and anchor is not None and look.frame > max(end.config.offsets):
-        measured = np.linalg.inv(here) @ anchor
-        reach = 1.0 + np.linalg.norm(measured[:3, 3])
-        weights = _weights(reach * noise.anchor, reach * noise.anchor_deg, np.inf)
-        edges.append((time, 0, measured, 0.0, weights, WINDOW))
-    return edges
-
-
-def _stacked(edges: Sequence[tuple]) -> Edges:
-    a, b, Z, ratios, weights, kinds = zip(*edges, strict=True)
-    return Edges(
-        a=jnp.asarray(a, jnp.int32),
-        b=jnp.asarray(b, jnp.int32),
-        Z_a_b=to_se3(np.stack(Z)),
-        log_ratio=jnp.asarray(ratios, jnp.float32),
-        sqrt_info=jnp.asarray(np.stack(weights), jnp.float32),
-        kind=jnp.asarray(kinds, jnp.int32),
-        valid=jnp.ones(len(edges), bool),
-    )
 
 
 def counts(end: BackEnd) -> dict[str, Any]:

@@ -15,10 +15,11 @@ from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.trajectory import to_tum
 from emgs_jax.localization import REASONS
 from emgs_jax.ops.camera import Camera
-from emgs_jax.running.back_end import BackEnd, BackEndConfig, Look
+from emgs_jax.running.back_end import BackEnd, BackEndConfig
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.convert import to_camera
 from emgs_jax.running.inputs import Input
+from emgs_jax.running.measuring import Look
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
 
 Seconds = Mapping[str, float]  # as a `Timer` reads
@@ -223,7 +224,7 @@ def correct(run: MappingRun, given: Input, info: StepInfo | None) -> None:
     for look, record in zip(looks, added, strict=True):
         end.add(look, record.pose, record.scale or 1.0, origin)
     found = end.look_for_loops(looks[-1])
-    if any(end.is_needed(loop) for loop in found):
+    if end.wants_to_close(found):
         run.state = end.close(run.state, found)
         _take_poses(run)
 
@@ -231,7 +232,8 @@ def correct(run: MappingRun, given: Input, info: StepInfo | None) -> None:
 def finish(run: MappingRun) -> None:
     """The best poses for all that was measured, and the map that conforms to them; nothing without a back end."""
     if run.back_end is not None and run.back_end.edges:
-        run.state = run.back_end.close(run.state)
+        end = run.back_end
+        run.state = end.close(run.state, [loop for loop in end.agreed() if end.misfit(loop) > end.config.max_known])
         _take_poses(run)
 
 
