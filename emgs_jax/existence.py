@@ -137,6 +137,7 @@ def join_layers(
         weight=map.weight + other.weight,
         num_updates=map.num_updates + other.num_updates,
         existence=jnp.maximum(map.existence, other.existence),
+        birth=map.birth,
     )
     map = where_rows(is_pair & is_heavier, joined, map)
     return without(map, is_pair & ~is_heavier)

@@ -20,12 +20,15 @@ class GaussianMap(eqx.Module):
         num_updates: how often EM or refinement fused something into it, at most twice a frame.
         existence: log-odds of there being what it stands for. A positive one is confirmed; any other is tentative: it
             is fused into, but neither aligned against nor exported.
+        birth: `SlamState.time` of the frame that it was made from. What moves that frame moves it, too: later frames
+            were placed by it.
     """
 
     gaussians: Gaussians
     weight: Float[Array, "*b n"]
     num_updates: Int[Array, "*b n"]
     existence: Float[Array, "*b n"]
+    birth: Int[Array, "*b n"]
 
 
 class AverageConfig(eqx.Module):
@@ -61,14 +64,17 @@ class SubmapConfig(eqx.Module):
 
 def empty_map(capacity: int, num_features: int) -> GaussianMap:
     """A map without a Gaussian."""
-    nothing = jnp.zeros(capacity)
-    return GaussianMap(empty_gaussians(capacity, num_features), nothing, jnp.zeros(capacity, jnp.int32), nothing)
+    nothing, none = jnp.zeros(capacity), jnp.zeros(capacity, jnp.int32)
+    return GaussianMap(empty_gaussians(capacity, num_features), nothing, none, nothing, none)
 
 
-def new_map(gaussians: Gaussians, weight: Float[Array, "n"], existence: Float[Array, ""]) -> GaussianMap:
-    """A map of Gaussians that are new, all with the same log-odds of existence."""
+def new_map(
+    gaussians: Gaussians, weight: Float[Array, "n"], existence: Float[Array, ""], birth: Int[Array, ""]
+) -> GaussianMap:
+    """A map of Gaussians that are new, all with the same log-odds of existence and from the same frame."""
     num_updates = jnp.ones(weight.shape, jnp.int32)
-    return GaussianMap(gaussians, weight, num_updates, jnp.broadcast_to(existence, weight.shape))
+    existence, birth = (jnp.broadcast_to(value, weight.shape) for value in (existence, birth))
+    return GaussianMap(gaussians, weight, num_updates, existence, birth)
 
 
 def confirmed(map: GaussianMap) -> Gaussians:
@@ -98,7 +104,7 @@ def update_average(
     gain = jnp.where(has_evidence, evidence / jnp.where(has_evidence, kept, 1.0), 0.0)
     weight = jnp.where(has_evidence, jnp.where(config.gain > 0, kept, gain), map.weight)
     blended = where_rows(has_evidence, blend(map.gaussians, new, gain, config.blend), map.gaussians)
-    return GaussianMap(blended, weight, map.num_updates + has_evidence, map.existence), gain
+    return GaussianMap(blended, weight, map.num_updates + has_evidence, map.existence, map.birth), gain
 
 
 def select_submap(

@@ -31,7 +31,7 @@ from emgs_jax.ops.linalg import Whitening, whitening
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
-from emgs_jax.registration.rigid import pose_row
+from emgs_jax.registration.rigid import median, pose_row
 from emgs_jax.splitting import SplittingConfig, split
 
 
@@ -75,11 +75,13 @@ class SlamState(eqx.Module):
         map: all Gaussians.
         previous: the last frame as it was aligned, world frame.
         T_world_previous: its pose.
+        time: frames so far, those that could not be placed included.
     """
 
     map: GaussianMap
     previous: Observation
     T_world_previous: jaxlie.SE3
+    time: Int[Array, ""]
 
 
 class Overflow(eqx.Module):
@@ -91,13 +93,14 @@ class Overflow(eqx.Module):
 
 
 class StepInfo(eqx.Module):
-    """What one step did."""
+    """What one step did; `origin` is the median birth of the Gaussians that explain its points, its own if none do."""
 
     T_world_camera: jaxlie.SE3
     T_world_newest: jaxlie.SE3
     localization: LocalizationInfo
     em: EmInfo
     refinement: RefinementInfo
+    origin: Int[Array, ""]
     num_gaussians: Int[Array, ""]
     overflow: Overflow
 
@@ -134,9 +137,11 @@ def _first_state(
     empty = empty_map(config.submap.map_capacity, world.features.shape[-1])
     # There is nothing else to align the second frame with, so the first window confirms itself.
     existence = jnp.maximum(config.existence.birth, config.existence.hit)
-    map, _, overflow = insert(empty, new_map(gaussians, _first_weight(weight, config.em.average), existence))
+    time = jnp.asarray(world.valid.shape[0], jnp.int32)
+    new = new_map(gaussians, _first_weight(weight, config.em.average), existence, time - 1)
+    map, _, overflow = insert(empty, new)
     previous = jax.tree.map(lambda leaf: leaf[-1], world)
-    return SlamState(map, previous, pose_row(T_world_views, -1)), overflow
+    return SlamState(map, previous, pose_row(T_world_views, -1), time), overflow
 
 
 @full_precision
@@ -165,11 +170,13 @@ def step(
     T, aligned, localization = call(_place, prediction.current, submap, coarse, config.localization, white)
     rows_each = spacing(camera, thin, config.fit)
     place = aligned, T, localization
-    submap, rest, em, halves = call(_fuse, submap, white, *place, rows_each, config.em, config.splitting)
+    submap, rest, em, halves, origin = call(
+        _fuse, submap, white, *place, state.time, rows_each, config.em, config.splitting
+    )
     candidates, weight = call(cluster, rest, call(_order, camera, thin), rows_each, config.fit)
     submap, fresh, refinement = call(_refine, submap, candidates, T, camera, thin, config.refinement)
     new = fresh, weight, halves
-    map, count, map_overflow = call(_store, state.map, submap, rows, new, place, camera, config)
+    map, count, map_overflow = call(_store, state.map, submap, rows, new, place, state.time, camera, config)
 
     info = StepInfo(
         T_world_camera=T,
@@ -177,10 +184,11 @@ def step(
         localization=localization,
         em=em,
         refinement=refinement,
+        origin=origin,
         num_gaussians=count,
         overflow=Overflow(map_overflow, submap_overflow, refinement.overflow),
     )
-    return SlamState(map, aligned, T), info
+    return SlamState(map, aligned, T, state.time + 1), info
 
 
 @eqx.filter_jit
@@ -221,20 +229,26 @@ def _fuse(
     aligned: Observation,
     T: jaxlie.SE3,
     localization: LocalizationInfo,
+    time: Int[Array, ""],
     spacing: int,
     config: EmConfig,
     splitting: SplittingConfig,
-) -> tuple[GaussianMap, Observation, EmInfo, GaussianMap]:
+) -> tuple[GaussianMap, Observation, EmInfo, GaussianMap, Int[Array, ""]]:
     """Fuse the points of a frame that is tracked, and split what they show to be too coarse.
 
     Returns:
-        The submap, the points that no Gaussian explains, counts, and the second halves of what was split.
+        The submap, the points that no Gaussian explains, counts, the second halves of what was split, and the median
+        birth of what explains the others.
     """
     trusted = _trusted(aligned, localization)
     noise = localization.noise[:, None] * (trusted.points - T.translation())
     submap, explained, em = em_update(submap, trusted, noise, config, white)
+    best = jnp.argmax(explained.responsibilities, axis=-1)[:, None]
+    births = submap.birth[jnp.take_along_axis(explained.rows, best, axis=-1)[:, 0]].astype(jnp.float32)
+    origin = jnp.where(em.num_fused > 0, median(births, explained.is_fused), time).astype(jnp.int32)
     submap, halves = split(submap, trusted, noise, (explained.rows, explained.responsibilities), spacing, splitting)
-    return submap, eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~explained.is_fused), em, halves
+    rest = eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~explained.is_fused)
+    return submap, rest, em, halves, origin
 
 
 def _trusted(aligned: Observation, localization: LocalizationInfo) -> Observation:
@@ -267,6 +281,7 @@ def _store(
     rows: Int[Array, "s"],
     new: tuple[Gaussians, Float[Array, "g"], GaussianMap],
     place: tuple[Observation, jaxlie.SE3, LocalizationInfo],
+    time: Int[Array, ""],
     camera: Camera,
     config: SlamConfig,
 ) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""]]:
@@ -281,7 +296,7 @@ def _store(
     map, is_seen = judge(write_back(map, submap, rows), trusted, T, thinned, noise, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
     submap = join_layers(take_rows(map, rows), is_seen, T, noise, config.existence)
-    born = new_map(fresh, _first_weight(weight, config.em.average), config.existence.birth)
+    born = new_map(fresh, _first_weight(weight, config.em.average), config.existence.birth, time)
     born = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), born, halves)
     map, _, overflow = insert(write_back(map, submap, rows), born)
     return map, jnp.sum(map.gaussians.valid), overflow

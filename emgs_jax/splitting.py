@@ -73,9 +73,7 @@ def is_too_coarse(
     return gaussians.valid & (count >= config.min_points * spacing) & is_contradicted
 
 
-def halves(
-    map: GaussianMap, min_std: Float[Array, ""]
-) -> tuple[GaussianMap, GaussianMap, Float[Array, "n"]]:
+def halves(map: GaussianMap, min_std: Float[Array, ""]) -> tuple[GaussianMap, GaussianMap, Float[Array, "n"]]:
     """Every Gaussian cut through its mean, across its longer tangential axis e.
 
     The halves of N(μ, S) have means μ ± √(2/π) s and the covariance S - 2/π s s', for s = S e / √(e' S e): together

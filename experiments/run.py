@@ -14,12 +14,12 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog
 from emgs_jax.prior.base import Prior
-from emgs_jax.report.metrics import describe, new_scorer, score_baselines, score_map, score_prior, spent
+from emgs_jax.report.metrics import describe, new_scorer, score_back_end, score_baselines, score_map, score_prior, spent
 from emgs_jax.report.printout import frame_lines
 from emgs_jax.report.provenance import print_metrics_table, provenance, write_metrics
 from emgs_jax.report.run_files import save_outputs, save_progress
 from emgs_jax.running.clock import Clock
-from emgs_jax.running.configure import baseline_configs, build_dataset, build_prior
+from emgs_jax.running.configure import baseline_configs, build_dataset, build_prior, graph_config
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
 from emgs_jax.running.drive import map_frames, show_record
 from emgs_jax.running.gathering import Baselines, RawPrior, gather
@@ -35,7 +35,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             dataset = build_dataset(config)
             prior = build_prior(config, dataset)
             slam, evaluation, densify = (instantiate(config[name]) for name in ("slam", "evaluation", "densify"))
-        session = new_run(dataset, slam, clock)
+        session = new_run(dataset, slam, clock, graph=graph_config(config))
         baselines = Baselines(baseline_configs(config), session, dataset)
         raw = _map(session, dataset, prior, baselines, evaluation, folder)
         save_progress(folder, session)
@@ -50,7 +50,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
             metrics |= dense.rendering | score_prior(session, raw, scorer)
             metrics |= score_baselines(session, baselines, raw, scorer)
-        metrics |= describe(session, dataset) | spent(clock) | prior.report()
+        metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()
     settings = OmegaConf.to_container(config, resolve=True)
     metrics["provenance"] = provenance(settings, dataset, prior.provenance)
     write_metrics(folder / "metrics.json", metrics)

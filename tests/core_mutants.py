@@ -112,6 +112,36 @@ REGISTRATION = [
     ),
 ]
 
+GRAPH = [
+    *own("graph/measurements", "graph/test_graph_residuals")(
+        ("jnp.exp(-ends.log_scale[0])", "jnp.exp(ends.log_scale[0])", "a translation that is scaled the wrong way"),
+        ("ends.log_scale[1] - ends.log_scale[0] -", "ends.log_scale[0] - ends.log_scale[1] -", "scales swapped"),
+        ("2.0 / (1.0 + excess)", "1.0 / (1.0 + excess)", "half the scaling, with a jump at φ"),
+        ("edges.valid & exists & both", "edges.valid & exists", "an edge to a node that is not in use"),
+        ("kind == LOOP, chi2 / kernel", "kind == WINDOW, chi2 / kernel", "the window's edges may be wrong, loops not"),
+    ),
+    *own("graph/sparse", "graph/test_graph_optimize")(
+        ("jacobians * free.ravel()[unknowns][:, None]", "jacobians", "the gauge moves"),
+        ("solved[rows, i]", "solved[rows, 0]", "covariances with the first node"),
+    ),
+    *own("graph/start", "graph/test_graph_optimize")(
+        ("turns.transpose(0, 2, 1)", "turns", "loops are spread against their direction"),
+    ),
+    *own("graph/problem", "graph/test_graph_optimize")(
+        ("(part == part[np.argmax(valid)])", "(part >= 0)", "a part without a path to the gauge counts"),
+        (
+            "problem.scale_information * np.asarray(nodes.log_scale)\n",
+            "0.0 * np.asarray(nodes.log_scale)\n",
+            "a prior on the change of scale",
+        ),
+    ),
+    *own("graph/optimize", "graph/test_graph_optimize")(
+        ("keeps = bool(reason) or", "keeps =", "what is refused moves the nodes"),
+        ("if gain > 0:  # not", "if True:  # not", "a step that costs more is taken"),
+        ("other if other.cost < given.cost else given", "given", "the errors are never spread"),
+    ),
+]
+
 STAGES = [
     *own("localization", "test_localization")(
         ("anchor_noise * reach**2", "anchor_noise * reach", "the anchor's deviation for its variance"),
@@ -274,7 +304,11 @@ STAGES = [
         ("gaussians.valid & has_feature", "has_feature", "free rows have a class"),
     ),
     *own("slam", "test_slam")(
-        ("SlamState(map, aligned, T), info", "SlamState(map, trusted, T), info", "a rejected frame is no previous one"),
+        (
+            "SlamState(map, aligned, T, state.time + 1), info",
+            "SlamState(map, trusted, T, state.time + 1), info",
+            "a rejected frame is no previous one",
+        ),
         ("view = downscale(camera, thin)", "view = camera", "the full camera for the thinned rows"),
         (
             "rows_each = spacing(camera, thin, config.fit)",
@@ -302,8 +336,8 @@ STAGES = [
             "one frame late",
         ),
         (
-            "SlamState(map, aligned, T), info",
-            "SlamState(map, aligned, coarse.T_world_camera), info",
+            "SlamState(map, aligned, T, state.time + 1), info",
+            "SlamState(map, aligned, coarse.T_world_camera, state.time + 1), info",
             "the coarse pose stays",
         ),
         (
@@ -352,4 +386,4 @@ RENDER = [
     ),
 ]
 
-MUTANTS = (*OPS, *REGISTRATION, *STAGES, *RENDER)
+MUTANTS = (*OPS, *REGISTRATION, *GRAPH, *STAGES, *RENDER)

@@ -9,7 +9,7 @@ from scene import compose
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.evaluation.trajectory import Alignment
-from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.gaussian_map import new_map
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
 from emgs_jax.running.record import FrameRecord
@@ -71,7 +71,7 @@ def hand_run(poses, raw_poses, true_poses, statuses=STATUSES, gaussians=None) ->
     """A finished run, as far as reports look at it; frame i is number i, taken at 100 + i / 4 seconds."""
     gaussians = wall(0.0, 1.0) if gaussians is None else gaussians
     count = gaussians.valid.shape[0]
-    map = GaussianMap(gaussians, jnp.ones(count), jnp.ones(count, jnp.int32), jnp.ones(count))
+    map = new_map(gaussians, jnp.ones(count), jnp.ones(()), jnp.asarray(0))
     records = [
         FrameRecord(index=i, name=f"{i}.png", timestamp=100.0 + i / 4, status=status)
         for i, status in enumerate(statuses)

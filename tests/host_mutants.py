@@ -39,6 +39,7 @@ FILES = ("tests/io/test_files.py",)
 MAP_FILE = ("tests/io/test_map_file.py",)
 MESH = ("tests/io/test_mesh.py",)
 PLY = ("tests/io/test_ply.py",)
+G2O = ("tests/io/test_g2o.py",)
 TRAJECTORY_FILE = ("tests/io/test_trajectory_file.py",)
 BACKPROJECTION = ("tests/data/test_backprojection.py",)
 READING = ("tests/data/test_reading.py", "tests/data/test_layouts.py")
@@ -57,62 +58,62 @@ TEXT = ("tests/features/test_text.py",)
 TOKENS = ("tests/features/test_tokens.py",)
 PATCHES = ("tests/features/test_patches.py",)
 STACKED = ("tests/running/test_stacked.py",)
-APPEARANCE = ("tests/graph/test_appearance.py",)
-VERIFICATION = ("tests/graph/test_verification.py",)
+APPEARANCE = ("tests/loops/test_appearance.py",)
+VERIFICATION = ("tests/loops/test_verification.py",)
 
 MUTANTS = (
-    # graph
+    # loops
     Mutant(
-        "emgs_jax/graph/appearance.py",
+        "emgs_jax/loops/appearance.py",
         "is_old = frames <= frames[row] - config.min_gap",
         "is_old = frames < frames[row]",
         APPEARANCE,
         "the frames just before are loops",
     ),
     Mutant(
-        "emgs_jax/graph/appearance.py",
+        "emgs_jax/loops/appearance.py",
         "    parts = _unit(parts)\n",
         "",
         APPEARANCE,
         "a repeated texture outweighs the rest of the image",
     ),
     Mutant(
-        "emgs_jax/graph/alignment.py",
+        "emgs_jax/loops/alignment.py",
         "rescaled(np.linalg.inv(T_b_a), np.exp(log_ratio))",
         "rescaled(np.linalg.inv(T_b_a), np.exp(-log_ratio))",
         VERIFICATION,
         "the reverse pose is brought into the wrong unit",
     ),
     Mutant(
-        "emgs_jax/graph/verification.py",
+        "emgs_jax/loops/verification.py",
         "rescaled(similarity.T_a_b, np.exp(neighbour.log_ratio))",
         "similarity.T_a_b",
         VERIFICATION,
         "a neighbour's lengths are taken for the candidate's",
     ),
     Mutant(
-        "emgs_jax/graph/verification.py",
+        "emgs_jax/loops/verification.py",
         "np.linalg.cholesky(np.linalg.inv(similarity.covariance)).T",
         "np.linalg.cholesky(similarity.covariance).T",
         VERIFICATION,
         "the covariance is given as information",
     ),
     Mutant(
-        "emgs_jax/graph/contradiction.py",
+        "emgs_jax/loops/contradiction.py",
         "points[is_inside, 2] < (1 - margin) * shown",
         "points[is_inside, 2] > (1 + margin) * shown",
         VERIFICATION,
         "what is hidden is a contradiction",
     ),
     Mutant(
-        "emgs_jax/graph/agreement.py",
+        "emgs_jax/loops/agreement.py",
         "(group == group[row]) & ~is_evidence",
         "agree[row] & ~is_evidence",
         VERIFICATION,
         "a contradiction does not reach what agrees with it one after the other",
     ),
     Mutant(
-        "emgs_jax/graph/agreement.py",
+        "emgs_jax/loops/agreement.py",
         " - {queries[row]}",
         "",
         VERIFICATION,
@@ -1293,6 +1294,15 @@ MUTANTS = (
         "height for width",
     ),
     # io
+    Mutant(
+        "emgs_jax/io/g2o.py",
+        "[6, 3, 4, 5, 0, 1, 2]",
+        "[3, 4, 5, 6, 0, 1, 2]",
+        G2O,
+        "quaternions with w first are read",
+    ),
+    Mutant("emgs_jax/io/g2o.py", "0.5 if half_angles", "2.0 if half_angles", G2O, "half angles are doubled"),
+    Mutant("emgs_jax/io/g2o.py", "[ids[name] for name in names]", "names", G2O, "names of vertices for their rows"),
     Mutant(
         "emgs_jax/io/trajectory.py",
         "Rotation.from_quat(rows[:, 4:])",

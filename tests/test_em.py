@@ -9,7 +9,7 @@ import reference
 from scene import as_numpy, assert_same, at, move_gaussians, pose, random_gaussians, random_observation
 
 from emgs_jax.em import EStep, e_step, em_update, m_step, precision, support, widened_distance_sq
-from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.gaussian_map import new_map
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.linalg import whitening
@@ -28,7 +28,7 @@ def em(*arguments):
     return map, step.is_fused, info
 
 
-MAP = GaussianMap(GAUSSIANS, jnp.ones(N), jnp.ones(N, jnp.int32), jnp.ones(N))
+MAP = new_map(GAUSSIANS, jnp.ones(N), jnp.ones(()), jnp.asarray(0))
 
 PAPER = ("slam/em=paper",)
 OPEN = {"min_normal_cos": -1.0, "max_mahalanobis_sq": np.inf, "max_log_gap": np.inf, "noise": 0.0}

@@ -8,7 +8,7 @@ import pytest
 from scene import assert_same, pose
 
 from emgs_jax.existence import depth_range, join_layers, judge
-from emgs_jax.gaussian_map import GaussianMap, confirmed
+from emgs_jax.gaussian_map import GaussianMap, confirmed, new_map
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
 from emgs_jax.ops.camera import Camera, pixel_grid, rays
@@ -43,7 +43,7 @@ def discs(means, normal=(0.0, 0.0, -1.0), std=0.05, features=None) -> Gaussians:
 def map_of(*parts: Gaussians, existence=0.5, weight=1.0) -> GaussianMap:
     gaussians = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     one = jnp.ones(gaussians.valid.shape[0])
-    return GaussianMap(gaussians, weight * one, one.astype(jnp.int32), existence * one)
+    return new_map(gaussians, weight * one, jnp.asarray(existence), jnp.asarray(0))
 
 
 def look(depth, valid=True) -> Observation:

@@ -27,7 +27,7 @@ insert = eqx.filter_jit(insert)
 
 def map_of(count: int, capacity: int, seed: int = 0) -> GaussianMap:
     return grow(
-        GaussianMap(random_gaussians(count, seed), jnp.ones(count), jnp.ones(count, jnp.int32), jnp.ones(count)),
+        new_map(random_gaussians(count, seed), jnp.ones(count), jnp.ones(()), jnp.asarray(0)),
         capacity,
     )
 
@@ -172,12 +172,12 @@ def with_holes(count, holes):
 def test_fresh_gaussians_fill_the_free_rows_in_order():
     map, fresh = with_holes(10, [2, 3, 7, 9]), random_gaussians(5, 9)
     fresh = eqx.tree_at(lambda g: g.valid, fresh, jnp.array([False, True, True, False, True]))
-    inserted, count, overflow = insert(map, new_map(fresh, jnp.arange(5.0), jnp.asarray(0.25)))
+    inserted, count, overflow = insert(map, new_map(fresh, jnp.arange(5.0), jnp.asarray(0.25), jnp.asarray(6)))
     assert (count, overflow) == (3, 0)
     for row, source in ((2, 1), (3, 2), (7, 4)):
         np.testing.assert_array_equal(inserted.gaussians.means[row], fresh.means[source])
         assert inserted.weight[row] == source and inserted.num_updates[row] == 1
-        assert inserted.existence[row] == 0.25
+        assert inserted.existence[row] == 0.25 and inserted.birth[row] == 6
     np.testing.assert_array_equal(inserted.gaussians.valid, [True] * 9 + [False])
     others = np.array([0, 1, 4, 5, 6, 8])
     assert_same(jax.tree.map(lambda x: x[others], inserted), jax.tree.map(lambda x: x[others], map))
@@ -186,7 +186,7 @@ def test_fresh_gaussians_fill_the_free_rows_in_order():
 @pytest.mark.parametrize(("holes", "expected"), [([2], 2), ([], 3), ([1, 4], 1), ([0, 1, 4], 0)])
 def test_what_finds_no_free_row_is_counted_and_the_rest_is_kept(holes, expected):
     map, fresh = with_holes(6, holes or [99]), random_gaussians(3, 9)
-    inserted, count, overflow = insert(map, new_map(fresh, jnp.ones(3), jnp.ones(())))
+    inserted, count, overflow = insert(map, new_map(fresh, jnp.ones(3), jnp.ones(()), jnp.asarray(0)))
     assert (count, overflow) == (3 - expected, expected)
     assert inserted.gaussians.valid.sum() == min(6, 6 - len(holes) + 3)
     kept = np.setdiff1d(np.arange(6), holes)
@@ -194,13 +194,17 @@ def test_what_finds_no_free_row_is_counted_and_the_rest_is_kept(holes, expected)
 
 
 def test_more_fresh_gaussians_than_rows_are_counted():
-    _, count, overflow = insert(empty_map(4, 0), new_map(random_gaussians(7), jnp.ones(7), jnp.ones(())))
+    _, count, overflow = insert(
+        empty_map(4, 0), new_map(random_gaussians(7), jnp.ones(7), jnp.ones(()), jnp.asarray(0))
+    )
     assert (count, overflow) == (4, 3)
 
 
 def test_inserting_nothing_changes_no_bit():
     map = with_holes(6, [1, 3])
-    inserted, count, overflow = insert(map, new_map(empty_gaussians(4, 0), jnp.full(4, 7.0), jnp.ones(())))
+    inserted, count, overflow = insert(
+        map, new_map(empty_gaussians(4, 0), jnp.full(4, 7.0), jnp.ones(()), jnp.asarray(0))
+    )
     assert_same(inserted, map)
     assert (count, overflow) == (0, 0)
 

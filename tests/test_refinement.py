@@ -8,7 +8,7 @@ import pytest
 import reference
 from scene import as_numpy, assert_same, at, move_gaussians, pose
 
-from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.gaussian_map import GaussianMap, new_map
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.refinement import average_candidates, refine
 
@@ -38,7 +38,7 @@ GRID = [(x, y, 2.0) for x in np.arange(-0.6, 0.61, 0.3) for y in np.arange(-0.6,
 
 def map_of(gaussians) -> GaussianMap:
     count = gaussians.valid.shape[0]
-    return GaussianMap(gaussians, jnp.ones(count), jnp.ones(count, jnp.int32), jnp.ones(count))
+    return new_map(gaussians, jnp.ones(count), jnp.ones(()), jnp.asarray(0))
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_a_refinement_equals_equations_5_and_6_one_candidate_at_a_time(settings,
     )
     weight = jnp.linspace(0.5, 3.0, count)
     map, T = (
-        GaussianMap(old, weight, jnp.ones(count, jnp.int32), jnp.ones(count)),
+        new_map(old, weight, jnp.ones(()), jnp.asarray(0)),
         pose((0.02, -0.03, 0.01), (0.05, -0.02, 0.1)),
     )
     merged, fresh, info = refined(map, new, T, camera, config)

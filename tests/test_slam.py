@@ -174,7 +174,7 @@ def test_a_step_moves_with_a_rigid_motion_of_the_world(state, camera, settings):
         prediction.has_newest,
     )
     map = eqx.tree_at(lambda m: m.gaussians, state.map, move_gaussians(motion, state.map.gaussians))
-    moved_state = SlamState(map, transform(motion, state.previous, one), motion @ state.T_world_previous)
+    moved_state = SlamState(map, transform(motion, state.previous, one), motion @ state.T_world_previous, state.time)
     new, info = step(moved_state, moved_prediction, FULL, settings)
     # The solver ends within its tolerance of the same pose; points near a gate may pass it or not.
     assert max(pose_error(info.T_world_camera, motion @ stepped[1].T_world_camera)) < 2e-3

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scene import assert_same, at, random_gaussians
+from scene import assert_same, random_gaussians
 
 from emgs_jax.em import em_update
 from emgs_jax.gaussian_map import GaussianMap, insert, new_map
@@ -33,7 +33,7 @@ def one_disc(std=(0.2, 0.1, 0.01), weight=6.0) -> GaussianMap:
         features=jnp.zeros((2, 0)),
         valid=jnp.array([True, False]),
     )
-    return new_map(one, jnp.full(2, weight), jnp.asarray(2.0))
+    return new_map(one, jnp.full(2, weight), jnp.asarray(2.0), jnp.asarray(3))
 
 
 def points_of(map: GaussianMap, count: int = 64, seed: int = 0) -> Observation:
@@ -114,7 +114,7 @@ def test_a_spread_within_the_noise_or_a_common_offset_is_no_contradiction(settin
 
 
 def test_halves_together_have_the_moments_and_the_weight_of_the_whole():
-    map = new_map(random_gaussians(20, 3), jnp.arange(20.0), jnp.asarray(1.5))
+    map = new_map(random_gaussians(20, 3), jnp.arange(20.0), jnp.asarray(1.5), jnp.asarray(3))
     min_std = jnp.sqrt(0.9 * jnp.min(jnp.linalg.eigvalsh(map.gaussians.covs)))
     first, second, _ = halves(map, min_std)
     a, b, whole = first.gaussians, second.gaussians, map.gaussians
@@ -138,7 +138,9 @@ def test_it_is_cut_across_its_longer_axis_as_a_normal_distribution_is(settings):
     np.testing.assert_allclose(second.gaussians.means[0], [1 + samples.mean(), 2, 3], atol=2e-3)
     np.testing.assert_allclose(first.gaussians.means[0], [1 - samples.mean(), 2, 3], atol=2e-3)
     variance = samples.var() + float(settings.min_std) ** 2
-    np.testing.assert_allclose(second.gaussians.covs[0], np.diag([variance, 0.01, float(settings.min_std) ** 2]), atol=2e-4)
+    np.testing.assert_allclose(
+        second.gaussians.covs[0], np.diag([variance, 0.01, float(settings.min_std) ** 2]), atol=2e-4
+    )
 
 
 def test_what_is_hardly_wider_than_the_floor_stays_one(settings):

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from scene import (
     observe_room,
@@ -17,6 +18,7 @@ from scene import (
 
 from emgs_jax import em, existence, gaussian_map, gaussians, initialization, localization, splitting
 from emgs_jax import observation as obs
+from emgs_jax.graph import measurements
 from emgs_jax.ops import camera as cam
 from emgs_jax.ops import clustering, linalg, neighbours
 from emgs_jax.ops.pytree import stack
@@ -30,7 +32,7 @@ ONE = jnp.ones(())
 
 
 def map_of(seed: int) -> gaussian_map.GaussianMap:
-    return gaussian_map.GaussianMap(random_gaussians(32, seed, 2), jnp.ones(32), jnp.ones(32, jnp.int32), jnp.ones(32))
+    return gaussian_map.new_map(random_gaussians(32, seed, 2), jnp.ones(32), ONE, jnp.asarray(0))
 
 
 def prediction_of(seed: int) -> obs.Prediction:
@@ -73,6 +75,18 @@ def close(seed: int):
     return obs.Observation(g.means + 0.01, g.colors, g.normals, g.features, jnp.ones(32), g.valid)
 
 
+def graph_of(seed: int) -> measurements.Graph:
+    """Poses that are some centimetres off what the edges say; one edge is not in use."""
+    rng = np.random.default_rng(seed)
+    numbers = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)  # noqa: E731
+    a, b = jnp.arange(6) % 5, (jnp.arange(6) + 2) % 5
+    T = jaxlie.SE3.exp(numbers(5, 6))
+    Z = jaxlie.SE3(T.wxyz_xyz[a]).inverse() @ jaxlie.SE3(T.wxyz_xyz[b]) @ jaxlie.SE3.exp(0.05 * numbers(6, 6))
+    nodes = measurements.Nodes(T, 0.1 * numbers(5), jnp.ones(5, bool))
+    kind, used = jnp.arange(6) % 2, jnp.arange(6) < 5
+    return measurements.Graph(nodes, measurements.Edges(a, b, Z, numbers(6), numbers(6, 7, 7), kind, used))
+
+
 NOISE = jnp.full((40, 3), 0.02)
 MASK, ORDER = jnp.arange(40) % 3 > 0, jnp.arange(40)
 # name: (verb of one item, its arguments by seed)
@@ -108,7 +122,7 @@ VERBS = {
         lambda s: (map_of(s), points(s)),
     ),
     "insert": (
-        lambda m, g: gaussian_map.insert(m, gaussian_map.new_map(g, jnp.ones(9), ONE)),
+        lambda m, g: gaussian_map.insert(m, gaussian_map.new_map(g, jnp.ones(9), ONE, jnp.asarray(0))),
         lambda s: (map_of(s), random_gaussians(9, s, 2)),
     ),
     "fit_rigid": (rigid.fit_rigid, lambda s: (points(s).points, points(s + 5).points, jnp.ones(40))),
@@ -163,6 +177,13 @@ VERBS = {
     "num_independent": (
         lambda e, p: noise.num_independent(e, p, jnp.arange(40) % 3 > 0),
         lambda s: (points(s).colors[:, 0], points(s).points),
+    ),
+    "move": (measurements.move, lambda s: (graph_of(s).nodes, 0.1 * jnp.ones((5, 7)))),
+    "residuals": (measurements.residuals, lambda s: (graph_of(s),)),
+    "linearize": (measurements.linearize, lambda s: (graph_of(s),)),
+    "robust": (
+        lambda chi2, kernel: measurements.robust(chi2, jnp.arange(6) % 2, kernel),
+        lambda s: (jnp.linspace(0.0, 60.0 + s, 6), ONE * 16.8),
     ),
     "refine": (
         lambda m, g, T: refine(m, g, T, CAMERA, CONFIG.refinement),

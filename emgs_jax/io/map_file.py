@@ -16,7 +16,7 @@ import numpy as np
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.files import atomic_write
 
-MAP_FORMAT, MAP_VERSION = "emgs_jax.map", 2
+MAP_FORMAT, MAP_VERSION = "emgs_jax.map", 3
 
 
 def save_map(path: str | os.PathLike, map: GaussianMap) -> None:

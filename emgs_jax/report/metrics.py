@@ -27,6 +27,7 @@ from emgs_jax.gaussian_map import confirmed
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.provenance import RAW_PRIOR, prefixed
+from emgs_jax.running.back_end import counts
 from emgs_jax.running.clock import Clock, peak_memory_mb
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
 from emgs_jax.running.gathering import Baselines, RawPrior
@@ -186,15 +187,26 @@ def score_settings(
 
 def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     """Size of the map, how many frames came to what, time and memory."""
-    counts = Counter(record.status for record in run.records)
+    statuses = Counter(record.status for record in run.records)
     metrics: Metrics = {"map/num_gaussians": int(np.asarray(confirmed(run.state.map).valid).sum())}
     metrics["map/num_tentative"] = int(np.asarray(run.state.map.gaussians.valid).sum()) - metrics["map/num_gaussians"]
     metrics["map/capacity"] = run.config.submap.map_capacity
-    metrics |= {f"frames/{status}": counts[status] for status in STATUSES}
+    metrics |= {f"frames/{status}": statuses[status] for status in STATUSES}
     metrics["frames/skipped"] = len(dataset.skipped)
     metrics["frames/overflow"] = sum(record.overflow or 0 for record in run.records)
     metrics["time/seconds_per_frame"] = seconds_per_frame(run.records)
     return metrics
+
+
+def score_back_end(run: MappingRun) -> Metrics:
+    """What became of loops, and the errors of the poses as they were when the frames were placed; empty without one."""
+    if run.back_end is None:
+        return {}
+    online = run.back_end.online
+    before = [record.pose for record in run.records[: len(run.records) - len(online)]]
+    poses = with_truth(run, np.stack([*before, *online])) if online else None
+    causal = {} if poses is None else trajectory_metrics(*poses)
+    return counts(run.back_end) | {key.replace("trajectory/", "trajectory_online/"): x for key, x in causal.items()}
 
 
 def spent(clock: Clock) -> Metrics:

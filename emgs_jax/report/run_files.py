@@ -6,22 +6,32 @@ import jax
 import numpy as np
 
 from emgs_jax.gaussian_map import confirmed
+from emgs_jax.io.g2o import save_graph_g2o
 from emgs_jax.io.map_file import save_map_npz
 from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.render.densify import DensifyConfig
+from emgs_jax.running.back_end import metric_graph
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.record import MappingRun
 
 
 def save_progress(folder: Path, run: MappingRun) -> None:
-    """Write trajectory.txt and map.npz of the frames so far; nothing before there is a map."""
+    """Write trajectory.txt and map.npz of the frames so far; nothing before there is a map.
+
+    With a back end also trajectory_online.txt, the poses as they were when the frames were placed, and graph.g2o.
+    """
     if run.state is not None:
         save_trajectory_tum(
             folder / "trajectory.txt", [record.timestamp for record in run.records], np.stack(run.poses)
         )
         save_map_npz(folder / "map.npz", run.state.map)
+    if run.back_end is not None and run.back_end.edges:
+        online = run.back_end.online
+        placed = [record.timestamp for record in run.records[-len(online) :]]
+        save_trajectory_tum(folder / "trajectory_online.txt", placed, np.stack(online))
+        save_graph_g2o(folder / "graph.g2o", metric_graph(run.back_end))
 
 
 def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: DensifyConfig, title: str) -> list[str]:

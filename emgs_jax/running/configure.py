@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from emgs_jax.evaluation.baselines import BaselineConfig
     from emgs_jax.evaluation.reconstruction import EvaluationConfig
     from emgs_jax.render.densify import DensifyConfig
+    from emgs_jax.running.back_end import BackEndConfig
     from emgs_jax.slam import SlamConfig
 
 # Installed below the package, in a clone beside it.
@@ -47,12 +48,14 @@ class RunConfig:
         slam: all stages.
         densify: what of a rendered view becomes a point.
         evaluation: the protocol of the comparison with the truth.
+        graph: the back end; None with `graph=none`.
     """
 
     settings: dict[str, Any]
     slam: "SlamConfig"
     densify: "DensifyConfig"
     evaluation: "EvaluationConfig"
+    graph: "BackEndConfig | None" = None
 
 
 def load_config(*overrides: str, name: str = "config") -> RunConfig:
@@ -68,10 +71,16 @@ def load_config(*overrides: str, name: str = "config") -> RunConfig:
     config = compose(*overrides, name=name)
     try:
         slam, densify, evaluation = (instantiate(config[part]) for part in ("slam", "densify", "evaluation"))
+        graph = graph_config(config)
     except InstantiationException as error:
         raise ValueError(message_of(error)) from error
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    return RunConfig(settings=settings, slam=slam, densify=densify, evaluation=evaluation)
+    return RunConfig(settings=settings, slam=slam, densify=densify, evaluation=evaluation, graph=graph)
+
+
+def graph_config(config: DictConfig) -> "BackEndConfig | None":
+    """The back end of a config; None with `graph=none`."""
+    return instantiate(config.graph, _convert_="all") if config.graph else None
 
 
 def compose(*overrides: str, name: str = "config") -> DictConfig:

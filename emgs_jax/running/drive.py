@@ -16,7 +16,16 @@ from emgs_jax.running.configure import RunConfig, build_dataset, build_prior
 from emgs_jax.running.convert import FirstWindow
 from emgs_jax.running.growth import advance, prepare, start
 from emgs_jax.running.inputs import Input, RawView, inputs
-from emgs_jax.running.record import FrameRecord, MappingRun, new_run, record_lost, record_start, record_step
+from emgs_jax.running.record import (
+    FrameRecord,
+    MappingRun,
+    correct,
+    finish,
+    new_run,
+    record_lost,
+    record_start,
+    record_step,
+)
 
 
 def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
@@ -37,7 +46,7 @@ def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
         Clock().watching() as clock,
         tqdm(total=len(dataset), unit="frame", desc="mapping", disable=not show_progress) as bar,
     ):
-        run = new_run(dataset, config.slam, clock, lambda record: show_record(bar, record))
+        run = new_run(dataset, config.slam, clock, lambda record: show_record(bar, record), config.graph)
         deque(map_frames(run, dataset, prior), maxlen=0)
     return run
 
@@ -58,6 +67,8 @@ def map_frames(run: MappingRun, dataset: Dataset, prior: Prior) -> Iterator[RawV
         with run.clock.phase("map"):
             take(run, given)
         yield from given.raw
+    with run.clock.phase("map"):
+        finish(run)
 
 
 def take(run: MappingRun, given: Input) -> None:
@@ -66,13 +77,18 @@ def take(run: MappingRun, given: Input) -> None:
     match given.taken:
         case None:
             record_lost(run, given)
+            return
         case FirstWindow() as first:
             prepare(first, run.camera, run.config)
             run.state, run.config = start(first, run.camera, run.config)
             record_start(run, given, spent(given, timer))
+            info = None
         case Prediction() as prediction:
             run.state, info, run.config = advance(run.state, prediction, run.camera, run.config)
-            record_step(run, given, jax.device_get(info), spent(given, timer))
+            info = jax.device_get(info)
+            record_step(run, given, info, spent(given, timer))
+    if run.back_end is not None:
+        correct(run, given, info)
 
 
 def spent(given: Input, timer: Timer, num_sharing: int = 1) -> Mapping[str, float]:

@@ -35,6 +35,7 @@ class Input:
         raw: what the prior alone says of each.
         taken: what the map starts from, or the prediction of a step; None where there is nothing to start from yet.
         T_world_anchor: known pose of the first frame.
+        T_anchor_views: what the inference says of every view of its window, by frame index.
         spent: seconds of the conversion.
     """
 
@@ -42,6 +43,7 @@ class Input:
     raw: tuple[RawView, ...]
     taken: FirstWindow | Prediction | None
     T_world_anchor: np.ndarray
+    T_anchor_views: Mapping[int, np.ndarray]
     spent: Mapping[str, float]
 
 
@@ -98,7 +100,7 @@ def _step(
     """The step that integrates the current frame."""
     timer, current = Timer(clock), prediction.window.current
     step = to_prediction(prediction, frames, anchor, config.observation)
-    return [Input((frames[current],), (raw[current],), step, anchor, timer.read())]
+    return [Input((frames[current],), (raw[current],), step, anchor, _poses(prediction), timer.read())]
 
 
 def _opening(
@@ -113,16 +115,21 @@ def _opening(
     timer = Timer(clock)
     window, usable = to_first_window(prediction, frames, anchor, config.observation, since=min(raw))
     before = [index for index in raw if not usable or index < usable[0]]
-    found = [Input((frames[index],), (raw[index],), None, anchor, {}) for index in before]
+    poses = _poses(prediction)
+    found = [Input((frames[index],), (raw[index],), None, anchor, poses, {}) for index in before]
     if window is None:
         return found
     first, steps = opening(window, config)
     count = len(usable) - len(steps)  # views that the map is made from
     shown = tuple(frames[index] for index in usable[:count]), tuple(raw[index] for index in usable[:count])
-    found.append(Input(*shown, first, anchor, timer.read()))
+    found.append(Input(*shown, first, anchor, poses, timer.read()))
     for index, step in zip(usable[count:], steps, strict=True):
-        found.append(Input((frames[index],), (raw[index],), step, anchor, {}))
+        found.append(Input((frames[index],), (raw[index],), step, anchor, poses, {}))
     return found
+
+
+def _poses(prediction: PriorPrediction) -> dict[int, np.ndarray]:
+    return dict(zip(prediction.window.views, prediction.T_anchor_view, strict=True))
 
 
 def _raw_views(

@@ -4,7 +4,7 @@ A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; file
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,11 @@ from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.trajectory import to_tum
 from emgs_jax.localization import REASONS
 from emgs_jax.ops.camera import Camera
+from emgs_jax.running.back_end import BackEnd, BackEndConfig
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.convert import to_camera
 from emgs_jax.running.inputs import Input
+from emgs_jax.running.measuring import Look
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
 
 Seconds = Mapping[str, float]  # as a `Timer` reads
@@ -96,6 +98,7 @@ class MappingRun:
         on_record: hears of each frame at once.
         state: None before the first window.
         records: of the frames in use, in order.
+        back_end: what moves poses and map after the fact; None: what is placed stays.
     """
 
     camera: Camera
@@ -104,6 +107,7 @@ class MappingRun:
     on_record: Callable[[FrameRecord], None] = lambda record: None
     state: SlamState | None = None
     records: list[FrameRecord] = field(default_factory=list)
+    back_end: BackEnd | None = None
 
     @property
     def map(self) -> GaussianMap | None:
@@ -131,9 +135,11 @@ def new_run(
     config: SlamConfig,
     clock: Clock | None = None,
     on_record: Callable[[FrameRecord], None] = lambda record: None,
+    graph: BackEndConfig | None = None,
 ) -> MappingRun:
-    """A run of `dataset` before its first frame."""
-    return MappingRun(to_camera(dataset), config, Clock() if clock is None else clock, on_record)
+    """A run of `dataset` before its first frame; with `graph` it has a back end."""
+    back_end = None if graph is None else BackEnd(graph, tuple(dataset.intrinsics), float(config.fit.min_std))
+    return MappingRun(to_camera(dataset), config, clock or Clock(), on_record, back_end=back_end)
 
 
 def record_lost(run: MappingRun, given: Input) -> None:
@@ -199,6 +205,43 @@ def _described(info: StepInfo) -> dict[str, Any]:
         "num_gaussians": int(info.num_gaussians),
         "overflow": int(info.overflow.tiles),
     }
+
+
+def correct(run: MappingRun, given: Input, info: StepInfo | None) -> None:
+    """Tell the back end of the frames that `given` added, and let poses and map follow what it finds.
+
+    Args:
+        run: with a back end, and a state.
+        given: what was taken.
+        info: of the step, on the host; None where the map was made from `given`.
+    """
+    end, added = run.back_end, run.records[-len(given.frames) :]
+    looks = [
+        Look(frame.index, frame.image, raw.points, raw.mask, given.T_anchor_views)
+        for frame, raw in zip(given.frames, given.raw, strict=True)
+    ]
+    origin = int(info.origin) if info is not None and added[-1].status == "tracked" else None
+    for look, record in zip(looks, added, strict=True):
+        end.add(look, record.pose, record.scale or 1.0, origin)
+    found = end.look_for_loops(looks[-1])
+    if end.wants_to_close(found):
+        run.state = end.close(run.state, found)
+        _take_poses(run)
+
+
+def finish(run: MappingRun) -> None:
+    """The best poses for all that was measured, and the map that conforms to them; nothing without a back end."""
+    if run.back_end is not None and run.back_end.edges:
+        end = run.back_end
+        run.state = end.close(run.state, [loop for loop in end.agreed() if end.misfit(loop) > end.config.max_known])
+        _take_poses(run)
+
+
+def _take_poses(run: MappingRun) -> None:
+    """The back end's poses into the records of its frames, which are the last ones."""
+    poses = run.back_end.poses
+    first = len(run.records) - len(poses)
+    run.records[first:] = [replace(record, pose=pose) for record, pose in zip(run.records[first:], poses, strict=True)]
 
 
 def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

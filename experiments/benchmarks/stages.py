@@ -61,7 +61,7 @@ def time_stages(data: Data, repetitions: int) -> list[Timing]:
     _, is_seen = stage("judge", judge, state.map, aligned, *look)
     seen = is_seen[jnp.minimum(rows, is_seen.shape[0] - 1)]
     stage("join layers", join_layers, submap, seen, T, localization.depth_noise, config.existence)
-    add = lambda m, s, r, f, w: insert(write_back(m, s, r), new_map(f, w, jnp.zeros(())))  # noqa: E731
+    add = lambda m, s, r, f, w: insert(write_back(m, s, r), new_map(f, w, jnp.zeros(()), jnp.asarray(0)))  # noqa: E731
     stage("insert", add, state.map, submap, rows, fresh, weight)
     candidates["whole step"] = called(step, state, prediction, data.camera, config)
     return interleaved("stages", candidates, repetitions)

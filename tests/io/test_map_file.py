@@ -91,7 +91,7 @@ def test_foreign_and_newer_maps_are_named_with_the_remedy(tmp_path):
         load_map_npz(path, Other)
     header = {"format": "emgs_jax.map", "version": 99, "class": "Other", "leaves": ["gain"], "static": {}}
     np.savez(path, __header__=np.array(json.dumps(header)), gain=np.ones(3))
-    with pytest.raises(ValueError, match="map version 99, this code reads 2"):
+    with pytest.raises(ValueError, match="map version 99, this code reads 3"):
         load_map_npz(path, Other)
     save_map_npz(path, a_map())
     with pytest.raises(ValueError, match="holds a Map, expected Other"):

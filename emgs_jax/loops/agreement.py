@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import chi2, norm
 
-from emgs_jax.graph.two_views import gap_between, rescaled
-from emgs_jax.graph.verification import LoopMeasurement
+from emgs_jax.loops.two_views import gap_between, rescaled
+from emgs_jax.loops.verification import LoopMeasurement
 
 
 @dataclass(frozen=True)

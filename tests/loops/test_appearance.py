@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from loop_scene import INTRINSICS, SIZE, appearance_config, looks
 
-from emgs_jax.graph.appearance import (
+from emgs_jax.keypoints.sift import detect
+from emgs_jax.loops.appearance import (
     Candidate,
     Database,
     Keyframe,
@@ -17,7 +18,6 @@ from emgs_jax.graph.appearance import (
     train,
     unit_descriptors,
 )
-from emgs_jax.keypoints.sift import detect
 
 
 def picture(seed=0, size=SIZE):

@@ -22,12 +22,12 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.data.apartment import Apartment
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.plan import APART
-from emgs_jax.graph.agreement import agreeing, is_consistent
-from emgs_jax.graph.alignment import Gate
-from emgs_jax.graph.appearance import Keyframe, describe
-from emgs_jax.graph.contradiction import contradicted_share
-from emgs_jax.graph.two_views import Similarity, gap_between, rescaled
-from emgs_jax.graph.verification import LoopMeasurement, Neighbour, VerifyInfo, tally, verify
+from emgs_jax.loops.agreement import agreeing, is_consistent
+from emgs_jax.loops.alignment import Gate
+from emgs_jax.loops.appearance import Keyframe, describe
+from emgs_jax.loops.contradiction import contradicted_share
+from emgs_jax.loops.two_views import Similarity, gap_between, rescaled
+from emgs_jax.loops.verification import LoopMeasurement, Neighbour, VerifyInfo, tally, verify
 
 CANDIDATE = matrix((0, 10, 0), (0.1, 0.0, 0.2))
 QUERY = matrix((3, -4, 2), (0.4, 0.1, -0.1))

@@ -8,8 +8,8 @@ from omegaconf import OmegaConf
 from scene import CONF
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.graph.appearance import BYTES_PER_UNIT, AppearanceConfig, Keyframe
-from emgs_jax.graph.verification import Neighbour, VerificationConfig
+from emgs_jax.loops.appearance import BYTES_PER_UNIT, AppearanceConfig, Keyframe
+from emgs_jax.loops.verification import Neighbour, VerificationConfig
 
 SIZE, INTRINSICS = (320, 240), (250.0, 260.0, 155.0, 122.5)
 

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import minimum_filter
 
-from emgs_jax.graph.appearance import Keyframe, grid_pixels
-from emgs_jax.graph.two_views import Similarity, moved_by
+from emgs_jax.loops.appearance import Keyframe, grid_pixels
+from emgs_jax.loops.two_views import Similarity, moved_by
 
 
 def contradicted_share(a: Keyframe, b: Keyframe, similarity: Similarity, margin: float) -> float:

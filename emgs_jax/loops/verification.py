@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from emgs_jax.graph.alignment import Aligned, AlignmentConfig, Gate, RefusedError, align, require
-from emgs_jax.graph.appearance import Keyframe
-from emgs_jax.graph.contradiction import contradicted_share
-from emgs_jax.graph.two_views import gap_between, rescaled
+from emgs_jax.loops.alignment import Aligned, AlignmentConfig, Gate, RefusedError, align, require
+from emgs_jax.loops.appearance import Keyframe
+from emgs_jax.loops.contradiction import contradicted_share
+from emgs_jax.loops.two_views import gap_between, rescaled
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from emgs_jax.graph.appearance import Keyframe, unit_descriptors
-from emgs_jax.graph.two_views import (
+from emgs_jax.keypoints.poses import calibration, essential, pose_of
+from emgs_jax.keypoints.sift import mutual
+from emgs_jax.loops.appearance import Keyframe, unit_descriptors
+from emgs_jax.loops.two_views import (
     MAD_TO_STD,
     Pairs,
     RefineConfig,
@@ -18,8 +20,6 @@ from emgs_jax.graph.two_views import (
     refine,
     rescaled,
 )
-from emgs_jax.keypoints.poses import calibration, essential, pose_of
-from emgs_jax.keypoints.sift import mutual
 
 MIN_POSE = 6  # points that a pose needs
 

@@ -1,0 +1,232 @@
+"""The best poses and scales for all measurements: Levenberg–Marquardt on the host, in float64."""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+
+from emgs_jax.graph.measurements import DEGREES, LOOP, WINDOW, Graph, Nodes
+from emgs_jax.graph.problem import Linear, Problem, linear, moved, num_rows, problem_of
+from emgs_jax.graph.sparse import columns_of_inverse, damped_step
+from emgs_jax.graph.start import spread
+from emgs_jax.ops.pytree import static, traced
+
+# χ² of a measured row that nothing is to be gained from: errors of a thousandth of their standard deviation.
+NOTHING_TO_GAIN = 1e-6
+MAX_DAMPING = 1e8
+COLUMNS_AT_ONCE = 224  # of the inverse: some MB for thousands of nodes
+
+
+class GraphConfig(eqx.Module):
+    """What counts, and when to stop.
+
+    Args:
+        scale_std: s_p: standard deviation of every σ about 0; 0: scales stay as they are (SE(3)); inf: no prior.
+        kernel: φ of dynamic covariance scaling on loops, in χ²; inf: quadratic.
+        start: `given`, or `spread` (errors spread over the paths, where that costs less).
+        max_iterations: of Levenberg and Marquardt; 0: nothing moves.
+        damping: λ at the start, times the Hessian's diagonal.
+        min_decrease: relative, of the cost; less has converged.
+        max_misfit: χ² per measured row of the window's edges: a result that bends them more, and more than they were,
+            is refused.
+    """
+
+    scale_std: Float[Array, "*b"] = traced()
+    kernel: Float[Array, "*b"] = traced()
+    start: str = static()
+    max_iterations: int = static()
+    damping: Float[Array, "*b"] = traced()
+    min_decrease: Float[Array, "*b"] = traced()
+    max_misfit: Float[Array, "*b"] = traced()
+
+    def __check_init__(self) -> None:
+        if self.start not in ("given", "spread"):
+            raise ValueError(f"graph.start must be given or spread; got {self.start!r}")
+
+
+@dataclass(frozen=True)
+class GraphInfo:
+    """What an optimisation found, also where that is refused and the nodes stay.
+
+    Args:
+        reason: why the nodes are those that were given; empty: they moved, or there is nothing to gain.
+        cost_before: Σρ over edges, and half the squared scale prior.
+        cost: likewise, at the end.
+        num_iterations: tried steps.
+        converged: the last step gained next to nothing.
+        edge_chi2: (e,) χ² of every edge at the end, unweighted; 0 where it is not in use.
+        edge_weights: (e,) share of that χ² that counts: s² of dynamic covariance scaling, 1 for a window's edges.
+        window_chi2: sum over the window's edges.
+        loop_chi2: weighted sum over loops.
+        num_window_rows: measured rows of the window's edges.
+        num_loop_rows: likewise of loops.
+        dof: measured rows, those of the scale prior included, minus free unknowns.
+        num_disconnected: nodes without a path to the gauge, which stay where they are.
+    """
+
+    reason: str
+    cost_before: float
+    cost: float
+    num_iterations: int
+    converged: bool
+    edge_chi2: np.ndarray
+    edge_weights: np.ndarray
+    window_chi2: float
+    loop_chi2: float
+    num_window_rows: int
+    num_loop_rows: int
+    dof: int
+    num_disconnected: int
+
+
+def _minimize(problem: Problem, now: Linear, config: GraphConfig) -> tuple[Linear, int, bool]:
+    """Levenberg and Marquardt: the best that was found, the number of tried steps, and whether it converged."""
+    damping, kernel = float(config.damping), float(config.kernel)
+    floor = NOTHING_TO_GAIN * num_rows(problem.graph.edges)
+    for iteration in range(config.max_iterations):
+        enough = float(config.min_decrease) * (now.cost + floor)
+        step = damped_step(now.equations, damping)
+        if step is not None and np.isfinite(step).all():
+            pull = damping * now.equations.hessian.diagonal()[:, None] * step - now.equations.gradient
+            promised = 0.5 * np.sum(step * pull)
+            trial = linear(problem, moved(now.nodes, step.reshape(-1, DEGREES)), kernel)
+            gain = now.cost - trial.cost
+            if gain > 0:  # not where it is NaN
+                now, damping = trial, 0.1 * damping
+            if promised <= enough or 0 < gain <= enough:
+                return now, iteration + 1, True
+            if gain > 0:
+                continue
+        damping *= 10.0
+        if damping > MAX_DAMPING:
+            return now, iteration + 1, False
+    return now, config.max_iterations, False
+
+
+def _info(
+    problem: Problem, before: float, end: Linear, tried: tuple[int, bool], num_edges: int, reason: str = ""
+) -> GraphInfo:
+    edges, count = problem.graph.edges, int(problem.used.sum())
+    edge_chi2, edge_weights = np.zeros(num_edges), np.ones(num_edges)
+    edge_chi2[problem.used], edge_weights[problem.used] = end.chi2[:count], end.weights[:count]
+    is_loop = np.asarray(edges.kind) == LOOP
+    num_window_rows, num_loop_rows = num_rows(edges, WINDOW), num_rows(edges, LOOP)
+    num_prior = int(np.sum(problem.free[:, 6])) if problem.scale_information > 0 else 0
+    return GraphInfo(
+        reason=reason,
+        cost_before=before,
+        cost=end.cost,
+        num_iterations=tried[0],
+        converged=tried[1],
+        edge_chi2=edge_chi2,
+        edge_weights=edge_weights,
+        window_chi2=float(np.sum(end.chi2[~is_loop])),
+        loop_chi2=float(np.sum((end.weights * end.chi2)[is_loop])),
+        num_window_rows=num_window_rows,
+        num_loop_rows=num_loop_rows,
+        dof=num_window_rows + num_loop_rows + num_prior - int(np.sum(end.equations.measured)),
+        num_disconnected=problem.num_disconnected,
+    )
+
+
+def _refused(graph: Graph, reason: str) -> GraphInfo:
+    """Of a graph that is not a problem."""
+    num_edges, nothing = graph.edges.a.shape[0], float("nan")
+    zeros = np.zeros(num_edges)
+    return GraphInfo(reason, nothing, nothing, 0, False, zeros, np.ones(num_edges), 0.0, 0.0, 0, 0, 0, 0)
+
+
+def _begin(problem: Problem, given: Linear, config: GraphConfig) -> Linear:
+    """The given poses, or those with the errors spread, whichever cost less."""
+    nodes = spread(problem.graph, problem.free) if config.start == "spread" else None
+    if nodes is None:
+        return given
+    other = linear(problem, nodes, float(config.kernel))
+    return other if other.cost < given.cost else given
+
+
+def _objection(problem: Problem, given: Linear, end: Linear, converged: bool, config: GraphConfig) -> str:
+    """Why a result is not to be used; empty where it is."""
+    if end is given and not converged:
+        return "no step lowers the cost"
+    is_window = np.asarray(problem.graph.edges.kind) == WINDOW
+    allowed = float(config.max_misfit) * num_rows(problem.graph.edges, WINDOW)
+    bent = float(np.sum(end.chi2[is_window]))
+    if bent > max(allowed, float(np.sum(given.chi2[is_window]))):
+        return f"the loops contradict the window's edges: their χ² would be {bent:.4g}, more than {allowed:.4g}"
+    return ""
+
+
+def _put_back(nodes: Nodes, problem: Problem, end: Nodes) -> Nodes:
+    """The nodes that may move, in the given precision; the others bit for bit."""
+    n = nodes.valid.shape[0]
+
+    def put(old: Array, new: Array, free: np.ndarray) -> Array:
+        return jnp.where(free.reshape(-1, *[1] * (old.ndim - 1)), jnp.asarray(new[:n], old.dtype), old)
+
+    poses = put(nodes.T_world.wxyz_xyz, end.T_world.wxyz_xyz, problem.free[:n, 0])
+    return Nodes(jaxlie.SE3(poses), put(nodes.log_scale, end.log_scale, problem.free[:n, 6]), nodes.valid)
+
+
+def optimize(graph: Graph, config: GraphConfig) -> tuple[Nodes, GraphInfo]:
+    """Poses and scales of least Σρ(χ²) + Σ(σ/s_p)²/2; the first valid node keeps its own.
+
+    Nodes without a path of measurements to it stay where they are. What is computed is float64, whatever the graph is
+    stored in. Nothing is raised: where the graph cannot be solved or there is nothing to gain, the nodes that were
+    given come back, and `GraphInfo.reason` says why (empty where there is nothing to gain).
+    """
+    num_edges = graph.edges.a.shape[0]
+    with jax.enable_x64(True):
+        problem = problem_of(graph, float(config.scale_std))
+        if isinstance(problem, str):
+            return graph.nodes, _refused(graph, problem)
+        given = linear(problem, problem.graph.nodes, float(config.kernel))
+        if not np.isfinite(given.cost):
+            return graph.nodes, _refused(graph, "the cost is not finite")
+        is_settled = given.cost <= NOTHING_TO_GAIN * num_rows(problem.graph.edges)
+        if is_settled or config.max_iterations == 0:
+            return graph.nodes, _info(problem, given.cost, given, (0, is_settled), num_edges)
+        end, num_iterations, converged = _minimize(problem, _begin(problem, given, config), config)
+        reason = _objection(problem, given, end, converged, config)
+        info = _info(problem, given.cost, end, (num_iterations, converged), num_edges, reason)
+        keeps = bool(reason) or end is given
+        return graph.nodes if keeps else _put_back(graph.nodes, problem, end.nodes), info
+
+
+def marginal_covariances(graph: Graph, rows: np.ndarray, config: GraphConfig) -> np.ndarray:
+    """Covariance of nodes given all measurements, by the steps of `move` (translation, rotation, log-scale).
+
+    Of the quadratic model at the graph's nodes: solve first. Only the asked columns of the inverse are computed.
+
+    Args:
+        graph: solved.
+        rows: (k,) of nodes.
+        config: of the solution.
+
+    Returns:
+        (k, 7, 7), float64; 0 in rows and columns of what is held, inf on the diagonal of what nothing determines.
+
+    Raises:
+        ValueError: the graph cannot be solved.
+    """
+    rows = np.asarray(rows)
+    with jax.enable_x64(True):
+        problem = problem_of(graph, float(config.scale_std))
+        if isinstance(problem, str):
+            raise ValueError(f"no covariances: {problem}")
+        equations = linear(problem, problem.graph.nodes, float(config.kernel)).equations
+    columns = rows[:, None] * DEGREES + np.arange(DEGREES)
+    blocks = columns_of_inverse(equations, columns, COLUMNS_AT_ONCE)
+    if blocks is None:
+        raise ValueError("no covariances: the measurements do not determine the poses; look at num_disconnected")
+    measured = equations.measured.reshape(-1, DEGREES)[rows]
+    blocks *= measured[:, :, None] & measured[:, None, :]
+    is_gauge = rows == np.argmax(np.asarray(problem.graph.nodes.valid))
+    unknown = ~measured & ~is_gauge[:, None]
+    unknown[:, 6] &= float(config.scale_std) > 0
+    blocks[:, np.arange(DEGREES), np.arange(DEGREES)] += np.where(unknown, np.inf, 0.0)
+    return blocks

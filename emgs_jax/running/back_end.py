@@ -1,0 +1,241 @@
+"""The back end of a run: what windows, map and loops measure, the best poses for all of it, and a map that follows.
+
+Nodes are the frames from the first of the map on, in the order of `SlamState.time`.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.graph.deform import deform, deform_view
+from emgs_jax.graph.measurements import Graph, Nodes
+from emgs_jax.graph.optimize import GraphConfig, GraphInfo, optimize
+from emgs_jax.loops.agreement import AgreementConfig, agreeing
+from emgs_jax.loops.appearance import AppearanceConfig, Database, describe, extend, propose
+from emgs_jax.loops.two_views import rescaled
+from emgs_jax.loops.verification import LoopMeasurement, Neighbour, VerificationConfig, VerifyInfo, verify
+from emgs_jax.running.convert import to_se3
+from emgs_jax.running.measuring import Edge, Look, NoiseConfig, loop_edge, map_edge, stacked, window_edges
+from emgs_jax.slam import SlamState
+
+_deform, _deform_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)
+
+
+@dataclass(frozen=True)
+class BackEndConfig:
+    """What is measured, how loops are found, and how all is solved.
+
+    Args:
+        offsets: earlier frames of a window that its current one is measured to.
+        noise: of these measurements.
+        appearance: keyframes and candidates.
+        verification: of a candidate.
+        agreement: of verified loops with each other.
+        every: frames between keyframes.
+        max_known: χ² of a loop at the poses as they are, up to which it says what is so already and is left out.
+        min_frames: between two closures.
+        solver: of the graph.
+    """
+
+    offsets: tuple[int, ...]
+    noise: NoiseConfig
+    appearance: AppearanceConfig
+    verification: VerificationConfig
+    agreement: AgreementConfig
+    every: int
+    max_known: float
+    min_frames: int
+    solver: GraphConfig
+
+
+@dataclass(frozen=True)
+class Closure:
+    """One solution: at which node, the loops that were new, and what the solver says of it."""
+
+    time: int
+    loops: tuple[LoopMeasurement, ...]
+    info: GraphInfo
+
+
+@dataclass
+class BackEnd:
+    """Measurements as far as a run is.
+
+    Args:
+        config: all of it.
+        intrinsics: of the images.
+        min_std: floor of the map's covariances.
+        poses: T_world_camera (4, 4) of the nodes, as they are now.
+        log_scales: σ of their inferences, likewise.
+        online: poses as they were when the frames were placed.
+        frames: index in the data set of every node.
+        edges: what was measured.
+        database: keyframes; their `frame` is the node.
+        verified: loops that passed every gate of two keyframes.
+        contradicted: loops that something speaks against.
+        accepted: loops that are edges.
+        refusals: why candidates were no loops.
+        closures: what was solved.
+    """
+
+    config: BackEndConfig
+    intrinsics: tuple[float, float, float, float]
+    min_std: float
+    poses: list[np.ndarray] = field(default_factory=list)
+    log_scales: list[float] = field(default_factory=list)
+    online: list[np.ndarray] = field(default_factory=list)
+    frames: list[int] = field(default_factory=list)
+    edges: list[Edge] = field(default_factory=list)
+    database: Database = field(default_factory=Database)
+    verified: list[LoopMeasurement] = field(default_factory=list)
+    contradicted: list[LoopMeasurement] = field(default_factory=list)
+    accepted: list[LoopMeasurement] = field(default_factory=list)
+    refusals: Counter = field(default_factory=Counter)
+    closures: list[Closure] = field(default_factory=list)
+
+    def add(self, look: Look, pose: np.ndarray, scale: float, origin: int | None) -> None:
+        """One node more, with what its window and the map measure.
+
+        Args:
+            look: of the frame.
+            pose: T_world_camera.
+            scale: of its inference.
+            origin: node of whose Gaussians it was placed by; None where it was not placed in the map.
+        """
+        time = len(self.poses)
+        self.poses.append(np.asarray(pose, np.float64))
+        self.online.append(self.poses[-1])
+        self.log_scales.append(float(np.log(scale)))
+        self.frames.append(look.frame)
+        noise = self.config.noise
+        self.edges += window_edges(look, time, self.log_scales, self.frames[0] == 0, self.config.offsets, noise)
+        if origin is not None and origin < time:
+            measured = np.linalg.inv(self.poses[time]) @ self.poses[origin]
+            self.edges.append(map_edge(time, origin, rescaled(measured, np.exp(-self.log_scales[time])), noise))
+
+    def look_for_loops(self, look: Look) -> list[LoopMeasurement]:
+        """Describe the last node, and verify what it looks like; returns the recent loops that are agreed upon."""
+        time, appearance = len(self.poses) - 1, self.config.appearance
+        if time % self.config.every:
+            return []
+        keyframe = describe(time, look.image, look.points, look.mask, self.intrinsics, appearance)
+        self.database = extend(self.database, keyframe, appearance)
+        row = len(self.database.keyframes) - 1
+        for candidate in propose(self.database, row, appearance):
+            self._verify(row, candidate.row)
+        return self.agreed(since=time - self.config.agreement.max_query_gap)
+
+    def agreed(self, since: int = 0) -> list[LoopMeasurement]:
+        """Loops of queries from `since` on that others agree with and that are no edges yet."""
+        recent = [loop for loop in self.verified if loop.b >= since]
+        poses, log_scales = (dict(enumerate(values)) for values in (self.poses, self.log_scales))
+        yes = agreeing(recent, self.contradicted, poses, log_scales, self.config.agreement)
+        known = {(loop.a, loop.b) for loop in self.accepted}
+        return [loop for loop, ok in zip(recent, yes, strict=True) if ok and (loop.a, loop.b) not in known]
+
+    def _verify(self, row: int, other: int) -> None:
+        keyframes = self.database.keyframes
+        candidate = keyframes[other]
+        beside = [keyframes[k] for k in (other - 1, other + 1) if 0 <= k < row]
+        inverse, scale = np.linalg.inv(self.poses[candidate.frame]), self.log_scales[candidate.frame]
+        neighbours = [
+            Neighbour(
+                one,
+                rescaled(inverse @ self.poses[one.frame], np.exp(-scale)),
+                self.log_scales[one.frame] - scale,
+            )
+            for one in beside
+        ]
+        loop, info = verify(keyframes[row], candidate, neighbours, self.config.verification)
+        self._note(loop, info)
+
+    def _note(self, loop: LoopMeasurement | None, info: VerifyInfo) -> None:
+        if info.contradicted is not None:
+            self.contradicted.append(info.contradicted)
+        if loop is None:
+            self.refusals[info.refused_by.value] += 1
+        else:
+            self.verified.append(loop)
+
+    def wants_to_close(self, loops: Sequence[LoopMeasurement]) -> bool:
+        """Whether some loop says what is not so, and the last closure is long enough ago."""
+        last = self.closures[-1].time if self.closures else -self.config.min_frames
+        is_due = len(self.poses) - 1 - last >= self.config.min_frames
+        return is_due and any(self.misfit(loop) > self.config.max_known for loop in loops)
+
+    def misfit(self, loop: LoopMeasurement) -> float:
+        """χ² of a loop at the poses and scales as they are."""
+        scale, other = self.log_scales[loop.a], self.log_scales[loop.b]
+        now = rescaled(np.linalg.inv(self.poses[loop.a]) @ self.poses[loop.b], np.exp(-scale))
+        error = np.linalg.inv(loop.Z_a_b) @ now
+        turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
+        return float(np.sum((loop.sqrt_info @ [*error[:3, 3], *turn, other - scale - loop.log_ratio]) ** 2))
+
+    def close(self, state: SlamState, loops: Sequence[LoopMeasurement] = ()) -> SlamState:
+        """Solve with `loops` as edges, and move poses and map; if that is refused all stays, and they are no edges."""
+        edges = [*self.edges, *map(loop_edge, loops)]
+        before = self.nodes()
+        after, info = optimize(Graph(before, stacked(edges)), self.config.solver)
+        self.closures.append(Closure(len(self.poses) - 1, tuple(loops), info))
+        if info.reason:
+            return state
+        self.edges = edges
+        self.accepted += loops
+        count = len(self.poses)
+        self.poses = list(np.asarray(after.T_world.as_matrix(), np.float64)[:count])
+        self.log_scales = list(np.asarray(after.log_scale, np.float64)[:count])
+        return follow(state, before, after, self.min_std)
+
+    def nodes(self) -> Nodes:
+        """All nodes, with free rows up to a power of two: the map's part compiles rarely."""
+        count = len(self.poses)
+        room = max(64, 1 << (count - 1).bit_length())
+        poses = to_se3(np.stack([*self.poses, *[np.eye(4)] * (room - count)]))
+        scales = jnp.asarray([*self.log_scales, *[0.0] * (room - count)], jnp.float32)
+        return Nodes(poses, scales, jnp.arange(room) < count)
+
+
+def metric_graph(end: BackEnd) -> Graph:
+    """Poses and measurements in the map's scale, without scales of their own: what other solvers read."""
+    scaled = [
+        edge._replace(Z_a_b=rescaled(edge.Z_a_b, np.exp(end.log_scales[edge.a])), log_ratio=0.0) for edge in end.edges
+    ]
+    nodes = end.nodes()
+    return Graph(replace(nodes, log_scale=jnp.zeros_like(nodes.log_scale)), stacked(scaled))
+
+
+def follow(state: SlamState, before: Nodes, after: Nodes, min_std: float) -> SlamState:
+    """The state whose map and last frame conform to other poses."""
+    last = state.time - 1
+    return replace(
+        state,
+        map=_deform(state.map, before, after, jnp.asarray(min_std, jnp.float32)),
+        previous=_deform_view(state.previous, before, after, last),
+        T_world_previous=_moved_pose(state.T_world_previous, before, after, int(last)),
+    )
+
+
+def _moved_pose(T: jaxlie.SE3, before: Nodes, after: Nodes, row: int) -> jaxlie.SE3:
+    """The node's new pose; T itself, bit for bit, where the node stays."""
+    old, new = before.T_world.wxyz_xyz[row], after.T_world.wxyz_xyz[row]
+    return jaxlie.SE3(jnp.where(jnp.all(old == new), T.wxyz_xyz, new))
+
+
+def counts(end: BackEnd) -> dict[str, Any]:
+    """What became of the candidates, for metrics.json."""
+    refused = {f"loops/refused_{gate}": count for gate, count in sorted(end.refusals.items())}
+    solved = [closure for closure in end.closures if closure.loops]
+    return {
+        "loops/verified": len(end.verified),
+        "loops/contradicted": len(end.contradicted),
+        "loops/accepted": len(end.accepted),
+        "loops/closures": sum(not closure.info.reason for closure in solved),
+        "loops/closures_refused": sum(bool(closure.info.reason) for closure in solved),
+    } | refused
