@@ -236,9 +236,8 @@ def _fuse(
 ) -> tuple[GaussianMap, Observation, EmInfo, GaussianMap, Int[Array, ""]]:
     """Fuse the points of a frame that is tracked, and split what they show to be too coarse.
 
-    Returns:
-        The submap, the points that no Gaussian explains, counts, the second halves of what was split, and the median
-        birth of what explains the others.
+    Returns the submap, the points that no Gaussian explains, counts, the second halves of what was split, and the
+    median birth of what explains the others.
     """
     trusted = _trusted(aligned, localization)
     noise = localization.noise[:, None] * (trusted.points - T.translation())

@@ -1,0 +1,136 @@
+"""Measurements of a walk on a ring, exact: nothing moves; after a drift one loop brings poses and map back."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from scene import assert_same, random_gaussians, random_observation
+
+from emgs_jax import load_config
+from emgs_jax.gaussian_map import new_map
+from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
+from emgs_jax.loops.verification import LoopMeasurement
+from emgs_jax.running.back_end import BackEnd, counts, metric_graph
+from emgs_jax.running.measuring import Look, window_edges
+from emgs_jax.slam import SlamState
+
+COUNT, WINDOW = 60, 10
+
+
+@pytest.fixture(scope="module")
+def graph():
+    return load_config("graph=default").graph
+
+
+def ring(turn: float = 2 * np.pi) -> np.ndarray:
+    """Camera poses (n, 4, 4) along a ring of 2 m that the last one closes; less than a turn drifts."""
+    poses = np.tile(np.eye(4), (COUNT, 1, 1))
+    for pose, angle in zip(poses, turn * np.arange(COUNT) / (COUNT - 1), strict=True):
+        pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        pose[:3, 3] = 2 * np.sin(angle), 0, 2 * np.cos(angle) - 2
+    return poses
+
+
+def look(poses: np.ndarray, index: int, frame: int | None = None) -> Look:
+    views = {0: poses[0]} | {i: poses[i] for i in range(max(index - WINDOW, 0), min(index + 2, COUNT))}
+    views = {i: np.linalg.inv(poses[0]) @ pose for i, pose in views.items()}
+    empty = np.zeros((4, 4, 3))
+    return Look(index if frame is None else frame, np.uint8(empty), empty, np.zeros((4, 4), bool), views)
+
+
+def state_of(poses: np.ndarray) -> SlamState:
+    """A Gaussian in front of every camera, born with it."""
+    gaussians = random_gaussians(COUNT)
+    means = jnp.asarray([pose[:3, :3] @ [0, 0, 1.5] + pose[:3, 3] for pose in poses], jnp.float32)
+    gaussians = eqx.tree_at(lambda g: g.means, gaussians, means)
+    map = new_map(gaussians, jnp.ones(COUNT), jnp.ones(()), jnp.asarray(0))
+    map = eqx.tree_at(lambda m: m.birth, map, jnp.arange(COUNT, dtype=jnp.int32))
+    last = jaxlie.SE3.from_matrix(jnp.asarray(poses[-1], jnp.float32))
+    return SlamState(map, random_observation(20), last, jnp.asarray(COUNT))
+
+
+def walked(graph, poses: np.ndarray) -> BackEnd:
+    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
+    for index, pose in enumerate(poses):
+        end.add(look(poses, index), pose, 1.0, max(index - 3, 0))
+    return end
+
+
+def loop(poses: np.ndarray) -> LoopMeasurement:
+    Z = np.linalg.inv(poses[1]) @ poses[-2]
+    return LoopMeasurement(1, COUNT - 2, Z, 0.0, np.diag([100.0] * 3 + [200.0] * 3 + [100.0]), 50)
+
+
+def error(poses, truth) -> float:
+    return max(np.linalg.norm(pose[:3, 3] - true[:3, 3]) for pose, true in zip(poses, truth, strict=True))
+
+
+def test_what_was_measured_without_error_moves_nothing(graph):
+    poses = ring()
+    end, state = walked(graph, poses), state_of(poses)
+    closed = end.close(state, [loop(poses)])
+    assert error(end.poses, poses) < 1e-5 and end.closures[-1].info.reason == ""
+    np.testing.assert_allclose(closed.map.gaussians.means, state.map.gaussians.means, atol=1e-5)
+    assert end.misfit(loop(poses)) < 1e-3 and not end.wants_to_close([loop(poses)])
+
+
+def test_a_loop_brings_poses_map_and_last_frame_back(graph):
+    """The anchor holds nothing here: its edges are left out, as with a prior that has lost it."""
+    truth, drifted = ring(), ring(1.95 * np.pi)
+    end = walked(graph, drifted)
+    end.edges = [edge for edge in end.edges if edge.b > 0 or edge.a <= 8]
+    state = state_of(drifted)
+    assert end.misfit(loop(truth)) > graph.max_known and end.wants_to_close([loop(truth)])
+    before, gap = error(drifted, truth), lambda poses: np.linalg.norm(poses[1][:3, 3] - poses[-2][:3, 3])
+    closed = end.close(state, [loop(truth)])
+    assert end.accepted and not end.wants_to_close([loop(truth)])
+    np.testing.assert_allclose(gap(end.poses), gap(truth), atol=0.02)
+    assert error(end.poses, truth) < 0.5 * before
+    for pose, mean in zip(end.poses, closed.map.gaussians.means, strict=True):
+        np.testing.assert_allclose(mean, pose[:3, :3] @ [0, 0, 1.5] + pose[:3, 3], atol=1e-4)
+    np.testing.assert_allclose(closed.T_world_previous.as_matrix(), end.poses[-1], atol=1e-5)
+    assert error(end.online, drifted) == 0
+
+
+def test_a_loop_that_cannot_be_solved_changes_nothing(graph):
+    poses = ring()
+    end, state = walked(graph, poses), state_of(poses)
+    broken = loop(poses)
+    broken.Z_a_b[0, 3] = np.nan
+    same = end.close(state, [broken])
+    assert_same(same, state)
+    assert not end.accepted and end.closures[-1].info.reason and error(end.poses, poses) == 0
+    assert counts(end)["loops/closures_refused"] == 1
+
+
+def test_a_window_measures_earlier_frames_and_the_anchor_once_each(graph):
+    poses = ring()
+    found = window_edges(look(poses, 30), 30, [0.0] * 31, True, graph.offsets, graph.noise)
+    assert [edge.b for edge in found] == [30 - offset for offset in graph.offsets] + [0]
+    for edge in found:
+        np.testing.assert_allclose(edge.Z_a_b, np.linalg.inv(poses[30]) @ poses[edge.b], atol=1e-12)
+    assert window_edges(look(poses, 30), 30, [0.0] * 31, False, graph.offsets, graph.noise)[-1].b != 0
+    measured = look(poses, 30)
+    measured.T_anchor_views[29][:] = np.nan
+    found = window_edges(measured, 30, [0.0] * 31, True, graph.offsets, graph.noise)
+    assert 29 not in [edge.b for edge in found]
+    measured.T_anchor_views[30][:] = np.nan
+    assert window_edges(measured, 30, [0.0] * 31, True, graph.offsets, graph.noise) == []
+
+
+def test_other_solvers_read_the_graph_in_the_scale_of_the_map(graph, tmp_path):
+    poses = ring()
+    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
+    for index, pose in enumerate(poses):
+        end.add(look(poses, index), pose, 1.1, None)
+    save_graph_g2o(tmp_path / "graph.g2o", metric_graph(end))
+    read = load_graph_g2o(tmp_path / "graph.g2o")
+    assert int(read.nodes.valid.sum()) == COUNT and len(read.edges.a) == len(end.edges)
+    np.testing.assert_allclose(read.edges.Z_a_b.translation()[0], 1.1 * end.edges[0].Z_a_b[:3, 3], rtol=1e-5, atol=1e-6)
+
+
+def test_without_a_graph_there_is_no_back_end():
+    assert load_config().graph is None
+    assert OmegaConf.create(load_config().settings).graph == {}
