@@ -170,13 +170,12 @@ def step(
     T, aligned, localization = call(_place, prediction.current, submap, coarse, config.localization, white)
     rows_each = spacing(camera, thin, config.fit)
     place = aligned, T, localization
-    submap, rest, em, halves, origin = call(
-        _fuse, submap, white, *place, state.time, rows_each, config.em, config.splitting
-    )
+    fine = rows_each, config.em, config.splitting
+    submap, rest, em, halves, origin = call(_fuse, submap, white, *place, state.time, *fine)
     candidates, weight = call(cluster, rest, call(_order, camera, thin), rows_each, config.fit)
     submap, fresh, refinement = call(_refine, submap, candidates, T, camera, thin, config.refinement)
-    new = fresh, weight, halves
-    map, count, map_overflow = call(_store, state.map, submap, rows, new, place, state.time, camera, config)
+    look = (fresh, weight, halves), place, state.time
+    map, count, map_overflow = call(_store, state.map, submap, rows, *look, camera, config)
 
     info = StepInfo(
         T_world_camera=T,
