@@ -124,6 +124,12 @@ GRAPH = [
         ("jacobians * free.ravel()[unknowns][:, None]", "jacobians", "the gauge moves"),
         ("solved[rows, i]", "solved[rows, 0]", "covariances with the first node"),
     ),
+    *own("graph/deform", "graph/test_deform")(
+        ("scales[:, None] * (gaussians.means - old)", "gaussians.means - old", "the scale leaves the means"),
+        ("scales[:, None, None] ** 2 * shapes", "scales[:, None, None] * shapes", "covariances by the scale once"),
+        ("where_rows(has_moved & gaussians.valid, moved, gaussians)", "moved", "free rows move"),
+        ("scale * (view.points - old) @ turn.T", "scale * (view.points - old) @ turn", "a view turned back"),
+    ),
     *own("graph/start", "graph/test_graph_optimize")(
         ("turns.transpose(0, 2, 1)", "turns", "loops are spread against their direction"),
     ),

@@ -60,8 +60,38 @@ PATCHES = ("tests/features/test_patches.py",)
 STACKED = ("tests/running/test_stacked.py",)
 APPEARANCE = ("tests/loops/test_appearance.py",)
 VERIFICATION = ("tests/loops/test_verification.py",)
+BACK_END = ("tests/running/test_back_end.py",)
 
 MUTANTS = (
+    # back end
+    Mutant(
+        "emgs_jax/running/back_end.py",
+        "        if info.reason:\n            return state\n",
+        "",
+        BACK_END,
+        "a refused loop is an edge",
+    ),
+    Mutant(
+        "emgs_jax/running/back_end.py",
+        "rescaled(measured, np.exp(-self.log_scales[time]))",
+        "measured",
+        BACK_END,
+        "the place in the map in the map's units",
+    ),
+    Mutant(
+        "emgs_jax/running/measuring.py",
+        "np.linalg.inv(here) @ there",
+        "np.linalg.inv(there) @ here",
+        BACK_END,
+        "edges the other way round",
+    ),
+    Mutant(
+        "emgs_jax/running/back_end.py",
+        "self.log_scales = list(np.asarray(after.log_scale, np.float64)[:count])",
+        "pass",
+        BACK_END,
+        "scales stay",
+    ),
     # loops
     Mutant(
         "emgs_jax/loops/appearance.py",

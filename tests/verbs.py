@@ -18,7 +18,7 @@ from scene import (
 
 from emgs_jax import em, existence, gaussian_map, gaussians, initialization, localization, splitting
 from emgs_jax import observation as obs
-from emgs_jax.graph import measurements
+from emgs_jax.graph import deform, measurements
 from emgs_jax.ops import camera as cam
 from emgs_jax.ops import clustering, linalg, neighbours
 from emgs_jax.ops.pytree import stack
@@ -179,6 +179,10 @@ VERBS = {
         lambda s: (points(s).colors[:, 0], points(s).points),
     ),
     "move": (measurements.move, lambda s: (graph_of(s).nodes, 0.1 * jnp.ones((5, 7)))),
+    "deform": (
+        lambda m, before, after: deform.deform(m, before, after, ONE * 0.01),
+        lambda s: (map_of(s), graph_of(s).nodes, graph_of(s + 5).nodes),
+    ),
     "residuals": (measurements.residuals, lambda s: (graph_of(s),)),
     "linearize": (measurements.linearize, lambda s: (graph_of(s),)),
     "robust": (

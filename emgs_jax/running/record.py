@@ -139,7 +139,8 @@ def new_run(
 ) -> MappingRun:
     """A run of `dataset` before its first frame; with `graph` it has a back end."""
     back_end = None if graph is None else BackEnd(graph, tuple(dataset.intrinsics), float(config.fit.min_std))
-    return MappingRun(to_camera(dataset), config, clock or Clock(), on_record, back_end=back_end)
+    clock = Clock() if clock is None else clock
+    return MappingRun(to_camera(dataset), config, clock, on_record, back_end=back_end)
 
 
 def record_lost(run: MappingRun, given: Input) -> None:

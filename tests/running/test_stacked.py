@@ -28,10 +28,12 @@ def sequence(camera):
     poses = [path_pose(i) for i in range(FRAME)]
     views = stack([observe_room(T, camera, num_features=2) for T in poses])
     steps = [predict_room(FRAME + i, camera, has_newest=i < 1, num_features=2) for i in range(2)]
-    first = Input(*zip(*map(shown, range(FRAME)), strict=True), FirstWindow(views, stack_poses(poses)), np.eye(4), {})
+    first = Input(
+        *zip(*map(shown, range(FRAME)), strict=True), FirstWindow(views, stack_poses(poses)), np.eye(4), {}, {}
+    )
     return [
         first,
-        *(Input(*((part,) for part in shown(FRAME + i)), step, np.eye(4), {}) for i, step in enumerate(steps)),
+        *(Input(*((part,) for part in shown(FRAME + i)), step, np.eye(4), {}, {}) for i, step in enumerate(steps)),
     ]
 
 

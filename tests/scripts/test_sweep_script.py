@@ -113,9 +113,10 @@ def test_a_grid_that_is_none_is_refused():
         read_axes(compose(AXES, "grid=random", name="sweep"))
 
 
-def test_baselines_are_no_part_of_a_sweep(tmp_path):
-    with pytest.raises(ValueError, match="baseline= is for run and evaluate"):
-        experiments.sweep.sweep(compose("baseline=voxel", name="sweep"), tmp_path)
+@pytest.mark.parametrize("word", ["baseline=voxel", "graph=default"])
+def test_baselines_and_loops_are_no_part_of_a_sweep(tmp_path, word):
+    with pytest.raises(ValueError, match=f"{word.split('=')[0]}= is for run and evaluate"):
+        experiments.sweep.sweep(compose(word, name="sweep"), tmp_path)
 
 
 def test_an_infinite_value_is_text_in_the_results():
