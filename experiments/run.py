@@ -30,6 +30,10 @@ from .command import command
 
 def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     """Map the sequence of `config`, write every output into `folder` and return the metrics."""
+    if config.graph and config.baseline:
+        raise ValueError(
+            "baseline= fuses every frame where it was placed, and graph= moves poses afterwards: use graph=none with it"
+        )
     with Clock().watching() as clock:
         with clock.phase("setup"):
             dataset = build_dataset(config)

@@ -67,8 +67,9 @@ def map_frames(run: MappingRun, dataset: Dataset, prior: Prior) -> Iterator[RawV
         with run.clock.phase("map"):
             take(run, given)
         yield from given.raw
-    with run.clock.phase("map"):
-        finish(run)
+    if run.back_end is not None:
+        with run.clock.phase("back_end"):
+            finish(run)
 
 
 def take(run: MappingRun, given: Input) -> None:
@@ -88,7 +89,8 @@ def take(run: MappingRun, given: Input) -> None:
             info = jax.device_get(info)
             record_step(run, given, info, spent(given, timer))
     if run.back_end is not None:
-        correct(run, given, info)
+        with run.clock.phase("back_end"):
+            correct(run, given, info)
 
 
 def spent(given: Input, timer: Timer, num_sharing: int = 1) -> Mapping[str, float]:

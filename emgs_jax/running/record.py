@@ -231,9 +231,9 @@ def correct(run: MappingRun, given: Input, info: StepInfo | None) -> None:
 
 
 def finish(run: MappingRun) -> None:
-    """The best poses for all that was measured, and the map that conforms to them; nothing without a back end."""
-    if run.back_end is not None and run.back_end.edges:
-        end = run.back_end
+    """The best poses for all that was measured by the back end of a run, and the map that conforms to them."""
+    end = run.back_end
+    if end.edges:
         run.state = end.close(run.state, [loop for loop in end.agreed() if end.misfit(loop) > end.config.max_known])
         _take_poses(run)
 

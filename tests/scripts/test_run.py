@@ -122,6 +122,22 @@ def test_baselines_stand_beside_ours_and_change_nothing_else(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_back_end_moves_nothing_that_is_exact_and_writes_what_it_measured(tmp_path):
+    metrics = experiments.run.run(compose("prior.level=0", "graph=default"), tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} >= FILES | {"trajectory_online.txt", "graph.g2o"}
+    before, after = (load_trajectory_tum(folder / "trajectory.txt")[1] for folder in (exact_run()[0], tmp_path))
+    np.testing.assert_allclose(after, before, atol=1e-4)  # m
+    online = load_trajectory_tum(tmp_path / "trajectory_online.txt")[1]
+    np.testing.assert_allclose(online, before, atol=1e-6)
+    assert metrics["trajectory_online/ate_se3_m"] < 1e-4 and metrics["loops/accepted"] == 0
+    assert metrics["time/back_end_seconds"] > 0
+
+
+def test_baselines_are_not_compared_with_poses_that_move(tmp_path):
+    with pytest.raises(ValueError, match="use graph=none with it"):
+        experiments.run.run(compose("graph=default", "baseline=voxel"), tmp_path)
+
+
 def test_the_phases_account_for_the_time():
     metrics = exact_run()[1]
     parts = sum(metrics[f"time/{name}_seconds"] for name in PHASES if name not in ("compile", "total"))
