@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.graph.deform import deform, deform_view
-from emgs_jax.graph.measurements import Graph, Nodes
+from emgs_jax.graph.measurements import LOOP, Graph, Nodes
 from emgs_jax.graph.optimize import GraphConfig, GraphInfo, optimize
 from emgs_jax.loops.agreement import AgreementConfig, agreeing
 from emgs_jax.loops.appearance import AppearanceConfig, Database, describe, extend, propose
@@ -134,11 +134,22 @@ class BackEnd:
 
     def agreed(self, since: int = 0) -> list[LoopMeasurement]:
         """Loops of queries from `since` on that others agree with and that are no edges yet."""
+        known = {(loop.a, loop.b) for loop in self.accepted}
+        return [loop for loop in self._agreed(since) if (loop.a, loop.b) not in known]
+
+    def retract(self) -> int:
+        """Take back the edges of loops that what was seen later speaks against; returns how many."""
+        good = {(loop.a, loop.b) for loop in self._agreed(0)}
+        before = len(self.accepted)
+        self.accepted = [loop for loop in self.accepted if (loop.a, loop.b) in good]
+        self.edges = [edge for edge in self.edges if edge.kind != LOOP or (edge.a, edge.b) in good]
+        return before - len(self.accepted)
+
+    def _agreed(self, since: int) -> list[LoopMeasurement]:
         recent = [loop for loop in self.verified if loop.b >= since]
         poses, log_scales = (dict(enumerate(values)) for values in (self.poses, self.log_scales))
         yes = agreeing(recent, self.contradicted, poses, log_scales, self.config.agreement)
-        known = {(loop.a, loop.b) for loop in self.accepted}
-        return [loop for loop, ok in zip(recent, yes, strict=True) if ok and (loop.a, loop.b) not in known]
+        return [loop for loop, ok in zip(recent, yes, strict=True) if ok]
 
     def _verify(self, row: int, other: int) -> None:
         keyframes = self.database.keyframes

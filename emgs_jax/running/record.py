@@ -234,6 +234,7 @@ def finish(run: MappingRun) -> None:
     """The best poses for all that was measured by the back end of a run, and the map that conforms to them."""
     end = run.back_end
     if end.edges:
+        end.retract()
         run.state = end.close(run.state, [loop for loop in end.agreed() if end.misfit(loop) > end.config.max_known])
         _take_poses(run)
 
