@@ -175,7 +175,7 @@ def step(
     candidates, weight = call(cluster, rest, call(_order, camera, thin), rows_each, config.fit)
     submap, fresh, refinement = call(_refine, submap, candidates, T, camera, thin, config.refinement)
     look = (fresh, weight, halves), place, state.time
-    map, count, map_overflow = call(_store, state.map, submap, rows, *look, camera, config)
+    map, count, map_overflow, time = call(_store, state.map, submap, rows, *look, camera, config)
 
     info = StepInfo(
         T_world_camera=T,
@@ -187,7 +187,7 @@ def step(
         num_gaussians=count,
         overflow=Overflow(map_overflow, submap_overflow, refinement.overflow),
     )
-    return SlamState(map, aligned, T, state.time + 1), info
+    return SlamState(map, aligned, T, time), info
 
 
 @eqx.filter_jit
@@ -282,11 +282,11 @@ def _store(
     time: Int[Array, ""],
     camera: Camera,
     config: SlamConfig,
-) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""]]:
+) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
     """The map with the submap written back, judged by this look; fresh Gaussians and second halves in free rows.
 
     Returns:
-        The map, the number of its Gaussians, and how many did not fit.
+        The map, the number of its Gaussians, how many did not fit, and the time of the next frame.
     """
     (aligned, T, localization), (fresh, weight, halves) = place, new
     thinned, noise = downscale(camera, config.observation.thin), localization.depth_noise
@@ -297,4 +297,4 @@ def _store(
     born = new_map(fresh, _first_weight(weight, config.em.average), config.existence.birth, time)
     born = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), born, halves)
     map, _, overflow = insert(write_back(map, submap, rows), born)
-    return map, jnp.sum(map.gaussians.valid), overflow
+    return map, jnp.sum(map.gaussians.valid), overflow, time + 1

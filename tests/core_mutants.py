@@ -311,8 +311,8 @@ STAGES = [
     ),
     *own("slam", "test_slam")(
         (
-            "SlamState(map, aligned, T, state.time + 1), info",
-            "SlamState(map, trusted, T, state.time + 1), info",
+            "SlamState(map, aligned, T, time), info",
+            "SlamState(map, trusted, T, time), info",
             "a rejected frame is no previous one",
         ),
         ("view = downscale(camera, thin)", "view = camera", "the full camera for the thinned rows"),
@@ -342,8 +342,8 @@ STAGES = [
             "one frame late",
         ),
         (
-            "SlamState(map, aligned, T, state.time + 1), info",
-            "SlamState(map, aligned, coarse.T_world_camera, state.time + 1), info",
+            "SlamState(map, aligned, T, time), info",
+            "SlamState(map, aligned, coarse.T_world_camera, time), info",
             "the coarse pose stays",
         ),
         (

@@ -85,6 +85,7 @@ def hand_run(poses, raw_poses, true_poses, statuses=STATUSES, gaussians=None) ->
         poses=[*poses],
         raw_poses=[*raw_poses],
         true_poses=[*true_poses],
+        back_end=None,
     )
 
 

@@ -67,7 +67,7 @@ def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
     key = jax.tree.structure((map, view, config)), tuple(leaf.shape for leaf in jax.tree.leaves((map, view)))
     if key in _prepared:
         return
-    step(SlamState(map, view, pose, jnp.asarray(0)), prediction, camera, config, note)
+    step(SlamState(map, view, pose, jnp.asarray(0, jnp.int32)), prediction, camera, config, note)
     run = full_precision(lambda call: jax.block_until_ready(call[0](*call[1])))  # as inside `step`: else it is another
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         list(threads.map(run, calls))

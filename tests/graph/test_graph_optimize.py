@@ -366,12 +366,10 @@ def test_a_singular_graph_has_no_covariances():
         marginal_covariances(Graph(nodes, edges), np.array([2]), config())
 
 
-def test_options_of_conf_are_configs_and_none_moves_nothing():
+def test_the_solver_of_conf_is_a_config_and_without_iterations_nothing_moves():
     _, graph = noisy_laps(24, 6, 4)
-    folder = ROOT / "conf" / "graph"
-    default = OmegaConf.load(folder / "default.yaml")
-    given = {key: value for key, value in OmegaConf.load(folder / "none.yaml").items() if key != "defaults"}
-    on, off = (hydra.utils.instantiate(x) for x in (default, OmegaConf.merge(default, given)))
+    default = OmegaConf.load(ROOT / "conf" / "graph" / "default.yaml").solver
+    on, off = (hydra.utils.instantiate(default, **changes) for changes in ({}, {"max_iterations": 0}))
     assert isinstance(on, GraphConfig) and rmse(optimize(graph, on)[0], graph.nodes) > 0.01
     assert same(optimize(graph, off)[0], graph.nodes)
     with pytest.raises(hydra.errors.InstantiationException, match="given or spread"):
