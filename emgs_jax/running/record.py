@@ -231,11 +231,15 @@ def correct(run: MappingRun, given: Input, info: StepInfo | None) -> None:
 
 
 def finish(run: MappingRun) -> None:
-    """The best poses for all that was measured by the back end of a run, and the map that conforms to them."""
+    """The best poses for all that was measured by the back end of a run, and the map that conforms to them.
+
+    Nothing where no loop says what is not so: among themselves frames and map fit better as they were placed.
+    """
     end = run.back_end
-    if end.edges:
-        end.retract()
-        run.state = end.close(run.state, [loop for loop in end.agreed() if end.misfit(loop) > end.config.max_known])
+    has_retracted = end.retract() > 0
+    loops = [loop for loop in end.agreed() if end.misfit(loop) > end.config.max_known]
+    if has_retracted or end.accepted or loops:
+        run.state = end.close(run.state, loops)
         _take_poses(run)
 
 
