@@ -102,6 +102,17 @@ def test_a_new_gaussian_weighs_as_many_images_as_its_points_amount_to_or_one_as_
     np.testing.assert_array_equal(np.asarray(printed.map.weight)[fresh], 1)
 
 
+def test_a_frame_knows_whose_gaussians_it_was_placed_by_and_the_new_ones_know_theirs(state, camera, settings):
+    known = jnp.where(jnp.arange(state.map.birth.shape[0]) % 5 == 0, 9, 4).astype(jnp.int32)
+    aged = eqx.tree_at(lambda s: (s.map.birth, s.time), state, (known, jnp.asarray(20, jnp.int32)))
+    new, info = step(aged, predict_room(FRAME, camera, num_features=2), FULL, settings)
+    assert info.origin == 4 and new.time == 21
+    was, now = np.asarray(state.map.gaussians.valid), np.asarray(new.map.gaussians.valid)
+    born = now & ~was
+    assert (np.asarray(new.map.birth)[born] == 20).all()
+    assert np.isin(np.asarray(new.map.birth)[now & was], [4, 9, 20]).all()
+
+
 def test_num_updates_counts_em_and_refinement_once_each(state, stepped):
     rise = np.asarray(stepped[0].map.num_updates - state.map.num_updates)
     assert 1 <= rise.max() <= 2 and rise.min() == 0
