@@ -69,6 +69,8 @@ def agreeing(
 ) -> Bool[np.ndarray, " n"]:
     """Which loops have enough others, of nearby queries to nearby candidates, that imply the same correction.
 
+    The correction of one, T_implied T_now⁻¹, must fit the query of the other.
+
     A false match of repeating texture is alone, or one of many that all say something else. Loops that agree one after
     the other are one statement, however far the path drifts in the meantime, and fall together if it is contradicted:
     see the top of this file.
@@ -81,7 +83,16 @@ def agreeing(
     every = [*loops, *contradicted]
     if not every:
         return np.zeros(0, bool)
-    agree = np.array([[_agree(one, other, poses, log_scales, config) for other in every] for one in every])
+    implied = [poses[loop.a] @ rescaled(loop.Z_a_b, np.exp(log_scales[loop.a])) for loop in every]
+    corrections = [T @ np.linalg.inv(poses[loop.b]) for T, loop in zip(implied, every, strict=True)]
+
+    def agrees(one: int, other: int) -> bool:
+        if not _are_near(every[one], every[other], config):
+            return False
+        distance, turn = gap_between(corrections[other] @ poses[every[one].b], implied[one])
+        return distance <= config.max_distance and turn <= config.max_turn_deg
+
+    agree = np.array([[agrees(one, other) for other in range(len(every))] for one in range(len(every))])
     agree &= agree.T
     _, group = connected_components(agree, directed=False)
     queries, is_evidence = np.array([loop.b for loop in every]), np.arange(len(every)) < len(loops)
@@ -94,16 +105,5 @@ def agreeing(
     return np.array([is_accepted(row) for row in range(len(loops))], bool)
 
 
-def _agree(
-    one: LoopMeasurement,
-    other: LoopMeasurement,
-    poses: Mapping[int, Float[np.ndarray, "4 4"]],
-    log_scales: Mapping[int, float],
-    config: AgreementConfig,
-) -> bool:
-    """Are two loops near each other, and does the correction of the other, T_implied T_now⁻¹, fit this query?"""
-    if abs(one.b - other.b) > config.max_query_gap or abs(one.a - other.a) > config.max_candidate_gap:
-        return False
-    implied, by_other = (poses[loop.a] @ rescaled(loop.Z_a_b, np.exp(log_scales[loop.a])) for loop in (one, other))
-    distance, turn = gap_between(by_other @ np.linalg.inv(poses[other.b]) @ poses[one.b], implied)
-    return distance <= config.max_distance and turn <= config.max_turn_deg
+def _are_near(one: LoopMeasurement, other: LoopMeasurement, config: AgreementConfig) -> bool:
+    return abs(one.b - other.b) <= config.max_query_gap and abs(one.a - other.a) <= config.max_candidate_gap

@@ -121,7 +121,7 @@ class BackEnd:
             self.edges.append(map_edge(time, origin, rescaled(measured, np.exp(-self.log_scales[time])), noise))
 
     def look_for_loops(self, look: Look) -> list[LoopMeasurement]:
-        """Describe the last node, and verify what it looks like; returns the recent loops that are agreed upon."""
+        """Describe the last node, and verify what it looks like; returns the new loops that are agreed upon."""
         time, appearance = len(self.poses) - 1, self.config.appearance
         if time % self.config.every:
             return []
@@ -130,26 +130,27 @@ class BackEnd:
         row = len(self.database.keyframes) - 1
         for candidate in propose(self.database, row, appearance):
             self._verify(row, candidate.row)
-        return self.agreed(since=time - self.config.agreement.max_query_gap)
+        return self.new(self.agreed(since=time - self.config.agreement.max_query_gap))
 
     def agreed(self, since: int = 0) -> list[LoopMeasurement]:
-        """Loops of queries from `since` on that others agree with and that are no edges yet."""
-        known = {(loop.a, loop.b) for loop in self.accepted}
-        return [loop for loop in self._agreed(since) if (loop.a, loop.b) not in known]
-
-    def retract(self) -> int:
-        """Take back the edges of loops that what was seen later speaks against; returns how many."""
-        good = {(loop.a, loop.b) for loop in self._agreed(0)}
-        before = len(self.accepted)
-        self.accepted = [loop for loop in self.accepted if (loop.a, loop.b) in good]
-        self.edges = [edge for edge in self.edges if edge.kind != LOOP or (edge.a, edge.b) in good]
-        return before - len(self.accepted)
-
-    def _agreed(self, since: int) -> list[LoopMeasurement]:
+        """Loops of queries from `since` on that others agree with."""
         recent = [loop for loop in self.verified if loop.b >= since]
         poses, log_scales = (dict(enumerate(values)) for values in (self.poses, self.log_scales))
         yes = agreeing(recent, self.contradicted, poses, log_scales, self.config.agreement)
         return [loop for loop, ok in zip(recent, yes, strict=True) if ok]
+
+    def new(self, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
+        """Those that are no edges yet."""
+        known = {(loop.a, loop.b) for loop in self.accepted}
+        return [loop for loop in loops if (loop.a, loop.b) not in known]
+
+    def retract(self, agreed: Sequence[LoopMeasurement]) -> int:
+        """Take back the edges of loops that are not among all that are `agreed` now; returns how many."""
+        good = {(loop.a, loop.b) for loop in agreed}
+        before = len(self.accepted)
+        self.accepted = [loop for loop in self.accepted if (loop.a, loop.b) in good]
+        self.edges = [edge for edge in self.edges if edge.kind != LOOP or (edge.a, edge.b) in good]
+        return before - len(self.accepted)
 
     def _verify(self, row: int, other: int) -> None:
         keyframes = self.database.keyframes

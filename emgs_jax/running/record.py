@@ -236,8 +236,9 @@ def finish(run: MappingRun) -> None:
     Nothing where no loop says what is not so: among themselves frames and map fit better as they were placed.
     """
     end = run.back_end
-    has_retracted = end.retract() > 0
-    loops = [loop for loop in end.agreed() if end.misfit(loop) > end.config.max_known]
+    agreed = end.agreed()
+    has_retracted = end.retract(agreed) > 0
+    loops = [loop for loop in end.new(agreed) if end.misfit(loop) > end.config.max_known]
     if has_retracted or end.accepted or loops:
         run.state = end.close(run.state, loops)
         _take_poses(run)

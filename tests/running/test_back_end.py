@@ -99,12 +99,12 @@ def test_loops_that_are_contradicted_later_are_no_edges_any_more(graph):
     truth, drifted = ring(), ring(1.95 * np.pi)
     end, loops = walked(graph, drifted), [loop(truth, row) for row in range(1, 9)]
     end.verified = list(loops)
-    assert end.agreed() == loops
+    assert end.new(end.agreed()) == loops
     end.close(state_of(drifted), loops)
-    assert end.retract() == 0 and len(end.accepted) == len(loops) and end.agreed() == []
+    assert end.retract(end.agreed()) == 0 and len(end.accepted) == len(loops) and end.new(end.agreed()) == []
     end.contradicted = [loop(truth, row) for row in (9, 10)]
     num_edges = len(end.edges)
-    assert end.retract() == len(loops) and not end.accepted and len(end.edges) == num_edges - len(loops)
+    assert end.retract(end.agreed()) == len(loops) and not end.accepted and len(end.edges) == num_edges - len(loops)
 
 
 def test_a_loop_that_cannot_be_solved_changes_nothing(graph):
