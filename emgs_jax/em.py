@@ -75,6 +75,13 @@ class EStep(eqx.Module):
     is_fused: Bool[Array, "m"]
 
 
+def owners(step: EStep, num_gaussians: int) -> Int[Array, "m"]:
+    """The Gaussian that explains each point best; `num_gaussians` where none does."""
+    best = jnp.argmax(step.responsibilities, axis=-1)[:, None]
+    rows = jnp.take_along_axis(step.rows, best, axis=-1)[:, 0]
+    return jnp.where(jnp.any(step.responsibilities > 0, axis=-1), rows, num_gaussians)
+
+
 class EmInfo(eqx.Module):
     """Counts of one update, and the mean log-joint of the fused points."""
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
-from emgs_jax.em import EmConfig, EmInfo, em_update
+from emgs_jax.em import EmConfig, EmInfo, em_update, owners
 from emgs_jax.existence import ExistenceConfig, join_layers, judge
 from emgs_jax.gaussian_map import (
     AverageConfig,
@@ -241,10 +241,10 @@ def _fuse(
     trusted = _trusted(aligned, localization)
     noise = localization.noise[:, None] * (trusted.points - T.translation())
     submap, explained, em = em_update(submap, trusted, noise, config, white)
-    best = jnp.argmax(explained.responsibilities, axis=-1)[:, None]
-    births = submap.birth[jnp.take_along_axis(explained.rows, best, axis=-1)[:, 0]].astype(jnp.float32)
+    owned = owners(explained, submap.birth.shape[0])
+    births = take_rows(submap.birth, owned).astype(jnp.float32)
     origin = jnp.where(em.num_fused > 0, median(births, explained.is_fused), time).astype(jnp.int32)
-    submap, halves = split(submap, trusted, noise, (explained.rows, explained.responsibilities), spacing, splitting)
+    submap, halves = split(submap, trusted, noise, owned, spacing, splitting)
     rest = eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~explained.is_fused)
     return submap, rest, em, halves, origin
 

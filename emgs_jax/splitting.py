@@ -37,7 +37,7 @@ def is_too_coarse(
     gaussians: Gaussians,
     points: Observation,
     noise: Float[Array, "m 3"],
-    explained: tuple[Int[Array, "m k"], Float[Array, "m k"]],
+    owners: Int[Array, "m"],
     spacing: int,
     config: SplittingConfig,
 ) -> Bool[Array, "n"]:
@@ -47,14 +47,10 @@ def is_too_coarse(
         gaussians: n of them, world frame.
         points: m of them, world frame.
         noise: of each along its viewing ray, a vector, m.
-        explained: K Gaussians of each point and their responsibilities, all 0 where none explains it; a point is of
-            the Gaussian that explains it best.
+        owners: the Gaussian that explains each point best; n where none does.
         spacing: points that make a new Gaussian.
         config: what counts as too many and as contradicted.
     """
-    rows, responsibilities = explained
-    owners = jnp.take_along_axis(rows, jnp.argmax(responsibilities, axis=-1)[:, None], axis=-1)[:, 0]
-    owners = jnp.where(jnp.any(responsibilities > 0, axis=-1), owners, gaussians.valid.shape[0])
     own = take_rows(gaussians, owners)
     height = jnp.sum((points.points - own.means) * own.normals, axis=-1)
     terms = (
@@ -106,7 +102,7 @@ def split(
     map: GaussianMap,
     points: Observation,
     noise: Float[Array, "m 3"],
-    explained: tuple[Int[Array, "m k"], Float[Array, "m k"]],
+    owners: Int[Array, "m"],
     spacing: int,
     config: SplittingConfig,
 ) -> tuple[GaussianMap, GaussianMap]:
@@ -117,7 +113,7 @@ def split(
     Returns:
         The map, and `max_splits` rows with the other halves, valid where there is one.
     """
-    is_coarse = is_too_coarse(map.gaussians, points, noise, explained, spacing, config)
+    is_coarse = is_too_coarse(map.gaussians, points, noise, owners, spacing, config)
     rows, exists, _ = compact_rows(is_coarse, config.max_splits)
     first, second, variance = halves(take_rows(map, rows), config.min_std)
     exists &= variance >= config.min_std**2

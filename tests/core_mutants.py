@@ -295,8 +295,14 @@ STAGES = [
         (">= config.min_normal_cos", ">= -1.0", "both sides of a panel"),
         ("(noise**2)[:, None, None]", "noise[:, None, None]", "a deviation for a variance"),
     ),
+    Mutant(
+        "emgs_jax/em.py",
+        "jnp.any(step.responsibilities > 0, axis=-1)",
+        "step.responsibilities[:, 0] >= 0",
+        ("tests/test_splitting.py",),
+        "points that nothing explains",
+    ),
     *own("splitting", "test_splitting")(
-        ("jnp.any(responsibilities > 0, axis=-1)", "responsibilities[:, 0] >= 0", "points that nothing explains"),
         ("count >= config.min_points * spacing", "count >= spacing", "a view from as far"),
         ("height_sq - height**2 >", "height_sq >", "an offset of all points"),
         ("(noise_sq + config.min_std**2)", "config.min_std**2", "what is within the noise"),

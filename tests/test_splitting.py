@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scene import assert_same, random_gaussians
 
-from emgs_jax.em import em_update
+from emgs_jax.em import EStep, em_update, owners
 from emgs_jax.gaussian_map import GaussianMap, insert, new_map
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
@@ -51,7 +51,8 @@ def points_of(map: GaussianMap, count: int = 64, seed: int = 0) -> Observation:
 
 
 def explained_by_first(count: int, share: float = 1.0):
-    return jnp.tile(jnp.array([[0, 1]]), (count, 1)), jnp.tile(jnp.array([[share, 0.0]]), (count, 1))
+    rows, shares = jnp.tile(jnp.array([[0, 1]]), (count, 1)), jnp.tile(jnp.array([[share, 0.0]]), (count, 1))
+    return owners(EStep(rows, shares, shares[:, 0] > 0), 2)
 
 
 def verdict(map, points, settings, noise=0.0, explained=None):
@@ -165,9 +166,9 @@ def test_no_more_than_max_splits_and_the_rest_in_the_next_frames(config):
     map = one_disc()
     both = jax.tree.map(lambda leaf: jnp.stack([leaf[0], leaf[0]]), map)
     points = colored(points_of(map))
-    rows = jnp.concatenate([jnp.zeros(64, jnp.int32), jnp.ones(64, jnp.int32)])[:, None]
+    rows = jnp.concatenate([jnp.zeros(64, jnp.int32), jnp.ones(64, jnp.int32)])
     points = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), points)
-    cut, second = splitted(both, points, jnp.zeros((128, 3)), (rows, jnp.ones((128, 1))), SPACING, settings)
+    cut, second = splitted(both, points, jnp.zeros((128, 3)), rows, SPACING, settings)
     assert second.gaussians.valid.sum() == 1
     np.testing.assert_array_equal(cut.gaussians.means[1], both.gaussians.means[1])
     assert (cut.gaussians.means[0] != both.gaussians.means[0]).any()
@@ -183,7 +184,7 @@ def frames_of_a_checkerboard(config, splitting, num_frames=12):
     counts = []
     for _ in range(num_frames):
         map, step, _ = fused(map, points, noise, config.em)
-        map, second = splitted(map, points, noise, (step.rows, step.responsibilities), SPACING, splitting)
+        map, second = splitted(map, points, noise, owners(step, 96), SPACING, splitting)
         map, _, overflow = insert(map, second)
         assert overflow == 0
         counts.append(int(map.gaussians.valid.sum()))

@@ -151,7 +151,7 @@ VERBS = {
     ),
     "em_update": (lambda m, o: em.em_update(m, o, NOISE[:32], CONFIG.em), lambda s: (map_of(s), close(s))),
     "split": (
-        lambda m, o, e: splitting.split(m, o, NOISE, (e.rows, e.responsibilities), 1, CONFIG.splitting),
+        lambda m, o, e: splitting.split(m, o, NOISE, em.owners(e, 32), 1, CONFIG.splitting),
         lambda s: (map_of(s), points(s), estep_of(s)),
     ),
     "project_gaussians": (

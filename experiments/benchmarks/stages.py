@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from emgs_jax.em import e_step, m_step, precision
+from emgs_jax.em import e_step, m_step, owners, precision
 from emgs_jax.existence import join_layers, judge
 from emgs_jax.gaussian_map import confirmed, insert, new_map, select_submap, write_back
 from emgs_jax.gaussians import cluster, spacing
@@ -49,8 +49,8 @@ def time_stages(data: Data, repetitions: int) -> list[Timing]:
     steps, _ = stage("E-step", e_step, submap.gaussians, aligned, noise, config.em)
     stage("M-step", m_step, submap.gaussians, aligned, precision(noise, config.em), steps, config.em)
     num_rows = spacing(data.camera, thin, config.fit)
-    explained = steps.rows, steps.responsibilities
-    stage("split", split, submap, aligned, noise, explained, num_rows, config.splitting)
+    owned = owners(steps, rows.shape[0])
+    stage("split", split, submap, aligned, noise, owned, num_rows, config.splitting)
     rest = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & ~steps.is_fused)
     order = morton_order(camera.height, camera.width)
     candidates_new, weight = stage("new Gaussians", cluster, rest, order, num_rows, config.fit)
