@@ -128,7 +128,7 @@ GRAPH = [
         ("scales[:, None] * (gaussians.means - old)", "gaussians.means - old", "the scale leaves the means"),
         ("scales[:, None, None] ** 2 * shapes", "scales[:, None, None] * shapes", "covariances by the scale once"),
         ("where_rows(has_moved & gaussians.valid, moved, gaussians)", "moved", "free rows move"),
-        ("scale * (view.points - old) @ turn.T", "scale * (view.points - old) @ turn", "a view turned back"),
+        ("view, jnp.ones(())), scale)", "view, scale), jnp.ones(()))", "a view scaled about the world's origin"),
     ),
     *own("graph/start", "graph/test_graph_optimize")(
         ("turns.transpose(0, 2, 1)", "turns", "loops are spread against their direction"),

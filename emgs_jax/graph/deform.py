@@ -6,9 +6,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.graph.measurements import Nodes
-from emgs_jax.observation import Observation
+from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import take_rows, where_rows
+from emgs_jax.registration.rigid import pose_row
 
 
 def _motions(before: Nodes, after: Nodes) -> tuple[Float[Array, "n 3 3"], Float[Array, "n"], Bool[Array, "n"]]:
@@ -51,8 +52,7 @@ def deform(map: GaussianMap, before: Nodes, after: Nodes, min_std: Float[Array, 
 @full_precision
 def deform_view(view: Observation, before: Nodes, after: Nodes, row: Int[Array, ""]) -> Observation:
     """A frame that was placed by node `row`, world frame, where that node is now; see `deform`."""
-    turn, scale, has_moved = (part[row] for part in _motions(before, after))
-    old, new = (nodes.T_world.translation()[row] for nodes in (before, after))
-    points = scale * (view.points - old) @ turn.T + new
-    moved = eqx.tree_at(lambda o: (o.points, o.normals), view, (points, view.normals @ turn.T))
+    _, scale, has_moved = (part[row] for part in _motions(before, after))
+    old, new = (pose_row(nodes.T_world, row) for nodes in (before, after))
+    moved = transform(new, transform(old.inverse(), view, jnp.ones(())), scale)
     return where_rows(has_moved & view.valid, moved, view)
