@@ -1,29 +1,22 @@
 """Localization (Method C): where the current frame is, first through the previous frame, then against the map."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.observation import Observation, Prediction, depth_in, transform
-from emgs_jax.ops.camera import Camera, nearest_pixel, project
+from emgs_jax.observation import Observation, Prediction, transform
+from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.linalg import Whitening
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
+from emgs_jax.registration.belief import Belief, certain, next_belief, predict, root_information, update
 from emgs_jax.registration.icp import IcpInfo, icp
 from emgs_jax.registration.noise import confidence_levels
 from emgs_jax.registration.problem import IcpConfig
-from emgs_jax.registration.rigid import (
-    MIN_PAIRS,
-    fit_rigid,
-    fit_rigid_robust,
-    interpolate,
-    median,
-    pose_row,
-    scale_translation,
-)
+from emgs_jax.registration.repeat import repeat_error, repeat_scale, through_previous
+from emgs_jax.registration.rigid import MIN_PAIRS, pose_row, scale_translation
 
 # Bits of LocalizationInfo.reason; the words are for people.
 REASONS = (
@@ -35,6 +28,8 @@ REASONS = (
 )
 
 LEAST_NOISE = 5e-4  # of the depth
+NO_INFORMATION = 1e-6  # in place of 0
+FUSED = 3
 
 
 class LocalizationConfig(eqx.Module):
@@ -43,12 +38,13 @@ class LocalizationConfig(eqx.Module):
     Args:
         coarse: `via_previous` (printed): closest points in the previous image carry over to its earlier prediction;
             `same_image`: the two predictions of the previous image directly; `anchored`: the prior's own pose;
-            `fused`: `same_image` and `anchored` by their uncertainties.
+            `fused`: the previous pose and the prior's motion from it, and `anchored`, by their uncertainties.
         coarse_scale: `none` (printed), `ratio` (median ratio of the depths that were predicted twice) or
             `estimated` (similarity fit).
-        scale_memory: power on the estimated scale; below 1 it is pulled towards the prior's own.
+        scale_std: of the logarithm of a scale about the mean of those before it, if it erred anew with every frame: the
+            longer errors last, the larger. inf: map and repeats alone hold the scale (printed).
         max_pair_distance: fraction of the depth; farther points are no pair.
-        anchor_noise: of `fused`: variance of the prior's own pose near the anchor, over that of the chain.
+        anchor_noise: of `fused`: variance of the prior's own pose near the anchor, over that of its motion.
         anchor_range: m; of `fused`: distance from the anchor at which its standard deviation has doubled.
         icp: the fine step.
         min_inlier_fraction: of the points, below which the fine pose is not accepted.
@@ -60,7 +56,7 @@ class LocalizationConfig(eqx.Module):
 
     coarse: Float[Array, "*b"] = choice("via_previous", "same_image", "anchored", "fused")
     coarse_scale: Float[Array, "*b"] = choice("none", "ratio", "estimated")
-    scale_memory: Float[Array, "*b"] = traced()
+    scale_std: Float[Array, "*b"] = traced()
     max_pair_distance: Float[Array, "*b"] = traced()
     anchor_noise: Float[Array, "*b"] = traced()
     anchor_range: Float[Array, "*b"] = traced()
@@ -81,6 +77,8 @@ class CoarsePose(eqx.Module):
         scale: by which this prediction is multiplied about its cameras' origins.
         repeat_rms: m; disagreement of the two predictions of the previous image, after alignment.
         mean_depth: m; of the previous image, scaled.
+        depth_noise: as a fraction; the larger of this disagreement and what the previous frame differed from the map.
+        belief: covariance of this pose and scale; the rest of the frame before.
         is_usable: False where the prediction has no valid point or pose.
     """
 
@@ -89,6 +87,8 @@ class CoarsePose(eqx.Module):
     scale: Float[Array, ""]
     repeat_rms: Float[Array, ""]
     mean_depth: Float[Array, ""]
+    depth_noise: Float[Array, ""]
+    belief: Belief
     is_usable: Bool[Array, ""]
 
 
@@ -105,6 +105,7 @@ class LocalizationInfo(eqx.Module):
         noise: likewise of each point, as those of its level of confidence do, in the order of the rows.
         step_m: between the coarse and the fine pose.
         step_rad: likewise.
+        belief: how well this frame is known.
         icp: of the fine step.
     """
 
@@ -117,43 +118,47 @@ class LocalizationInfo(eqx.Module):
     noise: Float[Array, "p"]
     step_m: Float[Array, ""]
     step_rad: Float[Array, ""]
+    belief: Belief
     icp: IcpInfo
 
 
-def _repeat_scale(
-    now: Observation, before: Observation, T_world_previous: jaxlie.SE3, paired: Array, config: LocalizationConfig
-) -> Float[Array, ""]:
-    """Scale of this prediction relative to the map, from the image that was predicted twice (R8)."""
-    depth_now = now.points[:, 2]
-    ratio = median(depth_in(T_world_previous, before) / jnp.where(paired, depth_now, 1.0), paired)
-    _, similarity = fit_rigid(now.points, before.points, paired.astype(jnp.float32))
-    scale = jnp.stack([jnp.ones(()), ratio, similarity])[config.coarse_scale.astype(jnp.int32)]
-    return jnp.where(jnp.isfinite(scale) & (scale > 0.1), scale, 1.0) ** config.scale_memory
+def _motion_noise(depth_noise: Float[Array, ""], mean_depth: Float[Array, ""], config: IcpConfig) -> Float[Array, "7"]:
+    """Standard deviations of the prior's motion between two frames, and of the ratio of their scales."""
+    angle = depth_noise / jnp.sqrt(jnp.maximum(config.prior_information, NO_INFORMATION))
+    ratio = depth_noise * jnp.maximum(config.scale_noise, NO_INFORMATION)
+    return jnp.append(jnp.repeat(jnp.stack([angle * mean_depth, angle]), 3), ratio)
 
 
-def _pairs_via_previous(
-    prediction: Prediction,
-    previous: Observation,
+def _measured(
+    T_world_camera: jaxlie.SE3,
     scale: Float[Array, ""],
-    T_previous_current: jaxlie.SE3,
-    camera: Camera,
+    covariance: Float[Array, "7 7"],
+    anchored: tuple[jaxlie.SE3, Float[Array, "6"]],
+    belief: Belief,
     config: LocalizationConfig,
-) -> tuple[Float[Array, "p 3"], Bool[Array, "p"]]:
-    """The printed chain (R7): current point -> closest point of the previous image now -> the same pixel before.
+) -> tuple[jaxlie.SE3, Float[Array, ""], Float[Array, "7 7"]]:
+    """Pose, scale and covariance after the prior's own pose (`fused` only) and the prior's own unit.
 
-    The closest point is looked up by projection, which needs no tree, from `T_previous_current` of the prior.
+    Where a prior has lost its anchor its pose is wrong altogether, and then lasting. So it counts by a Cauchy weight of
+    its distance from what is known, w = 1 / (1 + χ² / 6).
 
-    Returns:
-        A world-frame point for every current one, and which of these pairs exist.
+    Args:
+        T_world_camera: what is known.
+        scale: likewise.
+        covariance: of both.
+        anchored: the prior's own pose, and its standard deviations.
+        belief: of the previous frame.
+        config: readings.
     """
-    now, current = prediction.previous, prediction.current
-    seen = transform(T_previous_current, current, scale)
-    pixels, depth = project(camera, seen.points)
-    match, inside = nearest_pixel(pixels, (camera.height, camera.width))
-    distance = jnp.linalg.norm(seen.points - scale * now.points[match], axis=-1)
-    is_close = distance <= config.max_pair_distance * depth
-    via = inside & (depth > 0) & is_close & (now.valid & previous.valid)[match] & current.valid
-    return previous.points[match], via
+    pose, std = anchored
+    apart = (T_world_camera.inverse() @ pose).log()
+    is_used = (config.coarse == FUSED) & jnp.all(jnp.isfinite(apart))
+    apart = jnp.where(is_used, apart, 0.0)
+    chi_sq = apart @ jnp.linalg.solve(covariance[:-1, :-1] + jnp.diag(std**2), apart)
+    weights = is_used / (std**2 * (1.0 + chi_sq / apart.shape[0]))
+    difference = jnp.append(apart, belief.log_scale - jnp.log(scale))
+    step, covariance = update(covariance, difference, jnp.diag(jnp.append(weights, config.scale_std**-2)))
+    return T_world_camera @ jaxlie.SE3.exp(step[:-1]), scale * jnp.exp(step[-1]), covariance
 
 
 @full_precision
@@ -163,6 +168,7 @@ def localize_coarse(
     T_world_previous: jaxlie.SE3,
     camera: Camera,
     config: LocalizationConfig,
+    belief: Belief | None = None,
 ) -> CoarsePose:
     """Coarse registration through the previous frame, which was predicted twice, fused with the prior's own pose.
 
@@ -172,51 +178,37 @@ def localize_coarse(
         T_world_previous: its pose.
         camera: of the (thinned) rows.
         config: readings.
+        belief: of the previous frame; None: its pose is exact.
     """
-    now = prediction.previous
-    paired = now.valid & previous.valid
-    scale = _repeat_scale(now, previous, T_world_previous, paired, config)
-    views = prediction.T_world_views
+    now, belief = prediction.previous, certain() if belief is None else belief
+    scale = repeat_scale(now, previous, T_world_previous, jnp.exp(belief.log_scale), config.coarse_scale)
+    repeat_rms, mean_depth = repeat_error(now, previous, T_world_previous, scale, config.max_pair_distance)
+    depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, belief.depth_noise), LEAST_NOISE)
+    views, anchor = prediction.T_world_views, prediction.T_world_anchor
     raw_previous, raw_current = pose_row(views, 0), pose_row(views, 1)
     T_previous_current = scale_translation(raw_previous.inverse() @ raw_current, scale)
-    T_current_newest = scale_translation(raw_current.inverse() @ pose_row(views, 2), scale)
-
-    carried, via = _pairs_via_previous(prediction, previous, scale, T_previous_current, camera, config)
-    direct = scale * now.points, previous.points, paired, T_world_previous
-    chained = scale * prediction.current.points, carried, via, T_world_previous @ T_previous_current
-    fits = jax.vmap(fit_rigid_robust)(*stack([direct, chained]))  # side by side: one copy of the solve to compile
-    same_image, via_previous = pose_row(fits, 0) @ T_previous_current, pose_row(fits, 1)
-    anchor = prediction.T_world_anchor
     anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, scale)
+    last = previous, T_world_previous, T_previous_current
+    via_previous, same_image = through_previous(prediction, *last, scale, camera, config.max_pair_distance)
+    forms = stack([via_previous, same_image, anchored, T_world_previous @ T_previous_current])
     # After a frame that could not be placed the chain is broken, and the prior's own pose stands in for it.
-    is_linked = (jnp.sum(paired) >= MIN_PAIRS) & jnp.all(jnp.isfinite(same_image.wxyz_xyz))
-    same_image = jaxlie.SE3(jnp.where(is_linked, same_image.wxyz_xyz, anchored.wxyz_xyz))
-    reach = 1.0 + jnp.linalg.norm(anchored.translation() - anchor.translation()) / config.anchor_range
-    fused = interpolate(same_image, anchored, 1.0 / (1.0 + config.anchor_noise * reach**2))
-    forms = stack([via_previous, same_image, anchored, fused])
-    coarse = pose_row(forms, config.coarse.astype(jnp.int32))
+    is_linked = (jnp.sum(now.valid & previous.valid) >= MIN_PAIRS) & jnp.all(jnp.isfinite(forms.wxyz_xyz), axis=-1)
+    forms = jaxlie.SE3(jnp.where(is_linked[:, None], forms.wxyz_xyz, anchored.wxyz_xyz))
 
-    rotation, origin = T_world_previous.rotation().as_matrix(), T_world_previous.translation()
-    repeat_sq = jnp.sum((scale * now.points @ rotation.T + origin - previous.points) ** 2, axis=-1)
-    # 1.4826 makes the median absolute deviation a standard deviation (Gaussian errors).
-    # Without a pair nothing is known, and the pairing distance stands in.
-    mean_depth = scale * median(now.points[:, 2], now.valid)
-    unknown_sq = (config.max_pair_distance * mean_depth) ** 2
-    repeat_rms = 1.4826 * jnp.sqrt(jnp.where(jnp.any(paired), median(repeat_sq, paired), unknown_sq))
+    noise = _motion_noise(depth_noise, mean_depth, config.icp)
+    covariance = predict(belief.covariance, T_previous_current, noise)
+    reach = 1.0 + jnp.linalg.norm(anchored.translation() - anchor.translation()) / config.anchor_range
+    own = anchored, noise[:-1] * jnp.sqrt(config.anchor_noise) * reach
+    known = pose_row(forms, config.coarse.astype(jnp.int32)), scale, covariance
+    coarse, scale, covariance = _measured(*known, own, belief, config)
     is_finite = jnp.all(jnp.isfinite(coarse.wxyz_xyz))
     coarse = jaxlie.SE3(jnp.where(is_finite, coarse.wxyz_xyz, T_world_previous.wxyz_xyz))
-    newest = coarse @ T_current_newest
+    newest = coarse @ scale_translation(raw_current.inverse() @ pose_row(views, 2), scale)
     has_newest = prediction.has_newest & is_finite & jnp.all(jnp.isfinite(newest.wxyz_xyz))
     newest = jaxlie.SE3(jnp.where(has_newest, newest.wxyz_xyz, coarse.wxyz_xyz))
     is_usable = is_finite & (jnp.sum(prediction.current.valid) >= MIN_PAIRS)
-    return CoarsePose(
-        T_world_camera=coarse,
-        T_world_newest=newest,
-        scale=scale,
-        repeat_rms=repeat_rms,
-        mean_depth=mean_depth,
-        is_usable=is_usable,
-    )
+    belief = eqx.tree_at(lambda b: b.covariance, belief, covariance)
+    return CoarsePose(coarse, newest, scale, repeat_rms, mean_depth, depth_noise, belief, is_usable)
 
 
 @full_precision
@@ -240,10 +232,9 @@ def localize_fine(
         T_world_camera, the observation in the world frame, and the outcome.
     """
     scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
-    # The coarse pose is as good as two predictions of one image agree; the least keeps the solve well scaled.
-    depth_noise = jnp.maximum(coarse.repeat_rms / coarse.mean_depth, LEAST_NOISE)
-    noise = depth_noise * coarse.mean_depth, depth_noise
-    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, noise, config.icp, white)
+    noise = coarse.depth_noise * coarse.mean_depth, coarse.depth_noise
+    known = root_information(coarse.belief.covariance)
+    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, noise, config.icp, white, known)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     step_m, step_rad = jnp.linalg.norm(step[:3]), jnp.linalg.norm(step[3:])
     failed = jnp.stack(
@@ -261,6 +252,7 @@ def localize_fine(
     aligned = transform(T, current, scale)
     aligned = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & coarse.is_usable)
     bits = jnp.sum(failed * 2 ** jnp.arange(failed.shape[0]))
+    belief = next_belief(coarse.belief, info, coarse.depth_noise, scale, is_tracked)
     return (
         T,
         aligned,
@@ -274,6 +266,7 @@ def localize_fine(
             noise=info.misfit_of_levels[confidence_levels(current.confidence, current.valid)],
             step_m=step_m,
             step_rad=step_rad,
+            belief=belief,
             icp=info,
         ),
     )

@@ -31,6 +31,7 @@ from emgs_jax.ops.linalg import Whitening, whitening
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
+from emgs_jax.registration.belief import Belief, certain
 from emgs_jax.registration.rigid import median, pose_row
 from emgs_jax.splitting import SplittingConfig, split
 
@@ -75,12 +76,14 @@ class SlamState(eqx.Module):
         map: all Gaussians.
         previous: the last frame as it was aligned, world frame.
         T_world_previous: its pose.
+        belief: how well that is known.
         time: frames so far, those that could not be placed included.
     """
 
     map: GaussianMap
     previous: Observation
     T_world_previous: jaxlie.SE3
+    belief: Belief
     time: Int[Array, ""]
 
 
@@ -141,7 +144,7 @@ def _first_state(
     new = new_map(gaussians, _first_weight(weight, config.em.average), existence, time - 1)
     map, _, overflow = insert(empty, new)
     previous = jax.tree.map(lambda leaf: leaf[-1], world)
-    return SlamState(map, previous, pose_row(T_world_views, -1), time), overflow
+    return SlamState(map, previous, pose_row(T_world_views, -1), certain(), time), overflow
 
 
 @full_precision
@@ -164,8 +167,8 @@ def step(
         config: all stages.
         call: how an executable is called; `running.growth.prepare` learns from it what there is to compile.
     """
-    thin, last = config.observation.thin, (state.previous, state.T_world_previous)
-    coarse, guess = call(_approach, prediction, *last, camera, thin, config.localization)
+    thin, last = config.observation.thin, (state.previous, state.T_world_previous, state.belief)
+    coarse, guess = call(_approach, prediction, last, camera, thin, config.localization)
     submap, white, rows, submap_overflow = call(_select, state.map, (state.previous, guess), config.submap)
     T, aligned, localization = call(_place, prediction.current, submap, coarse, config.localization, white)
     rows_each = spacing(camera, thin, config.fit)
@@ -187,20 +190,19 @@ def step(
         num_gaussians=count,
         overflow=Overflow(map_overflow, submap_overflow, refinement.overflow),
     )
-    return SlamState(map, aligned, T, time), info
+    return SlamState(map, aligned, T, localization.belief, time), info
 
 
 @eqx.filter_jit
 def _approach(
     prediction: Prediction,
-    previous: Observation,
-    T_world_previous: jaxlie.SE3,
+    last: tuple[Observation, jaxlie.SE3, Belief],
     camera: Camera,
     thin: int,
     config: LocalizationConfig,
 ) -> tuple[CoarsePose, Observation]:
     """The coarse pose, and the current frame placed by it."""
-    coarse = localize_coarse(prediction, previous, T_world_previous, downscale(camera, thin), config)
+    coarse = localize_coarse(prediction, *last[:2], downscale(camera, thin), config, last[2])
     return coarse, transform(coarse.T_world_camera, prediction.current, coarse.scale)
 
 

@@ -24,6 +24,7 @@ from emgs_jax.registration.problem import (
     Problem,
     Uncertainty,
     candidates_at,
+    data_information,
     distances,
     information,
     matches_at,
@@ -45,6 +46,7 @@ class IcpInfo(eqx.Module):
         misfit: the same fraction of all points within `max_misfit`, as 1.4826 times the median, a robust standard
             deviation; 0 without any.
         misfit_of_levels: likewise of the points in each of the `confidence_levels`.
+        information: of the points alone, of (xi, log s).
         num_effective: how many independent measurements the points are worth, see `num_independent`.
         min_eigenvalue: smallest eigenvalue of what planes and colours say of the pose, per effective point (1/m² and
             1/rad²). Offsets from means do not count: the mean of a Gaussian is no landmark of its surface.
@@ -57,6 +59,7 @@ class IcpInfo(eqx.Module):
     residual: Float[Array, ""]
     misfit: Float[Array, ""]
     misfit_of_levels: Float[Array, "l"]
+    information: Float[Array, "7 7"]
     num_effective: Float[Array, ""]
     min_eigenvalue: Float[Array, ""]
     num_steps: Int[Array, ""]
@@ -120,6 +123,7 @@ def icp(
     noise: Noise,
     config: IcpConfig,
     white: Whitening | None = None,
+    known: Float[Array, "7 7"] | None = None,
 ) -> tuple[jaxlie.SE3, Float[Array, ""], IcpInfo]:
     """Place camera-frame `source` on `target`: argmin over xi and s of data + prior, T = T_world_coarse exp(xi).
 
@@ -139,6 +143,8 @@ def icp(
         noise: standard deviation of the coarse pose in metres, and of the points' depth as a fraction of it.
         config: terms and gates.
         white: `whitening` of the target's covariances; None makes it here.
+        known: root of the information of the coarse pose and scale, (xi, log s), where there is a prior; None: that of
+            `noise`.
 
     Returns:
         T_world_camera, the scale, and what the solve found.
@@ -148,7 +154,7 @@ def icp(
     surface = surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, white)
 
     def problem_of(uncertainty: Uncertainty) -> Problem:
-        return pose_problem(source, surface, T_world_coarse, noise[1], uncertainty, config)
+        return pose_problem(source, surface, T_world_coarse, noise[1], uncertainty, config, known)
 
     def search_and_solve(carry: _Carry, is_first: Bool[Array, ""]) -> tuple[_Carry, tuple]:
         return _search_and_solve(carry, is_first, problem_of, noise, config)
@@ -167,6 +173,7 @@ def icp(
         residual=jnp.sqrt(jnp.sum(jnp.where(matches.is_inlier, distance, 0.0) ** 2) / jnp.maximum(num_inliers, 1)),
         misfit=misfit,
         misfit_of_levels=misfit_of_levels,
+        information=data_information(y, matches, problem, config),
         num_effective=seen.num_effective,
         min_eigenvalue=jnp.linalg.eigvalsh(information(T, scale, matches, problem, config))[0],
         num_steps=jnp.sum(rounds[1]),

@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.registration.rigid import MIN_PAIRS, median
 
 NUM_LEVELS = 8  # of confidence
+NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute value
 NUM_CELLS = 4  # along each side of the image, whose errors are compared; few, for errors may be alike over much of it
 
 
@@ -22,8 +23,8 @@ def confidence_levels(confidence: Float[Array, "p"], valid: Bool[Array, "p"]) ->
 
 
 def robust_std(errors: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
-    """1.4826 times the median absolute error, the standard deviation of Gaussian errors; 0 without any."""
-    return jnp.where(jnp.any(valid), 1.4826 * median(jnp.abs(errors), valid), 0.0)
+    """`NORMAL` times the median absolute error, the standard deviation of Gaussian errors; 0 without any."""
+    return jnp.where(jnp.any(valid), NORMAL * median(jnp.abs(errors), valid), 0.0)
 
 
 def noise_of_levels(errors: Float[Array, "p"], valid: Bool[Array, "p"], levels: Int[Array, "p"]) -> Float[Array, "l"]:

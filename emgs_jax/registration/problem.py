@@ -77,7 +77,7 @@ class Problem(eqx.Module):
     T_world_coarse: jaxlie.SE3
     rays: Float[Array, "p 3"]  # noise of every point along its viewing ray, camera frame
     scale_unit: Float[Array, ""]  # of the scale's logarithm, which is the seventh unknown
-    prior: Float[Array, "7"]  # 1 / standard deviation of the unknowns
+    prior: Float[Array, "7 7"]  # root of the information that is there before
     weight: Float[Array, ""]  # of a point
 
 
@@ -88,18 +88,28 @@ def pose_problem(
     scale_unit: Float[Array, ""],
     uncertainty: Uncertainty,
     config: IcpConfig,
+    known: Float[Array, "7 7"] | None = None,
 ) -> Problem:
-    """What the uncertainty makes of points and map; `scale_unit` is the depth noise that the seventh unknown counts."""
-    prior = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack(uncertainty.pose), 3)
-    # Everything of a call errs with its scale, so the scale is held by the depths' common noise.
-    common = jnp.sqrt(jnp.mean(uncertainty.depth**2))
+    """What the uncertainty makes of points and map; `scale_unit` is the depth noise that the seventh unknown counts.
+
+    `known` is the root of the information of (xi, log s) where the points fit as well as they should; None: that of the
+    uncertainty alone.
+    """
+    if known is None:
+        pose = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack(uncertainty.pose), 3)
+        # Everything of a call errs with its scale, so the scale is held by the depths' common noise.
+        prior = jnp.diag(jnp.append(pose, scale_unit / jnp.sqrt(jnp.mean(uncertainty.depth**2))))
+    else:
+        units = jnp.ones(7).at[6].set(config.scale_noise * scale_unit)
+        prior = (config.prior_information > 0) * known * units * (scale_unit / uncertainty.pose[1])
+        prior = prior.at[6, 6].set(jnp.where(units[6] * prior[6, 6] > 0, prior[6, 6], 1.0))  # a scale that stays
     return Problem(
         source=source,
         surface=surface,
         T_world_coarse=T_world_coarse,
         rays=config.noise * uncertainty.depth[:, None] * source.points,
         scale_unit=config.scale_noise * scale_unit,
-        prior=jnp.append(prior, scale_unit / common),
+        prior=prior,
         weight=uncertainty.num_effective / jnp.maximum(jnp.sum(source.valid), 1),
     )
 
@@ -147,7 +157,7 @@ def residuals(
     matches = jax.lax.stop_gradient(matches_at(fixed, candidates, problem, config))
     jacobian = jax.lax.stop_gradient(jax.jacfwd(rows_of)(fixed, matches, problem, config))
     rows = rows_of(fixed, matches, problem, config) + jacobian @ (y - fixed)
-    return (rows, problem.prior * y), matches
+    return (rows, problem.prior @ y), matches
 
 
 def rows_of(y: Float[Array, "7"], matches: Matches, problem: Problem, config: IcpConfig) -> Float[Array, "p 5"]:
@@ -158,7 +168,9 @@ def rows_of(y: Float[Array, "7"], matches: Matches, problem: Problem, config: Ic
     plane = jnp.sum(offset * matches.normals, axis=-1) / matches.plane_std
     light = matches.light + jnp.sum(matches.gradients * offset, axis=-1)
     shade = (light - intensity(placed.colors)) / config.color_std
-    triangle, noise, entries = (jnp.unstack(rows, axis=-1) for rows in (matches.triangle, matches.noise, offset))
+    # The noise is the prediction's and grows with its scale; else a scale that shrinks all noisy points fits best.
+    noise = scale * matches.noise
+    triangle, noise, entries = (jnp.unstack(rows, axis=-1) for rows in (matches.triangle, noise, offset))
     white = jnp.stack(widen(whiten(triangle, entries), noise), axis=-1)
     # A point beyond the gate costs what it would at the gate and pulls nowhere.
     edge = jnp.sqrt(config.max_mahalanobis_sq)
@@ -173,6 +185,16 @@ def rows_of(y: Float[Array, "7"], matches: Matches, problem: Problem, config: Ic
     )
     valid = placed.valid
     return jnp.sqrt(problem.weight) * jnp.where(valid[:, None], rows, 0.0)
+
+
+def data_information(
+    y: Float[Array, "7"], matches: Matches, problem: Problem, config: IcpConfig
+) -> Float[Array, "7 7"]:
+    """J'J of the points' rows by (xi, log s) about y; 0 for the scale where it is no unknown."""
+    units = jnp.ones(7).at[6].set(problem.scale_unit)
+    jacobian = jax.jacfwd(rows_of)(y, matches, problem, config).reshape(-1, 7)
+    jacobian = jnp.where(units > 0, jacobian / jnp.where(units > 0, units, 1.0), 0.0)
+    return jacobian.T @ jacobian
 
 
 def information(

@@ -16,6 +16,7 @@ from emgs_jax.gaussian_map import empty_map, grow
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.precision import full_precision
+from emgs_jax.registration.belief import certain
 from emgs_jax.running.convert import FirstWindow
 from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
 
@@ -67,7 +68,8 @@ def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
     key = jax.tree.structure((map, view, config)), tuple(leaf.shape for leaf in jax.tree.leaves((map, view)))
     if key in _prepared:
         return
-    step(SlamState(map, view, pose, jnp.asarray(0, jnp.int32)), prediction, camera, config, note)
+    state = SlamState(map, view, pose, certain(), jnp.asarray(0, jnp.int32))
+    step(state, prediction, camera, config, note)
     run = full_precision(lambda call: jax.block_until_ready(call[0](*call[1])))  # as inside `step`: else it is another
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         list(threads.map(run, calls))

@@ -1,0 +1,92 @@
+"""What is known of a frame's pose and scale: one step of a Kalman filter from frame to frame.
+
+The error of a pose T and a scale s is T Exp(ξ) and s e^σ with (ξ, σ) ~ N(0, P), in the order translation (m), rotation
+(rad), logarithm of the scale, relative to the map.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from emgs_jax.registration.icp import IcpInfo
+
+DEGREES = 7
+
+
+class Belief(eqx.Module):
+    """What the next step needs to know of the last frame, beside its pose.
+
+    Args:
+        covariance: P of its pose and scale.
+        depth_noise: how much its points differ from the map, as a fraction of their depth.
+        log_scale: mean logarithm of the scales of the tracked frames: the prior's own unit, in that of the map.
+        num_scales: how many these are.
+    """
+
+    covariance: Float[Array, "*b 7 7"]
+    depth_noise: Float[Array, "*b"]
+    log_scale: Float[Array, "*b"]
+    num_scales: Float[Array, "*b"]
+
+
+def certain() -> Belief:
+    """Of the frame that the map is made of: its pose is exact, and its scale is the unit."""
+    return Belief(jnp.zeros((DEGREES, DEGREES)), jnp.zeros(()), jnp.zeros(()), jnp.ones(()))
+
+
+def predict(
+    covariance: Float[Array, "7 7"], T_previous_current: jaxlie.SE3, noise: Float[Array, "7"]
+) -> Float[Array, "7 7"]:
+    """P of the current frame: A P A' + Q, with A the adjoint of the motion's inverse, and Q = diag(noise²).
+
+    What the scale's error does to the length of the motion is left out: it is small against `noise`.
+    A motion that is not finite counts as none.
+    """
+    adjoint = T_previous_current.inverse().adjoint()
+    adjoint = jnp.where(jnp.all(jnp.isfinite(adjoint)), adjoint, jnp.eye(DEGREES - 1))
+    A = jnp.eye(DEGREES).at[:-1, :-1].set(adjoint)
+    return A @ covariance @ A.T + jnp.diag(noise**2)
+
+
+def update(
+    covariance: Float[Array, "7 7"], difference: Float[Array, "7"], information: Float[Array, "7 7"]
+) -> tuple[Float[Array, "7"], Float[Array, "7 7"]]:
+    """The step (ξ, σ) to the mean of what is known and what is measured, and its P: (P⁻¹ + W)⁻¹ W d and (P⁻¹ + W)⁻¹.
+
+    Args:
+        covariance: P, which may be singular.
+        difference: d, of the measurement from what is known.
+        information: W of the measurement; zero where nothing is measured.
+    """
+    posterior = jnp.linalg.solve(jnp.eye(DEGREES) + covariance @ information, covariance)
+    posterior = 0.5 * (posterior + posterior.T)
+    return posterior @ information @ difference, posterior
+
+
+def root_information(covariance: Float[Array, "7 7"]) -> Float[Array, "7 7"]:
+    """L⁻¹ of P = L L': |L⁻¹ x|² is the squared Mahalanobis distance of x. P must be positive definite."""
+    std = jnp.sqrt(jnp.diagonal(covariance))
+    correlation = covariance / std / std[:, None]
+    return jnp.linalg.inv(jnp.linalg.cholesky(correlation)) / std
+
+
+def next_belief(
+    belief: Belief, found: IcpInfo, depth_noise: Float[Array, ""], scale: Float[Array, ""], is_tracked: Bool[Array, ""]
+) -> Belief:
+    """What the points of a frame make of it; nothing where it is not tracked.
+
+    Args:
+        belief: of its coarse pose.
+        found: by ICP. Where the points fit worse than `depth_noise`, the coarse pose was worth as much less.
+        depth_noise: as a fraction of the depth.
+        scale: of its prediction.
+        is_tracked: the fine pose was accepted.
+    """
+    worth = jnp.maximum(found.misfit / depth_noise, 1.0)
+    _, covariance = update(worth**2 * belief.covariance, jnp.zeros(DEGREES), found.information)
+    num_scales = belief.num_scales + 1.0
+    log_scale = belief.log_scale + (jnp.log(scale) - belief.log_scale) / num_scales
+    after = Belief(covariance, found.misfit, log_scale, num_scales)
+    return jax.tree.map(lambda new, old: jnp.where(is_tracked, new, old), after, belief)

@@ -1,0 +1,107 @@
+"""What the image that was predicted twice says: the scale, how far to trust the prior, and poses through it."""
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from emgs_jax.observation import Observation, Prediction, depth_in, transform
+from emgs_jax.ops.camera import Camera, nearest_pixel, project
+from emgs_jax.ops.pytree import stack
+from emgs_jax.registration.noise import NORMAL, robust_std
+from emgs_jax.registration.rigid import MIN_PAIRS, fit_rigid, fit_rigid_robust, median, pose_row
+
+
+def repeat_scale(
+    now: Observation,
+    before: Observation,
+    T_world_previous: jaxlie.SE3,
+    otherwise: Float[Array, ""],
+    reading: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Scale of a prediction relative to the map, from the image that was predicted twice (R8).
+
+    Args:
+        now: its prediction of this call, camera frame.
+        before: that of the call before as it was aligned with the map, world frame.
+        T_world_previous: its pose.
+        otherwise: where there are too few pairs.
+        reading: row of `LocalizationConfig.coarse_scale`: 0 (1, as printed), 1 (median ratio of depths) or 2 (of the
+            similarity that fits best).
+    """
+    paired, depth_now = now.valid & before.valid, now.points[:, 2]
+    ratio = median(depth_in(T_world_previous, before) / jnp.where(paired, depth_now, 1.0), paired)
+    _, similarity = fit_rigid(now.points, before.points, paired.astype(jnp.float32))
+    scale = jnp.where(reading == 1, ratio, similarity)
+    is_found = (jnp.sum(paired) >= MIN_PAIRS) & jnp.isfinite(scale) & (scale > 0.1)
+    return jnp.where(reading > 0, jnp.where(is_found, scale, otherwise), 1.0)
+
+
+def repeat_error(
+    now: Observation,
+    before: Observation,
+    T_world_previous: jaxlie.SE3,
+    scale: Float[Array, ""],
+    max_pair_distance: Float[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """How far the two predictions of one image are apart, a robust standard deviation, and its mean depth, m.
+
+    Without a pair nothing is known, and `max_pair_distance` (fraction of the depth) stands in.
+    """
+    paired, mean_depth = now.valid & before.valid, scale * median(now.points[:, 2], now.valid)
+    apart = jnp.linalg.norm(transform(T_world_previous, now, scale).points - before.points, axis=-1)
+    apart = jnp.where(jnp.any(paired), robust_std(apart, paired), NORMAL * max_pair_distance * mean_depth)
+    return apart, mean_depth
+
+
+def through_previous(
+    prediction: Prediction,
+    previous: Observation,
+    T_world_previous: jaxlie.SE3,
+    T_previous_current: jaxlie.SE3,
+    scale: Float[Array, ""],
+    camera: Camera,
+    max_pair_distance: Float[Array, ""],
+) -> tuple[jaxlie.SE3, jaxlie.SE3]:
+    """The current pose through the points of the previous image (R7): `via_previous` and `same_image`.
+
+    Args:
+        prediction: of this call.
+        previous: the previous frame as it was aligned with the map, world frame.
+        T_world_previous: its pose.
+        T_previous_current: the prior's motion, scaled.
+        scale: of this prediction.
+        camera: of the rows.
+        max_pair_distance: fraction of the depth; farther points are no pair.
+    """
+    now = prediction.previous
+    carried, via = _pairs_via_previous(prediction, previous, scale, T_previous_current, camera, max_pair_distance)
+    direct = scale * now.points, previous.points, now.valid & previous.valid, T_world_previous
+    chained = scale * prediction.current.points, carried, via, T_world_previous @ T_previous_current
+    fits = jax.vmap(fit_rigid_robust)(*stack([direct, chained]))  # side by side: one copy of the solve to compile
+    return pose_row(fits, 1), pose_row(fits, 0) @ T_previous_current
+
+
+def _pairs_via_previous(
+    prediction: Prediction,
+    previous: Observation,
+    scale: Float[Array, ""],
+    T_previous_current: jaxlie.SE3,
+    camera: Camera,
+    max_pair_distance: Float[Array, ""],
+) -> tuple[Float[Array, "p 3"], Bool[Array, "p"]]:
+    """The printed chain: current point -> closest point of the previous image now -> the same pixel before.
+
+    The closest point is looked up by projection, which needs no tree, from `T_previous_current` of the prior.
+
+    Returns:
+        A world-frame point for every current one, and which of these pairs exist.
+    """
+    now, current = prediction.previous, prediction.current
+    seen = transform(T_previous_current, current, scale)
+    pixels, depth = project(camera, seen.points)
+    match, inside = nearest_pixel(pixels, (camera.height, camera.width))
+    distance = jnp.linalg.norm(seen.points - scale * now.points[match], axis=-1)
+    is_close = distance <= max_pair_distance * depth
+    via = inside & (depth > 0) & is_close & (now.valid & previous.valid)[match] & current.valid
+    return previous.points[match], via
