@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.data.readable import ReadableFrames
@@ -21,7 +20,7 @@ from emgs_jax.report.metrics import true_cloud
 from emgs_jax.report.provenance import provenance, write_metrics
 from emgs_jax.report.results import METRICS_FILE, estimates_of, is_finished, result_folder
 from emgs_jax.report.tables import average, full_table
-from emgs_jax.running.configure import build_dataset
+from emgs_jax.running.configure import build, build_dataset
 
 from .command import command
 
@@ -30,7 +29,7 @@ Metrics = dict[str, Any]
 
 def score(config: DictConfig) -> tuple[Metrics, Path]:
     """Compare the trajectory and the cloud of `config` with its data set; returns the metrics and their file."""
-    dataset, evaluation = build_dataset(config), instantiate(config.evaluation)
+    dataset, evaluation = build_dataset(config), build(config, "evaluation")
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     folder = result_folder(Path(config.out), dataset.name, dataset.sequence, config.method, 0)
     is_finished(folder, settings)  # scoring again replaces its own result, never another one

@@ -264,8 +264,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/evaluation/clouds.py",
-        "if not cloud.has_normals():",
-        "if cloud.has_normals():",
+        "if has_normals else",
+        "if not has_normals else",
         CLOUDS,
         "normals of a file are replaced",
     ),

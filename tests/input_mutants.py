@@ -3,6 +3,7 @@
 from mutant import Mutant
 
 PLY_READER = ("tests/io/test_ply_reader.py",)
+VALUES = ("tests/running/test_values.py",)
 
 MUTANTS = (
     Mutant(
@@ -32,5 +33,33 @@ MUTANTS = (
         '_row_type(vertex, "<"), vertex.count',
         PLY_READER,
         "the big end last",
+    ),
+    Mutant(
+        "emgs_jax/running/values.py",
+        "math.isfinite(value) if ends is None else ends.low <= value <= ends.high",
+        "ends is None or ends.low <= value <= ends.high",
+        VALUES,
+        "nan passes where a field has no range",
+    ),
+    Mutant(
+        "emgs_jax/running/values.py",
+        "else ends.low <= value <= ends.high",
+        "else not (value < ends.low or value > ends.high)",
+        VALUES,
+        "nan is in every range",
+    ),
+    Mutant(
+        "emgs_jax/running/values.py",
+        "        key = found[1]\n",
+        "        return key\n",
+        VALUES,
+        "the key that refers to a value is named, which cannot be set",
+    ),
+    Mutant(
+        "emgs_jax/running/configure.py",
+        "    check_values(config, key)\n",
+        "",
+        VALUES,
+        "nothing is checked",
     ),
 )

@@ -18,6 +18,7 @@ Number = int | float  # a YAML value may be written 585 or 585.0
 Size = tuple[int, int]  # (width, height)
 Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy; pixel centres at integers
 
+MAX_SIDE = 16384  # pixels; more is a slip of the hand, and would ask for gigabytes
 RIGID_TOLERANCE = 1e-2  # text files round; a flipped digit moves R^T R by more
 REMEDY = "fetch the file again or set on_bad_frame=skip"
 
@@ -49,6 +50,9 @@ def select(count: int, start: int, stop: int | None, stride: int, where: object)
     """The images in use out of the `count` that are there, in order."""
     if count == 0:
         raise ValueError(f"{where} has no images")
+    for name, value in (("start", start), ("stop", 0 if stop is None else stop), ("stride", stride)):
+        if not isinstance(value, int):
+            raise ValueError(f"dataset.{name} must be a whole number of images, got {value}")
     if stride < 1:
         raise ValueError(f"dataset.stride must be at least 1, got {stride}")
     if not 0 <= start < count:
@@ -68,10 +72,10 @@ def check_index(index: int, count: int) -> None:
 
 def check_size(size: Sequence[int]) -> Size:
     """`size` as two positive integers."""
-    values = tuple(int(v) for v in size)
-    if len(values) != 2 or min(values) < 1:
-        raise ValueError(f"dataset.size must be [width, height] in pixels, got {list(size)}")
-    return values
+    values = tuple(size) if isinstance(size, Iterable) else (size,)
+    if len(values) != 2 or not all(isinstance(value, int) and 1 <= value <= MAX_SIDE for value in values):
+        raise ValueError(f"dataset.size must be [width, height] in pixels, up to {MAX_SIDE}, got {size}")
+    return values[0], values[1]
 
 
 def check_depth_scale(depth_scale: Number) -> float:

@@ -45,6 +45,7 @@ from emgs_jax.prior.simulated.noise import (
 )
 
 VERSIONS = (1, 2)
+MAX_LEVEL = 100.0  # depths are then off by a factor of twenty; far beyond, nothing is finite
 
 
 @dataclass(frozen=True)
@@ -101,10 +102,13 @@ class Simulated(Prior):
             raise ValueError(
                 f"prior.version must be 1 (no drift) or 2 (drifts beyond the anchor's view), got {version}"
             )
-        if not (math.isfinite(level) and level >= 0):
-            raise ValueError(f"prior.level must be finite and at least 0 (0 is an exact prior), got {level}")
-        if seed < 0 or feature_size < 1:
-            raise ValueError(f"prior.seed must be ≥ 0 and prior.feature_size ≥ 1, got {seed} and {feature_size}")
+        if not 0 <= level <= MAX_LEVEL:
+            raise ValueError(f"prior.level must be from 0 (an exact prior) to {MAX_LEVEL:g}, got {level}")
+        if not isinstance(seed, int) or not isinstance(feature_size, int) or seed < 0 or feature_size < 1:
+            raise ValueError(
+                "prior.seed and prior.feature_size must be whole numbers, from 0 and from 1, got "
+                f"{seed} and {feature_size}"
+            )
         self.level, self.seed, self.version, self.standard = float(level), int(seed), int(version), Standard()
         self.feature_names = tuple(classes)
         self.text_features = random_embeddings(self.feature_names, feature_size)

@@ -225,3 +225,18 @@ def test_a_data_set_without_ground_truth_is_refused_before_any_work(room):
     room.has_ground_truth = False
     with pytest.raises(ValueError, match="prior=simulated needs a data set with ground truth; use prior=recorded or"):
         Simulated().check(room, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"level": 1e9}, r"prior\.level must be from 0 .* to 100, got 1000000000\.0"),
+        ({"level": float("nan")}, r"prior\.level must be from 0"),
+        ({"seed": 1.5}, r"prior\.seed and prior\.feature_size must be whole numbers.*got 1\.5"),
+        ({"feature_size": 0}, r"prior\.feature_size must be whole numbers.*and 0"),
+    ],
+)
+def test_a_level_or_seed_that_makes_no_sense_is_refused(options, message):
+    """A level of 1e9 gave depths that are not finite, and a seed of 1.5 was taken for 1."""
+    with pytest.raises(ValueError, match=message):
+        Simulated(**options)
