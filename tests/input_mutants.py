@@ -3,6 +3,9 @@
 from mutant import Mutant
 
 PLY_READER = ("tests/io/test_ply_reader.py",)
+READABLE = ("tests/data/test_readable.py",)
+READING = ("tests/data/test_reading.py",)
+TUM = ("tests/data/test_tum.py",)
 VALUES = ("tests/running/test_values.py",)
 
 MUTANTS = (
@@ -61,5 +64,33 @@ MUTANTS = (
         "",
         VALUES,
         "nothing is checked",
+    ),
+    Mutant(
+        "emgs_jax/data/readable.py",
+        "        if self.has_ground_truth:\n            _check_truth(dataset, self.kept)\n",
+        "",
+        READABLE,
+        "a bad true pose is found when its frame comes up",
+    ),
+    Mutant(
+        "emgs_jax/data/reading.py",
+        "if np.abs(position).max() > MAX_POSITION_M:",
+        "if position.max() > MAX_POSITION_M:",
+        READING,
+        "geo-referenced west of the origin",
+    ),
+    Mutant(
+        "emgs_jax/data/tum.py",
+        "[numbers[i] for i in order]",
+        "numbers",
+        TUM,
+        "the line of another pose where the times are out of order",
+    ),
+    Mutant(
+        "emgs_jax/data/tum.py",
+        "    if max(rows) < 0:",
+        "    if max(rows) < -1:",
+        TUM,
+        "a list that matches nothing is ground truth",
     ),
 )

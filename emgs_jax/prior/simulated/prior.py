@@ -121,6 +121,13 @@ class Simulated(Prior):
         """Raise ValueError, before any work is done, where the data set has no truth to disturb."""
         if not dataset.has_ground_truth:
             raise ValueError(_no_truth(f"{dataset.name} {dataset.sequence} has none"))
+        missing = [index for index in range(len(dataset)) if dataset.pose(index) is None]
+        if missing:
+            raise ValueError(
+                f"prior=simulated needs the true pose of every frame, and {len(missing)} of {len(dataset)} of "
+                f"{dataset.name} {dataset.sequence} have none, the first is frame {missing[0]}: choose others "
+                "(dataset.start, stop, stride), or another prior"
+            )
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Disturb the truth of `frames` (in the order of `window.views`); see the module for how."""
@@ -274,4 +281,10 @@ def check_frames(window: Window, frames: Sequence[Frame], needed: Collection[int
             raise ValueError(
                 f"the depth of {label} must have its image's size {frame.image.shape[:2]}, got {depth.shape}"
             )
+    if window.inference == 0 and not any((frame.depth > 0).any() for frame in frames if frame.index in needed):
+        raise ValueError(
+            _no_truth(
+                f"0 of the first {len(needed)} images, from {frames[0].name} on, have a true depth: it is 0 everywhere"
+            )
+        )
     return dict(zip(indices, frames, strict=True))

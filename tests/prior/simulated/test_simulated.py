@@ -240,3 +240,13 @@ def test_a_level_or_seed_that_makes_no_sense_is_refused(options, message):
     """A level of 1e9 gave depths that are not finite, and a seed of 1.5 was taken for 1."""
     with pytest.raises(ValueError, match=message):
         Simulated(**options)
+
+
+def test_a_truth_without_any_depth_is_named_and_not_the_prior(room):
+    """All of it was 0, and the error asked for another prior."""
+    frames = [replace(room[i], depth=np.zeros_like(room[i].depth)) for i in range(3)]
+    window = next(windows(3, 3))
+    with pytest.raises(ValueError, match=r"0 of the first 3 images, from 0\.png on, have a true depth: it is 0 every"):
+        Simulated().predict(window, frames, room.intrinsics)
+    frames[1] = room[1]
+    assert Simulated().predict(window, frames, room.intrinsics).mask.any(axis=(1, 2)).tolist() == [False, True, False]
