@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
-from emgs_jax.io.files import atomic_write
+from emgs_jax.io.files import atomic_write, remove_temporaries
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows, with_frames
 
 FORMAT, VERSION = "emgs_jax.predictions", 2
@@ -58,6 +58,7 @@ def record(
     header = _header(prior, dataset, window_size, len(calls))
     files = _resume(folder, header)
     folder.mkdir(parents=True, exist_ok=True)
+    remove_temporaries(folder)
     files["text_features.npz"] = _write(folder / "text_features.npz", _npz({"text_features": prior.text_features}))
     names = [f"{window.inference:06d}.npz" for window in calls]
     missing = {row for row, name in enumerate(names) if _digest_of(folder / name) != files.get(name, "")}
