@@ -3,6 +3,12 @@
 from mutant import Mutant
 
 PLY_READER = ("tests/io/test_ply_reader.py",)
+FILES = ("tests/io/test_files.py",)
+RUN_FILES = ("tests/report/test_run_files.py",)
+RESULTS = ("tests/report/test_results.py",)
+NPZ = ("tests/io/test_npz.py",)
+MAP_FILE = ("tests/io/test_map_file.py",)
+RECORDED = ("tests/prior/test_recorded.py",)
 READABLE = ("tests/data/test_readable.py",)
 READING = ("tests/data/test_reading.py",)
 TUM = ("tests/data/test_tum.py",)
@@ -92,5 +98,68 @@ MUTANTS = (
         "    if max(rows) < -1:",
         TUM,
         "a list that matches nothing is ground truth",
+    ),
+    Mutant(
+        "emgs_jax/report/run_files.py",
+        "            path.replace(target / path.name)\n",
+        "            path.unlink()\n",
+        RUN_FILES,
+        "the outputs of an earlier run are deleted",
+    ),
+    Mutant(
+        "emgs_jax/report/run_files.py",
+        "for name in OUTPUTS if (folder / name).exists()]",
+        "for name in OUTPUTS[1:] if (folder / name).exists()]",
+        RUN_FILES,
+        "old metrics stay beside a new trajectory",
+    ),
+    Mutant(
+        "emgs_jax/io/files.py",
+        "if name and not _is_running(int(name[1]))]",
+        "if name]",
+        FILES,
+        "a file that is being written is removed",
+    ),
+    Mutant(
+        "emgs_jax/report/results.py",
+        ' or part in (".", "..")',
+        "",
+        RESULTS,
+        "a variant of two dots",
+    ),
+    Mutant(
+        "emgs_jax/io/npz.py",
+        "num_bytes != len(data) - handle.tell()",
+        "num_bytes < len(data) - handle.tell()",
+        NPZ,
+        "memory is taken for what a header announces",
+    ),
+    Mutant(
+        "emgs_jax/io/map_file.py",
+        "jnp.isfinite(leaf[valid])",
+        "jnp.isfinite(leaf)",
+        MAP_FILE,
+        "what stands in free rows matters",
+    ),
+    Mutant(
+        "emgs_jax/io/map_file.py",
+        "if (leaf.shape, leaf.dtype) != (like.shape, like.dtype):",
+        "if leaf.shape != like.shape:",
+        MAP_FILE,
+        "a map of small integers",
+    ),
+    Mutant(
+        "emgs_jax/prior/recorded.py",
+        "        check_numbers(self.folder / name, arrays)\n",
+        "",
+        RECORDED,
+        "forged numbers are replayed",
+    ),
+    Mutant(
+        "emgs_jax/prior/recorded_checks.py",
+        "    poses = poses[np.isfinite(poses).all((1, 2))]\n",
+        "",
+        RECORDED,
+        "a view without a pose is a fault",
     ),
 )
