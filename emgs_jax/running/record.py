@@ -224,8 +224,10 @@ def correct(run: MappingRun, given: Input, info: StepInfo | None) -> None:
     origin = int(info.origin) if info is not None and added[-1].status == "tracked" else None
     for look, record in zip(looks, added, strict=True):
         end.add(look, record.pose, record.scale or 1.0, origin)
+    num_contradicted = len(end.contradicted)
     found = end.look_for_loops(looks[-1])
-    if end.wants_to_close(found):
+    has_retracted = len(end.contradicted) > num_contradicted and end.retract(end.agreed()) > 0
+    if has_retracted or end.wants_to_close(found):
         run.state = end.close(run.state, found)
         _take_poses(run)
 

@@ -1,5 +1,7 @@
 """Measurements of a walk on a ring, exact: nothing moves; after a drift one loop brings poses and map back."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
@@ -14,6 +16,7 @@ from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.running.back_end import BackEnd, counts, metric_graph
 from emgs_jax.running.measuring import Look, window_edges
+from emgs_jax.running.record import FrameRecord, MappingRun, correct
 from emgs_jax.slam import SlamState
 
 COUNT, WINDOW = 60, 10
@@ -105,6 +108,29 @@ def test_loops_that_are_contradicted_later_are_no_edges_any_more(graph):
     end.contradicted = [loop(truth, row) for row in (9, 10)]
     num_edges = len(end.edges)
     assert end.retract(end.agreed()) == len(loops) and not end.accepted and len(end.edges) == num_edges - len(loops)
+
+
+def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatch):
+    truth, drifted = ring(), ring(1.95 * np.pi)
+    end, loops = walked(graph, drifted), [loop(truth, row) for row in range(1, 9)]
+    end.verified = list(loops)
+    records = [FrameRecord(row, None, None, "tracked", pose=pose) for row, pose in enumerate(drifted)]
+    run = MappingRun(None, None, state=end.close(state_of(drifted), loops), records=records, back_end=end)
+    given = SimpleNamespace(frames=[SimpleNamespace(index=COUNT - 1, image=None)], raw=[SimpleNamespace(points=None, mask=None)], T_anchor_views={})
+    monkeypatch.setattr(end, "add", lambda *arguments: None)
+    monkeypatch.setattr(end, "look_for_loops", lambda look: [])
+    correct(run, given, None)
+    assert end.accepted == loops and len(end.closures) == 1
+
+    def contradict(look: Look) -> list:
+        end.contradicted = [loop(truth, row) for row in (9, 10)]
+        return []
+
+    monkeypatch.setattr(end, "look_for_loops", contradict)
+    correct(run, given, None)
+    assert not end.accepted and len(end.closures) == 2
+    assert error(end.poses, drifted) < 0.01
+    assert error([record.pose for record in run.records], end.poses) == 0
 
 
 def test_a_loop_that_cannot_be_solved_changes_nothing(graph):
