@@ -1,5 +1,7 @@
 """Expectation-maximisation map update (Method D, eq. 2 to 4): aligned points move the Gaussians that explain them."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -47,18 +49,18 @@ class EmConfig(eqx.Module):
         min_std: m; floor of the new covariances.
     """
 
-    num_neighbours: int = static()
-    min_normal_cos: Float[Array, "*b"] = traced()
-    max_mahalanobis_sq: Float[Array, "*b"] = traced()
-    max_log_gap: Float[Array, "*b"] = traced()
-    determinant_weight: Float[Array, "*b"] = traced()
-    normal_weight: Float[Array, "*b"] = traced()
-    feature_weight: Float[Array, "*b"] = traced()
+    num_neighbours: int = static(low=1, high=256)
+    min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
+    max_mahalanobis_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    max_log_gap: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    determinant_weight: Float[Array, "*b"] = traced(low=0, high=1000)
+    normal_weight: Float[Array, "*b"] = traced(low=0)
+    feature_weight: Float[Array, "*b"] = traced(low=0)
     support: Float[Array, "*b"] = choice("printed", "normalized")
     average: AverageConfig
-    noise: Float[Array, "*b"] = traced()
-    min_responsibility: Float[Array, "*b"] = traced()
-    min_std: Float[Array, "*b"] = traced()
+    noise: Float[Array, "*b"] = traced(low=0)
+    min_responsibility: Float[Array, "*b"] = traced(low=0)
+    min_std: Float[Array, "*b"] = traced(low=1e-6, high=1000)
 
 
 class EStep(eqx.Module):

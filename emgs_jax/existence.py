@@ -1,5 +1,7 @@
 """Existence: what later frames say of a Gaussian. It is confirmed or seen through, and two layers become one."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -33,16 +35,16 @@ class ExistenceConfig(eqx.Module):
         min_normal_cos: between their normals.
     """
 
-    birth: Float[Array, "*b"] = traced()
-    hit: Float[Array, "*b"] = traced()
-    miss: Float[Array, "*b"] = traced()
-    max_log_odds: Float[Array, "*b"] = traced()
-    refuted: Float[Array, "*b"] = traced()
-    num_std: Float[Array, "*b"] = traced()
-    min_cos: Float[Array, "*b"] = traced()
-    num_neighbours: int = static()
-    max_mahalanobis_sq: Float[Array, "*b"] = traced()
-    min_normal_cos: Float[Array, "*b"] = traced()
+    birth: Float[Array, "*b"] = traced(low=-1e6)
+    hit: Float[Array, "*b"] = traced(low=0)
+    miss: Float[Array, "*b"] = traced(low=0)
+    max_log_odds: Float[Array, "*b"] = traced(low=0)
+    refuted: Float[Array, "*b"] = traced(low=-math.inf)
+    num_std: Float[Array, "*b"] = traced(low=0)
+    min_cos: Float[Array, "*b"] = traced(low=-1, high=1)
+    num_neighbours: int = static(low=1, high=256)
+    max_mahalanobis_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
 
 
 def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -> Float[Array, "2 p"]:

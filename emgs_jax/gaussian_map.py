@@ -42,7 +42,7 @@ class AverageConfig(eqx.Module):
     """
 
     gain: Float[Array, "*b"] = choice("ema_printed", "count")
-    forgetting: Float[Array, "*b"] = traced()
+    forgetting: Float[Array, "*b"] = traced(low=0, high=1)
     blend: Float[Array, "*b"] = choice("linear", "moment_matched")
 
 
@@ -56,10 +56,10 @@ class SubmapConfig(eqx.Module):
         submap_capacity: rows of a submap at the start; likewise.
     """
 
-    voxel_size: Float[Array, "*b"] = traced()
-    margin: Float[Array, "*b"] = traced()
-    map_capacity: int = static()
-    submap_capacity: int = static()
+    voxel_size: Float[Array, "*b"] = traced(low=0.001, high=1000)
+    margin: Float[Array, "*b"] = traced(low=0, high=1000)
+    map_capacity: int = static(low=1, high=2**26)
+    submap_capacity: int = static(low=1, high=2**26)
 
 
 def empty_map(capacity: int, num_features: int) -> GaussianMap:

@@ -51,10 +51,10 @@ class FitConfig(eqx.Module):
         min_std: m; floor of a Gaussian's standard deviation in every direction.
     """
 
-    points_per_gaussian: int = static()
-    num_fit_neighbours: int = static()
-    num_kmeans_iterations: int = static()
-    min_std: Float[Array, "*b"] = traced()
+    points_per_gaussian: int = static(low=1, high=2**20)
+    num_fit_neighbours: int = static(low=1, high=256)
+    num_kmeans_iterations: int = static(low=0, high=1000)
+    min_std: Float[Array, "*b"] = traced(low=1e-6, high=1000)
 
 
 def spacing(camera: Camera, thin: int, config: FitConfig) -> int:

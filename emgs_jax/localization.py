@@ -1,5 +1,7 @@
 """Localization (Method C): where the current frame is, first through the previous frame, then against the map."""
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
@@ -56,16 +58,16 @@ class LocalizationConfig(eqx.Module):
 
     coarse: Float[Array, "*b"] = choice("via_previous", "same_image", "anchored", "fused")
     coarse_scale: Float[Array, "*b"] = choice("none", "ratio", "estimated")
-    scale_std: Float[Array, "*b"] = traced()
-    max_pair_distance: Float[Array, "*b"] = traced()
-    anchor_noise: Float[Array, "*b"] = traced()
-    anchor_range: Float[Array, "*b"] = traced()
+    scale_std: Float[Array, "*b"] = traced(low=1e-4, high=math.inf)
+    max_pair_distance: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    anchor_noise: Float[Array, "*b"] = traced(low=1e-6, high=math.inf)
+    anchor_range: Float[Array, "*b"] = traced(low=1e-6, high=math.inf)
     icp: IcpConfig
-    min_inlier_fraction: Float[Array, "*b"] = traced()
-    max_residual: Float[Array, "*b"] = traced()
-    max_step: Float[Array, "*b"] = traced()
-    max_step_rad: Float[Array, "*b"] = traced()
-    min_eigenvalue: Float[Array, "*b"] = traced()
+    min_inlier_fraction: Float[Array, "*b"] = traced(low=0, high=1)
+    max_residual: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    max_step: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    max_step_rad: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    min_eigenvalue: Float[Array, "*b"] = traced(low=0, high=1e9)
 
 
 class CoarsePose(eqx.Module):

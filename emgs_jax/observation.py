@@ -1,5 +1,7 @@
 """Observations: one image's predicted geometry, o^n_t of the paper, and what one call of the prior gives to a step."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -54,11 +56,11 @@ class ObservationConfig(eqx.Module):
         min_confidence: points below are left out.
     """
 
-    thin: int = static()
-    normal_radius: int = static()
-    normal_spacing: int = static()
-    max_depth_step: Float[Array, "*b"] = traced()
-    min_confidence: Float[Array, "*b"] = traced()
+    thin: int = static(low=1, high=64)
+    normal_radius: int = static(low=1, high=64)
+    normal_spacing: int = static(low=1, high=64)
+    max_depth_step: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    min_confidence: Float[Array, "*b"] = traced(low=0)
 
 
 def _shifted(image: Array, dy: int, dx: int, radius: int) -> Array:

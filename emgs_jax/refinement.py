@@ -1,5 +1,7 @@
 """Rasterisation-based refinement (Method D, eq. 5 and 6): what EM left over is merged on the image plane or is new."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -35,13 +37,13 @@ class RefinementConfig(eqx.Module):
         average: gain and blend, those of the EM step.
     """
 
-    num_candidates: int = static()
-    max_mahalanobis_sq_2d: Float[Array, "*b"] = traced()
-    front_margin: Float[Array, "*b"] = traced()
-    back_margin: Float[Array, "*b"] = traced()
+    num_candidates: int = static(low=1, high=256)
+    max_mahalanobis_sq_2d: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    front_margin: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    back_margin: Float[Array, "*b"] = traced(low=0, high=math.inf)
     depth_condition: Float[Array, "*b"] = choice("pixel", "pairs")
-    min_normal_cos: Float[Array, "*b"] = traced()
-    max_splat_std: Float[Array, "*b"] = traced()
+    min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
+    max_splat_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
     render: RenderConfig
     average: AverageConfig
 

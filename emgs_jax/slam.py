@@ -53,7 +53,7 @@ class SlamConfig(eqx.Module):
         existence: what later frames say of a Gaussian.
     """
 
-    window_size: int = static()
+    window_size: int = static(low=1, high=1000)
     initialization: str = static()
     observation: ObservationConfig
     fit: FitConfig

@@ -1,5 +1,7 @@
 """Splitting: a Gaussian that is seen closer than when it was made and no longer explains its points becomes two."""
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -25,12 +27,12 @@ class SplittingConfig(eqx.Module):
         min_std: m; the floor of the covariances; what is hardly wider stays one.
     """
 
-    max_splits: int = static()
-    min_points: Float[Array, "*b"] = traced()
-    color_std: Float[Array, "*b"] = traced()
-    min_normal_cos: Float[Array, "*b"] = traced()
-    num_std: Float[Array, "*b"] = traced()
-    min_std: Float[Array, "*b"] = traced()
+    max_splits: int = static(low=0, high=2**20)
+    min_points: Float[Array, "*b"] = traced(low=0)
+    color_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
+    num_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    min_std: Float[Array, "*b"] = traced(low=0, high=1000)
 
 
 def is_too_coarse(

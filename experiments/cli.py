@@ -3,6 +3,8 @@
 import sys
 from importlib import import_module
 
+from .interrupt import clear_interrupt
+
 COMMANDS = {  # name: (what it does, an example)
     "run": ("map one sequence", "emgs run dataset=tum dataset.root=tum dataset.sequence=rgbd_dataset_freiburg1_desk"),
     "evaluate": ("data sets × sequences × variants × seeds, with one table", "emgs evaluate suite=smoke seeds=[0,1,2]"),
@@ -36,7 +38,8 @@ def main() -> None:
         raise SystemExit(f"error: {name} is no command of emgs: choose one of {', '.join(COMMANDS)}")
     else:
         sys.argv = [f"emgs {name}", *rest]
-        import_module(f".{name}", __package__).main()
+        with clear_interrupt():  # the imports take seconds
+            import_module(f".{name}", __package__).main()
 
 
 if __name__ == "__main__":

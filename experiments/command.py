@@ -18,6 +18,8 @@ from omegaconf.errors import OmegaConfBaseException
 from emgs_jax.running.compilation import use_compilation_cache
 from emgs_jax.running.configure import CONF, compose, first_of_sweep, message_of
 
+from .interrupt import clear_interrupt
+
 
 def command(
     name: str, rewritten: Callable[[list[str]], list[str]] = list
@@ -33,10 +35,11 @@ def command(
                 return task(config)
 
         def main() -> None:
-            with clear_errors():
-                sys.argv[1:] = rewritten(sys.argv[1:])
-                check_arguments(name, sys.argv[1:])
-            hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name=name)(job)()
+            with clear_interrupt():
+                with clear_errors():
+                    sys.argv[1:] = rewritten(sys.argv[1:])
+                    check_arguments(name, sys.argv[1:])
+                hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name=name)(job)()
 
         main.__doc__ = task.__doc__
         return main

@@ -5,10 +5,10 @@ With `features.text=FILE` a run compares the features with these classes and nee
 
 from pathlib import Path
 
-from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from emgs_jax.features.text import save_text
+from emgs_jax.running.configure import build
 
 from .command import command
 
@@ -20,7 +20,7 @@ def embed(config: DictConfig) -> Path:
     names = tuple(str(name) for name in config.classes)
     if not names or len(set(names)) < len(names):
         raise ValueError(f"classes must name at least one class, each once, got {[*names]}")
-    text = instantiate(config.features, classes=names, text=None).embed(names)
+    text = build(config, "features", classes=names, text=None).embed(names)
     path = Path(config.out)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_text(path, text)

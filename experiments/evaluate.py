@@ -22,11 +22,13 @@ from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, wr
 from emgs_jax.report.results import is_finished, read_estimates, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
 from emgs_jax.running.configure import compose, message_of
+from emgs_jax.running.values import check_values
 
 from .command import command, overrides_of
 from .run import run
 
 ERROR_FILE = "error.txt"
+PARTS = ("slam", "densify", "evaluation", "graph", "dataset", "prior", "features", "baseline.voxel", "baseline.tsdf")
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
                     OmegaConf.update(config, data["key"], sequence)
                     if has_seed:
                         config.prior.seed = seed
+                    for part in PARTS:
+                        check_values(config, part)
                     folder = result_folder(Path(settings["out"]), dataset, sequence, variant, seed)
                     yield Job(f"{dataset}/{sequence}/{variant}/{seed}", dataset, config, folder)
 

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.render.densify import DensifyConfig
-from emgs_jax.running.configure import near
+from emgs_jax.running.configure import build, near
 from emgs_jax.running.stacked import programs
 from emgs_jax.slam import SlamConfig
 
@@ -98,7 +97,7 @@ def _variant(config: DictConfig, setting: dict[str, Value]) -> Variant:
     for key, value in setting.items():
         OmegaConf.update(changed, key, value)
     plain = {key: str(v) if isinstance(v, float) and not math.isfinite(v) else v for key, v in setting.items()}
-    return Variant(plain, instantiate(changed.slam), instantiate(changed.densify))
+    return Variant(plain, build(changed, "slam"), build(changed, "densify"))
 
 
 def notes(config: DictConfig, axes: Axes) -> list[str]:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
@@ -17,9 +16,9 @@ from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import describe, new_scorer, score_back_end, score_baselines, score_map, score_prior, spent
 from emgs_jax.report.printout import frame_lines
 from emgs_jax.report.provenance import print_metrics_table, provenance, write_metrics
-from emgs_jax.report.run_files import save_outputs, save_progress
+from emgs_jax.report.run_files import claim_folder, save_outputs, save_progress
 from emgs_jax.running.clock import Clock
-from emgs_jax.running.configure import baseline_configs, build_dataset, build_prior, graph_config
+from emgs_jax.running.configure import baseline_configs, build, build_dataset, build_prior, graph_config
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
 from emgs_jax.running.drive import map_frames, show_record
 from emgs_jax.running.gathering import Baselines, RawPrior, gather
@@ -36,11 +35,14 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         )
     with Clock().watching() as clock:
         with clock.phase("setup"):
+            slam, evaluation, densify = (build(config, name) for name in ("slam", "evaluation", "densify"))
+            graph, fused = graph_config(config), baseline_configs(config)
             dataset = build_dataset(config)
             prior = build_prior(config, dataset)
-            slam, evaluation, densify = (instantiate(config[name]) for name in ("slam", "evaluation", "densify"))
-        session = new_run(dataset, slam, clock, graph=graph_config(config))
-        baselines = Baselines(baseline_configs(config), session, dataset)
+        session = new_run(dataset, slam, clock, graph=graph)
+        baselines = Baselines(fused, session, dataset)
+        for note in claim_folder(folder):
+            tqdm.write(note)
         raw = _map(session, dataset, prior, baselines, evaluation, folder)
         save_progress(folder, session)
         with clock.phase("densify"):
@@ -87,6 +89,8 @@ def _map(
         except BaseException:
             with contextlib.suppress(OSError, ValueError):  # the first error is the one to show
                 save_progress(folder, session)
+                if session.state is not None:
+                    tqdm.write(f"ended early: what is mapped so far is in {folder}")
             raise
 
 

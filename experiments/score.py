@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.data.readable import ReadableFrames
@@ -16,21 +15,31 @@ from emgs_jax.evaluation.clouds import PointCloud, read_cloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, compare_clouds
 from emgs_jax.evaluation.trajectory import associate, trajectory_metrics
 from emgs_jax.io.trajectory import load_trajectory_tum
+from emgs_jax.ops.ranges import Range
 from emgs_jax.prior.base import Provenance
 from emgs_jax.report.metrics import true_cloud
 from emgs_jax.report.provenance import provenance, write_metrics
 from emgs_jax.report.results import METRICS_FILE, estimates_of, is_finished, result_folder
 from emgs_jax.report.tables import average, full_table
-from emgs_jax.running.configure import build_dataset
+from emgs_jax.running.configure import build, build_dataset
+from emgs_jax.running.values import Declared, check_value
 
 from .command import command
 
 Metrics = dict[str, Any]
+LIMITS = {  # of the keys that are no parameter of a class
+    "max_time_difference": Declared(frozenset({float}), range=Range(0, 1e6)),
+    "min_matched_percent": Declared(frozenset({float}), range=Range(0, 100)),
+    "normal_neighbours": Declared(frozenset({int}), range=Range(3, 1000)),
+}
 
 
 def score(config: DictConfig) -> tuple[Metrics, Path]:
     """Compare the trajectory and the cloud of `config` with its data set; returns the metrics and their file."""
-    dataset, evaluation = build_dataset(config), instantiate(config.evaluation)
+    for key, field in LIMITS.items():
+        check_value(key, config[key], field)
+    evaluation = build(config, "evaluation")
+    dataset = build_dataset(config)
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     folder = result_folder(Path(config.out), dataset.name, dataset.sequence, config.method, 0)
     is_finished(folder, settings)  # scoring again replaces its own result, never another one

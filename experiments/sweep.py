@@ -15,7 +15,6 @@ from typing import Any
 
 import jax
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
@@ -26,7 +25,7 @@ from emgs_jax.report.metrics import Metrics, Scorer, new_scorer, score_settings
 from emgs_jax.report.provenance import provenance
 from emgs_jax.report.sweeps import SweepResults, draw, table, write_csv
 from emgs_jax.running.clock import Clock
-from emgs_jax.running.configure import build_dataset, build_prior
+from emgs_jax.running.configure import build, build_dataset, build_prior
 from emgs_jax.running.gathering import gather
 from emgs_jax.running.record import new_run
 from emgs_jax.running.stacked import map_together, programs
@@ -66,7 +65,7 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
         results = SweepResults(folder, _provenance(config, dataset, prior))
         left = [variant for variant in grid if variant.setting not in results]
         chunks = _chunks(left, config.chunk)
-        scorer = new_scorer(dataset, instantiate(config.evaluation), prior) if chunks else None
+        scorer = new_scorer(dataset, build(config, "evaluation"), prior) if chunks else None
         with _replayed(prior, dataset, chunks, folder / "predictions") as priors, _bar(dataset, chunks) as bar:
             for chunk in chunks:
                 window_size = chunk[0].slam.window_size

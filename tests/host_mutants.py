@@ -264,8 +264,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/evaluation/clouds.py",
-        "if not cloud.has_normals():",
-        "if cloud.has_normals():",
+        "if has_normals else",
+        "if not has_normals else",
         CLOUDS,
         "normals of a file are replaced",
     ),
@@ -1504,8 +1504,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/data/seven_scenes.py",
-        "pose = pose @ np.linalg.inv(T_COLOR_DEPTH)",
-        "pose = pose @ T_COLOR_DEPTH",
+        "T_world_depth @ np.linalg.inv(T_COLOR_DEPTH) if is_moved",
+        "T_world_depth @ T_COLOR_DEPTH if is_moved",
         SEVEN_SCENES,
         "the colour camera on the other side",
     ),

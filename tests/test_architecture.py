@@ -4,6 +4,7 @@ What is core follows from the folder: everything but the rooms in `HOST` and `HO
 """
 
 import ast
+import re
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -108,6 +109,12 @@ def test_nothing_is_pickled():
     for path in FILES:
         assert not {"pickle", "dill", "cloudpickle", "joblib", "shelve"} & imports_of(path), path
         assert "allow_pickle=True" not in path.read_text(), path
+
+
+def test_weights_are_loaded_as_tensors_only():
+    for path in FILES:
+        for call in re.findall(r"torch\.load\(.*?\)", path.read_text(), re.DOTALL):
+            assert "weights_only=True" in call, path
 
 
 def test_pytorch_is_imported_inside_functions_only_so_that_the_rest_works_without_it():

@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import inspect
+import re
 import typing
 from pathlib import Path
 
@@ -125,6 +126,18 @@ def test_every_field_of_a_config_class_is_read():
     assert {"SlamConfig", "IcpConfig", "DensifyConfig", "EvaluationConfig", "MaskConfig", "SweepConfig"} <= names
     unread = [f"{module.__name__}.{field.name}" for module in classes for field in dataclasses.fields(module)]
     assert not [name for name in unread if name.rpartition(".")[2] not in read]
+
+
+def test_every_number_of_a_config_class_declares_its_range():
+    """A threshold that takes any value takes nan; `emgs_jax.running.values` refuses what is out of range."""
+    numeric = re.compile(r"\bint\b|\bfloat\b|Float\[")
+    without = [
+        f"{module.__name__}.{field.name}"
+        for module in config_classes()
+        for field in dataclasses.fields(module)
+        if numeric.search(str(field.type)) and not {"range", "choices"} & field.metadata.keys()
+    ]
+    assert sorted(without) == ["ImageConfig.mean", "ImageConfig.std"], "colours: any finite number"
 
 
 def test_a_value_that_stands_in_a_constructor_too_is_the_same_there():

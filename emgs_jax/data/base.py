@@ -36,7 +36,11 @@ class Frame:
 
 @runtime_checkable
 class Dataset(Protocol):
-    """A sequence of frames. Construction checks the layout; `dataset[i]` reads frame i and may raise BadFrameError."""
+    """A sequence of frames. Construction checks the layout; `dataset[i]` reads frame i and may raise BadFrameError.
+
+    With ground truth also `pose(i)`, which reads no image, so that the whole trajectory is checked before the first
+    frame: T_world_camera, float64 (4, 4), or None where there is no truth for this frame. It may raise BadFrameError.
+    """
 
     name: str  # e.g. "seven_scenes"
     sequence: str  # e.g. "redkitchen/seq-01"
@@ -49,6 +53,8 @@ class Dataset(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> Frame: ...
+
+    def pose(self, index: int) -> np.ndarray | None: ...
 
     def fingerprint(self) -> str:
         """Hex digest over what defines the frames (files' names and contents, options), for provenance."""

@@ -76,6 +76,9 @@ class Images:
         image = reading.resize_color(self._lens.straighten(image), self.size)
         return Frame(index, self._source.timestamp(row), self._source.label(row), image)
 
+    def pose(self, index: int) -> None:
+        return None
+
     def fingerprint(self) -> str:
         options = {
             "dataset": self.name,

@@ -77,8 +77,11 @@ class RayCast:
         number = self._numbers[index]
         name = f"{self.name} {self.sequence}, frame {number}"
         return Frame(
-            index, float(number), name, image.reshape(*depth.shape, 3), depth, pose.copy(), self._labels[objects]
+            index, float(number), name, image.reshape(*depth.shape, 3), depth, self.pose(index), self._labels[objects]
         )
+
+    def pose(self, index: int) -> Float[np.ndarray, "4 4"]:
+        return self._poses[self._numbers[index]].copy()
 
     def normals(self, index: int) -> Float32[np.ndarray, "h w 3"]:
         """Unit normals of the surfaces in the camera's axes, facing the camera."""

@@ -1,8 +1,10 @@
 """A data set without the frames that cannot be read."""
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
 
@@ -12,8 +14,8 @@ class ReadableFrames:
 
     Args:
         dataset: all frames.
-        on_bad_frame: `error`: a frame that cannot be read ends the run when it is its turn; `skip`: all frames are
-            read once here, and those that cannot be read are left out.
+        on_bad_frame: `error`: a frame that cannot be read ends the run when it is its turn, a true pose that cannot
+            be read at once; `skip`: all frames are read once here, and those that cannot be read are left out.
         progress: wraps the frame numbers of that first pass, e.g. tqdm.
 
     Attributes:
@@ -40,12 +42,17 @@ class ReadableFrames:
             what = f"{dataset.name} {dataset.sequence}"
             first = next(iter(self.skipped.values()), "there are none")
             raise ValueError(f"{what} has no frame that can be read: {first}")
+        if self.has_ground_truth:
+            _check_truth(dataset, self.kept)
 
     def __len__(self) -> int:
         return len(self.kept)
 
     def __getitem__(self, index: int) -> Frame:
         return replace(self._dataset[self.kept[index]], index=index)
+
+    def pose(self, index: int) -> np.ndarray | None:
+        return self._dataset.pose(self.kept[index])
 
     def fingerprint(self) -> str:
         """That of the data set, unless frames are left out."""
@@ -62,3 +69,13 @@ def _unreadable(dataset: Dataset, indices: Iterable[int]) -> dict[int, str]:
         except BadFrameError as error:
             reasons[index] = str(error)
     return reasons
+
+
+def _check_truth(dataset: Dataset, kept: Sequence[int]) -> None:
+    """Raise BadFrameError for the first true pose that is damaged, and ValueError where no frame has one."""
+    poses = [dataset.pose(index) for index in kept]  # all of them, before the first frame
+    if all(pose is None for pose in poses):
+        raise ValueError(
+            f"{dataset.name} {dataset.sequence}: 0 of {len(kept)} images have a true pose: fetch the trajectory again, "
+            "or choose other images (dataset.start, stop, stride)"
+        )

@@ -18,6 +18,8 @@ Number = int | float  # a YAML value may be written 585 or 585.0
 Size = tuple[int, int]  # (width, height)
 Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy; pixel centres at integers
 
+MAX_SIDE = 16384  # pixels; more is a slip of the hand, and would ask for gigabytes
+MAX_POSITION_M = 1000.0  # from the origin: steps of float32 are .06 mm there, and 6 cm at 1e6 m
 RIGID_TOLERANCE = 1e-2  # text files round; a flipped digit moves R^T R by more
 REMEDY = "fetch the file again or set on_bad_frame=skip"
 
@@ -49,6 +51,9 @@ def select(count: int, start: int, stop: int | None, stride: int, where: object)
     """The images in use out of the `count` that are there, in order."""
     if count == 0:
         raise ValueError(f"{where} has no images")
+    for name, value in (("start", start), ("stop", 0 if stop is None else stop), ("stride", stride)):
+        if not isinstance(value, int):
+            raise ValueError(f"dataset.{name} must be a whole number of images, got {value}")
     if stride < 1:
         raise ValueError(f"dataset.stride must be at least 1, got {stride}")
     if not 0 <= start < count:
@@ -68,10 +73,10 @@ def check_index(index: int, count: int) -> None:
 
 def check_size(size: Sequence[int]) -> Size:
     """`size` as two positive integers."""
-    values = tuple(int(v) for v in size)
-    if len(values) != 2 or min(values) < 1:
-        raise ValueError(f"dataset.size must be [width, height] in pixels, got {list(size)}")
-    return values
+    values = tuple(size) if isinstance(size, Iterable) else (size,)
+    if len(values) != 2 or not all(isinstance(value, int) and 1 <= value <= MAX_SIDE for value in values):
+        raise ValueError(f"dataset.size must be [width, height] in pixels, up to {MAX_SIDE}, got {size}")
+    return values[0], values[1]
 
 
 def check_depth_scale(depth_scale: Number) -> float:
@@ -130,7 +135,7 @@ def read_bytes(path: Path) -> bytes:
 
 def read_text(path: Path) -> str:
     """A file's text; bytes that are no text become a sign that no number parses."""
-    return read_bytes(path).decode("utf-8", "replace")
+    return read_bytes(path).decode("utf-8-sig", "replace")  # some editors put a mark before the first letter
 
 
 def damage(data: bytes) -> str | None:
@@ -225,21 +230,37 @@ def first_size(paths: Iterable[Path], where: object) -> Size:
     raise ValueError(f"{where}: none of its images can be read; fetch them again")
 
 
-def as_pose(text: str, where: object) -> Float[np.ndarray, "4 4"]:
-    """A rigid 4x4 transform from 16 numbers, row by row; BadFrameError where it is none (lost tracking: inf or nan)."""
+def as_pose(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
+    """A rigid 4x4 transform from 16 numbers, row by row; None where they are inf or nan, which means lost tracking.
+
+    Raises:
+        BadFrameError: they are no pose.
+        ValueError: it is farther away than positions can be held.
+    """
     try:
         pose = np.array([float(token) for token in text.split()], np.float64).reshape(4, 4)
     except ValueError as error:
         raise BadFrameError(f"{where} must hold 16 numbers (a 4x4 pose): {REMEDY}") from error
     if not np.isfinite(pose).all():
-        raise BadFrameError(f"{where} has a pose that is not finite, tracking was lost: set on_bad_frame=skip")
+        return None
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()
     if not (off < RIGID_TOLERANCE and np.linalg.det(pose[:3, :3]) > 0 and np.allclose(pose[3], (0, 0, 0, 1))):
         raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
+    check_position(pose[:3, 3], where)
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded
     return pose
+
+
+def check_position(position: Float[np.ndarray, " 3"], where: object) -> None:
+    """ValueError where a true position is so far away that float32, in which maps are, does not hold it."""
+    if np.abs(position).max() > MAX_POSITION_M:
+        shown = ", ".join(f"{value:g}" for value in position)
+        raise ValueError(
+            f"{where} has a position of [{shown}] m, and a map holds positions in float32 up to {MAX_POSITION_M:g} m: "
+            "where the trajectory is geo-referenced subtract one position from all of its lines, else correct this one"
+        )
 
 
 def fingerprint(root: Path, files: Iterable[Path], options: dict[str, object]) -> str:

@@ -5,6 +5,9 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
 from emgs_jax.data.intrinsics import Given, find_lens, pictures_of
@@ -64,9 +67,12 @@ class Replica:
         image = self._lens.straighten(reading.read_color(path, self._raw_size))
         depth = reading.read_depth(depth_path(path), self._depth_scale, self._raw_size)
         depth = self._lens.straighten_depth(depth)
-        pose = reading.as_pose(self._poses[index], f"{self._folder / 'traj.txt'}, row {number_of(path)} (from 0),")
         image, depth = reading.resize_color(image, self.size), reading.resize_nearest(depth, self.size)
-        return Frame(index, float(number_of(path)), str(path), image, depth, pose)
+        return Frame(index, float(number_of(path)), str(path), image, depth, self.pose(index))
+
+    def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
+        number = number_of(self._images[index])
+        return reading.as_pose(self._poses[index], f"{self._folder / 'traj.txt'}, row {number} (from 0),")
 
     def fingerprint(self) -> str:
         files = [self._folder / "traj.txt", *self._images, *map(depth_path, self._images)]

@@ -86,15 +86,18 @@ class SevenScenes:
         reading.check_index(index, len(self))
         path = self._images[index]
         image = reading.resize_color(self._lens.straighten(reading.read_color(path, RAW_SIZE)), self.size)
-        pose_path = sibling(path, "pose.txt")
-        pose = reading.as_pose(reading.read_text(pose_path), pose_path)  # T_world_depth
         depth = reading.read_depth(sibling(path, "depth.png"), self._depth_scale, RAW_SIZE)
         if self._register:
             depth = register(depth, self.intrinsics, self.size)
-            pose = pose @ np.linalg.inv(T_COLOR_DEPTH)
         else:
             depth = reading.resize_nearest(depth, self.size)
-        return Frame(index, frame_number(path), str(path), image, depth, pose)
+        return Frame(index, frame_number(path), str(path), image, depth, self.pose(index))
+
+    def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
+        path = sibling(self._images[index], "pose.txt")
+        T_world_depth = reading.as_pose(reading.read_text(path), path) if path.exists() else None
+        is_moved = self._register and T_world_depth is not None
+        return T_world_depth @ np.linalg.inv(T_COLOR_DEPTH) if is_moved else T_world_depth
 
     def fingerprint(self) -> str:
         files = [f for p in self._images for f in (p, sibling(p, "depth.png"), sibling(p, "pose.txt"))]

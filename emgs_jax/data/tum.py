@@ -16,6 +16,7 @@ from emgs_jax.data.reading import Intrinsics, Number
 LAYOUT = "root/SEQUENCE/{rgb.txt, depth.txt, groundtruth.txt, rgb/, depth/}"
 SOURCE = "TUM RGB-D benchmark, project page of the Computer Vision Group of TU Munich"
 RAW_SIZE = (640, 480)
+REMEDY = "correct the line or take it out (its image then has no true pose), or set on_bad_frame=skip"
 # Calibration by the benchmark (digits of ORB-SLAM2); fr3 comes undistorted. Distortion is k1, k2, p1, p2, k3.
 CALIBRATIONS: dict[str, tuple[Intrinsics, tuple[float, ...] | None]] = {
     "freiburg1": (
@@ -33,7 +34,8 @@ CALIBRATIONS: dict[str, tuple[Intrinsics, tuple[float, ...] | None]] = {
 class Tum:
     """One sequence in the TUM layout; without depth.txt or groundtruth.txt there is no ground truth.
 
-    A colour image without depth near in time stays in use with depth 0 everywhere; one without a pose has none.
+    A colour image without depth near in time stays in use with depth 0 everywhere; one without a pose, or with one of
+    inf or nan, has none. A list that no image has anything of is an error.
 
     Args:
         root: folder that holds the sequences.
@@ -63,7 +65,7 @@ class Tum:
         max_time_difference: Number = 0.02,
     ) -> None:
         self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
-        times, names = read_list(self._folder / "rgb.txt", 2)
+        times, names, _ = read_list(self._folder / "rgb.txt", 2)
         chosen = reading.select(len(times), start, stop, stride, f"{self._folder / 'rgb.txt'} (layout {LAYOUT})")
         self._times, self._images = times[chosen], [self._folder / names[i][0] for i in chosen]
         self.sequence = str(sequence)
@@ -71,6 +73,7 @@ class Tum:
         self._depth_scale = reading.check_depth_scale(depth_scale)
         if not (math.isfinite(max_time_difference) and max_time_difference >= 0):
             raise ValueError(f"dataset.max_time_difference must be seconds, 0 or more, got {max_time_difference}")
+        self._pose_lines: list[int] = []
         self._depths, self._poses = self._associate(float(max_time_difference))
         self.has_ground_truth = self._depths is not None and self._poses is not None
         given = find_calibration(self.sequence, intrinsics, distortion)
@@ -83,13 +86,15 @@ class Tum:
         """Per image in use the depth file and the words of the pose nearest in time; None where there is no list."""
         depths = poses = None
         if (self._folder / "depth.txt").exists():
-            times, names = read_list(self._folder / "depth.txt", 2)
-            rows = nearest_rows(self._times, times, tolerance)
+            times, names, _ = read_list(self._folder / "depth.txt", 2)
+            rows = matched_rows(self._times, times, tolerance, ("depth", self._folder / "depth.txt"))
             depths = [None if row < 0 else self._folder / names[row][0] for row in rows]
         if (self._folder / "groundtruth.txt").exists():
-            times, words = read_list(self._folder / "groundtruth.txt", 8)
-            rows = nearest_rows(self._times, times, tolerance)
+            path = self._folder / "groundtruth.txt"
+            times, words, lines = read_list(path, 8)
+            rows = matched_rows(self._times, times, tolerance, ("pose", path))
             poses = [None if row < 0 else words[row] for row in rows]
+            self._pose_lines = [lines[row] for row in rows]
         return depths, poses
 
     def __len__(self) -> int:
@@ -99,16 +104,20 @@ class Tum:
         reading.check_index(index, len(self))
         path, (w, h) = self._images[index], self.size
         image = reading.read_color(path, self._raw_size)
-        depth = pose = None
+        depth = None
         if self._depths is not None:
             depth = np.zeros((h, w), np.float32)
             if self._depths[index] is not None:
                 raw = reading.read_depth(self._depths[index], self._depth_scale, self._raw_size)
                 depth = reading.resize_nearest(self._lens.straighten_depth(raw), self.size)
-        if self._poses is not None and self._poses[index] is not None:
-            pose = as_transform(self._poses[index], self._folder / "groundtruth.txt")
         image = reading.resize_color(self._lens.straighten(image), self.size)
-        return Frame(index, float(self._times[index]), str(path), image, depth, pose)
+        return Frame(index, float(self._times[index]), str(path), image, depth, self.pose(index))
+
+    def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
+        words = None if self._poses is None else self._poses[index]
+        if words is None:
+            return None
+        return as_transform(words, f"{self._folder / 'groundtruth.txt'}, line {self._pose_lines[index]}:")
 
     def fingerprint(self) -> str:
         lists = [self._folder / name for name in ("rgb.txt", "depth.txt", "groundtruth.txt")]
@@ -125,13 +134,16 @@ class Tum:
         return reading.fingerprint(self._folder, files, options)
 
 
-def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[list[str]]]:
-    """Timestamps in ascending order and the words after them; lines of a '#' comment and empty lines do not count."""
+def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[list[str]], list[int]]:
+    """Timestamps in ascending order, the words after them and the number of the line that each stands in.
+
+    Lines of a '#' comment and empty lines do not count.
+    """
     try:
         lines = reading.read_text(path).splitlines()
     except BadFrameError as error:
         raise FileNotFoundError(f"{error}; expected the layout {LAYOUT} ({SOURCE})") from error
-    times, words = [], []
+    times, words, numbers = [], [], []
     for number, line in enumerate(lines, 1):
         row = line.replace(",", " ").split()
         if not row or row[0].startswith("#"):
@@ -144,8 +156,28 @@ def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[l
             raise ValueError(f"{path}, line {number}: expected a timestamp and {columns - 1} more, got {line[:80]!r}")
         times.append(time)
         words.append(row[1:columns])
+        numbers.append(number)
     order = np.argsort(times, kind="stable")
-    return np.array(times, np.float64)[order], [words[i] for i in order]
+    return np.array(times, np.float64)[order], [words[i] for i in order], [numbers[i] for i in order]
+
+
+def matched_rows(
+    times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, " m"], tolerance: float, of: tuple[str, Path]
+) -> list[int]:
+    """`nearest_rows`, which some image must have; `of` says what of and where it is listed."""
+    rows = nearest_rows(times, candidates, tolerance)
+    if max(rows) < 0:
+        what, path = of
+        raise ValueError(
+            f"{path}: 0 of {len(rows)} images have a {what} (max difference {tolerance:g} s): the images are at "
+            f"{_span(times)} s, the lines of this file at {_span(candidates)} s. Correct the times, choose other "
+            "images (dataset.start, stop), raise dataset.max_time_difference, or move the file away"
+        )
+    return rows
+
+
+def _span(times: Float[np.ndarray, " n"]) -> str:
+    return f"{times.min():.3f} to {times.max():.3f}" if len(times) else "no"
 
 
 def nearest_rows(times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, " m"], tolerance: float) -> list[int]:
@@ -160,15 +192,22 @@ def nearest_rows(times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, "
     return np.where(gaps.min(axis=0) <= tolerance, rows, -1).tolist()
 
 
-def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"]:
-    """T_world_camera from tx ty tz qx qy qz qw; BadFrameError where they are none."""
+def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"] | None:
+    """T_world_camera from tx ty tz qx qy qz qw; None where they are inf or nan, which means lost tracking.
+
+    Raises:
+        BadFrameError: they are no pose.
+        ValueError: it is farther away than positions can be held.
+    """
     try:
         values = np.array([float(word) for word in words], np.float64)
     except ValueError as error:
-        raise BadFrameError(f"{where}: {' '.join(words)!r} must be tx ty tz qx qy qz qw: {reading.REMEDY}") from error
-    norm = np.linalg.norm(values[3:])
-    if not np.isfinite(values).all() or abs(norm - 1) > reading.RIGID_TOLERANCE:
-        raise BadFrameError(f"{where}: {' '.join(words)!r} is no pose (finite, unit quaternion): {reading.REMEDY}")
+        raise BadFrameError(f"{where} {' '.join(words)!r} must be tx ty tz qx qy qz qw: {REMEDY}") from error
+    if not np.isfinite(values).all():
+        return None
+    if not np.abs(values[3:]).max() < 2 or abs(np.linalg.norm(values[3:]) - 1) > reading.RIGID_TOLERANCE:
+        raise BadFrameError(f"{where} {' '.join(words)!r} is no pose, as its quaternion has not length 1: {REMEDY}")
+    reading.check_position(values[:3], where)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
     return pose

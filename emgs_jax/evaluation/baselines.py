@@ -14,6 +14,7 @@ import numpy as np
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.evaluation.clouds import PointCloud, VoxelGrid, transform_cloud
 from emgs_jax.evaluation.trajectory import Alignment
+from emgs_jax.ops.ranges import number
 
 Image = tuple[np.ndarray, np.ndarray]  # camera-space z (h, w), 0 where there is none, and RGB in [0, 1], (h, w, 3)
 Draw = Callable[[np.ndarray], Image]  # from the pose T_world_camera (4, 4)
@@ -69,8 +70,8 @@ class VoxelConfig:
             lies just before the camera would fill the image.
     """
 
-    voxel_m: float
-    max_footprint_px: int
+    voxel_m: float = number(low=1e-6)
+    max_footprint_px: int = number(low=1, high=4096)
 
     def __post_init__(self) -> None:
         _require_positive("voxel", voxel_m=self.voxel_m, max_footprint_px=self.max_footprint_px)
@@ -93,9 +94,9 @@ class TsdfConfig:
         min_views: that must have seen a place.
     """
 
-    voxel_m: float
-    truncation_m: float
-    min_views: int
+    voxel_m: float = number(low=1e-6)
+    truncation_m: float = number(low=1e-6)
+    min_views: int = number(low=1)
 
     def __post_init__(self) -> None:
         _require_positive("tsdf", voxel_m=self.voxel_m, truncation_m=self.truncation_m, min_views=self.min_views)

@@ -1,7 +1,7 @@
 """Point clouds: reading and moving them, and averaging them per voxel without holding all points at once."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +10,9 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from emgs_jax.evaluation.trajectory import Alignment, align
+from emgs_jax.io.ply_reader import read_vertices
 
+_NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
 _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
 
 
@@ -34,22 +36,34 @@ class PointCloud:
 
 def read_cloud(path: str | os.PathLike, normal_neighbours: int) -> PointCloud:
     """Read a PLY; a cloud without normals gets those of planes through so many nearest points, sign unknown."""
-    import open3d as o3d  # slow to import, and only clouds of other systems need it
-
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path} does not exist: give a PLY file with the points in the trajectory's frame")
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.io.read_point_cloud(os.fspath(path))
-    points = np.asarray(cloud.points)
+    vertices = read_vertices(path)
+    points = _columns(vertices, ("x", "y", "z"), path)
     if not len(points):
-        raise ValueError(f"{path} has no points: it is empty or no PLY file; write the points of the map as PLY")
-    num_broken = int((~np.isfinite(points).all(1)).sum())
+        raise ValueError(f"{path} has no points: write the points of the map as PLY")
+    has_normals, has_colors = ({*names} <= vertices.keys() for names in (_NORMALS, _COLORS))
+    normals = _columns(vertices, _NORMALS, path) if has_normals else _fitted_normals(points, normal_neighbours)
+    return PointCloud(points, normals, _columns(vertices, _COLORS, path) if has_colors else np.zeros_like(points))
+
+
+def _columns(vertices: Mapping[str, np.ndarray], names: Sequence[str], path: object) -> np.ndarray:
+    """Properties (n, 3) as float64, those of integers (colours) as a fraction of the largest; all must be finite."""
+    rows = np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
+    num_broken = int((~np.isfinite(rows).all(1)).sum())
     if num_broken:
-        raise ValueError(f"{path}: {num_broken} of {len(points)} points are not finite: leave them out of the file")
-    if not cloud.has_normals():
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(normal_neighbours))
-    colors = np.asarray(cloud.colors) if cloud.has_colors() else np.zeros_like(points)
-    return PointCloud(points, np.asarray(cloud.normals), colors)
+        what = f"points are not finite in {', '.join(names)}"
+        raise ValueError(f"{path}: {num_broken} of {len(rows)} {what}: leave them out of the file")
+    kind = vertices[names[0]].dtype
+    return rows / np.iinfo(kind).max if names == _COLORS and kind.kind in "iu" else rows
+
+
+def _fitted_normals(points: np.ndarray, num_neighbours: int) -> np.ndarray:
+    import open3d as o3d  # slow to import, and only clouds of other systems need it
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(num_neighbours))
+    return np.asarray(cloud.normals)
 
 
 def transform_cloud(cloud: PointCloud, alignment: Alignment) -> PointCloud:

@@ -1,5 +1,6 @@
 """How far a reconstructed cloud is from the true one: building both clouds, accuracy, completion, F1, normals."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, register, transform_cloud, voxel_downsample
 from emgs_jax.evaluation.trajectory import Alignment, align_poses
+from emgs_jax.ops.ranges import number
 
 _BAND_ROWS = 40  # of an image whose normals are fitted at a time: what is computed in between stays in the cache
 
@@ -21,22 +23,22 @@ class EvaluationConfig:
     protocol: str
     alignment: str  # "sim3", or "se3": without the scale
     statistic: str  # "mean" or "rmse" of the distances
-    max_distance_m: float  # longer distances count as this long; F1 does not change
-    max_depth_m: float  # true depth farther away is left out
-    icp_distance_m: float  # ICP after the alignment takes pairs within this distance; 0 = no ICP
-    placement_icp_m: float  # likewise for reconstruction_icp/…, whatever the protocol does
-    icp_voxel_m: float
-    icp_max_steps: int
-    voxel_m: float
-    max_points: int | None  # compare a random choice of so many points of each cloud
-    f1_thresholds_m: tuple[float, ...]
-    max_normal_angle_deg: float
-    normal_radius_px: int
-    normal_step_px: int
-    max_normal_gap: float  # relative inverse-depth step to a tap of the normal's window
-    max_normal_residual: float  # relative inverse-depth distance of a tap from the fitted plane
-    min_normal_taps: int
-    label_neighbours: int  # a true point takes the most frequent label of so many nearest points of the map
+    max_distance_m: float = number(low=1e-6, high=math.inf)  # longer distances count as this long; F1 does not change
+    max_depth_m: float = number(low=1e-6, high=math.inf)  # true depth farther away is left out
+    icp_distance_m: float = number(low=0)  # ICP after the alignment takes pairs within this distance; 0 = no ICP
+    placement_icp_m: float = number(low=1e-6)  # likewise for reconstruction_icp/…, whatever the protocol does
+    icp_voxel_m: float = number(low=1e-6)
+    icp_max_steps: int = number(low=0, high=10000)
+    voxel_m: float = number(low=1e-6)
+    max_points: int | None = number(low=1, high=1e9)  # compare a random choice of so many points of each cloud
+    f1_thresholds_m: tuple[float, ...] = number(low=1e-9)
+    max_normal_angle_deg: float = number(low=0, high=180)
+    normal_radius_px: int = number(low=1, high=64)
+    normal_step_px: int = number(low=1, high=64)
+    max_normal_gap: float = number(low=0, high=math.inf)  # relative inverse-depth step to a tap of the normal's window
+    max_normal_residual: float = number(low=0, high=math.inf)  # likewise, distance of a tap from the fitted plane
+    min_normal_taps: int = number(low=3, high=1000)
+    label_neighbours: int = number(low=1, high=1000)  # nearest points of the map that vote for a true point's label
 
     def __post_init__(self):
         object.__setattr__(self, "f1_thresholds_m", tuple(float(value) for value in self.f1_thresholds_m))

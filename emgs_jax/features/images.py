@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from emgs_jax.ops.ranges import number
+
 
 @dataclass(frozen=True)
 class ImageConfig:
@@ -17,7 +19,7 @@ class ImageConfig:
         std: of RGB, divided by.
     """
 
-    long_side: int
+    long_side: int = number(low=1, high=65536)
     mean: Sequence[float]
     std: Sequence[float]
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from emgs_jax.io.files import atomic_write
+from emgs_jax.io.npz import read_npz
 
 FORMAT, VERSION = "emgs_jax.text", 1
 REMEDY = "write it with `python -m experiments.embed`"
@@ -98,16 +99,17 @@ def _read(path: Path) -> tuple[dict, np.ndarray]:
     if not path.is_file():
         raise ValueError(f"{path} does not exist: {REMEDY}")
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            header, vectors = json.loads(str(arrays["header"])), arrays["embeddings"]
-    except Exception as error:  # a broken zip raises a dozen types
+        arrays = read_npz(path.read_bytes(), ("header", "embeddings"))
+        header, vectors = json.loads(str(arrays["header"])), arrays["embeddings"]
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no file of text embeddings, or damaged ({error}): {REMEDY}") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ValueError(f"{path} is not of the format {FORMAT}: {REMEDY}")
     if header.get("version") != VERSION:
         raise ValueError(f"{path} has version {header.get('version')}, this program reads {VERSION}: {REMEDY}")
     is_whole = {"names", "templates", "model"} <= header.keys() and vectors.ndim == 2
-    if not is_whole or vectors.dtype != np.float32 or len(vectors) != len(header["names"]):
+    is_whole = is_whole and vectors.dtype == np.float32 and bool(np.isfinite(vectors).all())
+    if not is_whole or len(vectors) != len(header["names"]):
         raise ValueError(f"{path} is damaged (its embeddings are not those of its header): {REMEDY}")
     return header, vectors
 

@@ -1,5 +1,6 @@
 """The best poses and scales for all measurements: Levenberg–Marquardt on the host, in float64."""
 
+import math
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -35,13 +36,13 @@ class GraphConfig(eqx.Module):
             is refused.
     """
 
-    scale_std: Float[Array, "*b"] = traced()
-    kernel: Float[Array, "*b"] = traced()
+    scale_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    kernel: Float[Array, "*b"] = traced(low=1e-6, high=math.inf)
     start: str = static()
-    max_iterations: int = static()
-    damping: Float[Array, "*b"] = traced()
-    min_decrease: Float[Array, "*b"] = traced()
-    max_misfit: Float[Array, "*b"] = traced()
+    max_iterations: int = static(low=0, high=10000)
+    damping: Float[Array, "*b"] = traced(low=0)
+    min_decrease: Float[Array, "*b"] = traced(low=0, high=1)
+    max_misfit: Float[Array, "*b"] = traced(low=0, high=math.inf)
 
     def __check_init__(self) -> None:
         if self.start not in ("given", "spread"):

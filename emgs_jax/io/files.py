@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -30,6 +31,31 @@ def atomic_write(path: str | os.PathLike, mode: str = "wb") -> Iterator[IO]:
         raise _named(error, path) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_temporaries(folder: Path) -> list[str]:
+    """Remove what an `atomic_write` into `folder` left that was killed; returns the names. One process owns a folder.
+
+    A temporary file whose process still runs on this machine is left alone.
+    """
+    found = [(path, re.fullmatch(r"\..+\.(\d+)\.tmp(\..*)?", path.name)) for path in sorted(folder.glob(".*.tmp*"))]
+    dead = [path for path, name in found if name and not _is_running(int(name[1]))]
+    for path in dead:
+        path.unlink(missing_ok=True)
+    return [path.name for path in dead]
+
+
+def _is_running(process: int) -> bool:
+    """Whether a process of this number runs; where the system cannot be asked, it is taken to."""
+    if os.name != "posix":
+        return True
+    try:
+        os.kill(process, 0)  # asks only
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def jsonable(value: Any) -> Any:

@@ -1,11 +1,9 @@
 """The map's file: every leaf under its field path, bit for bit, and a header that says what it is."""
 
 import dataclasses
-import io
 import json
 import os
 import typing
-import zipfile
 from typing import Any
 
 import equinox as eqx
@@ -13,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.gaussian_map import GaussianMap, empty_map
 from emgs_jax.io.files import atomic_write
+from emgs_jax.io.npz import read_npz
 
 MAP_FORMAT, MAP_VERSION = "emgs_jax.map", 3
 
@@ -25,8 +24,25 @@ def save_map(path: str | os.PathLike, map: GaussianMap) -> None:
 
 
 def load_map(path: str | os.PathLike) -> GaussianMap:
-    """Read the map.npz of a run; raises ValueError for every file that is not a complete map of this version."""
-    return load_map_npz(path, GaussianMap)
+    """Read the map.npz of a run; raises ValueError for a file that is no complete, finite map of this version."""
+    map = load_map_npz(path, GaussianMap)
+    check_map(path, map)
+    return map
+
+
+def check_map(path: str | os.PathLike, map: GaussianMap) -> None:
+    """Raise ValueError where a leaf has not a map's dtype and shape, or is not finite where there is a Gaussian."""
+    valid, features = map.gaussians.valid, map.gaussians.features
+    if valid.ndim != 1 or valid.dtype != bool or features.ndim != 2:
+        raise ValueError(f"{path} is no map: gaussians.valid is {valid.dtype} {valid.shape}: map again")
+    shapes = jax.eval_shape(lambda: empty_map(len(valid), features.shape[1]))
+    leaves, expected = (jax.tree_util.tree_flatten_with_path(tree)[0] for tree in (map, shapes))
+    for (key, leaf), (_, like) in zip(leaves, expected, strict=True):
+        if (leaf.shape, leaf.dtype) != (like.shape, like.dtype):
+            wanted = f"{like.dtype} {like.shape}"
+            raise ValueError(f"{path}: {_name(key)} is {leaf.dtype} {leaf.shape}, expected {wanted}: map again")
+        if not bool(jnp.all(jnp.isfinite(leaf[valid]))):
+            raise ValueError(f"{path}: {_name(key)} is not finite where there is a Gaussian: map again")
 
 
 def save_map_npz(path: str | os.PathLike, tree: eqx.Module) -> None:
@@ -51,7 +67,8 @@ def load_map_npz(path: str | os.PathLike, like: Any) -> Any:
     Raises ValueError for every file that is not a complete map of this class and version.
     """
     try:
-        arrays = _read_arrays(path)
+        with open(path, "rb") as handle:
+            arrays = read_npz(handle)
         header = json.loads(str(arrays.pop("__header__", "{}")))
         header = header if isinstance(header, dict) else {}
     except FileNotFoundError:
@@ -78,16 +95,6 @@ def load_map_npz(path: str | os.PathLike, like: Any) -> Any:
 
 def _name(key_path: tuple) -> str:
     return jax.tree_util.keystr(key_path, simple=True, separator=".")
-
-
-def _read_arrays(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """Read every member completely before it is parsed, so that its checksum is tested first."""
-    arrays = {}
-    with zipfile.ZipFile(path) as archive:
-        for name in archive.namelist():
-            member = io.BytesIO(archive.read(name))
-            arrays[name.removesuffix(".npy")] = np.lib.format.read_array(member, allow_pickle=False)
-    return arrays
 
 
 def _static_fields(tree: eqx.Module, prefix: str = "") -> dict[str, Any]:

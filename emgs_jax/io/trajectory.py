@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.io.files import atomic_write
 
+MAX_VALUE, MAX_NORM_ERROR = 1e9, 1e-2  # of other systems, whose units are their own and whose digits may be few
+
 
 def save_trajectory_tum(path: str | os.PathLike, timestamps: Any, T_world_camera: Any) -> None:
     """Write poses (n, 4, 4) as lines `timestamp tx ty tz qx qy qz qw`, metres, camera → world, qw ≥ 0."""
@@ -31,14 +33,19 @@ def to_tum(pose: np.ndarray) -> tuple[float, ...]:
 def load_trajectory_tum(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     """Read a TUM trajectory: timestamps (n,) and T_world_camera (n, 4, 4), float64; `#` starts a comment."""
     rows = []
-    for number, line in enumerate(Path(path).read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+    for number, line in enumerate(Path(path).read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
         fields = line.split("#")[0].split()
         try:
             values = [float(field) for field in fields]
         except ValueError:
             values = [np.nan]
-        if fields and (len(values) != 8 or not np.isfinite(values).all() or not np.any(values[4:])):
+        if fields and (len(values) != 8 or not np.isfinite(values).all()):
             raise ValueError(f"{path}:{number}: expected `timestamp tx ty tz qx qy qz qw`, got {line[:80]!r}")
+        if fields and (np.abs(values[1:]).max() > MAX_VALUE or abs(np.linalg.norm(values[4:]) - 1) > MAX_NORM_ERROR):
+            raise ValueError(
+                f"{path}:{number}: expected a pose, with a quaternion of length 1 and a position within {MAX_VALUE:g}, "
+                f"got {line[:80]!r}"
+            )
         if fields:
             rows.append(values)
     rows = np.array(rows, np.float64).reshape(-1, 8)

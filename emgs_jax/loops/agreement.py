@@ -6,6 +6,7 @@ the rooms, it is wrong as a whole, also between keyframes that see nothing of th
 left: that the camera cannot have come back, as far as that is known.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from scipy.stats import chi2, norm
 
 from emgs_jax.loops.two_views import gap_between, rescaled
 from emgs_jax.loops.verification import LoopMeasurement
+from emgs_jax.ops.ranges import number
 
 
 @dataclass(frozen=True)
@@ -30,12 +32,12 @@ class AgreementConfig:
         max_contradicted: queries of contradicted loops, among all that agree one after the other.
     """
 
-    max_query_gap: int
-    max_candidate_gap: int
-    max_distance: float
-    max_turn_deg: float
-    min_others: int
-    max_contradicted: int
+    max_query_gap: int = number(low=0)
+    max_candidate_gap: int = number(low=0)
+    max_distance: float = number(low=0, high=math.inf)
+    max_turn_deg: float = number(low=0, high=math.inf)
+    min_others: int = number(low=0)
+    max_contradicted: int = number(low=0)
 
 
 def is_consistent(innovation: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], num_std: float) -> bool:

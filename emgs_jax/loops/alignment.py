@@ -1,5 +1,6 @@
 """Where one keyframe's camera is from another's, if they show the same: gates that ask these two, cheap ones first."""
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -20,6 +21,7 @@ from emgs_jax.loops.two_views import (
     refine,
     rescaled,
 )
+from emgs_jax.ops.ranges import number
 
 MIN_POSE = 6  # points that a pose needs
 
@@ -62,19 +64,19 @@ class AlignmentConfig:
         refine: the final pose.
     """
 
-    max_ratio: float
-    max_epipolar_error: float
-    min_matches: int
-    min_match_share: float
-    max_reprojection_error: float
-    min_pose_points: int
-    max_pose_gap: float
-    max_pose_turn_deg: float
-    min_hull: float
-    min_flatness: float
-    min_extent: float
-    max_depth_scatter: float
-    scale_std: float
+    max_ratio: float = number(low=0, high=1)
+    max_epipolar_error: float = number(low=0, high=1000)
+    min_matches: int = number(low=1)
+    min_match_share: float = number(low=0, high=1)
+    max_reprojection_error: float = number(low=0, high=1000)
+    min_pose_points: int = number(low=1)
+    max_pose_gap: float = number(low=0, high=math.inf)
+    max_pose_turn_deg: float = number(low=0, high=math.inf)
+    min_hull: float = number(low=0, high=1)
+    min_flatness: float = number(low=0, high=1)
+    min_extent: float = number(low=0)
+    max_depth_scatter: float = number(low=0, high=math.inf)
+    scale_std: float = number(low=0, high=math.inf)
     refine: RefineConfig
 
     def __post_init__(self) -> None:

@@ -5,6 +5,7 @@ own descriptors. How alike two images of one place are depends on the scene, so 
 keyframes just before the query, never with an absolute number.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int, UInt8
 
 from emgs_jax.keypoints import sift
+from emgs_jax.ops.ranges import number
 
 # A unit descriptor's entries as bytes; few exceed a half, and SIFT itself clips its own at .2.
 BYTES_PER_UNIT = 512.0
@@ -39,19 +41,19 @@ class AppearanceConfig:
         quantile: of these similarities, which a candidate must reach.
     """
 
-    num_features: int
-    min_contrast: float
-    max_depth_step: float
-    grid: tuple[int, int]
-    num_words: int
-    max_training: int
-    num_iterations: int
-    seed: int
-    min_gap: int
-    suppressed_gap: int
-    num_candidates: int
-    num_neighbours: int
-    quantile: float
+    num_features: int = number(low=1)
+    min_contrast: float = number(low=0, high=1)
+    max_depth_step: float = number(low=0, high=math.inf)
+    grid: tuple[int, int] = number(low=1, high=4096)
+    num_words: int = number(low=1, high=65536)
+    max_training: int = number(low=1, high=1e8)
+    num_iterations: int = number(low=0, high=1000)
+    seed: int = number(low=0, high=2**31)
+    min_gap: int = number(low=0)
+    suppressed_gap: int = number(low=0)
+    num_candidates: int = number(low=1, high=1000)
+    num_neighbours: int = number(low=1, high=1000)
+    quantile: float = number(low=0, high=1)
 
     def __post_init__(self) -> None:
         if not 0 <= self.quantile <= 1:

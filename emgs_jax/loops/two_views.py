@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.ops.ranges import number
+
 MAD_TO_STD = 1.4826  # of a normal distribution
 HUBER = 1.345  # standard deviations: 95 % efficient where all is normal
 
@@ -27,12 +29,12 @@ class RefineConfig:
             units of a, degrees, and of the log-ratio.
     """
 
-    min_pixel_std: float
-    min_depth_std: float
-    correlation: float
-    floor_translation: float
-    floor_rotation_deg: float
-    floor_log_ratio: float
+    min_pixel_std: float = number(low=1e-6, high=1000)
+    min_depth_std: float = number(low=1e-9, high=1000)
+    correlation: float = number(low=0, high=1)
+    floor_translation: float = number(low=0)
+    floor_rotation_deg: float = number(low=0)
+    floor_log_ratio: float = number(low=0)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ What passes all gates may still be wrong: by appearance two rooms that are furni
 them apart is in `agreement`.
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from emgs_jax.loops.alignment import Aligned, AlignmentConfig, Gate, RefusedErro
 from emgs_jax.loops.appearance import Keyframe
 from emgs_jax.loops.contradiction import contradicted_share
 from emgs_jax.loops.two_views import gap_between, rescaled
+from emgs_jax.ops.ranges import number
 
 
 @dataclass(frozen=True)
@@ -31,12 +33,12 @@ class VerificationConfig:
     """
 
     alignment: AlignmentConfig
-    min_neighbours: int
-    max_neighbour_gap: float
-    max_neighbour_distance: float
-    max_neighbour_turn_deg: float
-    max_contradicted: float
-    contradiction_margin: float
+    min_neighbours: int = number(low=0, high=1000)
+    max_neighbour_gap: float = number(low=0, high=math.inf)
+    max_neighbour_distance: float = number(low=0, high=math.inf)
+    max_neighbour_turn_deg: float = number(low=0, high=math.inf)
+    max_contradicted: float = number(low=0, high=1)
+    contradiction_margin: float = number(low=0)
 
 
 @dataclass(frozen=True)

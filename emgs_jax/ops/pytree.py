@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree, Shaped
 
+from emgs_jax.ops.ranges import ranged
+
 Tree = TypeVar("Tree")
 
 
@@ -16,9 +18,9 @@ def _as_float32(value: Any) -> Any:
     return value if isinstance(value, jax.ShapeDtypeStruct) else jnp.asarray(value, jnp.float32)
 
 
-def traced() -> Any:
-    """A config field that is a number of the computation: changing it compiles nothing."""
-    return eqx.field(converter=_as_float32)
+def traced(low: float | int | None = None, high: float | int | None = None) -> Any:
+    """A config field that is a number of the computation: changing it compiles nothing. `ops.ranges` has its ends."""
+    return eqx.field(converter=_as_float32, metadata=ranged(low, high))
 
 
 def choice(*names: str) -> Any:
@@ -34,9 +36,9 @@ def choice(*names: str) -> Any:
     return eqx.field(converter=convert, metadata={"choices": names})
 
 
-def static() -> Any:
+def static(low: float | int | None = None, high: float | int | None = None) -> Any:
     """A config field that is a shape, a loop bound or a choice of code: each value compiles once."""
-    return eqx.field(static=True)
+    return eqx.field(static=True, metadata=ranged(low, high))
 
 
 def take_rows(tree: Tree, rows: Int[Array, "r"]) -> Tree:

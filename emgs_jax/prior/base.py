@@ -93,8 +93,8 @@ def windows(num_frames: int, window_size: int) -> Iterator[Window]:
     A step sees the anchor, the `window_size` images before the current one, the current one and, except at the end
     of the sequence, the next; an image is never listed twice.
     """
-    if window_size < 1:
-        raise ValueError(f"window_size must be at least 1 image, got {window_size}")
+    if not isinstance(window_size, int) or window_size < 1:
+        raise ValueError(f"slam.window_size must be a whole number of images, 1 or more, got {window_size}")
     first = tuple(range(min(window_size, num_frames)))
     if first:
         yield Window(0, first, first, first[-1])

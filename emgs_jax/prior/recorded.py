@@ -18,7 +18,6 @@ run leaves a valid folder, which `record` completes.
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -26,19 +25,20 @@ from pathlib import Path
 import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
-from emgs_jax.io.files import atomic_write
+from emgs_jax.io.files import atomic_write, remove_temporaries
+from emgs_jax.io.npz import read_npz
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows, with_frames
+from emgs_jax.prior.recorded_checks import (
+    FIELDS,
+    REMEDY,
+    check_arrays,
+    check_manifest,
+    check_numbers,
+    check_text,
+)
 
 FORMAT, VERSION = "emgs_jax.predictions", 2
 READABLE = (1, 2)
-REMEDY = "record it again with `python -m experiments.predict`"
-FIELDS = {  # array -> dtype and the axes that it has; d, v, h, w, i, j, c have one length each, y, x, f are free
-    "T_anchor_view": (np.float64, "vij"),
-    "points": (np.float32, "dhwc"),
-    "confidence": (np.float32, "dhw"),
-    "mask": (np.bool_, "dhw"),
-    "features": (np.float16, "dyxf"),
-}
 
 
 def record(
@@ -58,6 +58,7 @@ def record(
     header = _header(prior, dataset, window_size, len(calls))
     files = _resume(folder, header)
     folder.mkdir(parents=True, exist_ok=True)
+    remove_temporaries(folder)
     files["text_features.npz"] = _write(folder / "text_features.npz", _npz({"text_features": prior.text_features}))
     names = [f"{window.inference:06d}.npz" for window in calls]
     missing = {row for row, name in enumerate(names) if _digest_of(folder / name) != files.get(name, "")}
@@ -87,6 +88,7 @@ class Recorded(Prior):
         self.provenance = Provenance(**self._manifest["provenance"])
         self.feature_names = tuple(self._manifest["feature_names"])
         self.text_features = self._load("text_features.npz", ("text_features",))["text_features"]
+        check_text(self.folder / "text_features.npz", self.text_features, self.feature_names)
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Raise ValueError where the recording is not of this data set, calibration and window size."""
@@ -112,9 +114,9 @@ class Recorded(Prior):
         recorded = [arrays[key].tolist() for key in ("inference", "views", "dense", "current")]
         if recorded != [window.inference, list(window.views), list(window.dense), window.current]:
             raise ValueError(f"{self.folder / name} answers another window ({recorded[1]}) than {window}: {REMEDY}")
-        _check_arrays(
-            self.folder / name, arrays, {"v": len(window.views), "d": len(window.dense), "h": shape[0], "w": shape[1]}
-        )
+        sizes = {"v": len(window.views), "d": len(window.dense), "h": shape[0], "w": shape[1]}
+        check_arrays(self.folder / name, arrays, sizes)
+        check_numbers(self.folder / name, arrays)
         return PriorPrediction(window, *(arrays[key] for key in FIELDS))
 
     def _load(self, name: str, keys: Sequence[str]) -> dict[str, np.ndarray]:
@@ -126,22 +128,9 @@ class Recorded(Prior):
         if hashlib.sha256(content).hexdigest() != self._manifest["files"].get(name):
             raise ValueError(f"{path} is damaged (its SHA-256 is not the manifest's): delete it and {REMEDY}")
         try:
-            with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-                return {key: arrays[key] for key in keys}
-        except (KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            return read_npz(content, keys)
+        except ValueError as error:
             raise ValueError(f"{path} is no file of this format ({error}): {REMEDY}") from error
-
-
-def _check_arrays(path: Path, arrays: dict[str, np.ndarray], sizes: dict[str, int]) -> None:
-    """Raise ValueError where an array has not the dtype and shape of the format."""
-    sizes = sizes | {"i": 4, "j": 4, "c": 3}
-    for key, (dtype, axes) in FIELDS.items():
-        got = arrays[key]
-        expected = tuple(sizes.get(axis, got.shape[k] if k < got.ndim else 0) for k, axis in enumerate(axes))
-        if got.dtype != dtype or got.shape != expected:
-            raise ValueError(
-                f"{path}: {key} must be {np.dtype(dtype)} {expected}, got {got.dtype} {got.shape}: {REMEDY}"
-            )
 
 
 def _described(dataset: Dataset) -> dict:
@@ -199,6 +188,7 @@ def _read_manifest(folder: Path) -> dict:
         raise ValueError(f"{path} has version {manifest.get('version')}, this program reads {READABLE}: {REMEDY}")
     if manifest.pop("sha256", None) != _digest(manifest):
         raise ValueError(f"{path} is damaged (its SHA-256 does not fit): delete the folder and {REMEDY}")
+    check_manifest(path, manifest)
     return manifest
 
 

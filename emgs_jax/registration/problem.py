@@ -1,5 +1,6 @@
 """What ICP minimises: the distances of points from Gaussians, in standard deviations, and the prior of the pose."""
 
+import math
 from typing import TypeAlias
 
 import equinox as eqx
@@ -46,19 +47,19 @@ class IcpConfig(eqx.Module):
     """
 
     residual: Float[Array, "*b"] = choice(*RESIDUALS)
-    color_std: Float[Array, "*b"] = traced()
-    noise: Float[Array, "*b"] = traced()
-    max_misfit: Float[Array, "*b"] = traced()
-    max_mahalanobis_sq: Float[Array, "*b"] = traced()
-    min_normal_cos: Float[Array, "*b"] = traced()
-    prior_information: Float[Array, "*b"] = traced()
-    scale_noise: Float[Array, "*b"] = traced()
-    num_points: int = static()
-    num_searches: int = static()
-    num_neighbours: int = static()
-    num_color_neighbours: int = static()
-    max_steps: int = static()
-    tolerance: float = static()
+    color_std: Float[Array, "*b"] = traced(low=0.0001)
+    noise: Float[Array, "*b"] = traced(low=0)
+    max_misfit: Float[Array, "*b"] = traced(low=0)
+    max_mahalanobis_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
+    prior_information: Float[Array, "*b"] = traced(low=0, high=1e9)
+    scale_noise: Float[Array, "*b"] = traced(low=0, high=1000)
+    num_points: int = static(low=1, high=2**24)
+    num_searches: int = static(low=1, high=100)
+    num_neighbours: int = static(low=1, high=256)
+    num_color_neighbours: int = static(low=1, high=256)
+    max_steps: int = static(low=0, high=1000)
+    tolerance: float = static(low=0, high=1)
 
 
 class Uncertainty(eqx.Module):

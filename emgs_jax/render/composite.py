@@ -36,14 +36,14 @@ class RenderConfig(eqx.Module):
         min_alpha: a pixel with less coverage has no depth.
     """
 
-    tile_size: int = static()
-    tile_capacity: int = static()
-    tile_batch: int = static()
-    opacity: Float[Array, "*b"] = traced()
-    covariance_scale: Float[Array, "*b"] = traced()
-    blur: Float[Array, "*b"] = traced()
-    radius: Float[Array, "*b"] = traced()
-    min_alpha: Float[Array, "*b"] = traced()
+    tile_size: int = static(low=1, high=1024)
+    tile_capacity: int = static(low=1, high=2**20)
+    tile_batch: int = static(low=1, high=2**20)
+    opacity: Float[Array, "*b"] = traced(low=0, high=1)
+    covariance_scale: Float[Array, "*b"] = traced(low=1e-6)
+    blur: Float[Array, "*b"] = traced(low=0)
+    radius: Float[Array, "*b"] = traced(low=0)
+    min_alpha: Float[Array, "*b"] = traced(low=0, high=1)
 
 
 class Rendering(eqx.Module):

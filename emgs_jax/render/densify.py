@@ -33,8 +33,8 @@ class DensifyConfig(eqx.Module):
         render: how the front is found.
     """
 
-    surface_depth: Float[Array, "*b"] = traced()
-    min_alpha: Float[Array, "*b"] = traced()
+    surface_depth: Float[Array, "*b"] = traced(low=0)
+    min_alpha: Float[Array, "*b"] = traced(low=0, high=1)
     render: RenderConfig
 
 

@@ -1,6 +1,7 @@
 """Where results lie: OUT/data set/sequence/variant/seed/metrics.json, and what may be read back from there."""
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,8 +46,16 @@ class Estimate:
 
 
 def result_folder(out: Path, dataset: str, sequence: str, variant: str, seed: int) -> Path:
-    """Folder of one result; each part is one level."""
-    return out / dataset / str(sequence).replace("/", "_") / variant / str(seed)
+    """Folder of one result; each part is one level.
+
+    Raises:
+        ValueError: a part is no name of one level, so that the folder would be elsewhere.
+    """
+    parts = {"dataset": dataset, "sequence": str(sequence).replace("/", "_"), "variant or method": variant}
+    for what, part in parts.items():
+        if not re.fullmatch(r"[^/\\\0]+", part) or part in (".", ".."):
+            raise ValueError(f"{what} must be a name that is one folder below out={out}, got {part!r}: choose another")
+    return out.joinpath(*parts.values(), str(seed))
 
 
 def read_metrics(path: Path) -> dict[str, Any]:

@@ -1,11 +1,13 @@
 """The files of a run: trajectory, map, Gaussians, densified points, mesh and the overview."""
 
+import itertools
 from pathlib import Path
 
 import jax
 import numpy as np
 
 from emgs_jax.gaussian_map import confirmed
+from emgs_jax.io.files import remove_temporaries
 from emgs_jax.io.g2o import save_graph_g2o
 from emgs_jax.io.map_file import save_map_npz
 from emgs_jax.io.mesh import save_mesh_ply
@@ -15,6 +17,28 @@ from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.running.back_end import metric_graph
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.record import MappingRun
+
+# metrics.json first: it is what makes a folder a finished result.
+OUTPUTS = (
+    *("metrics.json", "trajectory.txt", "trajectory_online.txt", "graph.g2o", "frames.jsonl"),
+    *("map.npz", "map.ply", "points.ply", "mesh.ply", "overview.png"),
+)
+
+
+def claim_folder(folder: Path) -> list[str]:
+    """Make a folder that of a new run: outputs of an earlier one go to previous-1, previous-2, …; says what was done.
+
+    So a run that ends early never lies beside the metrics of another one.
+    """
+    notes = [f"removed {folder / name}, which a write that was killed has left" for name in remove_temporaries(folder)]
+    old = [folder / name for name in OUTPUTS if (folder / name).exists()]
+    if old:
+        target = next(path for path in (folder / f"previous-{n}" for n in itertools.count(1)) if not path.exists())
+        target.mkdir()
+        for path in old:
+            path.replace(target / path.name)
+        notes.append(f"{folder} held outputs of an earlier run: they are in {target} now")
+    return notes
 
 
 def save_progress(folder: Path, run: MappingRun) -> None:

@@ -3,6 +3,7 @@
 Nodes are the frames from the first of the map on, in the order of `SlamState.time`.
 """
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -21,6 +22,7 @@ from emgs_jax.loops.agreement import AgreementConfig, agreeing
 from emgs_jax.loops.appearance import AppearanceConfig, Database, describe, extend, propose
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement, Neighbour, VerificationConfig, VerifyInfo, verify
+from emgs_jax.ops.ranges import number
 from emgs_jax.running.convert import to_se3
 from emgs_jax.running.measuring import Edge, Look, NoiseConfig, loop_edge, map_edge, stacked, window_edges
 from emgs_jax.slam import SlamState
@@ -44,14 +46,14 @@ class BackEndConfig:
         solver: of the graph.
     """
 
-    offsets: tuple[int, ...]
+    offsets: tuple[int, ...] = number(low=1, high=1000)
     noise: NoiseConfig
     appearance: AppearanceConfig
     verification: VerificationConfig
     agreement: AgreementConfig
-    every: int
-    max_known: float
-    min_frames: int
+    every: int = number(low=1, high=1000)
+    max_known: float = number(low=0, high=math.inf)
+    min_frames: int = number(low=0)
     solver: GraphConfig
 
 

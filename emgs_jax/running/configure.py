@@ -25,6 +25,7 @@ from tqdm import tqdm
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.featured import Featured, Requeried
+from emgs_jax.running.values import check_values
 
 if TYPE_CHECKING:
     from emgs_jax.evaluation.baselines import BaselineConfig
@@ -70,7 +71,7 @@ def load_config(*overrides: str, name: str = "config") -> RunConfig:
     """
     config = compose(*overrides, name=name)
     try:
-        slam, densify, evaluation = (instantiate(config[part]) for part in ("slam", "densify", "evaluation"))
+        slam, densify, evaluation = (build(config, part) for part in ("slam", "densify", "evaluation"))
         graph = graph_config(config)
     except InstantiationException as error:
         raise ValueError(message_of(error)) from error
@@ -78,9 +79,24 @@ def load_config(*overrides: str, name: str = "config") -> RunConfig:
     return RunConfig(settings=settings, slam=slam, densify=densify, evaluation=evaluation, graph=graph)
 
 
+def build(config: DictConfig, key: str, **more: Any) -> Any:
+    """What the node at `key` describes, made after all of its values are checked.
+
+    Args:
+        config: composed.
+        key: dotted, of a node with `_target_`.
+        more: parameters that the config does not hold.
+
+    Raises:
+        ValueError: a value is not of the kind or in the range that its field declares; the message has its full key.
+    """
+    check_values(config, key)
+    return instantiate(OmegaConf.select(config, key), **more)
+
+
 def graph_config(config: DictConfig) -> "BackEndConfig | None":
     """The back end of a config; None with `graph=none`."""
-    return instantiate(config.graph, _convert_="all") if config.graph else None
+    return build(config, "graph", _convert_="all") if config.graph else None
 
 
 def compose(*overrides: str, name: str = "config") -> DictConfig:
@@ -184,7 +200,7 @@ def near(key: str, known: Sequence[str]) -> str:
 
 def build_dataset(config: DictConfig) -> ReadableFrames:
     """The data set of a config, without unreadable frames where it says so."""
-    dataset = instantiate(config.dataset)
+    dataset = build(config, "dataset")
     if "note" in dataset.calibration:
         tqdm.write(f"intrinsics {dataset.calibration['note']}")
     return ReadableFrames(dataset, config.on_bad_frame, partial(tqdm, desc="checking", unit="frame"))
@@ -193,7 +209,7 @@ def build_dataset(config: DictConfig) -> ReadableFrames:
 def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
     """The prior of a config; raises ValueError where it cannot answer for the data set."""
     known = {"classes": list(dataset.classes)} if "classes" in config.prior else {}
-    prior = attach_features(config.features, dataset, instantiate(config.prior, **known))
+    prior = attach_features(config, dataset, build(config, "prior", **known))
     prior.check(dataset, config.slam.window_size)
     return prior
 
@@ -203,17 +219,18 @@ def baseline_configs(config: DictConfig) -> dict[str, "BaselineConfig"]:
     for name, node in config.baseline.items():
         if not isinstance(node, DictConfig) or "_target_" not in node:
             raise ValueError(f"baseline.{name} is no baseline: choose baseline=voxel, tsdf, all or none")
-    return {str(name): instantiate(node) for name, node in config.baseline.items()}
+    return {str(name): build(config, f"baseline.{name}") for name in config.baseline}
 
 
 def attach_features(config: DictConfig, dataset: ReadableFrames, prior: Prior) -> Prior:
     """The prior with the features of a config; without a feature model its own, compared with the text of a file."""
-    if "_target_" not in config:
-        return prior if config.text is None else Requeried(prior, config.text)
-    classes = config.classes
+    features = config.features
+    if "_target_" not in features:
+        return prior if features.text is None else Requeried(prior, features.text)
+    classes = features.classes
     if classes is None:  # all names of the file, or the data set's
-        classes = dataset.classes if config.text is None else ()
-    return Featured(prior, instantiate(config, classes=list(classes)))
+        classes = dataset.classes if features.text is None else ()
+    return Featured(prior, build(config, "features", classes=list(classes)))
 
 
 def message_of(error: Exception) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from emgs_jax.graph.measurements import LOOP, WINDOW, Edges
 from emgs_jax.loops.verification import LoopMeasurement
+from emgs_jax.ops.ranges import number
 from emgs_jax.running.convert import to_se3
 
 
@@ -24,13 +25,13 @@ class NoiseConfig:
         log_scale: of the ratio of two neighbours' scales.
     """
 
-    pair: float
-    pair_deg: float
-    anchor: float
-    anchor_deg: float
-    map: float
-    map_deg: float
-    log_scale: float
+    pair: float = number(low=1e-9, high=1000)
+    pair_deg: float = number(low=1e-9, high=1000)
+    anchor: float = number(low=1e-9, high=1000)
+    anchor_deg: float = number(low=1e-9, high=1000)
+    map: float = number(low=1e-9, high=1000)
+    map_deg: float = number(low=1e-9, high=1000)
+    log_scale: float = number(low=1e-9, high=1000)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from emgs_jax.gaussian_map import GaussianMap, grow
@@ -19,7 +18,7 @@ from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.prior.base import PriorPrediction
 from emgs_jax.running.clock import Clock
-from emgs_jax.running.configure import build_dataset, build_prior
+from emgs_jax.running.configure import build, build_dataset, build_prior
 from emgs_jax.running.convert import FirstWindow, to_camera, to_first_window, to_prediction
 from emgs_jax.running.growth import start
 from emgs_jax.running.inputs import first_pose, predictions
@@ -53,7 +52,7 @@ def load(config: DictConfig, thin: int | None = None) -> Data:
     """The data of a config; `thin` instead of its `observation.thin`. Raises ValueError where frames are missing."""
     dataset = build_dataset(config)
     prior = build_prior(config, dataset)
-    slam = instantiate(config.slam)
+    slam = build(config, "slam")
     if thin is not None:
         slam = replace(slam, observation=replace(slam.observation, thin=thin))
     calls = list(itertools.islice(predictions(dataset, prior, slam.window_size, Clock()), 2))

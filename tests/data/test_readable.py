@@ -57,3 +57,32 @@ def test_a_sequence_without_any_readable_frame_says_why():
         ReadableFrames(Damaged(*range(5)), "skip")
     with pytest.raises(ValueError, match="on_bad_frame must be error or skip, got 'maybe'"):
         ReadableFrames(SimpleNamespace(), "maybe")
+
+
+class WithTruth(Damaged):
+    """Frames of which some have no true pose, and some a damaged one."""
+
+    has_ground_truth = True
+
+    def __init__(self, lost=(), damaged=()):
+        super().__init__()
+        self.lost, self.damaged = lost, damaged
+
+    def pose(self, index):
+        if index in self.damaged:
+            raise BadFrameError(f"poses.txt, line {index}")
+        return None if index in self.lost else np.eye(4)
+
+    def __getitem__(self, index):
+        self.pose(index)
+        return super().__getitem__(index)
+
+
+def test_all_true_poses_are_read_before_the_first_frame():
+    """A bad line of the trajectory ended a run at the frame that it belongs to, the 47th of 125."""
+    with pytest.raises(BadFrameError, match=r"poses\.txt, line 4"):
+        ReadableFrames(WithTruth(lost=(0, 2), damaged=(4,)))
+    frames = ReadableFrames(WithTruth(lost=(0, 2), damaged=(4,)), "skip")
+    assert [frames.pose(i) is None for i in range(len(frames))] == [True, False, True, False]
+    with pytest.raises(ValueError, match="damaged one: 0 of 5 images have a true pose"):
+        ReadableFrames(WithTruth(lost=range(5)))

@@ -113,10 +113,23 @@ def test_a_rounded_pose_becomes_the_nearest_rotation():
     np.testing.assert_allclose(pose, exact, atol=1e-4)
 
 
-@pytest.mark.parametrize("value", ["inf", "-inf", "nan", "-1.#IND", "1.1", "-1", "1e300", ""])
+@pytest.mark.parametrize("value", ["-1.#IND", "1.1", "-1", "1e300", ""])
 def test_a_pose_that_is_none_names_its_file(value):
     with pytest.raises(BadFrameError, match="frame-7.pose.txt"):
         reading.as_pose(f"{value} 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1", "frame-7.pose.txt")
+
+
+@pytest.mark.parametrize("value", ["inf", "-inf", "nan"])
+def test_a_pose_of_lost_tracking_is_no_truth(value):
+    assert reading.as_pose(f"{value} 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1", "frame-7.pose.txt") is None
+
+
+@pytest.mark.parametrize("value", ["1e4", "-1e6", "1e300"])
+def test_a_position_that_float32_does_not_hold_is_refused_and_never_skipped(value):
+    with pytest.raises(ValueError, match=r"frame-7\.pose\.txt has a position of .* geo-referenced") as caught:
+        reading.as_pose(f"1 0 0 {value}  0 1 0 0  0 0 1 0  0 0 0 1", "frame-7.pose.txt")
+    assert not isinstance(caught.value, BadFrameError), "or on_bad_frame=skip would leave out everything"
+    assert reading.as_pose("1 0 0 -500  0 1 0 0  0 0 1 0  0 0 0 1", "x")[0, 3] == -500
 
 
 def test_the_fingerprint_is_of_names_contents_and_options_not_of_the_place(tmp_path):

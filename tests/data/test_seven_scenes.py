@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 from written_scene import color_image, plane_depth, scene_pose
 
 from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.seven_scenes import SevenScenes, register
+from emgs_jax.prior.simulated.prior import Simulated
 
 REAL = "redkitchen/seq-01"
 T_COLOR_DEPTH = np.array(  # as published with kapture's 7-Scenes; the code's own constant would agree with itself
@@ -80,11 +82,28 @@ def test_png_and_jpg_are_read_and_the_png_wins(seven_scenes_root):
     np.testing.assert_allclose([f.image[..., 0].mean() for f in dataset], [20, 60, 100], atol=1)  # red names the frame
 
 
-def test_lost_tracking_names_the_pose_file(seven_scenes_root):
+@pytest.mark.parametrize("text", ["inf " * 16, None])
+def test_a_frame_whose_tracking_was_lost_or_whose_pose_is_not_there_has_no_truth(seven_scenes_root, text):
     path = seven_scenes_root / "kitchen" / "seq-01" / "frame-000001.pose.txt"
-    path.write_text("inf " * 16)
-    with pytest.raises(BadFrameError, match="frame-000001.pose.txt"):
-        load(seven_scenes_root)[1]
+    path.unlink() if text is None else path.write_text(text)
+    frames = ReadableFrames(load(seven_scenes_root))
+    assert [frames.pose(i) is None for i in range(3)] == [False, True, False]
+    assert frames[1].T_world_camera is None and frames[1].depth.any()
+    with pytest.raises(ValueError, match="needs the true pose of every frame, and 1 of 3 .* is frame 1: choose"):
+        Simulated().check(frames, 3)
+
+
+def test_a_damaged_pose_is_named_before_the_first_frame_and_none_at_all_is_no_truth(seven_scenes_root):
+    folder = seven_scenes_root / "kitchen" / "seq-01"
+    whole = (folder / "frame-000001.pose.txt").read_text()
+    for text in (whole[:30], "7 " + whole[2:], whole.replace(whole.split()[3], "2e5")):
+        (folder / "frame-000001.pose.txt").write_text(text)
+        with pytest.raises(ValueError, match="frame-000001.pose.txt"):
+            ReadableFrames(load(seven_scenes_root))
+    for i in range(3):
+        (folder / f"frame-00000{i}.pose.txt").unlink()
+    with pytest.raises(ValueError, match="0 of 3 images have a true pose"):
+        ReadableFrames(load(seven_scenes_root))
 
 
 def test_missing_depth_and_images_of_another_size_name_the_file(seven_scenes_root):

@@ -126,12 +126,12 @@ def test_a_file_without_usable_points_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.ply does not exist"):
         read_cloud(tmp_path / "none.ply", 12)
     (tmp_path / "text.ply").write_text("no cloud")
-    with pytest.raises(ValueError, match=r"text\.ply has no points"):
+    with pytest.raises(ValueError, match=r"text\.ply is no PLY file"):
         read_cloud(tmp_path / "text.ply", 12)
     import open3d as o3d
 
     points = np.zeros((5, 3))
     points[1:3, 0] = np.nan, np.inf
     o3d.io.write_point_cloud(str(tmp_path / "a.ply"), o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
-    with pytest.raises(ValueError, match=r"a\.ply: 2 of 5 points are not finite"):
+    with pytest.raises(ValueError, match=r"a\.ply: 2 of 5 points are not finite in x, y, z"):
         read_cloud(tmp_path / "a.ply", 12)

@@ -3,12 +3,14 @@
 import errno
 import json
 import os
+import subprocess
+import sys
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from emgs_jax.io.files import FrameLog, atomic_write, jsonable, write_json
+from emgs_jax.io.files import FrameLog, atomic_write, jsonable, remove_temporaries, write_json
 from emgs_jax.io.ply import save_points_ply
 
 
@@ -63,3 +65,19 @@ def test_jsonable_is_strict_json_of_the_same_values():
     expected = {"a": 0.5, "b": [3, None], "c": [1.0, None], "4": ["x", "y"]}
     assert json.loads(json.dumps(jsonable(value), allow_nan=False)) == expected
     assert jsonable(np.bool_(True)) is True
+
+
+def test_what_killed_writes_left_is_removed_and_what_is_being_written_is_not(tmp_path):
+    """A process that is killed has no time to remove its temporary file."""
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    left, running = f".map.{dead.pid}.tmp.npz", f".map.{os.getppid()}.tmp.npz"
+    others = [".map.npz", ".tmp", f".map.{dead.pid}.tmpx", "map.npz"]
+    for name in (left, running, *others):
+        (tmp_path / name).write_text("half")
+    assert remove_temporaries(tmp_path) == [left]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([running, *others])
+    with atomic_write(tmp_path / "map.npz") as handle:
+        handle.write(b"whole")
+        assert remove_temporaries(tmp_path) == []
+    assert (tmp_path / "map.npz").read_bytes() == b"whole"

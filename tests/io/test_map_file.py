@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.io.map_file import load_map_npz, save_map_npz
+from emgs_jax.gaussian_map import empty_map
+from emgs_jax.io.map_file import check_map, load_map, load_map_npz, save_map, save_map_npz
 
 
 class Leaves(eqx.Module):
@@ -103,3 +104,41 @@ def test_foreign_and_newer_maps_are_named_with_the_remedy(tmp_path):
         load_map_npz(tmp_path / "none.npz", Other)
     with pytest.raises(ValueError, match="'gain' is float"):
         save_map_npz(path, Other(1.0))
+
+
+def gaussian_map(num_features=2):
+    """Three Gaussians in a map with room for five."""
+    return eqx.tree_at(lambda m: m.gaussians.valid, empty_map(5, num_features), jnp.arange(5) < 3)
+
+
+def test_a_map_of_gaussians_reloads_and_what_stands_in_rows_that_are_free_does_not_matter(tmp_path):
+    poison = eqx.tree_at(lambda m: m.gaussians.means, gaussian_map(0), jnp.ones((5, 3)).at[4].set(jnp.nan))
+    save_map(tmp_path / "map.npz", poison)
+    assert_same(load_map(tmp_path / "map.npz"), poison)
+
+
+@pytest.mark.parametrize(
+    ("where", "change", "message"),
+    [
+        (lambda m: m.gaussians.means, lambda a: a.at[1, 0].set(jnp.nan), "gaussians.means is not finite"),
+        (lambda m: m.weight, lambda a: a.at[2].set(jnp.inf), "weight is not finite where there is a Gaussian"),
+        (lambda m: m.weight, lambda a: a[:-1], r"weight is float32 \(4,\), expected float32 \(5,\)"),
+        (lambda m: m.gaussians.covs, lambda a: a[:, :2], r"gaussians.covs is float32 \(5, 2, 3\), expected"),
+        (
+            lambda m: m.gaussians.colors,
+            lambda a: a.astype(jnp.int8),
+            r"gaussians.colors is int8 \(5, 3\), ",
+        ),
+        (lambda m: m.num_updates, lambda a: a.astype(jnp.int8), r"num_updates is int8 \(5,\), expected int32"),
+        (lambda m: m.gaussians.valid, lambda a: a.astype(jnp.int32), "is no map: gaussians.valid is int32"),
+        (lambda m: m.gaussians.valid, lambda a: a[None], r"is no map: gaussians.valid is bool \(1, 5\)"),
+    ],
+)
+def test_a_map_with_other_shapes_dtypes_or_numbers_is_refused(tmp_path, where, change, message):
+    """It was loaded as it was, and failed or was wrong somewhere later."""
+    wrong = eqx.tree_at(where, gaussian_map(), replace_fn=change)
+    with pytest.raises(ValueError, match=rf"map\.npz.* {message}.*map again"):
+        check_map("map.npz", wrong)
+    save_map(tmp_path / "map.npz", wrong)
+    with pytest.raises(ValueError, match=r"map\.npz.*map again"):  # here the types of all constructors are checked, too
+        load_map(tmp_path / "map.npz")

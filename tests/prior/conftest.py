@@ -20,6 +20,9 @@ class Room:
     def __len__(self) -> int:
         return self.num_frames
 
+    def pose(self, index: int) -> np.ndarray:
+        return self[index].T_world_camera
+
     def __getitem__(self, index: int) -> Frame:
         width, height = self.size
         labels = np.zeros((height, width), np.int32)

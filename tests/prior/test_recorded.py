@@ -1,6 +1,7 @@
 """The recorded format: replay is the live run, and nothing damaged or foreign passes for it."""
 
 import hashlib
+import io
 import json
 from dataclasses import fields, replace
 
@@ -231,3 +232,102 @@ def test_an_array_of_the_wrong_shape_is_refused_even_with_a_fitting_hash(tmp_pat
     window, frames = calls(room)[0]
     with pytest.raises(ValueError, match=r"confidence must be float32 \(3, 30, 40\), got float32 \(3, 30, 39\)"):
         Recorded(tmp_path).predict(window, frames, room.intrinsics)
+
+
+def forge(folder, name, edit):
+    """Change one file of a recording and make all of its checksums fit again."""
+    content = edit((folder / name).read_bytes())
+    (folder / name).write_bytes(content)
+    forge_manifest(folder, lambda manifest: manifest["files"].update({name: hashlib.sha256(content).hexdigest()}))
+
+
+def forge_manifest(folder, edit):
+    manifest = json.loads((folder / "manifest.json").read_text())
+    del manifest["sha256"]
+    edit(manifest)
+    content = json.dumps(manifest, sort_keys=True, separators=(",", ":")).encode()
+    manifest["sha256"] = hashlib.sha256(content).hexdigest()
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def with_array(name, change, save=np.savez):
+    """An edit of an .npz: `change` of one array."""
+
+    def edit(content):
+        with np.load(io.BytesIO(content)) as arrays:
+            new = {key: arrays[key] for key in arrays}
+        new[name] = change(new[name])
+        buffer = io.BytesIO()
+        save(buffer, **new)
+        return buffer.getvalue()
+
+    return edit
+
+
+def poisoned(array, value):
+    array = array.copy()
+    array.reshape(-1)[-1] = value
+    return array
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("points", lambda a: poisoned(a, np.nan), "points under the mask are not finite"),
+        ("points", lambda a: a * np.float32(1e7), "points under the mask are farther than 1e"),
+        ("confidence", lambda a: poisoned(a, np.nan), "a confidence under the mask is negative or not finite"),
+        ("confidence", lambda a: -a, "a confidence under the mask is negative"),
+        ("features", lambda a: poisoned(a, np.nan), "features are not finite"),
+        ("T_anchor_view", lambda a: 7 * a, "a pose is no rigid motion"),
+        ("T_anchor_view", lambda a: a * np.array([-1, 1, 1, 1.0]), "a pose is no rigid motion"),
+        ("T_anchor_view", lambda a: a + 1e8 * np.eye(4)[[0], :, None] * np.eye(4)[3], "a pose is"),
+        ("T_anchor_view", lambda a: a.astype(np.float32), "T_anchor_view must be float64"),
+        ("mask", lambda a: a.astype(np.uint8), "mask must be bool"),
+    ],
+)
+def test_a_forged_recording_is_refused_even_with_fitting_checksums(folder, room, name, change, message):
+    forge(folder, "000001.npz", with_array(name, change))
+    window, frames = calls(room)[1]
+    with pytest.raises(ValueError, match=rf"000001\.npz: {message}.*experiments\.predict"):
+        Recorded(folder).predict(window, frames, room.intrinsics)
+
+
+def test_a_pose_that_is_not_there_is_no_fault(folder, room):
+    """A prior without a pose for a view says NaN, and the step marks the frame as lost."""
+    edit = with_array("T_anchor_view", lambda a: np.where(np.arange(len(a))[:, None, None] == 1, np.nan, a))
+    forge(folder, "000001.npz", edit)
+    window, frames = calls(room)[1]
+    assert np.isnan(Recorded(folder).predict(window, frames, room.intrinsics).T_anchor_view[1]).all()
+
+
+def test_an_array_that_announces_more_than_there_is_is_refused_before_any_memory_is_taken(folder, room):
+    """A header of 224 GiB ended in a MemoryError."""
+    forge(folder, "000001.npz", lambda content: content.replace(b"(2, 30, 40, 3)", b"(2,9999999,99)"))
+    window, frames = calls(room)[1]
+    with pytest.raises(ValueError, match=r"000001\.npz is no file of this format"):
+        Recorded(folder).predict(window, frames, room.intrinsics)
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda m: m.pop("files"), "files must be there as dict"),
+        (lambda m: m.pop("complete"), "complete must be there as bool"),
+        (lambda m: m.update(window_size="3"), "window_size must be there as int"),
+        (lambda m: m.update(dataset=None), "dataset must be there as dict"),
+        (lambda m: m["dataset"].pop("size"), "size must be there as list"),
+        (lambda m: m["provenance"].pop("is_simulated"), "is_simulated must be there as bool"),
+        (lambda m: m["provenance"].update(more=1), "provenance has more"),
+    ],
+)
+def test_a_manifest_that_lacks_a_key_is_refused_even_with_a_fitting_checksum(folder, edit, message):
+    """It was a KeyError or a TypeError."""
+    forge_manifest(folder, edit)
+    with pytest.raises(ValueError, match=rf"manifest\.json is no manifest: {message}.*experiments\.predict"):
+        Recorded(folder)
+
+
+def test_forged_text_features_are_refused(folder):
+    forge(folder, "text_features.npz", with_array("text_features", lambda a: poisoned(a, np.inf)))
+    with pytest.raises(ValueError, match=r"text_features\.npz must hold a finite vector for each of 2 names"):
+        Recorded(folder)

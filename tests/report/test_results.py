@@ -180,3 +180,13 @@ def test_results_of_another_version_are_refused_with_a_remedy(tmp_path, content,
     (folder / "metrics.json").write_text(content)
     with pytest.raises(ValueError, match=f"metrics.json {message}.*move its folder away or choose another out="):
         read_estimates(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["..", ".", "", "../../..", "a/b", "a\\b", "a\0"])
+def test_a_name_that_leads_out_of_the_folder_of_results_is_refused(tmp_path, name):
+    """`variant=../../..` wrote into the folder above."""
+    with pytest.raises(ValueError, match="variant or method must be a name that is one folder below"):
+        result_folder(tmp_path, "tum", "desk", name, 0)
+    assert result_folder(tmp_path, "tum", "a/b", "x", 0) == tmp_path / "tum" / "a_b" / "x" / "0"
+    with pytest.raises(ValueError, match="sequence must be a name"):
+        result_folder(tmp_path, "tum", "..", "x", 0)

@@ -9,7 +9,7 @@ from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.io.map_file import load_map_npz
 from emgs_jax.io.trajectory import load_trajectory_tum
-from emgs_jax.report.run_files import save_outputs, save_progress
+from emgs_jax.report.run_files import OUTPUTS, claim_folder, save_outputs, save_progress
 from emgs_jax.running.dense import DenseMap
 
 NUM_FRAMES = len(STATUSES)
@@ -115,3 +115,23 @@ def test_the_overview_shows_the_true_path_where_all_of_it_is_known(num_unknown, 
         for name, color in (("estimate", (228, 87, 46)), ("truth", (27, 153, 139)))
     }
     assert share["estimate"] > 1e-4 and (share["truth"] > 1e-4) == (num_unknown == 0)
+
+
+def test_a_new_run_never_lies_beside_the_outputs_of_another(tmp_path):
+    """A second run that ended early left its trajectory beside the metrics of the first."""
+    assert claim_folder(tmp_path) == []
+    for text, target in (("first", "previous-1"), ("second", "previous-2")):
+        for name in (*OUTPUTS, "notes.txt"):
+            (tmp_path / name).write_text(text)
+        (note,) = claim_folder(tmp_path)
+        assert note.endswith(f"they are in {tmp_path / target} now")
+        assert {path.name for path in (tmp_path / target).iterdir()} == set(OUTPUTS)
+        assert {path.read_text() for path in (tmp_path / target).iterdir()} == {text}
+        assert not any((tmp_path / name).exists() for name in OUTPUTS) and (tmp_path / "notes.txt").exists()
+
+
+def test_every_file_that_a_run_writes_is_known_as_an_output(tmp_path):
+    run = finished()
+    save_progress(tmp_path, run)
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    assert {path.name for path in tmp_path.iterdir()} <= set(OUTPUTS)

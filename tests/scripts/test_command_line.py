@@ -67,3 +67,17 @@ def test_the_wrong_word_ends_a_command_with_one_line():
 def run(module: str, *arguments: str) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", module, *arguments]
     return subprocess.run(command, cwd=CONF.parent, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("arguments", [("experiments.run",), ("experiments.cli", "run")])
+def test_an_interrupt_is_one_word_and_no_traceback(arguments):
+    program = "import runpy, sys; sys.argv = sys.argv[1:]; runpy.run_module(sys.argv[0], run_name='__main__')"
+    raising = "import emgs_jax.running.configure as c\ndef f(*_, **__): raise KeyboardInterrupt\nc.compose = f\n"
+    done = subprocess.run(
+        [sys.executable, "-c", raising + program, *arguments],
+        cwd=CONF.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")

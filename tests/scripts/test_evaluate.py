@@ -138,6 +138,20 @@ def test_results_that_the_command_does_not_name_stay_but_never_enter_its_tables(
     assert (evaluate.out / "synthetic/0/default/5" / METRICS_FILE).is_file()
 
 
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("+variants.wide={slam.window_size:2.5}", r"slam\.window_size must be a whole number from 1 to 1000, got 2\.5"),
+        ("seeds=[0,1.5]", r"prior\.seed must be a whole number, got 1\.5"),
+        ("+variants={../..:{}}", "variant or method must be a name"),
+    ],
+)
+def test_a_value_or_name_that_is_refused_ends_the_evaluation_before_it_begins(evaluate, override, message):
+    with pytest.raises(ValueError, match=message):
+        evaluate(override)
+    assert evaluate.runs == [] and not evaluate.out.exists()
+
+
 def test_a_result_of_another_version_ends_the_evaluation_before_it_begins(evaluate):
     evaluate("seeds=[0]")
     path = evaluate.out / "synthetic/1/default/0" / METRICS_FILE

@@ -115,7 +115,9 @@ def test_another_result_is_never_replaced_but_the_same_one_may_be_made_again(tmp
         ("empty trajectory", "no pose is within 0.01 s .* timestamps are none"),
         ("no cloud", "cloud.ply does not exist: give a PLY"),
         ("empty cloud", "cloud.ply has no points"),
-        ("text", "cloud.ply has no points: it is empty or no PLY"),
+        ("text", "cloud.ply is no PLY file"),
+        ("cut", r"cloud.ply has [0-9]+ bytes after its header, which announces [0-9]+ .*: it is truncated"),
+        ("no z", "cloud.ply has no element vertex with the properties x, y and z"),
         ("nan", r"cloud.ply: 1 of [0-9]+ points are not finite"),
     ],
 )
@@ -134,6 +136,24 @@ def test_bad_files_are_named_with_a_remedy_and_leave_no_result(tmp_path, truth, 
         begin = content.index(b"end_header\n") + len(b"end_header\n")
         content[begin : begin + 4] = np.float32("nan").tobytes()
         ply.write_bytes(content)
+    elif damage == "cut":
+        ply.write_bytes(ply.read_bytes()[: -len(ply.read_bytes()) // 3])
+    elif damage == "no z":
+        ply.write_bytes(ply.read_bytes().replace(b"float z\n", b"float w\n"))
     with pytest.raises((ValueError, OSError), match=message):
         scored(*files)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("max_time_difference=nan", "^max_time_difference must be a number from 0 to 1000000, got nan"),
+        ("normal_neighbours=2.5", "^normal_neighbours must be a whole number from 3 to 1000, got 2.5"),
+        ("min_matched_percent=many", "^min_matched_percent must be a number from 0 to 100, got 'many'"),
+        ("evaluation.voxel_m=-1", "^evaluation.voxel_m must be a number"),
+    ],
+)
+def test_a_value_out_of_range_is_named_before_anything_is_read(override, message):
+    with pytest.raises(ValueError, match=message):
+        scored("trajectory=nowhere.txt", override)

@@ -34,11 +34,11 @@ class BundleConfig(eqx.Module):
         tolerance: relative and absolute, of the solver.
     """
 
-    pixel_std: Float[Array, "*b"] = traced()
-    damping: Float[Array, "*b"] = traced()
-    num_point_steps: int = static()
-    max_steps: int = static()
-    tolerance: float = static()
+    pixel_std: Float[Array, "*b"] = traced(low=1e-6, high=1000)
+    damping: Float[Array, "*b"] = traced(low=0, high=1)
+    num_point_steps: int = static(low=0, high=100)
+    max_steps: int = static(low=0, high=1000)
+    tolerance: float = static(low=0, high=1)
 
 
 class Tracks(eqx.Module):

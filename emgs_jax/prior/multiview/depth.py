@@ -1,5 +1,7 @@
 """Dense depth of one view from several others, with holes where the images do not determine it."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,11 +30,11 @@ class DepthConfig(eqx.Module):
 
     sweep: SweepConfig
     semi_global: SemiGlobalConfig
-    max_cost: Float[Array, "*b"] = traced()
-    min_margin: Float[Array, "*b"] = traced()
-    temperature: Float[Array, "*b"] = traced()
-    median_radius: int = static()
-    max_depth_step: Float[Array, "*b"] = traced()
+    max_cost: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    min_margin: Float[Array, "*b"] = traced(low=0)
+    temperature: Float[Array, "*b"] = traced(low=1e-6)
+    median_radius: int = static(low=0, high=32)
+    max_depth_step: Float[Array, "*b"] = traced(low=0, high=math.inf)
 
 
 def _between_planes(total: Float[Array, "h w d"], best: Array) -> Float[Array, "h w"]:

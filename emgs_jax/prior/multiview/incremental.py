@@ -13,6 +13,7 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.bundle_adjustment import BundleConfig, Tracks, Unknowns, adjust
 from emgs_jax.prior.multiview.landmarks import (
     NONE,
@@ -46,11 +47,11 @@ class StructureConfig:
 
     matching: MatchingConfig
     bundle: BundleConfig
-    max_landmarks: int
-    num_fixed: int
-    num_rounds: int
-    distortion_std: float
-    median_depth: float
+    max_landmarks: int = number(low=1)
+    num_fixed: int = number(low=1, high=1000)
+    num_rounds: int = number(low=1, high=100)
+    distortion_std: float = number(low=0, high=1000)
+    median_depth: float = number(low=1e-6)
 
 
 def initialize(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> bool:

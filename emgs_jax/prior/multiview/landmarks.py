@@ -8,6 +8,7 @@ import numpy as np
 
 from emgs_jax.keypoints import sift
 from emgs_jax.keypoints.poses import essential, pose_of, unit_rays
+from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.lens import Lens, straight
 from emgs_jax.prior.multiview.memory import Memory, remember, without
 
@@ -30,15 +31,15 @@ class MatchingConfig:
         max_remembered: landmarks that no view of the window shows any more; the oldest go.
     """
 
-    num_features: int
-    min_contrast: float
-    max_ratio: float
-    max_epipolar_error: float
-    max_reprojection_error: float
-    min_matches: int
-    min_parallax_rad: float
-    min_refound: int
-    max_remembered: int
+    num_features: int = number(low=1)
+    min_contrast: float = number(low=0, high=1)
+    max_ratio: float = number(low=0, high=1)
+    max_epipolar_error: float = number(low=0, high=1000)
+    max_reprojection_error: float = number(low=0, high=1000)
+    min_matches: int = number(low=1)
+    min_parallax_rad: float = number(low=0, high=4)
+    min_refound: int = number(low=0)
+    max_remembered: int = number(low=0, high=1e8)
 
     def __post_init__(self) -> None:
         if self.min_matches < 6:

@@ -28,6 +28,7 @@ import numpy as np
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.keypoints.poses import calibration
 from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.ranges import number
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate_depth
 from emgs_jax.prior.multiview.incremental import StructureConfig, extend, initialize
@@ -53,12 +54,12 @@ class DenseConfig:
     """
 
     depth: DepthConfig
-    num_sources: int
-    best_parallax_rad: float
-    num_checks: int
-    tolerated_spread: float
-    min_support: float
-    depth_margin: float
+    num_sources: int = number(low=1, high=64)
+    best_parallax_rad: float = number(low=1e-6, high=4)
+    num_checks: int = number(low=0, high=64)
+    tolerated_spread: float = number(low=1e-6)
+    min_support: float = number(low=0)
+    depth_margin: float = number(low=1, high=1000)
 
 
 def _values(config: StructureConfig | DenseConfig) -> dict:

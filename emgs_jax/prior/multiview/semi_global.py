@@ -17,9 +17,9 @@ class SemiGlobalConfig(eqx.Module):
         edge: grey value difference, image in [0, 1], that halves the penalty of a larger change.
     """
 
-    small_step: Float[Array, "*b"] = traced()
-    large_step: Float[Array, "*b"] = traced()
-    edge: Float[Array, "*b"] = traced()
+    small_step: Float[Array, "*b"] = traced(low=0)
+    large_step: Float[Array, "*b"] = traced(low=0)
+    edge: Float[Array, "*b"] = traced(low=1e-6)
 
 
 def _advance(path: Array, cost: Array, large_step: Array, config: SemiGlobalConfig) -> Array:

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from emgs_jax.ops.ranges import number
 from emgs_jax.prior.network.resize import Resize, Size, resize_image, resize_intrinsics
 
 View = dict[str, Any]  # of the framework: `img`, `data_norm_type` and what else the network is told
@@ -78,7 +79,7 @@ class ComputeConfig:
     device: str | None
     amp: str
     memory_efficient: bool
-    minibatch_size: int | None
+    minibatch_size: int | None = number(low=1)
 
 
 @dataclass(frozen=True)

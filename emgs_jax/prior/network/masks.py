@@ -4,6 +4,8 @@ A pixel is left out where the network calls it ambiguous, where its confidence i
 edges, and where other views of the window contradict its depth. Every part has a neutral value that turns it off.
 """
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -28,13 +30,13 @@ class MaskConfig(eqx.Module):
         consistent_depth_share: this fraction of the depth.
     """
 
-    drop_ambiguous: Float[Array, "*b"] = traced()
-    confidence_percentile: Float[Array, "*b"] = traced()
-    max_edge_step: Float[Array, "*b"] = traced()
-    max_edge_degrees: Float[Array, "*b"] = traced()
-    min_consistent_share: Float[Array, "*b"] = traced()
-    consistent_depth_m: Float[Array, "*b"] = traced()
-    consistent_depth_share: Float[Array, "*b"] = traced()
+    drop_ambiguous: Float[Array, "*b"] = traced(low=0, high=1)
+    confidence_percentile: Float[Array, "*b"] = traced(low=0, high=100)
+    max_edge_step: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    max_edge_degrees: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    min_consistent_share: Float[Array, "*b"] = traced(low=0, high=1)
+    consistent_depth_m: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    consistent_depth_share: Float[Array, "*b"] = traced(low=0, high=math.inf)
 
 
 def _around(image: Array, fill: float | bool | None) -> list[Array]:

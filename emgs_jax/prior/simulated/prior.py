@@ -45,6 +45,7 @@ from emgs_jax.prior.simulated.noise import (
 )
 
 VERSIONS = (1, 2)
+MAX_LEVEL = 100.0  # depths are then off by a factor of twenty; far beyond, nothing is finite
 
 
 @dataclass(frozen=True)
@@ -101,10 +102,13 @@ class Simulated(Prior):
             raise ValueError(
                 f"prior.version must be 1 (no drift) or 2 (drifts beyond the anchor's view), got {version}"
             )
-        if not (math.isfinite(level) and level >= 0):
-            raise ValueError(f"prior.level must be finite and at least 0 (0 is an exact prior), got {level}")
-        if seed < 0 or feature_size < 1:
-            raise ValueError(f"prior.seed must be ≥ 0 and prior.feature_size ≥ 1, got {seed} and {feature_size}")
+        if not 0 <= level <= MAX_LEVEL:
+            raise ValueError(f"prior.level must be from 0 (an exact prior) to {MAX_LEVEL:g}, got {level}")
+        if not isinstance(seed, int) or not isinstance(feature_size, int) or seed < 0 or feature_size < 1:
+            raise ValueError(
+                "prior.seed and prior.feature_size must be whole numbers, from 0 and from 1, got "
+                f"{seed} and {feature_size}"
+            )
         self.level, self.seed, self.version, self.standard = float(level), int(seed), int(version), Standard()
         self.feature_names = tuple(classes)
         self.text_features = random_embeddings(self.feature_names, feature_size)
@@ -117,6 +121,13 @@ class Simulated(Prior):
         """Raise ValueError, before any work is done, where the data set has no truth to disturb."""
         if not dataset.has_ground_truth:
             raise ValueError(_no_truth(f"{dataset.name} {dataset.sequence} has none"))
+        missing = [index for index in range(len(dataset)) if dataset.pose(index) is None]
+        if missing:
+            raise ValueError(
+                f"prior=simulated needs the true pose of every frame, and {len(missing)} of {len(dataset)} of "
+                f"{dataset.name} {dataset.sequence} have none, the first is frame {missing[0]}: choose others "
+                "(dataset.start, stop, stride), or another prior"
+            )
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Disturb the truth of `frames` (in the order of `window.views`); see the module for how."""
@@ -270,4 +281,10 @@ def check_frames(window: Window, frames: Sequence[Frame], needed: Collection[int
             raise ValueError(
                 f"the depth of {label} must have its image's size {frame.image.shape[:2]}, got {depth.shape}"
             )
+    if window.inference == 0 and not any((frame.depth > 0).any() for frame in frames if frame.index in needed):
+        raise ValueError(
+            _no_truth(
+                f"0 of the first {len(needed)} images, from {frames[0].name} on, have a true depth: it is 0 everywhere"
+            )
+        )
     return dict(zip(indices, frames, strict=True))

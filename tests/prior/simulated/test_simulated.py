@@ -225,3 +225,28 @@ def test_a_data_set_without_ground_truth_is_refused_before_any_work(room):
     room.has_ground_truth = False
     with pytest.raises(ValueError, match="prior=simulated needs a data set with ground truth; use prior=recorded or"):
         Simulated().check(room, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"level": 1e9}, r"prior\.level must be from 0 .* to 100, got 1000000000\.0"),
+        ({"level": float("nan")}, r"prior\.level must be from 0"),
+        ({"seed": 1.5}, r"prior\.seed and prior\.feature_size must be whole numbers.*got 1\.5"),
+        ({"feature_size": 0}, r"prior\.feature_size must be whole numbers.*and 0"),
+    ],
+)
+def test_a_level_or_seed_that_makes_no_sense_is_refused(options, message):
+    """A level of 1e9 gave depths that are not finite, and a seed of 1.5 was taken for 1."""
+    with pytest.raises(ValueError, match=message):
+        Simulated(**options)
+
+
+def test_a_truth_without_any_depth_is_named_and_not_the_prior(room):
+    """All of it was 0, and the error asked for another prior."""
+    frames = [replace(room[i], depth=np.zeros_like(room[i].depth)) for i in range(3)]
+    window = next(windows(3, 3))
+    with pytest.raises(ValueError, match=r"0 of the first 3 images, from 0\.png on, have a true depth: it is 0 every"):
+        Simulated().predict(window, frames, room.intrinsics)
+    frames[1] = room[1]
+    assert Simulated().predict(window, frames, room.intrinsics).mask.any(axis=(1, 2)).tolist() == [False, True, False]

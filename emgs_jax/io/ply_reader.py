@@ -1,0 +1,118 @@
+"""Reading PLY: what the header says must be in the file, or nothing of it is read."""
+
+import math
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+REMEDY = "write the file again"
+_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+_TYPES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"}
+_TYPES |= {"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
+_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_MAX_HEADER_BYTES = 1 << 20
+
+
+class Element(NamedTuple):
+    """What stands `count` times in the body: its properties by name, a type or None for a list."""
+
+    name: str
+    count: int
+    properties: dict[str, str | None]
+
+
+def read_vertices(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """The properties of the vertices of a PLY, each (n,) in the type that the header says; x, y and z are there.
+
+    Raises:
+        ValueError: the file is no PLY, is shorter or longer than its header says, or has no x, y and z.
+    """
+    content = Path(path).read_bytes()
+    order, elements, start = _header(content, path)
+    before = [element.name for element in elements].index("vertex") if _has_vertices(elements) else None
+    if before is None:
+        raise ValueError(f"{path} has no element vertex with the properties x, y and z: it holds no points; {REMEDY}")
+    vertex, body = elements[before], memoryview(content)[start:]
+    if None in [kind for element in elements[: before + 1] for kind in element.properties.values()]:
+        raise ValueError(f"{path} has a list among or before its vertices, which is not read: {REMEDY} without it")
+    if order == "":
+        return _read_text(bytes(body), elements, before, path)
+    _check_size(len(body), elements, path)
+    skipped = sum(element.count * _row_type(element, order).itemsize for element in elements[:before])
+    rows = np.frombuffer(body, _row_type(vertex, order), vertex.count, skipped)
+    return {name: rows[name].astype(rows.dtype[name].newbyteorder("=")) for name in vertex.properties}
+
+
+def _header(content: bytes, path: object) -> tuple[str, list[Element], int]:
+    """Byte order ("" is text), elements, and where the body starts."""
+    if not content.startswith((b"ply\n", b"ply\r")):
+        raise ValueError(f"{path} is no PLY file (it does not begin with the word ply): give a PLY file")
+    end = content.find(b"end_header", 0, _MAX_HEADER_BYTES)
+    start = content.find(b"\n", end) + 1
+    if end < 0 or start == 0:
+        raise ValueError(f"{path} has no end_header: it is truncated, {REMEDY}")
+    order, elements = None, []
+    for number, line in enumerate(content[:end].decode("ascii", "replace").splitlines()[1:], start=2):
+        match line.split():
+            case ["comment" | "obj_info", *_] | []:
+                continue
+            case ["format", name, "1.0"] if name in _BYTE_ORDERS:
+                order = _BYTE_ORDERS[name]
+            case ["element", name, count] if count.isdecimal():
+                elements.append(Element(name, int(count), {}))
+            case ["property", "list", length, kind, name] if elements and {length, kind} <= _TYPES.keys():
+                elements[-1].properties[name] = None
+            case ["property", kind, name] if elements and kind in _TYPES and name not in elements[-1].properties:
+                elements[-1].properties[name] = _TYPES[kind]
+            case _:
+                raise ValueError(f"{path}, line {number}: {line[:80]!r} is no line of a PLY header: {REMEDY}")
+    if order is None:
+        raise ValueError(f"{path} does not say its format (ascii, binary_little_endian or _big_endian): {REMEDY}")
+    return order, elements, start
+
+
+def _has_vertices(elements: list[Element]) -> bool:
+    return any(element.name == "vertex" and {"x", "y", "z"} <= element.properties.keys() for element in elements)
+
+
+def _row_type(element: Element, order: str) -> np.dtype:
+    """One row of an element without lists."""
+    return np.dtype([(name, order + str(kind)) for name, kind in element.properties.items()])
+
+
+def _check_size(num_bytes: int, elements: list[Element], path: object) -> None:
+    """ValueError where a binary body is not as long as its header says; a list takes one byte or more."""
+    is_open = any(None in element.properties.values() for element in elements)
+    sizes = [sum(np.dtype(kind or "u1").itemsize for kind in element.properties.values()) for element in elements]
+    expected = sum(size * element.count for size, element in zip(sizes, elements, strict=True))
+    if num_bytes < expected or (num_bytes > expected and not is_open):
+        counts = ", ".join(f"{element.count} × {element.name}" for element in elements)
+        raise ValueError(
+            f"{path} has {num_bytes} bytes after its header, which announces {expected} ({counts}): it is "
+            f"{'truncated' if num_bytes < expected else 'another file’s header'}, {REMEDY}"
+        )
+
+
+def _read_text(body: bytes, elements: list[Element], before: int, path: object) -> dict[str, np.ndarray]:
+    """The vertices of a file in ascii: one line for each row of each element."""
+    lines = [line for line in body.decode("ascii", "replace").splitlines() if line.strip()]
+    expected = sum(element.count for element in elements)
+    if len(lines) != expected:
+        raise ValueError(f"{path} has {len(lines)} rows after its header, which announces {expected}: {REMEDY}")
+    vertex, first = elements[before], sum(element.count for element in elements[:before])
+    columns: list[list[float]] = []
+    for row in range(vertex.count):
+        words = lines[first + row].split()
+        try:
+            columns.append([float(word) for word in words])
+        except ValueError:
+            columns.append([math.nan] * (1 + len(vertex.properties)))
+        if len(columns[-1]) != len(vertex.properties):
+            raise ValueError(
+                f"{path}, vertex {row} (from 0): expected {len(vertex.properties)} numbers, got "
+                f"{lines[first + row][:80]!r}: {REMEDY}"
+            )
+    table = np.array(columns, np.float64).reshape(vertex.count, len(vertex.properties))
+    return {name: table[:, i].astype(kind) for i, (name, kind) in enumerate(vertex.properties.items())}

@@ -1,0 +1,26 @@
+"""What values a config field may have, declared with the field. Needs no JAX: recording a prior does not, either."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+LARGE = 1e6  # what a field without a bound of its own may reach
+
+
+class Range(NamedTuple):
+    """Both ends are allowed; an infinite end says that infinity is."""
+
+    low: float | int
+    high: float | int
+
+
+def ranged(low: float | int | None, high: float | int | None) -> Mapping[str, Any]:
+    """Metadata of a field: its range where one of the ends is given."""
+    if low is None and high is None:
+        return {}
+    return {"range": Range(-LARGE if low is None else low, LARGE if high is None else high)}
+
+
+def number(low: float | int | None = None, high: float | int | None = None) -> Any:
+    """A field of a plain dataclass that is one number, or several, from `low` to `high`."""
+    return dataclasses.field(metadata=ranged(low, high))

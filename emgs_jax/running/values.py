@@ -1,0 +1,152 @@
+"""The values of a config before anything is made of them: each is of the kind and in the range that its field declares.
+
+A field declares its range where it stands (`ops.ranges`, `traced`, `static`, `choice`); what kind it is its annotation
+says, as for the parameters of a class that is no dataclass.
+"""
+
+import dataclasses
+import inspect
+import math
+import numbers
+import re
+import types
+import typing
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from hydra.utils import get_class
+from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
+
+from emgs_jax.ops.ranges import Range
+
+_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Declared:
+    """What a field says of its values: plain kinds, the kinds of a list's elements, the ends, the names."""
+
+    kinds: frozenset[type]
+    elements: frozenset[type] = frozenset()
+    range: Range | None = None
+    choices: tuple[str, ...] = ()
+
+
+def check_values(config: DictConfig, key: str) -> None:
+    """Raise ValueError with the full key where a value at or below a node with `_target_` is not what is declared."""
+    node = OmegaConf.select(config, key)
+    if not isinstance(node, DictConfig):
+        return
+    fields = declared(get_class(node["_target_"])) if "_target_" in node else {}
+    for name in node:
+        own = _origin(config, f"{key}.{name}")
+        value = OmegaConf.select(config, own, default=MISSING)  # also where a value has yet to be given
+        if isinstance(value, DictConfig):
+            check_values(config, own)
+        elif name in fields and value != MISSING:
+            check_value(own, value, fields[name])
+
+
+def _origin(config: DictConfig, key: str) -> str:
+    """The key where a value stands that is only referred to, which is the one to change."""
+    while True:
+        parent, _, name = key.rpartition(".")
+        node = OmegaConf.select(config, parent) if parent else config
+        if not OmegaConf.is_interpolation(node, name):
+            return key
+        found = re.fullmatch(r"\$\{(\w[\w.]*)\}", str(OmegaConf.to_container(node, resolve=False)[name]))
+        if found is None:
+            return key
+        key = found[1]
+
+
+def check_value(key: str, value: Any, field: Declared) -> None:
+    """Raise ValueError where the value of `key` is not what its field declares."""
+    if field.choices:
+        if value not in field.choices:
+            raise ValueError(f"{key} must be one of {', '.join(field.choices)}; got {_shown(value)}")
+        return
+    if not field.kinds and not field.elements:
+        return
+    is_list = isinstance(value, ListConfig | list | tuple) and bool(field.elements)
+    items, kinds = (value, field.elements) if is_list else ([value], field.kinds)
+    if not all(_fits(item, kinds, field.range) for item in items):
+        raise ValueError(
+            f"{key} must be {_expected(field)}, got {_shown(value)}{_advice(value)}: "
+            "give such a value, or none for the one of conf/"
+        )
+
+
+def _fits(value: Any, kinds: frozenset[type], ends: Range | None) -> bool:
+    if value is None or isinstance(value, bool | str):
+        return type(value) in kinds
+    if not isinstance(value, numbers.Real) or not kinds & {int, float}:
+        return False
+    if float not in kinds and not isinstance(value, numbers.Integral):
+        return False
+    return math.isfinite(value) if ends is None else ends.low <= value <= ends.high  # nan is in no range
+
+
+def _expected(field: Declared) -> str:
+    """Words for what would be right."""
+    ends = "" if field.range is None else f" from {_end(field.range.low)} to {_end(field.range.high)}"
+    kinds = field.kinds - {int} if float in field.kinds else field.kinds
+    words = [name + ends * (kind in (int, float)) for kind, name in _NAMES.items() if kind in kinds]
+    if field.elements:
+        words.append(f"a list […, …] of {'' if float in field.elements else 'whole '}numbers{ends}")
+    return " or ".join(words + ["null"] * (type(None) in kinds))
+
+
+def _end(value: float) -> str:
+    return f"{value:.0f}" if abs(value) < 1e12 and value == round(value) else f"{value:g}"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, ListConfig):
+        value = OmegaConf.to_container(value)
+    return "null" if value is None else repr(value)
+
+
+def _advice(value: Any) -> str:
+    """Infinity is .inf in YAML and inf on the command line, where .inf is text."""
+    is_spelled = isinstance(value, str) and value.lower().lstrip("+-") == ".inf"
+    return ", which is text (on the command line infinity is written inf)" if is_spelled else ""
+
+
+def declared(cls: type) -> dict[str, Declared]:
+    """What the fields of a dataclass, or the parameters of another class, declare, by name."""
+    return dict(_declarations(cls))
+
+
+def _declarations(cls: type) -> Iterator[tuple[str, Declared]]:
+    if dataclasses.is_dataclass(cls):
+        for field in dataclasses.fields(cls):
+            hint, about = field.type, field.metadata
+            if "choices" in about:
+                yield field.name, Declared(frozenset({str}), choices=about["choices"])
+            elif "range" in about:
+                kinds, elements = _kinds(hint)
+                known = kinds or elements  # a traced field is annotated as the array that it becomes
+                yield field.name, Declared(kinds if known else frozenset({float}), elements, about["range"])
+            else:
+                yield field.name, Declared(*_kinds(hint))
+        return
+    for name, parameter in inspect.signature(cls).parameters.items():
+        yield name, Declared(*_kinds(parameter.annotation))
+
+
+def _kinds(hint: Any) -> tuple[frozenset[type], frozenset[type]]:
+    """Plain kinds that a hint allows, and those of a list's elements; none where it allows anything else."""
+    plain, elements = set(), set()
+    for part in typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,):
+        origin, arguments = typing.get_origin(part), typing.get_args(part)
+        if part in _NAMES or part is type(None):
+            plain.add(part)
+        elif origin in (tuple, list, Sequence) and arguments:
+            found = [_kinds(argument) for argument in arguments if argument is not ...]
+            if any(inner or not kinds <= {int, float} or not kinds for kinds, inner in found):
+                return frozenset(), frozenset()
+            elements |= set().union(*(kinds for kinds, _ in found))
+        else:
+            return frozenset(), frozenset()
+    return frozenset(plain), frozenset(elements)

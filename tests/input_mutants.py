@@ -1,0 +1,165 @@
+"""Plausible bugs of what stands between a run and its inputs: files of others, values of the config."""
+
+from mutant import Mutant
+
+PLY_READER = ("tests/io/test_ply_reader.py",)
+FILES = ("tests/io/test_files.py",)
+RUN_FILES = ("tests/report/test_run_files.py",)
+RESULTS = ("tests/report/test_results.py",)
+NPZ = ("tests/io/test_npz.py",)
+MAP_FILE = ("tests/io/test_map_file.py",)
+RECORDED = ("tests/prior/test_recorded.py",)
+READABLE = ("tests/data/test_readable.py",)
+READING = ("tests/data/test_reading.py",)
+TUM = ("tests/data/test_tum.py",)
+VALUES = ("tests/running/test_values.py",)
+
+MUTANTS = (
+    Mutant(
+        "emgs_jax/io/ply_reader.py",
+        "if num_bytes < expected or (num_bytes > expected and not is_open):",
+        "if num_bytes > expected and not is_open:",
+        PLY_READER,
+        "a truncated cloud is read",
+    ),
+    Mutant(
+        "emgs_jax/io/ply_reader.py",
+        "if len(lines) != expected:",
+        "if len(lines) > expected:",
+        PLY_READER,
+        "a truncated text is read",
+    ),
+    Mutant(
+        "emgs_jax/io/ply_reader.py",
+        '{"x", "y", "z"} <= element.properties.keys()',
+        '{"x", "y"} <= element.properties.keys()',
+        PLY_READER,
+        "a cloud without heights passes the header",
+    ),
+    Mutant(
+        "emgs_jax/io/ply_reader.py",
+        "_row_type(vertex, order), vertex.count",
+        '_row_type(vertex, "<"), vertex.count',
+        PLY_READER,
+        "the big end last",
+    ),
+    Mutant(
+        "emgs_jax/running/values.py",
+        "math.isfinite(value) if ends is None else ends.low <= value <= ends.high",
+        "ends is None or ends.low <= value <= ends.high",
+        VALUES,
+        "nan passes where a field has no range",
+    ),
+    Mutant(
+        "emgs_jax/running/values.py",
+        "else ends.low <= value <= ends.high",
+        "else not (value < ends.low or value > ends.high)",
+        VALUES,
+        "nan is in every range",
+    ),
+    Mutant(
+        "emgs_jax/running/values.py",
+        "        key = found[1]\n",
+        "        return key\n",
+        VALUES,
+        "the key that refers to a value is named, which cannot be set",
+    ),
+    Mutant(
+        "emgs_jax/running/configure.py",
+        "    check_values(config, key)\n",
+        "",
+        VALUES,
+        "nothing is checked",
+    ),
+    Mutant(
+        "emgs_jax/data/readable.py",
+        "        if self.has_ground_truth:\n            _check_truth(dataset, self.kept)\n",
+        "",
+        READABLE,
+        "a bad true pose is found when its frame comes up",
+    ),
+    Mutant(
+        "emgs_jax/data/reading.py",
+        "if np.abs(position).max() > MAX_POSITION_M:",
+        "if position.max() > MAX_POSITION_M:",
+        READING,
+        "geo-referenced west of the origin",
+    ),
+    Mutant(
+        "emgs_jax/data/tum.py",
+        "[numbers[i] for i in order]",
+        "numbers",
+        TUM,
+        "the line of another pose where the times are out of order",
+    ),
+    Mutant(
+        "emgs_jax/data/tum.py",
+        "    if max(rows) < 0:",
+        "    if max(rows) < -1:",
+        TUM,
+        "a list that matches nothing is ground truth",
+    ),
+    Mutant(
+        "emgs_jax/report/run_files.py",
+        "            path.replace(target / path.name)\n",
+        "            path.unlink()\n",
+        RUN_FILES,
+        "the outputs of an earlier run are deleted",
+    ),
+    Mutant(
+        "emgs_jax/report/run_files.py",
+        "for name in OUTPUTS if (folder / name).exists()]",
+        "for name in OUTPUTS[1:] if (folder / name).exists()]",
+        RUN_FILES,
+        "old metrics stay beside a new trajectory",
+    ),
+    Mutant(
+        "emgs_jax/io/files.py",
+        "if name and not _is_running(int(name[1]))]",
+        "if name]",
+        FILES,
+        "a file that is being written is removed",
+    ),
+    Mutant(
+        "emgs_jax/report/results.py",
+        ' or part in (".", "..")',
+        "",
+        RESULTS,
+        "a variant of two dots",
+    ),
+    Mutant(
+        "emgs_jax/io/npz.py",
+        "num_bytes != len(data) - handle.tell()",
+        "num_bytes < len(data) - handle.tell()",
+        NPZ,
+        "memory is taken for what a header announces",
+    ),
+    Mutant(
+        "emgs_jax/io/map_file.py",
+        "jnp.isfinite(leaf[valid])",
+        "jnp.isfinite(leaf)",
+        MAP_FILE,
+        "what stands in free rows matters",
+    ),
+    Mutant(
+        "emgs_jax/io/map_file.py",
+        "if (leaf.shape, leaf.dtype) != (like.shape, like.dtype):",
+        "if leaf.shape != like.shape:",
+        MAP_FILE,
+        "a map of small integers",
+    ),
+    Mutant(
+        "emgs_jax/prior/recorded.py",
+        "        check_numbers(self.folder / name, arrays)\n",
+        "",
+        RECORDED,
+        "forged numbers are replayed",
+    ),
+    Mutant(
+        "emgs_jax/prior/recorded_checks.py",
+        "    poses = poses[np.isfinite(poses).all((1, 2))]\n",
+        "",
+        RECORDED,
+        "a view without a pose is a fault",
+    ),
+)
