@@ -32,6 +32,7 @@ LENS = ("tests/prior/multiview/test_lens.py",)
 LANDMARKS = ("tests/prior/multiview/test_landmarks.py",)
 PLANE_SWEEP = ("tests/prior/multiview/test_plane_sweep.py",)
 SEMI_GLOBAL = ("tests/prior/multiview/test_semi_global.py",)
+SOURCES = ("tests/prior/multiview/test_sources.py",)
 MULTIVIEW = ("tests/prior/multiview/test_multiview_stereo.py",)
 MASKS = ("tests/prior/network/test_masks.py",)
 RESIZE = ("tests/prior/network/test_resize.py",)
@@ -1077,6 +1078,13 @@ MUTANTS = (
         "return pixels - distortion *",
         LENS,
         "distortion of the wrong sign",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/sources.py",
+        "np.sqrt(total + value).sum()",
+        "(total + value).sum()",
+        SOURCES,
+        "what is seen already counts as much as what is not",
     ),
     Mutant(
         "emgs_jax/prior/multiview/depth.py",

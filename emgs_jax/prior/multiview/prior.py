@@ -31,8 +31,9 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate_depth
 from emgs_jax.prior.multiview.incremental import StructureConfig, extend, initialize
-from emgs_jax.prior.multiview.landmarks import Structure, View, detect, forget, link
+from emgs_jax.prior.multiview.landmarks import Structure, detect, forget, link
 from emgs_jax.prior.multiview.lens import as_shown, points_shown, rectify, straight
+from emgs_jax.prior.multiview.sources import choose, parallax
 
 jitted_depth = eqx.filter_jit(estimate_depth)
 jitted_agreeing = eqx.filter_jit(count_agreeing)
@@ -79,7 +80,7 @@ class MultiviewStereo(Prior):
     def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:
         self._structure_config, self._dense_config = structure, dense
         settings = {"structure": _values(structure), "dense": _values(dense)}
-        self.provenance = Provenance("multiview_stereo", {"version": 2} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 3} | settings)
         self._next = 0
         self._structure = Structure(np.eye(3))
 
@@ -193,23 +194,20 @@ class MultiviewStereo(Prior):
         return np.asarray(depth), np.asarray(spread)
 
     def _sources(self, frame: int) -> list[int]:
-        """The placed views that show most of the view's landmarks under most parallax, best first."""
+        """The placed views that together show the view's landmarks under most parallax, best first."""
         view, placed = self._structure.views[frame], self._structure.placed()
         if frame not in placed:
             return []
-        scores = {other: self._parallax(view, placed[other]) for other in placed if other != frame}
-        ranked = sorted((other for other in scores if scores[other] > 0), key=lambda other: -scores[other])
-        return ranked[: self._dense_config.num_sources]
-
-    def _parallax(self, view: View, other: View) -> float:
-        """Sum over the shared landmarks of their parallax, as a share of the best."""
-        shared = np.intersect1d(view.landmark[self._structure.known(view)], other.landmark)
-        points, best = self._structure.points[shared], self._dense_config.best_parallax_rad
-        if not len(points):
-            return 0.0
-        a, b = (points - pose.T_ref_view[:3, 3] for pose in (view, other))
-        sine = np.linalg.norm(np.cross(a, b), axis=1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
-        return float(np.minimum(sine / best, 1.0).sum())
+        landmarks = view.landmark[self._structure.known(view)]
+        points, center = self._structure.points[landmarks], view.T_ref_view[:3, 3]
+        best = self._dense_config.best_parallax_rad
+        worth = {
+            index: np.isin(landmarks, other.landmark)
+            * np.minimum(parallax(points, center, other.T_ref_view[:3, 3]) / best, 1.0)
+            for index, other in placed.items()
+            if index != frame
+        }
+        return choose(worth, self._dense_config.num_sources)
 
     def _confidence(self, frame: int) -> np.ndarray:
         """One more than the views that confirm each depth, discounted by its spread."""
