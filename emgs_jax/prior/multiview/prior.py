@@ -1,13 +1,14 @@
 """The prior `multiview_stereo`: classical geometry from calibrated images, without weights and without a GPU.
 
-Structure from motion of the window gives the poses, a plane sweep against some of the other views the depth. What was
-found for an image (keypoints, matches, depth) is kept while the image is in the window, so the windows of a sequence
-must be asked for in order. The confidence of a depth is
+Structure from motion of the window gives the poses, a plane sweep against some of the other views the depth, and the
+matches on a blank region its plane (`planar.py`). What was found for an image (keypoints, matches, depth) is kept while
+the image is in the window, so the windows of a sequence must be asked for in order. The confidence of a depth is
 
     1 + n exp(-spread / tolerated_spread),
 
 n the views whose own depth confirms it, `spread` how far plausible planes of its cost curve lie from the best (see
-`estimate_depth`): 1 where nothing is known, more the smaller the expected error is.
+`estimate_depth`), or by how much the plane of a blank region is uncertain (see `fill_planes`): 1 where nothing is
+known, more the smaller the expected error is.
 
 The frame is that of the first image that could be placed (image 0, unless the camera rests at first), and the scale
 that of its window, which is fixed by `median_depth`; images alone do not tell it. The radial distortion of the lens is
@@ -33,6 +34,7 @@ from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate
 from emgs_jax.prior.multiview.incremental import StructureConfig, extend, initialize
 from emgs_jax.prior.multiview.landmarks import Structure, detect, forget, link
 from emgs_jax.prior.multiview.lens import as_shown, points_shown, rectify, straight
+from emgs_jax.prior.multiview.planar import PlanarConfig, fill_planes
 from emgs_jax.prior.multiview.sources import choose, parallax
 
 jitted_depth = eqx.filter_jit(estimate_depth)
@@ -45,6 +47,7 @@ class DenseConfig:
 
     Args:
         depth: matching and acceptance.
+        planar: blank regions that become planes.
         num_sources: views that it is matched against.
         best_parallax_rad: between the rays of a landmark, beyond which more is no better.
         num_checks: views whose depth is compared with it.
@@ -54,6 +57,7 @@ class DenseConfig:
     """
 
     depth: DepthConfig
+    planar: PlanarConfig
     num_sources: int
     best_parallax_rad: float
     num_checks: int
@@ -191,7 +195,9 @@ class MultiviewStereo(Prior):
             self._camera,
             self._dense_config.depth,
         )
-        return np.asarray(depth), np.asarray(spread)
+        spacing = (1.0 / depth_range[0] - 1.0 / depth_range[1]) / (self._dense_config.depth.sweep.num_planes - 1)
+        found = np.asarray(depth), np.asarray(spread)
+        return fill_planes(*found, self._grays[frame], spacing, self._dense_config.planar)
 
     def _sources(self, frame: int) -> list[int]:
         """The placed views that together show the view's landmarks under most parallax, best first."""
