@@ -32,6 +32,8 @@ LENS = ("tests/prior/multiview/test_lens.py",)
 LANDMARKS = ("tests/prior/multiview/test_landmarks.py",)
 PLANE_SWEEP = ("tests/prior/multiview/test_plane_sweep.py",)
 SEMI_GLOBAL = ("tests/prior/multiview/test_semi_global.py",)
+PLANAR = ("tests/prior/multiview/test_planar.py",)
+SOURCES = ("tests/prior/multiview/test_sources.py",)
 MULTIVIEW = ("tests/prior/multiview/test_multiview_stereo.py",)
 MASKS = ("tests/prior/network/test_masks.py",)
 RESIZE = ("tests/prior/network/test_resize.py",)
@@ -1077,6 +1079,48 @@ MUTANTS = (
         "return pixels - distortion *",
         LENS,
         "distortion of the wrong sign",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/planar.py",
+        "if chosen.mean() < config.min_share:",
+        "if False:",
+        PLANAR,
+        "a plane that half of the matches contradict",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/planar.py",
+        "better = (std < certain[region]) & (found > 0)",
+        "better = found > 0",
+        PLANAR,
+        "a plane replaces what is more certain",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/planar.py",
+        "better = (std < certain[region]) & (found > 0)",
+        "better = std < certain[region]",
+        PLANAR,
+        "a plane behind the camera",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/planar.py",
+        "pixels.T @ pixels / config.correlation**2",
+        "pixels.T @ pixels",
+        PLANAR,
+        "matches side by side are independent",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/planar.py",
+        "(spread <= config.max_spread)",
+        "(spread > 0)",
+        PLANAR,
+        "uncertain matches support a plane",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/sources.py",
+        "np.sqrt(total + value).sum()",
+        "(total + value).sum()",
+        SOURCES,
+        "what is seen already counts as much as what is not",
     ),
     Mutant(
         "emgs_jax/prior/multiview/depth.py",

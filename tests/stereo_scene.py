@@ -11,6 +11,7 @@ from emgs_jax.prior.multiview.depth import DepthConfig
 from emgs_jax.prior.multiview.incremental import StructureConfig
 from emgs_jax.prior.multiview.landmarks import NONE, Structure, View
 from emgs_jax.prior.multiview.lens import Lens
+from emgs_jax.prior.multiview.planar import PlanarConfig
 
 FOCAL, CENTER, SIZE = (55.0, 53.0), (30.5, 24.25), (64, 48)
 SMALL = ("prior.dense.depth.sweep.num_planes=24",)
@@ -20,6 +21,13 @@ SMALL = ("prior.dense.depth.sweep.num_planes=24",)
 def depth_config(*overrides: str) -> DepthConfig:
     """`prior.dense.depth` of conf/ with few planes."""
     return hydra.utils.instantiate(compose("prior=multiview_stereo", *SMALL, *overrides).prior.dense.depth)
+
+
+@cache
+def planar_config(*overrides: str) -> PlanarConfig:
+    """`prior.dense.planar` of conf/ for small regions."""
+    small = ("prior.dense.planar.min_area=150", "prior.dense.planar.min_matches=40")
+    return hydra.utils.instantiate(compose("prior=multiview_stereo", *small, *overrides).prior.dense.planar)
 
 
 @cache
@@ -52,8 +60,13 @@ def small_lens(distortion: float) -> Lens:
     return Lens(np.array(FOCAL), np.array(CENTER), distortion)
 
 
-def plane_image(T_world_camera: np.ndarray, slope: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Grey image and depth of the plane z = 2 m + slope x, painted with waves of 8 to 25 cm, ray by ray."""
+def plane_image(
+    T_world_camera: np.ndarray, slope: float, seed: int = 0, blank: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Grey image and depth of the plane z = 2 m + slope x, painted with waves of 8 to 25 cm, ray by ray.
+
+    Less than `blank` metres beside and above the middle it is not painted.
+    """
     x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(calibration()).T @ T_world_camera[:3, :3].T
     normal = np.array([-slope, 0.0, 1.0])
@@ -65,6 +78,7 @@ def plane_image(T_world_camera: np.ndarray, slope: float, seed: int = 0) -> tupl
         wave, angle, phase = rng.uniform(0.08, 0.25), rng.uniform(0, np.pi), rng.uniform(0, 2 * np.pi)
         along = points[..., 0] * np.cos(angle) + points[..., 1] * np.sin(angle)
         gray += 0.05 * np.cos(2 * np.pi * along / wave + phase)
+    gray[(np.abs(points[..., :2]) < blank).all(axis=-1)] = 0.5
     return np.float32(np.clip(gray, 0, 1)), np.float32(depth)
 
 

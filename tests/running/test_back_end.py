@@ -116,7 +116,8 @@ def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatc
     end.verified = list(loops)
     records = [FrameRecord(row, None, None, "tracked", pose=pose) for row, pose in enumerate(drifted)]
     run = MappingRun(None, None, state=end.close(state_of(drifted), loops), records=records, back_end=end)
-    given = SimpleNamespace(frames=[SimpleNamespace(index=COUNT - 1, image=None)], raw=[SimpleNamespace(points=None, mask=None)], T_anchor_views={})
+    frame, raw = SimpleNamespace(index=COUNT - 1, image=None), SimpleNamespace(points=None, mask=None)
+    given = SimpleNamespace(frames=[frame], raw=[raw], T_anchor_views={})
     monkeypatch.setattr(end, "add", lambda *arguments: None)
     monkeypatch.setattr(end, "look_for_loops", lambda look: [])
     correct(run, given, None)

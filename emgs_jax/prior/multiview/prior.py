@@ -1,13 +1,14 @@
 """The prior `multiview_stereo`: classical geometry from calibrated images, without weights and without a GPU.
 
-Structure from motion of the window gives the poses, a plane sweep against some of the other views the depth. What was
-found for an image (keypoints, matches, depth) is kept while the image is in the window, so the windows of a sequence
-must be asked for in order. The confidence of a depth is
+Structure from motion of the window gives the poses, a plane sweep against some of the other views the depth, and the
+matches on a blank region its plane (`planar.py`). What was found for an image (keypoints, matches, depth) is kept while
+the image is in the window, so the windows of a sequence must be asked for in order. The confidence of a depth is
 
     1 + n exp(-spread / tolerated_spread),
 
 n the views whose own depth confirms it, `spread` how far plausible planes of its cost curve lie from the best (see
-`estimate_depth`): 1 where nothing is known, more the smaller the expected error is.
+`estimate_depth`), or by how much the plane of a blank region is uncertain (see `fill_planes`): 1 where nothing is
+known, more the smaller the expected error is.
 
 The frame is that of the first image that could be placed (image 0, unless the camera rests at first), and the scale
 that of its window, which is fixed by `median_depth`; images alone do not tell it. The radial distortion of the lens is
@@ -32,8 +33,10 @@ from emgs_jax.ops.ranges import number
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate_depth
 from emgs_jax.prior.multiview.incremental import StructureConfig, extend, initialize
-from emgs_jax.prior.multiview.landmarks import Structure, View, detect, forget, link
+from emgs_jax.prior.multiview.landmarks import Structure, detect, forget, link
 from emgs_jax.prior.multiview.lens import as_shown, points_shown, rectify, straight
+from emgs_jax.prior.multiview.planar import PlanarConfig, fill_planes
+from emgs_jax.prior.multiview.sources import choose, parallax
 
 jitted_depth = eqx.filter_jit(estimate_depth)
 jitted_agreeing = eqx.filter_jit(count_agreeing)
@@ -45,6 +48,7 @@ class DenseConfig:
 
     Args:
         depth: matching and acceptance.
+        planar: blank regions that become planes.
         num_sources: views that it is matched against.
         best_parallax_rad: between the rays of a landmark, beyond which more is no better.
         num_checks: views whose depth is compared with it.
@@ -54,6 +58,7 @@ class DenseConfig:
     """
 
     depth: DepthConfig
+    planar: PlanarConfig
     num_sources: int = number(low=1, high=64)
     best_parallax_rad: float = number(low=1e-6, high=4)
     num_checks: int = number(low=0, high=64)
@@ -80,7 +85,7 @@ class MultiviewStereo(Prior):
     def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:
         self._structure_config, self._dense_config = structure, dense
         settings = {"structure": _values(structure), "dense": _values(dense)}
-        self.provenance = Provenance("multiview_stereo", {"version": 2} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 3} | settings)
         self._next = 0
         self._structure = Structure(np.eye(3))
 
@@ -191,26 +196,25 @@ class MultiviewStereo(Prior):
             self._camera,
             self._dense_config.depth,
         )
-        return np.asarray(depth), np.asarray(spread)
+        spacing = (1.0 / depth_range[0] - 1.0 / depth_range[1]) / (self._dense_config.depth.sweep.num_planes - 1)
+        found = np.asarray(depth), np.asarray(spread)
+        return fill_planes(*found, self._grays[frame], spacing, self._dense_config.planar)
 
     def _sources(self, frame: int) -> list[int]:
-        """The placed views that show most of the view's landmarks under most parallax, best first."""
+        """The placed views that together show the view's landmarks under most parallax, best first."""
         view, placed = self._structure.views[frame], self._structure.placed()
         if frame not in placed:
             return []
-        scores = {other: self._parallax(view, placed[other]) for other in placed if other != frame}
-        ranked = sorted((other for other in scores if scores[other] > 0), key=lambda other: -scores[other])
-        return ranked[: self._dense_config.num_sources]
-
-    def _parallax(self, view: View, other: View) -> float:
-        """Sum over the shared landmarks of their parallax, as a share of the best."""
-        shared = np.intersect1d(view.landmark[self._structure.known(view)], other.landmark)
-        points, best = self._structure.points[shared], self._dense_config.best_parallax_rad
-        if not len(points):
-            return 0.0
-        a, b = (points - pose.T_ref_view[:3, 3] for pose in (view, other))
-        sine = np.linalg.norm(np.cross(a, b), axis=1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
-        return float(np.minimum(sine / best, 1.0).sum())
+        landmarks = view.landmark[self._structure.known(view)]
+        points, center = self._structure.points[landmarks], view.T_ref_view[:3, 3]
+        best = self._dense_config.best_parallax_rad
+        worth = {
+            index: np.isin(landmarks, other.landmark)
+            * np.minimum(parallax(points, center, other.T_ref_view[:3, 3]) / best, 1.0)
+            for index, other in placed.items()
+            if index != frame
+        }
+        return choose(worth, self._dense_config.num_sources)
 
     def _confidence(self, frame: int) -> np.ndarray:
         """One more than the views that confirm each depth, discounted by its spread."""
