@@ -131,6 +131,30 @@ def _motion_noise(depth_noise: Float[Array, ""], mean_depth: Float[Array, ""], c
     return jnp.append(jnp.repeat(jnp.stack([angle * mean_depth, angle]), 3), ratio)
 
 
+def _readings(
+    prediction: Prediction,
+    previous: Observation,
+    T_world_previous: jaxlie.SE3,
+    scale: Float[Array, ""],
+    camera: Camera,
+    config: LocalizationConfig,
+) -> tuple[jaxlie.SE3, jaxlie.SE3, jaxlie.SE3]:
+    """The prior's motion from the previous frame, its own pose of the current one, and where each reading begins (R7).
+
+    After a frame that could not be placed the chain is broken, and the prior's own pose stands in for it.
+    """
+    anchor, paired = prediction.T_world_anchor, prediction.previous.valid & previous.valid
+    raw_previous, raw_current = pose_row(prediction.T_world_views, 0), pose_row(prediction.T_world_views, 1)
+    motion = scale_translation(raw_previous.inverse() @ raw_current, scale)
+    anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, scale)
+    last = previous, T_world_previous, motion
+    via_previous, same_image = through_previous(prediction, *last, scale, camera, config.max_pair_distance)
+    linked = stack([same_image, T_world_previous @ motion]).wxyz_xyz
+    is_linked = (jnp.sum(paired) >= MIN_PAIRS) & jnp.all(jnp.isfinite(linked), axis=-1)
+    same_image, chain = jnp.where(is_linked[:, None], linked, anchored.wxyz_xyz)
+    return motion, anchored, stack([via_previous, jaxlie.SE3(same_image), anchored, jaxlie.SE3(chain)])
+
+
 def _measured(
     T_world_camera: jaxlie.SE3,
     scale: Float[Array, ""],
@@ -154,8 +178,8 @@ def _measured(
     """
     pose, std = anchored
     apart = (T_world_camera.inverse() @ pose).log()
-    is_used = (config.coarse == FUSED) & jnp.all(jnp.isfinite(apart))
-    apart = jnp.where(is_used, apart, 0.0)
+    is_used = (config.coarse == FUSED) & jnp.all(jnp.isfinite(apart)) & jnp.all(jnp.isfinite(std))
+    apart, std = jnp.where(is_used, apart, 0.0), jnp.where(is_used, std, 1.0)
     chi_sq = apart @ jnp.linalg.solve(covariance[:-1, :-1] + jnp.diag(std**2), apart)
     weights = is_used / (std**2 * (1.0 + chi_sq / apart.shape[0]))
     difference = jnp.append(apart, belief.log_scale - jnp.log(scale))
@@ -186,26 +210,18 @@ def localize_coarse(
     scale = repeat_scale(now, previous, T_world_previous, jnp.exp(belief.log_scale), config.coarse_scale)
     repeat_rms, mean_depth = repeat_error(now, previous, T_world_previous, scale, config.max_pair_distance)
     depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, belief.depth_noise), LEAST_NOISE)
-    views, anchor = prediction.T_world_views, prediction.T_world_anchor
-    raw_previous, raw_current = pose_row(views, 0), pose_row(views, 1)
-    T_previous_current = scale_translation(raw_previous.inverse() @ raw_current, scale)
-    anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, scale)
-    last = previous, T_world_previous, T_previous_current
-    via_previous, same_image = through_previous(prediction, *last, scale, camera, config.max_pair_distance)
-    forms = stack([via_previous, same_image, anchored, T_world_previous @ T_previous_current])
-    # After a frame that could not be placed the chain is broken, and the prior's own pose stands in for it.
-    is_linked = (jnp.sum(now.valid & previous.valid) >= MIN_PAIRS) & jnp.all(jnp.isfinite(forms.wxyz_xyz), axis=-1)
-    forms = jaxlie.SE3(jnp.where(is_linked[:, None], forms.wxyz_xyz, anchored.wxyz_xyz))
-
+    motion, anchored, forms = _readings(prediction, previous, T_world_previous, scale, camera, config)
     noise = _motion_noise(depth_noise, mean_depth, config.icp)
-    covariance = predict(belief.covariance, T_previous_current, noise)
-    reach = 1.0 + jnp.linalg.norm(anchored.translation() - anchor.translation()) / config.anchor_range
+    covariance = predict(belief.covariance, motion, noise)
+    distance = jnp.linalg.norm(anchored.translation() - prediction.T_world_anchor.translation())
+    reach = 1.0 + distance / config.anchor_range
     own = anchored, noise[:-1] * jnp.sqrt(config.anchor_noise) * reach
     known = pose_row(forms, config.coarse.astype(jnp.int32)), scale, covariance
     coarse, scale, covariance = _measured(*known, own, belief, config)
     is_finite = jnp.all(jnp.isfinite(coarse.wxyz_xyz))
     coarse = jaxlie.SE3(jnp.where(is_finite, coarse.wxyz_xyz, T_world_previous.wxyz_xyz))
-    newest = coarse @ scale_translation(raw_current.inverse() @ pose_row(views, 2), scale)
+    raw_current, raw_newest = pose_row(prediction.T_world_views, 1), pose_row(prediction.T_world_views, 2)
+    newest = coarse @ scale_translation(raw_current.inverse() @ raw_newest, scale)
     has_newest = prediction.has_newest & is_finite & jnp.all(jnp.isfinite(newest.wxyz_xyz))
     newest = jaxlie.SE3(jnp.where(has_newest, newest.wxyz_xyz, coarse.wxyz_xyz))
     is_usable = is_finite & (jnp.sum(prediction.current.valid) >= MIN_PAIRS)

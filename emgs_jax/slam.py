@@ -137,12 +137,11 @@ def init_state(
 def _first_state(
     gaussians: Gaussians, weight: Float[Array, "g"], world: Observation, T_world_views: jaxlie.SE3, config: SlamConfig
 ) -> tuple[SlamState, Int[Array, ""]]:
-    empty = empty_map(config.submap.map_capacity, world.features.shape[-1])
     # There is nothing else to align the second frame with, so the first window confirms itself.
     existence = jnp.maximum(config.existence.birth, config.existence.hit)
     time = jnp.asarray(world.valid.shape[0], jnp.int32)
     new = new_map(gaussians, _first_weight(weight, config.em.average), existence, time - 1)
-    map, _, overflow = insert(empty, new)
+    map, _, overflow = insert(empty_map(config.submap.map_capacity, world.features.shape[-1]), new)
     previous = jax.tree.map(lambda leaf: leaf[-1], world)
     return SlamState(map, previous, pose_row(T_world_views, -1), certain(), time), overflow
 
@@ -171,8 +170,7 @@ def step(
     coarse, guess = call(_approach, prediction, last, camera, thin, config.localization)
     submap, white, rows, submap_overflow = call(_select, state.map, (state.previous, guess), config.submap)
     T, aligned, localization = call(_place, prediction.current, submap, coarse, config.localization, white)
-    rows_each = spacing(camera, thin, config.fit)
-    place = aligned, T, localization
+    rows_each, place = spacing(camera, thin, config.fit), (aligned, T, localization)
     fine = rows_each, config.em, config.splitting
     submap, rest, em, halves, origin = call(_fuse, submap, white, *place, state.time, *fine)
     candidates, weight = call(cluster, rest, call(_order, camera, thin), rows_each, config.fit)

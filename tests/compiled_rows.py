@@ -11,6 +11,7 @@ import jaxlie
 import numpy as np
 
 from emgs_jax import load_config
+from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
 from emgs_jax.registration.matching import Matches, Surface
 from emgs_jax.registration.problem import Problem, rows_of
@@ -44,9 +45,10 @@ def random_problem(rng: np.random.Generator) -> tuple[Matches, Problem]:
         gradients=normal(NUM_POINTS, 3),
         is_inlier=jnp.asarray(rng.random(NUM_POINTS) < 2 / 3),
     )
-    surface = Surface(*[None] * 5)  # what is matched already does not look at it
-    one = jnp.ones(())
-    return matches, Problem(source, surface, T, jnp.zeros((NUM_POINTS, 3)), 0.005 * one, jnp.ones(7), 0.01 * one)
+    one, zeros = jnp.ones(()), jnp.zeros((1, 3))
+    nothing = Gaussians(zeros, jnp.eye(3)[None], zeros, zeros, jnp.zeros((1, 0)), jnp.zeros(1, bool))
+    surface = Surface(nothing, jnp.zeros((1, 6)), one[None], one[None], zeros)  # what is matched does not look at it
+    return matches, Problem(source, surface, T, jnp.zeros((NUM_POINTS, 3)), 0.005 * one, jnp.eye(7), 0.01 * one)
 
 
 def largest_difference(matches: Matches, problem: Problem) -> float:

@@ -76,7 +76,7 @@ REGISTRATION = [
     *own("registration/noise", "registration/test_uncertainty")(
         ('side="left"', 'side="right"', "equal confidences are the highest"),
         ("jnp.where(valid, confidence, jnp.inf)", "confidence", "invalid points are ranked, too"),
-        ("1.4826 * median", "median", "the misfit is no standard deviation"),
+        ("NORMAL * median", "median", "the misfit is no standard deviation"),
         (">= MIN_PAIRS, found, ", ">= 0, found, ", "two points make a level"),
         ("jnp.clip(num_cells * ratio, num_cells, num_points)", "num_cells * ratio", "more measurements than points"),
         ("total**2 / jnp.maximum(count, 1.0)", "total**2", "the sum of a cell for its mean"),
@@ -92,6 +92,8 @@ REGISTRATION = [
         ("config.noise * uncertainty.depth", "uncertainty.depth", "the factor on the points' noise is dropped"),
         ("scale_unit=config.scale_noise * scale_unit", "scale_unit=config.scale_noise", "scale in absolute units"),
         ("jnp.sqrt(config.prior_information) /", "config.prior_information /", "information for its root"),
+        ("noise = scale * matches.noise", "noise = matches.noise", "a scale that shrinks noisy points fits best"),
+        ("* (scale_unit / uncertainty.pose[1])", "", "what is known counts in full where the points do not fit"),
         ("jnp.abs(distance) <= config.max_misfit", "jnp.abs(distance) >= 0", "what is far away counts as noise"),
         ("matches.normals, axis=-1) / depth", "matches.normals, axis=-1)", "distances in metres"),
         ("jnp.cross(jnp.concatenate([points, points]), axes)", "axes", "turning tells what moving tells"),
@@ -150,7 +152,9 @@ GRAPH = [
 
 STAGES = [
     *own("localization", "test_localization")(
-        ("anchor_noise * reach**2", "anchor_noise * reach", "the anchor's deviation for its variance"),
+        ("1.0 + distance / config.anchor_range", "1.0", "a pose far from the anchor counts like one near it"),
+        ("(1.0 + chi_sq / apart.shape[0])", "1.0", "a lost anchor counts in full"),
+        ("config.scale_std**-2", "0.0", "the prior's own unit holds no scale"),
         ("coarse.scale * jnp.where(is_tracked, scale, 1.0)", "coarse.scale", "the accepted scale is dropped"),
         (
             "misfit_of_levels[confidence_levels(current.confidence, current.valid)]",
@@ -158,30 +162,35 @@ STAGES = [
             "one for all",
         ),
         (
-            "scale_translation(raw_current.inverse() @ pose_row(views, 2), scale)",
-            "raw_current.inverse() @ pose_row(views, 2)",
+            "scale_translation(raw_current.inverse() @ raw_newest, scale)",
+            "raw_current.inverse() @ raw_newest",
             "the newest pose without its scale",
         ),
         (
-            "depth_noise * coarse.mean_depth, depth_noise",
-            "depth_noise, depth_noise",
+            "coarse.depth_noise * coarse.mean_depth, coarse.depth_noise",
+            "coarse.depth_noise, coarse.depth_noise",
             "a fraction of the depth for metres",
         ),
         (
-            "jnp.maximum(coarse.repeat_rms / coarse.mean_depth, LEAST_NOISE)",
-            "coarse.repeat_rms / coarse.mean_depth",
-            "none",
+            "repeat_rms / mean_depth, belief.depth_noise",
+            "repeat_rms / mean_depth, 0.0",
+            "what did not fit is forgotten",
         ),
-        ("<= config.max_pair_distance * depth", "<= jnp.inf", "pairs however far apart"),
-        ("** config.scale_memory", "", "the memory of the scale is not used"),
-        ("1.4826 * jnp.sqrt", "jnp.sqrt", "the disagreement is no standard deviation"),
         ("aligned.valid & coarse.is_usable", "aligned.valid", "a lost frame's points count"),
-        (
-            "jnp.stack([jnp.ones(()), ratio, similarity])",
-            "jnp.stack([jnp.ones(()), similarity, ratio])",
-            "R8's readings",
-        ),
+        ("jnp.where(is_linked[:, None], linked, anchored.wxyz_xyz)", "linked", "a broken chain goes on"),
+    ),
+    *own("registration/repeat", "test_localization")(
+        ("<= max_pair_distance * depth", "<= jnp.inf", "pairs however far apart"),
+        ("NORMAL * max_pair_distance", "max_pair_distance", "the disagreement is no standard deviation"),
+        ("jnp.where(reading == 1, ratio, similarity)", "jnp.where(reading == 1, similarity, ratio)", "R8's readings"),
         ("(scale > 0.1)", "(scale > 0.0)", "any scale is believed"),
+        ("jnp.where(is_found, scale, otherwise)", "scale", "the ratio of no pair"),
+    ),
+    *own("registration/belief", "registration/test_belief")(
+        ("A @ covariance @ A.T + ", "covariance + ", "the errors stay in the axes of the camera before"),
+        ("jnp.diag(noise**2)", "jnp.diag(noise)", "deviations for variances"),
+        ("worth**2 * belief", "worth * belief", "a deviation for its variance"),
+        ("jnp.where(is_tracked, new, old)", "new", "a frame that is not tracked counts"),
     ),
     *own("observation", "test_observation")(
         ("    valid &= jnp.any(normals != 0, axis=-1)\n", "", "points without a normal stay valid"),
@@ -317,14 +326,14 @@ STAGES = [
     ),
     *own("slam", "test_slam")(
         (
-            "SlamState(map, aligned, T, time), info",
-            "SlamState(map, trusted, T, time), info",
+            "SlamState(map, aligned, T, localization.belief, time), info",
+            "SlamState(map, trusted, T, localization.belief, time), info",
             "a rejected frame is no previous one",
         ),
         ("view = downscale(camera, thin)", "view = camera", "the full camera for the thinned rows"),
         (
-            "rows_each = spacing(camera, thin, config.fit)",
-            "rows_each = spacing(camera, 1, config.fit)",
+            "rows_each, place = spacing(camera, thin, config.fit)",
+            "rows_each, place = spacing(camera, 1, config.fit)",
             "λ in rows",
         ),
         ("aligned.valid & localization.is_tracked", "aligned.valid", "a frame that is not tracked is mapped"),
@@ -348,8 +357,8 @@ STAGES = [
             "one frame late",
         ),
         (
-            "SlamState(map, aligned, T, time), info",
-            "SlamState(map, aligned, coarse.T_world_camera, time), info",
+            "SlamState(map, aligned, T, localization.belief, time), info",
+            "SlamState(map, aligned, coarse.T_world_camera, localization.belief, time), info",
             "the coarse pose stays",
         ),
         (

@@ -12,6 +12,7 @@ from emgs_jax.gaussians import fit_to_points
 from emgs_jax.localization import REASONS, localize_coarse, localize_fine
 from emgs_jax.observation import transform
 from emgs_jax.ops.camera import Camera
+from emgs_jax.registration.belief import certain, root_information
 from emgs_jax.registration.icp import icp
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
@@ -40,7 +41,7 @@ def coarse_of(prediction, camera, config, previous=None):
 @pytest.fixture(scope="module")
 def printed(config):
     """Scale `none` and memory 1, whatever the presets say."""
-    return at(config("slam.localization.coarse_scale=none").localization, "scale_memory", 1.0)
+    return at(config("slam.localization.coarse_scale=none").localization, "scale_std", np.inf)
 
 
 @pytest.mark.parametrize("reading", ["same_image", "anchored", "fused"])
@@ -88,11 +89,29 @@ def test_a_ratio_is_not_moved_by_wrong_depths_and_a_fit_is(wide, printed):
     assert abs(ratio - 1 / 0.9) < 0.001 < 0.01 < abs(fit - 1 / 0.9)
 
 
-def test_the_printed_form_estimates_no_scale_and_memory_dampens_it(wide, printed):
+def test_the_printed_form_estimates_no_scale_and_the_priors_own_unit_holds_it(wide, printed):
+    """log s = P γ / (P + s_p²) + s_p² log r / (P + s_p²) for the ratio r, known to P, and the prior's own unit e^γ."""
     prediction = predict_room(FRAME, wide, scale=0.9)
     assert coarse_of(prediction, wide, printed).scale == 1
-    half = at(at(printed, "coarse_scale", SCALES["ratio"]), "scale_memory", 0.5)
-    np.testing.assert_allclose(coarse_of(prediction, wide, half).scale, 0.9**-0.5, rtol=1e-4)
+    ratio = at(at(printed, "coarse_scale", SCALES["ratio"]), "icp.scale_noise", 0.5)
+    belief = eqx.tree_at(lambda b: (b.log_scale, b.depth_noise), certain(), (jnp.asarray(0.02), jnp.asarray(0.04)))
+    for std in (0.02, 0.1):
+        found = coarse_step(
+            prediction, world(FRAME - 1, wide), path_pose(FRAME - 1), wide, at(ratio, "scale_std", std), belief
+        )
+        known = (0.5 * 0.04) ** 2
+        expected = (known * 0.02 + std**2 * np.log(1 / 0.9)) / (known + std**2)
+        np.testing.assert_allclose(jnp.log(found.scale), expected, atol=1e-4)
+        np.testing.assert_allclose(found.belief.covariance[6, 6], known * std**2 / (known + std**2), rtol=1e-3)
+
+
+def test_without_a_pair_the_scale_is_the_priors_own_unit(wide, printed):
+    prediction = predict_room(FRAME, wide, scale=0.9)
+    blind = eqx.tree_at(lambda p: p.previous.valid, prediction, jnp.zeros_like(prediction.previous.valid))
+    belief = eqx.tree_at(lambda b: b.log_scale, certain(), jnp.asarray(-0.2))
+    ratio = at(printed, "coarse_scale", SCALES["ratio"])
+    found = coarse_step(blind, world(FRAME - 1, wide), path_pose(FRAME - 1), wide, ratio, belief)
+    np.testing.assert_allclose(found.scale, np.exp(-0.2), rtol=1e-5)
 
 
 def test_the_printed_coarse_pose_does_not_use_the_priors_absolute_pose(wide, printed):
@@ -115,31 +134,41 @@ def test_the_fused_pose_lies_between_chain_and_anchor_and_far_from_the_anchor_at
         lambda p: p.T_world_views, prediction, jaxlie.SE3((shift @ prediction.T_world_views).wxyz_xyz)
     )
     fused = at(printed, "coarse", COARSE["fused"])
+    uncertain = eqx.tree_at(lambda b: b.depth_noise, certain(), jnp.asarray(1.0))
 
     def distance(noise, reach):
         config = at(at(fused, "anchor_noise", noise), "anchor_range", reach)
-        return pose_error(coarse_of(shifted, wide, config).T_world_camera, path_pose(FRAME))[0]
+        arguments = shifted, world(FRAME - 1, wide), path_pose(FRAME - 1), wide, config, uncertain
+        return pose_error(coarse_step(*arguments).T_world_camera, path_pose(FRAME))[0]
 
-    assert distance(0.0, 1.0) == pytest.approx(0.1, abs=1e-3)
-    # Equal variances near the anchor meet in the middle.
-    assert distance(1.0, 1e6) == pytest.approx(0.05, abs=1e-3)
+    assert distance(1e-6, 1.0) == pytest.approx(0.1, abs=1e-3)
     assert distance(1e9, 1.0) == pytest.approx(0.0, abs=1e-3)
     assert distance(1.0, 1e-3) == pytest.approx(0.0, abs=1e-3)
 
 
 @pytest.mark.parametrize(("noise", "reach"), [(1.0, 0.5), (0.25, 0.2), (3.0, 1.0)])
-def test_the_fused_pose_weighs_chain_and_anchor_by_their_variances(wide, printed, noise, reach):
-    """The standard deviation of the prior's own pose grows with its distance from the anchor: 1 + distance / range."""
-    prediction, shift = predict_room(FRAME, wide), pose(translation=(0.1, 0, 0))
+@pytest.mark.parametrize("shifted_by", [0.005, 0.1])
+def test_the_fused_pose_weighs_chain_and_anchor_by_their_variances(wide, printed, noise, reach, shifted_by):
+    """Q of the motion, Q · noise · (1 + distance / range)² of the prior's own pose, and its Cauchy weight."""
+    prediction, shift = predict_room(FRAME, wide), pose(translation=(shifted_by, 0, 0))
     shifted = eqx.tree_at(
         lambda p: p.T_world_views, prediction, jaxlie.SE3((shift @ prediction.T_world_views).wxyz_xyz)
     )
     config = at(at(at(printed, "coarse", COARSE["fused"]), "anchor_noise", noise), "anchor_range", reach)
-    result = coarse_of(shifted, wide, config)
+    config = at(config, "icp.prior_information", 30.0)
+    belief = eqx.tree_at(lambda b: b.depth_noise, certain(), jnp.asarray(0.03))
+    result = coarse_step(shifted, world(FRAME - 1, wide), path_pose(FRAME - 1), wide, config, belief)
     anchored, anchor = shift @ path_pose(FRAME), prediction.T_world_anchor
     distance = np.linalg.norm(anchored.translation() - anchor.translation())
-    share = 1 / (1 + noise * (1 + distance / reach) ** 2)
-    assert pose_error(result.T_world_camera, path_pose(FRAME))[0] == pytest.approx(0.1 * share, abs=1e-3)  # as above
+    motion = (0.03 * float(result.mean_depth)) ** 2 / 30
+    own = motion * noise * (1 + distance / reach) ** 2
+    weighted = own * (1 + shifted_by**2 / (motion + own) / 6)
+    share = motion / (motion + weighted)
+    moved = pose_error(result.T_world_camera, path_pose(FRAME))[0]
+    assert moved == pytest.approx(shifted_by * share, abs=1e-3)  # as above
+    np.testing.assert_allclose(
+        np.diag(result.belief.covariance)[:3], motion * weighted / (motion + weighted), rtol=0.05
+    )
 
 
 def test_points_that_are_too_far_apart_are_no_pair(wide, printed):
@@ -298,7 +327,7 @@ def test_depths_that_repeat_exactly_do_not_hold_a_wrong_pose(camera, submap, len
     """A prior that keeps the depth of an image repeats it to the bit, which says nothing of the pose between two."""
     settings = at(lenient, "icp.prior_information", 3.0)  # the sparse Gaussians of this room are centimetres thick
     coarse = coarse_of(nudged(camera), camera, settings)
-    coarse = eqx.tree_at(lambda c: c.repeat_rms, coarse, jnp.zeros(()))
+    coarse = eqx.tree_at(lambda c: c.depth_noise, coarse, jnp.asarray(5e-4))
     T, _, info = fine_step(nudged(camera).current, submap, coarse, settings)
     assert info.is_tracked
     assert pose_error(T, path_pose(FRAME))[0] < 0.8 * pose_error(coarse.T_world_camera, path_pose(FRAME))[0]
@@ -311,20 +340,21 @@ def small_prediction(camera):
     return predict_room(FRAME, camera, scale=0.96)
 
 
-@pytest.mark.parametrize(("repeat_rms", "coarse_scale"), [(0.02, 1.0), (0.05, 1.1), (1e-6, 1.0)])
+@pytest.mark.parametrize(("depth_noise", "coarse_scale"), [(0.01, 1.0), (0.03, 1.1), (1e-3, 1.0)])
 def test_the_fine_step_is_icp_of_the_scaled_points_with_the_noise_of_the_coarse_pose(
-    camera, submap, lenient, repeat_rms, coarse_scale
+    camera, submap, lenient, depth_noise, coarse_scale
 ):
-    """Metres for the pose, at least a 2000th of the depth, and the same over that depth for the points."""
+    """Metres for the pose, and the same over the depth for the points."""
     settings = at(at(lenient, "icp.prior_information", 30.0), "icp.scale_noise", 1.0)
     coarse = coarse_of(nudged(camera), camera, settings)
-    known = jnp.asarray(repeat_rms), jnp.asarray(coarse_scale)
-    coarse = eqx.tree_at(lambda c: (c.repeat_rms, c.scale), coarse, known)
+    known = jnp.asarray(depth_noise), jnp.asarray(coarse_scale)
+    coarse = eqx.tree_at(lambda c: (c.depth_noise, c.scale), coarse, known)
     current = small_prediction(camera).current
     T, aligned, info = fine_step(current, submap, coarse, settings)
     scaled = eqx.tree_at(lambda o: o.points, current, coarse_scale * current.points)
-    noise = jnp.maximum(coarse.repeat_rms, 5e-4 * coarse.mean_depth)
-    arguments = scaled, submap, coarse.T_world_camera, (noise, noise / coarse.mean_depth), settings.icp
+    noise = depth_noise * coarse.mean_depth, jnp.asarray(depth_noise)
+    known = root_information(coarse.belief.covariance)
+    arguments = scaled, submap, coarse.T_world_camera, noise, settings.icp, None, known
     expected, scale, found = eqx.filter_jit(icp)(*arguments)
     # Another program rounds in another order; the solver stops within its tolerance.
     assert max(pose_error(T, expected)) < 1e-4

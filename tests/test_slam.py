@@ -185,7 +185,9 @@ def test_a_step_moves_with_a_rigid_motion_of_the_world(state, camera, settings):
         prediction.has_newest,
     )
     map = eqx.tree_at(lambda m: m.gaussians, state.map, move_gaussians(motion, state.map.gaussians))
-    moved_state = SlamState(map, transform(motion, state.previous, one), motion @ state.T_world_previous, state.time)
+    moved_state = SlamState(
+        map, transform(motion, state.previous, one), motion @ state.T_world_previous, state.belief, state.time
+    )
     new, info = step(moved_state, moved_prediction, FULL, settings)
     # The solver ends within its tolerance of the same pose; points near a gate may pass it or not.
     assert max(pose_error(info.T_world_camera, motion @ stepped[1].T_world_camera)) < 2e-3
@@ -277,25 +279,25 @@ def off_walls(points):
     return np.minimum(np.abs(points - reference.ROOM_LOW), np.abs(points - reference.ROOM_HIGH)).min(axis=-1)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_map_of_noisy_predictions_is_more_accurate_than_their_points(camera, settings, config, seed):
+def test_a_map_of_noisy_predictions_is_more_accurate_than_their_points(camera, settings, config):
     """Oracle: the room's walls, and the camera's path. The prior's points lie where its own poses put them."""
-    rng, count = np.random.default_rng(seed), 8
-    poses = [path_pose(i) for i in range(FRAME)]
-    views = [noisy(observe_room(T, camera, num_features=2), camera, rng, 0.02) for T in poses]
-    first = FirstWindow(stack(views), stack_poses(poses))
-    sequence = [noisy_prediction(FRAME + i, camera, rng) for i in range(count)]
     chosen = config(*WHOLE, "slam.initialization=merged", "slam.em.average.gain=count")
     chosen = at(at(chosen, "localization.max_residual", 1.0), "localization.min_eigenvalue", 0.0)
-    final, infos = run([first, *sequence], FULL, chosen)
-    raw_poses = [jaxlie.SE3(p.T_world_views.wxyz_xyz[1]) for p in sequence]
-    pairs = [*zip(poses, views, strict=True), *zip(raw_poses, (p.current for p in sequence), strict=True)]
-    raw = np.concatenate([off_walls(transform(T, o, jnp.ones(())).points) for T, o in pairs])
-    ours = off_walls(final.map.gaussians.means)[np.asarray(final.map.gaussians.valid)]
-    assert all(i.localization.is_tracked for i in infos)
+    poses = [path_pose(i) for i in range(FRAME)]
+    ratios = []
+    for seed in range(6):  # few frames of a small world: one by itself says little
+        rng, count = np.random.default_rng(seed), 8
+        views = [noisy(observe_room(T, camera, num_features=2), camera, rng, 0.02) for T in poses]
+        sequence = [noisy_prediction(FRAME + i, camera, rng) for i in range(count)]
+        final, infos = run([FirstWindow(stack(views), stack_poses(poses)), *sequence], FULL, chosen)
+        assert all(i.localization.is_tracked for i in infos)
+        raw_poses = [jaxlie.SE3(p.T_world_views.wxyz_xyz[1]) for p in sequence]
+        pairs = [*zip(poses, views, strict=True), *zip(raw_poses, (p.current for p in sequence), strict=True)]
+        raw = np.concatenate([off_walls(transform(T, o, jnp.ones(())).points) for T, o in pairs])
+        ours = off_walls(final.map.gaussians.means)[np.asarray(final.map.gaussians.valid)]
+        ratios.append([np.median(ours) / np.median(raw), np.quantile(ours, 0.9) / np.quantile(raw, 0.9)])
     # Twelve frames see a wall, with errors that are independent but for the path's: a third is the most to hope for.
-    assert np.median(ours) < 0.65 * np.median(raw)
-    assert np.quantile(ours, 0.9) < 0.8 * np.quantile(raw, 0.9)
+    assert np.all(np.mean(ratios, axis=0) < 0.65), ratios
 
 
 def test_room_is_doubled_where_rows_did_not_fit(settings):

@@ -23,7 +23,7 @@ from emgs_jax.ops import camera as cam
 from emgs_jax.ops import clustering, linalg, neighbours
 from emgs_jax.ops.pytree import stack
 from emgs_jax.refinement import refine
-from emgs_jax.registration import icp, noise, rigid
+from emgs_jax.registration import belief, icp, noise, rigid
 from emgs_jax.render import composite, densify, project
 
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
@@ -55,9 +55,14 @@ def image_of(seed: int):
     return plane, 0.3 + 0.1 * jnp.abs(plane), features, jnp.ones((12, 16)), jnp.ones((12, 16), bool)
 
 
+def belief_of(seed: int) -> belief.Belief:
+    covariance = jnp.diag(jnp.array([4e-4] * 3 + [1e-4] * 4)) * (1.0 + seed)
+    return belief.Belief(covariance, ONE * 0.01, ONE * 0.02, ONE * 3.0)
+
+
 def coarse_of(seed: int) -> localization.CoarsePose:
     T = path_pose(2 + seed)
-    return localization.CoarsePose(T, T, ONE, ONE * 0.02, ONE * 2.0, jnp.asarray(True))
+    return localization.CoarsePose(T, T, ONE, ONE * 0.02, ONE * 2.0, ONE * 0.01, belief_of(seed), jnp.asarray(True))
 
 
 def estep_of(seed: int) -> em.EStep:
@@ -126,6 +131,14 @@ VERBS = {
         lambda s: (map_of(s), random_gaussians(9, s, 2)),
     ),
     "fit_rigid": (rigid.fit_rigid, lambda s: (points(s).points, points(s + 5).points, jnp.ones(40))),
+    "predict": (
+        lambda b, T: belief.predict(b.covariance, T, jnp.full(7, 0.01)),
+        lambda s: (belief_of(s), path_pose(s)),
+    ),
+    "update": (
+        lambda b: belief.update(b.covariance, jnp.linspace(0.0, 0.1, 7), 1e3 * jnp.eye(7)),
+        lambda s: (belief_of(s),),
+    ),
     "icp": (
         lambda o, g, T: icp.icp(o, g, T, (ONE * 0.02, ONE * 0.01), CONFIG.localization.icp),
         lambda s: (obs.transform(path_pose(s).inverse(), close(s), ONE), random_gaussians(32, s, 2), path_pose(s)),

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.icp import IcpInfo
 
 DEGREES = 7
@@ -36,6 +37,7 @@ def certain() -> Belief:
     return Belief(jnp.zeros((DEGREES, DEGREES)), jnp.zeros(()), jnp.zeros(()), jnp.ones(()))
 
 
+@full_precision
 def predict(
     covariance: Float[Array, "7 7"], T_previous_current: jaxlie.SE3, noise: Float[Array, "7"]
 ) -> Float[Array, "7 7"]:
@@ -50,6 +52,7 @@ def predict(
     return A @ covariance @ A.T + jnp.diag(noise**2)
 
 
+@full_precision
 def update(
     covariance: Float[Array, "7 7"], difference: Float[Array, "7"], information: Float[Array, "7 7"]
 ) -> tuple[Float[Array, "7"], Float[Array, "7 7"]]:
@@ -65,6 +68,7 @@ def update(
     return posterior @ information @ difference, posterior
 
 
+@full_precision
 def root_information(covariance: Float[Array, "7 7"]) -> Float[Array, "7 7"]:
     """L⁻¹ of P = L L': |L⁻¹ x|² is the squared Mahalanobis distance of x. P must be positive definite."""
     std = jnp.sqrt(jnp.diagonal(covariance))
@@ -72,6 +76,7 @@ def root_information(covariance: Float[Array, "7 7"]) -> Float[Array, "7 7"]:
     return jnp.linalg.inv(jnp.linalg.cholesky(correlation)) / std
 
 
+@full_precision
 def next_belief(
     belief: Belief, found: IcpInfo, depth_noise: Float[Array, ""], scale: Float[Array, ""], is_tracked: Bool[Array, ""]
 ) -> Belief:

@@ -1,6 +1,7 @@
 """ICP against Gaussians as one Levenberg–Marquardt solve."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import TypeAlias
 
 import equinox as eqx
@@ -149,19 +150,15 @@ def icp(
     Returns:
         T_world_camera, the scale, and what the solve found.
     """
-    stride = max(source.valid.shape[0] // config.num_points, 1)
-    source = jax.tree.map(lambda leaf: leaf[::stride], source)
+    source = jax.tree.map(lambda leaf: leaf[:: max(leaf.shape[0] // config.num_points, 1)], source)
     surface = surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, white)
 
     def problem_of(uncertainty: Uncertainty) -> Problem:
         return pose_problem(source, surface, T_world_coarse, noise[1], uncertainty, config, known)
 
-    def search_and_solve(carry: _Carry, is_first: Bool[Array, ""]) -> tuple[_Carry, tuple]:
-        return _search_and_solve(carry, is_first, problem_of, noise, config)
-
+    step = partial(_search_and_solve, problem_of=problem_of, noise=noise, config=config)
     given = Uncertainty(pose=noise, depth=jnp.full(source.valid.shape, noise[1]), num_effective=jnp.ones(()))
-    is_first = jnp.arange(config.num_searches) == 0
-    (y, uncertainty), rounds = jax.lax.scan(search_and_solve, (jnp.zeros(7), given), is_first)
+    (y, uncertainty), rounds = jax.lax.scan(step, (jnp.zeros(7), given), jnp.arange(config.num_searches) == 0)
     matches, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
     problem = problem_of(uncertainty)
     T, scale = pose_of(y, problem)

@@ -7,11 +7,13 @@ from jaxtyping import Array, Bool, Float
 
 from emgs_jax.observation import Observation, Prediction, depth_in, transform
 from emgs_jax.ops.camera import Camera, nearest_pixel, project
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import stack
 from emgs_jax.registration.noise import NORMAL, robust_std
 from emgs_jax.registration.rigid import MIN_PAIRS, fit_rigid, fit_rigid_robust, median, pose_row
 
 
+@full_precision
 def repeat_scale(
     now: Observation,
     before: Observation,
@@ -37,6 +39,7 @@ def repeat_scale(
     return jnp.where(reading > 0, jnp.where(is_found, scale, otherwise), 1.0)
 
 
+@full_precision
 def repeat_error(
     now: Observation,
     before: Observation,
@@ -54,6 +57,7 @@ def repeat_error(
     return apart, mean_depth
 
 
+@full_precision
 def through_previous(
     prediction: Prediction,
     previous: Observation,

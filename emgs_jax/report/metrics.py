@@ -139,7 +139,7 @@ def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer
     metrics: Metrics = {}
     for fusions, poses, rows, kind in (
         (baselines.raw, run.raw_poses, [raw.depths[row].any() for row in range(len(raw.depths))], "raw"),
-        (baselines.ours, run.poses, is_known, "ours"),
+        (baselines.ours, np.stack(baselines.poses), is_known, "ours"),
     ):
         compared = with_truth(run, poses)
         if compared is None:

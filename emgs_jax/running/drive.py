@@ -26,6 +26,7 @@ from emgs_jax.running.record import (
     record_start,
     record_step,
 )
+from emgs_jax.running.unit import in_own_unit
 
 
 def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
@@ -70,6 +71,7 @@ def map_frames(run: MappingRun, dataset: Dataset, prior: Prior) -> Iterator[RawV
     if run.back_end is not None:
         with run.clock.phase("back_end"):
             finish(run)
+    in_own_unit(run)
 
 
 def take(run: MappingRun, given: Input) -> None:

@@ -43,11 +43,13 @@ class Baselines:
         pinhole = Pinhole(dataset.intrinsics, *dataset.size)
         self.raw: dict[str, Fusion] = {name: config.start(pinhole) for name, config in configs.items()}
         self.ours: dict[str, Fusion] = {name: config.start(pinhole) for name, config in configs.items()}
+        self.poses: list[np.ndarray] = []  # ours, as they were: the finished run has another unit
         self._run = run
 
     def add(self, row: int, view: View, T_world_camera: np.ndarray) -> None:
         """Add the frame of a record, with its pose as the prior says it."""
         record = self._run.records[row]
+        self.poses.append(record.pose)
         for fusion in self.raw.values():
             fusion.add(view, T_world_camera, 1.0)
         if record.status in ("tracked", "initialization"):

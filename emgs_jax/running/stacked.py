@@ -25,6 +25,7 @@ from emgs_jax.running.drive import spent, take
 from emgs_jax.running.growth import advance, start
 from emgs_jax.running.inputs import Input, RawView, inputs
 from emgs_jax.running.record import MappingRun, record_lost, record_start, record_step
+from emgs_jax.running.unit import in_own_unit
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo, init_state, step
 
 
@@ -74,6 +75,8 @@ def map_together(
             yield from given.raw
     for group in stacks:
         group.hand_out()
+    for run in runs:
+        in_own_unit(run)
 
 
 class Stack:

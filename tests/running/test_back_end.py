@@ -14,6 +14,7 @@ from emgs_jax import load_config
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
 from emgs_jax.loops.verification import LoopMeasurement
+from emgs_jax.registration.belief import certain
 from emgs_jax.running.back_end import BackEnd, counts, metric_graph
 from emgs_jax.running.measuring import Look, window_edges
 from emgs_jax.running.record import FrameRecord, MappingRun, correct
@@ -51,7 +52,7 @@ def state_of(poses: np.ndarray) -> SlamState:
     map = new_map(gaussians, jnp.ones(COUNT), jnp.ones(()), jnp.asarray(0))
     map = eqx.tree_at(lambda m: m.birth, map, jnp.arange(COUNT, dtype=jnp.int32))
     last = jaxlie.SE3.from_matrix(jnp.asarray(poses[-1], jnp.float32))
-    return SlamState(map, random_observation(20), last, jnp.asarray(COUNT))
+    return SlamState(map, random_observation(20), last, certain(), jnp.asarray(COUNT))
 
 
 def walked(graph, poses: np.ndarray) -> BackEnd:

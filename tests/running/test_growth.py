@@ -56,7 +56,7 @@ def test_a_larger_map_compiles_the_look_up_and_the_insertion_and_nothing_of_the_
     state, config, _ = prepared
     state, _, config = advance(state, predict_room(3, camera, num_features=2), camera, config)
     larger = grow(state.map, 2 * config.submap.map_capacity)
-    state = type(state)(larger, state.previous, state.T_world_previous, state.time)
+    state = type(state)(larger, state.previous, state.T_world_previous, state.belief, state.time)
     with compiled() as names:
         advance(state, predict_room(4, camera, num_features=2), camera, config)
     assert set(names) == {"_select", "_store"}

@@ -1,0 +1,73 @@
+"""The unit of a finished map: that of the first inference until then, and the mean of what all of them say at last."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.running.record import MappingRun
+from emgs_jax.slam import SlamState
+
+
+def in_own_unit(run: MappingRun) -> None:
+    """Scale map and poses about the first camera by e^−γ, the mean of the prior's own units (`Belief.log_scale`).
+
+    A length of an inference times its scale is one of the map, so that the mean logarithm of the scales is what the
+    map's unit is short of the prior's own. One inference errs by its scale; their mean errs by less.
+    """
+    if run.state is None or not np.any(run.state.belief.log_scale):
+        return
+    factor = float(np.exp(-run.state.belief.log_scale))
+    first = next(record for record in run.records if record.status == "initialization")
+    origin = first.pose[:3, 3]
+
+    def placed(pose: np.ndarray | None) -> np.ndarray | None:
+        if pose is None:
+            return None
+        moved = pose.copy()
+        moved[:3, 3] = origin + factor * (pose[:3, 3] - origin)
+        return moved
+
+    run.state = rescaled(run.state, factor, origin)
+    run.records = [
+        replace(
+            record,
+            pose=placed(record.pose),
+            newest_pose=placed(record.newest_pose),
+            scale=None if record.scale is None else factor * record.scale,
+        )
+        for record in run.records
+    ]
+    if run.back_end is not None:
+        run.back_end.poses = [placed(pose) for pose in run.back_end.poses]
+        run.back_end.log_scales = [float(np.log(factor)) + scale for scale in run.back_end.log_scales]
+
+
+def rescaled(state: SlamState, factor: float, origin: np.ndarray) -> SlamState:
+    """All lengths of a state times `factor`, about `origin`; the scales of later predictions follow."""
+    center = jnp.asarray(origin, jnp.float32)
+
+    def placed(points: jnp.ndarray) -> jnp.ndarray:
+        return center + factor * (points - center)
+
+    def grown(map: GaussianMap) -> GaussianMap:
+        gaussians = map.gaussians
+        lengths = placed(gaussians.means), factor**2 * gaussians.covs
+        return eqx.tree_at(lambda m: (m.gaussians.means, m.gaussians.covs), map, lengths)
+
+    T, belief = state.T_world_previous, state.belief
+    units = jnp.asarray([factor] * 3 + [1.0] * 4, jnp.float32)
+    return replace(
+        state,
+        map=grown(state.map),
+        previous=eqx.tree_at(lambda o: o.points, state.previous, placed(state.previous.points)),
+        T_world_previous=jaxlie.SE3.from_rotation_and_translation(T.rotation(), placed(T.translation())),
+        belief=replace(
+            belief,
+            covariance=units[:, None] * belief.covariance * units,
+            log_scale=belief.log_scale + jnp.log(jnp.asarray(factor, jnp.float32)),
+        ),
+    )
