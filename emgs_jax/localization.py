@@ -131,6 +131,12 @@ def _motion_noise(depth_noise: Float[Array, ""], mean_depth: Float[Array, ""], c
     return jnp.append(jnp.repeat(jnp.stack([angle * mean_depth, angle]), 3), ratio)
 
 
+def _no_motion(mean_depth: Float[Array, ""], config: LocalizationConfig) -> Float[Array, "7"]:
+    """The same where nothing is known of the motion: as far as a fine step may go, at most a depth, a radian and e."""
+    step = jnp.stack([config.max_step, config.max_step_rad, config.scale_std])
+    return jnp.minimum(step, 1.0)[jnp.array([0, 0, 0, 1, 1, 1, 2])] * jnp.ones(7).at[:3].set(mean_depth)
+
+
 def _readings(
     prediction: Prediction,
     previous: Observation,
@@ -138,8 +144,10 @@ def _readings(
     scale: Float[Array, ""],
     camera: Camera,
     config: LocalizationConfig,
-) -> tuple[jaxlie.SE3, jaxlie.SE3, jaxlie.SE3]:
+) -> tuple[jaxlie.SE3, jaxlie.SE3, jaxlie.SE3, Bool[Array, ""]]:
     """The prior's motion from the previous frame, its own pose of the current one, and where each reading begins (R7).
+
+    Last, whether the previous frame leads here at all.
 
     After a frame that could not be placed the chain is broken, and the prior's own pose stands in for it.
     """
@@ -152,7 +160,8 @@ def _readings(
     linked = stack([same_image, T_world_previous @ motion]).wxyz_xyz
     is_linked = (jnp.sum(paired) >= MIN_PAIRS) & jnp.all(jnp.isfinite(linked), axis=-1)
     same_image, chain = jnp.where(is_linked[:, None], linked, anchored.wxyz_xyz)
-    return motion, anchored, stack([via_previous, jaxlie.SE3(same_image), anchored, jaxlie.SE3(chain)])
+    forms = stack([via_previous, jaxlie.SE3(same_image), anchored, jaxlie.SE3(chain)])
+    return motion, anchored, forms, is_linked[1]
 
 
 def _measured(
@@ -210,9 +219,9 @@ def localize_coarse(
     scale = repeat_scale(now, previous, T_world_previous, jnp.exp(belief.log_scale), config.coarse_scale)
     repeat_rms, mean_depth = repeat_error(now, previous, T_world_previous, scale, config.max_pair_distance)
     depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, belief.depth_noise), LEAST_NOISE)
-    motion, anchored, forms = _readings(prediction, previous, T_world_previous, scale, camera, config)
-    noise = _motion_noise(depth_noise, mean_depth, config.icp)
-    covariance = predict(belief.covariance, motion, noise)
+    motion, anchored, forms, is_linked = _readings(prediction, previous, T_world_previous, scale, camera, config)
+    noise, unknown = _motion_noise(depth_noise, mean_depth, config.icp), _no_motion(mean_depth, config)
+    covariance = predict(belief.covariance, motion, jnp.where(is_linked, noise, unknown))
     distance = jnp.linalg.norm(anchored.translation() - prediction.T_world_anchor.translation())
     reach = 1.0 + distance / config.anchor_range
     own = anchored, noise[:-1] * jnp.sqrt(config.anchor_noise) * reach

@@ -262,6 +262,18 @@ def test_without_enough_pairs_the_priors_own_pose_stands_in_for_the_chain(wide, 
     assert max(pose_error(result.T_world_camera, expected)) < 2e-3
     printed_result = coarse_of(blind, wide, at(printed, "coarse", COARSE["via_previous"]))
     assert max(pose_error(printed_result.T_world_camera, path_pose(FRAME))) < (2e-3 if count < 16 else 0.1)
+    # Where the chain is broken the pose is worth what the prior's own is; where it is not, what both are.
+    fused = at(at(printed, "coarse", COARSE["fused"]), "icp.prior_information", 30.0)
+    known, apart = (coarse_of(p, wide, fused) for p in (predict_room(FRAME, wide), blind))
+    assert max(pose_error(apart.T_world_camera, expected)) < (2e-3 if count < 16 else 0.5)
+    if count < 16:
+        noise = float(apart.depth_noise * apart.mean_depth) / 30**0.5
+        distance = np.linalg.norm(expected.translation() - prediction.T_world_anchor.translation())
+        own = noise * float(fused.anchor_noise) ** 0.5 * (1 + distance / float(fused.anchor_range))
+        far = min(float(fused.max_step), 1.0) * float(apart.mean_depth)
+        together = 1 / np.sqrt(1 / own**2 + 1 / (far**2 + noise**2))
+        np.testing.assert_allclose(np.sqrt(np.diag(apart.belief.covariance)[:3]), together, rtol=0.1)
+        assert np.all(np.diag(apart.belief.covariance)[:3] > np.diag(known.belief.covariance)[:3])
     if count == 0:  # nothing is known, and the largest distance of a pair stands in
         unknown = float(printed.max_pair_distance * result.mean_depth)
         assert result.repeat_rms == pytest.approx(1.4826 * unknown, rel=1e-5)

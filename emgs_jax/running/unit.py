@@ -21,8 +21,7 @@ def in_own_unit(run: MappingRun) -> None:
     if run.state is None or not np.any(run.state.belief.log_scale):
         return
     factor = float(np.exp(-run.state.belief.log_scale))
-    first = next(record for record in run.records if record.status == "initialization")
-    origin = first.pose[:3, 3]
+    origin = next(record.pose for record in run.records if record.pose is not None)[:3, 3]  # the anchor's
 
     def placed(pose: np.ndarray | None) -> np.ndarray | None:
         if pose is None:
