@@ -27,8 +27,6 @@ def use_compilation_cache(folder: str | None = "auto") -> None:
         return
     if str(folder) == "auto" and jax.config.jax_compilation_cache_dir is not None:
         return
-    # jaxlib 0.10.1 calls every executable from a folder an error, since a hint to the compiler is no feature of a CPU.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     path = cache_folder() if str(folder) == "auto" else Path(folder).expanduser()
     if (problem := _problem_of(path)) is not None:
         print(f"warning: nothing is kept of what JAX compiles, {path}: {problem}", file=sys.stderr)
