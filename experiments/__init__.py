@@ -2,6 +2,6 @@
 
 import os
 
-# jaxlib 0.10.1 calls every executable that it reads from a cache an error, for a hint to the compiler that is no feature
-# of a CPU. What does fail raises an exception.
+# jaxlib 0.10.1 logs an error for every executable that it reads from a cache, for a hint to the compiler that no CPU
+# lists as a feature. What does fail raises an exception.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
