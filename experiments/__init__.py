@@ -1,0 +1,7 @@
+"""Commands; what has to be so before any of them imports JAX."""
+
+import os
+
+# jaxlib 0.10.1 logs an error for every executable that it reads from a cache, for a hint to the compiler that no CPU
+# lists as a feature. What does fail raises an exception.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

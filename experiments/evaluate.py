@@ -28,7 +28,6 @@ from .command import command, overrides_of
 from .run import run
 
 ERROR_FILE = "error.txt"
-PARTS = ("slam", "densify", "evaluation", "graph", "dataset", "prior", "features", "baseline.voxel", "baseline.tsdf")
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
                     OmegaConf.update(config, data["key"], sequence)
                     if has_seed:
                         config.prior.seed = seed
-                    for part in PARTS:
+                    for part in config:
                         check_values(config, part)
                     folder = result_folder(Path(settings["out"]), dataset, sequence, variant, seed)
                     yield Job(f"{dataset}/{sequence}/{variant}/{seed}", dataset, config, folder)

@@ -1520,8 +1520,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/data/reading.py",
-        "np.linalg.det(pose[:3, :3]) > 0",
-        "np.linalg.det(pose[:3, :3]) != 0",
+        "np.linalg.det(turns) > 0",
+        "np.linalg.det(turns) != 0",
         READING,
         "a reflection is a pose",
     ),

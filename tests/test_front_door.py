@@ -26,7 +26,7 @@ dir(emgs_jax), emgs_jax.__version__
 heavy = {"matplotlib", "open3d", "torch", "trimesh", "cv2", "scipy", "hydra", "equinox", "optimistix"}
 print(sorted(heavy & set(sys.modules)))
 emgs_jax.step, emgs_jax.map_sequence, emgs_jax.load_map
-print({name for name, value in jax.config.values.items() if before[name] != value} or "unchanged")
+print({name for name, value in jax.config.values.items() if before.get(name, value) != value} or "unchanged")
 print(sorted({"matplotlib", "open3d", "torch"} & set(sys.modules)))
 """
 

@@ -243,14 +243,21 @@ def as_pose(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
         raise BadFrameError(f"{where} must hold 16 numbers (a 4x4 pose): {REMEDY}") from error
     if not np.isfinite(pose).all():
         return None
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()
-    if not (off < RIGID_TOLERANCE and np.linalg.det(pose[:3, :3]) > 0 and np.allclose(pose[3], (0, 0, 0, 1))):
+    if not is_rigid(pose):
         raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
     check_position(pose[:3, 3], where)
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded
     return pose
+
+
+def is_rigid(poses: Float[np.ndarray, "*b 4 4"]) -> bool:
+    """Whether all are rigid motions, up to `RIGID_TOLERANCE`."""
+    turns = poses[..., :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(turns @ turns.mT - np.eye(3))
+        is_turn = (off < RIGID_TOLERANCE).all() and (np.linalg.det(turns) > 0).all()
+    return bool(is_turn and np.allclose(poses[..., 3, :], (0, 0, 0, 1)))
 
 
 def check_position(position: Float[np.ndarray, " 3"], where: object) -> None:

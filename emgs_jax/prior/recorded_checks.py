@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from emgs_jax.data.reading import RIGID_TOLERANCE
+from emgs_jax.data.reading import is_rigid
 
 REMEDY = "record it again with `python -m experiments.predict`"
 FIELDS = {  # array -> dtype and the axes that it has; d, v, h, w, i, j, c have one length each, y, x, f are free
@@ -70,15 +70,12 @@ def check_numbers(path: object, arrays: Mapping[str, np.ndarray]) -> None:
     points, confident = arrays["points"][arrays["mask"]], arrays["confidence"][arrays["mask"]]
     poses = arrays["T_anchor_view"]
     poses = poses[np.isfinite(poses).all((1, 2))]
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(poses[:, :3, :3] @ poses[:, :3, :3].mT - np.eye(3))
-        rigid = (off < RIGID_TOLERANCE).all() and (np.linalg.det(poses[:, :3, :3]) > 0).all()
     faults = {
         "points under the mask are not finite": not np.isfinite(points).all(),
         f"points under the mask are farther than {MAX_LENGTH:g}": not (np.abs(points) <= MAX_LENGTH).all(),
         "a confidence under the mask is negative or not finite": not ((confident >= 0) & np.isfinite(confident)).all(),
         "features are not finite": not np.isfinite(arrays["features"]).all(),
-        "a pose is no rigid motion": not (rigid and np.allclose(poses[:, 3], (0, 0, 0, 1))),
+        "a pose is no rigid motion": not is_rigid(poses),
         f"a pose is farther than {MAX_LENGTH:g}": not (np.abs(poses[:, :3, 3]) <= MAX_LENGTH).all(),
     }
     for what, is_there in faults.items():

@@ -24,8 +24,12 @@ print(jax.config.jax_compilation_cache_dir)
 """
 
 
+QUIET = {"TF_CPP_MIN_LOG_LEVEL": "3"}  # as experiments/__init__.py says to commands
+
+
 def start(folder: object, max_bytes: int = 2**30, **environment: str) -> subprocess.Popen:
     variables = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")} | environment
+    variables |= QUIET  # else jaxlib 0.10.1 calls every executable from the folder an error
     command = [sys.executable, "-c", PROGRAM, str(folder), str(max_bytes)]
     return subprocess.Popen(command, env=variables, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 

@@ -177,13 +177,13 @@ def test_an_interrupted_run_leaves_what_it_has(tmp_path, monkeypatch, error):
             raise error
         return prediction
 
+    whole = load_trajectory_tum(exact_run()[0] / "trajectory.txt")  # made now, if nobody asked before
     monkeypatch.setattr(experiments.run, "build_prior", lambda config, dataset: EditedPrior(interrupt))
     with pytest.raises(error):
         experiments.run.run(compose(), tmp_path)
     num_done = WINDOW_SIZE + 1
     records = read_log(tmp_path)
     assert [record["index"] for record in records] == list(range(num_done))
-    whole = load_trajectory_tum(exact_run()[0] / "trajectory.txt")
     times, poses = load_trajectory_tum(tmp_path / "trajectory.txt")
     np.testing.assert_array_equal(times, whole[0][:num_done])
     np.testing.assert_array_equal(poses, whole[1][:num_done])
