@@ -54,6 +54,7 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.running.growth import advance, start
     from emgs_jax.running.inputs import Input, inputs
     from emgs_jax.running.record import FrameRecord, MappingRun, new_run
+    from emgs_jax.running.unit import own_unit
     from emgs_jax.semantics import classify
     from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
     from emgs_jax.splitting import SplittingConfig, split
@@ -87,6 +88,7 @@ _HOMES = {
     "running.growth": ("advance", "start"),
     "running.inputs": ("Input", "inputs"),
     "running.record": ("FrameRecord", "MappingRun", "new_run"),
+    "running.unit": ("own_unit",),
     "semantics": ("classify",),
     "slam": ("Overflow", "SlamConfig", "SlamState", "StepInfo", "init_state", "step"),
     "splitting": ("SplittingConfig", "split"),

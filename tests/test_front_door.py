@@ -97,6 +97,7 @@ def test_a_sequence_becomes_a_map_that_is_saved_loaded_and_carried_on_by_ones_ow
     state, _ = emgs_jax.init_state(first.taken.views, first.taken.T_world_views, camera, config.slam)
     for given in rest:
         state, info = emgs_jax.step(state, given.taken, camera, config.slam)
+    state = emgs_jax.own_unit(state, first.T_world_anchor[:3, 3])
     assert int(info.num_gaussians) == run.records[-1].num_gaussians and same_bits(state, run.state)
 
 

@@ -44,7 +44,8 @@ def claim_folder(folder: Path) -> list[str]:
 def save_progress(folder: Path, run: MappingRun) -> None:
     """Write trajectory.txt and map.npz of the frames so far; nothing before there is a map.
 
-    With a back end also trajectory_online.txt, the poses as they were when the frames were placed, and graph.g2o.
+    With a back end also trajectory_online.txt, the poses as they were when the frames were placed (in
+    the unit of the finished map), and graph.g2o.
     """
     if run.state is not None:
         save_trajectory_tum(

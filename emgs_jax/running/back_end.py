@@ -76,7 +76,7 @@ class BackEnd:
         min_std: floor of the map's covariances.
         poses: T_world_camera (4, 4) of the nodes, as they are now.
         log_scales: σ of their inferences, likewise.
-        online: poses as they were when the frames were placed.
+        online: poses as they were when the frames were placed, in the unit of `poses`.
         frames: index in the data set of every node.
         edges: what was measured.
         database: keyframes; their `frame` is the node.

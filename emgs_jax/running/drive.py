@@ -64,14 +64,16 @@ def map_frames(run: MappingRun, dataset: Dataset, prior: Prior) -> Iterator[RawV
     Raises:
         ValueError: no frame has a point and a pose from which a map can start.
     """
-    for given in inputs(dataset, prior, run.config, run.clock):
-        with run.clock.phase("map"):
-            take(run, given)
-        yield from given.raw
-    if run.back_end is not None:
-        with run.clock.phase("back_end"):
-            finish(run)
-    in_own_unit(run)
+    try:
+        for given in inputs(dataset, prior, run.config, run.clock):
+            with run.clock.phase("map"):
+                take(run, given)
+            yield from given.raw
+        if run.back_end is not None:
+            with run.clock.phase("back_end"):
+                finish(run)
+    finally:  # what an interrupted run leaves has the same unit
+        in_own_unit(run)
 
 
 def take(run: MappingRun, given: Input) -> None:

@@ -12,15 +12,25 @@ from emgs_jax.running.record import MappingRun
 from emgs_jax.slam import SlamState
 
 
-def in_own_unit(run: MappingRun) -> None:
-    """Scale map and poses about the first camera by e^−γ, the mean of the prior's own units (`Belief.log_scale`).
+def own_unit(state: SlamState, origin: np.ndarray) -> SlamState:
+    """A state about whose map the prior says, on average, that it has the right size: scaled by e^−γ about `origin`.
 
-    A length of an inference times its scale is one of the map, so that the mean logarithm of the scales is what the
-    map's unit is short of the prior's own. One inference errs by its scale; their mean errs by less.
+    γ is the mean logarithm of the scales (`Belief.log_scale`). A length of an inference times its scale is one of the
+    map, so that γ is what the map's unit, the first inference's, is short of the prior's own. One inference errs by its
+    scale; their mean errs by less. A state with γ = 0 stays as it is.
+
+    Args:
+        state: after the last step.
+        origin: (3,) of the first camera.
     """
-    if run.state is None or not np.any(run.state.belief.log_scale):
+    return rescaled(state, np.exp(-float(state.belief.log_scale)), origin) if state.belief.log_scale else state
+
+
+def in_own_unit(run: MappingRun) -> None:
+    """`own_unit` of a run that ends, and its poses with it, those of the back end included."""
+    if run.state is None or not run.state.belief.log_scale:
         return
-    factor = float(np.exp(-run.state.belief.log_scale))
+    factor = np.exp(-float(run.state.belief.log_scale))
     origin = next(record.pose for record in run.records if record.pose is not None)[:3, 3]  # the anchor's
 
     def placed(pose: np.ndarray | None) -> np.ndarray | None:
@@ -30,7 +40,7 @@ def in_own_unit(run: MappingRun) -> None:
         moved[:3, 3] = origin + factor * (pose[:3, 3] - origin)
         return moved
 
-    run.state = rescaled(run.state, factor, origin)
+    run.state = own_unit(run.state, origin)
     run.records = [
         replace(
             record,
@@ -42,6 +52,7 @@ def in_own_unit(run: MappingRun) -> None:
     ]
     if run.back_end is not None:
         run.back_end.poses = [placed(pose) for pose in run.back_end.poses]
+        run.back_end.online = [placed(pose) for pose in run.back_end.online]
         run.back_end.log_scales = [float(np.log(factor)) + scale for scale in run.back_end.log_scales]
 
 
