@@ -29,7 +29,7 @@ REASONS = (
     "the geometry does not determine the pose",
 )
 
-LEAST_NOISE = 5e-4  # of the depth
+LEAST_NOISE = 2e-4  # of the depth; keeps the covariance of an exact prior regular
 NO_INFORMATION = 1e-6  # in place of 0
 FUSED = 3
 
