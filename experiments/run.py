@@ -15,8 +15,9 @@ from emgs_jax.io.files import FrameLog
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import describe, new_scorer, score_back_end, score_baselines, score_map, score_prior, spent
 from emgs_jax.report.printout import frame_lines
-from emgs_jax.report.provenance import print_metrics_table, provenance, write_metrics
+from emgs_jax.report.provenance import print_metrics_table, provenance, signature, write_metrics
 from emgs_jax.report.run_files import claim_folder, save_outputs, save_progress
+from emgs_jax.running.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import baseline_configs, build, build_dataset, build_prior, graph_config
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
@@ -41,9 +42,12 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             prior = build_prior(config, dataset)
         session = new_run(dataset, slam, clock, graph=graph)
         baselines = Baselines(fused, session, dataset)
-        for note in claim_folder(folder):
+        settings = OmegaConf.to_container(config, resolve=True)
+        origin = provenance(settings, dataset, prior.provenance)
+        keeper = Keeper(folder / CHECKPOINT_FILE, build(config, "checkpoint"), signature(origin))
+        for note in [*filter(None, [keeper.note]), *claim_folder(folder, keeper.found is not None)]:
             tqdm.write(note)
-        raw = _map(session, dataset, prior, baselines, evaluation, folder)
+        raw = _map(session, dataset, prior, (baselines, evaluation), folder, keeper)
         save_progress(folder, session)
         with clock.phase("densify"):
             labels = label_centers(session, prior)
@@ -57,9 +61,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             metrics |= dense.rendering | score_prior(session, raw, scorer)
             metrics |= score_baselines(session, baselines, raw, scorer)
         metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()
-    settings = OmegaConf.to_container(config, resolve=True)
-    metrics["provenance"] = provenance(settings, dataset, prior.provenance)
-    write_metrics(folder / "metrics.json", metrics)
+    write_metrics(folder / "metrics.json", metrics | {"provenance": origin})
+    keeper.drop()
     for note in [*frame_lines(session.records, len(dataset.skipped)), *notes]:
         tqdm.write(note)
     return metrics
@@ -69,11 +72,14 @@ def _map(
     session: MappingRun,
     dataset: ReadableFrames,
     prior: Prior,
-    baselines: Baselines,
-    evaluation: EvaluationConfig,
+    compared: tuple[Baselines, EvaluationConfig],
     folder: Path,
+    keeper: Keeper,
 ) -> RawPrior:
     """Map all frames and log each; returns what the prior alone says. What an interrupted run has is written."""
+    if keeper.found is not None:
+        tqdm.write(f"going on after frame {len(keeper.found.records)}: those before are read and predicted only")
+    baselines, evaluation = compared
     with FrameLog(folder / "frames.jsonl") as log, tqdm(total=len(dataset), unit="frame", desc="mapping") as bar:
 
         def on_record(record: FrameRecord) -> None:
@@ -85,12 +91,16 @@ def _map(
             log.append(to_line(FrameRecord(index, None, None, "skipped", reason)))
         try:
             with session.clock.phase("raw_prior"):
-                return gather(map_frames(session, dataset, prior), evaluation, dataset.has_ground_truth, baselines)
+                return gather(
+                    map_frames(session, dataset, prior, keeper), evaluation, dataset.has_ground_truth, baselines
+                )
         except BaseException:
             with contextlib.suppress(OSError, ValueError):  # the first error is the one to show
                 save_progress(folder, session)
                 if session.state is not None:
                     tqdm.write(f"ended early: what is mapped so far is in {folder}")
+                if keeper.path.exists():
+                    tqdm.write(f"the same command with hydra.run.dir={folder} goes on from there")
             raise
 
 

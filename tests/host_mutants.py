@@ -46,6 +46,7 @@ TRAJECTORY_FILE = ("tests/io/test_trajectory_file.py",)
 BACKPROJECTION = ("tests/data/test_backprojection.py",)
 READING = ("tests/data/test_reading.py", "tests/data/test_layouts.py")
 READABLE = ("tests/data/test_readable.py",)
+CHECKPOINT = ("tests/running/test_checkpoint.py",)
 IMAGES = ("tests/data/test_images.py", "tests/data/test_layouts.py")
 REPLICA = ("tests/data/test_replica.py", "tests/data/test_layouts.py")
 INTRINSICS = (
@@ -65,6 +66,28 @@ VERIFICATION = ("tests/loops/test_verification.py",)
 BACK_END = ("tests/running/test_back_end.py",)
 
 MUTANTS = (
+    # checkpoints
+    Mutant(
+        "emgs_jax/running/drive.py",
+        "position < keeper.found.num_inputs",
+        "position <= keeper.found.num_inputs",
+        CHECKPOINT,
+        "one step more is taken for done",
+    ),
+    Mutant(
+        "emgs_jax/running/checkpoint.py",
+        "submap = replace(config.submap, **dict(zip(names, self.capacities, strict=True)))",
+        "submap = config.submap",
+        CHECKPOINT,
+        "the map has grown and its config has not",
+    ),
+    Mutant(
+        "emgs_jax/running/checkpoint.py",
+        '        other = difference(header["signature"], jsonable(signature))\n',
+        "        other = None\n",
+        CHECKPOINT,
+        "another run's checkpoint is gone on from",
+    ),
     # back end
     Mutant(
         "emgs_jax/running/back_end.py",

@@ -61,6 +61,12 @@ def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -
     }
 
 
+def signature(block: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a provenance decides the bits of a result: all but the folder of executables and when to write."""
+    ignored = ("compilation_cache", "checkpoint")
+    return {**block, "config": {key: value for key, value in block["config"].items() if key not in ignored}}
+
+
 def git_revision(folder: Path) -> dict[str, Any] | None:
     """Revision of the checkout whose top is `folder`, and whether tracked files differ from it; None elsewhere."""
     top = _git(folder, "rev-parse", "--show-toplevel")

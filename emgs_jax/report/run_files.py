@@ -15,23 +15,24 @@ from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.running.back_end import metric_graph
+from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.record import MappingRun
 
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (
     *("metrics.json", "trajectory.txt", "trajectory_online.txt", "graph.g2o", "frames.jsonl"),
-    *("map.npz", "map.ply", "points.ply", "mesh.ply", "overview.png"),
+    *("map.npz", "map.ply", "points.ply", "mesh.ply", "overview.png", CHECKPOINT_FILE),
 )
 
 
-def claim_folder(folder: Path) -> list[str]:
+def claim_folder(folder: Path, goes_on: bool = False) -> list[str]:
     """Make a folder that of a new run: outputs of an earlier one go to previous-1, previous-2, …; says what was done.
 
-    So a run that ends early never lies beside the metrics of another one.
+    So a run that ends early never lies beside the metrics of another one. What a run that `goes_on` has left stays.
     """
     notes = [f"removed {folder / name}, which a write that was killed has left" for name in remove_temporaries(folder)]
-    old = [folder / name for name in OUTPUTS if (folder / name).exists()]
+    old = [] if goes_on else [folder / name for name in OUTPUTS if (folder / name).exists()]
     if old:
         target = next(path for path in (folder / f"previous-{n}" for n in itertools.count(1)) if not path.exists())
         target.mkdir()

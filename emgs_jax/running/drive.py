@@ -1,5 +1,6 @@
 """A sequence through the whole pipeline: what each input does to a run."""
 
+import contextlib
 from collections import deque
 from collections.abc import Iterator, Mapping
 
@@ -10,6 +11,7 @@ from tqdm import tqdm
 from emgs_jax.data.base import Dataset
 from emgs_jax.observation import Prediction
 from emgs_jax.prior.base import Prior
+from emgs_jax.running.checkpoint import Checkpoint, Keeper
 from emgs_jax.running.clock import Clock, Timer
 from emgs_jax.running.compilation import use_compilation_cache
 from emgs_jax.running.configure import RunConfig, build_dataset, build_prior
@@ -58,20 +60,37 @@ def show_record(bar: tqdm, record: FrameRecord) -> None:
     bar.update()
 
 
-def map_frames(run: MappingRun, dataset: Dataset, prior: Prior) -> Iterator[RawView]:
+def map_frames(run: MappingRun, dataset: Dataset, prior: Prior, keeper: Keeper | None = None) -> Iterator[RawView]:
     """Map a sequence into `run`; yields on the way what the prior alone says of each frame, for comparison.
+
+    Args:
+        run: before its first frame.
+        dataset: of the frames.
+        prior: of the predictions.
+        keeper: of the run's checkpoint, from which it goes on where there is one.
 
     Raises:
         ValueError: no frame has a point and a pose from which a map can start.
     """
+    keeper = keeper or Keeper()
+    keeper.attend(run)
     try:
-        for given in inputs(dataset, prior, run.config, run.clock):
+        for position, given in enumerate(inputs(dataset, prior, run.config, run.clock)):
             with run.clock.phase("map"):
-                take(run, given)
+                if keeper.found is not None and position < keeper.found.num_inputs:
+                    repeat(run, given, keeper.found, is_last=position + 1 == keeper.found.num_inputs)
+                else:
+                    take(run, given)
+            keeper.keep(run, position + 1)
             yield from given.raw
+        keeper.save()
         if run.back_end is not None:
             with run.clock.phase("back_end"):
                 finish(run)
+    except BaseException:
+        with contextlib.suppress(OSError):  # the first error is the one to show
+            keeper.save()
+        raise
     finally:  # what an interrupted run leaves has the same unit
         in_own_unit(run)
 
@@ -87,14 +106,28 @@ def take(run: MappingRun, given: Input) -> None:
             prepare(first, run.camera, run.config)
             run.state, run.config = start(first, run.camera, run.config)
             record_start(run, given, spent(given, timer))
-            info = None
         case Prediction() as prediction:
             run.state, info, run.config = advance(run.state, prediction, run.camera, run.config)
-            info = jax.device_get(info)
-            record_step(run, given, info, spent(given, timer))
+            record_step(run, given, jax.device_get(info), spent(given, timer))
     if run.back_end is not None:
         with run.clock.phase("back_end"):
-            correct(run, given, info)
+            correct(run, given)
+
+
+def repeat(run: MappingRun, given: Input, checkpoint: Checkpoint, is_last: bool) -> None:
+    """Let a checkpoint stand for what `take` did of an input; after the last the run is where it was stopped."""
+    if isinstance(given.taken, FirstWindow):
+        prepare(given.taken, run.camera, run.config)
+        run.state, run.config = start(given.taken, run.camera, run.config)
+    first = len(run.records)
+    for record in checkpoint.records[first : first + len(given.frames)]:
+        run.records.append(record)
+        run.on_record(record)
+    if run.back_end is not None and run.state is not None:
+        with run.clock.phase("back_end"):
+            correct(run, given)  # moves the map of the first window, in which nobody looks
+    if is_last:
+        run.state, run.config = checkpoint.restored(run.state, run.config)
 
 
 def spent(given: Input, timer: Timer, num_sharing: int = 1) -> Mapping[str, float]:

@@ -46,6 +46,7 @@ class FrameRecord:
         depth_noise: how much the points differ from the map, as a fraction of their depth.
         step_m: between the coarse and the fine pose.
         step_rad: likewise.
+        origin: place in the run of the frame by whose Gaussians it was placed (median of their births).
         repeat_rms: how far the two predictions of the previous image are apart, m.
         fused: points that moved Gaussians.
         updated: Gaussians that they moved.
@@ -74,6 +75,7 @@ class FrameRecord:
     depth_noise: float | None = None
     step_m: float | None = None
     step_rad: float | None = None
+    origin: int | None = None
     repeat_rms: float | None = None
     fused: int | None = None
     updated: int | None = None
@@ -196,6 +198,7 @@ def _described(info: StepInfo) -> dict[str, Any]:
         "depth_noise": float(localization.depth_noise),
         "step_m": float(localization.step_m),
         "step_rad": float(localization.step_rad),
+        "origin": int(info.origin) if localization.is_tracked else None,
         "repeat_rms": float(localization.repeat_rms),
         "fused": int(em.num_fused),
         "updated": int(em.num_updated),
@@ -208,22 +211,20 @@ def _described(info: StepInfo) -> dict[str, Any]:
     }
 
 
-def correct(run: MappingRun, given: Input, info: StepInfo | None) -> None:
+def correct(run: MappingRun, given: Input) -> None:
     """Tell the back end of the frames that `given` added, and let poses and map follow what it finds.
 
     Args:
         run: with a back end, and a state.
         given: what was taken.
-        info: of the step, on the host; None where the map was made from `given`.
     """
     end, added = run.back_end, run.records[-len(given.frames) :]
     looks = [
         Look(frame.index, frame.image, raw.points, raw.mask, given.T_anchor_views)
         for frame, raw in zip(given.frames, given.raw, strict=True)
     ]
-    origin = int(info.origin) if info is not None and added[-1].status == "tracked" else None
     for look, record in zip(looks, added, strict=True):
-        end.add(look, record.pose, record.scale or 1.0, origin)
+        end.add(look, record.pose, record.scale or 1.0, record.origin)
     num_contradicted = len(end.contradicted)
     found = end.look_for_loops(looks[-1])
     has_retracted = len(end.contradicted) > num_contradicted and end.retract(end.agreed()) > 0

@@ -1,0 +1,178 @@
+"""A run that was stopped goes on: what its map is made of after some input, in one file, and the way back.
+
+Frames are read and the prior is asked from the start again, because what they carry along (landmarks of a window, the
+raw prior's points, keyframes of loops) follows from that alone, the same every time. The steps are not repeated: state
+and records come from the file, so that the result has the same bits as that of a run which nobody stopped.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emgs_jax.io.files import atomic_write, jsonable
+from emgs_jax.io.npz import read_npz
+from emgs_jax.ops.ranges import number
+from emgs_jax.running.record import FrameRecord, MappingRun
+from emgs_jax.slam import SlamConfig, SlamState
+
+CHECKPOINT_FILE = "checkpoint.npz"
+FORMAT, VERSION = "emgs_jax.checkpoint", 1
+POSES = tuple(field.name for field in fields(FrameRecord) if field.name.endswith("pose"))
+
+
+@dataclass(frozen=True)
+class CheckpointConfig:
+    """When a run writes what it has.
+
+    Args:
+        every: frames; 0 = never, and a run that is stopped begins anew.
+    """
+
+    every: int = number(low=0, high=1_000_000_000)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A run after some of its inputs.
+
+    Args:
+        num_inputs: that it has taken.
+        leaves: of the state, in the order of `jax.tree.leaves`; none before there is a map.
+        capacities: of map and submap.
+        records: as the frames were placed.
+    """
+
+    num_inputs: int
+    leaves: Sequence[np.ndarray]
+    capacities: tuple[int, int]
+    records: Sequence[FrameRecord]
+
+    def restored(self, like: SlamState | None, config: SlamConfig) -> tuple[SlamState | None, SlamConfig]:
+        """State and config; `like` is a state of the same run, of any size."""
+        names = ("map_capacity", "submap_capacity")
+        submap = replace(config.submap, **dict(zip(names, self.capacities, strict=True)))
+        leaves = [jnp.asarray(leaf) for leaf in self.leaves]
+        state = jax.tree.unflatten(jax.tree.structure(like), leaves) if leaves else None
+        return state, replace(config, submap=submap)
+
+
+def save_checkpoint(path: Path, checkpoint: Checkpoint, signature: Mapping[str, Any]) -> None:
+    """Write a checkpoint of the run that `signature` (as JSON has it) tells from others; the old one is replaced."""
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "signature": jsonable(signature),
+        "num_inputs": checkpoint.num_inputs,
+        "capacities": checkpoint.capacities,
+        "num_leaves": len(checkpoint.leaves),
+        "records": [{k: v for k, v in vars(record).items() if k not in POSES} for record in checkpoint.records],
+    }
+    arrays = {f"leaf_{row}": np.asarray(leaf) for row, leaf in enumerate(checkpoint.leaves)}
+    nothing = np.full((4, 4), np.nan)  # stands for None
+    for name in POSES:
+        poses = [nothing if getattr(r, name) is None else getattr(r, name) for r in checkpoint.records]
+        arrays[name] = np.asarray(poses, np.float64).reshape(-1, 4, 4)
+    with atomic_write(path) as handle:
+        np.savez(handle, __header__=np.array(json.dumps(header, default=lambda value: value.item())), **arrays)
+
+
+def load_checkpoint(path: Path, signature: Mapping[str, Any]) -> Checkpoint:
+    """Read the checkpoint of the run that `signature` describes.
+
+    Raises:
+        ValueError: there is none, it is damaged, or it is of another run; the message names what is different.
+    """
+    try:
+        with open(path, "rb") as handle:
+            arrays = read_npz(handle)
+        header = json.loads(str(arrays["__header__"]))
+        if (header["format"], header["version"]) != (FORMAT, VERSION):
+            raise ValueError(f"it is of version {header['version']}, this code reads {VERSION}")
+        other = difference(header["signature"], jsonable(signature))
+        if other is not None:
+            raise ValueError(f"it is of another run: {other}")
+        poses = [{name: arrays[name][row] for name in POSES} for row in range(len(header["records"]))]
+        records = [
+            FrameRecord(**line, **{name: None if np.isnan(pose).any() else pose for name, pose in found.items()})
+            for line, found in zip(header["records"], poses, strict=True)
+        ]
+        leaves = [arrays[f"leaf_{row}"] for row in range(header["num_leaves"])]
+        return Checkpoint(header["num_inputs"], leaves, tuple(header["capacities"]), records)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} cannot be gone on from: {error}") from error
+
+
+def difference(one: Any, other: Any, key: str = "") -> str | None:
+    """The first key in which two values as JSON has them differ, and both values; None where they are equal."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        for name in sorted(one.keys() | other.keys()):
+            found = difference(one.get(name), other.get(name), f"{key}.{name}".lstrip("."))
+            if found is not None:
+                return found
+        return None
+    return None if one == other else f"{key} was {one!r}, now it is {other!r}"
+
+
+class Keeper:
+    """Who keeps the checkpoint of a run: `found` is what it goes on from, None where it begins.
+
+    Args:
+        path: of the file.
+        config: when it is written; None = never.
+        signature: what tells this run from others.
+    """
+
+    def __init__(
+        self, path: Path = Path(CHECKPOINT_FILE), config: CheckpointConfig | None = None, signature: Mapping = {}
+    ) -> None:
+        self.path, self._every, self._signature = path, config.every if config else 0, signature
+        self.found: Checkpoint | None = None
+        self.note: str | None = None  # why a file that is there is of no use
+        self._placed: list[FrameRecord] = []
+        self._done: tuple[int, SlamState | None, SlamConfig, int] | None = None
+        self._num_saved = 0
+        if self._every and path.exists():
+            try:
+                self.found = load_checkpoint(path, signature)
+                self._num_saved = len(self.found.records)
+            except ValueError as error:
+                self.note = f"{error}; this run begins at its first frame"
+
+    def attend(self, run: MappingRun) -> None:
+        """Hear of the records of a run as its frames are placed."""
+        hear = run.on_record
+
+        def on_record(record: FrameRecord) -> None:
+            self._placed.append(record)
+            hear(record)
+
+        run.on_record = on_record
+
+    def keep(self, run: MappingRun, num_inputs: int) -> None:
+        """Take notice that a run has taken so many inputs, and write it if it is time."""
+        self._done = num_inputs, run.state, run.config, len(self._placed)
+        if len(self._placed) >= self._num_saved + self._every:
+            self.save()
+
+    def save(self) -> None:
+        """Write the run as it was after its last complete input, if that is not written yet."""
+        if not self._every or self._done is None or self._done[-1] <= self._num_saved:
+            return
+        num_inputs, state, config, count = self._done
+        capacities = config.submap.map_capacity, config.submap.submap_capacity
+        leaves = jax.device_get(jax.tree.leaves(state))
+        checkpoint = Checkpoint(num_inputs, leaves, capacities, self._placed[:count])
+        save_checkpoint(self.path, checkpoint, self._signature)
+        self._num_saved = count
+
+    def drop(self) -> None:
+        """Remove the file of a run that is complete."""
+        self.path.unlink(missing_ok=True)
