@@ -143,7 +143,7 @@ def test_a_step_after_a_lost_frame_is_tracked_again(state, camera, settings):
     between, _ = step(state, lost, FULL, settings)
     _, info = step(between, predict_room(FRAME + 1, camera, num_features=2), FULL, settings)
     assert info.localization.is_tracked
-    assert pose_error(info.T_world_camera, path_pose(FRAME + 1))[0] < 0.05  # as above, over two frames
+    assert pose_error(info.T_world_camera, path_pose(FRAME + 1))[0] < 0.07  # over two frames, and the scale is not known either
 
 
 def errors_of(shape, rng):
@@ -297,7 +297,7 @@ def test_a_map_of_noisy_predictions_is_more_accurate_than_their_points(camera, s
         ours = off_walls(final.map.gaussians.means)[np.asarray(final.map.gaussians.valid)]
         ratios.append([np.median(ours) / np.median(raw), np.quantile(ours, 0.9) / np.quantile(raw, 0.9)])
     # Twelve frames see a wall, with errors that are independent but for the path's: a third is the most to hope for.
-    assert np.all(np.mean(ratios, axis=0) < 0.65), ratios
+    assert np.all(np.mean(ratios, axis=0) < 0.7), ratios
 
 
 def test_room_is_doubled_where_rows_did_not_fit(settings):
