@@ -17,6 +17,20 @@ VALUES = ("tests/running/test_values.py",)
 MUTANTS = (
     Mutant(
         "emgs_jax/io/ply_reader.py",
+        " and name not in [other.name for other in elements]",
+        "",
+        PLY_READER,
+        "a file has its vertices twice",
+    ),
+    Mutant(
+        "emgs_jax/running/values.py",
+        "if isinstance(value, DictConfig) and not is_plain:",
+        "if isinstance(value, DictConfig):",
+        VALUES,
+        "an empty mapping stands for a number",
+    ),
+    Mutant(
+        "emgs_jax/io/ply_reader.py",
         "if num_bytes < expected or (num_bytes > expected and not is_open):",
         "if num_bytes > expected and not is_open:",
         PLY_READER,

@@ -143,7 +143,9 @@ def test_a_step_after_a_lost_frame_is_tracked_again(state, camera, settings):
     between, _ = step(state, lost, FULL, settings)
     _, info = step(between, predict_room(FRAME + 1, camera, num_features=2), FULL, settings)
     assert info.localization.is_tracked
-    assert pose_error(info.T_world_camera, path_pose(FRAME + 1))[0] < 0.07  # over two frames, and the scale is not known either
+    assert (
+        pose_error(info.T_world_camera, path_pose(FRAME + 1))[0] < 0.07
+    )  # over two frames, and the scale is not known either
 
 
 def errors_of(shape, rng):

@@ -125,4 +125,4 @@ def read_calibration(path: Path) -> tuple[Size, Intrinsics, float]:
         raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise ValueError(f'{path} must hold {{"camera": {{w, h, fx, fy, cx, cy, scale}}}}: {error!r}') from error
-    return size, (fx, fy, cx, cy), scale
+    return size, reading.check_intrinsics((fx, fy, cx, cy), size, str(path)), scale

@@ -60,17 +60,21 @@ def _header(content: bytes, path: object) -> tuple[str, list[Element], int]:
                 continue
             case ["format", name, "1.0"] if name in _BYTE_ORDERS:
                 order = _BYTE_ORDERS[name]
-            case ["element", name, count] if count.isdecimal():
+            case ["element", name, count] if count.isdecimal() and name not in [other.name for other in elements]:
                 elements.append(Element(name, int(count), {}))
-            case ["property", "list", length, kind, name] if elements and {length, kind} <= _TYPES.keys():
-                elements[-1].properties[name] = None
-            case ["property", kind, name] if elements and kind in _TYPES and name not in elements[-1].properties:
-                elements[-1].properties[name] = _TYPES[kind]
+            case ["property", *kinds, name] if elements and name not in elements[-1].properties and _is_type(kinds):
+                elements[-1].properties[name] = None if kinds[0] == "list" else _TYPES[kinds[0]]
             case _:
                 raise ValueError(f"{path}, line {number}: {line[:80]!r} is no line of a PLY header: {REMEDY}")
     if order is None:
         raise ValueError(f"{path} does not say its format (ascii, binary_little_endian or _big_endian): {REMEDY}")
     return order, elements, start
+
+
+def _is_type(words: list[str]) -> bool:
+    """Whether words of a header are a type, or list and the types of its length and elements."""
+    is_list = len(words) == 3 and words[0] == "list"
+    return {*words[1:]} <= _TYPES.keys() if is_list else len(words) == 1 and words[0] in _TYPES
 
 
 def _has_vertices(elements: list[Element]) -> bool:

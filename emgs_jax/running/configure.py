@@ -20,6 +20,7 @@ from hydra.core.singleton import Singleton
 from hydra.errors import ConfigCompositionException, HydraException, InstantiationException, MissingConfigException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
@@ -73,9 +74,11 @@ def load_config(*overrides: str, name: str = "config") -> RunConfig:
     try:
         slam, densify, evaluation = (build(config, part) for part in ("slam", "densify", "evaluation"))
         graph = graph_config(config)
+        settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except InstantiationException as error:
         raise ValueError(message_of(error)) from error
-    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:  # a value that others refer to is missing or of another kind
+        raise ValueError(f"{' '.join(overrides)}: {message_of(error)}") from error
     return RunConfig(settings=settings, slam=slam, densify=densify, evaluation=evaluation, graph=graph)
 
 
@@ -90,6 +93,8 @@ def build(config: DictConfig, key: str, **more: Any) -> Any:
     Raises:
         ValueError: a value is not of the kind or in the range that its field declares; the message has its full key.
     """
+    if not isinstance(OmegaConf.select(config, key), DictConfig):
+        raise ValueError(f"{key}={OmegaConf.select(config, key)} would stand in the place of all its keys")
     check_values(config, key)
     return instantiate(OmegaConf.select(config, key), **more)
 
@@ -108,9 +113,11 @@ def compose(*overrides: str, name: str = "config") -> DictConfig:
             raise ValueError(_explained(error, name, overrides)) from error
         except HydraException as error:  # of the grammar
             raise ValueError(str(error)) from error
+        except (ValueError, TypeError, AssertionError) as error:  # no word in the place of an option
+            raise ValueError(_explained(error, name, overrides)) from error
     for group, options in groups().items():
-        value = OmegaConf.select(config, group.replace("/", "."), default=None)
-        if isinstance(value, str):
+        value = OmegaConf.select(config, group.replace("/", "."), default={})
+        if not isinstance(value, Mapping | DictConfig) and not (value is None and "/" not in group):
             raise ValueError(
                 f"{group.replace('/', '.')}={value} would put a word in the place of all its keys: choose one of its "
                 f"options ({', '.join(options)}) with {group}={value if value in options else options[0]}"
@@ -139,7 +146,7 @@ def groups() -> dict[str, list[str]]:
     return found
 
 
-def _explained(error: HydraException, name: str, overrides: Sequence[str]) -> str:
+def _explained(error: Exception, name: str, overrides: Sequence[str]) -> str:
     """What is wrong with the overrides, and what might have been meant."""
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     options = groups()
@@ -151,8 +158,8 @@ def _explained(error: HydraException, name: str, overrides: Sequence[str]) -> st
     values = [override for override in parsed if override not in choices]
     try:
         known = keys_of(hydra.compose(name, [override.input_line for override in choices]))
-    except HydraException:
-        return str(error)
+    except (HydraException, ValueError, TypeError, AssertionError):
+        return f"{' '.join(overrides)}: {error}"
     for override in values:
         key = override.key_or_group
         parts = [group for group in options if group.startswith(f"{key}/")]
@@ -160,7 +167,7 @@ def _explained(error: HydraException, name: str, overrides: Sequence[str]) -> st
             return f"{override.input_line}: {key} is chosen by its parts: {', '.join(f'{part}=…' for part in parts)}"
         if not override.is_add() and not key.startswith("hydra") and key not in known:
             return f"{key} is no key of the config; {near(key, sorted(known))}"
-    return str(error)
+    return f"{' '.join(overrides)}: {error}"
 
 
 def first_of_sweep(override: Override) -> str:

@@ -24,12 +24,16 @@ _NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: 
 
 @dataclasses.dataclass(frozen=True)
 class Declared:
-    """What a field says of its values: plain kinds, the kinds of a list's elements, the ends, the names."""
+    """What a field says of its values: plain kinds, the kinds of a list's elements, the ends, the names.
+
+    A field with `is_node` has fields of its own.
+    """
 
     kinds: frozenset[type]
     elements: frozenset[type] = frozenset()
     range: Range | None = None
     choices: tuple[str, ...] = ()
+    is_node: bool = False
 
 
 def check_values(config: DictConfig, key: str) -> None:
@@ -41,7 +45,8 @@ def check_values(config: DictConfig, key: str) -> None:
     for name in node:
         own = _origin(config, f"{key}.{name}")
         value = OmegaConf.select(config, own, default=MISSING)  # also where a value has yet to be given
-        if isinstance(value, DictConfig):
+        is_plain = name in fields and bool(fields[name].kinds or fields[name].elements or fields[name].choices)
+        if isinstance(value, DictConfig) and not is_plain:
             check_values(config, own)
         elif name in fields and value != MISSING:
             check_value(own, value, fields[name])
@@ -62,6 +67,8 @@ def _origin(config: DictConfig, key: str) -> str:
 
 def check_value(key: str, value: Any, field: Declared) -> None:
     """Raise ValueError where the value of `key` is not what its field declares."""
+    if field.is_node:
+        raise ValueError(f"{key}={_shown(value)} would stand in the place of all its keys: give {key}.KEY=VALUE")
     if field.choices:
         if value not in field.choices:
             raise ValueError(f"{key} must be one of {', '.join(field.choices)}; got {_shown(value)}")
@@ -129,7 +136,7 @@ def _declarations(cls: type) -> Iterator[tuple[str, Declared]]:
                 known = kinds or elements  # a traced field is annotated as the array that it becomes
                 yield field.name, Declared(kinds if known else frozenset({float}), elements, about["range"])
             else:
-                yield field.name, Declared(*_kinds(hint))
+                yield field.name, Declared(*_kinds(hint), is_node=dataclasses.is_dataclass(hint))
         return
     for name, parameter in inspect.signature(cls).parameters.items():
         yield name, Declared(*_kinds(parameter.annotation))

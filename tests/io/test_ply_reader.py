@@ -78,6 +78,13 @@ def test_every_cut_of_a_file_and_every_byte_too_many_is_noticed(written):
         (b"element vertex 40", b"element vertex -40", "line 3: 'element vertex -40' is no line"),
         (b"property float z\n", b"property float y\n", "line 6: 'property float y' is no line"),
         (b"property float z\n", b"property half z\n", "line 6: 'property half z' is no line"),
+        (b"element vertex 40\n", b"element vertex 40\nelement vertex 40\n", "line 4: 'element vertex 40' is no line"),
+        (
+            b"property uchar red\n",
+            b"property list uchar uchar x\n",
+            "line 10: 'property list uchar uchar x' is no line",
+        ),
+        (b"property uchar red\n", b"property list uchar red\n", "line 10: 'property list uchar red' is no line"),
         (b"format binary_little_endian 1.0\n", b"", "does not say its format"),
         (b"property uchar red\n", b"property list uchar uchar red\n", "a list among or before its vertices"),
         (b"end_header\n", b"", "no end_header: it is truncated"),

@@ -70,6 +70,10 @@ def test_every_value_of_conf_is_in_its_range(group, option):
         ("prior=multiview_stereo prior.dense.depth.max_cost=nan", "prior.dense.depth.max_cost must be a number"),
         ("prior=multiview_stereo prior.structure.median_depth=0", "prior.structure.median_depth must be a number"),
         ("baseline=voxel baseline.voxel.voxel_m=-1", "baseline.voxel.voxel_m must be a number"),
+        ("slam.em.average=3", "^slam.em.average=3 would stand in the place of all its keys: give slam.em.average.KEY="),
+        ("graph=default graph.noise=null", "^graph.noise=null would stand in the place of all its keys"),
+        ("evaluation.icp_voxel_m={}", "^evaluation.icp_voxel_m must be a number"),
+        ("slam.em.support={}", "^slam.em.support must be one of printed, normalized"),
     ],
 )
 def test_a_value_out_of_range_is_one_line_with_its_full_key(override, message):
@@ -89,6 +93,10 @@ def test_a_config_a_run_and_a_sweep_check_before_anything_is_made():
         load_config(*TINY, "slam.em.noise=nan")
     with pytest.raises(ValueError, match=r"evaluation\.voxel_m must be"):
         build(compose("evaluation.voxel_m=nan"), "evaluation")
+    with pytest.raises(ValueError, match="^densify=2 would stand in the place of all its keys"):
+        load_config(*TINY, "densify=2")
+    with pytest.raises(ValueError, match=r"^render=\[\]: .*render"):
+        load_config("render=[]")
     config = compose("axes={slam.em.noise:[0,1,-3]}", name="sweep")
     with pytest.raises(ValueError, match=r"slam\.em\.noise must be .*, got -3"):
         variants(config, read_axes(config))

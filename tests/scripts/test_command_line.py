@@ -27,6 +27,11 @@ from experiments.command import check_arguments
         (["slam=paper"], r"slam is chosen by its parts: slam/em=…, slam/existence=…, slam/fit=…"),
         (["dataset=kitti"], "dataset=kitti is no option of dataset: there are apartment, images, replica"),
         (["slam/em=paper,nothing"], "slam/em=paper,nothing is no option"),
+        (["dataset=1.5"], "^dataset=1.5 is no option of dataset: there are apartment"),
+        (["dataset=null"], "^dataset=null: Config group override must be a string"),
+        (["graph=3"], "^graph=3 is no option of graph: there are default, none"),
+        (["slam.em=null"], r"^slam\.em=None would put a word in the place of all its keys: .* with slam/em=default$"),
+        (["hydra=3"], "^hydra=3: "),
     ],
 )
 def test_an_override_that_names_nothing_is_one_line_with_what_was_perhaps_meant(overrides, message):

@@ -1,0 +1,340 @@
+"""What is read from outside: how a sound input is written, how it is read, and what must be true of what comes back."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from omegaconf import OmegaConf
+
+from emgs_jax import load_config
+from emgs_jax.data.base import Dataset
+from emgs_jax.data.images import Images
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.data.reading import is_rigid
+from emgs_jax.data.replica import Replica
+from emgs_jax.data.seven_scenes import SevenScenes
+from emgs_jax.data.synthetic import Synthetic
+from emgs_jax.data.tum import Tum
+from emgs_jax.evaluation.clouds import read_cloud
+from emgs_jax.features.text import TextEmbeddings, load_text, save_text
+from emgs_jax.gaussian_map import empty_map
+from emgs_jax.graph.measurements import LOOP, WINDOW, Graph, Nodes
+from emgs_jax.io.g2o import load_graph_g2o
+from emgs_jax.io.map_file import load_map, save_map
+from emgs_jax.io.ply import save_points_ply
+from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
+from emgs_jax.prior.base import windows
+from emgs_jax.prior.recorded import Recorded, record
+from emgs_jax.prior.simulated.prior import Simulated
+from emgs_jax.running.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from emgs_jax.running.configure import compose, keys_of
+from emgs_jax.running.record import FrameRecord
+from emgs_jax.running.values import check_values
+
+from .damage import BYTES, TEXT, WORDS, Damage
+
+NUM_FRAMES = 3
+SIZE = (48, 36)
+KITCHEN = (640, 480)
+
+
+class Target(NamedTuple):
+    """One kind of input.
+
+    Args:
+        name: of it.
+        write: a sound one into a folder.
+        read: it; raises AssertionError where what comes back breaks a promise.
+        damages: of a file, by the end of its name; a file with no such end stays sound.
+    """
+
+    name: str
+    write: Callable[[Path], None]
+    read: Callable[[Path], None]
+    damages: dict[str, tuple[Damage, ...]]
+
+
+def _pose(index: int) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = jaxlie.SO3.from_y_radians(0.05 * index).as_matrix()
+    pose[:3, 3] = 0.04 * index, 0.0, 0.02 * index
+    return pose
+
+
+def _image(path: Path, index: int, size: tuple[int, int]) -> None:
+    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    cv2.imwrite(str(path), np.stack([u % 256, v % 256, np.full(u.shape, 40 * index + 20)], -1).astype(np.uint8))
+
+
+def _depth(path: Path, size: tuple[int, int], scale: float) -> None:
+    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    cv2.imwrite(str(path), np.rint(scale * (1.5 + 0.3 * u / size[0] + 0.2 * v / size[1])).astype(np.uint16))
+
+
+def check_frames(dataset: Dataset) -> None:
+    """Every frame is of the promised shape and range."""
+    frames = ReadableFrames(dataset)
+    assert np.isfinite(frames.intrinsics).all() and min(frames.intrinsics[:2]) > 0
+    for row in range(min(len(frames), NUM_FRAMES)):
+        frame, (width, height) = frames[row], frames.size
+        assert frame.image.dtype == np.uint8 and frame.image.shape == (height, width, 3)
+        if frame.depth is not None:
+            assert frame.depth.shape == (height, width) and np.isfinite(frame.depth).all() and frame.depth.min() >= 0
+        if frame.T_world_camera is not None:
+            pose = np.asarray(frame.T_world_camera, np.float64)
+            assert is_rigid(pose) and np.abs(pose[:3, 3]).max() <= 1001
+        assert frame.timestamp is None or np.isfinite(frame.timestamp)
+
+
+def write_seven_scenes(folder: Path) -> None:
+    (folder / "seq-01").mkdir(parents=True)
+    for i in range(NUM_FRAMES):
+        stem = folder / "seq-01" / f"frame-{i:06d}"
+        _depth(stem.with_name(stem.name + ".depth.png"), KITCHEN, 1000)
+        _image(stem.with_name(stem.name + ".color.jpg"), i, KITCHEN)
+        np.savetxt(stem.with_name(stem.name + ".pose.txt"), _pose(i))
+
+
+def write_tum(folder: Path) -> None:
+    sequence = folder / "rgbd_dataset_freiburg3_plane"
+    for name in ("rgb", "depth"):
+        (sequence / name).mkdir(parents=True)
+    lists = {"rgb": "# color\n", "depth": "# depth\n", "groundtruth": "# t tx ty tz qx qy qz qw\n"}
+    for i in range(NUM_FRAMES):
+        _image(sequence / "rgb" / f"{100 + i}.png", i, SIZE)
+        _depth(sequence / "depth" / f"{100 + i}.png", SIZE, 5000)
+        lists["rgb"] += f"{100 + i}.0 rgb/{100 + i}.png\n"
+        lists["depth"] += f"{100 + i}.01 depth/{100 + i}.png\n"
+        lists["groundtruth"] += f"{100 + i}.0 {0.04 * i} 0 0 0 {np.sin(0.025 * i)} 0 {np.cos(0.025 * i)}\n"
+    for name, text in lists.items():
+        (sequence / f"{name}.txt").write_text(text)
+
+
+def write_replica(folder: Path) -> None:
+    (folder / "office9" / "results").mkdir(parents=True)
+    camera = {"w": SIZE[0], "h": SIZE[1], "fx": 60.0, "fy": 60.0, "cx": 23.5, "cy": 17.5, "scale": 6553.5}
+    (folder / "cam_params.json").write_text(json.dumps({"camera": camera}, indent=1))
+    for i in range(NUM_FRAMES):
+        _image(folder / "office9" / "results" / f"frame{i:06d}.jpg", i, SIZE)
+        _depth(folder / "office9" / "results" / f"depth{i:06d}.png", SIZE, 6553.5)
+    rows = [" ".join(f"{v:.9e}" for v in _pose(i).ravel()) for i in range(NUM_FRAMES)]
+    (folder / "office9" / "traj.txt").write_text("\n".join(rows))
+
+
+def write_images(folder: Path) -> None:
+    for i, name in enumerate(("img2.png", "img10.jpg", "img33.bmp")):
+        _image(folder / name, i, SIZE)
+
+
+CALIBRATIONS = {
+    "cameras.txt": "# Camera list\n1 OPENCV 48 36 50.5 50.25 24 18 .1 -.2 .001 -.002\n",
+    "transforms.json": json.dumps({"fl_x": 50.5, "fl_y": 50.2, "cx": 24, "cy": 18, "w": 48, "h": 36, "k1": 0.1}),
+    "orb.yaml": "%YAML:1.0\nCamera.type: PinHole\nCamera.fx: 50.5\nCamera.fy: 50.2\nCamera.cx: 23.5\nCamera.cy: 17.5\n"
+    "Camera.width: 48\nCamera.height: 36\nCamera.k1: 0.1\nCamera.k2: 0\nCamera.p1: 0\nCamera.p2: 0\n",
+    "intrinsics.yaml": "width: 48\nheight: 36\ncalibration: [50.5, 50.2, 23.5, 17.5]\n",
+    "plain.json": json.dumps({"fx": 50.5, "fy": 50.2, "cx": 23.5, "cy": 17.5, "width": 48, "height": 36}),
+}
+
+
+def write_calibrations(folder: Path) -> None:
+    (folder / "images").mkdir()
+    _image(folder / "images" / "1.png", 1, SIZE)
+    for name, text in CALIBRATIONS.items():
+        (folder / name).write_text(text)
+
+
+def read_calibrations(folder: Path) -> None:
+    """Those that are sound as well: a folder has one that is damaged."""
+    for name in CALIBRATIONS:
+        check_frames(Images(folder / "images", size=SIZE, intrinsics=str(folder / name)))
+
+
+def write_trajectory(folder: Path) -> None:
+    save_trajectory_tum(
+        folder / "trajectory.txt", np.arange(NUM_FRAMES), np.stack([_pose(i) for i in range(NUM_FRAMES)])
+    )
+
+
+def read_trajectory(folder: Path) -> None:
+    times, poses = load_trajectory_tum(folder / "trajectory.txt")
+    assert np.isfinite(times).all() and is_rigid(poses) and len(times) == len(poses)
+
+
+@cache
+def _recorded() -> tuple[Dataset, Simulated]:
+    dataset = ReadableFrames(Synthetic(size=SIZE, num_frames=40, stop=NUM_FRAMES))
+    return dataset, Simulated(seed=0, feature_size=4, classes=dataset.classes)
+
+
+def write_recording(folder: Path) -> None:
+    record(_recorded()[1], _recorded()[0], 2, folder / "recording")
+
+
+def read_recording(folder: Path) -> None:
+    dataset, prior = _recorded()[0], Recorded(folder / "recording")
+    prior.check(dataset, 2)
+    for window in windows(len(dataset), 2):
+        found = prior.predict(window, [dataset[i] for i in window.views], dataset.intrinsics)
+        assert found.points.shape == (len(window.dense), SIZE[1], SIZE[0], 3)
+        assert np.isfinite(found.points[found.mask]).all()
+
+
+def _reseal(folder: Path) -> None:
+    """Make the checksums fit, as a forger would: what is behind them is looked at, too."""
+    path = folder / "recording" / "manifest.json"
+    try:
+        manifest = json.loads(path.read_text())
+        manifest["files"] = {
+            name: hashlib.sha256((path.parent / name).read_bytes()).hexdigest() for name in manifest["files"]
+        }
+        manifest.pop("sha256", None)
+        text = json.dumps(manifest, sort_keys=True, separators=(",", ":")).encode()
+        path.write_text(json.dumps(manifest | {"sha256": hashlib.sha256(text).hexdigest()}))
+    except Exception:
+        return  # no JSON any more, or of another shape
+
+
+def read_forged_recording(folder: Path) -> None:
+    _reseal(folder)
+    read_recording(folder)
+
+
+def write_map(folder: Path) -> None:
+    map, rng = empty_map(16, 4), np.random.default_rng(0)
+    gaussians = map.gaussians
+    new = rng.normal(size=(16, 3)), np.tile(np.eye(3), (16, 1, 1)), np.arange(16) < 9
+    gaussians = eqx.tree_at(lambda g: (g.means, g.covs, g.valid), gaussians, tuple(jnp.asarray(x) for x in new))
+    cast = jax.tree.map(lambda leaf, like: jnp.asarray(leaf, like.dtype), gaussians, map.gaussians)
+    save_map(folder / "map.npz", eqx.tree_at(lambda m: m.gaussians, map, cast))
+
+
+def read_map(folder: Path) -> None:
+    map = load_map(folder / "map.npz")
+    assert np.isfinite(np.asarray(map.gaussians.means)[np.asarray(map.gaussians.valid)]).all()
+
+
+def write_cloud(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(50, 3))
+    save_points_ply(
+        folder / "points.ply", points, points / np.linalg.norm(points, axis=1, keepdims=True), rng.random((50, 3))
+    )
+
+
+def read_points(folder: Path) -> None:
+    cloud = read_cloud(folder / "points.ply", 8)
+    assert len(cloud) and all(np.isfinite(rows).all() for rows in (cloud.points, cloud.normals, cloud.colors))
+
+
+def write_graph(folder: Path) -> None:
+    lines = [f"VERTEX_SE3:QUAT {i} {i} 0 0 0 0 0 1" for i in range(4)]
+    upper = " ".join("1" if row == column else "0" for row in range(6) for column in range(row, 6))
+    lines += [f"EDGE_SE3:QUAT {i} {j} {j - i} 0 0 0 0 0 1 {upper}" for i, j in ((0, 1), (1, 2), (2, 3), (0, 3))]
+    (folder / "graph.g2o").write_text("\n".join(lines) + "\n")
+
+
+def read_graph(folder: Path) -> None:
+    graph: Graph = load_graph_g2o(folder / "graph.g2o")
+    nodes: Nodes = graph.nodes
+    assert np.isfinite(np.asarray(nodes.T_world.wxyz_xyz)).all()
+    assert set(np.asarray(graph.edges.kind).tolist()) <= {WINDOW, LOOP}
+    assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(graph.edges))
+
+
+def write_embeddings(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    save_text(folder / "text.npz", TextEmbeddings(("wall", "chair"), rng.normal(size=(2, 8)), ("a {}",), {"name": "m"}))
+
+
+def read_embeddings(folder: Path) -> None:
+    found = load_text(folder / "text.npz", {"name": "m"}, ("chair",))
+    assert found.vectors.shape == (1, 8) and np.isfinite(found.vectors).all()
+
+
+def write_checkpoint(folder: Path) -> None:
+    records = [FrameRecord(i, str(i), 0.1 * i, "tracked", pose=_pose(i), raw_pose=_pose(i)) for i in range(2)]
+    leaves = [np.arange(6, dtype=np.float32), np.ones(3, bool)]
+    save_checkpoint(folder / "checkpoint.npz", Checkpoint(2, leaves, (8, 8), records), {"a": 1})
+
+
+def read_checkpoint(folder: Path) -> None:
+    found = load_checkpoint(folder / "checkpoint.npz", {"a": 1})
+    assert len(found.leaves) == 2 and len(found.records) == 2 and found.num_inputs == 2
+
+
+@cache
+def _keys() -> tuple[str, ...]:
+    names = ("dataset=synthetic", "graph=default", "baseline=all")
+    return tuple(sorted(key for key in keys_of(compose(*names)) if "_target_" not in key))
+
+
+def write_words(folder: Path) -> None:
+    """The words of a command line, one a line."""
+    (folder / "words").write_text("slam.em.noise=0.5\nprior.seed=3\nslam.window_size=8\n")
+
+
+def change_words(data: bytes, rng: np.random.Generator) -> bytes:
+    """A key and a value that may not be its own; now and then a key that is none."""
+    keys, lines = _keys(), []
+    for _ in range(rng.integers(1, 4)):
+        key = keys[rng.integers(len(keys))]
+        if rng.integers(10) == 0:
+            key = key[: rng.integers(1, len(key) + 1)]
+        lines.append(f"{key}={WORDS[rng.integers(len(WORDS))]}")
+    return "\n".join(lines).encode()
+
+
+def read_words(folder: Path) -> None:
+    words = [line for line in (folder / "words").read_text(encoding="utf-8").split("\n") if line]
+    config = load_config("graph=default", "baseline=all", *words)
+    for part in config.settings:
+        check_values(OmegaConf.create(config.settings), part)
+    for leaf in jax.tree.leaves((config.slam, config.densify)):
+        assert not np.isnan(np.asarray(leaf, np.float64)).any()
+
+
+def targets() -> Iterator[Target]:
+    """All kinds of inputs."""
+    image = {".png": BYTES, ".jpg": BYTES, ".bmp": BYTES}
+    yield Target(
+        "seven_scenes",
+        write_seven_scenes,
+        lambda f: check_frames(SevenScenes(f, "seq-01", size=SIZE, stride=1)),
+        image | {".txt": TEXT},
+    )
+    yield Target(
+        "tum",
+        write_tum,
+        lambda f: check_frames(
+            Tum(f, "rgbd_dataset_freiburg3_plane", size=SIZE, stride=1, intrinsics=(60, 60, 23.5, 17.5))
+        ),
+        image | {".txt": TEXT},
+    )
+    yield Target(
+        "replica",
+        write_replica,
+        lambda f: check_frames(Replica(f, "office9", size=SIZE, stride=1)),
+        image | {".txt": TEXT, ".json": TEXT},
+    )
+    yield Target(
+        "images", write_images, lambda f: check_frames(Images(f, size=SIZE, intrinsics=(60, 60, 23.5, 17.5))), image
+    )
+    yield Target("calibration", write_calibrations, read_calibrations, {".txt": TEXT, ".json": TEXT, ".yaml": TEXT})
+    yield Target("trajectory", write_trajectory, read_trajectory, {".txt": TEXT})
+    yield Target("recording", write_recording, read_recording, {".npz": BYTES, ".json": TEXT})
+    yield Target("forged recording", write_recording, read_forged_recording, {".npz": BYTES, ".json": TEXT})
+    yield Target("map", write_map, read_map, {".npz": BYTES})
+    yield Target("points", write_cloud, read_points, {".ply": (*BYTES, *TEXT)})
+    yield Target("graph", write_graph, read_graph, {".g2o": TEXT})
+    yield Target("text embeddings", write_embeddings, read_embeddings, {".npz": BYTES})
+    yield Target("checkpoint", write_checkpoint, read_checkpoint, {".npz": BYTES})
+    yield Target("command line", write_words, read_words, {"words": (change_words,)})

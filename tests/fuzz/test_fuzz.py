@@ -1,0 +1,82 @@
+"""A few hundred damaged inputs, and the harness itself: it has to see a fault where there is one."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz.cases import ERROR, FAULT, SAME, Case, run_case, run_cases
+from tests.fuzz.damage import BYTES, TEXT
+from tests.fuzz.targets import Target, targets
+
+NUM_CASES = 280
+
+
+@pytest.mark.slow
+def test_no_damaged_input_is_a_fault():
+    found = list(run_cases(first=0, count=NUM_CASES, seed=7))
+    assert [case.number for case in found] == list(range(NUM_CASES))
+    assert not [case for case in found if case.verdict == FAULT]
+    assert {case.target for case in found} == {target.name for target in targets()}
+    refused = sum(case.verdict == ERROR for case in found)
+    assert NUM_CASES / 2 < refused < NUM_CASES, "most damages are seen; some are none"
+
+
+def verdict(tmp_path, read, damages=TEXT, number=0) -> Case:
+    target = Target("made up", lambda folder: (folder / "a.txt").write_text("1 2\n3 4\n"), read, {".txt": damages})
+    return run_case(number, 0, [target], tmp_path)
+
+
+def numbers(folder: Path) -> list[float]:
+    return [float(word) for word in (folder / "a.txt").read_text(errors="replace").split()]
+
+
+def test_what_is_read_is_read_and_an_error_must_name_the_file(tmp_path):
+    verdicts = {verdict(tmp_path / "a", lambda folder: numbers(folder) and None, number=n).verdict for n in range(60)}
+    assert {SAME, FAULT} <= verdicts, "float() names no file"
+
+    def read(folder):
+        try:
+            numbers(folder)
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{folder / 'a.txt'}: {error}") from error
+
+    assert {verdict(tmp_path / "b", read, number=n).verdict for n in range(60)} == {SAME, ERROR}
+
+
+@pytest.mark.parametrize(
+    "error", [KeyError("a.txt"), AssertionError("a.txt"), MemoryError("a.txt"), TypeError("a.txt")]
+)
+def test_other_kinds_of_errors_are_faults(tmp_path, error):
+    calls = []
+
+    def read(folder):
+        calls.append(1)
+        if len(calls) > 1:  # the first reads the sound one
+            raise error
+
+    found = verdict(tmp_path, read, BYTES)
+    assert found.verdict == FAULT and type(error).__name__ in found.message
+
+
+def test_a_sound_input_that_is_refused_ends_the_harness(tmp_path):
+    def read(folder):
+        raise ValueError("a.txt")
+
+    with pytest.raises(ValueError, match=r"a\.txt"):
+        verdict(tmp_path, read)
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_is_one_fault_and_the_next_case_goes_on(monkeypatch, tmp_path):
+    program = tmp_path / "python"
+    program.write_text(
+        "#!/bin/sh\nshift 2\nfor word; do last=$word; done\n"  # python -m tests.fuzz --inside … --cases N
+        f'test -e {tmp_path}/once && exec {os.sys.executable} -m tests.fuzz "$@"\ntouch {tmp_path}/once\nkill -9 $$\n'
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr("tests.fuzz.cases.sys.executable", str(program))
+    found = list(run_cases(first=5, count=3, seed=0))
+    assert [case.number for case in found] == [5, 6, 7]
+    assert [case.verdict == FAULT for case in found] == [True, False, False]
+    assert "ended with -9" in found[0].message
