@@ -80,7 +80,9 @@ MODELS = {
     "dust3r": _dust3r("arbitrary", "DUSt3R: CC BY-NC-SA 4.0", extra="dust3r"),
     "metric_dust3r": _dust3r("metric", MAST3R, extra="dust3r"),
     "mast3r": _dust3r("metric", MAST3R, extra="mast3r", fields=_names),
-    "must3r": _dust3r("arbitrary", "MUSt3R: no commercial use", extra="must3r", precision="amp", fields=_names),
+    "must3r": _dust3r(
+        "arbitrary", "MUSt3R: no commercial use", needs_gpu=True, extra="must3r", precision="amp", fields=_names
+    ),
     "pow3r_ba": _dust3r("arbitrary", "Pow3R: see its model card", extra="pow3r", fields=_inputs),
 }
 

@@ -5,6 +5,7 @@ Tests that need torch are skipped without it; the framework itself is a stand-in
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import hydra
@@ -121,11 +122,12 @@ GEOMETRY = ("camera_intrinsics", "depthmap", "camera_pose", "true_shape")
 @pytest.mark.parametrize(
     ("name", "reads"), [("mast3r", ("label", "instance")), ("must3r", ("label", "instance")), ("pow3r_ba", GEOMETRY)]
 )
-def test_wrappers_find_in_every_view_what_they_read(torch, framework, name, reads):
+def test_wrappers_find_in_every_view_what_they_read(torch, framework, monkeypatch, name, reads):
     """Some could not work: a KeyError in the first window. MASt3R takes views of one name for one view."""
     data, _, models = framework
     model = Loaded(Double(data, convert=torch.from_numpy, patch=16), reads)
     models.init_model_from_config = lambda name, device: model
+    monkeypatch.setitem(MODELS, name, replace(MODELS[name], needs_gpu=False))
     prior = make(data, "null", f"prior.model={name}", "prior.resolution=[64,48]")
     window = list(windows(len(data), 3))[1]
     prior.predict(window, [data[i] for i in window.views], data.intrinsics)
