@@ -37,6 +37,21 @@ def test_without_torch_or_the_framework_the_prior_says_what_to_install(monkeypat
         assert part in said
 
 
+def test_a_package_of_another_torch_is_named_instead_of_what_it_broke(torch, monkeypatch, tmp_path):
+    """torchvision ends the import of the framework with a RuntimeError."""
+
+    def fail(name):
+        raise RuntimeError("operator torchvision::nms does not exist")
+
+    monkeypatch.setattr(loading.importlib, "import_module", fail)
+    monkeypatch.setattr(loading, "companion_problem", lambda: "torchvision 1 does not fit torch 2 (…): reinstall")
+    with pytest.raises(ValueError, match="cannot import mapanything.models: torchvision 1 does not fit torch 2"):
+        loading.import_framework("mapanything.models")
+    monkeypatch.setattr(loading, "companion_problem", lambda: None)
+    with pytest.raises(RuntimeError, match="nms"):
+        loading.import_framework("mapanything.models")
+
+
 def test_a_checkpoint_that_is_not_set_or_lacks_files_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"prior.checkpoint is not set.*map-anything-apache"):
         check_checkpoint(None, tmp_path)
