@@ -30,7 +30,7 @@ def site(tmp_path, monkeypatch):
         ),
         (
             "torchaudio",
-            'OSError("libcudart.so.13: cannot open shared object file\\\\nmore")',
+            'OSError("libcudart.so.13: cannot open shared object file\\nmore")',
             "pip uninstall torchaudio",
         ),
     ],
