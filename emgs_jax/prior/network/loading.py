@@ -62,8 +62,6 @@ def configured(torch: ModuleType, name: str, device: str) -> Any:
     try:
         with whole_weights(torch, f"the file of {known.weights}", "download it again"):
             return models.init_model_from_config(name, device=device).eval()
-    except (ValueError, torch.cuda.OutOfMemoryError):
-        raise
     except ImportError as error:
         install = f"in {CLONE}, pip install -e '.{f'[{known.extra}]' if known.extra else ''}'"
         raise ValueError(f"prior.model={name} needs more ({error}): {companion_problem() or install}") from error
@@ -74,6 +72,8 @@ def configured(torch: ModuleType, name: str, device: str) -> Any:
         ) from error
     except OSError as error:
         raise ValueError(_missing_file(name, error)) from error
+    except (ValueError, torch.cuda.OutOfMemoryError):  # some of the types above are ValueErrors, too
+        raise
     except Exception as error:  # each format of weights has its own types of errors
         raise ValueError(
             f"prior.model={name} cannot be made ({first_line(error)}): if its weights are damaged, download them again "

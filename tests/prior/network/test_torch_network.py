@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from network_double import Double
 from network_stand_in import DINOV2, Loaded, clone, settings, write_checkpoint, write_weights
+from omegaconf.errors import InterpolationToMissingValueError
 from tiny_run import compose
 
 from emgs_jax.prior.base import windows
@@ -192,7 +193,9 @@ def test_networks_may_optimise_and_draw_and_give_the_same_answer_twice(torch, fr
     models.init_model_from_config = lambda name, device: model
     prior = make(data, "null", "prior.model=dust3r", "prior.resolution=[64,48]")
     window = next(windows(len(data), 3))
-    a, b = (prior.predict(window, [data[i] for i in window.views], data.intrinsics) for _ in range(2))
+    a = prior.predict(window, [data[i] for i in window.views], data.intrinsics)
+    torch.rand(1)  # of somebody else
+    b = prior.predict(window, [data[i] for i in window.views], data.intrinsics)
     assert a.points.tobytes() == b.points.tobytes() and a.mask.any()
 
 
@@ -281,10 +284,16 @@ def test_the_extra_that_is_named_is_the_frameworks(framework, monkeypatch, model
         load_network(settings(model, device="cuda"))
 
 
+class NotCached(FileNotFoundError, ValueError):
+    """As huggingface_hub's error where it is offline."""
+
+
 @pytest.mark.parametrize(
     ("error", "text"),
     [
         (ImportError("No module named 'dust3r'"), r"pip install -e '\.\[dust3r\]'"),
+        (NotCached("cannot find it on disk"), "is not in the local caches .* download it once beforehand"),
+        (InterpolationToMissingValueError("???"), "is to be set in configs/machine/default.yaml in the clone"),
         (OSError("offline"), "is not in the local caches .* download it once beforehand"),
         (
             FileNotFoundError(2, "No such file or directory", "/weights/DUSt3R.pth"),
