@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from emgs_jax.running.compilation import use_compilation_cache
 from emgs_jax.running.configure import CONF, compose, first_of_sweep, message_of
+from emgs_jax.running.gpu import leave_memory_to_torch
 
 from .interrupt import clear_interrupt
 
@@ -30,6 +31,7 @@ def command(
         @wraps(task)
         def job(config: DictConfig) -> Any:
             with clear_errors():
+                leave_memory_to_torch(config)
                 if "compilation_cache" in config:
                     use_compilation_cache(config.compilation_cache)
                 return task(config)

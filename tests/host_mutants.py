@@ -36,6 +36,9 @@ PLANAR = ("tests/prior/multiview/test_planar.py",)
 SOURCES = ("tests/prior/multiview/test_sources.py",)
 MULTIVIEW = ("tests/prior/multiview/test_multiview_stereo.py",)
 MASKS = ("tests/prior/network/test_masks.py",)
+WEIGHTS = ("tests/prior/network/test_weights.py",)
+NETWORK = ("tests/prior/network/test_torch_network.py",)
+PRIOR = ("tests/prior/network/test_mapanything.py",)
 RESIZE = ("tests/prior/network/test_resize.py",)
 FILES = ("tests/io/test_files.py",)
 MAP_FILE = ("tests/io/test_map_file.py",)
@@ -58,6 +61,8 @@ TUM = ("tests/data/test_tum.py", "tests/data/test_layouts.py")
 SYNTHETIC = ("tests/data/test_synthetic.py",)
 APARTMENT = ("tests/data/test_apartment.py",)
 TEXT = ("tests/features/test_text.py",)
+DINO = ("tests/features/test_dino.py",)
+GPU = ("tests/running/test_gpu.py",)
 TOKENS = ("tests/features/test_tokens.py",)
 PATCHES = ("tests/features/test_patches.py",)
 STACKED = ("tests/running/test_stacked.py",)
@@ -1390,6 +1395,83 @@ MUTANTS = (
         RESIZE,
         "height for width",
     ),
+    Mutant(
+        "emgs_jax/prior/network/loading.py",
+        'parts = [_some(missing, "missing")] if missing else []',
+        "parts = []",
+        WEIGHTS,
+        "missing weights stay random",
+    ),
+    Mutant(
+        "emgs_jax/prior/network/loading.py",
+        "if more and (strict or is_exact) else []",
+        "if more and strict else []",
+        WEIGHTS,
+        "weights of another model are accepted",
+    ),
+    Mutant(
+        "emgs_jax/prior/network/loading.py",
+        "    module.load_state_dict = load_whole\n",
+        "",
+        WEIGHTS,
+        "the framework loads as it likes",
+    ),
+    Mutant(
+        "emgs_jax/prior/network/loading.py",
+        "if name not in tensors or tensors[name].data_ptr() not in loaded]",
+        "if name not in tensors or name not in state]",
+        WEIGHTS,
+        "both names of one tensor are demanded",
+    ),
+    Mutant(
+        "emgs_jax/prior/network/torch_network.py",
+        "torch.no_grad(), _same_draws(torch)",
+        "torch.inference_mode(), _same_draws(torch)",
+        NETWORK,
+        "a network cannot optimise",
+    ),
+    Mutant(
+        "emgs_jax/prior/network/torch_network.py",
+        "        torch.manual_seed(0)\n",
+        "",
+        NETWORK,
+        "an answer depends on the windows before",
+    ),
+    Mutant(
+        "emgs_jax/prior/network/torch_network.py",
+        "                model.cache_dir = folder\n",
+        "                pass\n",
+        NETWORK,
+        "MASt3R mixes windows",
+    ),
+    Mutant(
+        "emgs_jax/prior/network/torch_network.py",
+        'if device.startswith("cuda") and model.precision else',
+        'if device.startswith("cuda") else',
+        NETWORK,
+        "the provenance names a precision that did not run",
+    ),
+    Mutant(
+        "emgs_jax/prior/network/torch_network.py",
+        "    setattr(model, attribute,",
+        '    setattr(model, "_" + attribute,',
+        NETWORK,
+        "the wrapper keeps its own precision",
+    ),
+    Mutant(
+        "emgs_jax/prior/network/framework.py",
+        'f"{row:06d}"',
+        '"000000"',
+        NETWORK,
+        "views of one window have one name",
+    ),
+    Mutant(
+        "emgs_jax/prior/network/mapanything.py",
+        "if plan != resize or not np.array_equal(image, frame.image):",
+        "if plan != resize or image is None:",
+        PRIOR,
+        "a frame of the same number keeps the other image",
+    ),
     # io
     Mutant(
         "emgs_jax/io/g2o.py",
@@ -1758,6 +1840,41 @@ MUTANTS = (
         "vectors[: len(chosen)]",
         TEXT,
         "embeddings in the file's order",
+    ),
+    Mutant(
+        "emgs_jax/features/tokens.py",
+        'return unicodedata.normalize("NFC", narrow)',
+        "return narrow",
+        TOKENS,
+        "a composed letter is two",
+    ),
+    Mutant(
+        "emgs_jax/features/tokens.py",
+        "parts += [*run] if is_number else [run]",
+        "parts.append(run)",
+        TOKENS,
+        "numbers that are no digits make one word",
+    ),
+    Mutant(
+        "emgs_jax/features/dino.py",
+        "        if found != self._num_registers:\n",
+        "        if found > self._num_registers:\n",
+        DINO,
+        "a backbone without registers passes",
+    ),
+    Mutant(
+        "emgs_jax/features/dino.py",
+        "        if (names := sorted(loaded[key]))\n",
+        '        if (names := sorted(loaded[key])) and key != "missing_keys"\n',
+        DINO,
+        "missing weights of the backbone stay random",
+    ),
+    Mutant(
+        "emgs_jax/running/gpu.py",
+        'os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")',
+        "pass",
+        GPU,
+        "JAX takes the memory of the network",
     ),
     Mutant(
         "emgs_jax/features/tokens.py",

@@ -6,9 +6,11 @@ that of the class token. Nothing is ever downloaded.
 """
 
 import importlib.util
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from emgs_jax.features.dinotxt import text_tower, vision_head
 from emgs_jax.features.images import ImageConfig, grid_size, network_input
 from emgs_jax.features.text import TextEmbeddings, average_over_templates, check_templates, load_text
 from emgs_jax.features.tokens import Tokenizer
+from emgs_jax.io.torch_packages import companion_problem, first_line
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -30,6 +33,7 @@ class DinoText:
         name: of the model, for provenance: embeddings of another name are refused.
         checkpoint: folder of the weights.
         files: names of the files in it.
+        num_registers: of the backbone, which dino.txt was trained on.
         image: how images are resized and normalised.
         num_text_heads: of the text encoder's attention.
         device: of PyTorch; None = a GPU if there is one.
@@ -43,6 +47,7 @@ class DinoText:
         name: str,
         checkpoint: str,
         files: DinoFiles,
+        num_registers: int,
         image: ImageConfig,
         num_text_heads: int,
         device: str | None,
@@ -55,7 +60,8 @@ class DinoText:
             raise ValueError(f"features={name} needs {' and '.join(absent)}: pip install 'emgs_jax[features]'")
         check_templates(templates)
         self._name, self._folder, self._files, self._image = name, checkpoint, files, image
-        self._num_text_heads, self._device = num_text_heads, device or _best_device()
+        self._num_registers, self._num_text_heads = int(num_registers), num_text_heads
+        self._device = device or _best_device(name)
         self._classes, self._templates, self._file = tuple(classes), tuple(templates), text
 
     @cached_property
@@ -124,22 +130,57 @@ class DinoText:
     @cached_property
     def _vision(self) -> tuple[Any, dict[str, "Tensor"]]:
         """The backbone, and the weights of the head."""
-        import transformers
-
         require(self._folder, BACKBONE, self._files.source)
         (path,) = require(self._folder, [self._files.vision_head], self._files.source)
         head = load_part(path, "visual_model.head.", "ln_final.weight")
         folder = path.parent
-        try:
-            backbone = transformers.AutoModel.from_pretrained(folder, local_files_only=True, use_safetensors=True)
-        except Exception as error:  # each of its readers raises its own type
-            raise ValueError(f"{folder} holds no backbone that can be read ({error}): fetch it again") from error
+        backbone = read_backbone(folder, self._files.source)
+        found = getattr(backbone.config, "num_register_tokens", 0)
+        if found != self._num_registers:
+            raise ValueError(
+                f"{path} is for a backbone with {self._num_registers} registers, the one in {folder} has {found}: "
+                f"take the backbone that {self._files.source} names"
+            )
         if head["ln_final.weight"].shape != (backbone.config.hidden_size,):
             raise ValueError(
                 f"{path} is for a backbone of width {len(head['ln_final.weight'])}, the one in {folder} has "
                 f"{backbone.config.hidden_size}: take the backbone that {self._files.source} names"
             )
         return backbone.eval().float().to(self._device), {name: value.to(self._device) for name, value in head.items()}
+
+
+def read_backbone(folder: Path, source: str) -> Any:
+    """Hugging Face's model of a folder with exactly the weights in it.
+
+    Args:
+        folder: has config.json and model.safetensors.
+        source: where they are published, for messages.
+
+    Raises:
+        ValueError: the files are damaged or not of one model, or transformers cannot be imported.
+    """
+    import transformers
+
+    remedy = f"fetch config.json and model.safetensors again, from {source}"
+    try:
+        backbone, loaded = transformers.AutoModel.from_pretrained(
+            folder, local_files_only=True, use_safetensors=True, output_loading_info=True
+        )
+    except Exception as error:  # each of its readers raises its own type
+        problem = companion_problem()
+        if problem is not None:
+            raise ValueError(f"transformers cannot load its model of {folder}: {problem}") from error
+        raise ValueError(f"{folder} holds no backbone that can be read ({first_line(error)}): {remedy}") from error
+    wrong = [
+        f"{len(names)} {word} ({', '.join(map(str, names[:3]))}{', …' if len(names) > 3 else ''})"
+        for word, key in (("missing", "missing_keys"), ("that it does not have", "unexpected_keys"))
+        if (names := sorted(loaded[key]))
+    ]
+    if wrong:
+        raise ValueError(
+            f"{folder / 'model.safetensors'} does not fit the model of its config.json, {' and '.join(wrong)}: {remedy}"
+        )
+    return backbone
 
 
 def patch_grid(tokens: "Tensor", grid: tuple[int, int]) -> "Tensor":
@@ -154,10 +195,18 @@ def patch_grid(tokens: "Tensor", grid: tuple[int, int]) -> "Tensor":
     return (patches / patches.norm(dim=-1, keepdim=True)).reshape(rows, columns, -1)
 
 
-def _best_device() -> str:
+def _best_device(name: str) -> str:
+    """A GPU if there is one; a CPU, which nobody asked for, is mentioned."""
     import torch
 
-    return "cuda" if torch.cuda.is_available() else "cpu"
+    if torch.cuda.is_available():
+        return "cuda"
+    print(
+        f"warning: torch {torch.__version__} finds no GPU, so features={name} runs on the CPU, which is slow "
+        "(features.device=cpu says that this is meant)",
+        file=sys.stderr,
+    )
+    return "cpu"
 
 
 def _plain(value: Any) -> Any:

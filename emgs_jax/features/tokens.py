@@ -1,13 +1,23 @@
-"""Text to token numbers as CLIP does it: byte-level pairs, merged in the order of a vocabulary file."""
+"""Text to token numbers as CLIP does it: byte-level pairs, merged in the order of a vocabulary file.
+
+CLIP cleans its text with ftfy first. What of that matters for names is done here: composed characters, straight quotes,
+ligatures as letters, full-width characters as usual ones, and HTML's entities. Text that was decoded wrongly stays so.
+"""
 
 import gzip
+import html
 import re
+import unicodedata
 import zlib
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
+# Letters and all numbers but digits, a digit, or neither; Python has no class for letters alone.
 WORDS = re.compile(r"'s|'t|'re|'ve|'m|'ll|'d|[^\W\d_]+|\d|(?:[^\s\w]|_)+", re.IGNORECASE)
+NARROWED = re.compile("[\u0132\u0133\u0149\u01c4-\u01cc\u01f1-\u01f3\u3000\ufb00-\ufb06\uff01-\uffef]")
+QUOTES = str.maketrans(dict.fromkeys("‘’‚‛ʼ", "'") | dict.fromkeys("“”„‟", '"'))
 END_OF_WORD = "</w>"
 
 
@@ -33,8 +43,7 @@ class Tokenizer:
         """Return int64 (texts, length): start, text, end, zeros; a text that is too long is cut before the end."""
         rows = np.zeros((len(texts), self._length), np.int64)
         for row, text in zip(rows, texts, strict=True):
-            words = WORDS.findall(" ".join(text.lower().split()))
-            numbers = [self._number[part] for word in words for part in self._parts(word)]
+            numbers = [self._number[part] for word in words_of(text) for part in self._parts(word)]
             numbers = [self._start, *numbers[: self._length - 2], self._end]
             row[: len(numbers)] = numbers
         return rows
@@ -57,6 +66,34 @@ class Tokenizer:
                     merged.append(part)
             parts = merged
         return parts
+
+
+def words_of(text: str) -> list[str]:
+    """Return the parts of a text that are merged each by itself: words, single numbers, runs of signs."""
+    cleaned = " ".join(clean(text).lower().split())
+    return [part for word in WORDS.findall(cleaned) for part in _without_numbers(word)]
+
+
+def clean(text: str) -> str:
+    """Return the text with what looks like one character as one, and without the signs of a typesetter."""
+    narrow = "".join(_narrow(sign) for sign in html.unescape(html.unescape(text)).translate(QUOTES))
+    return unicodedata.normalize("NFC", narrow)
+
+
+def _narrow(sign: str) -> str:
+    """Return a ligature of Latin letters or a full- or half-width character as the usual ones."""
+    return unicodedata.normalize("NFKC", sign) if NARROWED.match(sign) else sign
+
+
+def _without_numbers(word: str) -> list[str]:
+    """Cut a word at its numbers, each of which stands alone: ² in m² is one, and a letter to Python's expressions."""
+    if not any(unicodedata.category(sign) in ("No", "Nl") for sign in word):
+        return [word]
+    parts: list[str] = []
+    for is_number, signs in groupby(word, lambda sign: unicodedata.category(sign).startswith("N")):
+        run = "".join(signs)
+        parts += [*run] if is_number else [run]
+    return parts
 
 
 def byte_symbols() -> dict[int, str]:

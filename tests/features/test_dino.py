@@ -8,6 +8,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="dino.txt runs in PyTorch")
 transformers = pytest.importorskip("transformers", reason="the backbone is one of transformers")
 
+from safetensors.torch import load_file, save_file  # noqa: E402
 from tiny_dino import DIM, NUM_HEADS, NUM_TOKENS, dinov2, dinov3, random_text_encoder, write_checkpoint  # noqa: E402
 
 from emgs_jax.features.base import FeatureModel  # noqa: E402
@@ -36,7 +37,7 @@ def make(folder, kind, files=None, classes=("wall", "chair"), text=None):
     """The model on a checkpoint, which is written first; 5x3 patches for an image of 100x60."""
     image = ImageConfig(5 * KINDS[kind][2], MEAN, STD)
     files = files or write(folder, kind)
-    return DinoText(kind, str(folder), files, image, NUM_HEADS, "cpu", classes, ("a {}.", "the {}."), text)
+    return DinoText(kind, str(folder), files, 4, image, NUM_HEADS, "cpu", classes, ("a {}.", "the {}."), text)
 
 
 def images():
@@ -160,11 +161,59 @@ def test_damaged_and_foreign_weights_are_refused(tmp_path):
     (tmp_path / "head.pth").write_bytes(head)
     weights = (tmp_path / "model.safetensors").read_bytes()
     (tmp_path / "model.safetensors").write_bytes(weights[: len(weights) // 2])
-    with pytest.raises(ValueError, match="holds no backbone that can be read"):
+    with pytest.raises(ValueError, match="holds no backbone that can be read .*: fetch config.json .*, from the tests"):
         model.extract(images()[0])
     dinov2(dim=8).save_pretrained(tmp_path, safe_serialization=True)
     with pytest.raises(ValueError, match="is for a backbone of width 16, the one in .* has 8"):
         model.extract(images()[0])
+
+
+def test_a_backbone_whose_weights_are_not_exactly_its_own_is_refused_with_the_names(tmp_path):
+    """transformers fills what is missing with random numbers, and only the width was compared."""
+    model, path = make(tmp_path, "dinov2_text"), tmp_path / "model.safetensors"
+    tensors = load_file(path)
+    name = sorted(tensors)[3]
+    save_file({key: value for key, value in tensors.items() if key != name}, path, {"format": "pt"})
+    with pytest.raises(ValueError, match=rf"model.safetensors does not fit .*config.json, 1 missing \({name}\): fetch"):
+        model.extract(images()[0])
+    save_file(tensors | {"encoder.more": torch.zeros(2)}, path, {"format": "pt"})
+    with pytest.raises(ValueError, match=r"1 that it does not have \(encoder.more\)"):
+        model.extract(images()[0])
+
+
+def test_a_backbone_without_registers_is_refused(tmp_path):
+    model = make(tmp_path, "dinov2_text")
+    config = transformers.Dinov2Config(
+        hidden_size=DIM, num_hidden_layers=2, num_attention_heads=NUM_HEADS, mlp_ratio=2, patch_size=14, image_size=56
+    )
+    transformers.Dinov2Model(config).save_pretrained(tmp_path, safe_serialization=True)
+    with pytest.raises(ValueError, match="is for a backbone with 4 registers, the one in .* has 0: take the backbone"):
+        model.extract(images()[0])
+
+
+def test_a_package_of_another_pytorch_is_named_instead_of_the_files(tmp_path, monkeypatch):
+    """torchaudio comes with uniception; transformers imports it where it is there and then cannot import its models."""
+    model = make(tmp_path, "dinov2_text")
+    (tmp_path / "site").mkdir()
+    cause = 'raise OSError("libcudart.so.13: cannot open shared object file")'
+    (tmp_path / "site" / "torchaudio.py").write_text(cause)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+
+    def fail(*arguments, **options):
+        raise ModuleNotFoundError("Could not import module 'Dinov2WithRegistersModel'")
+
+    monkeypatch.setattr(transformers.AutoModel, "from_pretrained", fail)
+    with pytest.raises(ValueError, match=r"torchaudio .*does not fit torch .*libcudart.*pip uninstall torchaudio"):
+        model.extract(images()[0])
+
+
+def test_a_cpu_that_nobody_asked_for_is_mentioned(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    make(tmp_path, "dinov2_text")
+    assert "finds no GPU" not in capsys.readouterr().err
+    image = ImageConfig(70, MEAN, STD)
+    DinoText("dinov2_text", str(tmp_path), None, 4, image, NUM_HEADS, None, (), ("a {}.",), None)
+    assert "finds no GPU, so features=dinov2_text runs on the CPU" in capsys.readouterr().err
 
 
 def test_weights_that_would_run_code_are_refused(tmp_path):

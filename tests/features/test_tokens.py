@@ -1,13 +1,15 @@
 """CLIP's tokens; oracle: the tokenizer of `transformers` with the same vocabulary."""
 
 import gzip
+import html
 
 import pytest
 
-from emgs_jax.features.tokens import Tokenizer, byte_symbols
+from emgs_jax.features.tokens import Tokenizer, byte_symbols, words_of
 
 MERGES = ["t h", "th e</w>", "c h", "ch a", "cha i", "i n</w>", "a n", "e n", "p h", "o t", "ot o</w>", "ph oto</w>"]
 TEXTS = ["a photo of a chair.", "There IS  a wall-chair, isn't it?", "über 12 ænä_chains 日本", ""]
+TEXTS += ["Café", "12 m² Ⅷx¾", "à la e\u0301te\u0301 chair's"]  # composed or not; numbers that are no digits
 
 
 @pytest.fixture
@@ -29,6 +31,34 @@ def test_tokens_are_those_of_transformers(vocabulary):
     for row, text in zip(rows, TEXTS, strict=True):
         expected = reference(text)["input_ids"]
         assert row[: len(expected)].tolist() == expected and not row[len(expected) :].any()
+
+
+# What dino.txt's own tokenizer makes of them: ftfy 6.3.1's fix_text, html.unescape twice, its expression of words.
+WORDS_UPSTREAM = {
+    "Café’s": ["café", "'s"],
+    "Cafe\u0301’s": ["café", "'s"],
+    "12 m²": ["1", "2", "m", "²"],
+    "“big” ﬁreplace": ['"', "big", '"', "fireplace"],
+    "ＴＶ　set": ["tv", "set"],
+    "Tom &amp;amp; Jerry": ["tom", "&", "jerry"],
+    "don’t—stop": ["don", "'t", "—", "stop"],
+    "xⅧ¾y": ["x", "ⅷ", "¾", "y"],
+    "sofa_1": ["sofa", "_", "1"],
+}
+
+
+@pytest.mark.parametrize("text", WORDS_UPSTREAM)
+def test_words_are_those_of_dino_txts_own_tokenizer(text):
+    assert words_of(text) == WORDS_UPSTREAM[text]
+
+
+def test_words_are_those_of_ftfy_and_regex_where_they_are_installed():
+    ftfy = pytest.importorskip("ftfy", reason="ftfy is the oracle")
+    regex = pytest.importorskip("regex", reason="regex is the oracle")
+    expression = regex.compile(r"'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+", regex.IGNORECASE)
+    for text in [*WORDS_UPSTREAM, *TEXTS]:
+        cleaned = " ".join(html.unescape(html.unescape(ftfy.fix_text(text))).split()).lower()
+        assert words_of(text) == expression.findall(cleaned), text
 
 
 def test_pairs_merge_in_the_order_of_the_vocabulary(vocabulary):

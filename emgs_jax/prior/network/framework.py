@@ -3,13 +3,14 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from emgs_jax.ops.ranges import number
-from emgs_jax.prior.network.resize import Resize, Size, resize_image, resize_intrinsics
+from emgs_jax.prior.network.resize import Resize, Size, resize_intrinsics
 
 View = dict[str, Any]  # of the framework: `img`, `data_norm_type` and what else the network is told
 NORMALIZATIONS = {  # of RGB in [0, 1]: mean, standard deviation
@@ -20,6 +21,13 @@ NORMALIZATIONS = {  # of RGB in [0, 1]: mean, standard deviation
 CHECKPOINT_FILES = ("config.json", "model.safetensors")
 DINOV2_CLONE = "facebookresearch_dinov2_main"  # the name that torch.hub gives to its copy of the repository
 DOWNLOAD = "hf download facebook/map-anything-apache --local-dir FOLDER"
+
+
+USED_OUTPUTS = ("pts3d_cam", "conf", "non_ambiguous_mask", "camera_poses", "intrinsics")  # a quarter of what there is
+
+
+class NoAnswerError(ValueError):
+    """The network's answer to a window is none, such as rays that no camera has."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +42,10 @@ class FrameworkModel:
         weights: published weights and their licence.
         is_conditioned: it takes intrinsics and poses; the others take images only.
         needs_gpu: it cannot be built without one.
+        extra: of the framework's package, which installs what the network needs beside it.
+        precision: attribute of the framework's wrapper that holds its precision, `infer` where it is an argument; the
+            others run in float32, because their wrappers optimise geometry as well.
+        fields: what its wrapper reads in every view though it ignores it; keys of `_fields`.
     """
 
     norm: str
@@ -43,25 +55,48 @@ class FrameworkModel:
     weights: str
     is_conditioned: bool = False
     needs_gpu: bool = False
+    extra: str = ""
+    precision: str = ""
+    fields: tuple[str, ...] = ()
 
 
 APACHE = "facebook/map-anything-apache: Apache-2.0 (facebook/map-anything: CC-BY-NC-4.0, no commercial use)"
+DA3, DA3_NESTED = "DA3-GIANT-1.1: CC-BY-NC-4.0", "DA3NESTED-GIANT-LARGE-1.1: CC-BY-NC-4.0"
+VGGT = "and DINOv2's code and weights in the cache of torch.hub"
+MAST3R = "MASt3R, metric: CC BY-NC-SA 4.0"
+_names, _inputs = ("label", "instance"), ("camera_intrinsics", "depthmap", "camera_pose", "true_shape")
+_vggt = partial(FrameworkModel, "identity", 518, 14, "arbitrary", needs_gpu=True, precision="dtype")
+_pi3 = partial(FrameworkModel, "identity", 518, 14, needs_gpu=True, precision="dtype", extra="pi3")
+_da3 = partial(FrameworkModel, "dinov2", 504, 14, needs_gpu=True, precision="dtype", extra="depth-anything-3")
+_dust3r = partial(FrameworkModel, "dust3r", 512, 16)
 MODELS = {
-    "mapanything": FrameworkModel("dinov2", 518, 14, "metric", APACHE, is_conditioned=True),
-    "vggt": FrameworkModel("identity", 518, 14, "arbitrary", "VGGT-1B: licence of its own", needs_gpu=True),
-    "vggt_commercial": FrameworkModel("identity", 518, 14, "arbitrary", "VGGT-1B-Commercial: gated", needs_gpu=True),
-    "pi3": FrameworkModel("identity", 518, 14, "arbitrary", "Pi3: see its model card", needs_gpu=True),
-    "pi3x": FrameworkModel("identity", 518, 14, "approximate", "Pi3X: CC-BY-NC-4.0", needs_gpu=True),
-    "da3": FrameworkModel("dinov2", 504, 14, "arbitrary", "DA3-GIANT-1.1: CC-BY-NC-4.0", needs_gpu=True),
-    "da3_nested": FrameworkModel(
-        "dinov2", 504, 14, "metric", "DA3NESTED-GIANT-LARGE-1.1: CC-BY-NC-4.0", needs_gpu=True
+    "mapanything": FrameworkModel("dinov2", 518, 14, "metric", APACHE, is_conditioned=True, precision="infer"),
+    "vggt": _vggt(f"VGGT-1B: licence of its own; {VGGT}"),
+    "vggt_commercial": _vggt(f"VGGT-1B-Commercial: gated; {VGGT}"),
+    "pi3": _pi3("arbitrary", "Pi3: see its model card"),
+    "pi3x": _pi3("approximate", "Pi3X: CC-BY-NC-4.0"),
+    "da3": _da3("arbitrary", DA3),
+    "da3_nested": _da3("metric", DA3_NESTED),
+    "dust3r": _dust3r("arbitrary", "DUSt3R: CC BY-NC-SA 4.0", extra="dust3r"),
+    "metric_dust3r": _dust3r("metric", MAST3R, extra="dust3r"),
+    "mast3r": _dust3r("metric", MAST3R, extra="mast3r", fields=_names),
+    "must3r": _dust3r(
+        "arbitrary", "MUSt3R: no commercial use", needs_gpu=True, extra="must3r", precision="amp", fields=_names
     ),
-    "dust3r": FrameworkModel("dust3r", 512, 16, "arbitrary", "DUSt3R: CC BY-NC-SA 4.0"),
-    "metric_dust3r": FrameworkModel("dust3r", 512, 16, "metric", "MASt3R, metric: CC BY-NC-SA 4.0"),
-    "mast3r": FrameworkModel("dust3r", 512, 16, "metric", "MASt3R, metric: CC BY-NC-SA 4.0"),
-    "must3r": FrameworkModel("dust3r", 512, 16, "arbitrary", "MUSt3R: no commercial use"),
-    "pow3r_ba": FrameworkModel("dust3r", 512, 16, "arbitrary", "Pow3R: see its model card"),
+    "pow3r_ba": _dust3r("arbitrary", "Pow3R: see its model card", extra="pow3r", fields=_inputs),
 }
+
+
+def _fields(row: int, height: int, width: int) -> dict[str, Any]:
+    """What a wrapper reads in a view though the network is told images only: names, and geometry that it ignores."""
+    return {
+        "label": ["window"],
+        "instance": [f"{row:06d}"],
+        "true_shape": np.array([[height, width]], np.int32),
+        "camera_intrinsics": np.eye(3, dtype=np.float32)[None],
+        "camera_pose": np.eye(4, dtype=np.float32)[None],
+        "depthmap": np.zeros((1, height, width, 1), np.float32),
+    }
 
 
 @dataclass(frozen=True)
@@ -131,18 +166,20 @@ def build_views(
     """Make the framework's views; the first is the anchor.
 
     Args:
-        images: RGB, uint8, of one size.
-        intrinsics: fx, fy, cx, cy of the images.
-        resize: onto the network's grid.
+        images: RGB, uint8, on the network's grid.
+        intrinsics: fx, fy, cx, cy of the frames.
+        resize: from the frames onto the grid.
         model: it decides the normalisation, and whether the intrinsics are told.
         anchor_is_metric: the anchor is given a pose, which is called metric or not; None gives it no pose. Its value
             has no influence, because the network expresses poses relative to the first view: it is the identity.
     """
     mean, deviation = (np.array(values, np.float32)[:, None, None] for values in NORMALIZATIONS[model.norm])
     views = []
-    for image in images:
-        rgb = resize_image(image, resize).transpose(2, 0, 1).astype(np.float32) / 255
-        views.append({"img": ((rgb - mean) / deviation)[None], "data_norm_type": [model.norm]})
+    for row, image in enumerate(images):
+        rgb = image.transpose(2, 0, 1).astype(np.float32) / 255
+        told = _fields(row, *image.shape[:2])
+        view = {"img": ((rgb - mean) / deviation)[None], "data_norm_type": [model.norm]}
+        views.append(view | {key: told[key] for key in model.fields})
     if model.is_conditioned:
         for view in views:
             view["intrinsics"] = resize_intrinsics(intrinsics, resize)[None]

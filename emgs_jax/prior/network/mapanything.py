@@ -31,12 +31,13 @@ from emgs_jax.prior.network.framework import (
     ComputeConfig,
     Network,
     NetworkSettings,
+    NoAnswerError,
     ViewOutput,
     build_views,
     read_output,
 )
 from emgs_jax.prior.network.masks import MaskConfig, consistent, usable
-from emgs_jax.prior.network.resize import Resize, Size, choose_grid, plan_resize, to_frame
+from emgs_jax.prior.network.resize import Resize, Size, choose_grid, plan_resize, resize_image, to_frame
 from emgs_jax.prior.network.torch_network import load_network
 
 _usable, _consistent = eqx.filter_jit(usable), eqx.filter_jit(consistent)
@@ -84,6 +85,7 @@ class MapAnything(Prior):
         folder = None if checkpoint is None else Path(checkpoint).expanduser()
         self._network = load(NetworkSettings(model, folder, compute))
         self._seconds: list[float] = []
+        self._resized: dict[int, tuple[np.ndarray, Resize, np.ndarray]] = {}  # of the last window, by frame
         self.provenance = Provenance("mapanything", self._settings(model, compute) | self._network.described)
 
     def _settings(self, model: str, compute: ComputeConfig) -> dict[str, Any]:
@@ -115,13 +117,19 @@ class MapAnything(Prior):
         }
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """Predict for `frames` (in the order of `window.views`); see the module for frame, scale and grid."""
+        """Predict for `frames` (in the order of `window.views`); see the module for frame, scale and grid.
+
+        Where the network has no answer no pixel is valid and all poses but the anchor's are NaN.
+        """
         size = check_frames(window, frames)
         resize = plan_resize(size, self._resolution or choose_grid(size, self._model.resolution_set))
-        images = [frame.image for frame in frames]
+        images = self._on_grid(frames, resize)
         views = build_views(images, intrinsics, resize, self._model, self._anchor_is_metric)
         begin = perf_counter()
-        answers = self._network.infer(views)
+        try:
+            answers = self._network.infer(views)
+        except NoAnswerError:
+            return no_prediction(window, size)
         self._seconds.append(perf_counter() - begin)
         outputs = [read_output(answer, resize.grid) for answer in answers]
         dense = [window.views.index(index) for index in window.dense]
@@ -131,9 +139,20 @@ class MapAnything(Prior):
             valid = self._without_contradicted(outputs, valid, dense, T_anchor_view)
         return self._prediction(window, outputs, valid, T_anchor_view, resize)
 
+    def _on_grid(self, frames: Sequence[Frame], resize: Resize) -> list[np.ndarray]:
+        """Return the images on the grid; those that were in the last window are not resized again."""
+        before, self._resized = self._resized, {}
+        for frame in frames:
+            image, plan, small = before.get(frame.index, (None, None, None))
+            if plan != resize or not np.array_equal(image, frame.image):
+                small = resize_image(frame.image, resize)
+            self._resized[frame.index] = frame.image, resize, small
+        return [self._resized[frame.index][2] for frame in frames]
+
     def _scaled(self, outputs: list[ViewOutput], dense: list[int]) -> tuple[list[ViewOutput], dict[int, np.ndarray]]:
         """Return the outputs in metres, and the masks of the views that are needed, by row."""
-        needed = range(len(outputs)) if self._masks.min_consistent_share > 0 else sorted({0, *dense})
+        anchor = {0} if self._anchor_depth_m is not None else set()
+        needed = range(len(outputs)) if self._masks.min_consistent_share > 0 else sorted(anchor | {*dense})
         valid = {}
         for row in needed:
             view = outputs[row]
@@ -213,6 +232,15 @@ def check_frames(window: Window, frames: Sequence[Frame]) -> Size:
                 f"frame {frame.index} ({frame.name}) {frame.image.shape[1::-1]}: bring them to one (dataset.size)"
             )
     return size
+
+
+def no_prediction(window: Window, size: Size) -> PriorPrediction:
+    """What is given out where there is no answer: nothing is valid, and only the anchor has a pose."""
+    width, height = size
+    shape, poses = (len(window.dense), height, width), np.full((len(window.views), 4, 4), np.nan)
+    poses[0] = np.eye(4)
+    points, features = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 0), np.float16)
+    return PriorPrediction(window, poses, points, np.ones(shape, np.float32), np.zeros(shape, bool), features)
 
 
 def relative_poses(T_reference_view: Sequence[np.ndarray]) -> np.ndarray:

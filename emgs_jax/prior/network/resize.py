@@ -2,7 +2,8 @@
 
 Sizes are (width, height) and pixel centres are at integers. The frame is scaled until it covers the grid, rounded down
 to whole pixels and cropped about its centre. The network's intrinsics follow the scale, as upstream; the resampling
-follows the rounded size, so that at the sides of some grids a ray is up to a third of a pixel off.
+follows the rounded size. The network learned with the two as they are, so they stay; at the sides of some grids a ray
+is up to half of a grid pixel beside what the pixel shows: .41 at 1200×680, a third at 640×480.
 """
 
 import math

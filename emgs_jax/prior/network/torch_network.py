@@ -1,21 +1,27 @@
-"""A network of the MapAnything framework in torch: loaded from local files, arrays in, arrays out.
-
-torch and the framework are imported when a network is loaded, and nothing is downloaded.
-"""
+"""A network of the MapAnything framework in torch: arrays in, arrays out, in the precision that was asked for."""
 
 import contextlib
-import hashlib
-import importlib
-import os
+import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-from omegaconf.errors import OmegaConfBaseException
 
-from emgs_jax.prior.network.framework import CHECKPOINT_FILES, MODELS, Network, NetworkSettings, View, check_checkpoint
+from emgs_jax.prior.network.framework import (
+    MODELS,
+    USED_OUTPUTS,
+    Network,
+    NetworkSettings,
+    NoAnswerError,
+    View,
+    check_checkpoint,
+)
+from emgs_jax.prior.network.loading import configured, digest, import_framework, offline, pretrained
+
+Call = Callable[[list[View]], list[View]]
 
 
 class TorchNetwork:
@@ -27,16 +33,25 @@ class TorchNetwork:
         described: as in `Network`.
     """
 
-    def __init__(self, call: Callable[[list[View]], list[View]], device: str, described: dict[str, Any]) -> None:
+    def __init__(self, call: Call, device: str, described: dict[str, Any]) -> None:
         self._call, self._device, self.described, self.peak_bytes = call, device, described, 0
 
     def infer(self, views: Sequence[View]) -> list[dict[str, np.ndarray]]:
-        """Return the outputs as arrays; ValueError where the GPU's memory does not suffice."""
-        torch = _import("torch")
+        """Return the outputs in use as arrays.
+
+        Raises:
+            ValueError: the GPU's memory does not suffice.
+            NoAnswerError: no camera fits the rays of a view.
+        """
+        torch = import_framework("torch")
         height, width = views[0]["img"].shape[2:]
-        with _memory_error(torch, f"{len(views)} images of {width}x{height}"), torch.inference_mode():
-            outputs = self._call([{key: self._tensor(torch, value) for key, value in v.items()} for v in views])
-            arrays = [{key: _array(value) for key, value in output.items()} for output in outputs]
+        # Some networks end in an optimisation by gradients, which no_grad lets them switch on again.
+        with _memory_error(torch, f"{len(views)} images of {width}x{height}"), torch.no_grad(), _same_draws(torch):
+            try:
+                outputs = self._call([{key: self._tensor(torch, value) for key, value in v.items()} for v in views])
+            except torch.linalg.LinAlgError as error:
+                raise NoAnswerError(f"no camera fits the rays that the network gives ({error})") from error
+            arrays = [{key: _array(output[key]) for key in USED_OUTPUTS if key in output} for output in outputs]
         if self._device.startswith("cuda"):
             self.peak_bytes = torch.cuda.max_memory_allocated(self._device)
         return arrays
@@ -55,28 +70,42 @@ def _array(value: Any) -> Any:
 
 def load_network(settings: NetworkSettings) -> Network:
     """Load a network from local files; ValueError naming what is not installed, missing or set wrongly."""
-    torch, model = _import("torch"), MODELS[settings.model]
-    _import("torch.hub")
-    device = settings.compute.device or ("cuda" if torch.cuda.is_available() else "cpu")
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(f"prior.compute.device={device}, but torch {torch.__version__} finds no GPU: use cpu or null")
+    torch, model = import_framework("torch"), MODELS[settings.model]
+    import_framework("torch.hub")
+    device = _device(torch, settings)
     if model.needs_gpu and not device.startswith("cuda"):
         raise ValueError(f"prior.model={settings.model} cannot be built without a GPU: use prior.model=mapanything")
-    amp = settings.compute.amp if device.startswith("cuda") else "float32"
+    amp = settings.compute.amp if device.startswith("cuda") and model.precision else "float32"
     described = {"device": device.partition(":")[0], "amp": amp}
     torch.backends.cudnn.benchmark, torch.backends.cudnn.deterministic = False, True
-    with _offline(torch), _memory_error(torch, f"the weights of {settings.model}"):
+    with offline(torch), _memory_error(torch, f"the weights of {settings.model}"):
         if model.is_conditioned:
             check_checkpoint(settings.checkpoint, Path(torch.hub.get_dir()))
-            described["checkpoint_sha256"] = _digest(settings.checkpoint)
-            network = _import("mapanything.models").MapAnything.from_pretrained(str(settings.checkpoint))
-            call = _conditioned_call(network.to(device).eval(), settings, amp)
+            described["checkpoint_sha256"] = digest(settings.checkpoint)
+            network = pretrained(torch, settings.checkpoint).to(device).eval()
+            call = _conditioned_call(network, settings, amp)
         else:
-            call = _plain_call(torch, _configured_model(settings.model, device), amp)
+            network = configured(torch, settings.model, device)
+            _set_precision(torch, network, settings.model, amp)
+            call = _plain_call(network)
     return TorchNetwork(call, device, described)
 
 
-def _conditioned_call(model: Any, settings: NetworkSettings, amp: str) -> Callable[[list[View]], list[View]]:
+def _device(torch: ModuleType, settings: NetworkSettings) -> str:
+    """The device that is asked for, or the one there is; a CPU that nobody asked for is mentioned."""
+    device = settings.compute.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(f"prior.compute.device={device}, but torch {torch.__version__} finds no GPU: use cpu or null")
+    if settings.compute.device is None and device == "cpu":
+        print(
+            f"warning: torch {torch.__version__} finds no GPU, so prior.model={settings.model} runs on the CPU, which "
+            "is slow (prior.compute.device=cpu says that this is meant)",
+            file=sys.stderr,
+        )
+    return device
+
+
+def _conditioned_call(model: Any, settings: NetworkSettings, amp: str) -> Call:
     def call(views: list[View]) -> list[View]:
         return model.infer(
             views,
@@ -90,54 +119,37 @@ def _conditioned_call(model: Any, settings: NetworkSettings, amp: str) -> Callab
     return call
 
 
-def _plain_call(torch: ModuleType, model: Any, amp: str) -> Callable[[list[View]], list[View]]:
-    postprocess = _import("mapanything.utils.inference").postprocess_model_outputs_for_inference
-    dtype = {"bf16": torch.bfloat16, "fp16": torch.float16, "float32": None}[amp]
+def _set_precision(torch: ModuleType, model: Any, name: str, amp: str) -> None:
+    """Put the precision where the framework's wrapper keeps its own choice, so that the provenance says what ran."""
+    attribute = MODELS[name].precision
+    if not attribute:
+        return
+    if not hasattr(model, attribute):
+        raise ValueError(f"prior.model={name} keeps no .{attribute}: this version of mapanything is not supported")
+    dtypes = {"bf16": torch.bfloat16, "fp16": torch.float16, "float32": torch.float32}
+    names = {"bf16": "bf16", "fp16": "fp16", "float32": False}
+    setattr(model, attribute, (dtypes if attribute == "dtype" else names)[amp])
+
+
+def _plain_call(model: Any) -> Call:
+    postprocess = import_framework("mapanything.utils.inference").postprocess_model_outputs_for_inference
 
     def call(views: list[View]) -> list[View]:
-        with torch.autocast("cuda", dtype=dtype) if dtype is not None else contextlib.nullcontext():
+        with tempfile.TemporaryDirectory() as folder:
+            if hasattr(model, "cache_dir"):  # MASt3R would take what it finds there under a view's name for the view's
+                model.cache_dir = folder
             raw = model(views)
         return postprocess(raw, views, apply_mask=False)
 
     return call
 
 
-def _configured_model(name: str, device: str) -> Any:
-    """A network that the framework composes from its own configuration, whose files must be in the caches already."""
-    from hydra.core.global_hydra import GlobalHydra
-
-    models, clone = _import("mapanything.models"), "the clone of facebookresearch/map-anything"
-    outer = GlobalHydra.instance().hydra  # the framework composes with Hydra too and would leave its own behind
-    try:
-        return models.init_model_from_config(name, device=device).eval()
-    except ImportError as error:
-        extra = name.partition("_")[0]
-        raise ValueError(f"prior.model={name} needs more ({error}): in {clone}, pip install -e '.[{extra}]'") from error
-    except OmegaConfBaseException as error:
-        raise ValueError(
-            f"prior.model={name} reads its weights from the folder root_pretrained_checkpoints_dir, which is to be set "
-            f"in configs/machine/default.yaml in {clone} ({error})"
-        ) from error
-    except OSError as error:
-        raise ValueError(
-            f"the weights of prior.model={name} ({MODELS[name].weights}) are not in the local caches (HF_HOME, "
-            f"TORCH_HOME), and nothing is downloaded at run time: download them once beforehand ({error})"
-        ) from error
-    finally:
-        GlobalHydra.instance().hydra = outer
-
-
-def _import(name: str) -> ModuleType:
-    """A module of torch or of the framework; ValueError with the commands that install it."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ValueError(
-            f"prior=mapanything needs torch and the package mapanything, but {error}: in a clone of this repository, "
-            'pip install -e ".[mapanything]"; then clone the GitHub repository facebookresearch/map-anything and in '
-            "it, pip install --no-deps -e . (it is in no package index); or record with experiments.predict where both "
-            "are installed and use prior=recorded here"
-        ) from error
+@contextlib.contextmanager
+def _same_draws(torch: ModuleType) -> Iterator[None]:
+    """Let every call draw the same random numbers: the same question gets the same answer."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        yield
 
 
 @contextlib.contextmanager
@@ -151,49 +163,3 @@ def _memory_error(torch: ModuleType, what: str) -> Iterator[None]:
             "true and prior.compute.minibatch_size=1, and with XLA_PYTHON_CLIENT_PREALLOCATE=false let JAX reserve "
             "less. What experiments.predict has recorded stays valid"
         ) from error
-
-
-def _digest(folder: Path) -> str:
-    """SHA-256 over the SHA-256 of the checkpoint's files."""
-    digests = []
-    for name in CHECKPOINT_FILES:
-        with (folder / name).open("rb") as handle:
-            digests.append(hashlib.file_digest(handle, "sha256").hexdigest())
-    return hashlib.sha256("".join(digests).encode()).hexdigest()
-
-
-@contextlib.contextmanager
-def _offline(torch: ModuleType) -> Iterator[None]:
-    """Let nothing be downloaded: the Hugging Face hub by its switch, torch.hub by loading from its cached clones."""
-    os.environ["HF_HUB_OFFLINE"] = os.environ["TRANSFORMERS_OFFLINE"] = "1"
-    with contextlib.suppress(ImportError):
-        constants = importlib.import_module("huggingface_hub.constants")
-        constants.HF_HUB_OFFLINE = True  # it has read the variable if something imported it before
-    hub = torch.hub
-    load, download = hub.load, hub.download_url_to_file
-
-    def load_cached(repository: str, *arguments: Any, source: str = "github", **options: Any) -> Any:
-        if source == "github":
-            repository = str(_cached_clone(repository, Path(hub.get_dir())))
-        return load(repository, *arguments, source="local", **options)
-
-    def refuse(url: str, target: str, *arguments: Any, **options: Any) -> None:
-        raise OSError(f"{target} is missing, and nothing is downloaded at run time: it belongs to {url}")
-
-    hub.load, hub.download_url_to_file = load_cached, refuse
-    try:
-        yield
-    finally:
-        hub.load, hub.download_url_to_file = load, download
-
-
-def _cached_clone(repository: str, hub: Path) -> Path:
-    """torch.hub's copy of a repository `owner/name[:reference]`."""
-    name, _, reference = repository.partition(":")
-    clones = [
-        hub / f"{name.replace('/', '_')}_{branch}" for branch in ([reference] if reference else ["main", "master"])
-    ]
-    for clone in clones:
-        if (clone / "hubconf.py").is_file():
-            return clone
-    raise OSError(f"{clones[0]} has no hubconf.py: clone the GitHub repository {name} into that folder once")

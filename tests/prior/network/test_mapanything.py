@@ -11,9 +11,10 @@ from scene import slam_config
 from tiny_run import compose, dataset
 
 from emgs_jax.prior.base import Prior, windows
+from emgs_jax.prior.network import mapanything
 from emgs_jax.prior.network.framework import MODELS, build_views
 from emgs_jax.prior.network.mapanything import relative_poses
-from emgs_jax.prior.network.resize import plan_resize
+from emgs_jax.prior.network.resize import plan_resize, resize_image
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.running.convert import to_first_window
 
@@ -130,12 +131,42 @@ def test_the_anchors_pose_and_its_flag_are_switches_that_reach_the_network(overr
 )
 def test_views_keep_the_contract_and_one_step_aside_breaks_it(spoil, error, text):
     data = Sphere()
-    images = [data[index].image for index in range(2)]
-    views = build_views(images, data.intrinsics, plan_resize((40, 30), (56, 42)), MODELS["mapanything"], False)
+    resize = plan_resize((40, 30), (56, 42))
+    images = [resize_image(data[index].image, resize) for index in range(2)]
+    views = build_views(images, data.intrinsics, resize, MODELS["mapanything"], False)
     check_views(views)
     spoil(views)
     with pytest.raises(error, match=text):
         check_views(views)
+
+
+def test_an_image_is_resized_once_while_it_stays_in_the_window(monkeypatch):
+    data, resized = Sphere(num_frames=6), []
+
+    def counted(image, resize):
+        resized.append(int(image[0, 0, 0]))
+        return resize_image(image, resize)
+
+    monkeypatch.setattr(mapanything, "resize_image", counted)
+    prior = make(Double(data))
+    for window in calls(data):
+        ask(prior, data, window)
+    assert sorted(resized) == list(range(6))
+    other = [replace(data[i], image=data[(i + 1) % 6].image) for i in window.views]
+    prior.predict(window, other, data.intrinsics)  # frames of the same numbers
+    assert len(resized) == 6 + len(other)
+
+
+def test_no_mask_is_made_that_nobody_asks_for(monkeypatch):
+    made, usable = [], mapanything._usable
+    monkeypatch.setattr(mapanything, "_usable", lambda *arguments: made.append(1) or usable(*arguments))
+    data = Sphere()
+    window = calls(data)[2]
+    assert 0 not in window.dense
+    ask(make(Double(data)), data, window)
+    assert len(made) == len(window.dense)
+    ask(make(Double(data), "model=vggt"), data, window)
+    assert len(made) == 2 * len(window.dense) + 1  # the anchor's median depth is the unit
 
 
 def test_the_truth_of_the_frames_is_not_looked_at():

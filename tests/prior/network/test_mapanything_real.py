@@ -158,3 +158,16 @@ def test_the_anchors_pose_and_its_metric_flag_change_what_comes_out(checkpoint):
     ]
     for one, other in ((0, 1), (0, 2), (1, 2)):
         assert np.abs(answers[one] - answers[other]).max() > 0
+
+
+def test_weights_that_leave_a_parameter_of_the_real_model_random_are_refused(checkpoint, tmp_path):
+    """`from_pretrained` took them, and every process predicted something else."""
+    tensors = safetensors.load_file(str(checkpoint / "model.safetensors"))
+    name = next(name for name in tensors if name.endswith("weight"))
+    (tmp_path / "config.json").write_bytes((checkpoint / "config.json").read_bytes())
+    renamed = {("other." + key if key == name else key): value for key, value in tensors.items()}
+    safetensors.save_file(renamed, str(tmp_path / "model.safetensors"))
+    with pytest.raises(hydra.errors.InstantiationException) as raised:
+        predict(tmp_path)
+    said = str(raised.value.__cause__)
+    assert f"1 missing ({name}) and 1 that it does not have (other.{name})" in said and str(tmp_path) in said

@@ -33,6 +33,17 @@ def test_grid_and_intrinsics_are_those_of_the_framework_to_the_last_digit(name):
     np.testing.assert_array_equal(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
 
 
+@pytest.mark.parametrize(("frame", "grid", "beside"), [((1200, 680), (518, 294), 0.41), ((640, 480), (518, 392), 0.33)])
+def test_what_a_grid_pixel_shows_is_beside_its_ray_by_what_upstreams_rounding_makes(frame, grid, beside):
+    """Its camera matrix follows the scale, its image the whole pixels of the scaled size."""
+    resize, size = plan_resize(frame, grid), np.array(frame)
+    fx, _, cx, _ = intrinsics = (600.0, 600.0, *((size - 1) / 2))
+    columns, _ = frame_on_grid(resize)
+    matrix = resize_intrinsics(intrinsics, resize)
+    of_camera = matrix[0, 0] * (np.arange(frame[0]) - cx) / fx + matrix[0, 2]
+    assert abs(np.abs(of_camera - columns).max() - beside) < 0.005
+
+
 def test_scaled_size_and_crop_are_those_of_the_framework():
     scenes, replica = plan_resize((640, 480), (518, 392)), plan_resize((1200, 680), (518, 294))
     assert (scenes.scaled, scenes.corner) == ((522, 392), (2, 0)) and abs(scenes.scale - 0.8166667) < 1e-6

@@ -1,0 +1,38 @@
+"""Packages that are compiled for one version of PyTorch: which of those installed was compiled for another."""
+
+import importlib
+import importlib.util
+from importlib.metadata import PackageNotFoundError, version
+
+REMEDIES = {
+    "torchaudio": "nothing here uses it: pip uninstall torchaudio",
+    "torchvision": "pip install --force-reinstall torch torchvision, both from the package index that torch is from",
+}
+
+
+def companion_problem() -> str | None:
+    """Say which companion of PyTorch is installed but cannot be imported, why, and the remedy; None where all is well.
+
+    Others import them when they find them, and then report what they could not import themselves.
+    """
+    for name, remedy in REMEDIES.items():
+        if importlib.util.find_spec(name) is None:
+            continue
+        try:
+            importlib.import_module(name)
+        except Exception as error:  # a library that is missing, an operator that is missing, another CUDA
+            return f"{name} {_version(name)} does not fit torch {_version('torch')} ({first_line(error)}): {remedy}"
+    return None
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of what an error says, or its type: some of PyTorch's go on for pages."""
+    lines = str(error).strip().splitlines()
+    return lines[0].strip()[:300] if lines else type(error).__name__
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "(of unknown version)"
