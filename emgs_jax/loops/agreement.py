@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import chi2, norm
 
@@ -85,19 +85,17 @@ def agreeing(
     every = [*loops, *contradicted]
     if not every:
         return np.zeros(0, bool)
-    implied = [poses[loop.a] @ rescaled(loop.Z_a_b, np.exp(log_scales[loop.a])) for loop in every]
-    corrections = [T @ np.linalg.inv(poses[loop.b]) for T, loop in zip(implied, every, strict=True)]
-
-    def agrees(one: int, other: int) -> bool:
-        if not _are_near(every[one], every[other], config):
-            return False
-        distance, turn = gap_between(corrections[other] @ poses[every[one].b], implied[one])
-        return distance <= config.max_distance and turn <= config.max_turn_deg
-
-    agree = np.array([[agrees(one, other) for other in range(len(every))] for one in range(len(every))])
+    implied = np.stack([poses[loop.a] @ rescaled(loop.Z_a_b, np.exp(log_scales[loop.a])) for loop in every])
+    now = np.stack([poses[loop.b] for loop in every])
+    corrections = implied @ np.linalg.inv(now)
+    queries, candidates = (np.array([getattr(loop, name) for loop in every]) for name in ("b", "a"))
+    agree = _are_near(queries, config.max_query_gap) & _are_near(candidates, config.max_candidate_gap)
+    one, other = np.nonzero(agree)
+    distance, turn = gap_between(corrections[other] @ now[one], implied[one])
+    agree[one, other] = (distance <= config.max_distance) & (turn <= config.max_turn_deg)
     agree &= agree.T
     _, group = connected_components(agree, directed=False)
-    queries, is_evidence = np.array([loop.b for loop in every]), np.arange(len(every)) < len(loops)
+    is_evidence = np.arange(len(every)) < len(loops)
 
     def is_accepted(row: int) -> bool:
         others = set(queries[agree[row] & is_evidence]) - {queries[row]}
@@ -107,5 +105,5 @@ def agreeing(
     return np.array([is_accepted(row) for row in range(len(loops))], bool)
 
 
-def _are_near(one: LoopMeasurement, other: LoopMeasurement, config: AgreementConfig) -> bool:
-    return abs(one.b - other.b) <= config.max_query_gap and abs(one.a - other.a) <= config.max_candidate_gap
+def _are_near(frames: Int[np.ndarray, " n"], max_gap: int) -> Bool[np.ndarray, "n n"]:
+    return np.abs(frames[:, None] - frames) <= max_gap

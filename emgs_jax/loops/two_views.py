@@ -5,11 +5,13 @@ of either seen by the other (pixels), and the two depths of one point (r, and th
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from threadpoolctl import ThreadpoolController
 
 from emgs_jax.ops.ranges import number
 
@@ -85,10 +87,12 @@ def moved_by(T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> F
     return points @ T[:3, :3].T + T[:3, 3]
 
 
-def gap_between(T: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
-    """Distance of two camera centres, and the angle between the cameras in degrees."""
-    angle = Rotation.from_matrix(T[:3, :3].T @ other[:3, :3]).magnitude()
-    return float(np.linalg.norm(T[:3, 3] - other[:3, 3])), float(np.degrees(angle))
+def gap_between(
+    T: Float[np.ndarray, "*n 4 4"], other: Float[np.ndarray, "*n 4 4"]
+) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+    """Distance of two camera centres, and the angle between the cameras in degrees; of one pair or of n."""
+    angle = Rotation.from_matrix(T[..., :3, :3].mT @ other[..., :3, :3]).magnitude()
+    return np.linalg.norm(T[..., :3, 3] - other[..., :3, 3], axis=-1), np.degrees(angle)
 
 
 def log_ratios(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float) -> Float[np.ndarray, "n"]:
@@ -117,7 +121,8 @@ def refine(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float, conf
         def weighted(step, start=(T_a_b, log_ratio), std=stds[kinds]):
             return _errors(pairs, *_stepped(*start, step)) / std
 
-        found = least_squares(weighted, np.zeros(7), loss="huber", f_scale=HUBER, x_scale="jac")
+        with _libraries().limit(limits=1, user_api="blas"):  # for seven unknowns threads cost more than they do
+            found = least_squares(weighted, np.zeros(7), loss="huber", f_scale=HUBER, x_scale="jac")
         T_a_b, log_ratio = _stepped(T_a_b, log_ratio, found.x)
         errors = np.abs(_errors(pairs, T_a_b, log_ratio))
         scatter = [MAD_TO_STD * np.median(errors[kinds == kind]) for kind in (0, 1)]
@@ -125,6 +130,12 @@ def refine(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float, conf
     inflation = 1 + (len(pairs.pixels_a) - 1) * config.correlation
     covariance = inflation * np.linalg.inv(found.jac.T @ found.jac) + np.diag(floors**2)
     return Similarity(T_a_b, float(log_ratio), covariance)
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    """The libraries with threads that this process has loaded, BLAS among them."""
+    return ThreadpoolController()
 
 
 def _stepped(

@@ -121,7 +121,7 @@ def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatc
     given = SimpleNamespace(frames=[frame], raw=[raw], T_anchor_views={})
     monkeypatch.setattr(end, "add", lambda *arguments: None)
     monkeypatch.setattr(end, "look_for_loops", lambda look: [])
-    correct(run, given, None)
+    correct(run, given)
     assert end.accepted == loops and len(end.closures) == 1
 
     def contradict(look: Look) -> list:
@@ -129,7 +129,7 @@ def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatc
         return []
 
     monkeypatch.setattr(end, "look_for_loops", contradict)
-    correct(run, given, None)
+    correct(run, given)
     assert not end.accepted and len(end.closures) == 2
     assert error(end.poses, drifted) < 0.01
     assert error([record.pose for record in run.records], end.poses) == 0
