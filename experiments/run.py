@@ -61,7 +61,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             metrics |= dense.rendering | score_prior(session, raw, scorer)
             metrics |= score_baselines(session, baselines, raw, scorer)
         metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()
-    write_metrics(folder / "metrics.json", metrics | {"provenance": origin})
+    metrics["provenance"] = origin
+    write_metrics(folder / "metrics.json", metrics)
     keeper.drop()
     for note in [*frame_lines(session.records, len(dataset.skipped)), *notes]:
         tqdm.write(note)

@@ -13,6 +13,9 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(MAX_BYTES))  # else 
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
+# Likewise: what jaxlib 0.10.1 logs of every executable from the cache fills the pipes of those processes.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
 # Likewise: small arrays need no thorough compilation, and an oracle holds for any. Flags of the user come last and win.
 QUICK = ["--xla_backend_optimization_level=0"]
 if tuple(map(int, version("jaxlib").split(".")[:2])) <= (0, 10):  # XLA ends the process at a flag that it does not know

@@ -114,8 +114,10 @@ def loop_edge(loop: LoopMeasurement) -> Edge:
 
 
 def stacked(edges: Sequence[Edge]) -> Edges:
-    """Rows of the graph, float32."""
-    a, b, Z, ratios, weights, kinds = zip(*edges, strict=True)
+    """Rows of the graph, float32, with free ones up to a power of two: what is compiled is so rarely."""
+    count = len(edges)
+    room = max(64, 1 << (count - 1).bit_length())
+    a, b, Z, ratios, weights, kinds = zip(*edges, *[edges[0]] * (room - count), strict=True)
     return Edges(
         a=jnp.asarray(a, jnp.int32),
         b=jnp.asarray(b, jnp.int32),
@@ -123,5 +125,5 @@ def stacked(edges: Sequence[Edge]) -> Edges:
         log_ratio=jnp.asarray(ratios, jnp.float32),
         sqrt_info=jnp.asarray(np.stack(weights), jnp.float32),
         kind=jnp.asarray(kinds, jnp.int32),
-        valid=jnp.ones(len(edges), bool),
+        valid=jnp.asarray(np.arange(room) < count),
     )

@@ -98,14 +98,18 @@ def test_a_run_that_is_stopped_and_goes_on_has_the_same_bits(tmp_path, monkeypat
 @pytest.mark.slow
 def test_a_scheduler_ends_a_run_with_one_word_and_the_same_command_goes_on(tmp_path):
     command = [sys.executable, "-m", "experiments.run", *TINY, *OVERRIDES, f"hydra.run.dir={tmp_path}"]
-    program = subprocess.Popen(command, cwd=CONF.parent, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    log = tmp_path / "frames.jsonl"
-    while program.poll() is None and not (log.exists() and log.read_bytes().count(b"\n") >= 3):
-        time.sleep(0.01)
-    program.send_signal(signal.SIGTERM)
-    said = program.communicate(timeout=300)[1]
+    log, errors = tmp_path / "frames.jsonl", tmp_path.with_suffix(".log")
+    with open(errors, "w") as file:  # a pipe that nobody reads is full at some time
+        program = subprocess.Popen(command, cwd=CONF.parent, stdout=file, stderr=subprocess.STDOUT)
+        end = time.monotonic() + 300
+        while program.poll() is None and not (log.exists() and log.read_bytes().count(b"\n") >= 3):
+            assert time.monotonic() < end, "no third frame"
+            time.sleep(0.01)
+        program.send_signal(signal.SIGTERM)
+        program.wait(timeout=300)
+    said = errors.read_text()
     assert program.returncode == 128 + signal.SIGTERM, said
-    assert said.endswith("terminated\n") and "Traceback" not in said
+    assert "terminated\n" in said and "Traceback" not in said
     assert f"the same command with hydra.run.dir={tmp_path} goes on" in said
     done = subprocess.run(command, cwd=CONF.parent, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0 and "going on after frame" in done.stdout + done.stderr, done.stderr
