@@ -6,7 +6,6 @@ that of the class token. Nothing is ever downloaded.
 """
 
 import importlib.util
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
@@ -20,7 +19,7 @@ from emgs_jax.features.dinotxt import text_tower, vision_head
 from emgs_jax.features.images import ImageConfig, grid_size, network_input
 from emgs_jax.features.text import TextEmbeddings, average_over_templates, check_templates, load_text
 from emgs_jax.features.tokens import Tokenizer
-from emgs_jax.io.torch_packages import companion_problem, first_line
+from emgs_jax.io.torch_packages import best_device, companion_problem, first_line
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -61,7 +60,7 @@ class DinoText:
         check_templates(templates)
         self._name, self._folder, self._files, self._image = name, checkpoint, files, image
         self._num_registers, self._num_text_heads = int(num_registers), num_text_heads
-        self._device = device or _best_device(name)
+        self._device = device or best_device(importlib.import_module("torch"), f"features={name}", "features.device")
         self._classes, self._templates, self._file = tuple(classes), tuple(templates), text
 
     @cached_property
@@ -193,20 +192,6 @@ def patch_grid(tokens: "Tensor", grid: tuple[int, int]) -> "Tensor":
     columns, rows = grid
     patches = tokens[0, -rows * columns :].float()
     return (patches / patches.norm(dim=-1, keepdim=True)).reshape(rows, columns, -1)
-
-
-def _best_device(name: str) -> str:
-    """A GPU if there is one; a CPU, which nobody asked for, is mentioned."""
-    import torch
-
-    if torch.cuda.is_available():
-        return "cuda"
-    print(
-        f"warning: torch {torch.__version__} finds no GPU, so features={name} runs on the CPU, which is slow "
-        "(features.device=cpu says that this is meant)",
-        file=sys.stderr,
-    )
-    return "cpu"
 
 
 def _plain(value: Any) -> Any:

@@ -55,7 +55,7 @@ def _pad(array: object, count: int) -> np.ndarray:
     return np.concatenate([array, np.zeros((count - len(array), *array.shape[1:]), array.dtype)])
 
 
-def _bucket(count: int) -> int:
+def bucket(count: int) -> int:
     """The next power of two, from 64 on: a growing graph compiles rarely."""
     return max(64, 1 << (max(count, 1) - 1).bit_length())
 
@@ -89,7 +89,7 @@ def problem_of(graph: Graph, scale_std: float) -> Problem | str:
     joined = _parts(graph, used)
     used = used & joined[np.asarray(edges.a) * used] & joined[np.asarray(edges.b) * used]
 
-    n, e = _bucket(len(valid)), _bucket(int(used.sum()))
+    n, e = bucket(len(valid)), bucket(int(used.sum()))
     still = np.tile([1.0, 0, 0, 0, 0, 0, 0], (n, 1))
     still[: len(valid)][joined] = poses[joined, :7]
     scales = np.where(joined, poses[:, 7], 0.0)

@@ -75,6 +75,14 @@ def jsonable(value: Any) -> Any:
     return str(value)
 
 
+def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values by dotted key."""
+    values = {}
+    for key, value in tree.items():
+        values |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return values
+
+
 def write_json(path: str | os.PathLike, value: Any) -> None:
     """Write `value` as indented, strictly valid JSON."""
     with atomic_write(path, "w") as handle:

@@ -2,7 +2,9 @@
 
 import importlib
 import importlib.util
+import sys
 from importlib.metadata import PackageNotFoundError, version
+from types import ModuleType
 
 REMEDIES = {
     "torchaudio": "nothing here uses it: pip uninstall torchaudio",
@@ -23,6 +25,24 @@ def companion_problem() -> str | None:
         except Exception as error:  # a library that is missing, an operator that is missing, another CUDA
             return f"{name} {_version(name)} does not fit torch {_version('torch')} ({first_line(error)}): {remedy}"
     return None
+
+
+def best_device(torch: ModuleType, what: str, key: str) -> str:
+    """A GPU if there is one; a CPU, which nobody asked for, is mentioned.
+
+    Args:
+        torch: the package.
+        what: runs there, for the message.
+        key: of the config that would ask for it.
+    """
+    if torch.cuda.is_available():
+        return "cuda"
+    print(
+        f"warning: torch {torch.__version__} finds no GPU, so {what} runs on the CPU, which is slow "
+        f"({key}=cpu says that this is meant)",
+        file=sys.stderr,
+    )
+    return "cpu"
 
 
 def first_line(error: BaseException) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from emgs_jax.io.files import jsonable
+from emgs_jax.io.files import flat, jsonable
 from emgs_jax.report.provenance import RESULT_FORMAT, ROWS, prefix_of
 
 METRICS_FILE = "metrics.json"
@@ -76,7 +76,7 @@ def is_finished(folder: Path, config: Mapping[str, Any]) -> bool:
     path = folder / METRICS_FILE
     if not path.exists():
         return False
-    made, wanted = _flat(read_metrics(path)["provenance"]["config"]), _flat(jsonable(config))
+    made, wanted = flat(read_metrics(path)["provenance"]["config"]), flat(jsonable(config))
     changes = [
         f"{key} was {made.get(key)}, now {wanted.get(key)}"
         for key in sorted({*made, *wanted} - set(_PLACES))
@@ -120,11 +120,3 @@ def _estimate(folder: Path, metrics: dict[str, Any], kind: str, prefix: str) -> 
         revision=(block["git"] or {}).get("revision"),
         values={key.removeprefix(prefix): value for key, value in own.items() if isinstance(value, int | float)},
     )
-
-
-def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values by dotted key."""
-    values = {}
-    for key, value in config.items():
-        values |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return values

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.graph.deform import deform, deform_view
 from emgs_jax.graph.measurements import LOOP, Graph, Nodes
 from emgs_jax.graph.optimize import GraphConfig, GraphInfo, optimize
+from emgs_jax.graph.problem import bucket
 from emgs_jax.loops.agreement import AgreementConfig, agreeing
 from emgs_jax.loops.appearance import AppearanceConfig, Database, describe, extend, propose
 from emgs_jax.loops.two_views import rescaled
@@ -210,7 +211,7 @@ class BackEnd:
     def nodes(self) -> Nodes:
         """All nodes, with free rows up to a power of two: the map's part compiles rarely."""
         count = len(self.poses)
-        room = max(64, 1 << (count - 1).bit_length())
+        room = bucket(count)
         poses = to_se3(np.stack([*self.poses, *[np.eye(4)] * (room - count)]))
         scales = jnp.asarray([*self.log_scales, *[0.0] * (room - count)], jnp.float32)
         return Nodes(poses, scales, jnp.arange(room) < count)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.io.files import atomic_write, jsonable
+from emgs_jax.io.files import atomic_write, flat, jsonable
 from emgs_jax.io.npz import read_npz
 from emgs_jax.ops.ranges import number
 from emgs_jax.running.record import FrameRecord, MappingRun
@@ -110,15 +110,11 @@ def load_checkpoint(path: Path, signature: Mapping[str, Any]) -> Checkpoint:
         raise ValueError(f"{path} cannot be gone on from: {error}") from error
 
 
-def difference(one: Any, other: Any, key: str = "") -> str | None:
-    """The first key in which two values as JSON has them differ, and both values; None where they are equal."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        for name in sorted(one.keys() | other.keys()):
-            found = difference(one.get(name), other.get(name), f"{key}.{name}".lstrip("."))
-            if found is not None:
-                return found
-        return None
-    return None if one == other else f"{key} was {one!r}, now it is {other!r}"
+def difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> str | None:
+    """The first key in which two trees as JSON has them differ, and both values; None where they are equal."""
+    before, now = flat(one), flat(other)
+    changed = (key for key in sorted({*before, *now}) if before.get(key) != now.get(key))
+    return next((f"{key} was {before.get(key)!r}, now it is {now.get(key)!r}" for key in changed), None)
 
 
 class Keeper:

@@ -40,6 +40,8 @@ CONF = next(
     folder for folder in (Path(__file__).parents[1] / "conf", Path(__file__).parents[2] / "conf") if folder.is_dir()
 )
 
+NO_WORD = (ValueError, TypeError, AssertionError)  # what Hydra raises where an option of a group is no word
+
 
 @dataclass(frozen=True)
 class RunConfig:
@@ -109,12 +111,10 @@ def compose(*overrides: str, name: str = "config") -> DictConfig:
     with _hydra():
         try:
             config = hydra.compose(name, list(overrides))
-        except (ConfigCompositionException, MissingConfigException) as error:
+        except (ConfigCompositionException, MissingConfigException, *NO_WORD) as error:
             raise ValueError(_explained(error, name, overrides)) from error
         except HydraException as error:  # of the grammar
             raise ValueError(str(error)) from error
-        except (ValueError, TypeError, AssertionError) as error:  # no word in the place of an option
-            raise ValueError(_explained(error, name, overrides)) from error
     for group, options in groups().items():
         value = OmegaConf.select(config, group.replace("/", "."), default={})
         if not isinstance(value, Mapping | DictConfig) and not (value is None and "/" not in group):
@@ -158,7 +158,7 @@ def _explained(error: Exception, name: str, overrides: Sequence[str]) -> str:
     values = [override for override in parsed if override not in choices]
     try:
         known = keys_of(hydra.compose(name, [override.input_line for override in choices]))
-    except (HydraException, ValueError, TypeError, AssertionError):
+    except (HydraException, *NO_WORD):
         return f"{' '.join(overrides)}: {error}"
     for override in values:
         key = override.key_or_group

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.graph.measurements import LOOP, WINDOW, Edges
+from emgs_jax.graph.problem import bucket
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.ops.ranges import number
 from emgs_jax.running.convert import to_se3
@@ -116,7 +117,7 @@ def loop_edge(loop: LoopMeasurement) -> Edge:
 def stacked(edges: Sequence[Edge]) -> Edges:
     """Rows of the graph, float32, with free ones up to a power of two: what is compiled is so rarely."""
     count = len(edges)
-    room = max(64, 1 << (count - 1).bit_length())
+    room = bucket(count)
     a, b, Z, ratios, weights, kinds = zip(*edges, *[edges[0]] * (room - count), strict=True)
     return Edges(
         a=jnp.asarray(a, jnp.int32),

@@ -1,7 +1,6 @@
 """A network of the MapAnything framework in torch: arrays in, arrays out, in the precision that was asked for."""
 
 import contextlib
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from emgs_jax.io.torch_packages import best_device
 from emgs_jax.prior.network.framework import (
     MODELS,
     USED_OUTPUTS,
@@ -92,16 +92,10 @@ def load_network(settings: NetworkSettings) -> Network:
 
 
 def _device(torch: ModuleType, settings: NetworkSettings) -> str:
-    """The device that is asked for, or the one there is; a CPU that nobody asked for is mentioned."""
-    device = settings.compute.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    """The device that is asked for, or the one there is; ValueError where it is asked for and not there."""
+    device = settings.compute.device or best_device(torch, f"prior.model={settings.model}", "prior.compute.device")
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise ValueError(f"prior.compute.device={device}, but torch {torch.__version__} finds no GPU: use cpu or null")
-    if settings.compute.device is None and device == "cpu":
-        print(
-            f"warning: torch {torch.__version__} finds no GPU, so prior.model={settings.model} runs on the CPU, which "
-            "is slow (prior.compute.device=cpu says that this is meant)",
-            file=sys.stderr,
-        )
     return device
 
 
