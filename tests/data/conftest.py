@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from written_scene import color_image, plane_depth, scene_pose
+from written_scene import color_image, plane_depth, scene_pose, write_depth
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 NUM_FRAMES = 3
@@ -22,10 +22,6 @@ def shared_data():
         return str(SHARED / name)
 
     return find
-
-
-def write_depth(path: Path, depth: np.ndarray, scale: float) -> None:
-    cv2.imwrite(str(path), np.rint(depth * scale).astype(np.uint16))
 
 
 @pytest.fixture

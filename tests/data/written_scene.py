@@ -1,5 +1,8 @@
 """The known scene that the tests write to disk: a slanted plane, seen from a camera that moves."""
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 
 
@@ -18,6 +21,11 @@ def plane_depth(pose: np.ndarray, intrinsics: tuple[float, ...], size: tuple[int
     u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
     rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones(u.shape)], axis=-1) @ pose[:3, :3].T
     return (2.0 - normal @ pose[:3, 3]) / (rays @ normal)
+
+
+def write_depth(path: Path, depth: np.ndarray, scale: float) -> None:
+    """A 16-bit image of so many units a metre."""
+    cv2.imwrite(str(path), np.rint(depth * scale).astype(np.uint16))
 
 
 def color_image(index: int, size: tuple[int, int]) -> np.ndarray:

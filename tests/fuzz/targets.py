@@ -11,7 +11,6 @@ import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from omegaconf import OmegaConf
 
@@ -39,6 +38,7 @@ from emgs_jax.running.checkpoint import Checkpoint, load_checkpoint, save_checkp
 from emgs_jax.running.configure import compose, keys_of
 from emgs_jax.running.record import FrameRecord
 from emgs_jax.running.values import check_values
+from tests.data.written_scene import color_image, plane_depth, scene_pose, write_depth
 
 from .damage import BYTES, TEXT, WORDS, Damage
 
@@ -63,21 +63,13 @@ class Target(NamedTuple):
     damages: dict[str, tuple[Damage, ...]]
 
 
-def _pose(index: int) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = jaxlie.SO3.from_y_radians(0.05 * index).as_matrix()
-    pose[:3, 3] = 0.04 * index, 0.0, 0.02 * index
-    return pose
-
-
 def _image(path: Path, index: int, size: tuple[int, int]) -> None:
-    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
-    cv2.imwrite(str(path), np.stack([u % 256, v % 256, np.full(u.shape, 40 * index + 20)], -1).astype(np.uint8))
+    cv2.imwrite(str(path), color_image(index, size))
 
 
 def _depth(path: Path, size: tuple[int, int], scale: float) -> None:
-    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
-    cv2.imwrite(str(path), np.rint(scale * (1.5 + 0.3 * u / size[0] + 0.2 * v / size[1])).astype(np.uint16))
+    center = (size[0] - 1) / 2, (size[1] - 1) / 2
+    write_depth(path, plane_depth(scene_pose(0), (size[0], size[0], *center), size), scale)
 
 
 def check_frames(dataset: Dataset) -> None:
@@ -101,7 +93,7 @@ def write_seven_scenes(folder: Path) -> None:
         stem = folder / "seq-01" / f"frame-{i:06d}"
         _depth(stem.with_name(stem.name + ".depth.png"), KITCHEN, 1000)
         _image(stem.with_name(stem.name + ".color.jpg"), i, KITCHEN)
-        np.savetxt(stem.with_name(stem.name + ".pose.txt"), _pose(i))
+        np.savetxt(stem.with_name(stem.name + ".pose.txt"), scene_pose(i))
 
 
 def write_tum(folder: Path) -> None:
@@ -126,7 +118,7 @@ def write_replica(folder: Path) -> None:
     for i in range(NUM_FRAMES):
         _image(folder / "office9" / "results" / f"frame{i:06d}.jpg", i, SIZE)
         _depth(folder / "office9" / "results" / f"depth{i:06d}.png", SIZE, 6553.5)
-    rows = [" ".join(f"{v:.9e}" for v in _pose(i).ravel()) for i in range(NUM_FRAMES)]
+    rows = [" ".join(f"{v:.9e}" for v in scene_pose(i).ravel()) for i in range(NUM_FRAMES)]
     (folder / "office9" / "traj.txt").write_text("\n".join(rows))
 
 
@@ -160,7 +152,7 @@ def read_calibrations(folder: Path) -> None:
 
 def write_trajectory(folder: Path) -> None:
     save_trajectory_tum(
-        folder / "trajectory.txt", np.arange(NUM_FRAMES), np.stack([_pose(i) for i in range(NUM_FRAMES)])
+        folder / "trajectory.txt", np.arange(NUM_FRAMES), np.stack([scene_pose(i) for i in range(NUM_FRAMES)])
     )
 
 
@@ -261,7 +253,7 @@ def read_embeddings(folder: Path) -> None:
 
 
 def write_checkpoint(folder: Path) -> None:
-    records = [FrameRecord(i, str(i), 0.1 * i, "tracked", pose=_pose(i), raw_pose=_pose(i)) for i in range(2)]
+    records = [FrameRecord(i, str(i), 0.1 * i, "tracked", pose=scene_pose(i), raw_pose=scene_pose(i)) for i in range(2)]
     leaves = [np.arange(6, dtype=np.float32), np.ones(3, bool)]
     save_checkpoint(folder / "checkpoint.npz", Checkpoint(2, leaves, (8, 8), records), {"a": 1})
 
