@@ -48,6 +48,7 @@ class LocalizationConfig(eqx.Module):
         max_pair_distance: fraction of the depth; farther points are no pair.
         anchor_noise: of `fused`: variance of the prior's own pose near the anchor, over that of its motion.
         anchor_range: m; of `fused`: distance from the anchor at which its standard deviation has doubled.
+        num_alike: frames that see one part of the map and share its errors, see `next_belief`.
         icp: the fine step.
         min_inlier_fraction: of the points, below which the fine pose is not accepted.
         max_residual: root mean square distance to the map's planes, as a fraction of the depth.
@@ -62,6 +63,7 @@ class LocalizationConfig(eqx.Module):
     max_pair_distance: Float[Array, "*b"] = traced(low=0, high=math.inf)
     anchor_noise: Float[Array, "*b"] = traced(low=1e-6, high=math.inf)
     anchor_range: Float[Array, "*b"] = traced(low=1e-6, high=math.inf)
+    num_alike: Float[Array, "*b"] = traced(low=1, high=math.inf)
     icp: IcpConfig
     min_inlier_fraction: Float[Array, "*b"] = traced(low=0, high=1)
     max_residual: Float[Array, "*b"] = traced(low=0, high=math.inf)
@@ -124,10 +126,13 @@ class LocalizationInfo(eqx.Module):
     icp: IcpInfo
 
 
-def _motion_noise(depth_noise: Float[Array, ""], mean_depth: Float[Array, ""], config: IcpConfig) -> Float[Array, "7"]:
+def _motion_noise(
+    depth_noise: Float[Array, ""], mean_depth: Float[Array, ""], ratio_std: Float[Array, ""], config: LocalizationConfig
+) -> Float[Array, "7"]:
     """Standard deviations of the prior's motion between two frames, and of the ratio of their scales."""
-    angle = depth_noise / jnp.sqrt(jnp.maximum(config.prior_information, NO_INFORMATION))
-    ratio = depth_noise * jnp.maximum(config.scale_noise, NO_INFORMATION)
+    angle = depth_noise / jnp.sqrt(jnp.maximum(config.icp.prior_information, NO_INFORMATION))
+    ratio = jnp.where(config.coarse_scale > 0, ratio_std, depth_noise * config.icp.scale_noise)
+    ratio = jnp.maximum(jnp.where(config.icp.scale_noise > 0, ratio, 0.0), NO_INFORMATION)
     return jnp.append(jnp.repeat(jnp.stack([angle * mean_depth, angle]), 3), ratio)
 
 
@@ -148,7 +153,6 @@ def _readings(
     """The prior's motion from the previous frame, its own pose of the current one, and where each reading begins (R7).
 
     Last, whether the previous frame leads here at all.
-
     After a frame that could not be placed the chain is broken, and the prior's own pose stands in for it.
     """
     anchor, paired = prediction.T_world_anchor, prediction.previous.valid & previous.valid
@@ -216,11 +220,11 @@ def localize_coarse(
         belief: of the previous frame; None: its pose is exact.
     """
     now, belief = prediction.previous, certain() if belief is None else belief
-    scale = repeat_scale(now, previous, T_world_previous, jnp.exp(belief.log_scale), config.coarse_scale)
+    scale, ratio_std = repeat_scale(now, previous, T_world_previous, jnp.exp(belief.log_scale), config.coarse_scale)
     repeat_rms, mean_depth = repeat_error(now, previous, T_world_previous, scale, config.max_pair_distance)
     depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, belief.depth_noise), LEAST_NOISE)
     motion, anchored, forms, is_linked = _readings(prediction, previous, T_world_previous, scale, camera, config)
-    noise, unknown = _motion_noise(depth_noise, mean_depth, config.icp), _no_motion(mean_depth, config)
+    noise, unknown = _motion_noise(depth_noise, mean_depth, ratio_std, config), _no_motion(mean_depth, config)
     covariance = predict(belief.covariance, motion, jnp.where(is_linked, noise, unknown))
     distance = jnp.linalg.norm(anchored.translation() - prediction.T_world_anchor.translation())
     reach = 1.0 + distance / config.anchor_range
@@ -279,21 +283,18 @@ def localize_fine(
     aligned = transform(T, current, scale)
     aligned = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & coarse.is_usable)
     bits = jnp.sum(failed * 2 ** jnp.arange(failed.shape[0]))
-    belief = next_belief(coarse.belief, info, coarse.depth_noise, scale, is_tracked)
-    return (
-        T,
-        aligned,
-        LocalizationInfo(
-            is_tracked=is_tracked,
-            is_lost=~coarse.is_usable,
-            reason=bits,
-            scale=scale,
-            repeat_rms=coarse.repeat_rms,
-            depth_noise=info.misfit,
-            noise=info.misfit_of_levels[confidence_levels(current.confidence, current.valid)],
-            step_m=step_m,
-            step_rad=step_rad,
-            belief=belief,
-            icp=info,
-        ),
+    belief = next_belief(coarse.belief, info, coarse.depth_noise, scale, is_tracked, config.num_alike)
+    outcome = LocalizationInfo(
+        is_tracked=is_tracked,
+        is_lost=~coarse.is_usable,
+        reason=bits,
+        scale=scale,
+        repeat_rms=coarse.repeat_rms,
+        depth_noise=info.misfit,
+        noise=info.misfit_of_levels[confidence_levels(current.confidence, current.valid)],
+        step_m=step_m,
+        step_rad=step_rad,
+        belief=belief,
+        icp=info,
     )
+    return T, aligned, outcome

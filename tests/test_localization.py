@@ -14,6 +14,7 @@ from emgs_jax.observation import transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.belief import certain, root_information
 from emgs_jax.registration.icp import icp
+from emgs_jax.registration.repeat import repeat_scale
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 
@@ -91,18 +92,23 @@ def test_a_ratio_is_not_moved_by_wrong_depths_and_a_fit_is(wide, printed):
 
 def test_the_printed_form_estimates_no_scale_and_the_priors_own_unit_holds_it(wide, printed):
     """log s = P γ / (P + s_p²) + s_p² log r / (P + s_p²) for the ratio r, known to P, and the prior's own unit e^γ."""
-    prediction = predict_room(FRAME, wide, scale=0.9)
+    prediction, T = predict_room(FRAME, wide, scale=0.9), path_pose(FRAME - 1)
     assert coarse_of(prediction, wide, printed).scale == 1
     ratio = at(at(printed, "coarse_scale", SCALES["ratio"]), "icp.scale_noise", 0.5)
-    belief = eqx.tree_at(lambda b: (b.log_scale, b.depth_noise), certain(), (jnp.asarray(0.02), jnp.asarray(0.04)))
+    belief = eqx.tree_at(lambda b: b.log_scale, certain(), jnp.asarray(0.02))
+    noise = jnp.asarray(0.3 * np.random.default_rng(0).normal(size=wide.height * wide.width))
+    before = observe_room(T, wide)
+    before = transform(
+        T, eqx.tree_at(lambda o: o.points, before, before.points * jnp.exp(noise)[:, None]), jnp.ones(())
+    )
+    found, known = eqx.filter_jit(repeat_scale)(prediction.previous, before, T, jnp.ones(()), ratio.coarse_scale)
     for std in (0.02, 0.1):
-        found = coarse_step(
-            prediction, world(FRAME - 1, wide), path_pose(FRAME - 1), wide, at(ratio, "scale_std", std), belief
-        )
-        known = (0.5 * 0.04) ** 2
-        expected = (known * 0.02 + std**2 * np.log(1 / 0.9)) / (known + std**2)
-        np.testing.assert_allclose(jnp.log(found.scale), expected, atol=1e-4)
-        np.testing.assert_allclose(found.belief.covariance[6, 6], known * std**2 / (known + std**2), rtol=1e-3)
+        result = coarse_step(prediction, before, T, wide, at(ratio, "scale_std", std), belief)
+        expected = (known**2 * 0.02 + std**2 * jnp.log(found)) / (known**2 + std**2)
+        np.testing.assert_allclose(jnp.log(result.scale), expected, atol=1e-4)
+        np.testing.assert_allclose(result.belief.covariance[6, 6], 1 / (known**-2 + std**-2), rtol=1e-3)
+    held = coarse_step(prediction, before, T, wide, at(ratio, "icp.scale_noise", 0.0), belief)
+    assert held.belief.covariance[6, 6] < 1e-10
 
 
 def test_without_a_pair_the_scale_is_the_priors_own_unit(wide, printed):

@@ -95,7 +95,7 @@ def rpe(estimate: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     moved_estimate = np.linalg.inv(estimate[:-1]) @ estimate[1:]
     moved_truth = np.linalg.inv(truth[:-1]) @ truth[1:]
     error = np.linalg.inv(moved_truth) @ moved_estimate
-    return _rms(np.linalg.norm(error[:, :3, 3], axis=-1)), _rms(np.degrees(_angles(error[:, :3, :3])))
+    return _rms(np.linalg.norm(error[:, :3, 3], axis=-1)), _rms(np.degrees(rotation_angles(error[:, :3, :3])))
 
 
 def trajectory_metrics(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float | int | str | None]:
@@ -169,7 +169,7 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _angles(rotations: np.ndarray) -> np.ndarray:
+def rotation_angles(rotations: np.ndarray) -> np.ndarray:
     """Rotation angles [rad] of (n, 3, 3); atan2 keeps the digits of small angles that arccos loses."""
     skew = rotations - np.swapaxes(rotations, -1, -2)
     sine = 0.5 * np.linalg.norm(np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1), axis=-1)

@@ -78,7 +78,12 @@ def root_information(covariance: Float[Array, "7 7"]) -> Float[Array, "7 7"]:
 
 @full_precision
 def next_belief(
-    belief: Belief, found: IcpInfo, depth_noise: Float[Array, ""], scale: Float[Array, ""], is_tracked: Bool[Array, ""]
+    belief: Belief,
+    found: IcpInfo,
+    depth_noise: Float[Array, ""],
+    scale: Float[Array, ""],
+    is_tracked: Bool[Array, ""],
+    num_alike: Float[Array, ""],
 ) -> Belief:
     """What the points of a frame make of it; nothing where it is not tracked.
 
@@ -88,9 +93,11 @@ def next_belief(
         depth_noise: as a fraction of the depth.
         scale: of its prediction.
         is_tracked: the fine pose was accepted.
+        num_alike: frames that see one part of the map: it is wrong for all of them in the same way, so the points of
+            one are worth so much less.
     """
     worth = jnp.maximum(found.misfit / depth_noise, 1.0)
-    _, covariance = update(worth**2 * belief.covariance, jnp.zeros(DEGREES), found.information)
+    _, covariance = update(worth**2 * belief.covariance, jnp.zeros(DEGREES), found.information / num_alike)
     num_scales = belief.num_scales + 1.0
     log_scale = belief.log_scale + (jnp.log(scale) - belief.log_scale) / num_scales
     after = Belief(covariance, found.misfit, log_scale, num_scales)

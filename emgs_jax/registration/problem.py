@@ -37,7 +37,7 @@ class IcpConfig(eqx.Module):
         prior_information: of the coarse pose, in units of one effective point as noisy as the coarse step shows;
             0 = no prior, the printed form.
         scale_noise: standard deviation of the logarithm of the scale about the coarse step's, in units of the points'
-            depth noise; 0 = no scale (printed).
+            depth noise, where nothing else is known of it; 0 = no scale (printed).
         num_points: how many points take part.
         num_searches: how often the Gaussians near every point are looked up, each time with a solve after it.
         num_neighbours: Gaussians near a point, which every step of a solve compares.

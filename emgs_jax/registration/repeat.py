@@ -9,7 +9,7 @@ from emgs_jax.observation import Observation, Prediction, depth_in, transform
 from emgs_jax.ops.camera import Camera, nearest_pixel, project
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import stack
-from emgs_jax.registration.noise import NORMAL, robust_std
+from emgs_jax.registration.noise import NORMAL, num_independent, robust_std
 from emgs_jax.registration.rigid import MIN_PAIRS, fit_rigid, fit_rigid_robust, median, pose_row
 
 
@@ -20,8 +20,11 @@ def repeat_scale(
     T_world_previous: jaxlie.SE3,
     otherwise: Float[Array, ""],
     reading: Float[Array, ""],
-) -> Float[Array, ""]:
-    """Scale of a prediction relative to the map, from the image that was predicted twice (R8).
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Scale of a prediction relative to the map, from the image that was predicted twice (R8), and how sure it is.
+
+    The second is the standard deviation of its logarithm: that of the pixels' ratios over the root of how many of them
+    say something of their own, times √(π/2) for a median. 0 where an image is predicted the same to the bit.
 
     Args:
         now: its prediction of this call, camera frame.
@@ -32,11 +35,16 @@ def repeat_scale(
             similarity that fits best).
     """
     paired, depth_now = now.valid & before.valid, now.points[:, 2]
-    ratio = median(depth_in(T_world_previous, before) / jnp.where(paired, depth_now, 1.0), paired)
+    ratios = depth_in(T_world_previous, before) / jnp.where(paired, depth_now, 1.0)
+    ratio = median(ratios, paired)
+    errors = jnp.where(paired, jnp.log(jnp.maximum(ratios, 1e-6) / jnp.maximum(ratio, 1e-6)), 0.0)
+    scatter = robust_std(errors, paired)
+    count = num_independent(errors / jnp.maximum(scatter, 1e-6), now.points, paired)
     _, similarity = fit_rigid(now.points, before.points, paired.astype(jnp.float32))
     scale = jnp.where(reading == 1, ratio, similarity)
     is_found = (jnp.sum(paired) >= MIN_PAIRS) & jnp.isfinite(scale) & (scale > 0.1)
-    return jnp.where(reading > 0, jnp.where(is_found, scale, otherwise), 1.0)
+    scale = jnp.where(reading > 0, jnp.where(is_found, scale, otherwise), 1.0)
+    return scale, jnp.sqrt(0.5 * jnp.pi / count) * scatter
 
 
 @full_precision

@@ -6,11 +6,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from emgs_jax.data.base import Frame
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.evaluation.layers import double_wall_share
+from emgs_jax.evaluation.loops import loop_metrics
 from emgs_jax.evaluation.reconstruction import (
     EvaluationConfig,
     Reference,
@@ -24,6 +27,8 @@ from emgs_jax.evaluation.rendering import Rendered
 from emgs_jax.evaluation.segmentation import LabelledPoints, compare_labels, label_cells, true_labels
 from emgs_jax.evaluation.trajectory import trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.loops.two_views import rescaled
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.provenance import RAW_PRIOR, prefixed
@@ -189,6 +194,7 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     """Size of the map, how many frames came to what, time and memory."""
     statuses = Counter(record.status for record in run.records)
     metrics: Metrics = {"map/num_gaussians": int(np.asarray(confirmed(run.state.map).valid).sum())}
+    metrics["map/double_wall_percent"] = double_walls(confirmed(run.state.map))
     metrics["map/num_tentative"] = int(np.asarray(run.state.map.gaussians.valid).sum()) - metrics["map/num_gaussians"]
     metrics["map/capacity"] = run.config.submap.map_capacity
     metrics |= {f"frames/{status}": statuses[status] for status in STATUSES}
@@ -198,15 +204,32 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     return metrics
 
 
+def double_walls(gaussians: Gaussians) -> float | None:
+    """Share of valid Gaussians that another stands behind, in per cent, see `double_wall_share`."""
+    rows = jax.device_get(gaussians)
+    share = double_wall_share(rows.means[rows.valid], rows.normals[rows.valid], rows.covs[rows.valid])
+    return None if share is None else 100.0 * share
+
+
 def score_back_end(run: MappingRun) -> Metrics:
     """What became of loops, and the errors of the poses as they were when the frames were placed; empty without one."""
     if run.back_end is None:
         return {}
-    online = run.back_end.online
+    end, online = run.back_end, run.back_end.online
     before = [record.pose for record in run.records[: len(run.records) - len(online)]]
     poses = with_truth(run, np.stack([*before, *online])) if online else None
     causal = {} if poses is None else trajectory_metrics(*poses)
-    return counts(run.back_end) | {key.replace("trajectory/", "trajectory_online/"): x for key, x in causal.items()}
+    causal = {key.replace("trajectory/", "trajectory_online/"): x for key, x in causal.items()}
+    return counts(end) | loop_metrics(*_loops(run), end.config.appearance.min_gap) | causal
+
+
+def _loops(run: MappingRun) -> tuple[list[tuple[int, int, np.ndarray]], list[np.ndarray | None]]:
+    """The accepted loops in metres of the truth, and the true poses of the frames that they are between."""
+    end = run.back_end
+    compared = with_truth(run, run.poses)
+    unit = (None if compared is None else trajectory_metrics(*compared)["trajectory/scale"]) or 1.0
+    loops = [(loop.a, loop.b, rescaled(loop.Z_a_b, unit * np.exp(end.log_scales[loop.a]))) for loop in end.accepted]
+    return loops, run.true_poses[len(run.records) - len(end.poses) :]
 
 
 def spent(clock: Clock) -> Metrics:

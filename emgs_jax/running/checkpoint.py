@@ -22,8 +22,9 @@ from emgs_jax.running.record import FrameRecord, MappingRun
 from emgs_jax.slam import SlamConfig, SlamState
 
 CHECKPOINT_FILE = "checkpoint.npz"
-FORMAT, VERSION = "emgs_jax.checkpoint", 1
+FORMAT, VERSION = "emgs_jax.checkpoint", 2
 POSES = tuple(field.name for field in fields(FrameRecord) if field.name.endswith("pose"))
+MATRICES = dict.fromkeys(POSES, 4) | {"covariance": 6}  # of a record, and how many rows they have
 
 
 @dataclass(frozen=True)
@@ -71,13 +72,13 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, signature: Mapping[str, 
         "num_inputs": checkpoint.num_inputs,
         "capacities": checkpoint.capacities,
         "num_leaves": len(checkpoint.leaves),
-        "records": [{k: v for k, v in vars(record).items() if k not in POSES} for record in checkpoint.records],
+        "records": [{k: v for k, v in vars(record).items() if k not in MATRICES} for record in checkpoint.records],
     }
     arrays = {f"leaf_{row}": np.asarray(leaf) for row, leaf in enumerate(checkpoint.leaves)}
-    nothing = np.full((4, 4), np.nan)  # stands for None
-    for name in POSES:
-        poses = [nothing if getattr(r, name) is None else getattr(r, name) for r in checkpoint.records]
-        arrays[name] = np.asarray(poses, np.float64).reshape(-1, 4, 4)
+    for name, size in MATRICES.items():
+        nothing = np.full((size, size), np.nan)  # stands for None
+        found = [nothing if getattr(r, name) is None else getattr(r, name) for r in checkpoint.records]
+        arrays[name] = np.asarray(found, np.float64).reshape(-1, size, size)
     with atomic_write(path) as handle:
         np.savez(handle, __header__=np.array(json.dumps(header, default=lambda value: value.item())), **arrays)
 
@@ -97,10 +98,10 @@ def load_checkpoint(path: Path, signature: Mapping[str, Any]) -> Checkpoint:
         other = difference(header["signature"], jsonable(signature))
         if other is not None:
             raise ValueError(f"it is of another run: {other}")
-        poses = [{name: arrays[name][row] for name in POSES} for row in range(len(header["records"]))]
+        matrices = [{name: arrays[name][row] for name in MATRICES} for row in range(len(header["records"]))]
         records = [
-            FrameRecord(**line, **{name: None if np.isnan(pose).any() else pose for name, pose in found.items()})
-            for line, found in zip(header["records"], poses, strict=True)
+            FrameRecord(**line, **{name: None if np.isnan(rows).any() else rows for name, rows in found.items()})
+            for line, found in zip(header["records"], matrices, strict=True)
         ]
         leaves = [arrays[f"leaf_{row}"] for row in range(header["num_leaves"])]
         return Checkpoint(header["num_inputs"], leaves, tuple(header["capacities"]), records)

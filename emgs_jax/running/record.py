@@ -40,6 +40,8 @@ class FrameRecord:
         raw_pose: the same as the prior alone says; the one before where it says none.
         true_pose: None where unknown.
         newest_pose: temporary pose of the next frame.
+        covariance: (6, 6) of ξ where the true pose is T Exp(ξ), translation (m), rotation (rad); of the pose as it was
+            placed, relative to the first inference.
         inliers: points that agree with the map.
         residual: of these to the map's planes, as a fraction of their depth.
         scale: by which the prediction was multiplied.
@@ -69,6 +71,7 @@ class FrameRecord:
     raw_pose: np.ndarray | None = None
     true_pose: np.ndarray | None = None
     newest_pose: np.ndarray | None = None
+    covariance: np.ndarray | None = None
     inliers: int | None = None
     residual: float | None = None
     scale: float | None = None
@@ -192,6 +195,7 @@ def _described(info: StepInfo) -> dict[str, Any]:
         "reason": "; ".join(reasons) or None,
         "pose": to_matrix(info.T_world_camera.wxyz_xyz),
         "newest_pose": to_matrix(info.T_world_newest.wxyz_xyz),
+        "covariance": np.asarray(localization.belief.covariance, np.float64)[:-1, :-1],
         "inliers": int(localization.icp.num_inliers),
         "residual": float(localization.icp.residual),
         "scale": float(localization.scale),
@@ -264,7 +268,7 @@ def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def to_line(record: FrameRecord) -> dict[str, Any]:
-    """A line of frames.jsonl: poses as tx, ty, tz (m), qx, qy, qz, qw."""
+    """A line of frames.jsonl: poses as tx, ty, tz (m), qx, qy, qz, qw, the covariance by rows."""
     line = dict(vars(record))
     poses = {name: value for name, value in line.items() if name.endswith("pose") and value is not None}
     return line | {name: to_tum(pose) for name, pose in poses.items()}

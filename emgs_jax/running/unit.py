@@ -40,12 +40,14 @@ def in_own_unit(run: MappingRun) -> None:
         moved[:3, 3] = origin + factor * (pose[:3, 3] - origin)
         return moved
 
+    units = np.array([factor] * 3 + [1.0] * 3)
     run.state = own_unit(run.state, origin)
     run.records = [
         replace(
             record,
             pose=placed(record.pose),
             newest_pose=placed(record.newest_pose),
+            covariance=None if record.covariance is None else units[:, None] * record.covariance * units,
             scale=None if record.scale is None else factor * record.scale,
         )
         for record in run.records

@@ -1,0 +1,55 @@
+"""Loops against true poses: which are right, and which returns they find."""
+
+import numpy as np
+
+from emgs_jax.evaluation.loops import loop_metrics
+
+
+def path(*positions: float) -> list[np.ndarray]:
+    poses = [np.eye(4) for _ in positions]
+    for pose, x in zip(poses, positions, strict=True):
+        pose[0, 3] = x
+    return poses
+
+
+THERE_AND_BACK = path(*range(40), *range(40, -1, -1))
+
+
+def between(a: int, b: int, truth: list[np.ndarray], error: float = 0.0, turn_deg: float = 0.0) -> tuple:
+    cos, sin = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    wrong = np.array([[cos, -sin, 0, error], [sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    return a, b, np.linalg.inv(truth[a]) @ truth[b] @ wrong
+
+
+def test_a_loop_is_right_up_to_30_cm_and_10_degrees():
+    loops = [between(0, 80, THERE_AND_BACK, *errors) for errors in ((0.29, 0.0), (0.31, 0.0), (0.0, 9.0), (0.0, 11.0))]
+    assert loop_metrics(loops, THERE_AND_BACK, 60)["loops/precision"] == 0.5
+
+
+def test_a_return_is_found_within_ten_frames_of_a_right_loop():
+    """Frames 70 to 80 see a place of 60 frames ago within 1 m: 2 |x - x'| apart in time."""
+    right, wrong = between(5, 75, THERE_AND_BACK), between(5, 75, THERE_AND_BACK, 1.0)
+    found = loop_metrics([right], THERE_AND_BACK, 60)
+    assert found["loops/returning_frames"] == 11 and found["loops/recall"] == 1.0
+    twice = [*THERE_AND_BACK, *THERE_AND_BACK[1:11]]
+    found = loop_metrics([between(10, 90, twice)], twice, 60)  # frames 80 to 90 of those from 70 to 90
+    assert found["loops/recall"] == 11 / 21
+    assert loop_metrics([wrong], THERE_AND_BACK, 60)["loops/recall"] == 0.0
+
+
+def test_without_loops_or_returns_or_truth_nothing_is_said():
+    assert loop_metrics([], THERE_AND_BACK, 60) == {
+        "loops/precision": None,
+        "loops/recall": 0.0,
+        "loops/returning_frames": 11,
+    }
+    assert loop_metrics([], THERE_AND_BACK, 90)["loops/recall"] is None
+    unknown = [None] * len(THERE_AND_BACK)
+    assert loop_metrics([between(5, 75, THERE_AND_BACK)], unknown, 60)["loops/precision"] is None
+
+
+def test_a_frame_that_looks_elsewhere_does_not_return():
+    turned = [pose.copy() for pose in THERE_AND_BACK]
+    for pose in turned[40:]:
+        pose[:3, :3] = [[-1, 0, 0], [0, -1, 0], [0, 0, 1]]
+    assert loop_metrics([], turned, 60)["loops/returning_frames"] == 0
