@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,32 @@ from matplotlib.patheffects import withStroke
 from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.io.files import atomic_write
 
-_ESTIMATE, _TRUTH, _INK = "#e4572e", "#1b998b", "#333333"
+_ESTIMATE, _TRUTH, _ONLINE, _LOOP, _INK = "#e4572e", "#1b998b", "#8d6a9f", "#2e86e4", "#333333"
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Where the camera was, (n, 4, 4) T_world_camera each, all in one frame; None where there is no such path.
+
+    Args:
+        estimate: of every frame.
+        is_placed: (n,), False where the camera was lost and a pose stands in for its own.
+        truth: NaN where unknown.
+        online: as the frames were placed, before poses moved.
+        loops: rows of the frames that loops join.
+    """
+
+    estimate: np.ndarray
+    is_placed: np.ndarray
+    truth: np.ndarray | None = None
+    online: np.ndarray | None = None
+    loops: tuple[tuple[int, int], ...] = ()
 
 
 def draw_overview(
     path: str | os.PathLike,
     cloud: PointCloud,
-    trajectories: tuple[np.ndarray, np.ndarray | None],
+    paths: Paths,
     frames: Sequence[Mapping[str, Any]],
     title: str,
     classes: Sequence[str] = (),
@@ -29,20 +49,19 @@ def draw_overview(
     """Draw the picture and write it as PNG.
 
     Args:
-        cloud: in the frame of the trajectories.
-        trajectories: estimated T_world_camera (n, 4, 4), and the true ones in the same frame or None.
+        cloud: in the frame of the paths.
+        paths: estimated, true, before poses moved, and loops.
         frames: about four, each with `image` uint8 (h, w, 3), `rendered_color` float (h, w, 3), `rendered_depth`
             float (h, w) in metres, `valid` bool (h, w), where it is known, `title`, and with classes `labels`,
             int (h, w), -1 = none.
         title: of the whole picture.
         classes: names of the labels.
     """
-    estimate, truth = (None if poses is None else np.asarray(poses, np.float64) for poses in trajectories)
     figure = Figure(figsize=(16, max(6.0, 0.8 + 2.05 * len(frames))), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=13, color=_INK)
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.05)) if frames else (figure, None)
-    _draw_map(left.subplots(), cloud, estimate, truth)
+    _draw_map(left.subplots(), cloud, paths)
     if right is not None:
         grid = right.subplots(len(frames), 4 if classes else 3, squeeze=False)
         _draw_frames(grid[:, [0, 1, -1]], frames)
@@ -100,9 +119,9 @@ def fill_holes(image: np.ndarray) -> np.ndarray:
     return image
 
 
-def _draw_map(axes: Axes, cloud: PointCloud, estimate: np.ndarray, truth: np.ndarray | None) -> None:
-    rotation = view_from_above(estimate)
-    path = estimate[:, :3, 3] @ rotation.T
+def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
+    rotation = view_from_above(paths.estimate)
+    path = paths.estimate[:, :3, 3] @ rotation.T
     finite = np.isfinite(cloud.points).all(1)
     points, colors = cloud.points[finite] @ rotation.T, cloud.colors[finite].clip(0.0, 1.0)
     if len(points):
@@ -115,10 +134,16 @@ def _draw_map(axes: Axes, cloud: PointCloud, estimate: np.ndarray, truth: np.nda
         cell = size / np.clip(1.2 * np.sqrt(seen.sum()), 100, 700)
         image, extent = paint_from_above(points[seen], colors[seen], cell)
         axes.imshow(fill_holes(image), extent=extent, origin="lower", interpolation="nearest", zorder=1)
-    if truth is not None:
-        _draw_path(axes, truth[:, :3, 3] @ rotation.T, _TRUTH, "true path", 5.0)
+    if paths.truth is not None:
+        _draw_path(axes, paths.truth[:, :3, 3] @ rotation.T, _TRUTH, "true path", 5.0)
+    if paths.online is not None:
+        _draw_path(axes, paths.online[:, :3, 3] @ rotation.T, _ONLINE, "as it was placed", 1.6)
     # Thinner with its outline than the true path, so that one on top of the other shows both.
-    _draw_path(axes, path, _ESTIMATE, "estimated path", 1.6)
+    _draw_path(axes, np.where(paths.is_placed[:, None], path, np.nan), _ESTIMATE, "estimated path", 1.6)
+    if paths.loops:
+        ends = path[np.array(paths.loops)]
+        axes.plot(*ends[..., :2].T, color=_LOOP, linewidth=1.6, zorder=3)
+        axes.plot([], [], color=_LOOP, linewidth=1.6, label=f"{len(ends)} loops")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_facecolor("#e3e6ea")
     axes.set_xlabel("metres", color=_INK)
@@ -132,10 +157,12 @@ def _draw_map(axes: Axes, cloud: PointCloud, estimate: np.ndarray, truth: np.nda
 
 
 def _draw_path(axes: Axes, path: np.ndarray, color: str, label: str, width: float) -> None:
+    """A line with a gap where the path (n, 3) is not known, a disc where it begins and a square where it ends."""
     outline = [withStroke(linewidth=width + 1.6, foreground="white")]
     axes.plot(path[:, 0], path[:, 1], color=color, linewidth=width, label=label, path_effects=outline)
-    axes.plot(*path[0, :2], marker="o", markersize=7, color=color, markeredgecolor="white", linestyle="none")
-    axes.plot(*path[-1, :2], marker="s", markersize=7, color=color, markeredgecolor="white", linestyle="none")
+    known = path[np.isfinite(path).all(1)]
+    for marker, end in (("o", known[:1]), ("s", known[-1:])):
+        axes.plot(*end[:, :2].T, marker=marker, markersize=7, color=color, markeredgecolor="white", linestyle="none")
 
 
 def _draw_scale_bar(axes: Axes) -> None:

@@ -70,13 +70,26 @@ def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: Densify
     save_gaussians_ply(folder / "map.ply", gaussians.means[valid], covs, *rest)
     labels = () if dense.labels is None else (dense.labels.labels, dense.labels.classes)
     save_points_ply(folder / "points.ply", dense.cloud.points, dense.cloud.normals, dense.cloud.colors, *labels)
-    from emgs_jax.report.overview import draw_overview  # matplotlib is slow to import, and the map does not wait for it
+    from emgs_jax.report.overview import (
+        Paths,
+        draw_overview,
+    )  # matplotlib is slow to import, and the map does not wait for it
 
     centers = center_cloud(run)
     no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, centers.colors)
-    is_known = all(pose is not None for pose in run.true_poses)
-    truth = np.stack(run.true_poses) if is_known else None
-    paths = np.stack(run.poses), truth
+    paths = Paths(run.poses, np.array([record.status != "lost" for record in run.records]), *_moved(run))
     classes = () if dense.labels is None else dense.labels.classes
     draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes)
     return [] if no_mesh is None else [f"no mesh.ply: {no_mesh}"]
+
+
+def _moved(run: MappingRun) -> tuple[np.ndarray | None, np.ndarray | None, tuple[tuple[int, int], ...]]:
+    """The true path, that before the back end moved it, and its loops, as `Paths` has them."""
+    unknown = np.full((4, 4), np.nan)
+    is_known = any(pose is not None for pose in run.true_poses)
+    truth = np.stack([unknown if pose is None else pose for pose in run.true_poses]) if is_known else None
+    if run.back_end is None or not run.back_end.accepted:
+        return truth, None, ()
+    first = len(run.records) - len(run.back_end.poses)
+    loops = tuple((first + loop.a, first + loop.b) for loop in run.back_end.accepted)
+    return truth, np.stack(run.back_end.online), loops

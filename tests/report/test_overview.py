@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.report.overview import (
+    Paths,
     below_ceiling,
     class_colors,
     draw_overview,
@@ -82,7 +83,7 @@ def test_the_picture_shows_floor_and_paths_and_is_the_same_twice(tmp_path, num_f
     frame = {"image": np.zeros((24, 32, 3), np.uint8), "rendered_color": np.full((24, 32, 3), np.nan)}
     frame |= {"rendered_depth": depth, "valid": np.ones((24, 32), bool), "title": "frame 0"}
     for name in ("a.png", "b.png"):
-        paths = (poses, poses + 0.0 if has_truth else None)
+        paths = Paths(poses, np.ones(len(poses), bool), poses if has_truth else None)
         cloud = PointCloud(points, np.zeros_like(points), colors)
         draw_overview(tmp_path / name, cloud, paths, [frame] * num_frames, "a run")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
@@ -97,6 +98,36 @@ def test_the_picture_shows_floor_and_paths_and_is_the_same_twice(tmp_path, num_f
     assert (share((27, 153, 139)) > 1e-4) == has_truth
 
 
+def test_what_is_lost_or_unknown_is_a_gap_and_loops_are_lines_beside_the_path_before(tmp_path):
+    import cv2
+
+    truth, estimate, online = (path_along([0.0, 4.0, 0.0], 9) for _ in range(3))
+    estimate[:, 0, 3], online[:, 0, 3] = 0.5, 1.0
+    holed = truth.copy()
+    holed[6] = np.nan
+    cloud = PointCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
+
+    def columns_of(paths: Paths, color: tuple[int, int, int]) -> np.ndarray:
+        """Columns of the picture, the path's direction, in which a colour is seen left of the legend."""
+        draw_overview(tmp_path / "a.png", cloud, paths, [], "a run")
+        image = cv2.imread(str(tmp_path / "a.png"))[..., ::-1].astype(int)
+        return np.flatnonzero(np.all(np.abs(image - color) <= 8, axis=-1)[image.shape[0] // 3 :].any(0))
+
+    def longest_gap(paths: Paths, color: tuple[int, int, int]) -> float:
+        columns = columns_of(paths, color)
+        return np.diff(columns).max() / np.ptp(columns)
+
+    whole = Paths(estimate, np.ones(9, bool), truth)
+    for color in ((228, 87, 46), (27, 153, 139)):
+        assert longest_gap(whole, color) < 0.1
+    broken = Paths(estimate, np.arange(9) != 3, holed)
+    for color in ((228, 87, 46), (27, 153, 139)):
+        assert 0.2 < longest_gap(broken, color) < 0.3  # two of eight pieces
+    for color in ((141, 106, 159), (46, 134, 228)):
+        moved = Paths(estimate, np.ones(9, bool), truth, online, ((0, 8),))
+        assert len(columns_of(moved, color)) > 200 and not len(columns_of(whole, color))
+
+
 def test_labels_are_drawn_in_the_colours_of_their_classes_with_a_legend_of_those_that_are_seen(tmp_path):
     import cv2
 
@@ -106,7 +137,8 @@ def test_labels_are_drawn_in_the_colours_of_their_classes_with_a_legend_of_those
     frame |= {"rendered_depth": depth, "valid": np.ones((24, 32), bool), "title": "frame 0"}
     cloud = PointCloud(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)))
     path = tmp_path / "a.png"
-    draw_overview(path, cloud, (path_along([1.0, -0.5, 0.0]), None), [frame] * 2, "a run", ("wall", "floor", "chair"))
+    paths = Paths(path_along([1.0, -0.5, 0.0]), np.ones(5, bool))
+    draw_overview(path, cloud, paths, [frame] * 2, "a run", ("wall", "floor", "chair"))
     image = cv2.imread(str(path))[..., ::-1].astype(int)
     shares = [np.all(np.abs(image - 255 * color) <= 3, axis=-1) for color in class_colors(3)]
     assert [bool(share.sum() > 50) for share in shares] == [False, False, True]
