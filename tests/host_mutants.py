@@ -3,6 +3,8 @@
 from mutant import Mutant
 
 TRAJECTORY = ("tests/evaluation/test_trajectory.py",)
+LAYERS = ("tests/evaluation/test_layers.py",)
+LOOPS = ("tests/evaluation/test_loop_metrics.py",)
 CLOUDS = ("tests/evaluation/test_clouds.py",)
 BASELINES = ("tests/evaluation/test_baselines.py",)
 RENDERING = ("tests/evaluation/test_rendering.py",)
@@ -180,6 +182,12 @@ MUTANTS = (
         "two loops of one query confirm each other",
     ),
     # evaluation
+    Mutant("emgs_jax/evaluation/layers.py", "(gap > MIN_STDS * ", "(gap > 0 * ", LAYERS, "a thick wall is two"),
+    Mutant("emgs_jax/evaluation/layers.py", "(across < spacing) & ", "", LAYERS, "what stands beside stands behind"),
+    Mutant("emgs_jax/evaluation/layers.py", "> MIN_COS]", "> 0.0]", LAYERS, "any surface behind counts"),
+    Mutant("emgs_jax/evaluation/loops.py", "<= RIGHT_M and", "<= PLACE_M and", LOOPS, "a loop may err by a metre"),
+    Mutant("emgs_jax/evaluation/loops.py", "rows <= row - min_gap", "rows < row", LOOPS, "any older frame is a place"),
+    Mutant("emgs_jax/evaluation/loops.py", "if is_right]", "]", LOOPS, "a false loop finds a return"),
     Mutant(
         "emgs_jax/evaluation/trajectory.py",
         "return _solve(x, y, covariance, with_scale, rotation), ",

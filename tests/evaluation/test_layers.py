@@ -34,7 +34,9 @@ def test_only_what_has_another_behind_it_counts():
 
 def test_the_two_sides_of_a_board_and_a_slope_are_no_double_wall():
     assert double_wall_share(*both(wall(0.0), wall(0.05, facing=-1.0))) == 0.0
-    means, normals, covs = wall(0.0)
+    means, normals, covs = wall(0.05)
+    tilted = normals @ np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]]) / np.sqrt(2.0)
+    assert double_wall_share(*both(wall(0.0), (means, tilted, covs))) == 0.0
     turn = np.array([[0.8, 0.0, -0.6], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
     assert double_wall_share(means @ turn.T, normals @ turn.T, turn @ covs @ turn.T) == 0.0
 

@@ -102,7 +102,8 @@ def test_what_is_lost_or_unknown_is_a_gap_and_loops_are_lines_beside_the_path_be
     import cv2
 
     truth, estimate, online = (path_along([0.0, 4.0, 0.0], 9) for _ in range(3))
-    estimate[:, 0, 3], online[:, 0, 3] = 0.5, 1.0
+    truth[0, 0, 3] = 1.2  # the highest, beside the legend
+    estimate[:, 0, 3], online[:, 0, 3] = 0.8, 0.4
     holed = truth.copy()
     holed[6] = np.nan
     cloud = PointCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
@@ -111,7 +112,7 @@ def test_what_is_lost_or_unknown_is_a_gap_and_loops_are_lines_beside_the_path_be
         """Columns of the picture, the path's direction, in which a colour is seen left of the legend."""
         draw_overview(tmp_path / "a.png", cloud, paths, [], "a run")
         image = cv2.imread(str(tmp_path / "a.png"))[..., ::-1].astype(int)
-        return np.flatnonzero(np.all(np.abs(image - color) <= 8, axis=-1)[image.shape[0] // 3 :].any(0))
+        return np.flatnonzero(np.all(np.abs(image - color) <= 8, axis=-1)[image.shape[0] // 4 :].any(0))
 
     def longest_gap(paths: Paths, color: tuple[int, int, int]) -> float:
         columns = columns_of(paths, color)

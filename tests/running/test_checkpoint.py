@@ -141,6 +141,7 @@ def checkpoint() -> Checkpoint:
     pose = np.arange(16.0).reshape(4, 4) / 3
     records = [FrameRecord(0, "a", 0.1, "initialization", pose=pose, raw_pose=pose, num_gaussians=3, seconds=1 / 3)]
     records += [FrameRecord(1, None, None, "lost", reason="why", pose=pose, residual=float("nan"))]
+    records += [FrameRecord(2, "c", 0.3, "tracked", pose=pose, covariance=np.arange(36.0).reshape(6, 6) / 7)]
     return Checkpoint(2, [np.float32([0.1, 0.2]), jnp.asarray([True])], (64, 32), records)
 
 

@@ -21,7 +21,8 @@ def a_run(log_scale: float) -> MappingRun:
         np.asarray(pose((0.1 * i, 0.2, -0.1 * i), (1.0 + 0.3 * i, -2.0, 0.5)).as_matrix(), float) for i in range(3)
     ]
     records = [FrameRecord(0, None, None, "initialization", pose=poses[0])]
-    records += [FrameRecord(i, None, None, "tracked", pose=poses[i], newest_pose=poses[i], scale=0.9) for i in (1, 2)]
+    known = {"scale": 0.9, "covariance": np.eye(6)}
+    records += [FrameRecord(i, None, None, "tracked", pose=poses[i], newest_pose=poses[i], **known) for i in (1, 2)]
     belief = eqx.tree_at(lambda b: (b.log_scale, b.covariance), certain(), (jnp.asarray(log_scale), jnp.eye(7)))
     map = new_map(random_gaussians(9), jnp.ones(9), jnp.ones(()), jnp.asarray(0))
     last = jaxlie.SE3.from_matrix(jnp.asarray(poses[-1], jnp.float32))
@@ -48,6 +49,7 @@ def test_all_lengths_grow_about_the_first_camera_and_directions_stay():
     np.testing.assert_allclose(after.T_world_previous.as_matrix(), run.records[2].pose, atol=1e-5)
     std = np.sqrt(np.diag(after.belief.covariance))
     np.testing.assert_allclose(std, [factor] * 3 + [1.0] * 4, rtol=1e-5)
+    np.testing.assert_allclose(np.sqrt(np.diag(run.records[1].covariance)), [factor] * 3 + [1.0] * 3, rtol=1e-12)
     assert float(after.belief.log_scale) == pytest.approx(0.0, abs=1e-6)
 
 
