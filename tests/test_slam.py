@@ -10,6 +10,7 @@ import pytest
 import reference
 from scene import assert_same, at, move_gaussians, observe_room, path_pose, pose, pose_error, predict_room, stack_poses
 
+from emgs_jax.gaussian_map import insert
 from emgs_jax.observation import Prediction, transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.pytree import stack
@@ -78,6 +79,18 @@ def test_the_frame_is_kept_as_it_was_aligned_for_the_next_step(stepped, camera):
     expected = transform(info.T_world_camera, current, info.localization.scale)
     np.testing.assert_allclose(new.previous.points, expected.points, atol=1e-5)  # roundings, here and below
     np.testing.assert_allclose(new.previous.normals, expected.normals, atol=1e-5)
+
+
+def test_two_layers_that_a_look_cannot_tell_apart_become_one(state, camera, settings):
+    gaussians = state.map.gaussians
+    beside = eqx.tree_at(lambda m: m.gaussians.means, state.map, gaussians.means + 1e-3 * gaussians.normals)
+    doubled, _, overflow = insert(state.map, beside)
+    assert overflow == 0 and doubled.gaussians.valid.sum() == 2 * gaussians.valid.sum()
+    twice = eqx.tree_at(lambda s: s.map, state, doubled)
+    new, info = step(twice, predict_room(FRAME, camera, num_features=2), FULL, settings)
+    assert info.localization.is_tracked
+    held, found = (int(m.gaussians.valid.sum()) for m in (doubled, new.map))
+    assert found < 0.85 * held and found < held + info.refinement.num_fresh  # the others are out of sight
 
 
 def test_candidates_come_from_the_points_that_em_left_over(stepped):
