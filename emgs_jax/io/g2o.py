@@ -123,7 +123,8 @@ def save_graph_g2o(path: str | os.PathLike, graph: Graph, half_angles: bool = Fa
     valid = np.asarray(nodes.valid)
     if np.any(np.asarray(nodes.log_scale)[valid] != 0):
         raise ValueError("g2o's format has no scales, and log_scale is not 0: write the map instead, or solve with 0")
-    lines = [f"{VERTEX} {row} {_numbers(_to_g2o(nodes.T_world)[row])}" for row in np.flatnonzero(valid)]
+    places = _to_g2o(nodes.T_world)
+    lines = [f"{VERTEX} {row} {_numbers(places[row])}" for row in np.flatnonzero(valid)]
     roots = np.asarray(edges.sqrt_info, np.float64)[:, :, :6] * np.repeat([1.0, 2.0 if half_angles else 1.0], 3)
     upper = (roots.transpose(0, 2, 1) @ roots)[:, UPPER[0], UPPER[1]]
     values = np.concatenate([_to_g2o(edges.Z_a_b), upper], axis=1)

@@ -1,5 +1,6 @@
 """A committed baseline: results must not get worse than it by more than a tolerance."""
 
+import itertools
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -51,7 +52,7 @@ def rounding_tolerances(
 
 
 def write_gate(path: str | os.PathLike, rows: Sequence[Row], tolerances: Mapping[str, Mapping[str, Any]]) -> None:
-    """Write the mean of each metric of `tolerances` for our own rows.
+    """Write the mean of each metric of `tolerances` for our own rows; comments above those of before stay.
 
     Args:
         rows: one for each sequence and variant.
@@ -68,8 +69,14 @@ def write_gate(path: str | os.PathLike, rows: Sequence[Row], tolerances: Mapping
             baseline[_name(row)] = {"protocol": row.protocol, "seeds": list(row.seeds), "metrics": metrics}
     if not baseline:
         raise ValueError(f"{path} is not written: there is no result of ours to take a baseline from")
+    head = list(itertools.takewhile(lambda line: line.startswith("#"), _lines(Path(path))))
     with atomic_write(path, "w") as handle:
+        handle.writelines(head)
         yaml.safe_dump({"format": GATE_FORMAT, "baseline": baseline}, handle, sort_keys=False)
+
+
+def _lines(path: Path) -> list[str]:
+    return path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
 
 
 def read_gate(path: str | os.PathLike) -> dict[str, Any]:

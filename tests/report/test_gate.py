@@ -28,6 +28,15 @@ def baseline(tmp_path):
     return read_gate(tmp_path / "gate.yaml")
 
 
+def test_what_is_said_above_a_baseline_stays_when_it_is_written_anew(tmp_path):
+    path = tmp_path / "gate.yaml"
+    write_gate(path, [a_row()], TOLERANCES)
+    plain = path.read_text()
+    path.write_text("# how it was made\n# and when\n" + plain + "# a remark\n")
+    write_gate(path, [a_row()], TOLERANCES)
+    assert path.read_text() == "# how it was made\n# and when\n" + plain
+
+
 def test_a_written_baseline_holds_our_rows_and_passes_with_the_same_results(baseline):
     assert list(baseline) == ["tum/xyz/default"]
     assert baseline["tum/xyz/default"]["metrics"] == {
