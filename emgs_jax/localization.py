@@ -48,7 +48,7 @@ class LocalizationConfig(eqx.Module):
         max_pair_distance: fraction of the depth; farther points are no pair.
         anchor_noise: of `fused`: variance of the prior's own pose near the anchor, over that of its motion.
         anchor_range: m; of `fused`: distance from the anchor at which its standard deviation has doubled.
-        num_alike: frames that see one part of the map and share its errors, see `next_belief`.
+        num_alike: frames that see one part of the map and share the error of its scale, see `next_belief`.
         icp: the fine step.
         min_inlier_fraction: of the points, below which the fine pose is not accepted.
         max_residual: root mean square distance to the map's planes, as a fraction of the depth.

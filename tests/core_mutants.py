@@ -190,7 +190,7 @@ STAGES = [
         ("A @ covariance @ A.T + ", "covariance + ", "the errors stay in the axes of the camera before"),
         ("jnp.diag(noise**2)", "jnp.diag(noise)", "deviations for variances"),
         ("worth**2 * belief", "worth * belief", "a deviation for its variance"),
-        ("found.information / num_alike", "found.information", "points of one map as if of many"),
+        ("set(num_alike**-0.5)", "set(1.0)", "a scale of one map as if of many"),
         ("jnp.where(is_tracked, new, old)", "new", "a frame that is not tracked counts"),
     ),
     *own("observation", "test_observation")(

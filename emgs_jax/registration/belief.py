@@ -93,11 +93,13 @@ def next_belief(
         depth_noise: as a fraction of the depth.
         scale: of its prediction.
         is_tracked: the fine pose was accepted.
-        num_alike: frames that see one part of the map: it is wrong for all of them in the same way, so the points of
-            one are worth so much less.
+        num_alike: frames that see one part of the map. Its scale is wrong for all of them in the same way, so what the
+            points of one say of the scale is worth so much less.
     """
     worth = jnp.maximum(found.misfit / depth_noise, 1.0)
-    _, covariance = update(worth**2 * belief.covariance, jnp.zeros(DEGREES), found.information / num_alike)
+    units = jnp.ones(DEGREES).at[-1].set(num_alike**-0.5)
+    information = units[:, None] * found.information * units
+    _, covariance = update(worth**2 * belief.covariance, jnp.zeros(DEGREES), information)
     num_scales = belief.num_scales + 1.0
     log_scale = belief.log_scale + (jnp.log(scale) - belief.log_scale) / num_scales
     after = Belief(covariance, found.misfit, log_scale, num_scales)

@@ -69,8 +69,9 @@ def test_a_frame_that_is_tracked_is_known_as_its_points_say_and_another_as_befor
     found = IcpInfo(one, zero, zero, jnp.asarray(0.04), jnp.zeros(8), 1e4 * jnp.eye(7), zero, zero, one, one > 0)
     arguments = before, found, jnp.asarray(0.02), jnp.asarray(1.1)
     after = next_belief(*arguments, jnp.asarray(True), jnp.asarray(5.0))
-    # Twice the noise is four times P, and five frames whose points err alike say what one of them does.
-    _, expected = update(4.0 * covariance(), jnp.zeros(7), found.information / 5.0)
+    # Twice the noise is four times P, and five frames whose points err alike say of the scale what one of them does.
+    said = jnp.diag(jnp.asarray([1e4] * 6 + [2e3]))
+    _, expected = update(4.0 * covariance(), jnp.zeros(7), said)
     np.testing.assert_allclose(after.covariance, expected, rtol=1e-5)
     np.testing.assert_allclose(after.log_scale, np.log(1.1) / 2, rtol=1e-5)
     assert after.num_scales == 2 and after.depth_noise == pytest.approx(0.04)
