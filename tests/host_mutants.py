@@ -598,10 +598,17 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/report/run_files.py",
-        "is_known = all(",
-        "is_known = any(",
+        "(first + loop.a, first + loop.b)",
+        "(loop.a, loop.b)",
         RUN_FILES,
-        "a run with some unknown true poses has no picture",
+        "loops join frames of before there was a map",
+    ),
+    Mutant(
+        "emgs_jax/report/run_files.py",
+        "is_known = any(",
+        "is_known = all(",
+        RUN_FILES,
+        "a true path that is unknown in one frame is not drawn",
     ),
     Mutant(
         "emgs_jax/report/run_files.py",

@@ -70,14 +70,12 @@ def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: Densify
     save_gaussians_ply(folder / "map.ply", gaussians.means[valid], covs, *rest)
     labels = () if dense.labels is None else (dense.labels.labels, dense.labels.classes)
     save_points_ply(folder / "points.ply", dense.cloud.points, dense.cloud.normals, dense.cloud.colors, *labels)
-    from emgs_jax.report.overview import (
-        Paths,
-        draw_overview,
-    )  # matplotlib is slow to import, and the map does not wait for it
+    # matplotlib is slow to import, and the map does not wait for it
+    from emgs_jax.report.overview import Paths, draw_overview
 
     centers = center_cloud(run)
     no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, centers.colors)
-    paths = Paths(run.poses, np.array([record.status != "lost" for record in run.records]), *_moved(run))
+    paths = Paths(np.stack(run.poses), np.array([record.status != "lost" for record in run.records]), *_moved(run))
     classes = () if dense.labels is None else dense.labels.classes
     draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes)
     return [] if no_mesh is None else [f"no mesh.ply: {no_mesh}"]

@@ -1,5 +1,7 @@
 """The files of a run; oracles: other programs' readers, a wall whose every property is known."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
@@ -103,7 +105,7 @@ def test_what_could_not_be_made_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("num_unknown", [0, 1, NUM_FRAMES])
-def test_the_overview_shows_the_true_path_where_all_of_it_is_known(num_unknown, tmp_path):
+def test_the_overview_shows_the_true_path_where_it_is_known(num_unknown, tmp_path):
     import cv2
 
     truth = [None] * num_unknown + [*poses_along(np.linspace(0.0, 1.0, NUM_FRAMES) + 0.3)][num_unknown:]
@@ -114,7 +116,24 @@ def test_the_overview_shows_the_true_path_where_all_of_it_is_known(num_unknown, 
         name: np.all(np.abs(image - color) <= 8, axis=-1).mean()
         for name, color in (("estimate", (228, 87, 46)), ("truth", (27, 153, 139)))
     }
-    assert share["estimate"] > 1e-4 and (share["truth"] > 1e-4) == (num_unknown == 0)
+    assert share["estimate"] > 1e-4 and (share["truth"] > 1e-4) == (num_unknown < NUM_FRAMES)
+
+
+def test_the_overview_shows_loops_between_the_frames_of_the_back_end_and_the_path_before(tmp_path, monkeypatch):
+    from emgs_jax.report import overview
+
+    drawn = []
+    monkeypatch.setattr(overview, "draw_overview", lambda path, cloud, paths, *rest: drawn.append(paths))
+    run, later = finished(), poses_along(np.full(NUM_FRAMES - 2, 5.0))
+    loops = [SimpleNamespace(a=0, b=2)]
+    run.back_end = SimpleNamespace(accepted=loops, poses=[*later], online=[*(later + 1.0)])  # after two lost frames
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    run.back_end.accepted = []
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    (paths, without) = drawn
+    assert paths.loops == ((2, 4),) and without.loops == () and without.online is None
+    np.testing.assert_array_equal(paths.online, later + 1.0)
+    np.testing.assert_array_equal(paths.is_placed, [status != "lost" for status in STATUSES])
 
 
 def test_a_new_run_never_lies_beside_the_outputs_of_another(tmp_path):
