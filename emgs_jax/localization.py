@@ -13,7 +13,7 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.linalg import Whitening
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
-from emgs_jax.registration.belief import Belief, certain, next_belief, predict, root_information, update
+from emgs_jax.registration.belief import Belief, certain, measured, moved, next_belief, root_information
 from emgs_jax.registration.icp import IcpInfo, icp
 from emgs_jax.registration.noise import confidence_levels
 from emgs_jax.registration.problem import IcpConfig
@@ -171,12 +171,11 @@ def _readings(
 def _measured(
     T_world_camera: jaxlie.SE3,
     scale: Float[Array, ""],
-    covariance: Float[Array, "7 7"],
     anchored: tuple[jaxlie.SE3, Float[Array, "6"]],
     belief: Belief,
     config: LocalizationConfig,
-) -> tuple[jaxlie.SE3, Float[Array, ""], Float[Array, "7 7"]]:
-    """Pose, scale and covariance after the prior's own pose (`fused` only) and the prior's own unit.
+) -> tuple[jaxlie.SE3, Float[Array, ""], Belief]:
+    """Pose, scale and belief after the prior's own pose (`fused` only) and the prior's own unit.
 
     Where a prior has lost its anchor its pose is wrong altogether, and then lasting. So it counts by a Cauchy weight of
     its distance from what is known, w = 1 / (1 + χ² / 6).
@@ -184,20 +183,19 @@ def _measured(
     Args:
         T_world_camera: what is known.
         scale: likewise.
-        covariance: of both.
         anchored: the prior's own pose, and its standard deviations.
-        belief: of the previous frame.
+        belief: of what is known.
         config: readings.
     """
     pose, std = anchored
     apart = (T_world_camera.inverse() @ pose).log()
     is_used = (config.coarse == FUSED) & jnp.all(jnp.isfinite(apart)) & jnp.all(jnp.isfinite(std))
     apart, std = jnp.where(is_used, apart, 0.0), jnp.where(is_used, std, 1.0)
-    chi_sq = apart @ jnp.linalg.solve(covariance[:-1, :-1] + jnp.diag(std**2), apart)
+    chi_sq = apart @ jnp.linalg.solve(belief.covariance[:-1, :-1] + jnp.diag(std**2), apart)
     weights = is_used / (std**2 * (1.0 + chi_sq / apart.shape[0]))
     difference = jnp.append(apart, belief.log_scale - jnp.log(scale))
-    step, covariance = update(covariance, difference, jnp.diag(jnp.append(weights, config.scale_std**-2)))
-    return T_world_camera @ jaxlie.SE3.exp(step[:-1]), scale * jnp.exp(step[-1]), covariance
+    step, belief = measured(belief, difference, jnp.diag(jnp.append(weights, config.scale_std**-2)))
+    return T_world_camera @ jaxlie.SE3.exp(step[:-1]), scale * jnp.exp(step[-1]), belief
 
 
 @full_precision
@@ -225,12 +223,12 @@ def localize_coarse(
     depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, belief.depth_noise), LEAST_NOISE)
     motion, anchored, forms, is_linked = _readings(prediction, previous, T_world_previous, scale, camera, config)
     noise, unknown = _motion_noise(depth_noise, mean_depth, ratio_std, config), _no_motion(mean_depth, config)
-    covariance = predict(belief.covariance, motion, jnp.where(is_linked, noise, unknown))
+    belief = moved(belief, motion, jnp.where(is_linked, noise, unknown))
     distance = jnp.linalg.norm(anchored.translation() - prediction.T_world_anchor.translation())
     reach = 1.0 + distance / config.anchor_range
     own = anchored, noise[:-1] * jnp.sqrt(config.anchor_noise) * reach
-    known = pose_row(forms, config.coarse.astype(jnp.int32)), scale, covariance
-    coarse, scale, covariance = _measured(*known, own, belief, config)
+    known = pose_row(forms, config.coarse.astype(jnp.int32)), scale
+    coarse, scale, belief = _measured(*known, own, belief, config)
     is_finite = jnp.all(jnp.isfinite(coarse.wxyz_xyz))
     coarse = jaxlie.SE3(jnp.where(is_finite, coarse.wxyz_xyz, T_world_previous.wxyz_xyz))
     raw_current, raw_newest = pose_row(prediction.T_world_views, 1), pose_row(prediction.T_world_views, 2)
@@ -238,7 +236,6 @@ def localize_coarse(
     has_newest = prediction.has_newest & is_finite & jnp.all(jnp.isfinite(newest.wxyz_xyz))
     newest = jaxlie.SE3(jnp.where(has_newest, newest.wxyz_xyz, coarse.wxyz_xyz))
     is_usable = is_finite & (jnp.sum(prediction.current.valid) >= MIN_PAIRS)
-    belief = eqx.tree_at(lambda b: b.covariance, belief, covariance)
     return CoarsePose(coarse, newest, scale, repeat_rms, mean_depth, depth_noise, belief, is_usable)
 
 

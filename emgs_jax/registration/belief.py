@@ -1,7 +1,8 @@
 """What is known of a frame's pose and scale: one step of a Kalman filter from frame to frame.
 
 The error of a pose T and a scale s is T Exp(ξ) and s e^σ with (ξ, σ) ~ N(0, P), in the order translation (m), rotation
-(rad), logarithm of the scale, relative to the map.
+(rad), logarithm of the scale. There are two P. One is relative to the map, into which a frame is fitted. The other is
+relative to the first frame, and has the errors of the map in it: it is what a user may rely on, and moves nothing.
 """
 
 import equinox as eqx
@@ -20,13 +21,15 @@ class Belief(eqx.Module):
     """What the next step needs to know of the last frame, beside its pose.
 
     Args:
-        covariance: P of its pose and scale.
+        covariance: P of its pose and scale, relative to the map.
+        world_covariance: P relative to the first frame.
         depth_noise: how much its points differ from the map, as a fraction of their depth.
         log_scale: mean logarithm of the scales of the tracked frames: the prior's own unit, in that of the map.
         num_scales: how many these are.
     """
 
     covariance: Float[Array, "*b 7 7"]
+    world_covariance: Float[Array, "*b 7 7"]
     depth_noise: Float[Array, "*b"]
     log_scale: Float[Array, "*b"]
     num_scales: Float[Array, "*b"]
@@ -34,7 +37,8 @@ class Belief(eqx.Module):
 
 def certain() -> Belief:
     """Of the frame that the map is made of: its pose is exact, and its scale is the unit."""
-    return Belief(jnp.zeros((DEGREES, DEGREES)), jnp.zeros(()), jnp.zeros(()), jnp.ones(()))
+    exact = jnp.zeros((DEGREES, DEGREES))
+    return Belief(exact, exact, jnp.zeros(()), jnp.zeros(()), jnp.ones(()))
 
 
 @full_precision
@@ -68,6 +72,21 @@ def update(
     return posterior @ information @ difference, posterior
 
 
+def moved(belief: Belief, T_previous_current: jaxlie.SE3, noise: Float[Array, "7"]) -> Belief:
+    """Of the current frame, before anything is measured of it; see `predict`."""
+    found = (predict(P, T_previous_current, noise) for P in (belief.covariance, belief.world_covariance))
+    return eqx.tree_at(lambda b: (b.covariance, b.world_covariance), belief, tuple(found))
+
+
+def measured(
+    belief: Belief, difference: Float[Array, "7"], information: Float[Array, "7 7"]
+) -> tuple[Float[Array, "7"], Belief]:
+    """The step to the mean of what is known relative to the map and what is measured, and the belief; see `update`."""
+    step, covariance = update(belief.covariance, difference, information)
+    _, world = update(belief.world_covariance, difference, information)
+    return step, eqx.tree_at(lambda b: (b.covariance, b.world_covariance), belief, (covariance, world))
+
+
 @full_precision
 def root_information(covariance: Float[Array, "7 7"]) -> Float[Array, "7 7"]:
     """L⁻¹ of P = L L': |L⁻¹ x|² is the squared Mahalanobis distance of x. P must be positive definite."""
@@ -93,14 +112,14 @@ def next_belief(
         depth_noise: as a fraction of the depth.
         scale: of its prediction.
         is_tracked: the fine pose was accepted.
-        num_alike: frames that see one part of the map. Its scale is wrong for all of them in the same way, so what the
-            points of one say of the scale is worth so much less.
+        num_alike: frames that see one part of the map, which is wrong for all of them in the same way: what the points
+            of one say of the scale, and of the place in the world, is worth so much less.
     """
-    worth = jnp.maximum(found.misfit / depth_noise, 1.0)
+    worth, nothing = jnp.maximum(found.misfit / depth_noise, 1.0) ** 2, jnp.zeros(DEGREES)
     units = jnp.ones(DEGREES).at[-1].set(num_alike**-0.5)
-    information = units[:, None] * found.information * units
-    _, covariance = update(worth**2 * belief.covariance, jnp.zeros(DEGREES), information)
+    _, covariance = update(worth * belief.covariance, nothing, units[:, None] * found.information * units)
+    _, world = update(worth * belief.world_covariance, nothing, found.information / num_alike)
     num_scales = belief.num_scales + 1.0
     log_scale = belief.log_scale + (jnp.log(scale) - belief.log_scale) / num_scales
-    after = Belief(covariance, found.misfit, log_scale, num_scales)
+    after = Belief(covariance, world, found.misfit, log_scale, num_scales)
     return jax.tree.map(lambda new, old: jnp.where(is_tracked, new, old), after, belief)

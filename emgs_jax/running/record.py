@@ -41,7 +41,7 @@ class FrameRecord:
         true_pose: None where unknown.
         newest_pose: temporary pose of the next frame.
         covariance: (6, 6) of ξ where the true pose is T Exp(ξ), translation (m), rotation (rad); of the pose as it was
-            placed, relative to the first inference.
+            placed, relative to the first frame.
         inliers: points that agree with the map.
         residual: of these to the map's planes, as a fraction of their depth.
         scale: by which the prediction was multiplied.
@@ -195,7 +195,7 @@ def _described(info: StepInfo) -> dict[str, Any]:
         "reason": "; ".join(reasons) or None,
         "pose": to_matrix(info.T_world_camera.wxyz_xyz),
         "newest_pose": to_matrix(info.T_world_newest.wxyz_xyz),
-        "covariance": np.asarray(localization.belief.covariance, np.float64)[:-1, :-1],
+        "covariance": np.asarray(localization.belief.world_covariance, np.float64)[:-1, :-1],
         "inliers": int(localization.icp.num_inliers),
         "residual": float(localization.icp.residual),
         "scale": float(localization.scale),

@@ -80,6 +80,7 @@ def rescaled(state: SlamState, factor: float, origin: np.ndarray) -> SlamState:
         belief=replace(
             belief,
             covariance=units[:, None] * belief.covariance * units,
+            world_covariance=units[:, None] * belief.world_covariance * units,
             log_scale=belief.log_scale + jnp.log(jnp.asarray(factor, jnp.float32)),
         ),
     )

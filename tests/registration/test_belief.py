@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scene import pose
 
-from emgs_jax.registration.belief import certain, next_belief, predict, root_information, update
+from emgs_jax.registration.belief import certain, measured, moved, next_belief, predict, root_information, update
 from emgs_jax.registration.icp import IcpInfo
 
 MOTION = pose((0.2, -0.1, 0.3), (0.3, 0.05, -0.4))
@@ -57,6 +57,17 @@ def test_what_is_certain_stays_and_what_is_not_measured_says_nothing():
     np.testing.assert_allclose(after, covariance(), rtol=1e-4, atol=1e-8)
 
 
+def test_both_covariances_take_the_same_motion_and_measurement_and_the_step_is_that_in_the_map():
+    before = eqx.tree_at(lambda b: (b.covariance, b.world_covariance), certain(), (covariance(), covariance(2)))
+    noise, d, W = jnp.linspace(0.005, 0.02, 7), jnp.linspace(-0.1, 0.1, 7), jnp.linalg.inv(covariance(1))
+    step, after = measured(moved(before, MOTION, noise), d, W)
+    expected_step, expected = update(predict(covariance(), MOTION, noise), d, W)
+    np.testing.assert_allclose(step, expected_step, rtol=1e-5)
+    np.testing.assert_allclose(after.covariance, expected, rtol=1e-5)
+    _, expected = update(predict(covariance(2), MOTION, noise), d, W)
+    np.testing.assert_allclose(after.world_covariance, expected, rtol=1e-5)
+
+
 def test_the_root_measures_the_mahalanobis_distance():
     P, x = covariance(), jnp.linspace(-0.1, 0.2, 7)
     expected = np.asarray(x, float) @ np.linalg.solve(np.asarray(P, float), np.asarray(x, float))
@@ -64,7 +75,7 @@ def test_the_root_measures_the_mahalanobis_distance():
 
 
 def test_a_frame_that_is_tracked_is_known_as_its_points_say_and_another_as_before():
-    before = eqx.tree_at(lambda b: b.covariance, certain(), covariance())
+    before = eqx.tree_at(lambda b: (b.covariance, b.world_covariance), certain(), (covariance(), covariance(2)))
     zero, one = jnp.zeros(()), jnp.ones((), jnp.int32)
     found = IcpInfo(one, zero, zero, jnp.asarray(0.04), jnp.zeros(8), 1e4 * jnp.eye(7), zero, zero, one, one > 0)
     arguments = before, found, jnp.asarray(0.02), jnp.asarray(1.1)
@@ -73,6 +84,8 @@ def test_a_frame_that_is_tracked_is_known_as_its_points_say_and_another_as_befor
     said = jnp.diag(jnp.asarray([1e4] * 6 + [2e3]))
     _, expected = update(4.0 * covariance(), jnp.zeros(7), said)
     np.testing.assert_allclose(after.covariance, expected, rtol=1e-5)
+    _, expected = update(4.0 * covariance(2), jnp.zeros(7), found.information / 5.0)  # and so of the place in the world
+    np.testing.assert_allclose(after.world_covariance, expected, rtol=1e-5)
     np.testing.assert_allclose(after.log_scale, np.log(1.1) / 2, rtol=1e-5)
     assert after.num_scales == 2 and after.depth_noise == pytest.approx(0.04)
     same = next_belief(*arguments, jnp.asarray(False), jnp.asarray(5.0))
