@@ -33,7 +33,7 @@ from emgs_jax.running.stacked import map_together, programs
 from .command import command
 from .grid import Variant, notes, read_axes, variants
 
-NOT_OF_RESULTS = ("axes", "grid", "chunk", "at_once", "compilation_cache")  # keys that change no number
+NOT_OF_RESULTS = ("axes", "grid", "chunk", "at_once", "compilation_cache", "checksums")  # keys that change no number
 
 
 @dataclass(frozen=True)
