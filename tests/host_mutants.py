@@ -50,6 +50,7 @@ BACKPROJECTION = ("tests/data/test_backprojection.py",)
 READING = ("tests/data/test_reading.py", "tests/data/test_layouts.py")
 READABLE = ("tests/data/test_readable.py",)
 CHECKPOINT = ("tests/running/test_checkpoint.py",)
+SWEEP_SCRIPT = ("tests/scripts/test_sweep_script.py",)
 UNTRACKED = ("tests/running/test_untracked.py",)
 IMAGES = ("tests/data/test_images.py", "tests/data/test_layouts.py")
 REPLICA = ("tests/data/test_replica.py", "tests/data/test_layouts.py")
@@ -72,6 +73,14 @@ VERIFICATION = ("tests/loops/test_verification.py",)
 BACK_END = ("tests/running/test_back_end.py",)
 
 MUTANTS = (
+    # sweeps that go on
+    Mutant(
+        "experiments/sweep.py",
+        "    remove_temporaries(folder)  # of writes that were killed\n",
+        "",
+        SWEEP_SCRIPT,
+        "what a kill left lies beside the results for ever",
+    ),
     # frames that do not fit
     Mutant(
         "emgs_jax/running/untracked.py",
