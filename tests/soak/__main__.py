@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from emgs_jax.io.files import write_json
+from emgs_jax.running.compilation import use_compilation_cache
 from emgs_jax.running.untracked import UNTRACKED
 
 from .scenes import SCENES, ToAndFro
@@ -50,6 +51,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("outputs/soak"))
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
+    use_compilation_cache()
     run, curves = soak(ToAndFro(given.steps), seconds=given.seconds)
     count = len(curves.status)
     found = {"walk": faults(run, count)}

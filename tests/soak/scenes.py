@@ -108,5 +108,5 @@ SCENES: dict[str, tuple[Callable[[Frame], Frame], Callable[[int], int]]] = {
     "motion blur": (_between(5, 9, _blurred), to_and_fro),
     "moving object": (_with_something_that_moves, to_and_fro),
     "exposure jump": (_between(5, 10**9, _darker), to_and_fro),
-    "zero overlap": (lambda frame: frame, lambda index: min(index, 5) if index < 6 else index + 20),
+    "zero overlap": (lambda frame: frame, lambda index: to_and_fro(index if index < 6 else index + 20)),
 }

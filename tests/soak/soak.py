@@ -11,6 +11,7 @@ import numpy as np
 from emgs_jax.data.base import Dataset
 from emgs_jax.prior.simulated.prior import Simulated
 from emgs_jax.report.metrics import STATUSES
+from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import build
 from emgs_jax.running.drive import map_frames
 from emgs_jax.running.record import FrameRecord, MappingRun, new_run
@@ -43,10 +44,11 @@ def memory_mb() -> float:
 def soak(dataset: Dataset, overrides: Sequence[str] = (), seconds: float = np.inf) -> tuple[MappingRun, Curves]:
     """Map a sequence with the small setting of the tests and the simulated prior, for so many seconds at most."""
     curves, end = Curves(), time.monotonic() + seconds
-    run = new_run(dataset, build(compose(*overrides), "slam"), on_record=curves.add)
-    for _ in map_frames(run, dataset, Simulated(seed=0, classes=dataset.classes)):
-        if time.monotonic() > end:
-            break
+    with Clock().watching() as clock:
+        run = new_run(dataset, build(compose(*overrides), "slam"), clock, curves.add)
+        for _ in map_frames(run, dataset, Simulated(seed=0, classes=dataset.classes)):
+            if time.monotonic() > end:
+                break
     return run, curves
 
 

@@ -30,6 +30,8 @@ def test_no_scene_poisons_the_map_and_every_frame_has_a_status(name):
 def test_the_walk_is_to_and_fro():
     assert [to_and_fro(i) for i in (0, 1, 38, 39, 40, 77, 78, 79)] == [0, 1, 38, 39, 38, 1, 0, 1]
     places = [to_and_fro(i) for i in range(500)]
+    for change, place in SCENES.values():
+        assert len([ToAndFro(30, change, place)[i] for i in range(30)]) == 30
     assert max(places) == NUM_FRAMES - 1 and set(np.abs(np.diff(places))) == {1}
 
 
