@@ -14,14 +14,14 @@ from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import describe, new_scorer, score_back_end, score_baselines, score_map, score_prior, spent
-from emgs_jax.report.printout import frame_lines
+from emgs_jax.report.printout import frame_lines, last_words
 from emgs_jax.report.provenance import print_metrics_table, provenance, signature, write_metrics
 from emgs_jax.report.run_files import claim_folder, save_outputs, save_progress
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import baseline_configs, build, build_dataset, build_prior, graph_config
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
-from emgs_jax.running.drive import map_frames, show_record
+from emgs_jax.running.drive import map_frames, show_records
 from emgs_jax.running.gathering import Baselines, RawPrior, gather
 from emgs_jax.running.record import FrameRecord, MappingRun, new_run, to_line
 
@@ -85,7 +85,7 @@ def _map(
 
         def on_record(record: FrameRecord) -> None:
             log.append(to_line(record) | {"index": dataset.kept[record.index]})
-            show_record(bar, record)
+            show_records(bar, session.records)
 
         session.on_record = on_record
         for index, reason in dataset.skipped.items():
@@ -114,7 +114,7 @@ def main(config: DictConfig) -> float:
     for key, value in metrics.items():
         if value is not None and (key.startswith("prior/") or key == "segmentation/miou_percent"):
             print(f"{key} {value:.4g}")
-    print(f"{metrics['time/seconds_per_frame']:.2f} s a frame; everything is in {folder}")
+    print(f"{last_words(metrics)}{metrics['time/seconds_per_frame']:.2f} s a frame; everything is in {folder}")
     error = metrics.get("trajectory/ate_sim3_m")
     return math.inf if error is None else error
 

@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.io.files import remove_temporaries
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.report.metrics import Metrics, Scorer, new_scorer, score_settings
@@ -33,7 +34,7 @@ from emgs_jax.running.stacked import map_together, programs
 from .command import command
 from .grid import Variant, notes, read_axes, variants
 
-NOT_OF_RESULTS = ("axes", "grid", "chunk", "at_once", "compilation_cache")  # keys that change no number
+NOT_OF_RESULTS = ("axes", "grid", "chunk", "at_once", "compilation_cache", "checksums")  # keys that change no number
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,15 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
     for note in notes(config, axes):
         print(note)
     folder.mkdir(parents=True, exist_ok=True)
+    remove_temporaries(folder)  # of writes that were killed
     with Clock().watching() as clock:
         dataset = build_dataset(config)
         prior = build_prior(config, dataset)
         results = SweepResults(folder, _provenance(config, dataset, prior))
-        left = [variant for variant in grid if variant.setting not in results]
-        chunks = _chunks(left, config.chunk)
+        chunks = _left(_chunks(grid, config.chunk), results)
+        num_left = sum(map(len, chunks))
+        if num_left < len(grid):
+            print(f"going on: {num_left} of {len(grid)} settings are left")
         scorer = new_scorer(dataset, build(config, "evaluation"), prior) if chunks else None
         with _replayed(prior, dataset, chunks, folder / "predictions") as priors, _bar(dataset, chunks) as bar:
             for chunk in chunks:
@@ -79,7 +83,7 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
         if no_picture:
             print(f"no heat_map.png: {no_picture}")
     print(table(rows, list(axes)))
-    print(f"{len(left)} settings in {clock.total_seconds:.1f} s, {clock.compile_seconds:.1f} s of it compilation")
+    print(f"{num_left} settings in {clock.total_seconds:.1f} s, {clock.compile_seconds:.1f} s of it compilation")
     return rows
 
 
@@ -89,15 +93,21 @@ def _provenance(config: DictConfig, dataset: ReadableFrames, prior: Prior) -> di
     return provenance(shared, dataset, prior.provenance)
 
 
-def _chunks(left: Sequence[Variant], size: int) -> list[list[Variant]]:
+def _chunks(grid: Sequence[Variant], size: int) -> list[list[Variant]]:
     """Settings that share a program and a pass over the sequence, in chunks of equal size up to one."""
     if size < 1:
         raise ValueError(f"chunk must be at least 1 setting, got {size}")
     chunks = []
-    for positions in programs([variant.slam for variant in left]):
+    for positions in programs([variant.slam for variant in grid]):
         count = -(-len(positions) // size)
-        chunks += [[left[position] for position in positions[start::count]] for start in range(count)]
+        chunks += [[grid[position] for position in positions[start::count]] for start in range(count)]
     return chunks
+
+
+def _left(chunks: Sequence[Sequence[Variant]], results: SweepResults) -> list[list[Variant]]:
+    """What is not done of chunks of the whole grid: a sweep that goes on has the chunks of one that nobody stopped."""
+    left = ([variant for variant in chunk if variant.setting not in results] for chunk in chunks)
+    return [chunk for chunk in left if chunk]
 
 
 def _side_by_side(config: DictConfig, size: int) -> tuple[int, int]:
@@ -144,7 +154,11 @@ def _map_and_score(work: Work, chunk: Sequence[Variant], bar: tqdm) -> list[Metr
 def main(config: DictConfig) -> None:
     """Sweep, and say where the results are."""
     folder = Path(HydraConfig.get().runtime.output_dir)
-    sweep(config, folder)
+    try:
+        sweep(config, folder)
+    except KeyboardInterrupt:
+        print(f"what is done is in {folder}; the same command with hydra.run.dir={folder} goes on from there")
+        raise
     print(f"everything is in {folder}")
 
 

@@ -52,6 +52,8 @@ BACKPROJECTION = ("tests/data/test_backprojection.py",)
 READING = ("tests/data/test_reading.py", "tests/data/test_layouts.py")
 READABLE = ("tests/data/test_readable.py",)
 CHECKPOINT = ("tests/running/test_checkpoint.py",)
+SWEEP_SCRIPT = ("tests/scripts/test_sweep_script.py",)
+UNTRACKED = ("tests/running/test_untracked.py",)
 IMAGES = ("tests/data/test_images.py", "tests/data/test_layouts.py")
 REPLICA = ("tests/data/test_replica.py", "tests/data/test_layouts.py")
 INTRINSICS = (
@@ -73,6 +75,36 @@ VERIFICATION = ("tests/loops/test_verification.py",)
 BACK_END = ("tests/running/test_back_end.py",)
 
 MUTANTS = (
+    # sweeps that go on
+    Mutant(
+        "experiments/sweep.py",
+        "    remove_temporaries(folder)  # of writes that were killed\n",
+        "",
+        SWEEP_SCRIPT,
+        "what a kill left lies beside the results for ever",
+    ),
+    # frames that do not fit
+    Mutant(
+        "emgs_jax/running/untracked.py",
+        "if len(row) != MANY_IN_A_ROW:",
+        "if len(row) < MANY_IN_A_ROW:",
+        UNTRACKED,
+        "every further frame that does not fit is said",
+    ),
+    Mutant(
+        "emgs_jax/running/untracked.py",
+        "row = _last_row(records[:-1], len(records))",
+        "row = _last_row(records[:-1], MANY_IN_A_ROW)",
+        UNTRACKED,
+        "the end of a long row counts its first frames only",
+    ),
+    Mutant(
+        "emgs_jax/report/metrics.py",
+        "dataset.kept[run.records[row[0]].index] if row",
+        "run.records[row[0]].index if row",
+        METRICS,
+        "a row begins at another frame than in frames.jsonl where some cannot be read",
+    ),
     # checkpoints
     Mutant(
         "emgs_jax/running/drive.py",

@@ -12,9 +12,38 @@ RECORDED = ("tests/prior/test_recorded.py",)
 READABLE = ("tests/data/test_readable.py",)
 READING = ("tests/data/test_reading.py",)
 TUM = ("tests/data/test_tum.py",)
+CHECKSUMS = ("tests/data/test_checksums.py",)
 VALUES = ("tests/running/test_values.py",)
 
 MUTANTS = (
+    Mutant(
+        "emgs_jax/data/checksums.py",
+        "if self._sound.get(place) == version:",
+        "if place in self._sound:",
+        CHECKSUMS,
+        "what was sound once is sound for ever",
+    ),
+    Mutant(
+        "emgs_jax/data/checksums.py",
+        "found[_place(path.parent / name)]",
+        "found[_place(Path(name))]",
+        CHECKSUMS,
+        "names are looked up where the program runs",
+    ),
+    Mutant(
+        "emgs_jax/data/checksums.py",
+        "    if missing:\n",
+        "    if len(missing) == len(images):\n",
+        CHECKSUMS,
+        "a list that was cut off checks some images only",
+    ),
+    Mutant(
+        "emgs_jax/data/readable.py",
+        "_unreadable(self._read, progress(indices))",
+        "_unreadable(dataset.__getitem__, progress(indices))",
+        CHECKSUMS,
+        "a changed frame ends a run that leaves out bad ones",
+    ),
     Mutant(
         "emgs_jax/io/ply_reader.py",
         " and name not in [other.name for other in elements]",

@@ -1,7 +1,8 @@
 """What a data set gives: frames in order, their calibration and, where it is known, the truth."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -55,6 +56,10 @@ class Dataset(Protocol):
     def __getitem__(self, index: int) -> Frame: ...
 
     def pose(self, index: int) -> np.ndarray | None: ...
+
+    def files(self, index: int) -> Sequence[Path]:
+        """What frame `index` is read from, its image first, lists and poses too; empty where frames are made."""
+        ...
 
     def fingerprint(self) -> str:
         """Hex digest over what defines the frames (files' names and contents, options), for provenance."""

@@ -79,6 +79,9 @@ class Images:
     def pose(self, index: int) -> None:
         return None
 
+    def files(self, index: int) -> list[Path]:
+        return [self._source.file(self._chosen[index])]
+
     def fingerprint(self) -> str:
         options = {
             "dataset": self.name,
@@ -87,8 +90,7 @@ class Images:
             **({} if self._lens.maps is None else {"lens": self.calibration["distortion"]}),
             "frames": (self._chosen.start, self._chosen.stop, self._chosen.step),
         }
-        files = {self._source.file(row) for row in self._chosen}
-        return reading.fingerprint(self._source.folder, files, options)
+        return reading.fingerprint(self._source.folder, reading.all_files(self), options)
 
 
 class Folder:

@@ -102,6 +102,9 @@ class RayCast:
         objects = hit["geometry_ids"].numpy().astype(np.int64)
         return hit["t_hit"].numpy(), objects, hit["primitive_normals"].numpy(), rays
 
+    def files(self, index: int) -> tuple[()]:
+        return ()
+
     def fingerprint(self) -> str:
         options = {
             "dataset": self.name,

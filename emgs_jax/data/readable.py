@@ -3,10 +3,12 @@
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
+from emgs_jax.data.checksums import find_checksums
 
 
 class ReadableFrames:
@@ -16,6 +18,8 @@ class ReadableFrames:
         dataset: all frames.
         on_bad_frame: `error`: a frame that cannot be read ends the run when it is its turn, a true pose that cannot
             be read at once; `skip`: all frames are read once here, and those that cannot be read are left out.
+        checksums: of the files of the frames: `auto`, a file or `off`, see `find_checksums`. A file that is not the
+            listed one is a frame that cannot be read.
         progress: wraps the frame numbers of that first pass, e.g. tqdm.
 
     Attributes:
@@ -27,16 +31,17 @@ class ReadableFrames:
         self,
         dataset: Dataset,
         on_bad_frame: str = "error",
+        checksums: str | None = "off",
         progress: Callable[[Iterable[int]], Iterable[int]] = iter,
     ) -> None:
         if on_bad_frame not in ("error", "skip"):
             raise ValueError(f"on_bad_frame must be error or skip, got {on_bad_frame!r}")
-        self._dataset = dataset
+        self._dataset, self._checksums = dataset, find_checksums(checksums, dataset)
         self.name, self.sequence, self.size = dataset.name, dataset.sequence, dataset.size
         self.intrinsics, self.calibration, self.classes = dataset.intrinsics, dataset.calibration, dataset.classes
         self.has_ground_truth = dataset.has_ground_truth
         indices = range(len(dataset))
-        self.skipped = _unreadable(dataset, progress(indices)) if on_bad_frame == "skip" else {}
+        self.skipped = _unreadable(self._read, progress(indices)) if on_bad_frame == "skip" else {}
         self.kept = tuple(index for index in indices if index not in self.skipped)
         if not self.kept:
             what = f"{dataset.name} {dataset.sequence}"
@@ -49,10 +54,19 @@ class ReadableFrames:
         return len(self.kept)
 
     def __getitem__(self, index: int) -> Frame:
-        return replace(self._dataset[self.kept[index]], index=index)
+        return replace(self._read(self.kept[index]), index=index)
+
+    def _read(self, index: int) -> Frame:
+        if self._checksums is not None:
+            for file in self._dataset.files(index):
+                self._checksums.check(file)
+        return self._dataset[index]
 
     def pose(self, index: int) -> np.ndarray | None:
         return self._dataset.pose(self.kept[index])
+
+    def files(self, index: int) -> Sequence[Path]:
+        return self._dataset.files(self.kept[index])
 
     def fingerprint(self) -> str:
         """That of the data set, unless frames are left out."""
@@ -60,12 +74,12 @@ class ReadableFrames:
         return hashlib.sha256(repr((whole, self.kept)).encode()).hexdigest() if self.skipped else whole
 
 
-def _unreadable(dataset: Dataset, indices: Iterable[int]) -> dict[int, str]:
+def _unreadable(read: Callable[[int], Frame], indices: Iterable[int]) -> dict[int, str]:
     """Index and reason of the frames that raise BadFrameError."""
     reasons = {}
     for index in indices:
         try:
-            dataset[index]
+            read(index)
         except BadFrameError as error:
             reasons[index] = str(error)
     return reasons

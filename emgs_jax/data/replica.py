@@ -74,15 +74,18 @@ class Replica:
         number = number_of(self._images[index])
         return reading.as_pose(self._poses[index], f"{self._folder / 'traj.txt'}, row {number} (from 0),")
 
+    def files(self, index: int) -> list[Path]:
+        image = self._images[index]
+        return [image, depth_path(image), self._folder / "traj.txt"]
+
     def fingerprint(self) -> str:
-        files = [self._folder / "traj.txt", *self._images, *map(depth_path, self._images)]
         options = {
             "dataset": self.name,
             "size": self.size,
             "intrinsics": self.intrinsics,
             "depth_scale": self._depth_scale,
         }
-        return reading.fingerprint(self._folder, files, options)
+        return reading.fingerprint(self._folder, reading.all_files(self), options)
 
 
 def find_images(folder: Path) -> list[Path]:

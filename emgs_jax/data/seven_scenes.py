@@ -99,8 +99,11 @@ class SevenScenes:
         is_moved = self._register and T_world_depth is not None
         return T_world_depth @ np.linalg.inv(T_COLOR_DEPTH) if is_moved else T_world_depth
 
+    def files(self, index: int) -> list[Path]:
+        image = self._images[index]
+        return [image, sibling(image, "depth.png"), sibling(image, "pose.txt")]
+
     def fingerprint(self) -> str:
-        files = [f for p in self._images for f in (p, sibling(p, "depth.png"), sibling(p, "pose.txt"))]
         options = {
             "dataset": self.name,
             "size": self.size,
@@ -108,7 +111,7 @@ class SevenScenes:
             "depth_scale": self._depth_scale,
             "register_depth": self._register,
         }
-        return reading.fingerprint(self._folder, files, options)
+        return reading.fingerprint(self._folder, reading.all_files(self), options)
 
 
 def find_images(folder: Path) -> list[Path]:

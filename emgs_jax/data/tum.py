@@ -119,9 +119,12 @@ class Tum:
             return None
         return as_transform(words, f"{self._folder / 'groundtruth.txt'}, line {self._pose_lines[index]}:")
 
-    def fingerprint(self) -> str:
+    def files(self, index: int) -> list[Path]:
         lists = [self._folder / name for name in ("rgb.txt", "depth.txt", "groundtruth.txt")]
-        files = [*lists, *self._images, *(p for p in self._depths or () if p is not None)]
+        depth = None if self._depths is None else self._depths[index]
+        return [self._images[index], *([] if depth is None else [depth]), *lists]
+
+    def fingerprint(self) -> str:
         options = {
             "dataset": self.name,
             "size": self.size,
@@ -131,7 +134,7 @@ class Tum:
             "depths": [p and p.name for p in self._depths or ()],
             "poses": self._poses,
         }
-        return reading.fingerprint(self._folder, files, options)
+        return reading.fingerprint(self._folder, reading.all_files(self), options)
 
 
 def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[list[str]], list[int]]:

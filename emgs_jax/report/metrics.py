@@ -37,6 +37,7 @@ from emgs_jax.running.clock import Clock, peak_memory_mb
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
 from emgs_jax.running.gathering import Baselines, RawPrior
 from emgs_jax.running.record import FrameRecord, MappingRun, with_truth
+from emgs_jax.running.untracked import longest_row
 
 Metrics = dict[str, Any]
 STATUSES = ("tracked", "degraded", "lost", "initialization")
@@ -199,6 +200,9 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     metrics["map/capacity"] = run.config.submap.map_capacity
     metrics |= {f"frames/{status}": statuses[status] for status in STATUSES}
     metrics["frames/skipped"] = len(dataset.skipped)
+    row = longest_row(run.records)
+    metrics["frames/longest_untracked"] = len(row)
+    metrics["frames/longest_untracked_from"] = dataset.kept[run.records[row[0]].index] if row else None
     metrics["frames/overflow"] = sum(record.overflow or 0 for record in run.records)
     metrics["time/seconds_per_frame"] = seconds_per_frame(run.records)
     return metrics

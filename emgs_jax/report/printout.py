@@ -1,32 +1,19 @@
 """What a run says at its end: how many frames came to what, and what to do where many were not tracked."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from emgs_jax.localization import REASONS
 from emgs_jax.running.record import FrameRecord
+from emgs_jax.running.untracked import MANY_IN_A_ROW, REMEDIES, UNTRACKED, called, longest_row, main_reason
 
 MANY = 0.1  # share of frames
-REMEDIES = dict(
-    zip(
-        REASONS,
-        (
-            "the prior gives nothing there; look at its confidence and mask, or leave these frames out "
-            "(dataset.start, dataset.stop)",
-            "take frames closer together (dataset.stride=…) or a wider submap (slam.submap.margin=…)",
-            "the predictions differ from the map; take frames closer together (dataset.stride=…), or accept more "
-            "(slam.localization.max_residual=…)",
-            "take frames closer together (dataset.stride=…), or trust the prior's pose less "
-            "(slam.localization.icp.prior_information=…, slam.localization.max_step=…)",
-            "the images show too little, such as one wall; take frames with more of the scene in view",
-        ),
-        strict=True,
-    )
-)
 
 
 def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
     """One line of counts; where many frames are degraded or lost, one more with the most frequent reason and a remedy.
+
+    Many are a tenth of all, or `MANY_IN_A_ROW`; these are named, too.
 
     Args:
         records: of a run.
@@ -35,9 +22,21 @@ def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
     counts = Counter(record.status for record in records) | Counter(skipped=num_skipped)
     words = ("tracked", "degraded", "lost", "initialization", "skipped")
     lines = [f"{len(records) + num_skipped} frames: " + ", ".join(f"{counts[word]} {word}" for word in words)]
-    bad = [record for record in records if record.status in ("degraded", "lost")]
-    if len(bad) > MANY * len(records):
-        reasons = Counter(reason for record in bad for reason in (record.reason or "").split("; ") if reason)
-        reason, count = reasons.most_common(1)[0]
-        lines.append(f"{len(bad)} frames were not tracked, {count} of them because {reason}: {REMEDIES[reason]}")
+    bad, row = [record for record in records if record.status in UNTRACKED], longest_row(records)
+    if len(bad) > MANY * len(records) or len(row) >= MANY_IN_A_ROW:
+        reason, count = main_reason(bad)
+        is_to_the_end = row.stop == len(records)
+        end = "to the end" if is_to_the_end else f"to {called(records[row[-1]])}"
+        where = f" ({len(row)} in a row, from {called(records[row[0]])} {end})" if len(row) > 1 else ""
+        lines.append(f"{len(bad)} frames were not tracked{where}, {count} of them because {reason}: {REMEDIES[reason]}")
     return lines
+
+
+def last_words(metrics: Mapping[str, Any]) -> str:
+    """For the line that ends a run: how many frames are not in the map and from which on; empty where all are."""
+    count = metrics["frames/degraded"] + metrics["frames/lost"]
+    if not count:
+        return ""
+    whole = count + sum(metrics[f"frames/{status}"] for status in ("tracked", "initialization", "skipped"))
+    row, start = metrics["frames/longest_untracked"], metrics["frames/longest_untracked_from"]
+    return f"{count} of {whole} frames are degraded or lost, {row} in a row from frame {start} on; "

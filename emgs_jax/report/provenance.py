@@ -62,8 +62,8 @@ def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -
 
 
 def signature(block: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a provenance decides the bits of a result: all but the folder of executables and when to write."""
-    ignored = ("compilation_cache", "checkpoint")
+    """What of a provenance decides the bits of a result: all but where things are and when to write."""
+    ignored = ("compilation_cache", "checkpoint", "checksums")
     return {**block, "config": {key: value for key, value in block["config"].items() if key not in ignored}}
 
 

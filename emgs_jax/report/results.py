@@ -11,7 +11,7 @@ from emgs_jax.io.files import flat, jsonable
 from emgs_jax.report.provenance import RESULT_FORMAT, ROWS, prefix_of
 
 METRICS_FILE = "metrics.json"
-_PLACES = ("dataset.root", "compilation_cache")  # say where things are, not what is computed
+_PLACES = ("dataset.root", "compilation_cache", "checksums")  # say where things are, not what is computed
 
 
 @dataclass(frozen=True)

@@ -210,7 +210,8 @@ def build_dataset(config: DictConfig) -> ReadableFrames:
     dataset = build(config, "dataset")
     if "note" in dataset.calibration:
         tqdm.write(f"intrinsics {dataset.calibration['note']}")
-    return ReadableFrames(dataset, config.on_bad_frame, partial(tqdm, desc="checking", unit="frame"))
+    progress = partial(tqdm, desc="checking", unit="frame")
+    return ReadableFrames(dataset, config.on_bad_frame, config.checksums, progress)
 
 
 def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import jax
 from omegaconf import OmegaConf
@@ -29,6 +29,7 @@ from emgs_jax.running.record import (
     record_step,
 )
 from emgs_jax.running.unit import in_own_unit
+from emgs_jax.running.untracked import alarm
 
 
 def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
@@ -49,14 +50,18 @@ def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
         Clock().watching() as clock,
         tqdm(total=len(dataset), unit="frame", desc="mapping", disable=not show_progress) as bar,
     ):
-        run = new_run(dataset, config.slam, clock, lambda record: show_record(bar, record), config.graph)
+        run = new_run(dataset, config.slam, clock, graph=config.graph)
+        run.on_record = lambda record: show_records(bar, run.records)
         deque(map_frames(run, dataset, prior), maxlen=0)
     return run
 
 
-def show_record(bar: tqdm, record: FrameRecord) -> None:
-    """Move the bar by one frame, and say what became of it."""
-    bar.set_postfix_str(f"{record.status}, {record.num_gaussians or 0} Gaussians", refresh=False)
+def show_records(bar: tqdm, records: Sequence[FrameRecord]) -> None:
+    """Move the bar by one frame, and say what became of it, the last of `records`; a line where many do not fit."""
+    said = None if bar.disable else alarm(records)
+    if said is not None:
+        tqdm.write(said)
+    bar.set_postfix_str(f"{records[-1].status}, {records[-1].num_gaussians or 0} Gaussians", refresh=False)
     bar.update()
 
 

@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 
 from emgs_jax import load_config
 from emgs_jax.data.base import Dataset
+from emgs_jax.data.checksums import SUMS_FILE
 from emgs_jax.data.images import Images
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.reading import is_rigid
@@ -120,6 +121,25 @@ def write_replica(folder: Path) -> None:
         _depth(folder / "office9" / "results" / f"depth{i:06d}.png", SIZE, 6553.5)
     rows = [" ".join(f"{v:.9e}" for v in scene_pose(i).ravel()) for i in range(NUM_FRAMES)]
     (folder / "office9" / "traj.txt").write_text("\n".join(rows))
+
+
+def write_listed_images(folder: Path) -> None:
+    write_images(folder)
+    write_sums(folder)
+
+
+def write_sums(folder: Path) -> None:
+    sums = [(hashlib.sha256(path.read_bytes()).hexdigest(), path.name) for path in sorted(folder.iterdir())]
+    (folder / SUMS_FILE).write_text("".join(f"{digest}  {name}\n" for digest, name in sums))
+
+
+def read_listed_images(folder: Path) -> None:
+    """Whatever was damaged, what is read is what was written."""
+    dataset = Images(folder, size=SIZE, intrinsics=(60, 60, 23.5, 17.5))
+    frames = ReadableFrames(dataset, checksums=str(folder / SUMS_FILE))
+    sound = {number: color_image(row, SIZE) for row, number in enumerate((2.0, 10.0, 33.0))}
+    for frame in frames:  # a picture of a JPEG is a little different
+        assert np.abs(frame.image.astype(int) - sound[frame.timestamp][..., ::-1]).mean() < 3
 
 
 def write_images(folder: Path) -> None:
@@ -320,6 +340,7 @@ def targets() -> Iterator[Target]:
     yield Target(
         "images", write_images, lambda f: check_frames(Images(f, size=SIZE, intrinsics=(60, 60, 23.5, 17.5))), image
     )
+    yield Target("checksums", write_listed_images, read_listed_images, image | {SUMS_FILE: TEXT})
     yield Target("calibration", write_calibrations, read_calibrations, {".txt": TEXT, ".json": TEXT, ".yaml": TEXT})
     yield Target("trajectory", write_trajectory, read_trajectory, {".txt": TEXT})
     yield Target("recording", write_recording, read_recording, {".npz": BYTES, ".json": TEXT})

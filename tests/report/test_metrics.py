@@ -223,9 +223,12 @@ def test_a_run_is_described_by_its_counts():
     run = hand_run(*[poses_along(np.zeros(NUM_FRAMES))] * 3)
     run.records[1] = dataclasses.replace(run.records[1], overflow=3)
     run.records[4] = dataclasses.replace(run.records[4], overflow=4)
-    metrics = describe(run, Room())
+    room = Room()
+    room.kept = (0, 1, 5, 6, 7, 8)
+    metrics = describe(run, room)
     counts = {"tracked": 3, "degraded": 1, "lost": 1, "initialization": 1, "skipped": 1, "overflow": 7}
     assert {name: metrics[f"frames/{name}"] for name in counts} == counts
+    assert (metrics["frames/longest_untracked"], metrics["frames/longest_untracked_from"]) == (2, 5)
     assert metrics["map/num_gaussians"] == int(run.state.map.gaussians.valid.sum())
     assert metrics["map/capacity"] == len(run.state.map.gaussians.valid) > metrics["map/num_gaussians"]
 

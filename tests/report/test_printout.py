@@ -3,12 +3,13 @@
 import pytest
 
 from emgs_jax.localization import REASONS
-from emgs_jax.report.printout import REMEDIES, frame_lines
+from emgs_jax.report.printout import frame_lines, last_words
 from emgs_jax.running.record import FrameRecord
+from emgs_jax.running.untracked import MANY_IN_A_ROW, REMEDIES
 
 
 def records(**statuses: int) -> list[FrameRecord]:
-    return [FrameRecord(0, "", 0.0, status, reason=None) for status, count in statuses.items() for _ in range(count)]
+    return [FrameRecord(0, None, 0.0, status, reason=None) for status, count in statuses.items() for _ in range(count)]
 
 
 def test_every_status_is_counted_and_few_bad_frames_need_no_advice():
@@ -19,9 +20,26 @@ def test_every_status_is_counted_and_few_bad_frames_need_no_advice():
 @pytest.mark.parametrize("reason", REASONS)
 def test_where_many_are_not_tracked_the_most_frequent_reason_comes_with_what_to_do(reason):
     other = REASONS[REASONS.index(reason) - 1]
-    bad = [FrameRecord(0, "", 0.0, "degraded", reason=text) for text in (f"{reason}; {other}", reason, other, reason)]
+    bad = [FrameRecord(0, None, 0.0, "degraded", reason=text) for text in (f"{reason}; {other}", reason, other, reason)]
     _, advice = frame_lines([*records(tracked=20), *bad], 0)
-    assert advice == f"4 frames were not tracked, 3 of them because {reason}: {REMEDIES[reason]}"
+    where = "4 in a row, from frame 0 to the end"
+    assert advice == f"4 frames were not tracked ({where}), 3 of them because {reason}: {REMEDIES[reason]}"
+
+
+def test_many_in_a_row_are_named_however_long_the_sequence_is():
+    bad = [FrameRecord(0, f"room/{place}.png", 0.0, "degraded", REASONS[2]) for place in range(MANY_IN_A_ROW)]
+    (_,) = frame_lines([*records(tracked=500), *bad[1:], *records(tracked=500)], 0)
+    _, advice = frame_lines([*records(tracked=500), *bad, *records(tracked=500)], 0)
+    assert advice.startswith("10 frames were not tracked (10 in a row, from 0.png to 9.png), 10 of them because")
+
+
+def test_the_line_that_ends_a_run_says_how_many_frames_are_not_in_the_map_and_from_which_on():
+    metrics = {f"frames/{key}": 0 for key in ("degraded", "lost")} | {"frames/tracked": 137, "frames/skipped": 2}
+    metrics |= {"frames/initialization": 1, "frames/longest_untracked": 0, "frames/longest_untracked_from": None}
+    assert last_words(metrics) == ""
+    metrics |= {"frames/degraded": 258, "frames/lost": 2, "frames/longest_untracked": 250}
+    metrics |= {"frames/longest_untracked_from": 138}
+    assert last_words(metrics) == "260 of 400 frames are degraded or lost, 250 in a row from frame 138 on; "
 
 
 def test_a_remedy_names_keys_that_there_are():

@@ -1,7 +1,6 @@
 """A run that is stopped and goes on; oracle: the bits of the same run that nobody stopped."""
 
 import itertools
-import json
 import signal
 import subprocess
 import sys
@@ -27,18 +26,13 @@ from emgs_jax.running.checkpoint import (
     save_checkpoint,
 )
 from emgs_jax.running.record import FrameRecord
+from tests.kills.folders import log_lines
 
-TIMES = ("seconds", "compile_seconds")
 OVERRIDES = ("prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=256")
 
 
 class Stopped(BaseException):
     """As a signal is: nobody catches it as an error."""
-
-
-def lines(folder):
-    found = [json.loads(line) for line in (folder / "frames.jsonl").read_text().splitlines()]
-    return [{key: value for key, value in line.items() if key not in TIMES} for line in found]
 
 
 def stopped(folder, monkeypatch, overrides, after, is_killed):
@@ -90,7 +84,7 @@ def test_a_run_that_is_stopped_and_goes_on_has_the_same_bits(tmp_path, monkeypat
     assert {path.name for path in tmp_path.iterdir()} == {path.name for path in folder.iterdir()}
     for name in {path.name for path in folder.iterdir()} - {"metrics.json", "frames.jsonl", "overview.png"}:
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
-    assert lines(tmp_path) == lines(folder)
+    assert log_lines(tmp_path) == log_lines(folder)
     same = [key for key in metrics if not key.startswith(("time/", "memory/"))]
     assert {key: found[key] for key in same} == {key: metrics[key] for key in same}
 

@@ -52,6 +52,7 @@ KEYS = {
     "segmentation/num_points",
     *(f"reconstruction_{kind}/{name}" for kind in ("se3", "centers") for name in RECONSTRUCTION),
     *(f"frames/{name}" for name in ("tracked", "degraded", "lost", "initialization", "skipped", "overflow")),
+    *("frames/longest_untracked", "frames/longest_untracked_from"),
     *(f"time/{name}_seconds" for name in PHASES),
     *(
         "time/seconds_per_frame",

@@ -90,6 +90,40 @@ def test_an_interrupted_sweep_keeps_its_chunks(monkeypatch, tmp_path):
     assert [row["setting"] for row in kept] == done and len(done) == 2
 
 
+@pytest.mark.slow
+def test_a_sweep_that_is_stopped_and_goes_on_has_the_same_bits_and_the_same_chunks(monkeypatch, tmp_path, capsys):
+    folder, _ = swept()
+    chunks, map_and_score = [], experiments.sweep._map_and_score
+
+    def stopped(work, chunk, bar):
+        chunks.append([variant.setting for variant in chunk])
+        if len(chunks) == 2:
+            raise KeyboardInterrupt
+        return map_and_score(work, chunk, bar)
+
+    monkeypatch.setattr(experiments.sweep, "_map_and_score", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        experiments.sweep.sweep(compose(AXES, "chunk=2", name="sweep"), tmp_path)
+    (tmp_path / ".sweep.999999999.tmp.json").write_text("{")  # as a kill leaves it
+    experiments.sweep.sweep(compose(AXES, "chunk=2", name="sweep"), tmp_path)
+    assert "going on: 2 of 4 settings are left" in capsys.readouterr().out
+    assert len(chunks) == 3 and chunks[2] == chunks[1]
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in folder.iterdir()}
+    assert (tmp_path / "sweep.csv").read_bytes() == (folder / "sweep.csv").read_bytes()
+    kept, whole = (json.loads((place / "sweep.json").read_text())["settings"] for place in (tmp_path, folder))
+    assert kept == whole
+
+
+def test_what_is_left_is_in_the_chunks_of_the_whole_grid():
+    """On an accelerator a chunk is stacked, and stacks of other sizes may round otherwise."""
+    config = compose("axes={slam.em.normal_weight:[0,1,2,3,4,5,6]}", name="sweep")
+    whole = experiments.sweep._chunks(variants(config, read_axes(config)), 3)
+    for count in range(len(whole) + 1):
+        done = [variant.setting for chunk in whole[:count] for variant in chunk]
+        assert experiments.sweep._left(whole, done) == whole[count:]
+    assert [len(chunk) for chunk in experiments.sweep._left(whole, [whole[0][1].setting])] == [2, 2, 2]
+
+
 def test_the_grid_is_every_combination_and_shared_nodes_change_wherever_they_are_used():
     config = compose("axes={slam.em.normal_weight:[0,5],render.opacity:[0.5,0.7]}", name="sweep")
     grid = variants(config, read_axes(config))

@@ -1,0 +1,128 @@
+"""One case: a run in a process, signals at random times, what is in its folder then, and what it comes to."""
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tests.tiny_run import TINY
+
+from .folders import digest, faults, lost, outputs
+
+ROOT = Path(__file__).resolve().parents[2]
+SETTINGS = ("dataset.stop=12", "prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=256")
+VARIANTS = ((), ("graph=default", "graph.every=1"))
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+SECONDS = 900.0  # that a run may take
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A run that nobody stopped: its folder, what is in it, and after how many seconds which file was there."""
+
+    folder: Path
+    digest: dict[str, str]
+    events: list[tuple[str, float]]  # ends with the end
+
+
+@dataclass(frozen=True)
+class Case:
+    """What was done to a run and what came of it.
+
+    Args:
+        number: with the seed it repeats the choices; the moments themselves depend on the machine.
+        stops: what the folder had when which signal came, and how the process ended.
+        faults: what is wrong; none where the case holds.
+    """
+
+    number: int
+    stops: tuple[str, ...]
+    faults: tuple[str, ...]
+
+
+def begin(folder: Path, more: Sequence[str], log: Path) -> subprocess.Popen:
+    """A run in a process of its own."""
+    command = [sys.executable, "-m", "experiments.run", *TINY, *SETTINGS, *more, f"hydra.run.dir={folder}"]
+    with open(log, "a") as said:  # a pipe that nobody reads is full at some time
+        return subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=subprocess.STDOUT)
+
+
+def event(folder: Path) -> str:
+    """How far a run is: its newest output, of the log the number of lines."""
+    files = [(path.stat().st_mtime_ns, path.name) for path in outputs(folder)] if folder.exists() else []
+    name = max(files, default=(0, "start"))[1]
+    is_log = name == "frames.jsonl"
+    return f"{name} {(folder / name).read_bytes().count(bytes([10]))}" if is_log else name
+
+
+def watch(program: subprocess.Popen, folder: Path, until: str | None = None) -> list[tuple[str, float]]:
+    """What is new in a folder and when, until the process ends or `until` is there."""
+    start, seen = time.monotonic(), [("start", 0.0)]
+    while program.poll() is None and seen[-1][0] != until:
+        if time.monotonic() - start > SECONDS:
+            program.kill()
+            raise TimeoutError(f"no end after {SECONDS} s; {folder} has {seen}")
+        try:
+            now = event(folder)
+        except FileNotFoundError:
+            continue  # moved meanwhile
+        if now != seen[-1][0]:
+            seen.append((now, time.monotonic() - start))
+        time.sleep(0.002)
+    return [*seen, ("end", time.monotonic() - start)]
+
+
+def run_whole(folder: Path, more: Sequence[str]) -> Whole:
+    """The run to compare with; its process has ended well, else RuntimeError."""
+    log = folder.with_suffix(".txt")
+    program = begin(folder, more, log)
+    events = watch(program, folder)
+    if program.wait() != 0:
+        raise RuntimeError(f"the run that nobody stops ended with {program.returncode}: {log.read_text()[-2000:]}")
+    return Whole(folder, digest(folder), events)
+
+
+def run_case(number: int, seed: int, whole: Whole, more: Sequence[str], folder: Path) -> Case:
+    """Stop a run once, twice or three times, look at its folder each time, and let it go on to its end."""
+    rng, log, stops, found = np.random.default_rng((seed, number)), folder.with_suffix(".txt"), [], []
+    earlier = {}
+    if rng.integers(3) == 0:  # the folder holds the outputs of an earlier run, of which nothing may be lost
+        shutil.copytree(whole.folder, folder)
+        earlier = {path.name: path.read_bytes() for path in outputs(folder)}
+    for _ in range(1 + (rng.integers(3) == 0) + (rng.integers(9) == 0)):
+        name, wait, sign = _moment(whole, rng)
+        program = begin(folder, more, log)
+        watch(program, folder, name)
+        time.sleep(wait)
+        before = event(folder)
+        program.send_signal(sign)
+        code = program.wait(SECONDS)
+        stops.append(f"{sign.name} {wait:.2f} s after {name}, at {before}: ended with {code}")
+        if code not in (0, -sign, 128 + sign):
+            found.append(f"{sign.name} ended with {code}")
+        found += faults(folder, sign == signal.SIGKILL) if folder.exists() else []
+        found += [f"{name} of the earlier run is lost" for name in lost(folder, earlier)]
+    program = begin(folder, more, log)
+    if program.wait(SECONDS) != 0:
+        return Case(number, tuple(stops), (*found, f"the same command ended with {program.returncode}"))
+    after = digest(folder)
+    names = sorted({*after, *whole.digest})
+    found += [f"{name} is different" for name in names if after.get(name) != whole.digest.get(name)]
+    found += [f"{name} of the earlier run is lost" for name in lost(folder, earlier)]
+    text = log.read_text()
+    if "Traceback" in text:
+        found.append(f"traceback: …{text[text.index('Traceback') :][:2000]}")
+    return Case(number, tuple(stops), tuple(found))
+
+
+def _moment(whole: Whole, rng: np.random.Generator) -> tuple[str, float, signal.Signals]:
+    """After which event, how many seconds later and with which signal a run is stopped."""
+    place = rng.integers(len(whole.events) - 1)
+    (name, start), (_, stop) = whole.events[place], whole.events[place + 1]
+    return name, float(rng.uniform(0, stop - start)), SIGNALS[rng.integers(len(SIGNALS))]
