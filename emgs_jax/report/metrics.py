@@ -202,11 +202,17 @@ def score_back_end(run: MappingRun) -> Metrics:
     """What became of loops, and the errors of the poses as they were when the frames were placed; empty without one."""
     if run.back_end is None:
         return {}
-    online = run.back_end.online
+    online = run.back_end.online[run.back_end.first :]
     before = [record.pose for record in run.records[: len(run.records) - len(online)]]
     poses = with_truth(run, np.stack([*before, *online])) if online else None
     causal = {} if poses is None else trajectory_metrics(*poses)
-    return counts(run.back_end) | {key.replace("trajectory/", "trajectory_online/"): x for key, x in causal.items()}
+    found = Counter(record.location for record in run.records if record.location is not None)
+    located = {f"location/{name}": count for name, count in sorted(found.items())}
+    return (
+        counts(run.back_end)
+        | located
+        | {key.replace("trajectory/", "trajectory_online/"): x for key, x in causal.items()}
+    )
 
 
 def spent(clock: Clock) -> Metrics:
