@@ -108,9 +108,10 @@ def locate(
     row, best = said[0]
     if best.num_inliers < config.min_inliers:
         return None, Gate.MATCHES
-    beside = [keyframes[other] for other in (row - 1, row + 1) if other in rows]
-    neighbours = neighbours_of(keyframes[row], beside, places.poses, places.log_scales)
-    loop, info = verify(query, keyframes[row], neighbours, verification)
+    candidate = keyframes[row]
+    by_time = sorted((keyframes[other] for other in rows), key=lambda other: abs(other.frame - candidate.frame))
+    neighbours = neighbours_of(candidate, by_time[1:3], places.poses, places.log_scales)
+    loop, info = verify(query, candidate, neighbours, verification)
     if loop is None:
         return None, info.refused_by
     found, depth = _located(loop, places), np.nanmedian(query.points[:, 2])
@@ -123,7 +124,8 @@ def locate(
 
     if not all(agrees(other) for _, other in said):
         return None, AMBIGUOUS
-    if any(agrees(info.contradicted) for *_, info in asked if info.contradicted is not None):
+    against = [info.contradicted for *_, info in asked if info.contradicted is not None]
+    if sum(agrees(other) for other in against) >= len(said):
         return None, Gate.CONTRADICTED
     return found, None
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import jaxlie
 import numpy as np
 from scipy.spatial.transform import Rotation
 
