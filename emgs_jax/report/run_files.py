@@ -55,7 +55,7 @@ def save_progress(folder: Path, run: MappingRun) -> None:
         )
         save_map_npz(folder / "map.npz", run.state.map)
     end = run.back_end
-    if end is not None and run.state is not None:
+    if end is not None and end.database.keyframes and run.state is not None:
         save_places(folder / "places.npz", end, float(run.state.belief.depth_noise))
     if end is not None and end.edges and len(end.online) > end.first:
         online = end.online[end.first :]
