@@ -156,11 +156,17 @@ def new_run(
     graph: BackEndConfig | None = None,
     saved: SavedMap | None = None,
 ) -> MappingRun:
-    """A run of `dataset` before its first frame; `graph` gives it a back end, `saved` that of an earlier run."""
+    """A run of `dataset` before its first frame; `graph` gives it a back end, `saved` that of an earlier run.
+
+    Raises:
+        ValueError: `saved`, and the map of the first window is to be made from all of its views at once.
+    """
     back_end = None if graph is None else BackEnd(graph, tuple(dataset.intrinsics), float(config.fit.min_std))
     clock, camera = Clock() if clock is None else clock, to_camera(dataset)
     if saved is None:
         return MappingRun(camera, config, clock, on_record, back_end=back_end)
+    if config.initialization == "merged":
+        raise ValueError("map= places one view after the other: use slam.initialization=incremental with it")
     config = replace(config, submap=replace(config.submap, map_capacity=saved.map.weight.shape[0]))
     return MappingRun(camera, config, clock, on_record, back_end=saved.back_end, saved=saved)
 

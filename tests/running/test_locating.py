@@ -29,7 +29,7 @@ from emgs_jax.running.locating import (
     refusal,
     with_map,
 )
-from emgs_jax.running.record import FrameRecord
+from emgs_jax.running.record import FrameRecord, new_run
 from emgs_jax.slam import SlamState
 
 PLACE = matrix((10, -70, 20), (3.0, -2.0, 1.0))
@@ -158,6 +158,13 @@ def test_the_map_has_the_last_word(changes, expected):
     found = SimpleNamespace(icp=SimpleNamespace(inlier_fraction=values.pop("inlier_fraction")), **values)
     config = load_config("graph=default").graph.location
     assert refusal(SimpleNamespace(localization=found), prediction(), FOUND_THERE, config) == expected
+
+
+def test_a_first_window_as_a_whole_has_no_place_in_a_saved_map():
+    frames = SimpleNamespace(intrinsics=(1.0, 1.0, 0.0, 0.0), size=(5, 4))
+    slam = load_config("slam.initialization=merged").slam
+    with pytest.raises(ValueError, match="use slam.initialization=incremental"):
+        new_run(frames, slam, saved=SimpleNamespace(map=some_map(), back_end=None))
 
 
 def test_a_map_that_stays_gets_the_room_of_the_others_and_keeps_its_rows():
