@@ -23,6 +23,7 @@ from emgs_jax.running.configure import baseline_configs, build, build_dataset, b
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
 from emgs_jax.running.drive import map_frames, show_records
 from emgs_jax.running.gathering import Baselines, RawPrior, gather
+from emgs_jax.running.places import load_saved
 from emgs_jax.running.record import FrameRecord, MappingRun, new_run, to_line
 
 from .command import command
@@ -40,7 +41,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             graph, fused = graph_config(config), baseline_configs(config)
             dataset = build_dataset(config)
             prior = build_prior(config, dataset)
-        session = new_run(dataset, slam, clock, graph=graph)
+            saved = load_saved(config.map, config.map_mode, graph, dataset.intrinsics, float(slam.fit.min_std))
+        session = new_run(dataset, slam, clock, graph=graph, saved=saved)
         baselines = Baselines(fused, session, dataset)
         settings = OmegaConf.to_container(config, resolve=True)
         origin = provenance(settings, dataset, prior.provenance)

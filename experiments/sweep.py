@@ -53,6 +53,8 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
     """Map and score every setting of `config.axes` that `folder` has not; returns a flat row for each."""
     if config.baseline:
         raise ValueError("baseline= is for run and evaluate: a sweep compares settings, and no baseline has them")
+    if config.map:
+        raise ValueError("map= is for run and evaluate: a sweep makes its own maps")
     if config.graph:
         raise ValueError("graph= is for run and evaluate: a sweep steps many maps at once, and no loop closes in them")
     axes = read_axes(config)

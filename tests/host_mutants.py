@@ -73,6 +73,10 @@ STACKED = ("tests/running/test_stacked.py",)
 APPEARANCE = ("tests/loops/test_appearance.py",)
 VERIFICATION = ("tests/loops/test_verification.py",)
 BACK_END = ("tests/running/test_back_end.py",)
+LOCATION = ("tests/loops/test_location.py",)
+PLACES = ("tests/running/test_places.py",)
+LOCATING = ("tests/running/test_locating.py",)
+COMING_BACK = ("tests/running/test_coming_back.py",)
 
 MUTANTS = (
     # sweeps that go on
@@ -155,6 +159,70 @@ MUTANTS = (
         "pass",
         BACK_END,
         "scales stay",
+    ),
+    # coming back
+    Mutant(
+        "emgs_jax/loops/location.py",
+        "if not all(agrees(other) for _, other in said):",
+        "if not any(agrees(other) for _, other in said):",
+        LOCATION,
+        "of two places that look alike the first is taken",
+    ),
+    Mutant(
+        "emgs_jax/loops/location.py",
+        "if places.is_placed[one.frame]]",
+        "]",
+        LOCATION,
+        "a frame that was lost says where the camera is",
+    ),
+    Mutant(
+        "emgs_jax/loops/location.py",
+        "rescaled(loop.Z_a_b, scale)",
+        "loop.Z_a_b",
+        LOCATION,
+        "a place in the units of an inference",
+    ),
+    Mutant(
+        "emgs_jax/running/locating.py",
+        "scale).inverse() @ anchor.inverse()",
+        "scale) @ anchor.inverse()",
+        LOCATING,
+        "the prior's world is moved the wrong way",
+    ),
+    Mutant(
+        "emgs_jax/running/locating.py",
+        "count + 1 >= run.back_end.config.location.patience",
+        "count >= run.back_end.config.location.patience",
+        LOCATING,
+        "the camera is looked for one frame late",
+    ),
+    Mutant(
+        "emgs_jax/running/places.py",
+        "births.max() >= len(end.poses)",
+        "births.max() > len(end.poses)",
+        PLACES,
+        "map and places of two runs",
+    ),
+    Mutant(
+        "emgs_jax/running/places.py",
+        "np.cumsum(counts)[:-1]",
+        "np.cumsum(counts)[1:]",
+        PLACES,
+        "keypoints of one keyframe are given to another",
+    ),
+    Mutant(
+        "emgs_jax/running/correction.py",
+        "            end.since = len(end.poses)\n",
+        "            pass\n",
+        COMING_BACK,
+        "frames that were lost hold those that were found",
+    ),
+    Mutant(
+        "emgs_jax/running/drive.py",
+        "state = with_map(state, run.saved.map, config.submap.map_capacity)",
+        "pass",
+        COMING_BACK,
+        "a map in which frames are only located changes",
     ),
     # loops
     Mutant(
@@ -630,7 +698,7 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/report/run_files.py",
-        "(first + loop.a, first + loop.b)",
+        "(shift + loop.a, shift + loop.b)",
         "(loop.a, loop.b)",
         RUN_FILES,
         "loops join frames of before there was a map",
@@ -1686,8 +1754,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/data/readable.py",
-        "return replace(self._dataset[self.kept[index]], index=index)",
-        "return self._dataset[self.kept[index]]",
+        "return replace(self._read(self.kept[index]), index=index)",
+        "return self._read(self.kept[index])",
         READABLE,
         "frames keep the numbers of the whole data set",
     ),

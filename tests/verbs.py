@@ -57,7 +57,7 @@ def image_of(seed: int):
 
 def belief_of(seed: int) -> belief.Belief:
     covariance = jnp.diag(jnp.array([4e-4] * 3 + [1e-4] * 4)) * (1.0 + seed)
-    return belief.Belief(covariance, ONE * 0.01, ONE * 0.02, ONE * 3.0)
+    return belief.Belief(covariance, covariance, ONE * 0.01, ONE * 0.02, ONE * 3.0)
 
 
 def coarse_of(seed: int) -> localization.CoarsePose:

@@ -230,9 +230,34 @@ def propose(database: Database, row: int, config: AppearanceConfig) -> list[Cand
     is_old = frames <= frames[row] - config.min_gap
     # An image without keypoints is like none, itself included.
     is_alike = (similarity >= np.quantile(neighbours, config.quantile)) & (similarity > 0)
+    return _apart(similarity, frames, is_old & is_alike, config.num_candidates, config.suppressed_gap)
+
+
+def nearest(
+    database: Database, query: Keyframe, rows: Sequence[int], count: int, config: AppearanceConfig
+) -> list[Candidate]:
+    """The rows that look most like a keyframe of no known time, the best only within `suppressed_gap` frames.
+
+    Nothing says how alike they must be: `propose` asks the query's neighbours, and this one has none.
+    """
+    similarity = database.vectors @ summarize(unit_descriptors(query), database.words)
+    frames = np.array([keyframe.frame for keyframe in database.keyframes])
+    is_allowed = np.zeros(len(frames), bool)
+    is_allowed[list(rows)] = True
+    return _apart(similarity, frames, is_allowed & (similarity > 0), count, config.suppressed_gap)
+
+
+def _apart(
+    similarity: Float32[np.ndarray, " n"],
+    frames: Int[np.ndarray, " n"],
+    is_allowed: Bool[np.ndarray, " n"],
+    count: int,
+    gap: int,
+) -> list[Candidate]:
+    """The most similar of the allowed rows, `count` at most, each more than `gap` frames from the better ones."""
     chosen: list[Candidate] = []
-    for other in np.argsort(-similarity, kind="stable"):
-        apart = [abs(frames[other] - frames[one.row]) > config.suppressed_gap for one in chosen]
-        if is_old[other] and is_alike[other] and all(apart) and len(chosen) < config.num_candidates:
-            chosen.append(Candidate(int(other), float(similarity[other])))
+    for row in np.argsort(-similarity, kind="stable"):
+        apart = [abs(frames[row] - frames[one.row]) > gap for one in chosen]
+        if is_allowed[row] and all(apart) and len(chosen) < count:
+            chosen.append(Candidate(int(row), float(similarity[row])))
     return chosen

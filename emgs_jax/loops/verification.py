@@ -115,6 +115,20 @@ def verify(
     return loop, VerifyInfo()
 
 
+def neighbours_of(
+    candidate: Keyframe,
+    others: Sequence[Keyframe],
+    poses: Sequence[Float[np.ndarray, "4 4"]],
+    log_scales: Sequence[float],
+) -> list[Neighbour]:
+    """Where other keyframes are from a candidate, by the poses and σ of all, under the keyframes' numbers."""
+    inverse, scale = np.linalg.inv(poses[candidate.frame]), log_scales[candidate.frame]
+    return [
+        Neighbour(one, rescaled(inverse @ poses[one.frame], np.exp(-scale)), log_scales[one.frame] - scale)
+        for one in others
+    ]
+
+
 def tally(infos: Iterable[VerifyInfo]) -> dict[str, int]:
     """How many candidates each gate refused, in the gates' order, and how many were `accepted`."""
     counts = Counter(info.refused_by for info in infos)

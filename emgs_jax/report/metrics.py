@@ -219,21 +219,24 @@ def score_back_end(run: MappingRun) -> Metrics:
     """What became of loops, and the errors of the poses as they were when the frames were placed; empty without one."""
     if run.back_end is None:
         return {}
-    end, online = run.back_end, run.back_end.online
+    end, online = run.back_end, run.back_end.online[run.back_end.first :]
     before = [record.pose for record in run.records[: len(run.records) - len(online)]]
     poses = with_truth(run, np.stack([*before, *online])) if online else None
     causal = {} if poses is None else trajectory_metrics(*poses)
     causal = {key.replace("trajectory/", "trajectory_online/"): x for key, x in causal.items()}
-    return counts(end) | loop_metrics(*_loops(run), end.config.appearance.min_gap) | causal
+    found = Counter(record.location for record in run.records if record.location is not None)
+    located = {f"location/{name}": count for name, count in sorted(found.items())}
+    return counts(end) | loop_metrics(*_loops(run), end.config.appearance.min_gap) | located | causal
 
 
 def _loops(run: MappingRun) -> tuple[list[tuple[int, int, np.ndarray]], list[np.ndarray | None]]:
-    """The accepted loops in metres of the truth, and the true poses of the frames that they are between."""
+    """The accepted loops in metres of the truth, and the true poses of the nodes that they are between."""
     end = run.back_end
     compared = with_truth(run, run.poses)
     unit = (None if compared is None else trajectory_metrics(*compared)["trajectory/scale"]) or 1.0
     loops = [(loop.a, loop.b, rescaled(loop.Z_a_b, unit * np.exp(end.log_scales[loop.a]))) for loop in end.accepted]
-    return loops, run.true_poses[len(run.records) - len(end.poses) :]
+    of_saved: list[np.ndarray | None] = [None] * end.first
+    return loops, of_saved + run.true_poses[len(run.records) - len(end.poses) + end.first :]
 
 
 def spent(clock: Clock) -> Metrics:

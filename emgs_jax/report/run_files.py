@@ -17,12 +17,13 @@ from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.running.back_end import metric_graph
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
+from emgs_jax.running.places import save_places
 from emgs_jax.running.record import MappingRun
 
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (
     *("metrics.json", "trajectory.txt", "trajectory_online.txt", "graph.g2o", "frames.jsonl"),
-    *("map.npz", "map.ply", "points.ply", "mesh.ply", "overview.png", CHECKPOINT_FILE),
+    *("map.npz", "places.npz", "map.ply", "points.ply", "mesh.ply", "overview.png", CHECKPOINT_FILE),
 )
 
 
@@ -45,19 +46,22 @@ def claim_folder(folder: Path, goes_on: bool = False) -> list[str]:
 def save_progress(folder: Path, run: MappingRun) -> None:
     """Write trajectory.txt and map.npz of the frames so far; nothing before there is a map.
 
-    With a back end also trajectory_online.txt, the poses as they were when the frames were placed (in
-    the unit of the finished map), and graph.g2o.
+    With a back end also places.npz, by which another run goes on in the map; trajectory_online.txt, the poses as they
+    were when the frames were placed (in the unit of the finished map), and graph.g2o.
     """
     if run.state is not None:
         save_trajectory_tum(
             folder / "trajectory.txt", [record.timestamp for record in run.records], np.stack(run.poses)
         )
         save_map_npz(folder / "map.npz", run.state.map)
-    if run.back_end is not None and run.back_end.edges:
-        online = run.back_end.online
+    end = run.back_end
+    if end is not None and end.database.keyframes and run.state is not None:
+        save_places(folder / "places.npz", end, float(run.state.belief.depth_noise))
+    if end is not None and end.edges and len(end.online) > end.first:
+        online = end.online[end.first :]
         placed = [record.timestamp for record in run.records[-len(online) :]]
         save_trajectory_tum(folder / "trajectory_online.txt", placed, np.stack(online))
-        save_graph_g2o(folder / "graph.g2o", metric_graph(run.back_end))
+        save_graph_g2o(folder / "graph.g2o", metric_graph(end))
 
 
 def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: DensifyConfig, title: str) -> list[str]:
@@ -86,8 +90,9 @@ def _moved(run: MappingRun) -> tuple[np.ndarray | None, np.ndarray | None, tuple
     unknown = np.full((4, 4), np.nan)
     is_known = any(pose is not None for pose in run.true_poses)
     truth = np.stack([unknown if pose is None else pose for pose in run.true_poses]) if is_known else None
-    if run.back_end is None or not run.back_end.accepted:
+    end = run.back_end
+    if end is None or not end.accepted:
         return truth, None, ()
-    first = len(run.records) - len(run.back_end.poses)
-    loops = tuple((first + loop.a, first + loop.b) for loop in run.back_end.accepted)
-    return truth, np.stack(run.back_end.online), loops
+    shift = len(run.records) - len(end.poses)  # from a node to the row of its record
+    loops = tuple((shift + loop.a, shift + loop.b) for loop in end.accepted if min(loop.a, loop.b) >= end.first)
+    return truth, np.stack(end.online[end.first :]), loops

@@ -20,9 +20,10 @@ from emgs_jax.graph.measurements import LOOP, Graph, Nodes
 from emgs_jax.graph.optimize import GraphConfig, GraphInfo, optimize
 from emgs_jax.graph.problem import bucket
 from emgs_jax.loops.agreement import AgreementConfig, agreeing
-from emgs_jax.loops.appearance import AppearanceConfig, Database, describe, extend, propose
+from emgs_jax.loops.appearance import AppearanceConfig, Database, Keyframe, describe, extend, propose
+from emgs_jax.loops.location import Location, LocationConfig, Places, locate
 from emgs_jax.loops.two_views import rescaled
-from emgs_jax.loops.verification import LoopMeasurement, Neighbour, VerificationConfig, VerifyInfo, verify
+from emgs_jax.loops.verification import LoopMeasurement, VerificationConfig, VerifyInfo, neighbours_of, verify
 from emgs_jax.ops.ranges import number
 from emgs_jax.running.convert import to_se3
 from emgs_jax.running.measuring import Edge, Look, NoiseConfig, loop_edge, map_edge, stacked, window_edges
@@ -45,6 +46,7 @@ class BackEndConfig:
         max_known: χ² of a loop at the poses as they are, up to which it says what is so already and is left out.
         min_frames: between two closures.
         solver: of the graph.
+        location: of a camera that is lost.
     """
 
     offsets: tuple[int, ...] = number(low=1, high=1000)
@@ -56,6 +58,7 @@ class BackEndConfig:
     max_known: float = number(low=0, high=math.inf)
     min_frames: int = number(low=0)
     solver: GraphConfig
+    location: LocationConfig
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,7 @@ class BackEnd:
         log_scales: σ of their inferences, likewise.
         online: poses as they were when the frames were placed, in the unit of `poses`.
         frames: index in the data set of every node.
+        is_placed: whether the map holds each of them: those that are neither degraded nor lost.
         edges: what was measured.
         database: keyframes; their `frame` is the node.
         verified: loops that passed every gate of two keyframes.
@@ -86,6 +90,8 @@ class BackEnd:
         accepted: loops that are edges.
         refusals: why candidates were no loops.
         closures: what was solved.
+        first: node of this run's first frame; those before are of the run that its map was saved by.
+        since: node since which one frame leads to the next; before it the camera was lost.
     """
 
     config: BackEndConfig
@@ -95,6 +101,7 @@ class BackEnd:
     log_scales: list[float] = field(default_factory=list)
     online: list[np.ndarray] = field(default_factory=list)
     frames: list[int] = field(default_factory=list)
+    is_placed: list[bool] = field(default_factory=list)
     edges: list[Edge] = field(default_factory=list)
     database: Database = field(default_factory=Database)
     verified: list[LoopMeasurement] = field(default_factory=list)
@@ -102,8 +109,10 @@ class BackEnd:
     accepted: list[LoopMeasurement] = field(default_factory=list)
     refusals: Counter = field(default_factory=Counter)
     closures: list[Closure] = field(default_factory=list)
+    first: int = 0
+    since: int = 0
 
-    def add(self, look: Look, pose: np.ndarray, scale: float, origin: int | None) -> None:
+    def add(self, look: Look, pose: np.ndarray, scale: float, origin: int | None, is_placed: bool = True) -> None:
         """One node more, with what its window and the map measure.
 
         Args:
@@ -111,14 +120,17 @@ class BackEnd:
             pose: T_world_camera.
             scale: of its inference.
             origin: node of whose Gaussians it was placed by; None where it was not placed in the map.
+            is_placed: the map holds it: it was placed in it, or the map was made from it.
         """
         time = len(self.poses)
         self.poses.append(np.asarray(pose, np.float64))
         self.online.append(self.poses[-1])
         self.log_scales.append(float(np.log(scale)))
         self.frames.append(look.frame)
-        noise = self.config.noise
-        self.edges += window_edges(look, time, self.log_scales, self.frames[0] == 0, self.config.offsets, noise)
+        self.is_placed.append(is_placed)
+        noise, offsets = self.config.noise, self.config.offsets
+        has_anchor = self.frames[self.first] == 0 and self.since == self.first
+        self.edges += window_edges(look, time, self.log_scales, self.since, has_anchor, offsets, noise)
         if origin is not None and origin < time:
             measured = np.linalg.inv(self.poses[time]) @ self.poses[origin]
             self.edges.append(map_edge(time, origin, rescaled(measured, np.exp(-self.log_scales[time])), noise))
@@ -128,12 +140,22 @@ class BackEnd:
         time, appearance = len(self.poses) - 1, self.config.appearance
         if time % self.config.every:
             return []
-        keyframe = describe(time, look.image, look.points, look.mask, self.intrinsics, appearance)
+        keyframe = self._described(time, look)
         self.database = extend(self.database, keyframe, appearance)
         row = len(self.database.keyframes) - 1
         for candidate in propose(self.database, row, appearance):
             self._verify(row, candidate.row)
         return self.new(self.agreed(since=time - self.config.agreement.max_query_gap))
+
+    def _described(self, time: int, look: Look) -> Keyframe:
+        return describe(time, look.image, look.points, look.mask, self.intrinsics, self.config.appearance)
+
+    def locate(self, look: Look) -> tuple[Location | None, str | None]:
+        """Where a frame that is no node yet was taken, by the keyframes that the map holds; else why that is open."""
+        query = self._described(len(self.poses), look)
+        places = Places(self.database, self.poses, self.log_scales, self.is_placed)
+        config = self.config
+        return locate(query, places, config.appearance, config.verification, config.location)
 
     def agreed(self, since: int = 0) -> list[LoopMeasurement]:
         """Loops of queries from `since` on that others agree with."""
@@ -159,15 +181,7 @@ class BackEnd:
         keyframes = self.database.keyframes
         candidate = keyframes[other]
         beside = [keyframes[k] for k in (other - 1, other + 1) if 0 <= k < row]
-        inverse, scale = np.linalg.inv(self.poses[candidate.frame]), self.log_scales[candidate.frame]
-        neighbours = [
-            Neighbour(
-                one,
-                rescaled(inverse @ self.poses[one.frame], np.exp(-scale)),
-                self.log_scales[one.frame] - scale,
-            )
-            for one in beside
-        ]
+        neighbours = neighbours_of(candidate, beside, self.poses, self.log_scales)
         loop, info = verify(keyframes[row], candidate, neighbours, self.config.verification)
         self._note(loop, info)
 

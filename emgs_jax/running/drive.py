@@ -16,20 +16,34 @@ from emgs_jax.running.clock import Clock, Timer
 from emgs_jax.running.compilation import use_compilation_cache
 from emgs_jax.running.configure import RunConfig, build_dataset, build_prior
 from emgs_jax.running.convert import FirstWindow
+from emgs_jax.running.correction import correct, finish
 from emgs_jax.running.growth import advance, prepare, start
 from emgs_jax.running.inputs import Input, RawView, inputs
+from emgs_jax.running.locating import (
+    anchored_by,
+    as_prediction,
+    begun,
+    found_at,
+    is_missing,
+    look_for,
+    moved,
+    refusal,
+    with_map,
+)
+from emgs_jax.running.places import load_saved
 from emgs_jax.running.record import (
+    FOUND,
     FrameRecord,
     MappingRun,
-    correct,
-    finish,
     new_run,
+    nowhere,
     record_lost,
     record_start,
     record_step,
 )
 from emgs_jax.running.unit import in_own_unit
 from emgs_jax.running.untracked import alarm
+from emgs_jax.slam import StepInfo
 
 
 def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
@@ -46,11 +60,14 @@ def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
     use_compilation_cache(settings.compilation_cache)
     dataset = build_dataset(settings)
     prior = build_prior(settings, dataset)
+    saved = load_saved(
+        settings.map, settings.map_mode, config.graph, dataset.intrinsics, float(config.slam.fit.min_std)
+    )
     with (
         Clock().watching() as clock,
         tqdm(total=len(dataset), unit="frame", desc="mapping", disable=not show_progress) as bar,
     ):
-        run = new_run(dataset, config.slam, clock, graph=config.graph)
+        run = new_run(dataset, config.slam, clock, graph=config.graph, saved=saved)
         run.on_record = lambda record: show_records(bar, run.records)
         deque(map_frames(run, dataset, prior), maxlen=0)
     return run
@@ -89,7 +106,9 @@ def map_frames(run: MappingRun, dataset: Dataset, prior: Prior, keeper: Keeper |
             keeper.keep(run, position + 1)
             yield from given.raw
         keeper.save()
-        if run.back_end is not None:
+        if run.saved is not None and run.state is None:
+            raise ValueError(nowhere(run))
+        if run.back_end is not None and not run.is_fixed:
             with run.clock.phase("back_end"):
                 finish(run)
     except BaseException:
@@ -107,28 +126,67 @@ def take(run: MappingRun, given: Input) -> None:
         case None:
             record_lost(run, given)
             return
-        case FirstWindow() as first:
+        case FirstWindow() as first if run.saved is None:
             prepare(first, run.camera, run.config)
             run.state, run.config = start(first, run.camera, run.config)
             record_start(run, given, spent(given, timer))
-        case Prediction() as prediction:
-            run.state, info, run.config = advance(run.state, prediction, run.camera, run.config)
-            record_step(run, given, jax.device_get(info), spent(given, timer))
-    if run.back_end is not None:
+        case taken:
+            if isinstance(taken, FirstWindow):
+                prepare(taken, run.camera, run.config)
+            info, location = integrate(run, given, as_prediction(taken))
+            if info is None:
+                record_lost(run, given, location)
+                return
+            record_step(run, given, jax.device_get(info), spent(given, timer), location)
+            anchor_anew(run, given)
+    if run.back_end is not None and not run.is_fixed:
         with run.clock.phase("back_end"):
             correct(run, given)
+
+
+def integrate(run: MappingRun, given: Input, prediction: Prediction) -> tuple[StepInfo | None, str | None]:
+    """One step; a camera that is missing is looked for, and then the step begins where it is found.
+
+    Returns:
+        What the step did, None where the camera has no place yet; and what became of the search, None without one.
+    """
+    state, config, info, location = run.state, run.config, None, None
+    if state is not None:
+        state, info, config = advance(state, moved(prediction, run.prior_motion), run.camera, config)
+    if is_missing(run, info):
+        place, location = look_for(run, given)
+        if place is not None:
+            begin, again = found_at(run, prediction, place)
+            found = advance(begin, again, run.camera, run.config)
+            location = refusal(found[1], again, place, run.back_end.config.location) or FOUND
+            if location == FOUND:
+                state, info, config = found
+    if run.is_fixed and state is not None:
+        state = with_map(state, run.saved.map, config.submap.map_capacity)
+    run.state, run.config = state, config
+    return info, location
+
+
+def anchor_anew(run: MappingRun, given: Input) -> None:
+    """From the last frame on the prior's world is where that was found, if it was."""
+    if run.records[-1].location == FOUND:
+        run.prior_motion = anchored_by(run.records[-1], as_prediction(given.taken))
 
 
 def repeat(run: MappingRun, given: Input, checkpoint: Checkpoint, is_last: bool) -> None:
     """Let a checkpoint stand for what `take` did of an input; after the last the run is where it was stopped."""
     if isinstance(given.taken, FirstWindow):
         prepare(given.taken, run.camera, run.config)
-        run.state, run.config = start(given.taken, run.camera, run.config)
+        if run.saved is None:
+            run.state, run.config = start(given.taken, run.camera, run.config)
     first = len(run.records)
     for record in checkpoint.records[first : first + len(given.frames)]:
         run.records.append(record)
         run.on_record(record)
-    if run.back_end is not None and run.state is not None:
+    anchor_anew(run, given)
+    if run.state is None and run.records[-1].location == FOUND:
+        run.state = begun(run, as_prediction(given.taken))
+    if run.back_end is not None and run.state is not None and not run.is_fixed:
         with run.clock.phase("back_end"):
             correct(run, given)  # moves the map of the first window, in which nobody looks
     if is_last:

@@ -71,7 +71,13 @@ def _weights(distance: float, turn_deg: float, log_scale: float = np.inf) -> np.
 
 
 def window_edges(
-    look: Look, time: int, log_scales: Sequence[float], has_anchor: bool, offsets: Sequence[int], noise: NoiseConfig
+    look: Look,
+    time: int,
+    log_scales: Sequence[float],
+    since: int,
+    has_anchor: bool,
+    offsets: Sequence[int],
+    noise: NoiseConfig,
 ) -> list[Edge]:
     """What an inference says of its current frame and earlier ones of its window, and of the anchor.
 
@@ -79,7 +85,8 @@ def window_edges(
         look: of the frame.
         time: its node; that of a frame k before it is k less.
         log_scales: of all nodes, this one's included.
-        has_anchor: the first node is the anchor.
+        since: the first node that it may be measured to: before it the camera was lost.
+        has_anchor: that node is the anchor.
         offsets: of the earlier frames.
         noise: of the measurements.
     """
@@ -90,7 +97,7 @@ def window_edges(
     edges = []
     for offset in offsets:
         there, row = poses.get(look.frame - offset), time - offset
-        if there is None or row < 0 or not np.isfinite(there).all():
+        if there is None or row < since or not np.isfinite(there).all():
             continue
         spread, is_next = np.sqrt(offset), offset == 1
         weights = _weights(spread * noise.pair, spread * noise.pair_deg, noise.log_scale if is_next else np.inf)
@@ -100,7 +107,7 @@ def window_edges(
     if has_anchor and anchor is not None and look.frame > max(offsets):
         measured = np.linalg.inv(here) @ anchor
         reach = 1.0 + np.linalg.norm(measured[:3, 3])
-        edges.append(Edge(time, 0, measured, 0.0, _weights(reach * noise.anchor, reach * noise.anchor_deg), WINDOW))
+        edges.append(Edge(time, since, measured, 0.0, _weights(reach * noise.anchor, reach * noise.anchor_deg), WINDOW))
     return edges
 
 

@@ -3,10 +3,12 @@
 A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; files write it as TUM's seven numbers.
 """
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import jaxlie
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -19,10 +21,13 @@ from emgs_jax.running.back_end import BackEnd, BackEndConfig
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.convert import to_camera
 from emgs_jax.running.inputs import Input
-from emgs_jax.running.measuring import Look
+from emgs_jax.running.places import SavedMap
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
 
 Seconds = Mapping[str, float]  # as a `Timer` reads
+PLACED = ("tracked", "initialization")  # statuses of frames that the map holds
+FOUND = "found"
+NOT_FOUND = "its place in the saved map is not found"
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,7 @@ class FrameRecord:
         status: tracked, degraded (the coarse pose stays, nothing is fused), lost (not even that is known),
             initialization (the map was made from it) or skipped (it cannot be read).
         reason: why it is not tracked.
+        location: `found` where the camera was looked for and the run goes on from there, or what refused every place.
         pose: T_world_camera; of a lost frame what stands in for it.
         raw_pose: the same as the prior alone says; the one before where it says none.
         true_pose: None where unknown.
@@ -67,6 +73,7 @@ class FrameRecord:
     timestamp: float | None
     status: str
     reason: str | None = None
+    location: str | None = None
     pose: np.ndarray | None = None
     raw_pose: np.ndarray | None = None
     true_pose: np.ndarray | None = None
@@ -104,6 +111,8 @@ class MappingRun:
         state: None before the first window.
         records: of the frames in use, in order.
         back_end: what moves poses and map after the fact; None: what is placed stays.
+        saved: what the run begins in; None: it makes its own map.
+        prior_motion: what moves the prior's world since the camera was found; None: nothing.
     """
 
     camera: Camera
@@ -113,6 +122,13 @@ class MappingRun:
     state: SlamState | None = None
     records: list[FrameRecord] = field(default_factory=list)
     back_end: BackEnd | None = None
+    saved: SavedMap | None = None
+    prior_motion: jaxlie.SE3 | None = None
+
+    @property
+    def is_fixed(self) -> bool:
+        """Frames are only located: the map and all that was measured for it stay."""
+        return self.saved is not None and self.saved.is_fixed
 
     @property
     def map(self) -> GaussianMap | None:
@@ -141,16 +157,29 @@ def new_run(
     clock: Clock | None = None,
     on_record: Callable[[FrameRecord], None] = lambda record: None,
     graph: BackEndConfig | None = None,
+    saved: SavedMap | None = None,
 ) -> MappingRun:
-    """A run of `dataset` before its first frame; with `graph` it has a back end."""
+    """A run of `dataset` before its first frame; `graph` gives it a back end, `saved` that of an earlier run.
+
+    Raises:
+        ValueError: `saved`, and the map of the first window is to be made from all of its views at once.
+    """
     back_end = None if graph is None else BackEnd(graph, tuple(dataset.intrinsics), float(config.fit.min_std))
-    clock = Clock() if clock is None else clock
-    return MappingRun(to_camera(dataset), config, clock, on_record, back_end=back_end)
+    clock, camera = Clock() if clock is None else clock, to_camera(dataset)
+    if saved is None:
+        return MappingRun(camera, config, clock, on_record, back_end=back_end)
+    if config.initialization == "merged":
+        raise ValueError("map= places one view after the other: use slam.initialization=incremental with it")
+    config = replace(config, submap=replace(config.submap, map_capacity=saved.map.weight.shape[0]))
+    return MappingRun(camera, config, clock, on_record, back_end=saved.back_end, saved=saved)
 
 
-def record_lost(run: MappingRun, given: Input) -> None:
-    """Add a frame with nothing to start a map from; the anchor's pose stands in for the one that is not known."""
-    _add(run, given, 0, status="lost", reason=REASONS[0], pose=given.T_world_anchor)
+def record_lost(run: MappingRun, given: Input, location: str | None = None) -> None:
+    """Add a frame before there is a place to start from; the anchor's or last pose stands in for the unknown one."""
+    reason, pose = REASONS[0] if location is None else NOT_FOUND, given.T_world_anchor
+    if run.saved is not None:
+        pose = run.records[-1].pose if run.records else run.saved.back_end.poses[-1]
+    _add(run, given, 0, status="lost", reason=reason, location=location, pose=pose)
 
 
 def record_start(run: MappingRun, given: Input, spent: Seconds) -> None:
@@ -167,9 +196,10 @@ def record_start(run: MappingRun, given: Input, spent: Seconds) -> None:
         _add(run, given, row, status="initialization", pose=to_matrix(pose), num_gaussians=count, **share)
 
 
-def record_step(run: MappingRun, given: Input, info: StepInfo, spent: Seconds) -> None:
+def record_step(run: MappingRun, given: Input, info: StepInfo, spent: Seconds, location: str | None = None) -> None:
     """Add what a step did, `info` on the host, and the seconds that it took."""
-    _add(run, given, 0, **_described(info), **spent)
+    kept = {"fused": 0, "updated": 0, "new": 0, "num_gaussians": run.saved.count} if run.is_fixed else {}
+    _add(run, given, 0, **_described(info) | kept, location=location, **spent)
 
 
 def _add(run: MappingRun, given: Input, row: int, **described: Any) -> None:
@@ -215,47 +245,14 @@ def _described(info: StepInfo) -> dict[str, Any]:
     }
 
 
-def correct(run: MappingRun, given: Input) -> None:
-    """Tell the back end of the frames that `given` added, and let poses and map follow what it finds.
-
-    Args:
-        run: with a back end, and a state.
-        given: what was taken.
-    """
-    end, added = run.back_end, run.records[-len(given.frames) :]
-    looks = [
-        Look(frame.index, frame.image, raw.points, raw.mask, given.T_anchor_views)
-        for frame, raw in zip(given.frames, given.raw, strict=True)
-    ]
-    for look, record in zip(looks, added, strict=True):
-        end.add(look, record.pose, record.scale or 1.0, record.origin)
-    num_contradicted = len(end.contradicted)
-    found = end.look_for_loops(looks[-1])
-    has_retracted = len(end.contradicted) > num_contradicted and end.retract(end.agreed()) > 0
-    if has_retracted or end.wants_to_close(found):
-        run.state = end.close(run.state, found)
-        _take_poses(run)
-
-
-def finish(run: MappingRun) -> None:
-    """The best poses for all that was measured by the back end of a run, and the map that conforms to them.
-
-    Nothing where no loop says what is not so: among themselves frames and map fit better as they were placed.
-    """
-    end = run.back_end
-    agreed = end.agreed()
-    has_retracted = end.retract(agreed) > 0
-    loops = [loop for loop in end.new(agreed) if end.misfit(loop) > end.config.max_known]
-    if has_retracted or end.accepted or loops:
-        run.state = end.close(run.state, loops)
-        _take_poses(run)
-
-
-def _take_poses(run: MappingRun) -> None:
-    """The back end's poses into the records of its frames, which are the last ones."""
-    poses = run.back_end.poses
-    first = len(run.records) - len(poses)
-    run.records[first:] = [replace(record, pose=pose) for record, pose in zip(run.records[first:], poses, strict=True)]
+def nowhere(run: MappingRun) -> str:
+    """That no frame was found in the saved map, and why."""
+    counts = Counter(record.location for record in run.records if record.location is not None)
+    reasons = ", ".join(f"{name} {count}" for name, count in counts.most_common())
+    return (
+        f"none of the {len(run.records)} frames is found in the saved map ({reasons or 'none has points and a pose'}): "
+        "take images of the same place, or map it anew without map="
+    )
 
 
 def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

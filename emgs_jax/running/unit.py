@@ -27,8 +27,8 @@ def own_unit(state: SlamState, origin: np.ndarray) -> SlamState:
 
 
 def in_own_unit(run: MappingRun) -> None:
-    """`own_unit` of a run that ends, and its poses with it, those of the back end included."""
-    if run.state is None or not run.state.belief.log_scale:
+    """`own_unit` of a run that ends, its poses and those of the back end included; a saved map keeps its own."""
+    if run.state is None or run.saved is not None or not run.state.belief.log_scale:
         return
     factor = np.exp(-float(run.state.belief.log_scale))
     origin = next(record.pose for record in run.records if record.pose is not None)[:3, 3]  # the anchor's

@@ -32,11 +32,15 @@ from emgs_jax.io.g2o import load_graph_g2o
 from emgs_jax.io.map_file import load_map, save_map
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
+from emgs_jax.loops.appearance import Keyframe, extend
 from emgs_jax.prior.base import windows
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.simulated.prior import Simulated
+from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from emgs_jax.running.configure import compose, keys_of
+from emgs_jax.running.measuring import Look
+from emgs_jax.running.places import load_places, save_places
 from emgs_jax.running.record import FrameRecord
 from emgs_jax.running.values import check_values
 from tests.data.written_scene import color_image, plane_depth, scene_pose, write_depth
@@ -234,6 +238,25 @@ def read_map(folder: Path) -> None:
     assert np.isfinite(np.asarray(map.gaussians.means)[np.asarray(map.gaussians.valid)]).all()
 
 
+def write_places(folder: Path) -> None:
+    end, rng = BackEnd(load_config("graph=default").graph, (50.0, 50.0, 31.5, 23.5), 0.01), np.random.default_rng(0)
+    image, mask = np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), bool)
+    for frame in range(3):
+        end.add(Look(frame, image, np.zeros((48, 64, 3)), mask, {}), np.eye(4), 1.0, None)
+        pixels, descriptors = rng.uniform(0, 40, (9, 2)), rng.integers(0, 99, (9, 128))
+        shown = np.float32(pixels), np.uint8(descriptors), np.full((9, 3), np.nan, np.float32)
+        one = Keyframe(frame, *shown, end.intrinsics, (64, 48), np.zeros((6, 8), np.float16))
+        end.database = extend(end.database, one, end.config.appearance)
+    save_places(folder / "places.npz", end, 0.01)
+
+
+def read_places(folder: Path) -> None:
+    end = BackEnd(load_config("graph=default").graph, (50.0, 50.0, 31.5, 23.5), 0.01)
+    load_places(folder / "places.npz", end)
+    assert np.isfinite(end.poses).all() and len(end.poses) == len(end.is_placed) == end.first
+    assert all(0 <= one.frame < len(end.poses) for one in end.database.keyframes)
+
+
 def write_cloud(folder: Path) -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(50, 3))
@@ -346,6 +369,7 @@ def targets() -> Iterator[Target]:
     yield Target("recording", write_recording, read_recording, {".npz": BYTES, ".json": TEXT})
     yield Target("forged recording", write_recording, read_forged_recording, {".npz": BYTES, ".json": TEXT})
     yield Target("map", write_map, read_map, {".npz": BYTES})
+    yield Target("places", write_places, read_places, {".npz": BYTES})
     yield Target("points", write_cloud, read_points, {".ply": (*BYTES, *TEXT)})
     yield Target("graph", write_graph, read_graph, {".g2o": TEXT})
     yield Target("text embeddings", write_embeddings, read_embeddings, {".npz": BYTES})

@@ -125,8 +125,9 @@ def test_the_overview_shows_loops_between_the_frames_of_the_back_end_and_the_pat
     drawn = []
     monkeypatch.setattr(overview, "draw_overview", lambda path, cloud, paths, *rest: drawn.append(paths))
     run, later = finished(), poses_along(np.full(NUM_FRAMES - 2, 5.0))
-    loops = [SimpleNamespace(a=0, b=2)]
-    run.back_end = SimpleNamespace(accepted=loops, poses=[*later], online=[*(later + 1.0)])  # after two lost frames
+    loops = [SimpleNamespace(a=3, b=5), SimpleNamespace(a=1, b=5)]  # the first three nodes are a saved map's
+    poses = [np.eye(4)] * 3 + [*later]
+    run.back_end = SimpleNamespace(accepted=loops, poses=poses, online=[pose + 1.0 for pose in poses], first=3)
     save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
     run.back_end.accepted = []
     save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")

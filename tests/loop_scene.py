@@ -19,7 +19,7 @@ def loops_config(*overrides: str) -> dict:
     """What conf/graph/default.yaml says of loops, changed by words like `appearance.min_gap=5`."""
     config = OmegaConf.merge(
         OmegaConf.masked_copy(
-            OmegaConf.load(CONF / "graph" / "default.yaml"), ["appearance", "verification", "agreement"]
+            OmegaConf.load(CONF / "graph" / "default.yaml"), ["appearance", "verification", "agreement", "location"]
         ),
         OmegaConf.from_dotlist(list(overrides)),
     )

@@ -1,0 +1,139 @@
+"""Where is the camera, among keyframes that know their place? For one that is lost, or new in a saved map.
+
+Nothing is known of the pose, so a keyframe that looks alike is no better than any other that does: all candidates are
+asked by themselves, and the camera is where the best of them says only if none says something else.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from emgs_jax.loops.alignment import Gate
+from emgs_jax.loops.appearance import AppearanceConfig, Database, Keyframe, nearest
+from emgs_jax.loops.two_views import gap_between, rescaled
+from emgs_jax.loops.verification import LoopMeasurement, VerificationConfig, neighbours_of, verify
+from emgs_jax.ops.ranges import number
+
+NO_CANDIDATE, AMBIGUOUS = "no_candidate", "ambiguous"  # what refuses beside the gates of two keyframes
+
+
+@dataclass(frozen=True)
+class LocationConfig:
+    """When the camera is looked for, and when what is found counts.
+
+    Args:
+        patience: frames in a row that are not tracked, from which on it is looked for.
+        num_candidates: keyframes that are asked, each of another time span.
+        max_distance: between where two of them put the camera, times the distance of the points that it sees.
+        max_turn_deg: likewise.
+        min_inliers: points that agree with the best.
+        min_inlier_fraction: of the points, that agree with the map at last.
+        max_step: between the pose by the keyframe and that by the map, times the mean depth.
+        max_step_deg: likewise.
+    """
+
+    patience: int = number(low=1)
+    num_candidates: int = number(low=1, high=1000)
+    max_distance: float = number(low=0, high=math.inf)
+    max_turn_deg: float = number(low=0, high=math.inf)
+    min_inliers: int = number(low=0)
+    min_inlier_fraction: float = number(low=0, high=1)
+    max_step: float = number(low=0, high=math.inf)
+    max_step_deg: float = number(low=0, high=180)
+
+
+@dataclass(frozen=True)
+class Places:
+    """Keyframes and where they are; poses and the rest by the keyframes' numbers.
+
+    Args:
+        database: of keyframes.
+        poses: T_world_camera (4, 4).
+        log_scales: σ: a length of the inference times e^σ is one of the map.
+        is_placed: whether the map knows it to be there.
+    """
+
+    database: Database
+    poses: Sequence[np.ndarray]
+    log_scales: Sequence[float]
+    is_placed: Sequence[bool]
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where a camera is found.
+
+    Args:
+        T_world_camera: camera -> world.
+        log_scale: σ of its inference.
+        covariance: of (translation, rotation, σ) where the truth is T Exp(·), lengths of the map.
+        by: number of the keyframe that says so.
+    """
+
+    T_world_camera: Float[np.ndarray, "4 4"]
+    log_scale: float
+    covariance: Float[np.ndarray, "7 7"]
+    by: int
+
+
+def locate(
+    query: Keyframe,
+    places: Places,
+    appearance: AppearanceConfig,
+    verification: VerificationConfig,
+    config: LocationConfig,
+) -> tuple[Location | None, str | None]:
+    """The place of a keyframe that is none of the others; None with what refuses it where it is not sure.
+
+    Args:
+        query: described like the others.
+        places: where it is looked for.
+        appearance: of the keyframes.
+        verification: of query and candidate.
+        config: what a place needs.
+    """
+    keyframes = places.database.keyframes
+    rows = [row for row, one in enumerate(keyframes) if places.is_placed[one.frame]]
+    candidates = nearest(places.database, query, rows, config.num_candidates, appearance)
+    if not candidates:
+        return None, NO_CANDIDATE
+    alone = replace(verification, min_neighbours=0)
+    asked = [(one.row, *verify(query, keyframes[one.row], (), alone)) for one in candidates]
+    said = sorted(((row, loop) for row, loop, _ in asked if loop), key=lambda found: -found[1].num_inliers)
+    if not said:
+        return None, max((info.refused_by for *_, info in asked), key=list(Gate).index)
+    row, best = said[0]
+    if best.num_inliers < config.min_inliers:
+        return None, Gate.MATCHES
+    candidate = keyframes[row]
+    by_time = sorted((keyframes[other] for other in rows), key=lambda other: abs(other.frame - candidate.frame))
+    neighbours = neighbours_of(candidate, by_time[1:3], places.poses, places.log_scales)
+    loop, info = verify(query, candidate, neighbours, verification)
+    if loop is None:
+        return None, info.refused_by
+    found, depth = _located(loop, places), np.nanmedian(query.points[:, 2])
+
+    def agrees(other: LoopMeasurement) -> bool:
+        there = _located(other, places)
+        distance, turn = gap_between(there.T_world_camera, found.T_world_camera)
+        allowed = config.max_distance * depth * np.exp(found.log_scale)
+        return bool(distance <= allowed and turn <= config.max_turn_deg)
+
+    if not all(agrees(other) for _, other in said):
+        return None, AMBIGUOUS
+    against = [info.contradicted for *_, info in asked if info.contradicted is not None]
+    if sum(agrees(other) for other in against) >= len(said):
+        return None, Gate.CONTRADICTED
+    return found, None
+
+
+def _located(loop: LoopMeasurement, places: Places) -> Location:
+    """Where the query of a loop is, by its candidate's place."""
+    scale = np.exp(places.log_scales[loop.a])
+    units = np.array([scale] * 3 + [1.0] * 4)
+    covariance = np.linalg.inv(loop.sqrt_info.T @ loop.sqrt_info) * units[:, None] * units
+    pose = places.poses[loop.a] @ rescaled(loop.Z_a_b, scale)
+    return Location(pose, places.log_scales[loop.a] + loop.log_ratio, covariance, loop.a)

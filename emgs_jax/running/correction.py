@@ -1,0 +1,56 @@
+"""A run that follows its back end: what its frames measure goes there, and better poses come back."""
+
+from dataclasses import replace
+
+from emgs_jax.running.inputs import Input
+from emgs_jax.running.measuring import Look
+from emgs_jax.running.record import FOUND, PLACED, MappingRun
+
+
+def correct(run: MappingRun, given: Input) -> None:
+    """Tell the back end of the frames that `given` added, and let poses and map follow what it finds.
+
+    Args:
+        run: with a back end, and a state.
+        given: what was taken.
+    """
+    end, added, looks = run.back_end, run.records[-len(given.frames) :], looks_of(given)
+    for look, record in zip(looks, added, strict=True):
+        if record.location == FOUND:
+            end.since = len(end.poses)
+        end.add(look, record.pose, record.scale or 1.0, record.origin, record.status in PLACED)
+    num_contradicted = len(end.contradicted)
+    found = end.look_for_loops(looks[-1])
+    has_retracted = len(end.contradicted) > num_contradicted and end.retract(end.agreed()) > 0
+    if has_retracted or end.wants_to_close(found):
+        run.state = end.close(run.state, found)
+        _take_poses(run)
+
+
+def looks_of(given: Input) -> list[Look]:
+    """What the back end takes of each frame."""
+    return [
+        Look(frame.index, frame.image, raw.points, raw.mask, given.T_anchor_views)
+        for frame, raw in zip(given.frames, given.raw, strict=True)
+    ]
+
+
+def finish(run: MappingRun) -> None:
+    """The best poses for all that was measured by the back end of a run, and the map that conforms to them.
+
+    Nothing where no loop says what is not so: among themselves frames and map fit better as they were placed.
+    """
+    end = run.back_end
+    agreed = end.agreed()
+    has_retracted = end.retract(agreed) > 0
+    loops = [loop for loop in end.new(agreed) if end.misfit(loop) > end.config.max_known]
+    if has_retracted or end.accepted or loops:
+        run.state = end.close(run.state, loops)
+        _take_poses(run)
+
+
+def _take_poses(run: MappingRun) -> None:
+    """The back end's poses into the records of its frames, which are the last ones."""
+    poses = run.back_end.poses[run.back_end.first :]
+    first = len(run.records) - len(poses)
+    run.records[first:] = [replace(record, pose=pose) for record, pose in zip(run.records[first:], poses, strict=True)]

@@ -1,0 +1,125 @@
+"""A camera that is lost, or new in a saved map: it is looked for among the keyframes, and goes on where it is found."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from emgs_jax.gaussian_map import GaussianMap, grow
+from emgs_jax.loops.location import Location, LocationConfig
+from emgs_jax.observation import Prediction, transform
+from emgs_jax.registration.belief import certain
+from emgs_jax.registration.rigid import pose_row, scale_translation
+from emgs_jax.running.convert import FirstWindow, to_se3
+from emgs_jax.running.correction import looks_of
+from emgs_jax.running.inputs import Input
+from emgs_jax.running.record import PLACED, FrameRecord, MappingRun
+from emgs_jax.slam import SlamState, StepInfo
+
+FINE_POSE = "fine_pose"  # what refuses a place by which the frame does not fit the map
+
+
+def is_missing(run: MappingRun, info: StepInfo | None) -> bool:
+    """Whether the camera is to be looked for: no place is known, or no frame has been tracked for a while."""
+    if run.back_end is None or (run.state is None and run.saved is None):
+        return False
+    if info is None:
+        return True
+    placed = [row for row, record in enumerate(run.records) if record.status in PLACED]
+    count = len(run.records) - (placed[-1] + 1 if placed else 0)
+    is_tracked = bool(info.localization.is_tracked)
+    return not is_tracked and count + 1 >= run.back_end.config.location.patience
+
+
+def look_for(run: MappingRun, given: Input) -> tuple[Location | None, str | None]:
+    """Where the first frame of `given` was taken, or what refuses every place; see `loops.location`."""
+    return run.back_end.locate(looks_of(given)[0])
+
+
+def as_prediction(taken: FirstWindow | Prediction) -> Prediction:
+    """The first view of a sequence as a step's current frame; what is one stays."""
+    if isinstance(taken, Prediction):
+        return taken
+    view, T = jax.tree.map(lambda leaf: leaf[0], taken.views), pose_row(taken.T_world_views, 0)
+    return Prediction(
+        current=view,
+        previous=view,
+        T_world_views=_repeated(T, 3),
+        T_world_anchor=T,
+        has_newest=jnp.asarray(False),
+    )
+
+
+def begun(run: MappingRun, prediction: Prediction) -> SlamState:
+    """A state in the saved map, of the form of any other: for one that is read from a checkpoint."""
+    time = jnp.asarray(len(run.back_end.poses), jnp.int32)
+    return SlamState(run.saved.map, prediction.current, prediction.T_world_anchor, certain(), time)
+
+
+def found_at(run: MappingRun, prediction: Prediction, location: Location) -> tuple[SlamState, Prediction]:
+    """State and prediction whose step begins where the camera is found: this frame is its own previous one.
+
+    Raises:
+        ValueError: the features of a saved map are not as wide as those of this run.
+    """
+    T, scale = to_se3(location.T_world_camera), jnp.exp(jnp.asarray(location.log_scale, jnp.float32))
+    placed = moved(prediction, anchor_motion(prediction, T, scale))
+    views = placed.T_world_views.wxyz_xyz[jnp.array([1, 1, 2])]
+    again = replace(placed, previous=placed.current, T_world_views=jaxlie.SE3(views))
+    covariance = jnp.asarray(location.covariance, jnp.float32)
+    if run.state is None:
+        map, time, saved = run.saved.map, len(run.saved.back_end.poses), run.saved
+        widths = map.gaussians.features.shape[-1], prediction.current.features.shape[-1]
+        if widths[0] != widths[1]:
+            raise ValueError(
+                f"the features of the saved map have width {widths[0]} and those of this run {widths[1]}: use prior= "
+                "and features= that it was mapped with"
+            )
+        # The prior's unit in this map is what this frame says.
+        depth_noise, log_scale = (jnp.asarray(x, jnp.float32) for x in (saved.depth_noise, location.log_scale))
+        belief, time = replace(certain(), depth_noise=depth_noise, log_scale=log_scale), jnp.asarray(time, jnp.int32)
+    else:
+        map, belief, time = run.state.map, run.state.belief, run.state.time
+    belief = replace(belief, covariance=covariance, world_covariance=covariance)
+    return SlamState(map, transform(T, prediction.current, scale), T, belief, time), again
+
+
+def anchor_motion(prediction: Prediction, T_world_camera: jaxlie.SE3, scale: jnp.ndarray) -> jaxlie.SE3:
+    """What moves the prior's world so that its own pose of the current frame, scaled about the anchor, is this one."""
+    anchor, current = prediction.T_world_anchor, pose_row(prediction.T_world_views, 1)
+    return T_world_camera @ scale_translation(anchor.inverse() @ current, scale).inverse() @ anchor.inverse()
+
+
+def anchored_by(record: FrameRecord, prediction: Prediction) -> jaxlie.SE3:
+    """`anchor_motion` by a frame that was found."""
+    return anchor_motion(prediction, to_se3(record.pose), jnp.asarray(record.scale, jnp.float32))
+
+
+def moved(prediction: Prediction, motion: jaxlie.SE3 | None) -> Prediction:
+    """The prediction in a world that has moved; the same where there is no motion."""
+    if motion is None:
+        return prediction
+    views = [motion @ pose_row(prediction.T_world_views, row) for row in range(3)]
+    views = jaxlie.SE3(jnp.stack([view.wxyz_xyz for view in views]))
+    return replace(prediction, T_world_views=views, T_world_anchor=motion @ prediction.T_world_anchor)
+
+
+def refusal(info: StepInfo, prediction: Prediction, location: Location, config: LocationConfig) -> str | None:
+    """What the map says against a place: too few points agree with it, or they move the pose too far; None: nothing."""
+    found, current = info.localization, prediction.current
+    depth = np.median(np.asarray(current.points[:, 2])[np.asarray(current.valid)]) * np.exp(location.log_scale)
+    agrees = bool(found.is_tracked) and float(found.icp.inlier_fraction) >= config.min_inlier_fraction
+    stays = found.step_m <= config.max_step * depth and np.degrees(found.step_rad) <= config.max_step_deg
+    return None if agrees and stays else FINE_POSE
+
+
+def with_map(state: SlamState, map: GaussianMap, capacity: int) -> SlamState:
+    """The state with the map as it was, with as much room as there is now."""
+    room = grow(map, capacity) if capacity > map.weight.shape[0] else map
+    return replace(state, map=room)
+
+
+def _repeated(T: jaxlie.SE3, count: int) -> jaxlie.SE3:
+    return jaxlie.SE3(jnp.stack([T.wxyz_xyz] * count))
