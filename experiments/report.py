@@ -25,7 +25,7 @@ def report(folder: Path) -> Path:
 
 
 def images_of(settings: Mapping[str, Any], count: int) -> tuple[ReadableFrames | None, str]:
-    """The data set of a run, or why it cannot be had; raises ValueError where the settings name other code than ours."""
+    """The data set of a run, or why there is none; raises ValueError where settings name other code than ours."""
     check_targets(settings["dataset"])
     try:
         dataset = build_dataset(OmegaConf.create(dict(settings)))

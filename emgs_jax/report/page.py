@@ -1,6 +1,6 @@
 """report.html: a run as one file that opens by double click, asks for nothing, and is read without a program, too.
 
-The page's own source is in the folder `page/`; here it is put together with what the run says.
+The page's own source is in the folder `web/`; here it is put together with what the run says.
 """
 
 import base64
@@ -22,13 +22,12 @@ from emgs_jax.report.overview import class_colors, view_from_above
 from emgs_jax.report.page_map import COV_UNIT, map_layers, packed, thinned
 from emgs_jax.report.page_pictures import Views, draw_views, jpeg
 from emgs_jax.report.page_strip import PlacedPaths, key_of, placed_paths, strip
-from emgs_jax.report.recorded_run import RecordedRun
+from emgs_jax.report.recorded_run import REPORT_FILE, RecordedRun
 
-REPORT_FILE = "report.html"
 MAX_BYTES = 5_000_000
 _MAP_BYTES = 2_800_000  # of base64; the rest is for pictures and words
 _MAX_PICTURES = 120  # frames, evenly spread
-_SOURCE = Path(__file__).parent / "page"
+_SOURCE = Path(__file__).parent / "web"
 _SCRIPTS = ("data.js", "vectors.js", "splats.js", "layers.js", "controls.js", "overlay.js", "frames.js", "main.js")
 LAYERS = {
     "color": "colour",
@@ -65,7 +64,7 @@ def write_report(run: RecordedRun, dataset: Dataset | None, note: str = "") -> P
     """
     evaluation = run.provenance["config"].get("evaluation", {})
     paths = placed_paths(run, evaluation.get("alignment") == "sim3")
-    layers, config = map_layers(run.map, run.text), _render_config(run)
+    layers, config = map_layers(run.map, run.text), render_config(run)
     rows = sorted({int(row) for row in np.linspace(0, len(run.poses) - 1, min(_MAX_PICTURES, len(run.poses)))})
     placed = np.array([line["status"] != "lost" for line in run.frames])
     views = draw_views(run.map, run.poses, rows, placed, run.camera, config, dataset)
@@ -78,7 +77,7 @@ def write_report(run: RecordedRun, dataset: Dataset | None, note: str = "") -> P
     return target
 
 
-def _render_config(run: RecordedRun) -> RenderConfig:
+def render_config(run: RecordedRun) -> RenderConfig:
     """As the run drew its map."""
     settings = {key: value for key, value in run.provenance["config"]["densify"]["render"].items() if key != "_target_"}
     try:
@@ -145,9 +144,7 @@ def _about(run: RecordedRun, layers: dict[str, np.ndarray], paths: PlacedPaths) 
     }
 
 
-def _page(
-    run: RecordedRun, paths: PlacedPaths, views: Views, about: dict[str, Any], packing: str, note: str
-) -> str:
+def _page(run: RecordedRun, paths: PlacedPaths, views: Views, about: dict[str, Any], packing: str, note: str) -> str:
     """All of it, with pictures of as many frames as fit."""
     script = "\n".join(_source(name) for name in _SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
@@ -164,7 +161,10 @@ def _page(
         "depths": f"{views.near:.1f} to {views.far:.1f} m",
         "strip": strip(run, paths.errors),
         "key": key_of(run, paths.errors),
-        "sections": page_words.errors(run) + page_words.loops(run) + page_words.settings(run) + page_words.files(run, note),
+        "sections": page_words.errors(run)
+        + page_words.loops(run)
+        + page_words.settings(run)
+        + page_words.files(run, note),
         "footer": page_words.licences(run),
         "arrays": packing,
         "vertex": _source("splats.vert"),
@@ -205,7 +205,9 @@ def _options(values: Mapping[Any, str]) -> str:
 
 def _layers(run: RecordedRun) -> str:
     """Without features there are no classes to show, and the page says so."""
-    known = {name: words for name, words in LAYERS.items() if run.text is not None or name not in ("class", "similarity")}
+    known = {
+        name: words for name, words in LAYERS.items() if run.text is not None or name not in ("class", "similarity")
+    }
     missing = "" if run.text is not None else "<option disabled>class: the map has no classes</option>"
     return _options(known) + missing
 

@@ -42,9 +42,7 @@ class Views(NamedTuple):
 
 
 @eqx.filter_jit
-def _drawn(
-    gaussians: Gaussians, pose: jaxlie.SE3, camera: Camera, config: RenderConfig
-) -> tuple[jax.Array, jax.Array]:
+def _drawn(gaussians: Gaussians, pose: jaxlie.SE3, camera: Camera, config: RenderConfig) -> tuple[jax.Array, jax.Array]:
     drawing = render(gaussians, gaussians.colors, pose, camera, config)
     return drawing.values, drawing.depth
 
@@ -78,7 +76,9 @@ def draw_views(
     for row in rows:
         color, depth = drawn.get(row, (None, None))
         rendered = "" if color is None else jpeg(np.rint(255 * color.clip(0.0, 1.0)).astype(np.uint8))
-        pictures.append(Picture(row, _seen(dataset, row), rendered, "" if depth is None else jpeg(_painted(depth, near, far))))
+        pictures.append(
+            Picture(row, _seen(dataset, row), rendered, "" if depth is None else jpeg(_painted(depth, near, far)))
+        )
     return Views(pictures, near, far)
 
 

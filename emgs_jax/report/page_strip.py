@@ -67,6 +67,7 @@ def strip(run: RecordedRun, errors: dict[str, np.ndarray]) -> str:
     column = {
         name: _numbers(run, name) for name in ("inliers", "residual", "scale", "new", "seconds", "compile_seconds")
     }
+    column["residual"][column["inliers"] == 0] = np.nan  # of nothing
     if errors:
         look = {"raw": (RAW, "raw prior"), "online": (ONLINE, "as placed"), "ours": (OURS, "ours")}
         curves = [Curve(100 * errors[key], *look[key]) for key in look if key in errors]
@@ -165,7 +166,9 @@ def _arcs(run: RecordedRun) -> str:
     for loop in sorted(run.loops, key=lambda item: item["outcome"] == "accepted"):
         a, b = loop["other"] + 0.5, loop["frame"] + 0.5
         is_accepted = loop["outcome"] == "accepted"
-        color, opacity = ("#1e9e50", 0.8) if is_accepted else ("#b3261e" if loop["outcome"] == "refused" else "#98a2b3", 0.45)
+        color, opacity = (
+            ("#1e9e50", 0.8) if is_accepted else ("#b3261e" if loop["outcome"] == "refused" else "#98a2b3", 0.45)
+        )
         path = f"M{a:g} 100Q{(a + b) / 2:g} {-80 if is_accepted else -20:g} {b:g} 100"
         style = f'fill="none" stroke="{color}" opacity="{opacity}" vector-effect="non-scaling-stroke"'
         parts.append(f'<path d="{path}" {style}><title>{escape(loop_words(loop))}</title></path>')
@@ -189,7 +192,7 @@ GATES = {
 OUTCOMES = {
     "accepted": "accepted",
     "known": "verified; the poses said so already",
-    "unconfirmed": "verified, but no other loop agrees",
+    "unconfirmed": "verified, but others do not agree",
 }
 
 

@@ -61,7 +61,9 @@ def verdict(run: RecordedRun) -> tuple[str, str]:
     words = f"The path is off by {100 * ours:.1f} cm (RMS, placed with its scale)"
     is_worse = raw is not None and ours > raw
     if raw:
-        words += f", {abs(1 - ours / raw):.0%} {'more' if is_worse else 'less'} than the prior alone ({100 * raw:.1f} cm)"
+        words += (
+            f", {abs(1 - ours / raw):.0%} {'more' if is_worse else 'less'} than the prior alone ({100 * raw:.1f} cm)"
+        )
     key = "rendering/depth_within_5_percent"
     met, met_raw = metrics.get(key), metrics.get(RAW_PRIOR + key)
     if met is not None and met_raw is not None:
@@ -85,13 +87,16 @@ def head(run: RecordedRun) -> str:
     parts = [f"<h1>{title} <small>prior {escape(str(prior['name']))}</small>{badge}</h1>"]
     parts.append(f'<p class="verdict {level}">{escape(words)}</p>')
     if block["simulated"]:
-        parts.append(_quiet("Simulated: the prior is the ground truth, disturbed. Its numbers must not be set beside published ones."))
+        parts.append(
+            _quiet("Simulated: the prior is the disturbed ground truth. Numbers must not be set beside published ones.")
+        )
     if not is_metric(run):
-        parts.append(_quiet("Images alone do not tell the scale: lengths are multiples of a median depth that was assumed, not metres."))
+        parts.append(_quiet("Images alone do not tell the scale: lengths follow from a median depth that was assumed."))
     git = block.get("git") or {}
     commit = f"commit {git['revision'][:12]}{' with changes' if git.get('dirty') else ''}" if git else "no checkout"
     device = block.get("device", {}).get("kind", "")
-    where = f"emgs_jax {block['versions']['emgs_jax']}, {commit}, on {device}; {run.camera.width} × {run.camera.height} pixels"
+    size = f"{run.camera.width} × {run.camera.height} pixels"
+    where = f"emgs_jax {block['versions']['emgs_jax']}, {commit}, on {device}; images of {size}"
     return "".join([*parts, _quiet(where), f"<p><code>{escape(command_of(block['config']))}</code></p>"])
 
 
@@ -102,7 +107,9 @@ def errors(run: RecordedRun) -> str:
         return _section("Errors", "<p>None: the data set has no ground truth.</p>")
     names = {prefix: name for prefix, name in ROWS.items() if any(prefix + c.key in metrics for c in _COLUMNS)}
     rows = [(name, [metrics.get(prefix + column.key) for column in _COLUMNS]) for prefix, name in names.items()]
-    online = {column.key: metrics.get(column.key.replace("trajectory/", "trajectory_online/")) for column in _COLUMNS[:2]}
+    online = {
+        column.key: metrics.get(column.key.replace("trajectory/", "trajectory_online/")) for column in _COLUMNS[:2]
+    }
     if any(value is not None for value in online.values()):
         rows.insert(1, ("ours, as placed", [online.get(column.key) for column in _COLUMNS]))
     used = [k for k in range(len(_COLUMNS)) if any(values[k] is not None for _, values in rows)]
@@ -117,9 +124,9 @@ def errors(run: RecordedRun) -> str:
         lines.append(f'<tr class="{name.split(",")[0]}"><td>{escape(name)}</td>{"".join(cells)}</tr>')
     titles = "".join(f"<th>{escape(_COLUMNS[k].title)}</th>" for k in used)
     how = (
-        f"Protocol {run.provenance['protocol']}: {config.get('statistic', 'mean')} distances, clouds placed by the path "
-        f"({config.get('alignment')}), ICP: by the points; rendered at each one's own poses. "
-        f"{metrics.get('trajectory/num_frames')} frames with truth. Raw prior: the same predictions without any mapping."
+        f"Protocol {run.provenance['protocol']}: {config.get('statistic', 'mean')} distances, clouds placed by the "
+        f"path ({config.get('alignment')}), ICP: by the points; rendered at each one's own poses. "
+        f"{metrics.get('trajectory/num_frames')} frames with truth. Raw prior: the same predictions without mapping."
     )
     return _section("Errors", f"<table><tr><th></th>{titles}</tr>{''.join(lines)}</table>{_quiet(how)}")
 
@@ -134,7 +141,9 @@ def loops(run: RecordedRun) -> str:
     more = f"<li>and {len(run.loops) - 500} more in loops.json</li>" if len(run.loops) > 500 else ""
     closures = f"{run.metrics.get('loops/closures', 0)} closures moved poses and map."
     table = _table(("candidates", "outcome"), rows)
-    return _section("Loops", f"{table}{_quiet(closures)}<details><summary>each of them</summary><ul>{each}{more}</ul></details>")
+    return _section(
+        "Loops", f"{table}{_quiet(closures)}<details><summary>each of them</summary><ul>{each}{more}</ul></details>"
+    )
 
 
 def settings(run: RecordedRun) -> str:
@@ -156,7 +165,8 @@ def licences(run: RecordedRun) -> str:
     data = DATA_LICENCES.get(name, f"{name}: see its publisher")
     is_own = prior.startswith(("simulated", "multiview_stereo"))
     network = "" if is_own else "; its weights have a licence of their own: docs/priors.md"
-    return f"<p>Licences. Page and program: emgs_jax, Apache-2.0. Data: {escape(data)}. Prior: {escape(prior)}{network}.</p>"
+    own = "Licences. Page and program: emgs_jax, Apache-2.0."
+    return f"<p>{own} Data: {escape(data)}. Prior: {escape(prior)}{network}.</p>"
 
 
 def _section(title: str, body: str) -> str:

@@ -16,6 +16,7 @@ from emgs_jax.report.results import METRICS_FILE, read_metrics
 
 TEXT_FILE = "text.npz"  # classes of a map with features, in the format of `experiments.embed`
 LOOPS_FILE = "loops.json"
+REPORT_FILE = "report.html"
 FRAMES_FILE = "frames.jsonl"
 _POSES = ("raw_pose", "true_pose")
 _OUTCOMES = ("accepted", "known", "unconfirmed", "refused")
@@ -72,7 +73,9 @@ def read_run(folder: Path) -> RecordedRun:
     """
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder: give the one that a run wrote, with metrics.json in it")
-    missing = [name for name in (METRICS_FILE, FRAMES_FILE, "trajectory.txt", "map.npz") if not (folder / name).is_file()]
+    missing = [
+        name for name in (METRICS_FILE, FRAMES_FILE, "trajectory.txt", "map.npz") if not (folder / name).is_file()
+    ]
     if missing:
         raise ValueError(f"{folder} holds no finished run: it lacks {', '.join(missing)}; run it to its end")
     metrics = read_metrics(folder / METRICS_FILE)
@@ -138,7 +141,9 @@ def _camera(path: Path, metrics: dict[str, Any]) -> Camera:
         fx, fy, cx, cy = (float(value) for value in known["intrinsics"])
         width, height = (int(value) for value in known["size"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} does not say which camera it was ({error!r}): an older version wrote it, run again") from error
+        raise ValueError(
+            f"{path} does not say which camera it was ({error!r}): an older version wrote it, run again"
+        ) from error
     return Camera((fx, fy), (cx, cy), width, height)
 
 

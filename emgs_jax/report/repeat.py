@@ -61,7 +61,10 @@ def _options(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
     for group, default in _default_options().items():
         wanted = flat(_at(settings, group.split("/")))
         options = {path.stem: _content(path) for path in sorted((CONF / group).glob("*.yaml"))}
-        gaps = {name: sum(made.get(k, ...) != wanted.get(k, ...) for k in {*made, *wanted}) for name, made in options.items()}
+        gaps = {
+            name: sum(made.get(k, ...) != wanted.get(k, ...) for k in {*made, *wanted})
+            for name, made in options.items()
+        }
         best = min(gaps, key=lambda name: (gaps[name], name != default))
         if best != default:
             found.append((group, best))
@@ -107,7 +110,11 @@ def _written(value: Any) -> str:
 
 def check_targets(settings: Any) -> None:
     """Raise ValueError where settings name a class that conf/ does not: a file from elsewhere must not choose code."""
-    known = {value for path in CONF.rglob("*.yaml") for key, value in flat(_read(path)).items() if key.endswith("_target_")}
+    known = {
+        value for path in CONF.rglob("*.yaml") for key, value in flat(_read(path)).items() if key.endswith("_target_")
+    }
     named = {value for key, value in flat({"": settings}).items() if key.endswith("_target_")}
     if named - known:
-        raise ValueError(f"metrics.json names {sorted(map(str, named - known))}, which no file of conf/ does: run again")
+        raise ValueError(
+            f"metrics.json names {sorted(map(str, named - known))}, which no file of conf/ does: run again"
+        )

@@ -256,7 +256,7 @@ def loop_list(end: BackEnd) -> list[dict[str, Any]]:
     """What became of every candidate, for loops.json, in the order of the frames.
 
     `frame` and `other` are places among the frames in use, the later first; `outcome` is accepted, known (the poses
-    said so already), unconfirmed (no other loop agrees) or refused, and then `gate` and `measured` say by what.
+    said so already), unconfirmed (others do not agree) or refused, and then `gate` and `measured` say by what.
     """
     accepted = {(loop.a, loop.b) for loop in end.accepted}
     found = [Refusal(loop.a, loop.b, "", math.nan) for loop in end.verified]

@@ -104,7 +104,8 @@ class SplatRenderer {
     const starts = new Uint32Array(NUM_BUCKETS + 1), step = (NUM_BUCKETS - 1) / (far || 1);
     for (let row = 0; row < count; row++) if (depths[row] > 0) starts[NUM_BUCKETS - ((depths[row] * step) | 0)]++;
     for (let bucket = 1; bucket <= NUM_BUCKETS; bucket++) starts[bucket] += starts[bucket - 1];
-    for (let row = count - 1; row >= 0; row--)
+    // Of equally far ones the first in the map is the nearest, as in our own renderer.
+    for (let row = 0; row < count; row++)
       if (depths[row] > 0) order[--starts[NUM_BUCKETS - ((depths[row] * step) | 0)]] = row;
     return depths.reduce((number, depth) => number + (depth > 0), 0);
   }

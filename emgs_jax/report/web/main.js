@@ -82,7 +82,7 @@ function wireDrawing(report) {
     state.atFrame = false;
     state.pivot = ABOUT.pivot;
     const away = add(mul(ABOUT.up, 0.95), mul(ABOUT.front, -0.6));
-    state.view = lookAt(add(state.pivot, mul(unit(away), 1.15 * state.size)), state.pivot, ABOUT.up);
+    state.view = lookAt(add(state.pivot, mul(unit(away), 0.8 * state.size)), state.pivot, ABOUT.up);
     report.moved();
   };
   report.showFrame = (row, goesThere = true) => {
