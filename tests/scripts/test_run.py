@@ -20,7 +20,7 @@ from emgs_jax.io.map_file import load_map_npz
 from emgs_jax.io.trajectory import load_trajectory_tum
 from experiments.command import clear_errors
 
-FILES = {"trajectory.txt", "map.npz", "map.ply", "points.ply", "mesh.ply", "frames.jsonl", "overview.png"}
+FILES = {"trajectory.txt", "map.npz", "map.ply", "points.ply", "mesh.ply", "frames.jsonl", "overview.png", "text.npz"}
 ERRORS = [f"{kind}_{size}cm_percent" for size in (20, 5) for kind in ("f1", "precision", "recall")]
 NORMALS = ["normals_abs_cos_percent", "normals_within_30deg_percent"]
 TRAJECTORY = [

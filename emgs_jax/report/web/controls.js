@@ -60,7 +60,7 @@ class Controls {
     const ahead = about(view.ahead);
     if (Math.abs(dot(ahead, up)) > 0.998) return; // straight up or down there is no left and right
     const position = flies ? view.position : sub(state.pivot, mul(ahead, norm(sub(state.pivot, view.position))));
-    state.view = lookAt(flies ? position : position, add(position, ahead), up);
+    state.view = lookAt(position, add(position, ahead), up);
     this.onMove();
   }
 

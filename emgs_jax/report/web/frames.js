@@ -31,20 +31,21 @@ function showPictures(report, row) {
   report.state.frame = row;
   $("cursor").style.left = `${(100 * (row + 0.5)) / numFrames()}%`;
   const { frames, pictures } = ABOUT;
-  const nearest = pictures.reduce((best, one) => (Math.abs(one[0] - row) < Math.abs(best[0] - row) ? one : best), pictures[0]);
-  const facts = [`<b>${escaped(frames.title[row])}</b>`, `<span class="status ${frames.status[row]}">${frames.status[row]}</span>`];
-  if (frames.reason[row]) facts.push(escaped(frames.reason[row]));
-  facts.push(escaped(frames.facts[row]));
-  if (nearest && nearest[0] !== row) facts.push(`pictures of ${escaped(frames.title[nearest[0]])}, the nearest that has some`);
-  $("facts").innerHTML = facts.join(" · ");
+  const away = (picture) => Math.abs(picture[0] - row);
+  const nearest = pictures.reduce((best, one) => (away(one) < away(best) ? one : best), pictures[0]);
+  const title = document.createElement("b"), status = document.createElement("span");
+  title.textContent = frames.title[row];
+  status.textContent = frames.status[row];
+  status.className = `status ${frames.status[row]}`;
+  const facts = [frames.reason[row], frames.facts[row]];
+  if (nearest && away(nearest)) facts.push(`pictures of ${frames.title[nearest[0]]}, the nearest that has some`);
+  $("facts").replaceChildren(title, " ", status, " ", facts.filter(Boolean).join(" · "));
   ["seen", "rendered", "depth"].forEach((id, k) => {
     const content = nearest && nearest[k + 1];
     if (content) $(id).src = `data:image/jpeg;base64,${content}`;
     $(id).hidden = !content;
   });
 }
-
-const escaped = (text) => text.replace(/[&<>"']/g, (letter) => `&#${letter.charCodeAt(0)};`);
 
 // A click: the Gaussian in front there; its numbers, or an end of the ruler.
 function clicked(report, x, y) {
@@ -57,8 +58,9 @@ function clicked(report, x, y) {
   }
   const { arrays } = report, row = found.row;
   const label = arrays.label && arrays.label[row] >= 0 ? ABOUT.classes[arrays.label[row]] + " · " : "";
-  $("picked").textContent = `Gaussian ${row}: ${label}at ${found.point.map((v) => v.toFixed(3)).join(", ")} · existence `
-    + `${(arrays.existence[row] / 255).toFixed(2)} · ${arrays.updates[row]} updates · born at frame ${arrays.birth[row]}`;
+  const place = found.point.map((value) => value.toFixed(3)).join(", ");
+  const numbers = `certain by ${(arrays.existence[row] / 255).toFixed(2)} · ${arrays.updates[row]} updates`;
+  $("picked").textContent = `Gaussian ${row}: ${label}at ${place} · ${numbers} · born at step ${arrays.birth[row]}`;
   state.pivot = found.point;
 }
 
@@ -78,7 +80,8 @@ function pick(report, x, y) {
     const point = add(view.position, mul(way, depth));
     const c = arrays.cov.subarray(6 * row, 6 * row + 6);
     const size = (half(c[0]) + half(c[3]) + half(c[5])) * ABOUT.covUnit; // its squared radius, at most
-    if (depth > 0 && norm(sub(point, mean)) ** 2 < 1.5 * size && (!best || depth < best.depth)) best = { row, point, depth };
+    const isHit = depth > 0 && norm(sub(point, mean)) ** 2 < 1.5 * size;
+    if (isHit && (!best || depth < best.depth)) best = { row, point, depth };
   }
   return best;
 }

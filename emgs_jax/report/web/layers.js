@@ -31,7 +31,8 @@ class Layers {
 
   values(name, word) {
     const { arrays, count, numClasses } = this;
-    if (name === "similarity") return Float32Array.from({ length: count }, (_, row) => arrays.similarity[row * numClasses + word] / 255);
+    const similarity = (_, row) => arrays.similarity[row * numClasses + word] / 255;
+    if (name === "similarity") return Float32Array.from({ length: count }, similarity);
     if (name === "existence") return Float32Array.from(arrays.existence, (value) => value / 255);
     if (name === "updates") return Float32Array.from(arrays.updates, (value) => Math.log10(1 + value));
     if (name === "birth") return Float32Array.from(arrays.birth);

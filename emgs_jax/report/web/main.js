@@ -41,7 +41,8 @@ function wireDrawing(report) {
   // The image's own camera where a frame is chosen, else one without distortion of its axes.
   report.lens = (width, height) => {
     const { camera } = ABOUT;
-    if (!state.atFrame) return { focal: [state.focal * height, state.focal * height], center: [(width - 1) / 2, (height - 1) / 2] };
+    const focal = state.focal * height;
+    if (!state.atFrame) return { focal: [focal, focal], center: [(width - 1) / 2, (height - 1) / 2] };
     const scale = Math.min(width / camera.width, height / camera.height);
     const shift = [(width - scale * camera.width) / 2, (height - scale * camera.height) / 2];
     return { focal: [scale * camera.fx, scale * camera.fy],
@@ -55,7 +56,7 @@ function wireDrawing(report) {
     return sum <= 0;
   };
   report.draw = (share) => {
-    const width = Math.round(box.clientWidth * devicePixelRatio), height = Math.round(box.clientHeight * devicePixelRatio);
+    const [width, height] = [box.clientWidth, box.clientHeight].map((side) => Math.round(side * devicePixelRatio));
     const coarse = [Math.max(1, Math.round(share * width)), Math.max(1, Math.round(share * height))];
     const { canvas } = splats;
     if (canvas.width !== coarse[0] || canvas.height !== coarse[1]) [canvas.width, canvas.height] = coarse;

@@ -56,15 +56,16 @@ class Overlay {
       const here = poseAt(poses, row).position;
       const isKnown = Number.isFinite(here[0]);
       const isLost = poses === this.arrays.poses && ABOUT.frames.status[row] === "lost";
-      if (before && isKnown) this.segment(before, here, isLost ? "#e5484d" : color, isLost ? 1 : width, isLost ? [3, 6] : []);
+      const look = isLost ? ["#e5484d", 1, [3, 6]] : [color, width];
+      if (before && isKnown) this.segment(before, here, ...look);
       before = isKnown ? here : null;
     }
   }
 
   loops() {
+    const place = (row) => poseAt(this.arrays.poses, row).position;
     for (const [frame, other, outcome] of ABOUT.loops)
-      if (outcome === "accepted")
-        this.segment(poseAt(this.arrays.poses, frame).position, poseAt(this.arrays.poses, other).position, "#63e68b", 1);
+      if (outcome === "accepted") this.segment(place(frame), place(other), "#63e68b", 1);
   }
 
   // The chosen frame's camera as a pyramid of a twentieth of the map's size.
@@ -108,4 +109,6 @@ class Overlay {
   }
 }
 
-const lengthText = (meters) => (meters < 1 ? `${(100 * meters).toFixed(1)} cm` : `${meters.toFixed(2)} m`) + ABOUT.unitNote;
+function lengthText(meters) {
+  return (meters < 1 ? `${(100 * meters).toFixed(1)} cm` : `${meters.toFixed(2)} m`) + ABOUT.unitNote;
+}

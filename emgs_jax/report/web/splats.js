@@ -17,7 +17,7 @@ class SplatRenderer {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error("this browser has no WebGL2");
     this.gl = gl;
-    this.program = this.link(document.getElementById("vertex").textContent, document.getElementById("fragment").textContent);
+    this.program = this.link(...["vertex", "fragment"].map((id) => document.getElementById(id).textContent));
     gl.useProgram(this.program);
     this.textures = [
       this.texture(gl.RGB32F, gl.RGB, gl.FLOAT, arrays.mean, 3, Float32Array),

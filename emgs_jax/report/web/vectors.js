@@ -26,7 +26,8 @@ function lookAt(position, target, up) {
 // A pose of the data: twelve numbers, the upper rows of T_world_camera.
 function poseAt(poses, row) {
   const m = poses.subarray(12 * row, 12 * row + 12);
-  return { position: [m[3], m[7], m[11]], right: [m[0], m[4], m[8]], down: [m[1], m[5], m[9]], ahead: [m[2], m[6], m[10]] };
+  const [right, down, ahead, position] = [0, 1, 2, 3].map((k) => [m[k], m[k + 4], m[k + 8]]);
+  return { position, right, down, ahead };
 }
 
 const toCamera = (view, point) => {
