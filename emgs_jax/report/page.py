@@ -23,6 +23,7 @@ from emgs_jax.report.page_map import COV_UNIT, map_layers, packed, thinned
 from emgs_jax.report.page_pictures import Views, draw_views, jpeg
 from emgs_jax.report.page_strip import PlacedPaths, key_of, placed_paths, strip
 from emgs_jax.report.recorded_run import REPORT_FILE, RecordedRun
+from emgs_jax.report.repeat import repeat
 
 MAX_BYTES = 5_000_000
 _MAP_BYTES = 2_800_000  # of base64; the rest is for pictures and words
@@ -148,12 +149,12 @@ def _page(run: RecordedRun, paths: PlacedPaths, views: Views, about: dict[str, A
     """All of it, with pictures of as many frames as fit."""
     script = "\n".join(_source(name) for name in _SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
-    block = run.provenance
+    block, again = run.provenance, repeat(run.provenance["config"])
     parts = {
         "policy": f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'",
         "title": _text(f"{block['data']['name']} {block['data']['sequence']}: report of a run"),
         "style": _source("page.css"),
-        "head": page_words.head(run),
+        "head": page_words.head(run, again),
         "overview": _overview(run),
         "layers": _layers(run),
         "words": _options({-1: "all"} | dict(enumerate(about["classes"]))),
@@ -163,7 +164,7 @@ def _page(run: RecordedRun, paths: PlacedPaths, views: Views, about: dict[str, A
         "key": key_of(run, paths.errors),
         "sections": page_words.errors(run)
         + page_words.loops(run)
-        + page_words.settings(run)
+        + page_words.settings(again)
         + page_words.files(run, note),
         "footer": page_words.licences(run),
         "arrays": packing,

@@ -5,6 +5,7 @@ import zlib
 from collections.abc import Mapping
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +17,7 @@ from emgs_jax.semantics import similarities
 
 COV_UNIT = 1e-4  # m²; float16 then holds standard deviations from .1 mm to 2.5 m
 _LARGEST_HALF = 65504.0
+_similarities = eqx.filter_jit(similarities)
 _UPPER = np.triu_indices(3)
 
 
@@ -47,7 +49,7 @@ def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.nd
             f"text.npz has embeddings of width {text.vectors.shape[1]} and map.npz features of width "
             f"{gaussians.features.shape[1]}: they are of two runs, run again"
         )
-    cosines = np.asarray(similarities(confirmed(map), jnp.asarray(text.vectors)))[rows]
+    cosines = np.asarray(_similarities(confirmed(map), jnp.asarray(text.vectors)))[rows]
     is_known = np.asarray(has_feature(map.gaussians.features))[rows]
     labels = np.where(is_known, cosines.argmax(1), -1).astype(np.int16)
     return layers | {"label": labels, "similarity": _bytes(cosines)}

@@ -83,7 +83,7 @@ def strip(run: RecordedRun, errors: dict[str, np.ndarray]) -> str:
             is_scale = title.startswith("scale")
             rows.append(_curves(title, unit, [Curve(values, "#3d4b63", "")], 34, from_zero=not is_scale))
     if run.loops:
-        rows.append(_row("loops", _arcs(run), "", 44))
+        rows.append(_row("loops", _arcs(run), "", 60))
     return "".join(rows) + '<div id="track"><div id="cursor"></div></div>'
 
 

@@ -10,7 +10,7 @@ from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, cell
 from emgs_jax.report.page_strip import loop_why, loop_words
 from emgs_jax.report.provenance import RAW_PRIOR, ROWS
 from emgs_jax.report.recorded_run import RecordedRun
-from emgs_jax.report.repeat import command_of, differences
+from emgs_jax.report.repeat import Repeated
 
 MANY_LOST = 0.1  # share of the frames
 _SE3 = Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True)
@@ -61,9 +61,7 @@ def verdict(run: RecordedRun) -> tuple[str, str]:
     words = f"The path is off by {100 * ours:.1f} cm (RMS, placed with its scale)"
     is_worse = raw is not None and ours > raw
     if raw:
-        words += (
-            f", {abs(1 - ours / raw):.0%} {'more' if is_worse else 'less'} than the prior alone ({100 * raw:.1f} cm)"
-        )
+        words += f", {100 * abs(1 - ours / raw):.0f} % {'more' if is_worse else 'less'} than the prior alone ({100 * raw:.1f} cm)"
     key = "rendering/depth_within_5_percent"
     met, met_raw = metrics.get(key), metrics.get(RAW_PRIOR + key)
     if met is not None and met_raw is not None:
@@ -78,7 +76,7 @@ def is_metric(run: RecordedRun) -> bool:
     return not any(key.endswith("median_depth") for key in flat(run.provenance["config"].get("prior", {})))
 
 
-def head(run: RecordedRun) -> str:
+def head(run: RecordedRun, again: Repeated) -> str:
     """What was mapped, by what, how well, and how it is done again."""
     block, (level, words) = run.provenance, verdict(run)
     data, prior = block["data"], block["prior"]
@@ -97,7 +95,7 @@ def head(run: RecordedRun) -> str:
     device = block.get("device", {}).get("kind", "")
     size = f"{run.camera.width} × {run.camera.height} pixels"
     where = f"emgs_jax {block['versions']['emgs_jax']}, {commit}, on {device}; images of {size}"
-    return "".join([*parts, _quiet(where), f"<p><code>{escape(command_of(block['config']))}</code></p>"])
+    return "".join([*parts, _quiet(where), f"<p><code>{escape(again.command)}</code></p>"])
 
 
 def errors(run: RecordedRun) -> str:
@@ -112,17 +110,17 @@ def errors(run: RecordedRun) -> str:
     }
     if any(value is not None for value in online.values()):
         rows.insert(1, ("ours, as placed", [online.get(column.key) for column in _COLUMNS]))
-    used = [k for k in range(len(_COLUMNS)) if any(values[k] is not None for _, values in rows)]
     lines = []
-    for name, values in rows:
-        cells = []
-        for k in used:
-            column, known = _COLUMNS[k], [other[k] for _, other in rows if other[k] is not None]
-            best = (min if column.is_lower_better else max)(known)
+    for k, column in enumerate(_COLUMNS):
+        known = [values[k] for _, values in rows if values[k] is not None]
+        if not known:
+            continue
+        best, cells = (min if column.is_lower_better else max)(known), []
+        for _, values in rows:
             mark = ' class="best"' if values[k] == best and len(known) > 1 else ""
             cells.append(f"<td{mark}>{cell(values[k], None, column.factor, column.digits)}</td>")
-        lines.append(f'<tr class="{name.split(",")[0]}"><td>{escape(name)}</td>{"".join(cells)}</tr>')
-    titles = "".join(f"<th>{escape(_COLUMNS[k].title)}</th>" for k in used)
+        lines.append(f"<tr><td>{escape(column.title)}</td>{''.join(cells)}</tr>")
+    titles = "".join(f"<th>{escape(name)}</th>" for name, _ in rows)
     how = (
         f"Protocol {run.provenance['protocol']}: {config.get('statistic', 'mean')} distances, clouds placed by the "
         f"path ({config.get('alignment')}), ICP: by the points; rendered at each one's own poses. "
@@ -146,9 +144,9 @@ def loops(run: RecordedRun) -> str:
     )
 
 
-def settings(run: RecordedRun) -> str:
+def settings(again: Repeated) -> str:
     """What differs from the defaults."""
-    rows = [(key, _plain(value), _plain(default)) for key, value, default in differences(run.provenance["config"])]
+    rows = [(key, _plain(value), _plain(default)) for key, value, default in again.differences]
     body = _table(("setting", "here", "default"), rows) if rows else "<p>None: all settings are the defaults.</p>"
     return _section("Settings that differ from the defaults", body)
 

@@ -5,7 +5,7 @@ import re
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -17,46 +17,46 @@ _PLAIN = re.compile(r"[A-Za-z_][\w./-]*|/[\w./-]*")
 _WORDS = {"null", "none", "true", "false", "nan", "inf", "on", "off", "yes", "no"}
 
 
-def words_of(settings: Mapping[str, Any]) -> list[str]:
-    """Overrides of `emgs run` that compose `settings`, groups first; a key that conf/ no longer has is added with +.
+class Repeated(NamedTuple):
+    """How a run is done again.
 
     Args:
-        settings: `config` of a provenance.
+        words: overrides of `emgs run` that compose its config, groups first; a key that conf/ no longer has has a +.
+        differences: key, value and default of each of them; a default that is not there is ...
     """
-    settings = jsonable(settings)
-    words = [f"{group}={option}" for group, option in _options(settings)]
+
+    words: list[str]
+    differences: list[tuple[str, Any, Any]]
+
+    @property
+    def command(self) -> str:
+        """The line for a shell."""
+        return shlex.join(["emgs", "run", *self.words])
+
+
+def repeat(settings: Mapping[str, Any]) -> Repeated:
+    """How to repeat the run with these settings, the `config` of a provenance."""
+    settings, options = flat(jsonable(settings)), _options(settings)
+    words = [f"{group}={option}" for group, option, _ in options]
+    differences: list[tuple[str, Any, Any]] = list(options)
     for follows_another in (False, True):  # what is taken from another key follows that one
         config = compose(*words)
         composed, own = _values(config), flat(OmegaConf.to_container(config, resolve=False))
-        for key, value in flat(settings).items():
-            if composed.get(key, ...) != value and (follows_another or not str(own.get(key, "${")).startswith("${")):
+        for key, value in settings.items():
+            default = composed.get(key, ...)
+            if default != value and (follows_another or not str(own.get(key, "${")).startswith("${")):
                 is_known = OmegaConf.select(config, key, default=...) is not ...
                 words.append(f"{'' if is_known else '+'}{key}={_written(value)}")
-    return words
-
-
-def command_of(settings: Mapping[str, Any]) -> str:
-    """The line for a shell."""
-    return shlex.join(["emgs", "run", *words_of(settings)])
-
-
-def differences(settings: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Key, value and default of the words that repeat a run; a default that is not there is ..."""
-    words = words_of(settings)
-    default_options = _default_options()
-    chosen = [word for word in words if word.split("=")[0] in default_options]
-    defaults, found = _values(compose(*chosen)), flat(jsonable(settings))
-    options = [(group, option, default_options[group]) for group, option in (word.split("=") for word in chosen)]
-    keys = [word.split("=")[0].lstrip("+") for word in words[len(chosen) :]]
-    return options + [(key, found[key], defaults.get(key, ...)) for key in keys]
+                differences.append((key, value, default))
+    return Repeated(words, differences)
 
 
 def _values(config: DictConfig) -> dict[str, Any]:
     return flat(jsonable(OmegaConf.to_container(config, resolve=True)))
 
 
-def _options(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The nearest option of every group, where it is nearer than the default one; files alone are read."""
+def _options(settings: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Group, option and default of every group with an option nearer than the default; files alone are read."""
     found = []
     for group, default in _default_options().items():
         wanted = flat(_at(settings, group.split("/")))
@@ -67,7 +67,7 @@ def _options(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
         }
         best = min(gaps, key=lambda name: (gaps[name], name != default))
         if best != default:
-            found.append((group, best))
+            found.append((group, best, default))
     return found
 
 

@@ -115,10 +115,10 @@ def test_the_same_run_gives_the_same_bytes(folder, tmp_path):
 def test_without_a_program_the_words_and_curves_are_there(folder):
     text = re.sub(r"<script.*?</script>", "", text_of(folder), flags=re.DOTALL)
     assert "SIMULATED" in text
-    assert "The path is off by 1.2 cm" in text and "60% less than the prior alone (3.0 cm)" in text
+    assert "The path is off by 1.2 cm" in text and "60 % less than the prior alone (3.0 cm)" in text
     assert "emgs run" in text and "dataset.stop" in text and "paper/sim3" in text
     assert "refused: what both show is in a small part of an image" in text and "frames 5 and 0: accepted" in text
-    assert text.count("<svg") == 7 and "map.npz" in text and "Apache-2.0" in text  # statuses, five curves, loops
+    assert text.count("<svg") == 8 and "map.npz" in text and "Apache-2.0" in text  # statuses, six curves, loops
 
 
 def test_a_large_map_is_thinned_to_the_size_of_a_page_and_the_page_says_so(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import shlex
 import pytest
 from omegaconf import OmegaConf
 
-from emgs_jax.report.repeat import check_targets, command_of, differences, words_of
+from emgs_jax.report.repeat import check_targets, repeat
 from emgs_jax.running.configure import compose
 
 
@@ -25,16 +25,16 @@ def settings_of(*words):
 )
 def test_the_words_compose_the_same_config(words):
     settings = settings_of(*words)
-    again = shlex.split(command_of(settings))
+    again = shlex.split(repeat(settings).command)
     assert again[:2] == ["emgs", "run"]
     assert settings_of(*again[2:]) == settings
 
 
 def test_words_are_few_and_say_the_default_beside():
     settings = settings_of("dataset=apartment", "slam.em.max_log_gap=9.5", "render.opacity=.5")
-    assert words_of(settings) == ["dataset=apartment", "slam.em.max_log_gap=9.5", "render.opacity=0.5"]
+    assert repeat(settings).words == ["dataset=apartment", "slam.em.max_log_gap=9.5", "render.opacity=0.5"]
     default = settings_of()
-    assert differences(settings) == [
+    assert repeat(settings).differences == [
         ("dataset", "apartment", "synthetic"),
         ("slam.em.max_log_gap", 9.5, default["slam"]["em"]["max_log_gap"]),
         ("render.opacity", 0.5, default["render"]["opacity"]),
@@ -44,8 +44,8 @@ def test_words_are_few_and_say_the_default_beside():
 def test_a_key_of_another_version_is_added():
     settings = settings_of()
     settings["slam"]["em"]["bygone"] = 3
-    assert words_of(settings) == ["+slam.em.bygone=3"]
-    assert differences(settings) == [("slam.em.bygone", 3, ...)]
+    assert repeat(settings).words == ["+slam.em.bygone=3"]
+    assert repeat(settings).differences == [("slam.em.bygone", 3, ...)]
 
 
 def test_only_classes_that_conf_names_are_made():
