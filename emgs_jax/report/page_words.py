@@ -61,7 +61,8 @@ def verdict(run: RecordedRun) -> tuple[str, str]:
     words = f"The path is off by {100 * ours:.1f} cm (RMS, placed with its scale)"
     is_worse = raw is not None and ours > raw
     if raw:
-        words += f", {100 * abs(1 - ours / raw):.0f} % {'more' if is_worse else 'less'} than the prior alone ({100 * raw:.1f} cm)"
+        change = f"{100 * abs(1 - ours / raw):.0f} % {'more' if is_worse else 'less'}"
+        words += f", {change} than the prior alone ({100 * raw:.1f} cm)"
     key = "rendering/depth_within_5_percent"
     met, met_raw = metrics.get(key), metrics.get(RAW_PRIOR + key)
     if met is not None and met_raw is not None:

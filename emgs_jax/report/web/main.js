@@ -4,6 +4,7 @@
 const $ = (id) => document.getElementById(id);
 const BACKGROUND = [0.086, 0.098, 0.118];
 const SLOW = 60; // ms; a drawing that takes longer is drawn coarsely while the view moves
+const FEW = 20000; // Gaussians that are drawn coarsely
 const REST = 200; // ms without a move until it is drawn in full
 
 async function start() {
@@ -64,7 +65,8 @@ function wireDrawing(report) {
       [overlay.canvas.width, overlay.canvas.height] = [width, height];
     }
     const begin = performance.now(), lens = report.lens(canvas.width, canvas.height);
-    splats.draw(state.view, lens, state.seesThrough && !state.atFrame ? facing : null);
+    const step = share < 1 ? Math.ceil(splats.count / FEW) : 1;
+    splats.draw(state.view, lens, state.seesThrough && !state.atFrame ? facing : null, step);
     if (share === 1) report.frameTime = performance.now() - begin;
     overlay.draw(state.view, lens, width / canvas.width);
   };

@@ -90,30 +90,31 @@ class SplatRenderer {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXTURE_WIDTH, height, gl.RGBA, gl.UNSIGNED_BYTE, filled);
   }
 
-  // Rows of what is in front of the camera, farthest first (a counting sort); returns how many.
-  sort(view, isSeen) {
+  // Rows of what is in front of the camera, farthest first (a counting sort), every `step`-th; returns how many.
+  sort(view, isSeen, step) {
     const { means, colors, depths, order, count } = this;
     const [x, y, z] = view.ahead, start = dot(view.ahead, view.position);
     let far = 0;
     for (let row = 0; row < count; row++) {
       let depth = means[3 * row] * x + means[3 * row + 1] * y + means[3 * row + 2] * z - start;
-      if (depth <= 1e-3 || colors[4 * row + 3] === 0 || (isSeen && !isSeen(row))) depth = -1;
+      if (depth <= 1e-3 || row % step || colors[4 * row + 3] === 0 || (isSeen && !isSeen(row))) depth = -1;
       depths[row] = depth;
       if (depth > far) far = depth;
     }
-    const starts = new Uint32Array(NUM_BUCKETS + 1), step = (NUM_BUCKETS - 1) / (far || 1);
-    for (let row = 0; row < count; row++) if (depths[row] > 0) starts[NUM_BUCKETS - ((depths[row] * step) | 0)]++;
+    const starts = new Uint32Array(NUM_BUCKETS + 1), share = (NUM_BUCKETS - 1) / (far || 1);
+    for (let row = 0; row < count; row++) if (depths[row] > 0) starts[NUM_BUCKETS - ((depths[row] * share) | 0)]++;
     for (let bucket = 1; bucket <= NUM_BUCKETS; bucket++) starts[bucket] += starts[bucket - 1];
     // Of equally far ones the first in the map is the nearest, as in our own renderer.
     for (let row = 0; row < count; row++)
-      if (depths[row] > 0) order[--starts[NUM_BUCKETS - ((depths[row] * step) | 0)]] = row;
+      if (depths[row] > 0) order[--starts[NUM_BUCKETS - ((depths[row] * share) | 0)]] = row;
     return depths.reduce((number, depth) => number + (depth > 0), 0);
   }
 
   // lens: focal [fx, fy] and center [cx, cy] in pixels of the canvas. isSeen(row): false leaves a Gaussian out.
-  draw(view, lens, isSeen) {
+  // step: only every step-th is drawn, as much larger.
+  draw(view, lens, isSeen, step = 1) {
     const gl = this.gl, { width, height } = this.canvas, { render, covUnit } = this.settings;
-    const number = this.sort(view, isSeen);
+    const number = this.sort(view, isSeen, step);
     gl.viewport(0, 0, width, height);
     gl.clearColor(...this.background, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
@@ -130,7 +131,7 @@ class SplatRenderer {
     gl.uniform2fv(this.place("focal"), lens.focal);
     gl.uniform2fv(this.place("center"), lens.center);
     gl.uniform2f(this.place("size"), width, height);
-    gl.uniform1f(this.place("covScale"), covUnit * render.covarianceScale);
+    gl.uniform1f(this.place("covScale"), covUnit * render.covarianceScale * step);
     for (const name of ["blur", "radius", "opacity"]) gl.uniform1f(this.place(name), render[name]);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, number);
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits, so that time can be taken
