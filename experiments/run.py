@@ -14,9 +14,11 @@ from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import describe, new_scorer, score_back_end, score_baselines, score_map, score_prior, spent
+from emgs_jax.report.page import write_report
 from emgs_jax.report.printout import frame_lines, last_words
 from emgs_jax.report.provenance import print_metrics_table, provenance, signature, write_metrics
-from emgs_jax.report.run_files import claim_folder, save_outputs, save_progress
+from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.run_files import claim_folder, save_classes, save_outputs, save_progress
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import baseline_configs, build, build_dataset, build_prior, graph_config
@@ -57,6 +59,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         with clock.phase("export"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
             notes = save_outputs(folder, session, dense, densify, title)
+            save_classes(folder, prior)
         with clock.phase("evaluate"):
             scorer = new_scorer(dataset, evaluation, prior)
             metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
@@ -66,6 +69,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     metrics["provenance"] = origin
     write_metrics(folder / "metrics.json", metrics)
     keeper.drop()
+    write_report(read_run(folder), dataset)
     for note in [*frame_lines(session.records, len(dataset.skipped)), *notes]:
         tqdm.write(note)
     return metrics
@@ -116,7 +120,8 @@ def main(config: DictConfig) -> float:
     for key, value in metrics.items():
         if value is not None and (key.startswith("prior/") or key == "segmentation/miou_percent"):
             print(f"{key} {value:.4g}")
-    print(f"{last_words(metrics)}{metrics['time/seconds_per_frame']:.2f} s a frame; everything is in {folder}")
+    pace = f"{metrics['time/seconds_per_frame']:.2f} s a frame"
+    print(f"{last_words(metrics)}{pace}; everything is in {folder}, report.html shows it")
     error = metrics.get("trajectory/ate_sim3_m")
     return math.inf if error is None else error
 

@@ -17,6 +17,8 @@ RESULTS = ("tests/report/test_results.py",)
 GATE = ("tests/report/test_gate.py",)
 SWEEPS = ("tests/report/test_sweeps.py",)
 OVERVIEW = ("tests/report/test_overview.py",)
+PAGE = ("tests/report/test_page.py",)
+REPEAT = ("tests/report/test_repeat.py",)
 PROVENANCE = ("tests/report/test_provenance.py",)
 DENSE = ("tests/running/test_dense.py",)
 CONVERT = ("tests/running/test_convert.py",)
@@ -576,6 +578,62 @@ MUTANTS = (
         "a confusion matrix on its side",
     ),
     # report
+    Mutant(
+        "emgs_jax/report/page.py",
+        '.replace("<", "\\\\u003c")',
+        '.replace("<", "<")',
+        PAGE,
+        "a name in the data ends its element of the page and begins a script",
+    ),
+    Mutant(
+        "emgs_jax/report/page_strip.py",
+        "escape(f\"{words[start]}{': ' if reasons else ''}{'; '.join(reasons)}\")",
+        "f\"{words[start]}{': ' if reasons else ''}{'; '.join(reasons)}\"",
+        PAGE,
+        "a reason is written into the page as it is",
+    ),
+    Mutant(
+        "emgs_jax/report/page_map.py",
+        'np.argsort(-layers["updates"].astype(np.int64), kind="stable")[:count]',
+        'np.argsort(layers["updates"].astype(np.int64), kind="stable")[:count]',
+        PAGE,
+        "of a large map the page shows what fewest frames agree on",
+    ),
+    Mutant(
+        "emgs_jax/report/page_map.py",
+        "parts.append(np.ascontiguousarray(raw.T).tobytes())",
+        "parts.append(raw.tobytes())",
+        PAGE,
+        "bytes of a number lie side by side, and the page reads them by kind",
+    ),
+    Mutant(
+        "emgs_jax/report/page_words.py",
+        "is_worse = raw is not None and ours > raw",
+        "is_worse = raw is not None and ours < raw",
+        PAGE,
+        "the verdict is that of the raw prior",
+    ),
+    Mutant(
+        "emgs_jax/report/page_strip.py",
+        "-(rotation @ a.translation) / a.scale)",
+        "-(rotation @ a.translation))",
+        PAGE,
+        "the true path stands elsewhere where the scales differ",
+    ),
+    Mutant(
+        "emgs_jax/report/repeat.py",
+        "    if named - known:",
+        "    if not known:",
+        REPEAT,
+        "a foreign metrics.json chooses the class that is made",
+    ),
+    Mutant(
+        "emgs_jax/report/repeat.py",
+        """value.replace("\\\\", "\\\\\\\\").replace("'", "\\\\'")""",
+        """value.replace("\\\\", "\\\\\\\\")""",
+        REPEAT,
+        "a quote in a path ends the word of the command",
+    ),
     Mutant(
         "emgs_jax/running/record.py",
         "for pose, true in zip(poses, run.true_poses, strict=True) if true is not None]",

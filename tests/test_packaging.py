@@ -34,6 +34,16 @@ def test_the_type_marker_and_every_yaml_are_installed():
     assert {path.suffix for path in CONF.rglob("*") if path.is_file()} == {".yaml"}
 
 
+def test_the_sources_of_the_report_are_installed_and_are_readable_text():
+    """No bundle of others: short files, short lines."""
+    assert SETUP["package-data"]["emgs_jax.report"] == ["web/*"]
+    sources = sorted((ROOT / "emgs_jax" / "report" / "web").iterdir())
+    assert {path.suffix for path in sources} == {".html", ".css", ".js", ".vert", ".frag"}
+    for path in sources:
+        lines = path.read_text().splitlines()
+        assert len(lines) <= 300 and max(map(len, lines)) <= 120, path
+
+
 def test_the_scripts_import_each_other_by_relative_names_so_that_they_work_under_both():
     for path in (ROOT / "experiments").rglob("*.py"):
         assert "from experiments" not in path.read_text() and "import experiments" not in path.read_text(), path

@@ -94,6 +94,12 @@ def load_text(path: Path | str, model: dict, names: Sequence[str] = ()) -> TextE
     return TextEmbeddings(chosen, vectors[[known[name] for name in chosen]], tuple(header["templates"]), model)
 
 
+def read_text(path: Path | str) -> TextEmbeddings:
+    """All embeddings of a file, whatever their model is; raises ValueError as `load_text`."""
+    header, vectors = _read(Path(path))
+    return TextEmbeddings(tuple(header["names"]), vectors, tuple(header["templates"]), header["model"])
+
+
 def _read(path: Path) -> tuple[dict, np.ndarray]:
     """Return header and vectors of a file that is whole."""
     if not path.is_file():

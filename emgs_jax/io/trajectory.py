@@ -30,6 +30,16 @@ def to_tum(pose: np.ndarray) -> tuple[float, ...]:
     return tuple(float(value) for value in (*pose[:3, 3], *quaternion))
 
 
+def from_tum(values: np.ndarray) -> np.ndarray:
+    """Poses (n, 4, 4) of tx, ty, tz, qx, qy, qz, qw (n, 7); rows that are not finite become nan."""
+    is_finite = np.isfinite(values).all(1)
+    poses = np.where(is_finite[:, None, None], np.eye(4), np.nan)
+    poses[is_finite, :3, 3] = values[is_finite, :3]
+    if is_finite.any():
+        poses[is_finite, :3, :3] = Rotation.from_quat(values[is_finite, 3:]).as_matrix()
+    return poses
+
+
 def load_trajectory_tum(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     """Read a TUM trajectory: timestamps (n,) and T_world_camera (n, 4, 4), float64; `#` starts a comment."""
     rows = []
@@ -49,8 +59,4 @@ def load_trajectory_tum(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray
         if fields:
             rows.append(values)
     rows = np.array(rows, np.float64).reshape(-1, 8)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, 3] = rows[:, 1:4]
-    if len(rows):
-        poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
-    return rows[:, 0], poses
+    return rows[:, 0], from_tum(rows[:, 1:])

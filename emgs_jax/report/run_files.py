@@ -6,15 +6,18 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.gaussian_map import confirmed
-from emgs_jax.io.files import remove_temporaries
+from emgs_jax.io.files import remove_temporaries, write_json
 from emgs_jax.io.g2o import save_graph_g2o
 from emgs_jax.io.map_file import save_map_npz
 from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
+from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
-from emgs_jax.running.back_end import metric_graph
+from emgs_jax.report.recorded_run import LOOPS_FILE, REPORT_FILE, TEXT_FILE
+from emgs_jax.running.back_end import loop_list, metric_graph
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.places import save_places
@@ -22,8 +25,9 @@ from emgs_jax.running.record import MappingRun
 
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (
-    *("metrics.json", "trajectory.txt", "trajectory_online.txt", "graph.g2o", "frames.jsonl"),
-    *("map.npz", "places.npz", "map.ply", "points.ply", "mesh.ply", "overview.png", CHECKPOINT_FILE),
+    *("metrics.json", "trajectory.txt", "trajectory_online.txt", "graph.g2o", LOOPS_FILE, "frames.jsonl"),
+    *("map.npz", "places.npz", "map.ply", "points.ply", "mesh.ply", "overview.png", TEXT_FILE, REPORT_FILE),
+    CHECKPOINT_FILE,
 )
 
 
@@ -47,7 +51,7 @@ def save_progress(folder: Path, run: MappingRun) -> None:
     """Write trajectory.txt and map.npz of the frames so far; nothing before there is a map.
 
     With a back end also places.npz, by which another run goes on in the map; trajectory_online.txt, the poses as they
-    were when the frames were placed (in the unit of the finished map), and graph.g2o.
+    were when the frames were placed (in the unit of the finished map), graph.g2o and loops.json.
     """
     if run.state is not None:
         save_trajectory_tum(
@@ -62,6 +66,15 @@ def save_progress(folder: Path, run: MappingRun) -> None:
         placed = [record.timestamp for record in run.records[-len(online) :]]
         save_trajectory_tum(folder / "trajectory_online.txt", placed, np.stack(online))
         save_graph_g2o(folder / "graph.g2o", metric_graph(end))
+        write_json(folder / LOOPS_FILE, loop_list(end))
+
+
+def save_classes(folder: Path, prior: Prior) -> None:
+    """Write text.npz, the classes that the map's features can be compared with; nothing where there are none."""
+    if prior.feature_names:
+        model = {"prior": prior.provenance.name}
+        text = TextEmbeddings(tuple(prior.feature_names), np.asarray(prior.text_features, np.float32), (), model)
+        save_text(folder / TEXT_FILE, text)
 
 
 def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: DensifyConfig, title: str) -> list[str]:

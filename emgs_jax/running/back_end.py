@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -70,6 +70,15 @@ class Closure:
     info: GraphInfo
 
 
+class Refusal(NamedTuple):
+    """A candidate that was no loop: two nodes, the gate that it did not pass, and what that gate measured."""
+
+    a: int
+    b: int
+    gate: str
+    measured: float
+
+
 @dataclass
 class BackEnd:
     """Measurements as far as a run is.
@@ -107,7 +116,7 @@ class BackEnd:
     verified: list[LoopMeasurement] = field(default_factory=list)
     contradicted: list[LoopMeasurement] = field(default_factory=list)
     accepted: list[LoopMeasurement] = field(default_factory=list)
-    refusals: Counter = field(default_factory=Counter)
+    refusals: list[Refusal] = field(default_factory=list)
     closures: list[Closure] = field(default_factory=list)
     first: int = 0
     since: int = 0
@@ -183,13 +192,13 @@ class BackEnd:
         beside = [keyframes[k] for k in (other - 1, other + 1) if 0 <= k < row]
         neighbours = neighbours_of(candidate, beside, self.poses, self.log_scales)
         loop, info = verify(keyframes[row], candidate, neighbours, self.config.verification)
-        self._note(loop, info)
+        self._note((candidate.frame, keyframes[row].frame), loop, info)
 
-    def _note(self, loop: LoopMeasurement | None, info: VerifyInfo) -> None:
+    def _note(self, nodes: tuple[int, int], loop: LoopMeasurement | None, info: VerifyInfo) -> None:
         if info.contradicted is not None:
             self.contradicted.append(info.contradicted)
         if loop is None:
-            self.refusals[info.refused_by.value] += 1
+            self.refusals.append(Refusal(*nodes, info.refused_by.value, info.measured))
         else:
             self.verified.append(loop)
 
@@ -257,9 +266,28 @@ def _moved_pose(T: jaxlie.SE3, before: Nodes, after: Nodes, row: int) -> jaxlie.
     return jaxlie.SE3(jnp.where(jnp.all(old == new), T.wxyz_xyz, new))
 
 
+def loop_list(end: BackEnd) -> list[dict[str, Any]]:
+    """What became of every candidate, for loops.json, in the order of the frames.
+
+    `frame` and `other` are places among the frames in use, the later first; `outcome` is accepted, known (the poses
+    said so already), unconfirmed (others do not agree) or refused, and then `gate` and `measured` say by what.
+    """
+    accepted = {(loop.a, loop.b) for loop in end.accepted}
+    found = [Refusal(loop.a, loop.b, "", math.nan) for loop in end.verified]
+    agreed = {(loop.a, loop.b) for loop in end.agreed()}
+    lines = []
+    known = (item for item in [*found, *end.refusals] if item.a >= end.first)  # what is older is of another run
+    for a, b, gate, measured in sorted(known, key=lambda item: (item.b, item.a)):
+        verified = "accepted" if (a, b) in accepted else "known" if (a, b) in agreed else "unconfirmed"
+        line = {"frame": end.frames[b], "other": end.frames[a], "outcome": "refused" if gate else verified}
+        lines.append(line | ({"gate": gate, "measured": measured} if gate else {}))
+    return lines
+
+
 def counts(end: BackEnd) -> dict[str, Any]:
     """What became of the candidates, for metrics.json."""
-    refused = {f"loops/refused_{gate}": count for gate, count in sorted(end.refusals.items())}
+    gates = Counter(refusal.gate for refusal in end.refusals)
+    refused = {f"loops/refused_{gate}": count for gate, count in sorted(gates.items())}
     solved = [closure for closure in end.closures if closure.loops]
     return {
         "loops/verified": len(end.verified),

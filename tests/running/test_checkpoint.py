@@ -82,7 +82,12 @@ def test_a_run_that_is_stopped_and_goes_on_has_the_same_bits(tmp_path, monkeypat
     assert 0 < len(calls) < NUM_FRAMES - 1, "the steps before are not repeated"
     assert "going on after frame" in "".join(capsys.readouterr())
     assert {path.name for path in tmp_path.iterdir()} == {path.name for path in folder.iterdir()}
-    for name in {path.name for path in folder.iterdir()} - {"metrics.json", "frames.jsonl", "overview.png"}:
+    for name in {path.name for path in folder.iterdir()} - {
+        "metrics.json",
+        "frames.jsonl",
+        "overview.png",
+        "report.html",
+    }:
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
     assert log_lines(tmp_path) == log_lines(folder)
     same = [key for key in metrics if not key.startswith(("time/", "memory/"))]

@@ -20,7 +20,16 @@ from emgs_jax.io.map_file import load_map_npz
 from emgs_jax.io.trajectory import load_trajectory_tum
 from experiments.command import clear_errors
 
-FILES = {"trajectory.txt", "map.npz", "map.ply", "points.ply", "mesh.ply", "frames.jsonl", "overview.png"}
+FILES = {
+    "trajectory.txt",
+    "map.npz",
+    "map.ply",
+    "points.ply",
+    "mesh.ply",
+    "frames.jsonl",
+    "overview.png",
+    "text.npz",
+} | {"report.html"}
 ERRORS = [f"{kind}_{size}cm_percent" for size in (20, 5) for kind in ("f1", "precision", "recall")]
 NORMALS = ["normals_abs_cos_percent", "normals_within_30deg_percent"]
 TRAJECTORY = [
@@ -125,7 +134,7 @@ def test_baselines_stand_beside_ours_and_change_nothing_else(tmp_path):
 @pytest.mark.slow
 def test_a_back_end_moves_nothing_that_is_exact_and_writes_what_it_measured(tmp_path):
     metrics = experiments.run.run(compose("prior.level=0", "graph=default"), tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} >= FILES | {"trajectory_online.txt", "graph.g2o"}
+    assert {path.name for path in tmp_path.iterdir()} >= FILES | {"trajectory_online.txt", "graph.g2o", "loops.json"}
     before, after = (load_trajectory_tum(folder / "trajectory.txt")[1] for folder in (exact_run()[0], tmp_path))
     np.testing.assert_allclose(after, before, atol=1e-4)  # m
     online = load_trajectory_tum(tmp_path / "trajectory_online.txt")[1]

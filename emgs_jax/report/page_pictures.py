@@ -1,0 +1,122 @@
+"""Small pictures for the page: what the camera saw, what the map shows from there, and how far away it is."""
+
+import base64
+import io
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jaxlie
+import matplotlib
+import numpy as np
+from PIL import Image
+
+from emgs_jax.data.base import BadFrameError, Dataset
+from emgs_jax.gaussian_map import GaussianMap, confirmed
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.ops.camera import Camera, downscale
+from emgs_jax.render.composite import RenderConfig, render
+from emgs_jax.running.convert import to_se3
+
+WIDTH = 200  # pixels; a picture is not wider
+QUALITY = 80  # of JPEG
+_NO_DEPTH = (221, 221, 221)
+
+
+class Picture(NamedTuple):
+    """JPEGs in base64 of one frame; "" where there is none."""
+
+    row: int
+    seen: str
+    rendered: str
+    depth: str
+
+
+class Views(NamedTuple):
+    """Pictures, and the depths [m] of the first and last colour."""
+
+    pictures: list[Picture]
+    near: float
+    far: float
+
+
+@eqx.filter_jit
+def _drawn(gaussians: Gaussians, pose: jaxlie.SE3, camera: Camera, config: RenderConfig) -> tuple[jax.Array, jax.Array]:
+    drawing = render(gaussians, gaussians.colors, pose, camera, config)
+    return drawing.values, drawing.depth
+
+
+def draw_views(
+    map: GaussianMap,
+    poses: np.ndarray,
+    rows: Sequence[int],
+    placed: np.ndarray,
+    camera: Camera,
+    config: RenderConfig,
+    dataset: Dataset | None,
+) -> Views:
+    """Pictures of some frames, the map drawn by our own renderer.
+
+    Args:
+        map: whose confirmed Gaussians are drawn.
+        poses: T_world_camera of all frames, (n, 4, 4).
+        rows: of the frames.
+        placed: bool (n,); from a frame that is not, nothing is drawn.
+        camera: of the frames.
+        config: as they are drawn.
+        dataset: for the images; None: without them.
+    """
+    small = downscale(camera, -(-camera.width // WIDTH))
+    drawn = dict(_draw_all(confirmed(map), poses, [row for row in rows if placed[row]], small, config))
+    depths = [depth[depth > 0] for _, depth in drawn.values()]
+    known = np.concatenate(depths) if depths else np.zeros(0)
+    near, far = (float(value) for value in np.percentile(known, [1, 99])) if len(known) else (0.0, 1.0)
+    pictures = []
+    for row in rows:
+        color, depth = drawn.get(row, (None, None))
+        rendered = "" if color is None else jpeg(np.rint(255 * color.clip(0.0, 1.0)).astype(np.uint8))
+        pictures.append(
+            Picture(row, _seen(dataset, row), rendered, "" if depth is None else jpeg(_painted(depth, near, far)))
+        )
+    return Views(pictures, near, far)
+
+
+def _draw_all(
+    gaussians: Gaussians, poses: np.ndarray, rows: Sequence[int], camera: Camera, config: RenderConfig
+) -> Iterator[tuple[int, tuple[np.ndarray, np.ndarray]]]:
+    """Colour (h, w, 3) and depth (h, w) of rows; the next is being drawn while one is fetched."""
+    pending = None
+    for row in rows:
+        drawing = row, _drawn(gaussians, to_se3(poses[row]), camera, config)
+        if pending is not None:
+            yield jax.device_get(pending)
+        pending = drawing
+    if pending is not None:
+        yield jax.device_get(pending)
+
+
+def _seen(dataset: Dataset | None, row: int) -> str:
+    if dataset is None:
+        return ""
+    try:
+        image = Image.fromarray(dataset[row].image)
+    except (BadFrameError, OSError):  # gone since the run
+        return ""
+    image.thumbnail((WIDTH, WIDTH * image.height), Image.Resampling.BOX)
+    return jpeg(np.asarray(image))
+
+
+def _painted(depth: np.ndarray, near: float, far: float) -> np.ndarray:
+    """Depth in colours, uint8 (h, w, 3); grey where there is none."""
+    share = (depth - near) / max(far - near, 1e-9)
+    colors = np.rint(255 * matplotlib.colormaps["turbo"](share.clip(0.0, 1.0))[..., :3]).astype(np.uint8)
+    return np.where((depth > 0)[..., None], colors, np.uint8(_NO_DEPTH))
+
+
+def jpeg(image: np.ndarray | Image.Image) -> str:
+    """JPEG in base64 of RGB, uint8 (h, w, 3)."""
+    image = image if isinstance(image, Image.Image) else Image.fromarray(image)
+    content = io.BytesIO()
+    image.convert("RGB").save(content, "JPEG", quality=QUALITY)
+    return base64.b64encode(content.getvalue()).decode("ascii")

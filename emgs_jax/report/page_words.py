@@ -1,0 +1,202 @@
+"""What the page says in words and tables: the verdict, errors, loops, settings, files, licences. All of it escaped."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+from emgs_jax.io.files import flat
+from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, cell
+from emgs_jax.report.page_strip import loop_why, loop_words
+from emgs_jax.report.provenance import RAW_PRIOR, ROWS
+from emgs_jax.report.recorded_run import RecordedRun
+from emgs_jax.report.repeat import Repeated
+
+MANY_LOST = 0.1  # share of the frames
+_SE3 = Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True)
+_COLUMNS = (MAIN[0]._replace(title="ATE Sim(3) [cm]"), _SE3, *MAIN[1:], *PLACED[:1], *PLACED[3:4], *RENDERED)
+FILES = {
+    "report.html": "this page; any browser of 2023 or later",
+    "overview.png": "the map from above with both paths, some frames; any viewer of images",
+    "metrics.json": "all errors, counts, times, and where the result comes from; any editor",
+    "trajectory.txt": "the pose of every frame, TUM format; evo",
+    "trajectory_online.txt": "the poses as they were when the frames were placed, TUM format; evo",
+    "frames.jsonl": "a line per frame; any editor, pandas.read_json(…, lines=True)",
+    "graph.g2o": "poses and measurements; g2o_viewer, GTSAM",
+    "loops.json": "candidates of loops and what became of them; any editor",
+    "map.npz": "the map itself: emgs_jax.load_map",
+    "text.npz": "classes that the map's features are compared with; features.text=",
+    "map.ply": "the Gaussians as 3D Gaussian splatting has them; SuperSplat, rerun",
+    "points.ply": "a dense cloud with normals, colours and labels; MeshLab, CloudCompare",
+    "mesh.ply": "a mesh from centres and normals; MeshLab, Blender",
+}
+_OWN = "made by this program, Apache-2.0"
+DATA_LICENCES = {
+    "synthetic": _OWN,
+    "apartment": _OWN,
+    "tum": "TUM RGB-D: CC BY 4.0, unless the sequence says otherwise",
+    "seven_scenes": "7-Scenes: Microsoft Research's licence, non-commercial use",
+    "replica": "Replica: its own research licence, non-commercial use",
+    "images": "your own images, your own licence",
+}
+
+
+def verdict(run: RecordedRun) -> tuple[str, str]:
+    """`good`, `mixed`, `bad` or `unknown`, and one sentence. Without ground truth only the tracking is judged.
+
+    Bad: more than a tenth of the frames is lost, or the path is worse than the raw prior's. Mixed: of the true depth
+    fewer pixels are met than by the raw prior, or a tenth of the frames is degraded.
+    """
+    metrics, statuses = run.metrics, Counter(line["status"] for line in run.frames)
+    total = max(len(run.frames), 1)
+    tracked = f"{statuses['tracked'] + statuses['initialization']} of {len(run.frames)} frames are in the map"
+    if statuses["lost"] or statuses["degraded"]:
+        tracked += f" ({statuses['degraded']} degraded, {statuses['lost']} lost)"
+    tracked += f", {len(run.skipped)} skipped" if run.skipped else ""
+    is_lost, is_degraded = (statuses[word] > MANY_LOST * total for word in ("lost", "degraded"))
+    ours, raw = (metrics.get(prefix + MAIN[0].key) for prefix in ("", RAW_PRIOR))
+    if ours is None:
+        level = "bad" if is_lost else "mixed" if is_degraded else "unknown"
+        return level, f"{tracked}. There is no ground truth that errors could be told from."
+    words = f"The path is off by {100 * ours:.1f} cm (RMS, placed with its scale)"
+    is_worse = raw is not None and ours > raw
+    if raw:
+        change = f"{100 * abs(1 - ours / raw):.0f} % {'more' if is_worse else 'less'}"
+        words += f", {change} than the prior alone ({100 * raw:.1f} cm)"
+    key = "rendering/depth_within_5_percent"
+    met, met_raw = metrics.get(key), metrics.get(RAW_PRIOR + key)
+    if met is not None and met_raw is not None:
+        words += f"; {met:.0f} % of what the map shows is within 5 % of the true depth (prior alone: {met_raw:.0f} %)"
+    is_mixed = is_degraded or (met is not None and met_raw is not None and met < met_raw)
+    level = "bad" if is_lost or is_worse else "mixed" if is_mixed else "good"
+    return level, f"{words}; {tracked}."
+
+
+def is_metric(run: RecordedRun) -> bool:
+    """Whether lengths of the map are meant to be metres."""
+    return not any(key.endswith("median_depth") for key in flat(run.provenance["config"].get("prior", {})))
+
+
+def head(run: RecordedRun, again: Repeated) -> str:
+    """What was mapped, by what, how well, and how it is done again."""
+    block, (level, words) = run.provenance, verdict(run)
+    data, prior = block["data"], block["prior"]
+    badge = ' <span class="badge">SIMULATED</span>' if block["simulated"] else ""
+    title = f"{escape(str(data['name']))} {escape(str(data['sequence']))}"
+    parts = [f"<h1>{title} <small>prior {escape(str(prior['name']))}</small>{badge}</h1>"]
+    parts.append(f'<p class="verdict {level}">{escape(words)}</p>')
+    if block["simulated"]:
+        parts.append(
+            _quiet("Simulated: the prior is the disturbed ground truth. Numbers must not be set beside published ones.")
+        )
+    if not is_metric(run):
+        parts.append(_quiet("Images alone do not tell the scale: lengths follow from a median depth that was assumed."))
+    git = block.get("git") or {}
+    commit = f"commit {git['revision'][:12]}{' with changes' if git.get('dirty') else ''}" if git else "no checkout"
+    device = block.get("device", {}).get("kind", "")
+    size = f"{run.camera.width} × {run.camera.height} pixels"
+    where = f"emgs_jax {block['versions']['emgs_jax']}, {commit}, on {device}; images of {size}"
+    return "".join([*parts, _quiet(where), f"<p><code>{escape(again.command)}</code></p>"])
+
+
+def errors(run: RecordedRun) -> str:
+    """The table of errors: ours, as placed, the raw prior and baselines."""
+    metrics, config = run.metrics, run.provenance["config"].get("evaluation", {})
+    if not any(MAIN[0].key in key for key in metrics):
+        return _section("Errors", "<p>None: the data set has no ground truth.</p>")
+    names = {prefix: name for prefix, name in ROWS.items() if any(prefix + c.key in metrics for c in _COLUMNS)}
+    rows = [(name, [metrics.get(prefix + column.key) for column in _COLUMNS]) for prefix, name in names.items()]
+    online = {
+        column.key: metrics.get(column.key.replace("trajectory/", "trajectory_online/")) for column in _COLUMNS[:2]
+    }
+    if any(value is not None for value in online.values()):
+        rows.insert(1, ("ours, as placed", [online.get(column.key) for column in _COLUMNS]))
+    lines = []
+    for k, column in enumerate(_COLUMNS):
+        known = [values[k] for _, values in rows if values[k] is not None]
+        if not known:
+            continue
+        best, cells = (min if column.is_lower_better else max)(known), []
+        for _, values in rows:
+            mark = ' class="best"' if values[k] == best and len(known) > 1 else ""
+            cells.append(f"<td{mark}>{cell(values[k], None, column.factor, column.digits)}</td>")
+        lines.append(f"<tr><td>{escape(column.title)}</td>{''.join(cells)}</tr>")
+    titles = "".join(f"<th>{escape(name)}</th>" for name, _ in rows)
+    how = (
+        f"Protocol {run.provenance['protocol']}: {config.get('statistic', 'mean')} distances, clouds placed by the "
+        f"path ({config.get('alignment')}), ICP: by the points; rendered at each one's own poses. "
+        f"{metrics.get('trajectory/num_frames')} frames with truth. Raw prior: the same predictions without mapping."
+    )
+    return _section("Errors", f"<table><tr><th></th>{titles}</tr>{''.join(lines)}</table>{_quiet(how)}")
+
+
+def loops(run: RecordedRun) -> str:
+    """Counts of outcomes with their reasons, and every candidate; nothing without a back end."""
+    if not run.loops:
+        return ""
+    counts = Counter(map(loop_why, run.loops)).most_common()
+    rows = [(f"{count}", words) for words, count in counts]
+    each = "".join(f"<li>{escape(loop_words(loop))}</li>" for loop in run.loops[:500])
+    more = f"<li>and {len(run.loops) - 500} more in loops.json</li>" if len(run.loops) > 500 else ""
+    closures = f"{run.metrics.get('loops/closures', 0)} closures moved poses and map."
+    table = _table(("candidates", "outcome"), rows)
+    return _section(
+        "Loops", f"{table}{_quiet(closures)}<details><summary>each of them</summary><ul>{each}{more}</ul></details>"
+    )
+
+
+def settings(again: Repeated) -> str:
+    """What differs from the defaults."""
+    rows = [(key, _plain(value), _plain(default)) for key, value, default in again.differences]
+    body = _table(("setting", "here", "default"), rows) if rows else "<p>None: all settings are the defaults.</p>"
+    return _section("Settings that differ from the defaults", body)
+
+
+def files(run: RecordedRun, note: str) -> str:
+    """What lies beside the page, and what opens it."""
+    there = [(name, words) for name, words in FILES.items() if name == "report.html" or (run.folder / name).is_file()]
+    return _section("Files of the run", _table(("file", "what it is; what opens it"), there) + _quiet(note))
+
+
+def licences(run: RecordedRun) -> str:
+    """Of the program, the data and the prior."""
+    name, prior = str(run.provenance["data"]["name"]), str(run.provenance["prior"]["name"])
+    data = DATA_LICENCES.get(name, f"{name}: see its publisher")
+    is_own = prior.startswith(("simulated", "multiview_stereo"))
+    network = "" if is_own else "; its weights have a licence of their own: docs/priors.md"
+    own = "Licences. Page and program: emgs_jax, Apache-2.0."
+    return f"<p>{own} Data: {escape(data)}. Prior: {escape(prior)}{network}.</p>"
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{escape(title)}</h2>{body}</section>"
+
+
+def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["".join(f'<td class="text">{escape(text)}</td>' for text in row) for row in rows]
+    top = "".join(f'<th class="text">{escape(title)}</th>' for title in titles)
+    return f"<table><tr>{top}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
+
+
+def _quiet(text: str) -> str:
+    return f'<p class="quiet">{escape(text)}</p>' if text else ""
+
+
+def _plain(value: Any) -> str:
+    if value is ...:
+        return "not there"
+    return ", ".join(map(str, value)) if isinstance(value, list) else "none" if value is None else str(value)
+
+
+def frame_facts(line: Mapping[str, Any]) -> str:
+    """Numbers of a frame in one line."""
+    known = {
+        "inliers": lambda v: f"{v:,} inliers",
+        "residual": lambda v: f"residual {100 * v:.1f} % of the depth",
+        "scale": lambda v: f"scale {v:.3f}",
+        "new": lambda v: f"{v:,} new",
+        "num_gaussians": lambda v: f"{v:,} Gaussians",
+        "seconds": lambda v: f"{v:.2f} s",
+    }
+    found = [say(line[name]) for name, say in known.items() if isinstance(line.get(name), int | float)]
+    return " · ".join(found)

@@ -1,0 +1,162 @@
+"""A finished run as its folder tells it, for whoever shows it: checked once, read only."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emgs_jax.features.text import TextEmbeddings, read_text
+from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.io.map_file import load_map
+from emgs_jax.io.trajectory import from_tum, load_trajectory_tum
+from emgs_jax.ops.camera import Camera
+from emgs_jax.report.results import METRICS_FILE, read_metrics
+
+TEXT_FILE = "text.npz"  # classes of a map with features, in the format of `experiments.embed`
+LOOPS_FILE = "loops.json"
+REPORT_FILE = "report.html"
+FRAMES_FILE = "frames.jsonl"
+_POSES = ("raw_pose", "true_pose")
+_OUTCOMES = ("accepted", "known", "unconfirmed", "refused")
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """What a run has written.
+
+    Args:
+        folder: of the run.
+        metrics: of metrics.json.
+        frames: lines of frames.jsonl that have a pose, in order.
+        skipped: the other lines.
+        poses: T_world_camera of `frames`, (n, 4, 4) float64: the final ones.
+        online: the same as they were when the frames were placed; nan before the back end begins, None without one.
+        raw: as the prior alone says.
+        truth: (n, 4, 4), nan where unknown.
+        map: all Gaussians.
+        camera: of the frames.
+        text: classes that the map's features are compared with; None without.
+        loops: lines of loops.json; empty without a back end.
+    """
+
+    folder: Path
+    metrics: dict[str, Any]
+    frames: list[dict[str, Any]]
+    skipped: list[dict[str, Any]]
+    poses: np.ndarray
+    online: np.ndarray | None
+    raw: np.ndarray
+    truth: np.ndarray
+    map: GaussianMap
+    camera: Camera
+    text: TextEmbeddings | None
+    loops: list[dict[str, Any]]
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Where the result comes from."""
+        return self.metrics["provenance"]
+
+    @property
+    def has_truth(self) -> np.ndarray:
+        """Of each frame, bool (n,)."""
+        return np.isfinite(self.truth).all((1, 2))
+
+
+def read_run(folder: Path) -> RecordedRun:
+    """Read the folder of a finished run.
+
+    Raises:
+        ValueError: it is no folder of a finished run of this version; the message names the file and the remedy.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is no folder: give the one that a run wrote, with metrics.json in it")
+    missing = [
+        name for name in (METRICS_FILE, FRAMES_FILE, "trajectory.txt", "map.npz") if not (folder / name).is_file()
+    ]
+    if missing:
+        raise ValueError(f"{folder} holds no finished run: it lacks {', '.join(missing)}; run it to its end")
+    metrics = read_metrics(folder / METRICS_FILE)
+    lines = _lines(folder / FRAMES_FILE)
+    frames = [line for line in lines if line.get("pose") is not None]
+    _, poses = load_trajectory_tum(folder / "trajectory.txt")
+    if len(frames) != len(poses):
+        raise ValueError(
+            f"{folder}: frames.jsonl has {len(frames)} poses and trajectory.txt {len(poses)}: they are of two runs, "
+            "or one was cut off; run again"
+        )
+    raw, truth = (_poses(folder / FRAMES_FILE, frames, name) for name in _POSES)
+    return RecordedRun(
+        folder=folder,
+        metrics=metrics,
+        frames=frames,
+        skipped=[line for line in lines if line.get("pose") is None],
+        poses=poses,
+        online=_online(folder / "trajectory_online.txt", len(poses)),
+        raw=raw,
+        truth=truth,
+        map=load_map(folder / "map.npz"),
+        camera=_camera(folder / METRICS_FILE, metrics),
+        text=read_text(folder / TEXT_FILE) if (folder / TEXT_FILE).is_file() else None,
+        loops=_loops(folder / LOOPS_FILE, len(poses)),
+    )
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    lines = []
+    for number, text in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        try:
+            line = json.loads(text)
+            if not isinstance(line["index"], int) or not isinstance(line["status"], str):
+                raise TypeError("index and status must be a number and a word")
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise ValueError(f"{path}:{number} is no record of a frame ({error!r}): run again") from error
+        lines.append(line)
+    return lines
+
+
+def _poses(path: Path, frames: list[dict[str, Any]], name: str) -> np.ndarray:
+    try:
+        rows = [[np.nan] * 7 if line.get(name) is None else line[name] for line in frames]
+        return from_tum(np.array(rows, np.float64).reshape(len(frames), 7))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: some {name} is not the seven numbers of a pose ({error}): run again") from error
+
+
+def _online(path: Path, count: int) -> np.ndarray | None:
+    if not path.is_file():
+        return None
+    _, placed = load_trajectory_tum(path)
+    if len(placed) > count:
+        raise ValueError(f"{path} has {len(placed)} poses and trajectory.txt {count}: they are of two runs; run again")
+    return np.concatenate([np.full((count - len(placed), 4, 4), np.nan), placed])
+
+
+def _camera(path: Path, metrics: dict[str, Any]) -> Camera:
+    """Of the images in use."""
+    try:
+        known = metrics["provenance"]["data"]["camera"]
+        fx, fy, cx, cy = (float(value) for value in known["intrinsics"])
+        width, height = (int(value) for value in known["size"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path} does not say which camera it was ({error!r}): an older version wrote it, run again"
+        ) from error
+    return Camera((fx, fy), (cx, cy), width, height)
+
+
+def _loops(path: Path, count: int) -> list[dict[str, Any]]:
+    if not path.is_file():
+        return []
+    try:
+        loops = json.loads(path.read_text(encoding="utf-8"))
+        is_sound = all(
+            loop["outcome"] in _OUTCOMES and 0 <= loop["other"] < count and 0 <= loop["frame"] < count for loop in loops
+        )
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path} is no list of loops ({error!r}): run again") from error
+    if not is_sound:
+        raise ValueError(f"{path} names frames or outcomes that this run does not have: run again")
+    return loops

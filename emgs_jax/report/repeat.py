@@ -1,0 +1,120 @@
+"""The command that repeats a run: the words that make its config of conf/."""
+
+import json
+import re
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+from emgs_jax.io.files import flat, jsonable
+from emgs_jax.running.configure import CONF, compose
+
+_PLAIN = re.compile(r"[A-Za-z_][\w./-]*|/[\w./-]*")
+_WORDS = {"null", "none", "true", "false", "nan", "inf", "on", "off", "yes", "no"}
+
+
+class Repeated(NamedTuple):
+    """How a run is done again.
+
+    Args:
+        words: overrides of `emgs run` that compose its config, groups first; a key that conf/ no longer has has a +.
+        differences: key, value and default of each of them; a default that is not there is ...
+    """
+
+    words: list[str]
+    differences: list[tuple[str, Any, Any]]
+
+    @property
+    def command(self) -> str:
+        """The line for a shell."""
+        return shlex.join(["emgs", "run", *self.words])
+
+
+def repeat(settings: Mapping[str, Any]) -> Repeated:
+    """How to repeat the run with these settings, the `config` of a provenance."""
+    settings, options = flat(jsonable(settings)), _options(settings)
+    words = [f"{group}={option}" for group, option, _ in options]
+    differences: list[tuple[str, Any, Any]] = list(options)
+    for follows_another in (False, True):  # what is taken from another key follows that one
+        config = compose(*words)
+        composed, own = _values(config), flat(OmegaConf.to_container(config, resolve=False))
+        for key, value in settings.items():
+            default = composed.get(key, ...)
+            if default != value and (follows_another or not str(own.get(key, "${")).startswith("${")):
+                is_known = OmegaConf.select(config, key, default=...) is not ...
+                words.append(f"{'' if is_known else '+'}{key}={_written(value)}")
+                differences.append((key, value, default))
+    return Repeated(words, differences)
+
+
+def _values(config: DictConfig) -> dict[str, Any]:
+    return flat(jsonable(OmegaConf.to_container(config, resolve=True)))
+
+
+def _options(settings: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Group, option and default of every group with an option nearer than the default; files alone are read."""
+    found = []
+    for group, default in _default_options().items():
+        wanted = flat(_at(settings, group.split("/")))
+        options = {path.stem: _content(path) for path in sorted((CONF / group).glob("*.yaml"))}
+        gaps = {
+            name: sum(made.get(k, ...) != wanted.get(k, ...) for k in {*made, *wanted})
+            for name, made in options.items()
+        }
+        best = min(gaps, key=lambda name: (gaps[name], name != default))
+        if best != default:
+            found.append((group, best, default))
+    return found
+
+
+def _default_options() -> dict[str, str]:
+    """The option of every group that conf/config.yaml names."""
+    lines = [line for line in _read(CONF / "config.yaml")["defaults"] if isinstance(line, dict)]
+    named = {group: option for line in lines for group, option in line.items()}
+    return {group: option for group, option in named.items() if option and (CONF / group).is_dir()}
+
+
+def _at(tree: Mapping[str, Any], path: list[str]) -> Mapping[str, Any]:
+    for name in path:
+        tree = tree.get(name) if isinstance(tree, Mapping) else None
+    return tree if isinstance(tree, Mapping) else {}
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """Values by dotted key of a file of conf/, with those that it inherits from others beside it."""
+    node = _read(path)
+    parents = [path.parent / f"{name}.yaml" for name in node.pop("defaults", []) if isinstance(name, str)]
+    inherited = [_content(parent) for parent in parents if parent.is_file()]
+    return {key: value for part in [*inherited, flat(node)] for key, value in part.items()}
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+
+
+def _written(value: Any) -> str:
+    """A value as Hydra's grammar reads it back."""
+    if isinstance(value, list):
+        return f"[{','.join(_written(item) for item in value)}]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{_written(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, str):
+        is_plain = _PLAIN.fullmatch(value) and value.lower() not in _WORDS
+        return value if is_plain else "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    return json.dumps(value)
+
+
+def check_targets(settings: Any) -> None:
+    """Raise ValueError where settings name a class that conf/ does not: a file from elsewhere must not choose code."""
+    known = {
+        value for path in CONF.rglob("*.yaml") for key, value in flat(_read(path)).items() if key.endswith("_target_")
+    }
+    named = {value for key, value in flat({"": settings}).items() if key.endswith("_target_")}
+    if named - known:
+        raise ValueError(
+            f"metrics.json names {sorted(map(str, named - known))}, which no file of conf/ does: run again"
+        )

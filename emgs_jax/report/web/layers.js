@@ -1,0 +1,70 @@
+// What a Gaussian's colour says: its own colour, class, similarity to a class, normal, and how sure it is.
+"use strict";
+
+// Turbo (A. Mikhailov, 2019) as polynomials; share in [0, 1] to RGB in [0, 255].
+function turbo(share) {
+  const x = Math.min(Math.max(share, 0), 1), v = [1, x, x * x, x ** 3, x ** 4, x ** 5];
+  const of = (c) => 255 * Math.min(Math.max(c.reduce((sum, k, i) => sum + k * v[i], 0), 0), 1);
+  return [of([0.1357, 4.6154, -42.6603, 132.1311, -152.9424, 59.2864]),
+          of([0.0914, 2.1942, 4.8430, -14.1850, 4.2773, 2.8296]),
+          of([0.1067, 12.6419, -60.5820, 110.3628, -89.9031, 27.3482])];
+}
+
+const NO_CLASS = [90, 96, 104];
+
+class Layers {
+  constructor(arrays) {
+    this.arrays = arrays;
+    this.count = arrays.mean.length / 3;
+    this.numClasses = ABOUT.classes.length;
+  }
+
+  // [low, high] of what a layer shows, without the outermost hundredths; null where it has no scale.
+  range(name, word) {
+    const values = this.values(name, word);
+    if (!values) return null;
+    const sorted = Float32Array.from(values).sort();
+    const at = (share) => sorted[Math.round(share * (sorted.length - 1))] || 0;
+    const [low, high] = [at(0.01), at(0.99)];
+    return high > low ? [low, high] : [low, low + 1];
+  }
+
+  values(name, word) {
+    const { arrays, count, numClasses } = this;
+    const similarity = (_, row) => arrays.similarity[row * numClasses + word] / 255;
+    if (name === "similarity") return Float32Array.from({ length: count }, similarity);
+    if (name === "existence") return Float32Array.from(arrays.existence, (value) => value / 255);
+    if (name === "updates") return Float32Array.from(arrays.updates, (value) => Math.log10(1 + value));
+    if (name === "birth") return Float32Array.from(arrays.birth);
+    return null;
+  }
+
+  // RGBA of all Gaussians. word: number of a class, -1 = all. threshold: of a similarity, as a share of its range.
+  paint(name, word, threshold, minExistence) {
+    const { arrays, count } = this;
+    const out = new Uint8Array(4 * count);
+    const range = this.range(name, word), values = this.values(name, word);
+    for (let row = 0; row < count; row++) {
+      const own = arrays.color.subarray(3 * row, 3 * row + 3);
+      let color = own;
+      if (name === "class") {
+        const label = arrays.label[row];
+        color = label < 0 ? NO_CLASS : ABOUT.classColors[label];
+        if (word >= 0 && label !== word) color = faded(own);
+      } else if (name === "normal") {
+        color = [0, 1, 2].map((k) => 127.5 + arrays.normal[3 * row + k]);
+      } else if (values) {
+        const share = (values[row] - range[0]) / (range[1] - range[0]);
+        color = name === "similarity" && share < threshold ? faded(own) : turbo(share);
+      }
+      out.set([color[0], color[1], color[2], arrays.existence[row] >= 255 * minExistence ? 255 : 0], 4 * row);
+    }
+    return out;
+  }
+}
+
+// Grey and dark, so that what is asked for stands out.
+function faded(color) {
+  const grey = 0.25 * (0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]) + 22;
+  return [grey, grey, grey + 6];
+}

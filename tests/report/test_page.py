@@ -1,0 +1,227 @@
+"""report.html as text; oracles: an HTML parser, unpacking by hand, metrics that are known, hostile names."""
+
+import base64
+import hashlib
+import json
+import re
+import zlib
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from written_run import CLASSES, two_walls, written_run
+
+from emgs_jax.report import page
+from emgs_jax.report.page import MAX_BYTES, write_report
+from emgs_jax.report.page_map import COV_UNIT, packed, thinned
+from emgs_jax.report.page_strip import placed_paths
+from emgs_jax.report.page_words import verdict
+from emgs_jax.report.recorded_run import read_run
+from experiments.report import report
+
+HOSTILE = """</script><script>alert(1)</script><img src=x onerror=alert(2)> "'&{head}{about}"""
+
+
+class Elements(HTMLParser):
+    """Elements with their attributes, and the text of scripts by their id."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found, self.scripts, self._script = [], {}, None
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+        self._script = dict(attrs).get("id", "") if tag == "script" else None
+
+    def handle_data(self, data):
+        if self._script is not None:
+            self.scripts[self._script] = self.scripts.get(self._script, "") + data
+
+    def handle_endtag(self, tag):
+        self._script = None
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = written_run(tmp_path_factory.mktemp("run"))
+    write_report(read_run(folder), None)
+    return folder
+
+
+def text_of(folder) -> str:
+    return (folder / "report.html").read_text()
+
+
+def unpacked(elements) -> dict[str, np.ndarray]:
+    """What the page's program makes of its bytes: of each number all first bytes stand before all second ones."""
+    content = zlib.decompress(base64.b64decode(elements.scripts["arrays"]))
+    arrays = {}
+    for about in json.loads(elements.scripts["about"])["arrays"]:
+        kind, shape = np.dtype(about["type"]), (about["columns"], about["rows"])
+        size = kind.itemsize * shape[0] * shape[1]
+        raw = np.frombuffer(content[about["offset"] : about["offset"] + size], np.uint8).reshape(kind.itemsize, -1)
+        arrays[about["name"]] = raw.T.copy().view(kind).reshape(shape).T
+    return arrays
+
+
+def test_the_page_holds_the_map_as_it_is(folder):
+    arrays, walls = unpacked(Elements(text_of(folder))), two_walls()
+    np.testing.assert_array_equal(arrays["mean"], walls.means)
+    upper = np.asarray(walls.covs)[:, *np.triu_indices(3)]
+    np.testing.assert_allclose(arrays["cov"].astype(float) * COV_UNIT, upper, rtol=1e-3)  # float16 has 11 bits
+    np.testing.assert_allclose(arrays["color"] / 255, walls.colors, atol=0.5 / 255)
+    np.testing.assert_array_equal(arrays["normal"], np.tile([0, 0, -127], (len(walls.means), 1)))
+    np.testing.assert_array_equal(arrays["label"][:, 0], np.asarray(walls.features).argmax(1))
+    np.testing.assert_array_equal(arrays["similarity"], 255 * np.asarray(walls.features))
+    np.testing.assert_allclose(arrays["poses"].reshape(6, 3, 4)[:, 0, 3], np.linspace(0, 0.5, 6), atol=1e-6)
+    assert np.isnan(arrays["online"][0]).all() and np.isfinite(arrays["online"][1:]).all()
+
+
+def test_the_page_asks_for_nothing_and_runs_no_script_but_its_own(folder):
+    text = text_of(folder)
+    elements = Elements(text)
+    for tag, attributes in elements.found:
+        assert not any(name.startswith("on") for name in attributes), (tag, attributes)
+        for name in ("src", "href", "action", "data", "poster", "srcset"):
+            assert str(attributes.get(name) or "data:").startswith("data:"), (tag, attributes)
+    assert "http:" not in text.replace("http-equiv", "") and "https:" not in text
+    policy = next(a["content"] for _, a in elements.found if a.get("http-equiv") == "Content-Security-Policy")
+    digest = base64.b64encode(hashlib.sha256(elements.scripts[""].encode()).digest()).decode()
+    assert policy.startswith("default-src 'none'") and policy.endswith(f"script-src 'sha256-{digest}'")
+
+
+def test_hostile_names_stay_text(tmp_path):
+    folder = written_run(tmp_path, sequence=HOSTILE)
+    lines = (folder / "frames.jsonl").read_text().splitlines()
+    first = json.loads(lines[0]) | {"reason": HOSTILE, "status": HOSTILE}
+    (folder / "frames.jsonl").write_text("\n".join([json.dumps(first), *lines[1:]]) + "\n")
+    write_report(read_run(folder), None)
+    elements, plain = Elements(text_of(folder)), written_run(tmp_path / "plain")
+    write_report(read_run(plain), None)
+    tags = [tag for tag, _ in elements.found]
+    assert tags.count("script") == [tag for tag, _ in Elements(text_of(plain)).found].count("script") == 5
+    assert "alert" not in elements.scripts[""]
+    assert json.loads(elements.scripts["about"])["frames"]["reason"][0] == HOSTILE
+    assert not any("onerror" in attributes for _, attributes in elements.found)
+
+
+def test_the_same_run_gives_the_same_bytes(folder, tmp_path):
+    other = written_run(tmp_path)
+    write_report(read_run(other), None)
+    assert (other / "report.html").read_bytes() == (folder / "report.html").read_bytes()
+
+
+def test_without_a_program_the_words_and_curves_are_there(folder):
+    text = re.sub(r"<script.*?</script>", "", text_of(folder), flags=re.DOTALL)
+    assert "SIMULATED" in text
+    assert "The path is off by 1.2 cm" in text and "60 % less than the prior alone (3.0 cm)" in text
+    assert "emgs run" in text and "dataset.stop" in text and "paper/sim3" in text
+    assert "refused: what both show is in a small part of an image" in text and "frames 5 and 0: accepted" in text
+    assert text.count("<svg") == 8 and "map.npz" in text and "Apache-2.0" in text  # statuses, six curves, loops
+
+
+def test_a_large_map_is_thinned_to_the_size_of_a_page_and_the_page_says_so(tmp_path, monkeypatch):
+    folder = written_run(tmp_path)
+    monkeypatch.setattr(page, "_MAP_BYTES", 5_000)
+    write_report(read_run(folder), None)
+    elements = Elements(text_of(folder))
+    shown, whole = len(unpacked(elements)["mean"]), len(two_walls().means)
+    assert len(elements.scripts["arrays"]) <= 5_000 and 0 < shown < whole
+    assert f"The page shows the {shown:,} of {whole:,} Gaussians" in text_of(folder)
+    assert len(text_of(folder).encode()) < MAX_BYTES
+
+
+def test_thinning_keeps_what_most_frames_agree_on_in_its_order():
+    layers = {"updates": np.array([5, 1, 9, 5, 5]), "mean": np.arange(5)}
+    assert list(thinned(layers, 3)["mean"]) == [0, 2, 3]
+    assert list(thinned(layers, 9)["mean"]) == [0, 1, 2, 3, 4]
+
+
+def test_packing_is_undone_by_reading_columns_and_bytes():
+    values = np.array([[1.5, -2.0], [1e-3, 7.0], [0.0, 4e4]], np.float32)
+    about, text = packed({"a": values, "b": np.array([-3, 300], np.int16)})
+    content = zlib.decompress(base64.b64decode(text))
+    assert [(item["name"], item["rows"], item["columns"], item["offset"]) for item in about] == [
+        ("a", 3, 2, 0),
+        ("b", 2, 1, 24),
+    ]
+    first_bytes = np.ascontiguousarray(values.T).view(np.uint8).reshape(-1, 4)[:, 0]
+    assert content[:6] == first_bytes.tobytes() and content[24:] == bytes([0xFD, 0x2C, 0xFF, 0x01])
+
+
+def test_the_true_path_is_placed_on_ours_as_the_error_is_measured(folder):
+    run = read_run(folder)
+    placed = placed_paths(run, with_scale=True)
+    left = np.linalg.norm(placed.truth[:, :3, 3] - run.poses[:, :3, 3], axis=1)
+    assert left.max() < 0.03  # of .05 m that the paths are apart, and .03 m to the side
+    assert placed.errors["ours"].max() < 0.035 and set(placed.errors) == {"ours", "online", "raw"}
+    assert placed.errors["raw"].max() < 1e-6  # its path is the true one, in this run
+
+
+@pytest.mark.parametrize(
+    ("metrics", "level"),
+    [
+        ({}, "good"),
+        ({"trajectory/ate_sim3_m": 0.04}, "bad"),  # worse than the raw prior's 3 cm
+        ({"rendering/depth_within_5_percent": 50.0, "raw_prior/rendering/depth_within_5_percent": 60.0}, "mixed"),
+        ({"rendering/depth_within_5_percent": 70.0, "raw_prior/rendering/depth_within_5_percent": 60.0}, "good"),
+    ],
+)
+def test_the_verdict_compares_with_the_raw_prior(tmp_path, metrics, level):
+    folder = written_run(tmp_path, **metrics)
+    text = (folder / "frames.jsonl").read_text().replace('"degraded"', '"tracked"').replace('"lost"', '"tracked"')
+    (folder / "frames.jsonl").write_text(text)
+    assert verdict(read_run(folder))[0] == level
+
+
+def test_without_truth_only_the_tracking_is_judged(tmp_path):
+    level, words = verdict(read_run(written_run(tmp_path, has_truth=False)))
+    assert level == "bad" and "no ground truth" in words and "(1 degraded, 1 lost)" in words  # a sixth is lost
+    write_report(read_run(tmp_path), None)
+    assert "None: the data set has no ground truth" in text_of(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["metrics.json", "frames.jsonl", "trajectory.txt", "map.npz"])
+def test_a_folder_that_lacks_a_file_is_refused_by_its_name_and_left_as_it_is(tmp_path, name):
+    folder = written_run(tmp_path)
+    (folder / "report.html").write_text("old")
+    (folder / name).unlink()
+    with pytest.raises(ValueError, match=f"holds no finished run: it lacks {name}"):
+        report(folder)
+    assert (folder / "report.html").read_text() == "old"
+
+
+def edited(path, change):
+    path.write_text(change(path.read_text()))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("metrics.json", lambda text: text.replace('"format": 1', '"format": 9'), "another version"),
+        ("metrics.json", lambda text: text[:50], "is not the result of a run"),
+        ("metrics.json", lambda text: text.replace('"intrinsics"', '"other"', 1), "which camera"),
+        ("metrics.json", lambda text: text.replace("emgs_jax.data.synthetic.Synthetic", "os.system"), "os.system"),
+        ("frames.jsonl", lambda text: text + '{"index": 3\n', "frames.jsonl:7 is no record"),
+        ("frames.jsonl", lambda text: "".join(text.splitlines(True)[:-1]), "5 poses and trajectory.txt 6"),
+        ("loops.json", lambda text: text.replace("5", "77"), "loops.json names frames"),
+        ("loops.json", lambda text: text.replace('"accepted"', '"</script>"'), "loops.json names frames"),
+        ("trajectory_online.txt", lambda text: text + 3 * text.splitlines()[-1] + "\n", "expected"),
+    ],
+)
+def test_a_damaged_or_foreign_file_is_named_and_nothing_is_written(tmp_path, name, change, words):
+    folder = written_run(tmp_path)
+    edited(folder / name, change)
+    with pytest.raises(ValueError, match=words):
+        report(folder)
+    assert not (folder / "report.html").exists()
+
+
+def test_text_of_another_run_is_refused(tmp_path):
+    from emgs_jax.features.text import TextEmbeddings, save_text
+
+    folder = written_run(tmp_path)
+    save_text(folder / "text.npz", TextEmbeddings(CLASSES, np.eye(2, 5, dtype=np.float32), (), {}))
+    with pytest.raises(ValueError, match="embeddings of width 5 and map.npz features of width 2"):
+        write_report(read_run(folder), None)
