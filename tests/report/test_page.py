@@ -5,10 +5,12 @@ import hashlib
 import json
 import re
 import zlib
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from hand_run import random_similarity
 from written_run import CLASSES, two_walls, written_run
 
 from emgs_jax.report import page
@@ -157,6 +159,15 @@ def test_the_true_path_is_placed_on_ours_as_the_error_is_measured(folder):
     assert left.max() < 0.03  # of .05 m that the paths are apart, and .03 m to the side
     assert placed.errors["ours"].max() < 0.035 and set(placed.errors) == {"ours", "online", "raw"}
     assert placed.errors["raw"].max() < 1e-6  # its path is the true one, in this run
+
+
+def test_a_true_path_that_is_ours_in_another_frame_and_size_lies_on_ours(folder):
+    run = read_run(folder)
+    similarity = random_similarity(np.random.default_rng(0), 2.5)
+    run = replace(run, truth=similarity.apply_to_poses(run.poses))
+    placed = placed_paths(run, with_scale=True)
+    np.testing.assert_allclose(placed.truth, run.poses, atol=1e-9)  # float64
+    assert placed.errors["ours"].max() < 1e-9
 
 
 @pytest.mark.parametrize(
