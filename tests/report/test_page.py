@@ -104,6 +104,7 @@ def test_hostile_names_stay_text(tmp_path):
     tags = [tag for tag, _ in elements.found]
     assert tags.count("script") == [tag for tag, _ in Elements(text_of(plain)).found].count("script") == 5
     assert "alert" not in elements.scripts[""]
+    assert "<" not in elements.scripts["about"]  # an end of a script may have a space or a slash before its >
     assert json.loads(elements.scripts["about"])["frames"]["reason"][0] == HOSTILE
     assert not any("onerror" in attributes for _, attributes in elements.found)
 
