@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.report.page import write_report
@@ -29,6 +30,8 @@ def images_of(settings: Mapping[str, Any], count: int) -> tuple[ReadableFrames |
     check_targets(settings["dataset"])
     try:
         dataset = build_dataset(OmegaConf.create(dict(settings)))
+    except OmegaConfBaseException as error:  # a key of ours that the settings of older code do not have
+        return None, f"The images are not shown: the run is of another version ({str(error).splitlines()[0]})."
     except (ValueError, OSError) as error:
         return None, f"The images are not shown: {message_of(error)}"
     if len(dataset) != count:

@@ -237,3 +237,11 @@ def test_text_of_another_run_is_refused(tmp_path):
     save_text(folder / "text.npz", TextEmbeddings(CLASSES, np.eye(2, 5, dtype=np.float32), (), {}))
     with pytest.raises(ValueError, match="embeddings of width 5 and map.npz features of width 2"):
         write_report(read_run(folder), None)
+
+
+def test_settings_of_older_code_make_a_page_without_images_that_says_so(tmp_path, capsys):
+    folder = written_run(tmp_path)
+    edited(folder / "metrics.json", lambda text: text.replace('"on_bad_frame"', '"of_older_code"', 1))
+    report(folder)
+    assert "the run is of another version (Missing key on_bad_frame)" in capsys.readouterr().out
+    assert "of another version" in (folder / "report.html").read_text()
