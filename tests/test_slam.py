@@ -93,6 +93,42 @@ def test_two_layers_that_a_look_cannot_tell_apart_become_one(state, camera, sett
     assert found < 0.85 * held and found < held + info.refinement.num_fresh  # the others are out of sight
 
 
+def small_steps(camera, num_frames, slab_frames=()):
+    """Predictions along a fifth of the path's steps; in some a block of the image stands at half its depth."""
+    y, x = np.divmod(np.arange(camera.height * camera.width), camera.width)
+    is_slab = (abs(y - camera.height // 2) < 4) & (abs(x - camera.width // 2) < 6)
+    before = FRAME - 1.0
+    for k in range(num_frames):
+        i = FRAME + 0.2 * k
+        prediction = predict_room(i, camera, num_features=2)
+        views = stack_poses([path_pose(j) for j in (before, i, i + 0.2)])
+        seen = observe_room(path_pose(before), camera, num_features=2)
+        prediction = eqx.tree_at(lambda p: (p.previous, p.T_world_views), prediction, (seen, views))
+        if k in slab_frames:
+            points = jnp.where(is_slab[:, None], 0.5 * prediction.current.points, prediction.current.points)
+            prediction = eqx.tree_at(lambda p: p.current.points, prediction, points)
+        before = i
+        yield prediction
+
+
+def test_a_slab_that_two_frames_show_is_gone_within_twenty_and_the_wall_behind_it_stays(state, camera, settings):
+    """Beside the same steps without it. Gaussians of this room stand some 20 cm apart, the slab a metre before it."""
+
+    def means_of(state):
+        return np.asarray(state.map.gaussians.means)[np.asarray(state.map.gaussians.valid)]
+
+    clean, state_with, counts = state, state, []
+    for prediction in small_steps(camera, 22):
+        clean, _ = step(clean, prediction, FULL, settings)
+    for prediction in small_steps(camera, 22, slab_frames=(0, 1)):
+        state_with, info = step(state_with, prediction, FULL, settings)
+        assert info.localization.is_tracked
+        apart = np.linalg.norm(means_of(state_with)[:, None] - means_of(clean), axis=-1)
+        counts.append(int((apart.min(1) > 0.4).sum()))
+    assert counts[1] >= 5 and counts[-1] == 0
+    assert (apart.min(0) < 0.25).mean() >= 0.99
+
+
 def test_candidates_come_from_the_points_that_em_left_over(stepped):
     """One for every eighth of them, λ of this config."""
     _, info = stepped
