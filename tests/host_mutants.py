@@ -1657,8 +1657,8 @@ MUTANTS = (
     Mutant("emgs_jax/io/g2o.py", "[ids[name] for name in names]", "names", G2O, "names of vertices for their rows"),
     Mutant(
         "emgs_jax/io/trajectory.py",
-        "Rotation.from_quat(rows[:, 4:])",
-        "Rotation.from_quat(rows[:, [7, 4, 5, 6]])",
+        "Rotation.from_quat(values[is_finite, 3:])",
+        "Rotation.from_quat(values[is_finite][:, [6, 3, 4, 5]])",
         TRAJECTORY_FILE,
         "quaternions with w first are read",
     ),

@@ -66,6 +66,7 @@ KEYS = {
     *(
         "time/seconds_per_frame",
         "map/num_gaussians",
+        "map/double_wall_percent",
         "map/num_tentative",
         "map/capacity",
         "memory/peak_mb",
