@@ -32,11 +32,12 @@ def outputs(folder: Path) -> list[Path]:
 
 
 def digest(folder: Path) -> dict[str, str]:
-    """Digest of each output by name; of the log and the metrics without times, of the picture that it is there."""
+    """Digest of each output by name; of the log and the metrics without times, of what shows those that it is there."""
     read = {
         "frames.jsonl": lambda path: json.dumps(log_lines(folder)).encode(),
         "metrics.json": lambda path: json.dumps(metrics(folder), sort_keys=True).encode(),
         "overview.png": lambda path: b"",
+        "report.html": lambda path: b"",
     }
     contents = {path.name: read.get(path.name, Path.read_bytes)(path) for path in outputs(folder)}
     return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
@@ -51,6 +52,11 @@ def _picture(path: Path) -> None:
     reason = damage(path.read_bytes())
     if reason is not None:
         raise ValueError(reason)
+
+
+def _page(path: Path) -> None:
+    if not path.read_text(encoding="utf-8").rstrip().endswith("</html>"):
+        raise ValueError("it has no end")
 
 
 def _arrays(path: Path) -> None:
@@ -68,6 +74,10 @@ READERS: dict[str, Callable[[Path], object]] = {
     "points.ply": read_vertices,
     "mesh.ply": read_vertices,
     "overview.png": _picture,
+    "report.html": _page,
+    "loops.json": lambda path: json.loads(path.read_text()),
+    "places.npz": _arrays,
+    "text.npz": _arrays,
     "checkpoint.npz": _arrays,
 }
 
