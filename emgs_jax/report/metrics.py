@@ -36,7 +36,7 @@ from emgs_jax.running.back_end import counts
 from emgs_jax.running.clock import Clock, peak_memory_mb
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
 from emgs_jax.running.gathering import Baselines, RawPrior
-from emgs_jax.running.record import FrameRecord, MappingRun, with_truth
+from emgs_jax.running.record import FrameRecord, MappingRun, row_of_first_node, with_truth
 from emgs_jax.running.untracked import longest_row
 
 Metrics = dict[str, Any]
@@ -220,7 +220,7 @@ def score_back_end(run: MappingRun) -> Metrics:
     if run.back_end is None:
         return {}
     end, online = run.back_end, run.back_end.online[run.back_end.first :]
-    before = [record.pose for record in run.records[: len(run.records) - len(online)]]
+    before = [record.pose for record in run.records[: row_of_first_node(run)]]
     poses = with_truth(run, np.stack([*before, *online])) if online else None
     causal = {} if poses is None else trajectory_metrics(*poses)
     causal = {key.replace("trajectory/", "trajectory_online/"): x for key, x in causal.items()}
@@ -236,7 +236,7 @@ def _loops(run: MappingRun) -> tuple[list[tuple[int, int, np.ndarray]], list[np.
     unit = (None if compared is None else trajectory_metrics(*compared)["trajectory/scale"]) or 1.0
     loops = [(loop.a, loop.b, rescaled(loop.Z_a_b, unit * np.exp(end.log_scales[loop.a]))) for loop in end.accepted]
     of_saved: list[np.ndarray | None] = [None] * end.first
-    return loops, of_saved + run.true_poses[len(run.records) - len(end.poses) + end.first :]
+    return loops, of_saved + run.true_poses[row_of_first_node(run) :]
 
 
 def spent(clock: Clock) -> Metrics:

@@ -21,7 +21,7 @@ from emgs_jax.running.back_end import loop_list, metric_graph
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.places import save_places
-from emgs_jax.running.record import MappingRun
+from emgs_jax.running.record import MappingRun, row_of_first_node
 
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (
@@ -106,6 +106,6 @@ def _moved(run: MappingRun) -> tuple[np.ndarray | None, np.ndarray | None, tuple
     end = run.back_end
     if end is None or not end.accepted:
         return truth, None, ()
-    shift = len(run.records) - len(end.poses)  # from a node to the row of its record
+    shift = row_of_first_node(run) - end.first  # from a node to the row of its record
     loops = tuple((shift + loop.a, shift + loop.b) for loop in end.accepted if min(loop.a, loop.b) >= end.first)
     return truth, np.stack(end.online[end.first :]), loops

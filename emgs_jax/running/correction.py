@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from emgs_jax.running.inputs import Input
 from emgs_jax.running.measuring import Look
-from emgs_jax.running.record import FOUND, PLACED, MappingRun
+from emgs_jax.running.record import FOUND, PLACED, MappingRun, row_of_first_node
 
 
 def correct(run: MappingRun, given: Input) -> None:
@@ -51,6 +51,5 @@ def finish(run: MappingRun) -> None:
 
 def _take_poses(run: MappingRun) -> None:
     """The back end's poses into the records of its frames, which are the last ones."""
-    poses = run.back_end.poses[run.back_end.first :]
-    first = len(run.records) - len(poses)
+    poses, first = run.back_end.poses[run.back_end.first :], row_of_first_node(run)
     run.records[first:] = [replace(record, pose=pose) for record, pose in zip(run.records[first:], poses, strict=True)]

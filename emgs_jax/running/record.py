@@ -245,6 +245,11 @@ def _described(info: StepInfo) -> dict[str, Any]:
     }
 
 
+def row_of_first_node(run: MappingRun) -> int:
+    """The record of the first frame that the back end has as a node of this run; it has all later ones, too."""
+    return len(run.records) - (len(run.back_end.poses) - run.back_end.first)
+
+
 def nowhere(run: MappingRun) -> str:
     """That no frame was found in the saved map, and why."""
     counts = Counter(record.location for record in run.records if record.location is not None)
