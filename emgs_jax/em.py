@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
-from emgs_jax.gaussians import Gaussians, has_feature
+from emgs_jax.gaussians import Gaussians, has_feature, mean_features
 from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import (
     Entries,
@@ -145,12 +145,13 @@ def _explain(
     ray, normals = (jnp.unstack(vectors[:, None], axis=-1) for vectors in (config.noise * noise, points.normals))
     distance_sq, log_growth = widened_distance_sq(gather_entries(triangles, rows), offsets, ray)
     normal_cos = dot(gather_entries(gaussians.normals, rows), normals)
-    # Features are unit vectors, so their product is the cosine; without one of them the term must vanish.
+    # Without one of the features the term must vanish.
     feature_gap = 0.0
     if gaussians.features.shape[-1]:
         feature = jnp.unstack(points.features[:, None], axis=-1)
-        both = has_feature(points.features)[:, None] & has_feature(gaussians.features)[rows]
-        feature_gap = jnp.where(both, dot(gather_entries(gaussians.features, rows), feature) - 1.0, 0.0)
+        meaning = safe_normalize(gaussians.features)
+        both = has_feature(points.features)[:, None] & has_feature(meaning)[rows]
+        feature_gap = jnp.where(both, dot(gather_entries(meaning, rows), feature) - 1.0, 0.0)
     log_det_term = -config.determinant_weight * (logdets[rows] + log_growth)
     log_joint = -0.5 * distance_sq + log_det_term
     log_joint += config.normal_weight * (normal_cos - 1.0) + config.feature_weight * feature_gap
@@ -198,7 +199,8 @@ def m_step(
 ) -> tuple[Gaussians, Float[Array, "n"]]:
     """Responsibility-weighted mean, covariance about it, normal and colour of the points of every Gaussian.
 
-    A point counts r_ik times its weight, see `precision`.
+    A point counts r_ik times its weight, see `precision`. Its feature, which may be wide, counts only for the Gaussian
+    that explains it best.
 
     Returns:
         The new parameters (the old ones where no point is), and the total responsibility Σ_i r_ik.
@@ -213,13 +215,14 @@ def m_step(
     second = jnp.zeros((total.shape[0], 3, 3)).at[:, rows, columns].set(mean[:, 3:9])
     second = second.at[:, columns, rows].set(mean[:, 3:9])
     new = eqx.tree_at(
-        lambda g: (g.means, g.covs, g.normals, g.colors),
+        lambda g: (g.means, g.covs, g.normals, g.colors, g.features),
         gaussians,
         (
             gaussians.means + mean[:, :3],
             second - outer(mean[:, :3]) + config.min_std**2 * jnp.eye(3),
             safe_normalize(mean[:, 9:12]),
             mean[:, 12:],
+            mean_features(points.features, owners(step, total.shape[0])[:, None], weights[:, None], total.shape[0]),
         ),
     )
     return where_rows(has_points, new, gaussians), jnp.where(has_points, total, 0.0)

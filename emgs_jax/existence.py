@@ -15,7 +15,7 @@ from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.linalg import inverse_3x3, mahalanobis_sq, outer
 from emgs_jax.ops.neighbours import knn
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import static, take_rows, traced, where_rows
+from emgs_jax.ops.pytree import choice, static, take_rows, traced, where_rows
 
 
 class ExistenceConfig(eqx.Module):
@@ -33,6 +33,7 @@ class ExistenceConfig(eqx.Module):
         num_neighbours: nearest seen Gaussians among which another layer of the same surface is looked for.
         max_mahalanobis_sq: between two layers, the look's noise along the normal included; 0 joins none, as printed.
         min_normal_cos: between their normals.
+        feature: whether features stay or are averaged, as in the EM step (R16).
     """
 
     birth: Float[Array, "*b"] = traced(low=-1e6)
@@ -45,6 +46,7 @@ class ExistenceConfig(eqx.Module):
     num_neighbours: int = static(low=1, high=256)
     max_mahalanobis_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
     min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
+    feature: Float[Array, "*b"] = choice("medoid", "mean")
 
 
 def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -> Float[Array, "2 p"]:
@@ -130,7 +132,7 @@ def join_layers(
     old, other, rows = map.gaussians, take_rows(map, partner), jnp.arange(partner.shape[0])
     is_heavier = (map.weight > other.weight) | ((map.weight == other.weight) & (rows < partner))
     share = other.weight / jnp.maximum(map.weight + other.weight, jnp.finfo(jnp.float32).tiny)
-    mean = blend(old, other.gaussians, share, jnp.zeros(()))
+    mean = blend(old, other.gaussians, share, jnp.zeros(()), config.feature)
     difference = other.gaussians.means - old.means
     along = difference - _inner(difference, mean.normals)[:, None] * mean.normals
     spread = (share * (1.0 - share))[:, None, None] * outer(along)

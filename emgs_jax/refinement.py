@@ -9,7 +9,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
-from emgs_jax.gaussians import Gaussians, has_feature
+from emgs_jax.gaussians import Gaussians, has_feature, mean_features
 from emgs_jax.ops.camera import Camera, nearest_pixel
 from emgs_jax.ops.linalg import inverse_2x2, mahalanobis_sq, outer, safe_normalize
 from emgs_jax.ops.neighbours import knn
@@ -113,7 +113,8 @@ def merge_weights(
     some = found | ~jnp.any(found, axis=-1, keepdims=True)  # a softmax over nothing would be NaN
     omega = jax.nn.softmax(-0.5 * distance_sq, axis=-1, where=some)
     if old.features.shape[-1]:
-        cosine = jnp.einsum("gkf,gf->gk", old.features[rows], candidates.features)
+        mapped, fresh = (safe_normalize(g.features) for g in (old, candidates))
+        cosine = jnp.einsum("gkf,gf->gk", mapped[rows], fresh)
         both = has_feature(candidates.features)[:, None] & has_feature(old.features)[rows]
         omega = omega * jnp.where(both, jnp.maximum(cosine, 0.0), 1.0)  # opposite meanings do not merge
     is_match = found & (candidates.valid & on_surface)[:, None] & (distance_sq < config.max_mahalanobis_sq_2d)
@@ -139,13 +140,14 @@ def average_candidates(
     around = offsets - mean_offset[rows]
     covs = total(share[..., None, None] * (candidates.covs[:, None] + outer(around)))
     averaged = eqx.tree_at(
-        lambda g: (g.means, g.covs, g.colors, g.normals),
+        lambda g: (g.means, g.covs, g.colors, g.normals, g.features),
         old,
         (
             old.means + mean_offset,
             covs,
             total(share[..., None] * candidates.colors[:, None]),
             safe_normalize(total(share[..., None] * candidates.normals[:, None])),
+            mean_features(candidates.features, rows, weights, size),
         ),
     )
     return where_rows(sums > 0, averaged, old)

@@ -13,7 +13,16 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog
 from emgs_jax.prior.base import Prior
-from emgs_jax.report.metrics import describe, new_scorer, score_back_end, score_baselines, score_map, score_prior, spent
+from emgs_jax.report.metrics import (
+    compared_text,
+    describe,
+    new_scorer,
+    score_back_end,
+    score_baselines,
+    score_map,
+    score_prior,
+    spent,
+)
 from emgs_jax.report.page import write_report
 from emgs_jax.report.printout import frame_lines, last_words
 from emgs_jax.report.provenance import print_metrics_table, provenance, signature, write_metrics
@@ -99,7 +108,11 @@ def _map(
         try:
             with session.clock.phase("raw_prior"):
                 return gather(
-                    map_frames(session, dataset, prior, keeper), evaluation, dataset.has_ground_truth, baselines
+                    map_frames(session, dataset, prior, keeper),
+                    evaluation,
+                    dataset.has_ground_truth,
+                    baselines,
+                    compared_text(dataset, prior),
                 )
         except BaseException:
             with contextlib.suppress(OSError, ValueError):  # the first error is the one to show

@@ -22,7 +22,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.io.files import remove_temporaries
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.recorded import Recorded, record
-from emgs_jax.report.metrics import Metrics, Scorer, new_scorer, score_settings
+from emgs_jax.report.metrics import Metrics, Scorer, compared_text, new_scorer, score_settings
 from emgs_jax.report.provenance import provenance
 from emgs_jax.report.sweeps import SweepResults, draw, table, write_csv
 from emgs_jax.running.clock import Clock
@@ -147,7 +147,8 @@ def _bar(dataset: ReadableFrames, chunks: Sequence[Sequence[Variant]]) -> tqdm:
 def _map_and_score(work: Work, chunk: Sequence[Variant], bar: tqdm) -> list[Metrics]:
     runs = [new_run(work.dataset, variant.slam, work.clock, lambda record: bar.update()) for variant in chunk]
     views = map_together(runs, work.dataset, work.prior, work.at_once, work.num_threads)
-    raw = gather(views, work.scorer.evaluation, work.dataset.has_ground_truth)
+    text = compared_text(work.dataset, work.scorer.prior)
+    raw = gather(views, work.scorer.evaluation, work.dataset.has_ground_truth, text=text)
     densify = [variant.densify for variant in chunk]
     return score_settings(runs, raw, densify, work.scorer, work.num_threads)
 

@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int32
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
 from emgs_jax.data.intrinsics import ALTERNATIVES, Given, find_lens, pictures_of
+from emgs_jax.data.labels import LabelFolder, as_unknown
 from emgs_jax.data.reading import Intrinsics, Number
 
 LAYOUT = "root/SEQUENCE/{rgb.txt, depth.txt, groundtruth.txt, rgb/, depth/}"
@@ -46,10 +47,12 @@ class Tum:
         distortion: k1, k2, p1, p2, k3 that goes with four numbers of `intrinsics`; None = what those say themselves.
         depth_scale: raw units per metre.
         max_time_difference: seconds between a colour image and its depth image or pose.
+        labels: folder in the sequence with the true classes of every image, see `LabelFolder`; None = there are none.
+        classes: file in the sequence that names them.
+        unknown: their ids that mean no class.
     """
 
     name = "tum"
-    classes: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -63,6 +66,9 @@ class Tum:
         distortion: Sequence[Number] | None = None,
         depth_scale: Number = 5000.0,
         max_time_difference: Number = 0.02,
+        labels: str | None = None,
+        classes: str = "classes.txt",
+        unknown: Sequence[int] = (0,),
     ) -> None:
         self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
         times, names, _ = read_list(self._folder / "rgb.txt", 2)
@@ -81,6 +87,11 @@ class Tum:
         self._lens = find_lens(given, pictures_of(self._images, self._raw_size))
         self.calibration = self._lens.about
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
+        self._labels = None
+        if labels is not None:
+            ids = as_unknown(unknown, "dataset.unknown")
+            self._labels = LabelFolder(self._folder / labels, self._folder / classes, ids)
+        self.classes = () if self._labels is None else self._labels.names
 
     def _associate(self, tolerance: float) -> tuple[list[Path | None] | None, list[list[str] | None] | None]:
         """Per image in use the depth file and the words of the pose nearest in time; None where there is no list."""
@@ -111,7 +122,17 @@ class Tum:
                 raw = reading.read_depth(self._depths[index], self._depth_scale, self._raw_size)
                 depth = reading.resize_nearest(self._lens.straighten_depth(raw), self.size)
         image = reading.resize_color(self._lens.straighten(image), self.size)
-        return Frame(index, float(self._times[index]), str(path), image, depth, self.pose(index))
+        return Frame(
+            index, float(self._times[index]), str(path), image, depth, self.pose(index), self._classes_of(path)
+        )
+
+    def _classes_of(self, image: Path) -> Int32[np.ndarray, "h w"] | None:
+        if self._labels is None:
+            return None
+        ids = self._labels.read(image, self._raw_size)
+        # Beyond a straight image's border there is no class; the lens fills with 0, which here would be a class.
+        straight = self._lens.straighten_depth((ids + 1).astype(np.float32)).astype(np.int32) - 1
+        return reading.resize_nearest(straight, self.size)
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
         words = None if self._poses is None else self._poses[index]
@@ -122,7 +143,8 @@ class Tum:
     def files(self, index: int) -> list[Path]:
         lists = [self._folder / name for name in ("rgb.txt", "depth.txt", "groundtruth.txt")]
         depth = None if self._depths is None else self._depths[index]
-        return [self._images[index], *([] if depth is None else [depth]), *lists]
+        labels = [] if self._labels is None else [self._labels.path(self._images[index]), self._labels.classes]
+        return [self._images[index], *([] if depth is None else [depth]), *labels, *lists]
 
     def fingerprint(self) -> str:
         options = {
@@ -133,7 +155,7 @@ class Tum:
             "depth_scale": self._depth_scale,
             "depths": [p and p.name for p in self._depths or ()],
             "poses": self._poses,
-        }
+        } | ({} if self._labels is None else {"classes": self.classes})
         return reading.fingerprint(self._folder, reading.all_files(self), options)
 
 

@@ -1,12 +1,13 @@
-"""How well depth and colours that are rendered from the poses of a run agree with its frames."""
+"""How well depth, colours and classes that are rendered from the poses of a run agree with its frames."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
+from emgs_jax.evaluation.segmentation import confusion_matrix, segmentation_metrics
 from emgs_jax.evaluation.trajectory import align_poses
 
 _TOLERANCE = 0.05  # of the true depth; it is in the name of the metric
@@ -22,6 +23,7 @@ class ViewScore:
         depth_l1: mean absolute error of the depth, m; None where nothing is covered.
         squared_error: of the colours, RGB in [0, 1], summed over the covered pixels and channels.
         num_colors: how many numbers that are; 0 where no colours were rendered.
+        confusion: of the pixels whose true class is known, see `segmentation`; None where no classes are compared.
     """
 
     coverage: float
@@ -29,6 +31,7 @@ class ViewScore:
     depth_l1: float | None = None
     squared_error: float = 0.0
     num_colors: int = 0
+    confusion: np.ndarray | None = None
 
 
 class Rendered:
@@ -38,17 +41,33 @@ class Rendered:
         dataset: with the images and the true depth.
         poses: of the estimate and the true ones (n, 4, 4), for the scale; None: nothing is compared.
         config: the protocol.
+        has_classes: each view comes with the classes of its pixels.
     """
 
-    def __init__(self, dataset: Dataset, poses: tuple[np.ndarray, np.ndarray] | None, config: EvaluationConfig) -> None:
+    def __init__(
+        self,
+        dataset: Dataset,
+        poses: tuple[np.ndarray, np.ndarray] | None,
+        config: EvaluationConfig,
+        has_classes: bool = False,
+    ) -> None:
         self._dataset, self._max_depth = dataset, config.max_depth_m
+        self._num_classes = len(dataset.classes) if has_classes else 0
         self._scale = depth_scale(poses, config) if poses is not None and dataset.has_ground_truth else None
         self._scores: dict[int, ViewScore | None] = {}
 
-    def add(self, row: int, depth: np.ndarray | None, colors: np.ndarray | None) -> None:
-        """Add a frame of the data set; the rest as for `score_view`."""
-        if self._scale is not None:
-            self._scores[row] = score_view(self._dataset[row], depth, colors, self._scale, self._max_depth)
+    def add(
+        self, row: int, depth: np.ndarray | None, colors: np.ndarray | None, labels: np.ndarray | None = None
+    ) -> None:
+        """Add a frame of the data set, `labels` being the class of each pixel, -1 = none; the rest as `score_view`."""
+        if self._scale is None:
+            return
+        frame = self._dataset[row]
+        score = score_view(frame, depth, colors, self._scale, self._max_depth)
+        if score is not None and self._num_classes and frame.labels is not None:
+            labels = np.full(frame.labels.shape, -1) if labels is None else labels
+            score = replace(score, confusion=confusion_matrix(frame.labels, labels, self._num_classes))
+        self._scores[row] = score
 
     def metrics(self) -> dict[str, float | int | None]:
         """`rendering_metrics` of the data set, where frames that were not added are lost; empty without truth."""
@@ -101,13 +120,16 @@ def rendering_metrics(views: Iterable[ViewScore | None]) -> dict[str, float | in
     A lost frame counts as covered nowhere. `rendering/depth_within_5_percent` is a share of all pixels with true depth,
     so a pixel that was not rendered counts as not within; `rendering/depth_l1_m` is about the rendered ones only, and
     frames without any are left out of its mean. The PSNR is that of the mean squared error over the covered pixels of
-    all frames together.
+    all frames together. Classes are counted over the pixels of all frames whose true class is known; a pixel without an
+    answer is wrong.
     """
     views = [view for view in views if view is not None]
     errors = [view.depth_l1 for view in views if view.depth_l1 is not None]
     num_colors, squares = sum(view.num_colors for view in views), sum(view.squared_error for view in views)
     coverage = [100.0 * view.coverage for view in views]
     psnr = 10.0 * np.log10(num_colors / max(squares, 1e-12 * num_colors)) if num_colors else None
+    counts = [view.confusion for view in views if view.confusion is not None]
+    labels = segmentation_metrics(np.sum(counts, axis=0)) if counts else {}
     return {
         "rendering/coverage_percent": float(np.mean(coverage)) if views else None,
         "rendering/worst_coverage_percent": min(coverage, default=None),
@@ -115,4 +137,6 @@ def rendering_metrics(views: Iterable[ViewScore | None]) -> dict[str, float | in
         "rendering/depth_within_5_percent": 100.0 * float(np.mean([v.within for v in views])) if views else None,
         "rendering/psnr_db": None if psnr is None else float(psnr),
         "rendering/num_frames": len(views),
+        "rendering/label_accuracy_percent": labels.get("segmentation/accuracy_percent"),
+        "rendering/label_miou_percent": labels.get("segmentation/miou_percent"),
     }

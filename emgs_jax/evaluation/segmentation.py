@@ -13,6 +13,8 @@ from scipy.spatial import cKDTree
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 
+_MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
+
 
 @dataclass(frozen=True)
 class LabelledPoints:
@@ -49,12 +51,58 @@ def true_labels(cells: Sequence[np.ndarray], dataset: Dataset, voxel: float) -> 
 
 def compare_labels(found: LabelledPoints, truth: LabelledPoints, num_neighbours: int) -> dict[str, float | int | None]:
     """Segmentation metrics of points in the frame of the truth; classes are the same where their names are."""
-    number = {name: position for position, name in enumerate(truth.classes)}
-    # A class that the truth does not know is a wrong answer, not a missing one: it takes part in the vote.
-    positions = np.array([number.get(name, len(number)) for name in found.classes], np.int64)
-    labels = np.where(found.labels >= 0, positions[found.labels], -1)
+    labels = translate(found.labels, found.classes, truth.classes)
     predicted = transfer_labels(found.points, labels, truth.points, num_neighbours)
     return segmentation_metrics(confusion_matrix(truth.labels, predicted, len(truth.classes)))
+
+
+def translate(labels: np.ndarray, classes: Sequence[str], others: Sequence[str]) -> np.ndarray:
+    """Labels of `classes` as positions in `others`, where names are the same; -1 stays.
+
+    A class that the others do not have becomes their number, an answer that is wrong and not one that is missing.
+    """
+    number = {name: position for position, name in enumerate(others)}
+    positions = np.array([number.get(name, len(number)) for name in classes] + [-1], np.int64)
+    return positions[np.where(labels >= 0, labels, -1)]
+
+
+def nearest_classes(features: np.ndarray, text_features: np.ndarray) -> np.ndarray:
+    """Class whose embedding (c, f) is nearest to each feature (…, f) by angle; -1 for a feature of zero."""
+    length = np.linalg.norm(text_features, axis=1, keepdims=True)
+    scores = features.astype(np.float32) @ (text_features / np.maximum(length, 1e-12)).T.astype(np.float32)
+    return np.where(features.any(-1), scores.argmax(-1), -1)
+
+
+class LabelGrid:
+    """Counts which classes are seen in each voxel [m] of the world, once a view."""
+
+    def __init__(self, voxel: float) -> None:
+        self._voxel = voxel
+        self._rows = [np.empty((0, 5), np.int64)]  # cell, class, number of views; the first is what was merged
+
+    def add(self, points: np.ndarray, labels: np.ndarray) -> None:
+        """Add a view: points (n, 3) and their classes (n,); what has none or is not finite is left out."""
+        known = (labels >= 0) & np.isfinite(points).all(-1)
+        cells = np.floor(points[known] / self._voxel).astype(np.int64)
+        rows = _distinct(np.column_stack([cells, labels[known]]))
+        self._rows.append(np.column_stack([rows, np.ones(len(rows), np.int64)]))
+        if sum(map(len, self._rows[1:])) > max(_MERGE_ROWS, len(self._rows[0])):
+            self._rows = [self._merged()]
+
+    def points(self, classes: Sequence[str]) -> LabelledPoints:
+        """The centre of every voxel with the class of most views; of equally frequent ones the first."""
+        rows = self._merged()
+        rows = rows[np.lexsort((rows[:, 3], -rows[:, 4], *rows.T[:3]))]
+        is_first = np.append(True, (np.diff(rows[:, :3], axis=0) != 0).any(1))[: len(rows)]
+        return LabelledPoints((rows[is_first, :3] + 0.5) * self._voxel, rows[is_first, 3], tuple(classes))
+
+    def _merged(self) -> np.ndarray:
+        rows = np.concatenate(self._rows)
+        if not len(rows):
+            return rows
+        rows = rows[np.lexsort(rows.T[:4])]
+        begins = np.flatnonzero(np.append(True, (np.diff(rows[:, :4], axis=0) != 0).any(1)))
+        return np.column_stack([rows[begins, :4], np.add.reduceat(rows[:, 4], begins)])
 
 
 def transfer_labels(points: np.ndarray, labels: np.ndarray, targets: np.ndarray, num_neighbours: int) -> np.ndarray:

@@ -4,6 +4,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.features.text import TextEmbeddings
 
 
@@ -22,6 +23,10 @@ class FeatureModel(Protocol):
         """Embed the names with the text encoder."""
         ...
 
-    def extract(self, image: np.ndarray) -> np.ndarray:
-        """Return unit features (y, x, f), float16, of a grid of cells that cover the RGB `image` (h, w, 3), uint8."""
+    def check(self, dataset: Dataset) -> None:
+        """Raise ValueError where it cannot describe the frames of the data set."""
+        ...
+
+    def extract(self, frame: Frame) -> np.ndarray:
+        """Return features (y, x, f), float16, unit or zero, of a grid of cells that cover the frame's image."""
         ...

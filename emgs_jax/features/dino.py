@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.features.checkpoint import BACKBONE, DinoFiles, digest, load_part, require
 from emgs_jax.features.dinotxt import text_tower, vision_head
 from emgs_jax.features.images import ImageConfig, grid_size, network_input
@@ -107,10 +108,14 @@ class DinoText:
             tuple(names), average_over_templates(names, self._templates, encode), self._templates, self.identity
         )
 
-    def extract(self, image: np.ndarray) -> np.ndarray:
+    def check(self, dataset: Dataset) -> None:
+        """Any data set will do: all that is needed are its images."""
+
+    def extract(self, frame: Frame) -> np.ndarray:
         """Return the unit tokens of the vision head, float16 (rows, columns, f): one cell per patch."""
         import torch
 
+        image = frame.image
         backbone, head = self._vision
         patch = int(backbone.config.patch_size)
         columns, rows = grid_size(image.shape[1::-1], patch, self._image.long_side)

@@ -6,6 +6,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.features.text import TextEmbeddings, average_over_templates, check_templates, load_text, random_embeddings
 
 
@@ -48,8 +49,12 @@ class RandomFeatures:
             )
         return TextEmbeddings(tuple(names), vectors, self._templates, self.identity)
 
-    def extract(self, image: np.ndarray) -> np.ndarray:
+    def check(self, dataset: Dataset) -> None:
+        """Any data set will do: all that is needed are its images."""
+
+    def extract(self, frame: Frame) -> np.ndarray:
         """Return the unit projection of (r, g, b, 1) of each cell's mean colour in [0, 1], float16 (y, x, f)."""
+        image = frame.image
         height, width = image.shape[:2]
         cells = max(round(width / self._cell), 1), max(round(height / self._cell), 1)
         colors = cv2.resize(image.astype(np.float32) / np.float32(255), cells, interpolation=cv2.INTER_AREA)

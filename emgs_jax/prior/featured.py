@@ -22,7 +22,7 @@ class Featured(Prior):
     def __init__(self, prior: Prior, model: FeatureModel) -> None:
         self._prior, self._model = prior, model
         self.is_sequential = prior.is_sequential
-        self._known: list[tuple[np.ndarray, np.ndarray]] = []  # (image, features) of the window before
+        self._known: list[tuple[Frame, np.ndarray]] = []  # features of the window before
         features = {**model.settings, "model": model.identity}  # before the text: names all missing files
         self.feature_names, self.text_features = model.text.names, model.text.vectors
         features |= {"templates": [*model.text.templates]}
@@ -34,8 +34,9 @@ class Featured(Prior):
         )
 
     def check(self, dataset: Dataset, window_size: int) -> None:
-        """Raise ValueError where the prior cannot answer for the data set."""
+        """Raise ValueError where prior or model cannot answer for the data set."""
         self._prior.check(dataset, window_size)
+        self._model.check(dataset)
 
     def report(self) -> dict[str, float]:
         """What the prior measured of itself, if it does."""
@@ -44,16 +45,17 @@ class Featured(Prior):
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Predict geometry, and describe the dense images; an image of the window before is not described again."""
         prediction = self._prior.predict(window, frames, intrinsics)
-        images = {frame.index: frame.image for frame in frames}
-        known = [(images[index], self._features(images[index])) for index in window.dense]
+        by_index = {frame.index: frame for frame in frames}
+        known = [(by_index[index], self._features(by_index[index])) for index in window.dense]
         self._known = known
         return replace(prediction, features=np.stack([features for _, features in known]))
 
-    def _features(self, image: np.ndarray) -> np.ndarray:
+    def _features(self, frame: Frame) -> np.ndarray:
         for known, features in self._known:
-            if known is image or np.array_equal(known, image):
+            is_same = known.image is frame.image or np.array_equal(known.image, frame.image)
+            if known.name == frame.name and is_same:
                 return features
-        return self._model.extract(image)
+        return self._model.extract(frame)
 
 
 class Requeried(Prior):

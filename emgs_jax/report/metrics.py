@@ -24,7 +24,7 @@ from emgs_jax.evaluation.reconstruction import (
     reference,
 )
 from emgs_jax.evaluation.rendering import Rendered
-from emgs_jax.evaluation.segmentation import LabelledPoints, compare_labels, label_cells, true_labels
+from emgs_jax.evaluation.segmentation import LabelledPoints, compare_labels, label_cells, translate, true_labels
 from emgs_jax.evaluation.trajectory import trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
@@ -35,7 +35,7 @@ from emgs_jax.report.provenance import RAW_PRIOR, prefixed
 from emgs_jax.running.back_end import counts
 from emgs_jax.running.clock import Clock, peak_memory_mb
 from emgs_jax.running.dense import center_cloud, dense_map, label_centers
-from emgs_jax.running.gathering import Baselines, RawPrior
+from emgs_jax.running.gathering import Baselines, RawPrior, Text
 from emgs_jax.running.record import FrameRecord, MappingRun, row_of_first_node, with_truth
 from emgs_jax.running.untracked import longest_row
 
@@ -64,10 +64,15 @@ class Scorer:
 
 def new_scorer(dataset: ReadableFrames, evaluation: EvaluationConfig, prior: Prior) -> Scorer:
     """Read the truth of a data set, each frame once."""
-    cells: list[np.ndarray] | None = [] if dataset.classes and prior.feature_names else None
+    cells: list[np.ndarray] | None = None if compared_text(dataset, prior) is None else []
     truth = true_cloud(dataset, evaluation, cells)
     labels = None if cells is None else true_labels(cells, dataset, evaluation.voxel_m)
     return Scorer(dataset, evaluation, truth, labels, prior)
+
+
+def compared_text(dataset: ReadableFrames, prior: Prior) -> Text | None:
+    """The prior's classes where the data set has true ones to compare them with."""
+    return (tuple(prior.feature_names), prior.text_features) if dataset.classes and prior.feature_names else None
 
 
 def true_cloud(dataset: ReadableFrames, config: EvaluationConfig, cells: list[np.ndarray] | None = None) -> Reference:
@@ -125,15 +130,33 @@ def score_cloud(cloud: PointCloud, poses: tuple[np.ndarray, np.ndarray], scorer:
 
 
 def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
-    """Trajectory, reconstruction and rendering metrics of the raw prior, whose rendering is its depth of each frame."""
+    """Trajectory, reconstruction, rendering and segmentation metrics of the raw prior.
+
+    Its rendering is what it says of each frame; its segmentation is that of its points with the classes that most
+    frames see there.
+    """
     poses = with_truth(run, run.raw_poses)
     if poses is None:
         return {}
-    rendered = Rendered(scorer.dataset, poses, scorer.evaluation)
+    rendered = Rendered(scorer.dataset, poses, scorer.evaluation, has_classes=raw.classes is not None)
     for row in range(len(raw.depths)):
-        rendered.add(row, raw.depths[row], None)
+        rendered.add(row, raw.depths[row], None, _own_classes(raw, row, scorer))
     metrics = trajectory_metrics(*poses) | score_cloud(raw.cloud, poses, scorer) | rendered.metrics()
+    if raw.labels is not None and scorer.labels is not None:
+        nothing = np.zeros_like(raw.labels.points)
+        aligned, _ = align_cloud(
+            PointCloud(raw.labels.points, nothing, nothing), scorer.truth, poses, scorer.evaluation
+        )
+        labels = replace(raw.labels, points=aligned.points)
+        metrics |= compare_labels(labels, scorer.labels, scorer.evaluation.label_neighbours)
     return prefixed(metrics, RAW_PRIOR)
+
+
+def _own_classes(raw: RawPrior, row: int, scorer: Scorer) -> np.ndarray | None:
+    """What the prior itself says of the pixels of a frame, as positions in the data set's classes."""
+    if raw.classes is None:
+        return None
+    return translate(raw.classes[row], scorer.prior.feature_names, scorer.dataset.classes)
 
 
 def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer: Scorer) -> Metrics:
@@ -180,8 +203,8 @@ def score_settings(
         counts = {k: v for k, v in describe(run, scorer.dataset).items() if not k.startswith("time/")}
         if all(pose is None for pose in run.true_poses):
             return counts
-        dense = dense_map(run, scorer.dataset, config, scorer.evaluation, num_pictures=0)
         labels = label_centers(run, scorer.prior)
+        dense = dense_map(run, scorer.dataset, config, scorer.evaluation, labels, num_pictures=0)
         return score_map(run, dense.cloud, center_cloud(run), labels, scorer) | dense.rendering | counts
 
     with ThreadPoolExecutor(num_threads) as threads:

@@ -135,9 +135,9 @@ def _online(path: Path, count: int) -> np.ndarray | None:
 
 
 def _camera(path: Path, metrics: dict[str, Any]) -> Camera:
-    """Of the images in use."""
+    """Of the frames as they were used."""
     try:
-        known = metrics["provenance"]["data"]["camera"]
+        known = metrics["provenance"]["data"]["frames"]
         fx, fy, cx, cy = (float(value) for value in known["intrinsics"])
         width, height = (int(value) for value in known["size"])
     except (KeyError, TypeError, ValueError) as error:

@@ -235,6 +235,8 @@ def attach_features(config: DictConfig, dataset: ReadableFrames, prior: Prior) -
     features = config.features
     if "_target_" not in features:
         return prior if features.text is None else Requeried(prior, features.text)
+    if "classes" not in features:  # the model's own
+        return Featured(prior, build(config, "features"))
     classes = features.classes
     if classes is None:  # all names of the file, or the data set's
         classes = dataset.classes if features.text is None else ()

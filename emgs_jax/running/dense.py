@@ -14,7 +14,7 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.evaluation.rendering import Rendered
-from emgs_jax.evaluation.segmentation import LabelledPoints, transfer_labels
+from emgs_jax.evaluation.segmentation import LabelledPoints, transfer_labels, translate
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
@@ -63,13 +63,17 @@ def dense_map(
     known = [row for row, record in enumerate(run.records) if record.status != "lost"]
     shown = {known[int(i)] for i in np.linspace(0, len(known) - 1, num_pictures)} if known else set()
     pictures: list[dict[str, Any]] = []
-    rendered = Rendered(dataset, with_truth(run, run.poses), evaluation)
+    compares_classes = centers is not None and bool(dataset.classes)
+    rendered = Rendered(dataset, with_truth(run, run.poses), evaluation, compares_classes)
 
     def clouds() -> Iterator[PointCloud]:
         for row, view in zip(known, _drawn_ahead(run, known, config), strict=True):
-            if row in shown:
-                pictures.append(_picture(run, dataset, row, view) | _label_image(view, centers))
-            rendered.add(row, np.where(view.valid, view.depth, 0.0), view.colors)
+            is_shown = row in shown
+            labels = _label_image(view, centers) if is_shown or compares_classes else None
+            if is_shown:
+                pictures.append(_picture(run, dataset, row, view) | ({} if labels is None else {"labels": labels}))
+            found = translate(labels, centers.classes, dataset.classes) if compares_classes else None
+            rendered.add(row, np.where(view.valid, view.depth, 0.0), view.colors, found)
             yield PointCloud(
                 *(rows[view.valid].astype(np.float64) for rows in (view.points, view.normals, view.colors))
             )
@@ -130,10 +134,10 @@ def _labelled(centers: LabelledPoints, points: np.ndarray) -> LabelledPoints:
     return LabelledPoints(points, transfer_labels(centers.points, centers.labels, points, 1), centers.classes)
 
 
-def _label_image(view: Any, centers: LabelledPoints | None) -> dict[str, np.ndarray]:
-    """Class of each pixel (h, w), -1 = none."""
+def _label_image(view: Any, centers: LabelledPoints | None) -> np.ndarray | None:
+    """Class of each pixel (h, w), -1 = none; None without classes."""
     if centers is None:
-        return {}
+        return None
     labels = np.full(view.valid.shape, -1)
     labels[view.valid] = _labelled(centers, view.points[view.valid]).labels
-    return {"labels": labels}
+    return labels

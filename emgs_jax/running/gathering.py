@@ -6,12 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from emgs_jax.data.base import Dataset
+from emgs_jax.data.reading import resize_nearest
 from emgs_jax.evaluation.baselines import BaselineConfig, Fusion, Pinhole, View
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, posed
+from emgs_jax.evaluation.segmentation import LabelGrid, LabelledPoints, nearest_classes
 from emgs_jax.io.spool import Spool
 from emgs_jax.running.inputs import RawView
 from emgs_jax.running.record import MappingRun
+
+Text = tuple[tuple[str, ...], np.ndarray]  # names of classes and their embeddings (c, f)
 
 
 @dataclass(frozen=True)
@@ -21,10 +25,14 @@ class RawPrior:
     Args:
         cloud: its points at its poses, averaged per voxel.
         depths: camera-space z of each frame (h, w), in the prior's own lengths; 0 where it says none.
+        classes: of each frame's pixels (h, w), as positions in the prior's names, -1 = none; None without classes.
+        labels: its points, averaged likewise, with the class that most frames see there; None without classes.
     """
 
     cloud: PointCloud
     depths: Spool
+    classes: Spool | None = None
+    labels: LabelledPoints | None = None
 
 
 class Baselines:
@@ -58,19 +66,37 @@ class Baselines:
 
 
 def gather(
-    views: Iterable[RawView], evaluation: EvaluationConfig, keeps_depths: bool, baselines: Baselines | None = None
+    views: Iterable[RawView],
+    evaluation: EvaluationConfig,
+    keeps_depths: bool,
+    baselines: Baselines | None = None,
+    text: Text | None = None,
 ) -> RawPrior:
-    """Take all views of a sequence, one after the other; depths are of use where the truth is known."""
-    depths = Spool()
+    """Take all views of a sequence, one after the other.
+
+    Args:
+        views: of all frames.
+        evaluation: points of one of its voxels are averaged.
+        keeps_depths: the truth is known.
+        baselines: that take the views, too.
+        text: names of the classes that the views are asked for, and their embeddings; None: they are not.
+    """
+    depths, classes, grid = Spool(), Spool(), LabelGrid(evaluation.voxel_m)
 
     def clouds() -> Iterator[PointCloud]:
-        for row, (points, mask, image, pose) in enumerate(views):
+        for row, (points, mask, image, pose, features) in enumerate(views):
             depth = np.where(mask & np.isfinite(points[..., 2]), points[..., 2], 0.0).astype(np.float32)
             cloud = camera_cloud(points, mask, image, evaluation)
             if keeps_depths:
                 depths.append(depth)
+            if text is not None:
+                labels = resize_nearest(nearest_classes(features, text[1]).astype(np.int32), depth.shape[::-1])
+                classes.append(labels)
+                seen = mask & (labels >= 0)
+                grid.add(points[seen] @ pose[:3, :3].T + pose[:3, 3], labels[seen])
             if baselines is not None:
                 baselines.add(row, View(depth, image, cloud), pose)
             yield posed(cloud, pose)
 
-    return RawPrior(fuse_clouds(clouds(), evaluation.voxel_m), depths)
+    cloud = fuse_clouds(clouds(), evaluation.voxel_m)
+    return RawPrior(cloud, depths) if text is None else RawPrior(cloud, depths, classes, grid.points(text[0]))

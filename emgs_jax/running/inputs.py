@@ -24,6 +24,7 @@ class RawView(NamedTuple):
     mask: np.ndarray
     image: np.ndarray
     T_world_camera: np.ndarray  # the frame's before where the prior says none
+    features: np.ndarray  # (y, x, f), a grid that covers the image
 
 
 @dataclass(frozen=True)
@@ -148,6 +149,7 @@ def _raw_views(
         mask = prediction.mask[row] & (prediction.confidence[row] >= float(config.observation.min_confidence))
         if not np.isfinite(pose).all():
             pose, mask = pose_before, np.zeros_like(mask)
-        views[index] = RawView(prediction.points[row], mask, frames[index].image, pose)
+        image, features = frames[index].image, prediction.features[row]
+        views[index] = RawView(prediction.points[row], mask, image, pose, features)
         pose_before = pose
     return views

@@ -11,6 +11,7 @@ transformers = pytest.importorskip("transformers", reason="the backbone is one o
 from safetensors.torch import load_file, save_file  # noqa: E402
 from tiny_dino import DIM, NUM_HEADS, NUM_TOKENS, dinov2, dinov3, random_text_encoder, write_checkpoint  # noqa: E402
 
+from emgs_jax.data.base import Frame  # noqa: E402
 from emgs_jax.features.base import FeatureModel  # noqa: E402
 from emgs_jax.features.dino import DinoText, patch_grid  # noqa: E402
 from emgs_jax.features.dinotxt import text_tower, vision_head  # noqa: E402
@@ -20,6 +21,10 @@ from emgs_jax.features.tokens import Tokenizer  # noqa: E402
 
 KINDS = {"dinov3_text": (dinov3, True, 16), "dinov2_text": (dinov2, False, 14)}
 MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
+
+
+def as_frame(image):
+    return Frame(0, 0.0, "", image)
 
 
 @pytest.fixture(params=KINDS)
@@ -64,7 +69,7 @@ def local(model):
 def test_a_patch_is_the_cell_of_its_row_and_column(tmp_path, kind):
     model = local(make(tmp_path, kind))
     assert isinstance(model, FeatureModel)
-    plain, marked = (model.extract(image) for image in images())
+    plain, marked = (model.extract(as_frame(image)) for image in images())
     differs = np.zeros((3, 5), bool)
     differs[1, 3] = True
     np.testing.assert_array_equal((plain != marked).any(axis=-1), differs)
@@ -80,7 +85,7 @@ def test_features_are_the_unit_tokens_of_the_head_on_the_backbones(tmp_path, kin
         assert states.shape[1] == 1 + 4 + 15  # class token, registers, patches
         expected = vision_head(states, head, NUM_HEADS)[0, 5:].reshape(3, 5, DIM)
     expected = torch.nn.functional.normalize(expected, dim=-1)
-    features = model.extract(image)
+    features = model.extract(as_frame(image))
     assert features.dtype == np.float16
     np.testing.assert_allclose(features, expected.numpy(), atol=1e-3)  # float16
 
@@ -154,18 +159,18 @@ def test_damaged_and_foreign_weights_are_refused(tmp_path):
     head = (tmp_path / "head.pth").read_bytes()
     (tmp_path / "head.pth").write_bytes(head[: len(head) // 2])
     with pytest.raises(ValueError, match="head.pth is no file of weights, or damaged"):
-        model.extract(images()[0])
+        model.extract(as_frame(images()[0]))
     (tmp_path / "head.pth").write_bytes((tmp_path / "text.pth").read_bytes())
     with pytest.raises(ValueError, match="head.pth has no visual_model.head.ln_final.weight"):
-        model.extract(images()[0])
+        model.extract(as_frame(images()[0]))
     (tmp_path / "head.pth").write_bytes(head)
     weights = (tmp_path / "model.safetensors").read_bytes()
     (tmp_path / "model.safetensors").write_bytes(weights[: len(weights) // 2])
     with pytest.raises(ValueError, match="holds no backbone that can be read .*: fetch config.json .*, from the tests"):
-        model.extract(images()[0])
+        model.extract(as_frame(images()[0]))
     dinov2(dim=8).save_pretrained(tmp_path, safe_serialization=True)
     with pytest.raises(ValueError, match="is for a backbone of width 16, the one in .* has 8"):
-        model.extract(images()[0])
+        model.extract(as_frame(images()[0]))
 
 
 def test_a_backbone_whose_weights_are_not_exactly_its_own_is_refused_with_the_names(tmp_path):
@@ -175,10 +180,10 @@ def test_a_backbone_whose_weights_are_not_exactly_its_own_is_refused_with_the_na
     name = sorted(tensors)[3]
     save_file({key: value for key, value in tensors.items() if key != name}, path, {"format": "pt"})
     with pytest.raises(ValueError, match=rf"model.safetensors does not fit .*config.json, 1 missing \({name}\): fetch"):
-        model.extract(images()[0])
+        model.extract(as_frame(images()[0]))
     save_file(tensors | {"encoder.more": torch.zeros(2)}, path, {"format": "pt"})
     with pytest.raises(ValueError, match=r"1 that it does not have \(encoder.more\)"):
-        model.extract(images()[0])
+        model.extract(as_frame(images()[0]))
 
 
 def test_a_backbone_without_registers_is_refused(tmp_path):
@@ -188,7 +193,7 @@ def test_a_backbone_without_registers_is_refused(tmp_path):
     )
     transformers.Dinov2Model(config).save_pretrained(tmp_path, safe_serialization=True)
     with pytest.raises(ValueError, match="is for a backbone with 4 registers, the one in .* has 0: take the backbone"):
-        model.extract(images()[0])
+        model.extract(as_frame(images()[0]))
 
 
 def test_a_package_of_another_pytorch_is_named_instead_of_the_files(tmp_path, monkeypatch):
@@ -204,7 +209,7 @@ def test_a_package_of_another_pytorch_is_named_instead_of_the_files(tmp_path, mo
 
     monkeypatch.setattr(transformers.AutoModel, "from_pretrained", fail)
     with pytest.raises(ValueError, match=r"torchaudio .*does not fit torch .*libcudart.*pip uninstall torchaudio"):
-        model.extract(images()[0])
+        model.extract(as_frame(images()[0]))
 
 
 def test_a_cpu_that_nobody_asked_for_is_mentioned(tmp_path, monkeypatch, capsys):
@@ -225,7 +230,7 @@ def test_weights_that_would_run_code_are_refused(tmp_path):
 
     torch.save({"ln_final.weight": Runs()}, tmp_path / "head.pth")
     with pytest.raises(ValueError, match="head.pth is no file of weights"):
-        model.extract(images()[0])
+        model.extract(as_frame(images()[0]))
     assert not (tmp_path / "ran").exists()
 
 
@@ -241,4 +246,4 @@ def test_a_gpu_without_memory_says_what_to_lower(tmp_path):
     with pytest.raises(
         ValueError, match="no memory for 5x3 patches: lower features.image.long_side=80 or set features"
     ):
-        model.extract(images()[0])
+        model.extract(as_frame(images()[0]))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from emgs_jax.data.base import Frame
 from emgs_jax.features.base import FeatureModel
 from emgs_jax.features.random import RandomFeatures
 from emgs_jax.features.text import random_embeddings
@@ -16,15 +17,15 @@ def make(seed=0, templates=("{}",), **changes):
 def test_a_cell_is_the_unit_projection_of_its_mean_colour():
     rng = np.random.default_rng(1)
     image = rng.integers(0, 256, (24, 32, 3), np.uint8)
-    features = make(seed=4).extract(image)
+    features = make(seed=4).extract(Frame(0, 0.0, "", image))
     colors = image.reshape(3, 8, 4, 8, 3).mean(axis=(1, 3)) / 255
     weights = np.random.default_rng(4).standard_normal((6, 4))
     expected = np.concatenate([colors, np.ones((3, 4, 1))], axis=-1) @ weights.T
     expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
     assert features.dtype == np.float16
     np.testing.assert_allclose(features, expected, atol=1e-3)  # float16
-    assert features.tobytes() == make(seed=4).extract(image).tobytes()
-    assert features.tobytes() != make(seed=5).extract(image).tobytes()
+    assert features.tobytes() == make(seed=4).extract(Frame(0, 0.0, "", image)).tobytes()
+    assert features.tobytes() != make(seed=5).extract(Frame(0, 0.0, "", image)).tobytes()
 
 
 def test_an_embedding_is_the_mean_of_its_prompts():

@@ -18,9 +18,9 @@ WINDOW_SIZE = 3
 class Counting(RandomFeatures):
     num_images = 0
 
-    def extract(self, image):
+    def extract(self, frame):
         self.num_images += 1
-        return super().extract(image)
+        return super().extract(frame)
 
 
 def make_model(seed=0, classes=("wall", "box"), text=None):
@@ -51,8 +51,8 @@ def test_geometry_is_bit_identical_and_features_are_the_models(textured):
     for got, expected in zip(predictions(prior, textured), predictions(plain, textured), strict=True):
         for name in ("T_anchor_view", "points", "confidence", "mask"):
             assert getattr(got, name).tobytes() == getattr(expected, name).tobytes(), name
-        images = [textured[index].image for index in got.window.dense]
-        np.testing.assert_array_equal(got.features, np.stack([RandomFeatures.extract(model, i) for i in images]))
+        frames = [textured[index] for index in got.window.dense]
+        np.testing.assert_array_equal(got.features, np.stack([RandomFeatures.extract(model, f) for f in frames]))
         assert got.features.shape[1:] == (6, 8, 8) and got.features.dtype == np.float16
 
 
@@ -69,7 +69,7 @@ def test_another_image_of_the_same_number_is_described_anew(textured):
     first, second = (replace(textured[index], index=0) for index in (0, 1))
     prior.predict(window, [first], textured.intrinsics)
     features = prior.predict(window, [second], textured.intrinsics).features[0]
-    np.testing.assert_array_equal(features, model.extract(second.image))
+    np.testing.assert_array_equal(features, model.extract(second))
 
 
 def test_provenance_tells_the_geometry_and_the_features():

@@ -1,0 +1,121 @@
+"""Features from the class images of any segmentation network: each class has a direction of its own."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from emgs_jax.data import reading
+from emgs_jax.data.base import BadFrameError, Dataset, Frame
+from emgs_jax.data.labels import LabelFolder, as_unknown
+from emgs_jax.features.text import TextEmbeddings, read_text
+
+
+class LabelFeatures:
+    """Reads what a segmenter said of each image (implements `FeatureModel`).
+
+    A pixel's feature is the vector of its class, or where there are scores the mean of all classes' vectors under them,
+    unit length again. Without a file of embeddings each class has an axis of its own: all are equally far apart, and
+    their mean over many views holds the shares of the views.
+
+    Args:
+        folder: STEM.png with class ids (see `LabelFolder`), or STEM.npy with scores (h, w, classes), at least 0, in
+            the order of `names`, for every image STEM.* of the data set.
+        names: file of the classes.
+        unknown: ids that mean no class.
+        text: file of `experiments.embed` with the names' embeddings; None = the axes.
+    """
+
+    def __init__(self, folder: str, names: str, unknown: Sequence[int] = (0,), text: str | None = None) -> None:
+        ids = as_unknown(unknown, "features.unknown")
+        self._labels = LabelFolder(Path(folder).expanduser(), Path(names).expanduser(), ids)
+        self._names_file, self._file = names, text
+        self.settings = {"folder": Path(folder).name, "unknown": [*ids]}
+
+    @property
+    def identity(self) -> dict:
+        return self.text.model
+
+    @cached_property
+    def text(self) -> TextEmbeddings:
+        names = self._labels.names
+        if self._file is None:
+            model = {"name": "labels", "version": 1, "classes": [*names]}
+            return TextEmbeddings(names, np.eye(len(names), dtype=np.float32), (), model)
+        found = read_text(self._file)
+        rows = {name: row for row, name in enumerate(found.names)}
+        missing = [name for name in names if name not in rows]
+        if missing:
+            raise ValueError(
+                f"features.text={self._file} has no embedding of {missing[:5]} of {self._names_file}: write it with "
+                "`python -m experiments.embed` for these names"
+            )
+        return TextEmbeddings(names, found.vectors[[rows[name] for name in names]], found.templates, found.model)
+
+    def embed(self, names: tuple[str, ...]) -> TextEmbeddings:
+        """The vectors of classes of `names`; raises ValueError where one is none of them."""
+        unknown = [name for name in names if name not in self.text.names]
+        if unknown:
+            raise ValueError(f"{unknown} are no classes of {self._names_file}, which has {', '.join(self.text.names)}")
+        rows = [self.text.names.index(name) for name in names]
+        return TextEmbeddings(tuple(names), self.text.vectors[rows], self.text.templates, self.text.model)
+
+    def check(self, dataset: Dataset) -> None:
+        """Raise ValueError where a frame has no file, or the images are no longer those that were segmented."""
+        images = [str(files[0]) for i in range(len(dataset)) if (files := dataset.files(i))]
+        missing = [name for name in images if not self._file_of(name).is_file()]
+        if missing:
+            raise ValueError(
+                f"{self._file_of(missing[0])} does not exist, nor do those of {len(missing)} of {len(dataset)} images: "
+                "features.folder must hold a class image (PNG) or scores (.npy) of the name of every image in use"
+            )
+        if any(dataset.calibration.get("distortion") or ()):
+            raise ValueError(
+                f"{dataset.name} straightens its images, and the classes of {self._labels.folder} are of the distorted "
+                "ones: straighten both beforehand and give the intrinsics of the straight ones"
+            )
+
+    def extract(self, frame: Frame) -> np.ndarray:
+        """Features (h, w, f), float16, at the frame's size; zero where there is no class."""
+        path = self._file_of(frame.name)
+        vectors, size = self.text.vectors, frame.image.shape[1::-1]
+        if path.suffix == ".npy":
+            scores = _read_scores(path, len(vectors))
+            _check_shape(scores.shape[1::-1], size, path)
+            features = cv2.resize(scores, size, interpolation=cv2.INTER_AREA).reshape(*size[::-1], -1) @ vectors
+            features /= np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-12)
+            return features.astype(np.float16)
+        labels = self._labels.read(frame.name)
+        _check_shape(labels.shape[::-1], size, path)
+        labels = reading.resize_nearest(labels, size)
+        return np.vstack([vectors, np.zeros_like(vectors[:1])]).astype(np.float16)[labels]
+
+    def _file_of(self, image: str) -> Path:
+        scores = self._labels.folder / f"{Path(image).stem}.npy"
+        return scores if scores.is_file() else self._labels.path(image)
+
+
+def _check_shape(found: tuple[int, int], size: tuple[int, int], path: Path) -> None:
+    """BadFrameError where labels are not of the shape of the image; half a pixel of a smaller side may be cut."""
+    (w, h), (width, height) = found, size
+    if abs(w * height - h * width) > max(w, h, width, height):
+        raise BadFrameError(
+            f"{path} is {w}x{h}, which is not of the shape of the {width}x{height} frame: give whole ones"
+        )
+
+
+def _read_scores(path: Path, num_classes: int) -> np.ndarray:
+    try:
+        scores = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise BadFrameError(f"{path} is no array of scores, or damaged ({error}): write it again") from error
+    if scores.ndim != 3 or scores.shape[2] != num_classes or scores.dtype.kind not in "fiu":
+        raise BadFrameError(
+            f"{path} must hold scores (h, w, {num_classes}), one a class, got {scores.dtype} {scores.shape}"
+        )
+    scores = scores.astype(np.float32)
+    if not (np.isfinite(scores).all() and (scores >= 0).all()):
+        raise BadFrameError(f"{path} has scores that are negative or not finite: give probabilities")
+    return scores
