@@ -31,9 +31,10 @@ from emgs_jax.report.run_files import claim_folder, save_classes, save_outputs, 
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import baseline_configs, build, build_dataset, build_prior, graph_config
-from emgs_jax.running.dense import center_cloud, dense_map, label_centers
+from emgs_jax.running.dense import center_cloud, dense_map
 from emgs_jax.running.drive import map_frames, show_records
 from emgs_jax.running.gathering import Baselines, RawPrior, gather
+from emgs_jax.running.labelling import labelled_map
 from emgs_jax.running.places import load_saved
 from emgs_jax.running.record import FrameRecord, MappingRun, new_run, to_line
 
@@ -63,15 +64,14 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         raw = _map(session, dataset, prior, (baselines, evaluation), folder, keeper)
         save_progress(folder, session)
         with clock.phase("densify"):
-            labels = label_centers(session, prior)
-            dense = dense_map(session, dataset, densify, evaluation, labels)
+            dense = dense_map(session, dataset, densify, evaluation, labelled_map(session, prior))
         with clock.phase("export"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
             notes = save_outputs(folder, session, dense, densify, title)
             save_classes(folder, prior)
         with clock.phase("evaluate"):
             scorer = new_scorer(dataset, evaluation, prior)
-            metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
+            metrics = score_map(session, dense.cloud, center_cloud(session), dense.labels, scorer)
             metrics |= dense.rendering | score_prior(session, raw, scorer)
             metrics |= score_baselines(session, baselines, raw, scorer)
         metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()

@@ -34,8 +34,9 @@ from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.provenance import RAW_PRIOR, prefixed
 from emgs_jax.running.back_end import counts
 from emgs_jax.running.clock import Clock, peak_memory_mb
-from emgs_jax.running.dense import center_cloud, dense_map, label_centers
+from emgs_jax.running.dense import center_cloud, dense_map
 from emgs_jax.running.gathering import Baselines, RawPrior, Text
+from emgs_jax.running.labelling import labelled_map
 from emgs_jax.running.record import FrameRecord, MappingRun, row_of_first_node, with_truth
 from emgs_jax.running.untracked import longest_row
 
@@ -100,7 +101,7 @@ def score_map(
         run: finished.
         dense: the map, densified.
         centers: the Gaussians' means.
-        labels: of the centres, row by row.
+        labels: of the dense map's points.
         scorer: the truth.
     """
     poses, truth, config = with_truth(run, run.poses), scorer.truth, scorer.evaluation
@@ -112,9 +113,7 @@ def score_map(
     aligned, note = align_cloud(centers, truth, poses, config)
     found = reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
     metrics |= _renamed(found, "reconstruction_centers/")
-    if labels is not None and scorer.labels is not None:
-        metrics |= compare_labels(replace(labels, points=aligned.points), scorer.labels, config.label_neighbours)
-    return metrics
+    return metrics | _score_labels(labels, poses, scorer)
 
 
 def score_cloud(cloud: PointCloud, poses: tuple[np.ndarray, np.ndarray], scorer: Scorer) -> Metrics:
@@ -142,14 +141,17 @@ def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
     for row in range(len(raw.depths)):
         rendered.add(row, raw.depths[row], None, _own_classes(raw, row, scorer))
     metrics = trajectory_metrics(*poses) | score_cloud(raw.cloud, poses, scorer) | rendered.metrics()
-    if raw.labels is not None and scorer.labels is not None:
-        nothing = np.zeros_like(raw.labels.points)
-        aligned, _ = align_cloud(
-            PointCloud(raw.labels.points, nothing, nothing), scorer.truth, poses, scorer.evaluation
-        )
-        labels = replace(raw.labels, points=aligned.points)
-        metrics |= compare_labels(labels, scorer.labels, scorer.evaluation.label_neighbours)
+    metrics |= _score_labels(raw.labels, poses, scorer)
     return prefixed(metrics, RAW_PRIOR)
+
+
+def _score_labels(labels: LabelledPoints | None, poses: tuple[np.ndarray, np.ndarray], scorer: Scorer) -> Metrics:
+    """Segmentation metrics of points with classes, aligned like the cloud; empty without classes."""
+    if labels is None or scorer.labels is None:
+        return {}
+    nothing = np.zeros_like(labels.points)
+    aligned, _ = align_cloud(PointCloud(labels.points, nothing, nothing), scorer.truth, poses, scorer.evaluation)
+    return compare_labels(replace(labels, points=aligned.points), scorer.labels, scorer.evaluation.label_neighbours)
 
 
 def _own_classes(raw: RawPrior, row: int, scorer: Scorer) -> np.ndarray | None:
@@ -203,9 +205,9 @@ def score_settings(
         counts = {k: v for k, v in describe(run, scorer.dataset).items() if not k.startswith("time/")}
         if all(pose is None for pose in run.true_poses):
             return counts
-        labels = label_centers(run, scorer.prior)
-        dense = dense_map(run, scorer.dataset, config, scorer.evaluation, labels, num_pictures=0)
-        return score_map(run, dense.cloud, center_cloud(run), labels, scorer) | dense.rendering | counts
+        labelled = labelled_map(run, scorer.prior)
+        dense = dense_map(run, scorer.dataset, config, scorer.evaluation, labelled, num_pictures=0)
+        return score_map(run, dense.cloud, center_cloud(run), dense.labels, scorer) | dense.rendering | counts
 
     with ThreadPoolExecutor(num_threads) as threads:
         shared = threads.submit(score_prior, runs[0], raw, scorer)

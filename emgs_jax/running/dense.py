@@ -6,7 +6,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
@@ -14,13 +13,12 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.evaluation.rendering import Rendered
-from emgs_jax.evaluation.segmentation import LabelledPoints, transfer_labels, translate
+from emgs_jax.evaluation.segmentation import LabelledPoints, translate
 from emgs_jax.gaussian_map import confirmed
-from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.running.convert import to_se3
+from emgs_jax.running.labelling import LabelledMap
 from emgs_jax.running.record import MappingRun, with_truth
-from emgs_jax.semantics import classify
 
 _densify = eqx.filter_jit(densify)
 
@@ -47,7 +45,7 @@ def dense_map(
     dataset: Dataset,
     config: DensifyConfig,
     evaluation: EvaluationConfig,
-    centers: LabelledPoints | None = None,
+    labelled: LabelledMap | None = None,
     num_pictures: int = 4,
 ) -> DenseMap:
     """Render the map from the pose of every frame that is not lost.
@@ -57,29 +55,30 @@ def dense_map(
         dataset: for the images in the pictures, and the truth.
         config: what becomes a point.
         evaluation: points of one of its voxels are averaged, and views are compared with the truth under it.
-        centers: of the `label_centers`, whose nearest one labels a point.
+        labelled: `labelled_map` of the run, which says the class of each point.
         num_pictures: frames that are shown, evenly spread.
     """
     known = [row for row, record in enumerate(run.records) if record.status != "lost"]
     shown = {known[int(i)] for i in np.linspace(0, len(known) - 1, num_pictures)} if known else set()
     pictures: list[dict[str, Any]] = []
-    compares_classes = centers is not None and bool(dataset.classes)
+    compares_classes = labelled is not None and bool(dataset.classes)
     rendered = Rendered(dataset, with_truth(run, run.poses), evaluation, compares_classes)
 
     def clouds() -> Iterator[PointCloud]:
         for row, view in zip(known, _drawn_ahead(run, known, config), strict=True):
             is_shown = row in shown
-            labels = _label_image(view, centers) if is_shown or compares_classes else None
+            labels = _label_image(view, labelled) if is_shown or compares_classes else None
             if is_shown:
                 pictures.append(_picture(run, dataset, row, view) | ({} if labels is None else {"labels": labels}))
-            found = translate(labels, centers.classes, dataset.classes) if compares_classes else None
+            found = translate(labels, labelled.classes, dataset.classes) if compares_classes else None
             rendered.add(row, np.where(view.valid, view.depth, 0.0), view.colors, found)
             yield PointCloud(
                 *(rows[view.valid].astype(np.float64) for rows in (view.points, view.normals, view.colors))
             )
 
     cloud = fuse_clouds(clouds(), evaluation.voxel_m)
-    labels = None if centers is None else _labelled(centers, cloud.points)
+    points = cloud.points
+    labels = None if labelled is None else LabelledPoints(points, labelled.classes_of(points), labelled.classes)
     return DenseMap(cloud, labels, pictures, rendered.metrics())
 
 
@@ -106,20 +105,6 @@ def center_cloud(run: MappingRun) -> PointCloud:
     return PointCloud(*(values[gaussians.valid].astype(np.float64) for values in rows))
 
 
-def label_centers(run: MappingRun, prior: Prior) -> LabelledPoints | None:
-    """The confirmed Gaussians' means with the class of the text closest to their feature; None without either.
-
-    Raises:
-        ValueError: the embeddings' width differs from the features'.
-    """
-    gaussians = confirmed(run.state.map)
-    if not prior.feature_names or not gaussians.features.shape[-1]:
-        return None
-    labels = np.asarray(classify(gaussians, jnp.asarray(prior.text_features, jnp.float32)))
-    valid = np.asarray(gaussians.valid)
-    return LabelledPoints(np.asarray(gaussians.means, np.float64)[valid], labels[valid], tuple(prior.feature_names))
-
-
 def _picture(run: MappingRun, dataset: Dataset, row: int, view: Any) -> dict[str, Any]:
     return {
         "image": dataset[row].image,
@@ -130,14 +115,10 @@ def _picture(run: MappingRun, dataset: Dataset, row: int, view: Any) -> dict[str
     }
 
 
-def _labelled(centers: LabelledPoints, points: np.ndarray) -> LabelledPoints:
-    return LabelledPoints(points, transfer_labels(centers.points, centers.labels, points, 1), centers.classes)
-
-
-def _label_image(view: Any, centers: LabelledPoints | None) -> np.ndarray | None:
+def _label_image(view: Any, labelled: LabelledMap | None) -> np.ndarray | None:
     """Class of each pixel (h, w), -1 = none; None without classes."""
-    if centers is None:
+    if labelled is None:
         return None
     labels = np.full(view.valid.shape, -1)
-    labels[view.valid] = _labelled(centers, view.points[view.valid]).labels
+    labels[view.valid] = labelled.classes_of(view.points[view.valid].astype(np.float64))
     return labels

@@ -1,0 +1,89 @@
+"""Classes of points of the surface: each Gaussian that explains a point votes with its responsibility for it."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from emgs_jax.gaussian_map import confirmed
+from emgs_jax.prior.base import Prior
+from emgs_jax.running.record import MappingRun
+from emgs_jax.semantics import classify
+
+NUM_NEIGHBOURS = 8  # Gaussians that may explain a point
+MAX_POINTS = 50_000  # at once; bounds the memory, does not change the result
+
+
+@dataclass(frozen=True)
+class LabelledMap:
+    """Gaussians with a class each.
+
+    Args:
+        means: (n, 3), m.
+        whiten: (n, 3, 3), inverse of the Cholesky factors of the covariances.
+        log_dets: (n,), of the covariances.
+        labels: (n,), position in `classes`; all have one.
+        classes: their names.
+    """
+
+    means: np.ndarray
+    whiten: np.ndarray
+    log_dets: np.ndarray
+    labels: np.ndarray
+    classes: tuple[str, ...]
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the means."""
+        return cKDTree(self.means)
+
+    def classes_of(self, points: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
+        """The class that has most of the responsibility for each point (eq. 3, by place alone); -1 without Gaussians.
+
+        Nearest Gaussians by their means, as in the E-step. A wall's Gaussian whose mean is near to a cup does not
+        explain the cup, because it is flat.
+        """
+        if not len(self.means):
+            return np.full(len(points), -1)
+        k = min(NUM_NEIGHBOURS, len(self.means))
+        rows = self.tree.query(points, [*range(1, k + 1)], workers=-1)[1]
+        votes = self.labels[rows]
+        classes = votes[:, 0].copy()
+        # Where all neighbours have one class it is that one; the others are few, and the memory for them is bounded.
+        is_open = np.flatnonzero((votes != votes[:, :1]).any(1))
+        for part in np.array_split(is_open, -(-len(is_open) // MAX_POINTS)) if len(is_open) else ():
+            classes[part] = self._elected(points[part], rows[part])
+        return classes
+
+    def _elected(self, points: Float[np.ndarray, "m 3"], rows: Int[np.ndarray, "m k"]) -> Int[np.ndarray, "m"]:
+        white = np.matvec(self.whiten[rows], points[:, None] - self.means[rows])
+        log_density = -0.5 * ((white**2).sum(-1) + self.log_dets[rows])
+        responsibility, votes = np.exp(log_density - log_density.max(1, keepdims=True)), self.labels[rows]
+        share = ((votes[:, :, None] == votes[:, None, :]) * responsibility[:, None, :]).sum(-1)
+        return np.take_along_axis(votes, share.argmax(1)[:, None], axis=1)[:, 0]
+
+
+def labelled_map(run: MappingRun, prior: Prior) -> LabelledMap | None:
+    """The confirmed Gaussians that have a feature, with the class whose text is nearest to it; None without classes.
+
+    Raises:
+        ValueError: the embeddings' width differs from the features'.
+    """
+    gaussians = confirmed(run.state.map)
+    if not prior.feature_names or not gaussians.features.shape[-1]:
+        return None
+    labels = np.asarray(classify(gaussians, jnp.asarray(prior.text_features, jnp.float32)))
+    rows = jax.device_get(gaussians)
+    known = rows.valid & (labels >= 0)
+    factors = np.linalg.cholesky(rows.covs[known].astype(np.float64))
+    return LabelledMap(
+        means=rows.means[known].astype(np.float64),
+        whiten=np.linalg.inv(factors),
+        log_dets=2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(-1),
+        labels=labels[known],
+        classes=tuple(prior.feature_names),
+    )
