@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
-from emgs_jax.gaussians import Gaussians, has_feature, mean_features
+from emgs_jax.gaussians import Gaussians, gathered_features, has_feature
 from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import (
     Entries,
@@ -43,6 +43,7 @@ class EmConfig(eqx.Module):
         feature_weight: κ2.
         support: δ as `printed`, clipped to 1, or `normalized` by the total responsibility (R5).
         average: gain and blend (R4, R13).
+        feature: of a Gaussian: the one that it was made with (`medoid`, printed), or `accumulated` (R16).
         noise: factor on the points' noise along their viewing rays, which widens every Gaussian when a point is
             compared with it; 0 as printed.
         min_responsibility: a Gaussian that receives less in total from a frame is left as it is.
@@ -58,6 +59,7 @@ class EmConfig(eqx.Module):
     feature_weight: Float[Array, "*b"] = traced(low=0)
     support: Float[Array, "*b"] = choice("printed", "normalized")
     average: AverageConfig
+    feature: Float[Array, "*b"] = choice("medoid", "accumulated")
     noise: Float[Array, "*b"] = traced(low=0)
     min_responsibility: Float[Array, "*b"] = traced(low=0)
     min_std: Float[Array, "*b"] = traced(low=1e-6, high=1000)
@@ -199,8 +201,7 @@ def m_step(
 ) -> tuple[Gaussians, Float[Array, "n"]]:
     """Responsibility-weighted mean, covariance about it, normal and colour of the points of every Gaussian.
 
-    A point counts r_ik times its weight, see `precision`. Its feature, which may be wide, counts only for the Gaussian
-    that explains it best.
+    A point counts r_ik times its weight, see `precision`.
 
     Returns:
         The new parameters (the old ones where no point is), and the total responsibility Σ_i r_ik.
@@ -215,14 +216,13 @@ def m_step(
     second = jnp.zeros((total.shape[0], 3, 3)).at[:, rows, columns].set(mean[:, 3:9])
     second = second.at[:, columns, rows].set(mean[:, 3:9])
     new = eqx.tree_at(
-        lambda g: (g.means, g.covs, g.normals, g.colors, g.features),
+        lambda g: (g.means, g.covs, g.normals, g.colors),
         gaussians,
         (
             gaussians.means + mean[:, :3],
             second - outer(mean[:, :3]) + config.min_std**2 * jnp.eye(3),
             safe_normalize(mean[:, 9:12]),
             mean[:, 12:],
-            mean_features(points.features, owners(step, total.shape[0])[:, None], weights[:, None], total.shape[0]),
         ),
     )
     return where_rows(has_points, new, gaussians), jnp.where(has_points, total, 0.0)
@@ -247,6 +247,14 @@ def _add_statistics(
     return sums.at[step.rows].add(jnp.concatenate([r[..., None], weighted[..., None] * statistics], axis=-1))
 
 
+def _with_features(submap: GaussianMap, points: Observation, step: EStep, config: EmConfig) -> GaussianMap:
+    """Add the feature of each point, which may be wide, to that of the Gaussian that explains it best."""
+    features = submap.gaussians.features
+    owner = owners(step, features.shape[0])[:, None]
+    said = gathered_features(points.features, owner, config.feature * jnp.ones(owner.shape), features.shape[0])
+    return eqx.tree_at(lambda m: m.gaussians.features, submap, features + said)
+
+
 @full_precision
 def em_update(
     submap: GaussianMap,
@@ -267,6 +275,7 @@ def em_update(
     new, total = m_step(gaussians, aligned, precision(noise, config), step, config)
     evidence = jnp.where(total > 0, support(gaussians, aligned, step, config), 0.0)
     updated, gain = update_average(submap, new, evidence, config.average)
+    updated = _with_features(updated, aligned, step, config)
     num_fused = jnp.sum(step.is_fused)
     info = EmInfo(
         num_points=jnp.sum(aligned.valid),

@@ -33,7 +33,7 @@ class ExistenceConfig(eqx.Module):
         num_neighbours: nearest seen Gaussians among which another layer of the same surface is looked for.
         max_mahalanobis_sq: between two layers, the look's noise along the normal included; 0 joins none, as printed.
         min_normal_cos: between their normals.
-        feature: whether features stay or are averaged, as in the EM step (R16).
+        feature: of what two become: that of the heavier (`medoid`), or the sum of both (`accumulated`), see `EmConfig`.
     """
 
     birth: Float[Array, "*b"] = traced(low=-1e6)
@@ -46,7 +46,7 @@ class ExistenceConfig(eqx.Module):
     num_neighbours: int = static(low=1, high=256)
     max_mahalanobis_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
     min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
-    feature: Float[Array, "*b"] = choice("medoid", "mean")
+    feature: Float[Array, "*b"] = choice("medoid", "accumulated")
 
 
 def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -> Float[Array, "2 p"]:
@@ -132,12 +132,13 @@ def join_layers(
     old, other, rows = map.gaussians, take_rows(map, partner), jnp.arange(partner.shape[0])
     is_heavier = (map.weight > other.weight) | ((map.weight == other.weight) & (rows < partner))
     share = other.weight / jnp.maximum(map.weight + other.weight, jnp.finfo(jnp.float32).tiny)
-    mean = blend(old, other.gaussians, share, jnp.zeros(()), config.feature)
+    mean = blend(old, other.gaussians, share, jnp.zeros(()))
     difference = other.gaussians.means - old.means
     along = difference - _inner(difference, mean.normals)[:, None] * mean.normals
     spread = (share * (1.0 - share))[:, None, None] * outer(along)
+    features = old.features + config.feature * other.gaussians.features
     joined = GaussianMap(
-        gaussians=eqx.tree_at(lambda g: g.covs, mean, mean.covs + spread),
+        gaussians=eqx.tree_at(lambda g: (g.covs, g.features), mean, (mean.covs + spread, features)),
         weight=map.weight + other.weight,
         num_updates=map.num_updates + other.num_updates,
         existence=jnp.maximum(map.existence, other.existence),

@@ -39,14 +39,11 @@ class AverageConfig(eqx.Module):
             tends to the mean of all frames (R4; West 1979).
         forgetting: factor on the kept α or W before each update; 1 = the printed form.
         blend: of covariances: `linear` (printed) or `moment_matched` (R13).
-        feature: `medoid`, a Gaussian keeps what it was made with (printed), or `mean`, it averages what all frames say
-            of it (R16).
     """
 
     gain: Float[Array, "*b"] = choice("ema_printed", "count")
     forgetting: Float[Array, "*b"] = traced(low=0, high=1)
     blend: Float[Array, "*b"] = choice("linear", "moment_matched")
-    feature: Float[Array, "*b"] = choice("medoid", "mean")
 
 
 class SubmapConfig(eqx.Module):
@@ -106,8 +103,7 @@ def update_average(
     has_evidence = (evidence > 0) & map.gaussians.valid
     gain = jnp.where(has_evidence, evidence / jnp.where(has_evidence, kept, 1.0), 0.0)
     weight = jnp.where(has_evidence, jnp.where(config.gain > 0, kept, gain), map.weight)
-    blended = blend(map.gaussians, new, gain, config.blend, config.feature)
-    blended = where_rows(has_evidence, blended, map.gaussians)
+    blended = where_rows(has_evidence, blend(map.gaussians, new, gain, config.blend), map.gaussians)
     return GaussianMap(blended, weight, map.num_updates + has_evidence, map.existence, map.birth), gain
 
 

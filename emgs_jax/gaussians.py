@@ -24,7 +24,7 @@ class Gaussians(eqx.Module):
     covs: Float[Array, "*b n 3 3"]  # Σ, m²; every eigenvalue is at least min_std²
     colors: Float[Array, "*b n 3"]  # c, RGB in [0, 1]
     normals: Float[Array, "*b n 3"]  # n̄, unit
-    features: Float[Array, "*b n f"]  # f; its direction is the meaning, its length (≤ 1) how well the views agree on it
+    features: Float[Array, "*b n f"]  # f; its direction is the meaning; zero = unknown
     valid: Bool[Array, "*b n"]
 
 
@@ -49,15 +49,15 @@ class FitConfig(eqx.Module):
         num_fit_neighbours: M of eq. 1 (R10).
         num_kmeans_iterations: of Lloyd's algorithm.
         min_std: m; floor of a Gaussian's standard deviation in every direction.
-        feature: `medoid`, the point's feature that is nearest to the mean (printed), or the `mean` itself, which the
-            following frames go on averaging (R16).
+        feature: the `medoid` of the points' features (printed), or their sum, to which EM and refinement add what
+            other frames say: `accumulated` evidence (R16).
     """
 
     points_per_gaussian: int = static(low=1, high=2**20)
     num_fit_neighbours: int = static(low=1, high=256)
     num_kmeans_iterations: int = static(low=0, high=1000)
     min_std: Float[Array, "*b"] = traced(low=1e-6, high=1000)
-    feature: Float[Array, "*b"] = choice("medoid", "mean")
+    feature: Float[Array, "*b"] = choice("medoid", "accumulated")
 
 
 def spacing(camera: Camera, thin: int, config: FitConfig) -> int:
@@ -86,10 +86,8 @@ def fit_to_points(
     triangle = jnp.unstack(whitening(covs)[0][:, None], axis=-1)
     white = whiten(triangle, jnp.unstack(offsets, axis=-1))
     weights = jax.nn.softmax(-0.5 * dot(white, white), axis=-1, where=found)
+    mean_feature = jnp.einsum("km,kmf->kf", weights, near.features)
     is_known = found & has_feature(near.features)
-    known_weights = weights * is_known
-    known_weights /= jnp.maximum(jnp.sum(known_weights, axis=-1, keepdims=True), jnp.finfo(jnp.float32).tiny)
-    mean_feature = jnp.einsum("km,kmf->kf", known_weights, near.features)
     closeness = jnp.where(is_known, jnp.einsum("kmf,kf->km", near.features, mean_feature), -jnp.inf)
     medoid = jnp.take_along_axis(near.features, jnp.argmax(closeness, axis=-1)[:, None, None], axis=1)[:, 0]
     fitted = Gaussians(
@@ -128,37 +126,29 @@ def cluster(
     even = take_rows(observation, rows)
     even = eqx.tree_at(lambda o: o.valid, even, even.valid & row_exists)
     fitted = fit_to_points(centers, exists, even, config)
+    evidence = jnp.where(config.feature > 0, count, 1.0)[:, None] * fitted.features
+    fitted = eqx.tree_at(lambda g: g.features, fitted, jnp.where(fitted.valid[:, None], evidence, 0.0))
     return fitted, jnp.where(fitted.valid, count / spacing, 0.0)
 
 
-def blend(
-    old: Gaussians,
-    new: Gaussians,
-    gain: Float[Array, "n"],
-    moment_matched: Float[Array, ""],
-    mean_feature: Float[Array, ""],
-) -> Gaussians:
-    """(1 - gain) old + gain new on means, covariances, colours and normals (eq. 4 and 6).
+def blend(old: Gaussians, new: Gaussians, gain: Float[Array, "n"], moment_matched: Float[Array, ""]) -> Gaussians:
+    """(1 - gain) old + gain new on means, covariances, colours and normals (eq. 4 and 6); features stay (R13).
 
     Args:
         moment_matched: 0 = the printed linear blend of covariances; 1 adds gain (1 - gain) Δ Δ' for the means'
-            difference Δ, which makes it the covariance of the moment-matched mixture (R13).
-        mean_feature: 0 = features stay as they are (printed); 1 = they are averaged like the rest, where one of both
-            is missing the other is taken (R16).
+            difference Δ, which makes it the covariance of the moment-matched mixture.
     """
     weight = gain[:, None]
     difference = new.means - old.means
     spread = moment_matched * (gain * (1.0 - gain))[:, None, None] * outer(difference)
-    of_feature = jnp.where(has_feature(old.features), gain, gain > 0) * has_feature(new.features) * mean_feature
     return eqx.tree_at(
-        lambda g: (g.means, g.covs, g.colors, g.normals, g.features),
+        lambda g: (g.means, g.covs, g.colors, g.normals),
         old,
         (
             old.means + weight * difference,
             old.covs + weight[..., None] * (new.covs - old.covs) + spread,
             old.colors + weight * (new.colors - old.colors),
             safe_normalize(old.normals + weight * (new.normals - old.normals)),
-            old.features + of_feature[:, None] * (new.features - old.features),
         ),
     )
 
@@ -168,18 +158,12 @@ def has_feature(features: Float[Array, "*b f"]) -> Bool[Array, "*b"]:
     return jnp.any(features != 0, axis=-1)
 
 
-def mean_features(
+def gathered_features(
     features: Float[Array, "m f"], rows: Int[Array, "m k"], weights: Float[Array, "m k"], num_rows: int
 ) -> Float[Array, "n f"]:
-    """Weighted mean of the features that go to each of n rows; those that are missing have no weight.
-
-    Zero for a row that none goes to; a row number past the end is dropped.
-    """
-    weights = weights * has_feature(features)[:, None]
-    total = jnp.zeros(num_rows).at[rows].add(weights, mode="drop")
-    share = weights / jnp.where(total > 0, total, 1.0).at[rows].get(mode="fill", fill_value=1.0)
+    """Weighted sum of the features that go to each of n rows; a row number past the end is dropped."""
     sums = jnp.zeros((num_rows, features.shape[-1]))
-    return sums.at[rows].add(share[..., None] * features[:, None], mode="drop")
+    return sums.at[rows].add(weights[..., None] * features[:, None], mode="drop")
 
 
 def intensity(colors: Float[Array, "*b 3"]) -> Float[Array, "*b"]:

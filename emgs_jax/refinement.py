@@ -9,7 +9,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
-from emgs_jax.gaussians import Gaussians, has_feature, mean_features
+from emgs_jax.gaussians import Gaussians, gathered_features, has_feature
 from emgs_jax.ops.camera import Camera, nearest_pixel
 from emgs_jax.ops.linalg import inverse_2x2, mahalanobis_sq, outer, safe_normalize
 from emgs_jax.ops.neighbours import knn
@@ -35,6 +35,7 @@ class RefinementConfig(eqx.Module):
             dropped; `inf` as printed.
         render: how both sets are drawn.
         average: gain and blend, those of the EM step.
+        feature: likewise.
     """
 
     num_candidates: int = static(low=1, high=256)
@@ -46,6 +47,7 @@ class RefinementConfig(eqx.Module):
     max_splat_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
     render: RenderConfig
     average: AverageConfig
+    feature: Float[Array, "*b"] = choice("medoid", "accumulated")
 
 
 class RefinementInfo(eqx.Module):
@@ -140,14 +142,13 @@ def average_candidates(
     around = offsets - mean_offset[rows]
     covs = total(share[..., None, None] * (candidates.covs[:, None] + outer(around)))
     averaged = eqx.tree_at(
-        lambda g: (g.means, g.covs, g.colors, g.normals, g.features),
+        lambda g: (g.means, g.covs, g.colors, g.normals),
         old,
         (
             old.means + mean_offset,
             covs,
             total(share[..., None] * candidates.colors[:, None]),
             safe_normalize(total(share[..., None] * candidates.normals[:, None])),
-            mean_features(candidates.features, rows, weights, size),
         ),
     )
     return where_rows(sums > 0, averaged, old)
@@ -199,6 +200,9 @@ def refine(
     evidence = jnp.zeros(old.valid.shape[0]).at[rows].max(omega)
     merged, _ = update_average(submap, averaged, evidence, config.average)
     is_merged = jnp.any(omega > 0, axis=-1)
+    share = config.feature * omega / jnp.where(is_merged, jnp.sum(omega, axis=-1), 1.0)[:, None]
+    said = gathered_features(candidates.features, rows, share, old.valid.shape[0])
+    merged = eqx.tree_at(lambda m: m.gaussians.features, merged, merged.gaussians.features + said)
     fresh = eqx.tree_at(lambda g: g.valid, candidates, candidates.valid & ~is_merged)
     info = RefinementInfo(jnp.sum(candidates.valid), jnp.sum(is_merged), jnp.sum(fresh.valid), rendering.overflow)
     return merged, fresh, info

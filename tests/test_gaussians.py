@@ -229,7 +229,7 @@ def test_a_linear_intensity_on_a_plane_has_its_gradient_within_the_plane():
 @pytest.mark.parametrize(("gain", "expected"), [(0.0, "old"), (1.0, "new")])
 def test_a_blend_with_gain_0_or_1_is_the_old_or_the_new(gain, expected, moment_matched):
     sets = {"old": random_gaussians(5, 0, 2), "new": random_gaussians(5, 1, 2)}
-    blended = blend(sets["old"], sets["new"], jnp.full(5, gain), jnp.asarray(moment_matched), jnp.zeros(()))
+    blended = blend(sets["old"], sets["new"], jnp.full(5, gain), jnp.asarray(moment_matched))
     for name in ("means", "covs", "colors", "normals"):
         np.testing.assert_allclose(
             getattr(blended, name), getattr(sets[expected], name), atol=1e-6
@@ -240,9 +240,7 @@ def test_a_blend_with_gain_0_or_1_is_the_old_or_the_new(gain, expected, moment_m
 def test_the_printed_blend_is_linear_in_every_parameter_and_normals_stay_unit():
     old, new = (as_numpy(random_gaussians(6, seed)) for seed in (0, 1))
     gain = np.linspace(0.1, 0.9, 6)
-    blended = blend(
-        random_gaussians(6, 0), random_gaussians(6, 1), jnp.asarray(gain, jnp.float32), jnp.zeros(()), jnp.zeros(())
-    )
+    blended = blend(random_gaussians(6, 0), random_gaussians(6, 1), jnp.asarray(gain, jnp.float32), jnp.zeros(()))
     for name in ("means", "covs", "colors"):
         weight = gain.reshape(-1, *[1] * (old[name].ndim - 1))
         np.testing.assert_allclose(getattr(blended, name), (1 - weight) * old[name] + weight * new[name], atol=1e-6)
@@ -254,7 +252,7 @@ def test_the_printed_blend_is_linear_in_every_parameter_and_normals_stay_unit():
 def test_the_moment_matched_blend_has_the_moments_of_the_mixture():
     old, new = random_gaussians(4, 0), random_gaussians(4, 1)
     gain = jnp.array([0.1, 0.3, 0.5, 0.8])
-    blended = blend(old, new, gain, jnp.ones(()), jnp.zeros(()))
+    blended = blend(old, new, gain, jnp.ones(()))
     rng = np.random.default_rng(0)
     for k in range(4):
         share = [1 - float(gain[k]), float(gain[k])]
