@@ -91,6 +91,7 @@ def test_the_paper_preset_takes_every_printed_reading():
         "localization.icp.residual": "colored",  # R9
         "localization.icp.prior_information": 0.0,
         "em.average.blend": "linear",  # R13
+        "fit.feature": "medoid",  # R16
         "em.noise": 0.0,
     }
     assert {key: OmegaConf.select(paper.slam, key) for key in printed} == printed

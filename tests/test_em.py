@@ -30,7 +30,7 @@ def em(*arguments):
 
 MAP = new_map(GAUSSIANS, jnp.ones(N), jnp.ones(()), jnp.asarray(0))
 
-PAPER = ("slam/em=paper",)
+PAPER = ("slam/em=paper", "slam/fit=paper")
 OPEN = {"min_normal_cos": -1.0, "max_mahalanobis_sq": np.inf, "max_log_gap": np.inf, "noise": 0.0}
 
 
@@ -302,9 +302,21 @@ def test_the_update_is_estep_mstep_support_and_average_in_a_row(opened):
         old, fresh = (np.asarray(getattr(g, name), float) for g in (GAUSSIANS, new))
         a = alpha.reshape(-1, *[1] * (old.ndim - 1))
         np.testing.assert_allclose(getattr(updated.gaussians, name), (1 - a) * old + a * fresh, atol=1e-5)  # roundings
-    assert_same(updated.gaussians.features, GAUSSIANS.features)  # features are fixed at creation
+    assert_same(updated.gaussians.features, GAUSSIANS.features)  # as printed, they are those of the creation
     np.testing.assert_allclose(updated.weight, np.where(alpha > 0, alpha, 1), atol=1e-6)
     assert info.num_fused == M == is_fused.sum() and info.num_updated == (alpha > 0).sum()
+
+
+def test_accumulated_features_are_those_of_all_points_that_a_gaussian_explains_best(opened):
+    step, _ = estep(GAUSSIANS, POINTS, QUIET, opened)
+    best = dense(step).argmax(axis=1)
+    expected = np.array(GAUSSIANS.features)
+    np.add.at(expected, best, np.asarray(POINTS.features))
+    updated, _, _ = em(MAP, POINTS, QUIET, changed(opened, feature=1.0))
+    np.testing.assert_allclose(updated.gaussians.features, expected, rtol=1e-5)
+    longer = eqx.tree_at(lambda m: m.gaussians.features, MAP, 7.0 * GAUSSIANS.features)
+    _, _, info = em(MAP, POINTS, QUIET, opened)
+    np.testing.assert_allclose(em(longer, POINTS, QUIET, opened)[2].mean_log_joint, info.mean_log_joint, rtol=1e-5)
 
 
 @pytest.mark.slow  # compiles both steps anew

@@ -9,6 +9,7 @@ import reference
 from scene import (
     as_numpy,
     assert_same,
+    at,
     move_gaussians,
     observe_room,
     path_pose,
@@ -30,7 +31,7 @@ ONE = jnp.ones(())
 
 @pytest.fixture(scope="module")
 def fit_config(config):
-    return config().fit
+    return config("slam.fit.feature=medoid").fit
 
 
 @pytest.mark.parametrize(("num_features", "num_valid"), [(0, 200), (4, 200), (4, 6)])
@@ -62,6 +63,17 @@ def test_a_feature_is_one_of_the_points_and_not_their_mean(fit_config):
     points = eqx.tree_at(lambda o: (o.features, o.points), points, (features, positions))
     fitted = fit(jnp.zeros((1, 3)), jnp.ones(1, bool), points, fit_config)
     np.testing.assert_array_equal(fitted.features, [features[3]])
+
+
+def test_accumulated_evidence_is_the_sum_of_the_points_features_and_a_missing_one_says_nothing(fit_config):
+    """Twelve points in one place: seven say the one, three the other, two nothing."""
+    config = at(fit_config, "feature", 1)
+    points = random_observation(12, num_features=2)
+    features = jnp.array([[1.0, 0]] * 7 + [[0.0, 1]] * 3 + [[0.0, 0]] * 2)
+    positions = jnp.asarray(np.random.default_rng(0).normal(size=(12, 3)) * 1e-4 + [0, 0, 2], jnp.float32)
+    points = eqx.tree_at(lambda o: (o.features, o.points), points, (features, positions))
+    gaussians, _ = eqx.filter_jit(cluster)(points, jnp.arange(12), 12, config)
+    np.testing.assert_allclose(gaussians.features, [[7.0, 3.0]], rtol=1e-3)  # equal weights up to e^-1e-4
 
 
 def test_no_eigenvalue_is_below_the_floor(fit_config, camera):

@@ -44,7 +44,7 @@ def map_of(gaussians) -> GaussianMap:
 @pytest.fixture(scope="module")
 def settings(config):
     """As printed (margins 0 and infinite, linear blend, α/(α+…)), but 1 cm of margin for rounding."""
-    return at(config("slam/em=paper", "slam/refinement=paper").refinement, "front_margin", 0.005)
+    return at(config("slam/em=paper", "slam/fit=paper", "slam/refinement=paper").refinement, "front_margin", 0.005)
 
 
 def run(settings, camera, candidates, gaussians=None):
@@ -63,6 +63,15 @@ def test_a_candidate_on_the_mapped_surface_merges_by_equations_5_and_6(settings,
     np.testing.assert_allclose(g.covs[0], (1 - gamma) * old.covs[0] + gamma * new.covs[0], atol=1e-6)
     np.testing.assert_array_equal(g.features, old.features)
     np.testing.assert_allclose(merged.weight, gamma, atol=1e-6)
+
+
+def test_evidence_of_a_merged_candidate_is_shared_out_and_none_is_lost(settings, camera):
+    """Two equal map Gaussians: each gets half of the candidate's evidence; what is not merged gives none."""
+    old = discs([(0.02, 0, 2.0), (-0.02, 0, 2.0)], std=0.3)
+    new = discs([(0, 0, 2.0), (0, 0, 1.0)], std=0.3, feature=(3.0, 1.0))
+    merged, fresh, info = run(at(settings, "feature", 1.0), camera, new, old)
+    assert info.num_merged == 1 and fresh.valid.tolist() == [False, True]
+    np.testing.assert_allclose(merged.gaussians.features, np.tile([1.0 + 1.5, 0.5], (2, 1)), rtol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -139,3 +139,28 @@ def test_without_truth_nothing_is_compared():
         rendered = Rendered(dataset, poses, evaluation_config())
         rendered.add(0, np.ones(SHAPE), None)
         assert rendered.metrics() == {}
+
+
+def test_classes_of_rendered_pixels_are_counted_over_all_frames_and_a_lost_one_has_none_right():
+    """Two frames of the classes 0 and 1, half each: one rendered with a quarter wrong, one lost; 9 of 24 are right."""
+
+    class Labelled(list):
+        classes, has_ground_truth = ("wall", "box"), True
+
+    labels = np.zeros(SHAPE, np.int32)
+    labels[:, 3:] = 1
+    frames = Labelled(dataclasses.replace(a_frame(index=i), labels=labels) for i in (0, 1))
+    for frame in frames:
+        frame.labels[0] = -1  # without a true class: these say nothing
+    poses = poses_along([0.0, 1.0])
+    rendered = Rendered(frames, (poses, poses), evaluation_config(), has_classes=True)
+    found = labels.copy()
+    found[1:, :2] = [[1, -1]] * 3  # six of eighteen: a wrong answer or none
+    rendered.add(0, np.full(SHAPE, 2.0), None, found)
+    metrics = rendered.metrics()
+    assert metrics["rendering/label_accuracy_percent"] == pytest.approx(100 * 12 / 36)
+    # wall: 3 right of 18 true, none but these predicted; box: 9 right, 18 true and 3 that are wall.
+    assert metrics["rendering/label_miou_percent"] == pytest.approx(100 * (3 / 18 + 9 / 21) / 2)
+    plain = Rendered(frames, (poses, poses), evaluation_config())
+    plain.add(0, np.full(SHAPE, 2.0), None)
+    assert plain.metrics()["rendering/label_accuracy_percent"] is None

@@ -5,12 +5,15 @@ import pytest
 
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.segmentation import (
+    LabelGrid,
     LabelledPoints,
     compare_labels,
     confusion_matrix,
     label_cells,
+    nearest_classes,
     segmentation_metrics,
     transfer_labels,
+    translate,
     true_labels,
 )
 
@@ -121,3 +124,26 @@ def test_classes_are_compared_by_their_names_and_one_that_the_truth_lacks_is_wro
     lost = LabelledPoints(truth.points, np.where(truth.labels == 0, 0, 1), ("lamp", "right"))
     metrics = compare_labels(lost, truth, 1)
     assert (metrics["segmentation/miou_percent"], metrics["segmentation/accuracy_percent"]) == (50.0, 50.0)
+
+
+def test_the_class_of_a_voxel_is_that_of_most_views_and_a_view_counts_once(monkeypatch):
+    monkeypatch.setattr("emgs_jax.evaluation.segmentation._MERGE_ROWS", 2)  # merges on the way
+    grid, here, there = LabelGrid(0.1), [0.05, 0.05, 0.05], [-0.05, 0.05, 0.25]
+    grid.add(np.array([here, here, here, there]), np.array([2, 2, 2, 0]))
+    for labels in ([1, -1], [1, 0]):
+        grid.add(np.array([here, there]), np.array(labels))
+    grid.add(np.array([here, [np.nan, 0, 0]]), np.array([0, 0]))
+    found = grid.points(("a", "b", "c"))
+    np.testing.assert_allclose(found.points, [there, here])
+    np.testing.assert_array_equal(found.labels, [0, 1])
+    assert found.classes == ("a", "b", "c") and len(LabelGrid(0.1).points(("a",)).labels) == 0
+
+
+def test_labels_are_translated_by_name_and_a_class_that_the_others_lack_stays_an_answer():
+    found = translate(np.array([[0, 1], [2, -1]]), ("chair", "wall", "cat"), ("wall", "chair"))
+    np.testing.assert_array_equal(found, [[1, 0], [2, -1]])
+
+
+def test_the_nearest_class_is_by_angle_and_a_missing_feature_has_none():
+    features = np.array([[[5.0, 1.0], [0.0, 0.0], [0.1, 0.2]]], np.float16)
+    np.testing.assert_array_equal(nearest_classes(features, np.array([[3.0, 0], [0, 1.0]])), [[0, -1, 1]])

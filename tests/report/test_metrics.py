@@ -170,7 +170,7 @@ def test_the_centres_are_compared_as_they_are():
     assert metrics["reconstruction_centers/alignment_note"] is None
 
 
-def test_labels_of_the_centres_are_compared_where_the_alignment_puts_the_centres():
+def test_labels_of_points_are_compared_where_the_alignment_puts_the_points():
     scene = Scene()
     centers = inverse(scene.ours).apply(scene.cloud.points[::2])
     labels = LabelledPoints(centers, scene.labels.labels[::2], CLASSES)
@@ -203,7 +203,7 @@ class Dark(Room):
 
 
 def test_the_truth_is_that_of_every_frame_and_its_labels_where_the_prior_has_classes():
-    prior = SimpleNamespace(feature_names=CLASSES)
+    prior = SimpleNamespace(feature_names=CLASSES, text_features=np.eye(len(CLASSES)))
     scorer = new_scorer(Room(), evaluation_config(), prior)
     for x in (0.0, 4.0, 8.0):
         assert (np.abs(scorer.truth.cloud.points[:, 0] - x) < 1.2).sum() == 48

@@ -32,7 +32,8 @@ METRICS = {
 
 
 class ADataset:
-    name, sequence, calibration = "synthetic", "room-0", {"source": "rendered"}
+    name, sequence, calibration = "synthetic", "room-0", {"source": "rendered", "size": [64, 48]}
+    size, intrinsics = (32, 24), (30.0, 30.0, 15.5, 11.5)  # half of those that are found
 
     def fingerprint(self):
         return "abc123"
@@ -47,8 +48,11 @@ def test_provenance_names_protocol_config_data_seed_code_and_machine():
     block = a_provenance(True)
     assert (block["protocol"], block["seed"], block["simulated"]) == ("paper", 7, True)
     assert block["config"] == {"evaluation": {"protocol": "paper"}}
-    camera = {"source": "rendered"}
-    assert block["data"] == {"name": "synthetic", "sequence": "room-0", "fingerprint": "abc123", "camera": camera}
+    cameras = {
+        "camera": {"source": "rendered", "size": [64, 48]},
+        "frames": {"size": [32, 24], "intrinsics": [30.0, 30.0, 15.5, 11.5]},
+    }
+    assert block["data"] == {"name": "synthetic", "sequence": "room-0", "fingerprint": "abc123"} | cameras
     assert block["prior"] == {"name": "simulated", "settings": {"level": 1, "seed": 7}}
     versions = block["versions"]
     assert set(versions) == {"python", "jax", "jaxlib", "numpy", "optimistix", "equinox", "open3d", "cv2", "emgs_jax"}

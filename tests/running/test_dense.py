@@ -8,8 +8,8 @@ from hand_run import STATUSES, densify_config, hand_run, poses_along, wall
 from scene import evaluation_config
 
 from emgs_jax.data.base import Frame
-from emgs_jax.evaluation.segmentation import LabelledPoints
-from emgs_jax.running.dense import center_cloud, dense_map, label_centers
+from emgs_jax.running.dense import center_cloud, dense_map
+from emgs_jax.running.labelling import LabelledMap
 
 XS = 1.0 + 3.0 * np.arange(len(STATUSES))  # of the cameras, which see one metre to each side
 LENGTH = XS[-1] + 2.0
@@ -18,7 +18,7 @@ LENGTH = XS[-1] + 2.0
 class Pictures:
     """A data set whose images have one colour each, the frame's number."""
 
-    has_ground_truth = False
+    has_ground_truth, classes = False, ()
 
     def __getitem__(self, index):
         return SimpleNamespace(image=np.full((16, 24, 3), index, np.uint8))
@@ -33,9 +33,9 @@ def run():
 
 @pytest.fixture(scope="module")
 def labels():
-    """Centres of two classes: near the wall's two ends."""
-    points = np.array([[0.0, 0.0, 2.0], [LENGTH, 0.0, 2.0]])
-    return LabelledPoints(points, np.array([1, 0]), ("right", "left"))
+    """Two round Gaussians of two classes: at the wall's two ends."""
+    means, round_ = np.array([[0.0, 0.0, 2.0], [LENGTH, 0.0, 2.0]]), np.stack([np.eye(3)] * 2)
+    return LabelledMap(means, round_, np.zeros(2), np.array([1, 0]), ("right", "left"))
 
 
 @pytest.fixture(scope="module")
@@ -73,14 +73,15 @@ def test_pictures_are_of_frames_spread_evenly_over_those_that_are_not_lost(dense
 class Truth:
     """What the frames of the wall would be if it were twice as large and gray."""
 
-    has_ground_truth = True
+    has_ground_truth, classes = True, ("left", "right")
 
     def __len__(self):
         return len(STATUSES)
 
     def __getitem__(self, index):
         image = np.full((16, 24, 3), 51 * index, np.uint8)
-        return Frame(index, 0.0, "f", image, np.full((16, 24), 4.0, np.float32))
+        labels = np.full((16, 24), int(XS[index] > LENGTH / 2), np.int32)
+        return Frame(index, 0.0, "f", image, np.full((16, 24), 4.0, np.float32), labels=labels)
 
 
 def test_the_views_are_compared_with_their_frames_at_the_size_of_the_alignment_and_lost_ones_are_empty(run, dense):
@@ -103,9 +104,18 @@ def test_the_views_are_compared_with_their_frames_at_the_size_of_the_alignment_a
     ]
     np.testing.assert_allclose(metrics["rendering/psnr_db"], -10 * np.log10(np.mean(errors)), atol=0.05)
     assert dense.rendering == {}, "nobody knows the truth"
+    assert metrics["rendering/label_accuracy_percent"] is None, "the map has no classes"
 
 
-def test_points_and_pictures_take_the_label_of_the_nearest_centre(dense, labels):
+def test_the_classes_of_rendered_pixels_are_compared_with_those_of_the_frames_by_name(run, labels):
+    larger = np.stack(run.poses)
+    larger[:, :3, 3] *= 2.0
+    compared = hand_run(run.poses, run.raw_poses, larger, gaussians=run.state.map.gaussians)
+    metrics = dense_map(compared, Truth(), densify_config(), evaluation_config(), labels, num_pictures=0).rendering
+    np.testing.assert_allclose(metrics["rendering/label_accuracy_percent"], 100.0 * 5 / 6, atol=0.5)  # one is lost
+
+
+def test_points_and_pictures_have_the_class_of_the_gaussians_there(dense, labels):
     assert dense.labels.classes == labels.classes and dense.labels.points is dense.cloud.points
     np.testing.assert_array_equal(dense.labels.labels, dense.cloud.points[:, 0] < LENGTH / 2)
     for picture, label in zip(dense.pictures, (1, 1, 0), strict=True):
@@ -125,12 +135,3 @@ def test_centres_are_the_means_of_the_rows_in_use(run):
     np.testing.assert_allclose(20.0 * cloud.colors[:, 0], cloud.points[:, 0], atol=1e-5)
     np.testing.assert_array_equal(cloud.normals, np.broadcast_to([0.0, 0.0, -1.0], cloud.points.shape))
     assert cloud.points.dtype == np.float64
-
-
-def test_each_centre_has_the_class_whose_text_its_feature_is(run):
-    prior = SimpleNamespace(feature_names=("left", "right"), text_features=np.eye(2, dtype=np.float32))
-    labels = label_centers(run, prior)
-    np.testing.assert_array_equal(labels.points, center_cloud(run).points)
-    np.testing.assert_array_equal(labels.labels, labels.points[:, 0] > LENGTH / 2)
-    assert labels.classes == ("left", "right")
-    assert label_centers(run, SimpleNamespace(feature_names=(), text_features=None)) is None

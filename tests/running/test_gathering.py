@@ -53,9 +53,12 @@ def gathered():
         for row, record in enumerate(records):
             run.records.append(record)  # as `map_frames` does: a frame's record is there before its view
             points = backproject(np.full(SHAPE, WALL / (SCALES[row] or 1.0)), INTRINSICS)
-            yield RawView(points, np.full(SHAPE, row != 4), Walls()[row].image, raw[row])
+            features = np.zeros((1, 2, 2), np.float16)  # left half, right half of the image
+            features[0, :, row % 2] = 1.0 if row else [1.0, 0.0]
+            yield RawView(points, np.full(SHAPE, row != 4), Walls()[row].image, raw[row], features)
 
-    return run, baselines, gather(views(), evaluation_config(), True, baselines)
+    text = ("wall", "cat"), np.eye(2, dtype=np.float32)
+    return run, baselines, gather(views(), evaluation_config(), True, baselines, text)
 
 
 @pytest.mark.parametrize("name", CONFIGS)
@@ -83,6 +86,20 @@ def test_the_raw_priors_depths_are_zero_where_it_says_nothing_and_are_kept_where
     assert len(depths) == len(STATUSES) and not depths[4].any()
     np.testing.assert_allclose(depths[1], WALL / 2.0, rtol=1e-6)
     assert len(gather([], evaluation_config(), False).depths) == 0
+
+
+def test_the_classes_of_each_frame_are_kept_and_those_of_its_points_are_where_the_prior_puts_them(gathered):
+    _, _, raw = gathered
+    width = SHAPE[1] // 2
+    assert len(raw.classes) == len(STATUSES)
+    np.testing.assert_array_equal(raw.classes[0], np.tile(np.repeat([0, -1], [width, SHAPE[1] - width]), (SHAPE[0], 1)))
+    np.testing.assert_array_equal(raw.classes[1], np.ones(SHAPE))
+    assert raw.labels.classes == ("wall", "cat") and (raw.labels.points[:, 1] > 1.0).all()
+    for row in (1, 2, 3):
+        seen = np.abs(raw.labels.points[:, 0] - XS[row]) < 1.0
+        assert seen.sum() > 50 and (raw.labels.labels[seen] == row % 2).all()
+    plain = gather([], evaluation_config(), False)
+    assert plain.classes is None and plain.labels is None
 
 
 def test_baselines_are_compared_at_the_poses_that_they_were_built_at(gathered):

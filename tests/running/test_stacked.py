@@ -20,7 +20,9 @@ FRAME = 3
 
 def shown(index: int) -> tuple[Frame, RawView]:
     image = np.zeros((24, 32, 3), np.uint8)
-    return Frame(index, float(index), str(index), image), RawView(image, image[..., 0] > 0, image, np.eye(4))
+    return Frame(index, float(index), str(index), image), RawView(
+        image, image[..., 0] > 0, image, np.eye(4), np.zeros((1, 1, 0))
+    )
 
 
 @pytest.fixture(scope="module")

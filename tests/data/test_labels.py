@@ -1,0 +1,112 @@
+"""Class images: ids by the file of names, positions in it, and what is wrong with each kind of bad file."""
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+from written_scene import scene_pose
+
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.labels import LabelFolder, as_unknown, read_classes
+from emgs_jax.data.tum import Tum
+
+SEQUENCE = "rgbd_dataset_freiburg3_plane"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "semantic").mkdir()
+    (tmp_path / "classes.txt").write_text("# id name\n7 sofa\n3 wall plug\n300 wall\n")
+    ids = np.array([[7, 3, 0], [300, 300, 7]], np.uint16)
+    cv2.imwrite(str(tmp_path / "semantic" / "0.5.png"), ids)
+    return tmp_path
+
+
+def labels_of(folder, **options):
+    return LabelFolder(folder / "semantic", folder / "classes.txt", **options)
+
+
+def test_ids_become_positions_among_the_names(folder):
+    labels = labels_of(folder)
+    assert labels.names == ("sofa", "wall plug", "wall")
+    np.testing.assert_array_equal(labels.read("rgb/0.5.jpg", (3, 2)), [[0, 1, -1], [2, 2, 0]])
+
+
+def test_names_alone_count_from_zero(tmp_path):
+    (tmp_path / "names.txt").write_text("wall\n3d printer\n\nold chair\n")
+    assert read_classes(tmp_path / "names.txt") == ((0, 1, 2), ("wall", "3d printer", "old chair"))
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [("", "names no classes"), ("1 a\n1 b", "the id 1 twice"), ("1 a\n2 a", "the name 'a' twice")],
+)
+def test_a_file_of_classes_that_cannot_be_used_is_named(tmp_path, text, problem):
+    (tmp_path / "c.txt").write_text(text)
+    with pytest.raises(ValueError, match=re.escape(str(tmp_path / "c.txt")) + f".*{problem}"):
+        read_classes(tmp_path / "c.txt")
+
+
+def test_a_folder_or_a_file_that_is_not_there_is_named(folder):
+    with pytest.raises(ValueError, match=r"other is no folder"):
+        LabelFolder(folder / "other", folder / "classes.txt")
+    with pytest.raises(ValueError, match=r"names\.txt does not exist"):
+        LabelFolder(folder / "semantic", folder / "names.txt")
+
+
+BAD = {
+    "has the ids \\[5\\], which .*classes.txt does not name": np.array([[5, 7]], np.uint16),
+    "has 8 bits, but .* has ids up to 300: write it with 16 bits": np.array([[7, 44]], np.uint8),  # 300 & 255
+    "one channel .* write the ids, not their colours": np.zeros((2, 3, 3), np.uint8),
+    "is 2x1, but": np.array([[7, 7]], np.uint16),
+}
+
+
+@pytest.mark.parametrize("problem", BAD)
+def test_a_bad_class_image_is_named_with_the_remedy(folder, problem):
+    path = folder / "semantic" / "0.5.png"
+    cv2.imwrite(str(path), BAD[problem])
+    with pytest.raises(BadFrameError, match=re.escape(str(path)) + f".*{problem}"):
+        labels_of(folder).read("0.5.jpg", (3, 2) if "2x1" in problem else None)
+
+
+def test_ids_that_mean_no_class_are_the_users_to_name(folder):
+    with pytest.raises(BadFrameError, match=r"has the ids \[0\]"):
+        labels_of(folder, unknown=()).read("0.5.jpg")
+    for bad in ("0", [-1], [1.5]):
+        with pytest.raises(ValueError, match=r"dataset\.unknown must be a list of ids"):
+            as_unknown(bad, "dataset.unknown")
+
+
+@pytest.fixture
+def labelled_root(tum_root):
+    """The left third of each image is wall, the rest has no class, but for a row of cups."""
+    sequence = tum_root / SEQUENCE
+    (sequence / "semantic").mkdir()
+    (sequence / "classes.txt").write_text("4 wall\n9 cup\n")
+    ids = np.zeros((480, 640), np.uint8)
+    ids[:, :200], ids[100] = 4, 9
+    for image in (sequence / "rgb").iterdir():
+        cv2.imwrite(str(sequence / "semantic" / f"{image.stem}.png"), ids)
+    return tum_root
+
+
+def test_a_sequence_in_the_tum_layout_may_have_true_classes(labelled_root):
+    dataset = Tum(str(labelled_root), SEQUENCE, stride=1, size=(640, 480), labels="semantic")
+    assert dataset.classes == ("wall", "cup")
+    for index, frame in enumerate(dataset):
+        assert frame.labels.dtype == np.int32 and frame.labels.shape == (480, 640)
+        assert (frame.labels[100] == 1).all() and (frame.labels[101:, :200] == 0).all()
+        assert (frame.labels[101:, 200:] == -1).all()
+        np.testing.assert_allclose(frame.T_world_camera, scene_pose(index), atol=1e-6)
+        assert labelled_root / SEQUENCE / "semantic" / f"{index + 100}.png" not in dataset.files(0)[:1]
+    assert dataset.fingerprint() != Tum(str(labelled_root), SEQUENCE, stride=1, size=(640, 480)).fingerprint()
+    assert Tum(str(labelled_root), SEQUENCE, stride=1)[0].labels is None
+
+
+def test_where_a_straightened_image_has_no_pixel_there_is_no_class(labelled_root):
+    """Barrel distortion: the straight image's corners come from beyond the border."""
+    options = {"intrinsics": [535.4, 539.2, 320.1, 247.6], "distortion": [0.2, 0, 0, 0, 0]}
+    frame = Tum(str(labelled_root), SEQUENCE, stride=1, size=(640, 480), labels="semantic", **options)[0]
+    assert set(np.unique(frame.labels)) == {-1, 0, 1}
