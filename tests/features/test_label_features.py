@@ -81,7 +81,7 @@ def test_bad_scores_are_named(folder, scores, problem):
 
 def test_scores_that_are_no_array_and_labels_of_another_shape_are_named(folder):
     cv2.imwrite(str(folder / "a.png"), np.full((4, 4), 2, np.uint8))
-    with pytest.raises(BadFrameError, match=r"a\.png is 4x4, not of the shape of the 4x2 frame"):
+    with pytest.raises(BadFrameError, match=r"a\.png is 4x4, which is not of the shape of the 4x2 frame"):
         model_of(folder).extract(FRAME)
     (folder / "a.npy").write_bytes(b"\x93NUMPY\x01\x00\x10")
     with pytest.raises(BadFrameError, match=r"a\.npy is no array of scores, or damaged"):
