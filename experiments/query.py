@@ -10,7 +10,6 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from emgs_jax.features.base import FeatureModel
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.io.class_file import read_classes
 from emgs_jax.io.trajectory import load_trajectory_tum
@@ -27,7 +26,7 @@ from emgs_jax.report.query_pictures import (
     views_of,
 )
 from emgs_jax.report.recorded_run import RecordedRun, read_run
-from emgs_jax.report.vocabulary import Vocabulary, check_folder, vocabulary, words_of
+from emgs_jax.report.vocabulary import Vocabulary, check_folder, feature_model, vocabulary, words_of
 from emgs_jax.running.configure import build
 from emgs_jax.running.values import Declared, check_value
 
@@ -84,13 +83,6 @@ def asked(config: DictConfig) -> tuple[str, ...]:
     if not words:
         raise ValueError("nothing is asked: give text=chair, text=[chair,table] or classes=FILE")
     return words_of(words, "text and classes")
-
-
-def feature_model(config: DictConfig, words: tuple[str, ...]) -> FeatureModel | None:
-    """The text encoder of a config; None with features=none, or where a file has the embeddings."""
-    if "_target_" not in config.features or config.features.text is not None:
-        return None
-    return build(config, "features", classes=list(words))
 
 
 def rivals(config: DictConfig, words: tuple[str, ...], texts: Vocabulary) -> TextEmbeddings:

@@ -33,7 +33,7 @@ class SegmentationProtocol:
         logit_scale: a point's probabilities are the softmax of its cosines times this.
         min_probability: a point whose largest probability is less has no class.
         min_class_probability: a class whose probability is less at every point of the scene is given to none.
-        counted: classes of a mean: `seen` (true or predicted anywhere), or `true`.
+        counted: classes of a mean: `seen` (true or predicted anywhere), or `in_truth`.
         scenes: `sum` (one matrix of all) or `mean` (of each scene's metrics).
         accuracy: what is called Acc: `mean_recall` of the classes, or `overall`, the share of the points.
     """
@@ -53,7 +53,11 @@ class SegmentationProtocol:
     accuracy: str = field()
 
     def __post_init__(self):
-        choices = {"compared_at": ("truth", "map"), "offered": ("all", "kept", "scene"), "counted": ("seen", "true")}
+        choices = {
+            "compared_at": ("truth", "map"),
+            "offered": ("all", "kept", "scene"),
+            "counted": ("seen", "in_truth"),
+        }
         choices |= {"scenes": ("sum", "mean"), "accuracy": ("mean_recall", "overall")}
         for key, allowed in choices.items():
             if getattr(self, key) not in allowed:
@@ -138,12 +142,10 @@ def table_metrics(
     return {name: float(np.mean(found)) if found else None for name, found in values.items()}
 
 
-def matrix_metrics(
-    confusion: np.ndarray, ignored: Sequence[int], p: SegmentationProtocol
-) -> dict[str, float | None]:
+def matrix_metrics(confusion: np.ndarray, ignored: Sequence[int], p: SegmentationProtocol) -> dict[str, float | None]:
     """mIoU, f-mIoU and Acc in percent of one matrix; None without any true point."""
     num_true = confusion.sum(1)
-    if p.counted == "true":
+    if p.counted == "in_truth":
         ignored = np.flatnonzero(num_true == 0)
         if p.compared_at == "map":  # as ConceptGraphs: the columns of these classes are left out, too
             confusion = confusion.copy()

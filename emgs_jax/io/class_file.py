@@ -53,7 +53,7 @@ class ClassFile:
             )
         if unnamed:
             raise ValueError(
-                f"{what}: no name in {self.path} for {_some(unnamed)}: give the class file of this data set, or add them"
+                f"{what}: no name in {self.path} for {_some(unnamed)}: give the class file of this data set"
             )
         return np.array([self.positions[int(number)] for number in found], np.int64)[inverse.reshape(np.shape(ids))]
 

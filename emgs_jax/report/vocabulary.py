@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from omegaconf import DictConfig
 
 from emgs_jax.features.base import FeatureModel
 from emgs_jax.features.text import TextEmbeddings, load_text
 from emgs_jax.report.recorded_run import TEXT_FILE, RecordedRun
+from emgs_jax.running.configure import build
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,13 @@ def vocabulary(run: RecordedRun, file: str | None, model: FeatureModel | None) -
             "(features.text=FILE of emgs embed) or the text encoder (features=…)"
         )
     return Vocabulary(str(run.folder / TEXT_FILE), width, run.text)
+
+
+def feature_model(config: DictConfig, words: Sequence[str]) -> FeatureModel | None:
+    """The text encoder of a config; None with features=none, or where `features.text` has the embeddings."""
+    if "_target_" not in config.features or config.features.text is not None:
+        return None
+    return build(config, "features", classes=list(words))
 
 
 def words_of(value: Any, key: str) -> tuple[str, ...]:
