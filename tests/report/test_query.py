@@ -37,7 +37,7 @@ def test_the_object_has_its_place_and_every_file_says_the_same(folder, tmp_path,
     found = said(folder, "text=sofa", f"out={tmp_path}")
     assert {path.name for path in tmp_path.iterdir()} == FILES
     assert json.loads((tmp_path / "query.json").read_text())["words"][0]["word"] == "sofa"
-    means = np.asarray(load_map(folder / "map.npz").gaussians.means)
+    means = np.asarray(load_map(folder / "map.npz").gaussians.means, np.float64)
     near = means[:, 2] == 1.0
     (word,) = found["words"]
     (sofa,) = word["instances"]
@@ -95,7 +95,8 @@ def test_a_rendered_image_shows_each_gaussian_where_it_is(folder):
     is_near = (np.asarray(run.map.gaussians.means)[:, 2] == 1.0).astype(np.float32)[:, None]
     image = drawn(run, run.map.gaussians, is_near, frame_view(run, 0), run.camera)[..., 0]
     # The camera looks along z from the origin: what is left of x = .46 at 1 m is pixel 22 + 40 · .46.
-    assert np.nanmin(image[8:32, 4:36]) > 0.95 and np.nanmax(image[8:32, 44:47]) < 0.05
+    # A tenth of the far wall may shine through, since the opacity is .9.
+    assert np.nanmin(image[8:32, 4:36]) > 0.9 and np.nanmax(image[8:32, 44:47]) < 0.05
 
 
 def test_pictures_are_drawn_from_given_poses_and_frames(folder, tmp_path):
@@ -105,7 +106,7 @@ def test_pictures_are_drawn_from_given_poses_and_frames(folder, tmp_path):
     said(folder, "text=sofa", f"out={tmp_path / 'a'}", f"pose={tmp_path / 'poses.txt'}")
     said(folder, "text=sofa", f"out={tmp_path / 'b'}", "frame=2")
     heights = [matplotlib.image.imread(tmp_path / name / "query.png").shape[0] for name in "ab"]
-    assert heights[0] == 2 * heights[1]
+    assert 1.9 < heights[0] / heights[1] < 2.1  # two lines and one
     with pytest.raises(ValueError, match="has no pose of frame=77: choose one from 0 to 5"):
         said(folder, "text=sofa", "frame=77")
     with pytest.raises(ValueError, match="give one of them"):
@@ -150,7 +151,7 @@ def test_embeddings_of_another_width_or_encoder_are_refused_and_both_are_named(f
 
 
 def test_a_text_encoder_embeds_any_word_and_what_anything_is_stands_against_it(tmp_path):
-    """The features of the near wall are those of the random model for "a red chair"."""
+    """The features of the near wall are those of the random model for "red chair", the other's those for "things"."""
     folder = written_run(tmp_path / "run")
     model = RandomFeatures(16, 8, 0, (), ["a {}."], None)
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -158,7 +159,7 @@ def test_a_text_encoder_embeds_any_word_and_what_anything_is_stands_against_it(t
     (folder / "metrics.json").write_text(json.dumps(metrics))
     map = load_map(folder / "map.npz")
     near = np.asarray(map.gaussians.means)[:, 2:] == 1.0
-    vectors = model.embed(("red chair", "green wall")).vectors
+    vectors = model.embed(("red chair", "things")).vectors
     features = jnp.asarray(np.where(near, vectors[0], vectors[1]))
     save_map(folder / "map.npz", eqx.tree_at(lambda m: m.gaussians.features, map, features))
     found = said(folder, "text='red chair'", "features=random", "features.templates=['a {}.']")
