@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import Gaussians, has_feature
 from emgs_jax.ops.linalg import safe_normalize
@@ -40,8 +40,7 @@ def classify(gaussians: Gaussians, text_features: Float[Array, "c f"]) -> Int[Ar
         ValueError: the embeddings' width differs from the map's, or there is no class.
     """
     _check_width(gaussians, text_features)
-    is_known = gaussians.valid & has_feature(gaussians.features)
-    return jnp.where(is_known, jnp.argmax(similarities(gaussians, text_features), axis=-1), -1)
+    return jnp.where(_is_known(gaussians), jnp.argmax(similarities(gaussians, text_features), axis=-1), -1)
 
 
 @full_precision
@@ -74,7 +73,7 @@ def relevance(
     cosines, is_best = known[:, : words.shape[0]], is_best[:, : words.shape[0]]
     leads = cosines - jnp.where(is_best, second, highest)
     is_answer = is_best & (leads >= margin) & (cosines >= min_cosine)
-    is_answer &= (gaussians.valid & has_feature(gaussians.features))[:, None]
+    is_answer &= _is_known(gaussians)[:, None]
     labels = jnp.where(jnp.any(is_answer, axis=-1), jnp.argmax(is_answer, axis=-1), -1)
     return Relevance(cosines, leads, labels)
 
@@ -86,7 +85,7 @@ def principal_colors(gaussians: Gaussians) -> Float[Array, "n 3"]:
     Each direction's sign makes its largest entry positive; from 0 to 1 go 98 % of the Gaussians. Grey (.5) is a
     direction in which features do not differ, an invalid row, and a Gaussian without a feature.
     """
-    is_known = gaussians.valid & has_feature(gaussians.features)
+    is_known = _is_known(gaussians)
     count = jnp.maximum(jnp.sum(is_known), 1)
     units = jnp.where(is_known[:, None], safe_normalize(gaussians.features), 0.0)
     centered = jnp.where(is_known[:, None], units - jnp.sum(units, axis=0) / count, 0.0)
@@ -98,6 +97,10 @@ def principal_colors(gaussians: Gaussians) -> Float[Array, "n 3"]:
     is_spread = high - low > MIN_SPREAD  # False where nothing is known, which makes both ends NaN
     shares = (along - jnp.where(is_spread, low, 0.0)) / jnp.where(is_spread, high - low, 1.0)
     return jnp.where(is_spread & is_known[:, None], jnp.clip(shares, 0.0, 1.0), 0.5)
+
+
+def _is_known(gaussians: Gaussians) -> Bool[Array, "n"]:
+    return gaussians.valid & has_feature(gaussians.features)
 
 
 def _check_width(gaussians: Gaussians, text_features: Float[Array, "c f"]) -> None:

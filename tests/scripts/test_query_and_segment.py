@@ -43,10 +43,12 @@ def test_the_one_chair_and_the_one_picture_are_found_where_they_are(name, tmp_pa
     """Pixels are 2 to 3 cm apart there, and a Gaussian stands for a cluster of some twenty."""
     found = query(configure.compose(f"map={exact_run()}", f"text={name}", f"out={tmp_path}", name="query"))
     points = true_points(name)
-    best = found["words"][0]["instances"][0]
-    np.testing.assert_allclose(best["center_m"], points.mean(0), atol=0.15)
-    assert (best["low_m"] < points.mean(0)).all() and (points.mean(0) < best["high_m"]).all()
-    assert found["features"]["num_gaussians"] > sum(one["num_gaussians"] for one in found["words"][0]["instances"])
+    objects = found["words"][0]["instances"]  # back and seat of the chair are seen apart
+    np.testing.assert_allclose(objects[0]["center_m"], points.mean(0), atol=0.15)
+    counts = [one["num_gaussians"] for one in objects]
+    centers = np.array([one["center_m"] for one in objects])
+    np.testing.assert_allclose(np.average(centers, axis=0, weights=counts), points.mean(0), atol=0.1)
+    assert sum(counts) < 0.2 * found["features"]["num_gaussians"]
 
 
 def test_segment_says_of_labelled_frames_what_the_run_itself_said(tmp_path):
