@@ -1,11 +1,29 @@
 """Open-set queries (Experiments C): every Gaussian gets the class whose text embedding is closest to its feature."""
 
+import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import Gaussians, has_feature
 from emgs_jax.ops.linalg import safe_normalize
 from emgs_jax.ops.precision import full_precision
+
+MIN_SPREAD = 1e-3  # of a direction of unit features; along a smaller one they do not differ, but for rounding
+
+
+class Relevance(eqx.Module):
+    """What a map says to c words.
+
+    Args:
+        cosines: of every Gaussian's feature with each word; 0 without a feature.
+        leads: cosine minus the largest one with any other word or rival; plus 1 where there is no other. Positive for
+            the closest word only.
+        labels: the word that a Gaussian is an answer to, -1 for none of these.
+    """
+
+    cosines: Float[Array, "n c"]
+    leads: Float[Array, "n c"]
+    labels: Int[Array, "n"]
 
 
 @full_precision
@@ -21,10 +39,73 @@ def classify(gaussians: Gaussians, text_features: Float[Array, "c f"]) -> Int[Ar
     Raises:
         ValueError: the embeddings' width differs from the map's, or there is no class.
     """
+    _check_width(gaussians, text_features)
+    return jnp.where(_is_known(gaussians), jnp.argmax(similarities(gaussians, text_features), axis=-1), -1)
+
+
+@full_precision
+def relevance(
+    gaussians: Gaussians,
+    words: Float[Array, "c f"],
+    rivals: Float[Array, "r f"],
+    margin: Float[Array, ""],
+    min_cosine: Float[Array, ""],
+) -> Relevance:
+    """Ask for words. A Gaussian is an answer to the closest one, unless a rival or another word is nearly as close.
+
+    Args:
+        gaussians: invalid rows and those without a feature answer to nothing.
+        words: text embeddings; of any length but 0.
+        rivals: embeddings of what is not asked for; perhaps none.
+        margin: the lead that an answer needs.
+        min_cosine: the cosine that an answer needs.
+
+    Raises:
+        ValueError: the embeddings' width differs from the map's, or there is no word.
+    """
+    _check_width(gaussians, words)
+    texts = jnp.concatenate([words, rivals])
+    known = similarities(gaussians, texts)
+    best = jnp.argmax(known, axis=-1)
+    is_best = jnp.arange(texts.shape[0]) == best[:, None]
+    highest = jnp.max(known, axis=-1, keepdims=True)
+    second = jnp.max(jnp.where(is_best, -1.0, known), axis=-1, keepdims=True)
+    cosines, is_best = known[:, : words.shape[0]], is_best[:, : words.shape[0]]
+    leads = cosines - jnp.where(is_best, second, highest)
+    is_answer = is_best & (leads >= margin) & (cosines >= min_cosine)
+    is_answer &= _is_known(gaussians)[:, None]
+    labels = jnp.where(jnp.any(is_answer, axis=-1), jnp.argmax(is_answer, axis=-1), -1)
+    return Relevance(cosines, leads, labels)
+
+
+@full_precision
+def principal_colors(gaussians: Gaussians) -> Float[Array, "n 3"]:
+    """Where features lie along the three directions in which they differ most, as RGB in [0, 1].
+
+    Each direction's sign makes its largest entry positive; from 0 to 1 go 98 % of the Gaussians. Grey (.5) is a
+    direction in which features do not differ, an invalid row, and a Gaussian without a feature.
+    """
+    is_known = _is_known(gaussians)
+    count = jnp.maximum(jnp.sum(is_known), 1)
+    units = jnp.where(is_known[:, None], safe_normalize(gaussians.features), 0.0)
+    centered = jnp.where(is_known[:, None], units - jnp.sum(units, axis=0) / count, 0.0)
+    _, directions = jnp.linalg.eigh(centered.T @ centered / count)
+    directions = jnp.pad(directions[:, ::-1], ((0, 0), (0, 3)))[:, :3]
+    largest = jnp.take_along_axis(directions, jnp.argmax(jnp.abs(directions), axis=0)[None], axis=0)
+    along = centered @ jnp.where(largest < 0, -directions, directions)
+    low, high = jnp.nanpercentile(jnp.where(is_known[:, None], along, jnp.nan), jnp.array([1.0, 99.0]), axis=0)
+    is_spread = high - low > MIN_SPREAD  # False where nothing is known, which makes both ends NaN
+    shares = (along - jnp.where(is_spread, low, 0.0)) / jnp.where(is_spread, high - low, 1.0)
+    return jnp.where(is_spread & is_known[:, None], jnp.clip(shares, 0.0, 1.0), 0.5)
+
+
+def _is_known(gaussians: Gaussians) -> Bool[Array, "n"]:
+    return gaussians.valid & has_feature(gaussians.features)
+
+
+def _check_width(gaussians: Gaussians, text_features: Float[Array, "c f"]) -> None:
     if text_features.shape[0] == 0 or text_features.shape[1] != gaussians.features.shape[-1]:
         raise ValueError(
             f"text_features must be (classes, {gaussians.features.shape[-1]}) like the map's features, "
             f"got {tuple(text_features.shape)}: embed the classes with the model that made the map's features"
         )
-    is_known = gaussians.valid & has_feature(gaussians.features)
-    return jnp.where(is_known, jnp.argmax(similarities(gaussians, text_features), axis=-1), -1)

@@ -14,6 +14,8 @@ COMMANDS = {  # name: (what it does, an example)
     "report": ("write the page of a finished run anew", "emgs report outputs/synthetic/2026-01-31_12-00-00"),
     "predict": ("record what a prior says of a sequence", "emgs predict dataset=… prior=mapanything out=predictions"),
     "embed": ("class names to text features", "emgs embed features=dinov3_text 'classes=[wall,floor]' out=text.npz"),
+    "query": ("ask a finished map for things", "emgs query map=outputs/monday 'text=[chair,table]'"),
+    "segment": ("segmentation of finished maps, as the paper's Table III", "emgs segment 'map=[outputs/office0]' …"),
     "tables": ("the tables of README.md, from one commit", "emgs tables root=data"),
     "benchmark": ("how long the stages take", "emgs benchmark 'parts=[em,icp]'"),
 }

@@ -370,6 +370,20 @@ STAGES = [
             "the newest image where the current is",
         ),
     ),
+    *own("semantics", "test_semantics")(
+        ("(leads >= margin) &", "", "an answer that is hardly closer than another"),
+        ("& (cosines >= min_cosine)", "", "an answer that is far from every word"),
+        ("jnp.where(is_best, second, highest)", "highest", "a word is its own rival"),
+        ("jnp.concatenate([words, rivals])", "words", "rivals are not heard"),
+        (
+            "jnp.where(is_best, -1.0, known)",
+            "jnp.where(is_best, 0.0, known)",
+            "without another word a lead is too small",
+        ),
+        ("directions[:, ::-1]", "directions", "the directions in which features differ least"),
+        ("jnp.where(largest < 0, -directions, directions)", "directions", "colours whose sign is the solver's choice"),
+        ("along = centered @", "along = units @", "a blank of the mean in the colours of padding"),
+    ),
 ]
 
 RENDER = [

@@ -79,8 +79,99 @@ LOCATION = ("tests/loops/test_location.py",)
 PLACES = ("tests/running/test_places.py",)
 LOCATING = ("tests/running/test_locating.py",)
 COMING_BACK = ("tests/running/test_coming_back.py",)
+INSTANCES = ("tests/evaluation/test_instances.py",)
+PROTOCOLS = ("tests/evaluation/test_protocols.py",)
+CLASS_FILE = ("tests/io/test_class_file.py",)
+LABELLED_MESH = ("tests/evaluation/test_labelled_mesh.py",)
+QUERY = ("tests/report/test_query.py",)
+SEGMENTATION_TABLE = ("tests/report/test_segmentation_table.py",)
 
 MUTANTS = (
+    # questions to a map, and classes against the truth
+    Mutant(
+        "emgs_jax/evaluation/instances.py",
+        "rows = answers[numbers == one]",
+        "rows = np.flatnonzero(numbers == one)",
+        QUERY,
+        "rows among the answers, not of the map",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/instances.py",
+        "-one.score * len(one.rows)",
+        "-one.score",
+        INSTANCES,
+        "a crumb before the object",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/protocols.py",
+        "shares[:, shares[is_known].max(0) < p.min_class_probability] = 0.0",
+        "pass",
+        PROTOCOLS,
+        "classes that are sure nowhere are given",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/protocols.py",
+        "labels + 1, true_points, p.num_neighbours) - 1, true",
+        "labels, true_points, p.num_neighbours), true",
+        PROTOCOLS,
+        "voxels without a class do not vote",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/protocols.py",
+        "            confusion[:, ignored] = 0\n",
+        "            pass\n",
+        PROTOCOLS,
+        "what was given to a class that the map does not meet is a miss",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/protocols.py",
+        "np.lexsort((pairs[:, 1], -counts, pairs[:, 0]))",
+        "np.lexsort((pairs[:, 1], pairs[:, 0]))",
+        PROTOCOLS,
+        "the smallest label of a voxel, however rare",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/protocols.py",
+        "offered &= np.isin(np.arange(len(offered)), true_labels)",
+        "pass",
+        PROTOCOLS,
+        "classes that the scene does not have are offered",
+    ),
+    Mutant(
+        "emgs_jax/data/class_file.py",
+        "positions[number] = position if position < len(names) else -1",
+        "positions[number] = position",
+        CLASS_FILE,
+        "what OVO ignores is a class",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/labelled_mesh.py",
+        "if len(ids) != len(points):",
+        "if len(ids) > len(points):",
+        LABELLED_MESH,
+        "labels of another mesh",
+    ),
+    Mutant(
+        "emgs_jax/report/vocabulary.py",
+        "if model.identity != space:",
+        "if not space:",
+        QUERY,
+        "words of one encoder against features of another",
+    ),
+    Mutant(
+        "emgs_jax/report/query.py",
+        "safe_normalize(answer.gaussians.features[rows])",
+        "answer.gaussians.features",
+        QUERY,
+        "features of other rows in semantic.npz",
+    ),
+    Mutant(
+        "emgs_jax/report/segmentation_table.py",
+        "        points = moved.apply(points)\n",
+        "",
+        SEGMENTATION_TABLE,
+        "a map that is said to be placed by its points is not",
+    ),
     # sweeps that go on
     Mutant(
         "experiments/sweep.py",

@@ -12,17 +12,27 @@ import pytest
 from omegaconf import OmegaConf
 from scene import CONF, compose, slam_config
 
+from emgs_jax.running import configure
 from emgs_jax.slam import SlamConfig
 
 ROOT = CONF.parent
 # Studies and suites hold no class; tests/scripts composes them.
 UNTYPED = {CONF, CONF / "experiment", CONF / "experiment_on", CONF / "suite", CONF / "sweep"}
 GATE = CONF / "baseline" / "smoke.yaml"  # results to compare with, no option
+OF_COMMANDS = {"protocol": "segment"}  # groups of another command than a run
 GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent not in UNTYPED and path != GATE)
 
 
 def group_and_option(path: Path) -> tuple[str, str]:
     return str(path.parent.relative_to(CONF)), path.stem
+
+
+def composed(group: str, option: str) -> dict:
+    """The config of the command that has the group."""
+    if group not in OF_COMMANDS:
+        return OmegaConf.to_container(compose(f"{group}={option}"), resolve=False)
+    config = configure.compose(f"{group}={option}", name=OF_COMMANDS[group])
+    return {group: OmegaConf.to_container(config[group], resolve=False)}
 
 
 def targets(node):
@@ -37,8 +47,7 @@ def targets(node):
 @pytest.mark.parametrize("path", GROUPED, ids=lambda path: "/".join(group_and_option(path)))
 def test_every_option_composes_and_its_keys_are_parameters(path):
     group, option = group_and_option(path)
-    config = OmegaConf.to_container(compose(f"{group}={option}"), resolve=False)
-    nodes = list(targets(config))
+    nodes = list(targets(composed(group, option)))
     assert nodes
     for node in nodes:
         parameters = inspect.signature(hydra.utils.get_class(node["_target_"])).parameters
@@ -110,7 +119,7 @@ def config_classes():
                 visit(hint)
 
     for group, option in map(group_and_option, GROUPED):
-        for node in targets(OmegaConf.to_container(compose(f"{group}={option}"), resolve=False)):
+        for node in targets(composed(group, option)):
             visit(hydra.utils.get_class(node["_target_"]))
     return seen
 
@@ -145,7 +154,7 @@ def test_a_value_that_stands_in_a_constructor_too_is_the_same_there():
     """conf/ is where a value is looked up; a class that can be made by hand must not disagree with it."""
     for group, option in map(group_and_option, GROUPED):
         if option not in ("default", "paper", "none", group):
-            for node in targets(OmegaConf.to_container(compose(f"{group}={option}"))):
+            for node in targets(composed(group, option)):
                 if node["_target_"].startswith(("emgs_jax.data.", "emgs_jax.prior.")):
                     parameters = inspect.signature(hydra.utils.get_class(node["_target_"])).parameters
                     for key, value in node.items():

@@ -1,12 +1,15 @@
 """Open-set classification against hand-made features, and end to end on labels that a prior has seen."""
 
+import time
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from emgs_jax.gaussians import empty_gaussians
-from emgs_jax.semantics import classify, similarities
+from emgs_jax.semantics import classify, principal_colors, relevance, similarities
 
 
 @pytest.fixture
@@ -32,3 +35,101 @@ def test_similarities_are_cosines(three):
 def test_embeddings_of_another_model_are_refused(three, shape):
     with pytest.raises(ValueError, match="embed the classes"):
         classify(three, jnp.zeros(shape))
+
+
+_relevance, _colors = eqx.filter_jit(relevance), eqx.filter_jit(principal_colors)
+
+
+def asked(gaussians, words, rivals=(), margin=0.0, min_cosine=-1.0):
+    rivals = jnp.asarray(rivals, jnp.float32).reshape(-1, gaussians.features.shape[-1])
+    return _relevance(gaussians, jnp.asarray(words, jnp.float32), rivals, jnp.asarray(margin), jnp.asarray(min_cosine))
+
+
+def test_relevance_is_what_a_loop_over_gaussians_and_words_finds():
+    rng = np.random.default_rng(0)
+    features, words, rivals = (rng.normal(size=(count, 5)) for count in (40, 3, 2))
+    features[7] = 0.0
+    valid = np.arange(40) != 11
+    gaussians = eqx.tree_at(
+        lambda g: (g.features, g.valid),
+        empty_gaussians(40, 5),
+        (jnp.asarray(features, jnp.float32), jnp.asarray(valid)),
+    )
+    margin, least = 0.15, 0.3
+    found = asked(gaussians, words, rivals, margin, least)
+    for row in range(40):
+        cosines = [f @ features[row] / max(np.linalg.norm(f) * np.linalg.norm(features[row]), 1e-9) for f in words]
+        others = [f @ features[row] / max(np.linalg.norm(f) * np.linalg.norm(features[row]), 1e-9) for f in rivals]
+        leads = [cosines[c] - max([*others, *cosines[:c], *cosines[c + 1 :]]) for c in range(3)]
+        np.testing.assert_allclose(found.cosines[row], cosines, atol=1e-6)
+        np.testing.assert_allclose(found.leads[row], leads, atol=1e-6)
+        best = int(np.argmax(cosines))
+        is_answer = valid[row] and features[row].any() and leads[best] >= margin and cosines[best] >= least
+        assert found.labels[row] == (best if is_answer else -1)
+    assert (found.labels == -1).any() and (found.labels >= 0).any()
+
+
+def test_margin_rivals_and_a_least_cosine_make_none_of_these(three):
+    """Row 1 has cosines .6 and .8 with the first two axes, 0 with the third."""
+    axes = np.eye(3)
+    assert asked(three, axes[:2]).labels.tolist() == [0, 1, -1, -1]
+    assert asked(three, axes[:2], margin=0.19).labels[1] == 1 and asked(three, axes[:2], margin=0.21).labels[1] == -1
+    assert asked(three, axes[:1]).labels.tolist() == [0, 0, -1, -1]  # nothing else is asked for
+    assert asked(three, axes[:1], axes[1:2]).labels.tolist() == [0, -1, -1, -1]
+    assert asked(three, axes[:1], min_cosine=0.61).labels.tolist() == [0, -1, -1, -1]
+    with pytest.raises(ValueError, match="embed the classes"):
+        asked(three, np.ones((0, 3)))
+
+
+def test_the_length_of_a_feature_says_nothing(three):
+    longer = eqx.tree_at(lambda g: g.features, three, three.features * jnp.array([[0.1], [7.0], [1.0], [1.0]]))
+    np.testing.assert_allclose(asked(longer, np.eye(3)).cosines, asked(three, np.eye(3)).cosines, atol=1e-6)
+    np.testing.assert_allclose(_colors(longer), _colors(three), atol=1e-4)
+
+
+def test_colours_are_the_features_along_their_main_directions():
+    """Oracle: a singular value decomposition in float64, signs by its largest entry, percentiles by NumPy."""
+    rng = np.random.default_rng(1)
+    features = rng.normal(size=(60, 6)) * [5.0, 3.0, 2.0, 0.3, 0.2, 0.1] + 1.0
+    features[3] = 0.0
+    valid = np.arange(60) != 5
+    gaussians = eqx.tree_at(
+        lambda g: (g.features, g.valid),
+        empty_gaussians(60, 6),
+        (jnp.asarray(features, jnp.float32), jnp.asarray(valid)),
+    )
+    known = valid & features.any(1)
+    units = features[known] / np.linalg.norm(features[known], axis=1, keepdims=True)
+    centered = units - units.mean(0)
+    directions = np.linalg.svd(centered)[2][:3]
+    directions *= np.sign(np.take_along_axis(directions, np.abs(directions).argmax(1)[:, None], 1))
+    along = centered @ directions.T
+    low, high = np.percentile(along, [1, 99], axis=0)
+    colors = np.asarray(_colors(gaussians))
+    np.testing.assert_allclose(colors[known], ((along - low) / (high - low)).clip(0, 1), atol=2e-3)
+    np.testing.assert_array_equal(colors[~known], 0.5)
+
+
+def test_features_that_do_not_differ_are_grey(three):
+    same = eqx.tree_at(lambda g: g.features, three, jnp.ones((4, 3)))
+    np.testing.assert_array_equal(_colors(same), 0.5)
+    np.testing.assert_array_equal(_colors(empty_gaussians(4, 2)), 0.5)
+    two = eqx.tree_at(lambda g: g.features, three, jnp.array([[1.0, 0, 0], [0, 1.0, 0], [1.0, 0, 0], [0, 1.0, 0]]))
+    np.testing.assert_allclose(_colors(two)[:, 1:], 0.5)  # one direction only
+
+
+@pytest.mark.slow
+def test_twenty_words_to_twenty_thousand_gaussians_of_width_1024_take_a_moment():
+    """The bar is .2 s on two cores: .4 s of processor time, whatever else the machine does."""
+    rng = np.random.default_rng(0)
+    features = jnp.asarray(rng.normal(size=(20000, 1024)), jnp.float32)
+    gaussians = eqx.tree_at(
+        lambda g: (g.features, g.valid), empty_gaussians(20000, 1024), (features, jnp.ones(20000, bool))
+    )
+    words = jnp.asarray(rng.normal(size=(20, 1024)), jnp.float32)
+    seconds = []
+    for _ in range(6):
+        begin = time.process_time()
+        jax.block_until_ready(_relevance(gaussians, words, words[:4], jnp.asarray(0.0), jnp.asarray(-1.0)).labels)
+        seconds.append(time.process_time() - begin)
+    assert min(seconds[1:]) < 0.4, seconds

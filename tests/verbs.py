@@ -16,7 +16,7 @@ from scene import (
     stack_poses,
 )
 
-from emgs_jax import em, existence, gaussian_map, gaussians, initialization, localization, splitting
+from emgs_jax import em, existence, gaussian_map, gaussians, initialization, localization, semantics, splitting
 from emgs_jax import observation as obs
 from emgs_jax.graph import deform, measurements
 from emgs_jax.ops import camera as cam
@@ -201,6 +201,10 @@ VERBS = {
     "robust": (
         lambda chi2, kernel: measurements.robust(chi2, jnp.arange(6) % 2, kernel),
         lambda s: (jnp.linspace(0.0, 60.0 + s, 6), ONE * 16.8),
+    ),
+    "relevance": (
+        lambda g, words: semantics.relevance(g, words, words[:1] + 0.1, ONE * 0.01, -ONE),
+        lambda s: (random_gaussians(32, s, 2), jnp.array([[1.0, 0.2], [0.1, -1.0 - s]])),
     ),
     "refine": (
         lambda m, g, T: refine(m, g, T, CAMERA, CONFIG.refinement),

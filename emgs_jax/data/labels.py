@@ -1,6 +1,7 @@
 """Images of classes: an id per pixel, and the file that says what the ids mean."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ from jaxtyping import Int32
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.class_file import read_classes
 
 
 class LabelFolder:
@@ -16,8 +18,7 @@ class LabelFolder:
 
     Args:
         folder: of PNG images of ids with one channel, 8 or 16 bits.
-        classes: file with a line "id name" for every class, or a line "name" each, whose ids count from 0; lines that
-            begin with # say nothing.
+        classes: file that names them, see `data.class_file`; names without ids count from 0.
         unknown: ids that mean that there is no class.
 
     Raises:
@@ -28,8 +29,11 @@ class LabelFolder:
         if not folder.is_dir():
             raise ValueError(f"{folder} is no folder: give one with a class image (PNG) for every image")
         self.folder, self.classes = folder, classes
-        ids, self.names = read_classes(classes)
-        self._position = {**dict.fromkeys(unknown, -1), **{id_: row for row, id_ in enumerate(ids)}}
+        known = read_classes(classes)
+        self.names = known.names
+        positions = {row: row for row in range(len(self.names))} if known.positions is None else known.positions
+        named = {id_: position for id_, position in positions.items() if position >= 0}
+        self._known = replace(known, positions=dict.fromkeys(unknown, -1) | named)
 
     def path(self, image: str | Path) -> Path:
         """The file of an image's classes."""
@@ -53,44 +57,13 @@ class LabelFolder:
                 f"{ids.shape}: write the ids, not their colours"
             )
         reading.check_raw_size(ids, raw_size, path)
-        if ids.dtype == np.uint8 and max(self._position) > 255:
-            raise BadFrameError(
-                f"{path} has 8 bits, but {self.classes} has ids up to {max(self._position)}: write it with 16 bits"
-            )
-        found = np.unique(ids)
-        nameless = [int(id_) for id_ in found if id_ not in self._position]
-        if nameless:
-            raise BadFrameError(
-                f"{path} has the ids {nameless[:5]}, which {self.classes} does not name: add their lines, or say with "
-                "`unknown` that they mean no class"
-            )
-        table = np.full(int(found[-1]) + 1, -1, np.int32)
-        table[found] = [self._position[id_] for id_ in found]
-        return table[ids]
-
-
-def read_classes(path: Path) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Ids and names of a file of classes, as `LabelFolder` takes it."""
-    if not path.is_file():
-        raise ValueError(f"{path} does not exist: give a file with a line 'id name' for every class")
-    lines = [line.strip() for line in reading.read_text(path).splitlines()]
-    rows = [line.split(maxsplit=1) for line in lines if line and not line.startswith("#")]
-    if not rows:
-        raise ValueError(f"{path} names no classes: write a line 'id name' for every one")
-    if all(len(row) == 2 and row[0].isdecimal() for row in rows):
-        ids, names = [int(row[0]) for row in rows], [row[1] for row in rows]
-    else:
-        ids, names = [*range(len(rows))], [" ".join(row) for row in rows]
-    for what, values in (("id", ids), ("name", names)):
-        twice = _first_twice(values)
-        if twice is not None:
-            raise ValueError(f"{path} has the {what} {twice!r} twice: each class needs its own")
-    return tuple(ids), tuple(names)
-
-
-def _first_twice(values: Iterable[object]) -> object | None:
-    seen: set[object] = set()
-    return next((value for value in values if value in seen or seen.add(value)), None)
+        largest = max(self._known.positions or ())
+        if ids.dtype == np.uint8 and largest > 255:
+            raise BadFrameError(f"{path} has 8 bits, but {self.classes} has ids up to {largest}: write it with 16 bits")
+        try:
+            return self._known.positions_of(ids, path).astype(np.int32)
+        except ValueError as error:
+            raise BadFrameError(f"{error}, or say with `unknown` which ids mean no class") from error
 
 
 def as_unknown(unknown: Sequence[int], key: str) -> tuple[int, ...]:

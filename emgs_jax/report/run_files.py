@@ -27,7 +27,7 @@ from emgs_jax.running.record import MappingRun, row_of_first_node
 OUTPUTS = (
     *("metrics.json", "trajectory.txt", "trajectory_online.txt", "graph.g2o", LOOPS_FILE, "frames.jsonl"),
     *("map.npz", "places.npz", "map.ply", "points.ply", "mesh.ply", "overview.png", TEXT_FILE, REPORT_FILE),
-    CHECKPOINT_FILE,
+    *(CHECKPOINT_FILE, "query.json", "query.png", "semantic.npz", "semantic.ply", "features.png"),
 )
 
 
@@ -72,8 +72,10 @@ def save_progress(folder: Path, run: MappingRun) -> None:
 def save_classes(folder: Path, prior: Prior) -> None:
     """Write text.npz, the classes that the map's features can be compared with; nothing where there are none."""
     if prior.feature_names:
-        model = {"prior": prior.provenance.name}
-        text = TextEmbeddings(tuple(prior.feature_names), np.asarray(prior.text_features, np.float32), (), model)
+        about = prior.provenance.settings.get("features", {})  # of the model that made them, if there is one
+        model, templates = about.get("model", {"prior": prior.provenance.name}), tuple(about.get("templates", ()))
+        vectors = np.asarray(prior.text_features, np.float32)
+        text = TextEmbeddings(tuple(prior.feature_names), vectors, templates, model)
         save_text(folder / TEXT_FILE, text)
 
 

@@ -5,6 +5,7 @@ import pytest
 from written_scene import plane_depth, scene_pose
 
 from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.class_file import read_classes
 from emgs_jax.data.replica import Replica
 
 
@@ -75,3 +76,9 @@ def test_points_of_one_frame_lie_on_the_surfaces_of_another(pair, shared_data, d
     dataset = Replica(shared_data("replica"), "office0_from_mesh", stride=1)
     assert len(dataset) == 200
     assert np.median(np.abs(depth_gaps(dataset, *pair))) < 0.006  # exact depth; half a pixel of rounding on slants
+
+
+def test_the_class_file_of_ovo_has_51_classes(shared_data):
+    found = read_classes(f"{shared_data('replica')}/ovo_eval_info.yaml")
+    assert len(found.names) == 51 and found.names[:3] == ("wall", "ceiling", "floor")
+    np.testing.assert_array_equal(found.positions_of(np.array([93, 79, -2, 101]), "x"), [0, 50, -1, -1])

@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from emgs_jax import load_config
 from emgs_jax.data.base import Dataset
 from emgs_jax.data.checksums import SUMS_FILE
+from emgs_jax.data.class_file import read_classes
 from emgs_jax.data.images import Images
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.reading import is_rigid
@@ -25,6 +26,7 @@ from emgs_jax.data.seven_scenes import SevenScenes
 from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.data.tum import Tum
 from emgs_jax.evaluation.clouds import read_cloud
+from emgs_jax.evaluation.labelled_mesh import read_labelled_mesh
 from emgs_jax.features.text import TextEmbeddings, load_text, save_text
 from emgs_jax.gaussian_map import empty_map
 from emgs_jax.graph.measurements import LOOP, WINDOW, Graph, Nodes
@@ -295,6 +297,25 @@ def read_embeddings(folder: Path) -> None:
     assert found.vectors.shape == (1, 8) and np.isfinite(found.vectors).all()
 
 
+CLASS_LINES = "93 wall\n20 chair\n"
+CLASS_YAML = "class_names_reduced: [wall, chair]\nmap_to_reduced: {93: 0, 20: 1, -1: 2}\nclass_names: [none, lamp]\n"
+
+
+def write_labelled_mesh(folder: Path) -> None:
+    points = np.random.default_rng(0).normal(size=(4, 3))
+    save_points_ply(folder / "a_mesh.ply", points, points, np.zeros((4, 3)))
+    (folder / "a.txt").write_text("93\n20\n20\n93\n")
+    (folder / "classes.txt").write_text(CLASS_LINES)
+    (folder / "classes.yaml").write_text(CLASS_YAML)
+
+
+def read_classes_and_mesh(folder: Path) -> None:
+    for name in ("classes.txt", "classes.yaml"):
+        found = read_labelled_mesh(folder, "a", read_classes(folder / name))
+        assert len(found.points) == len(found.labels) and found.labels.max(initial=-1) < len(found.classes)
+        assert all(name.strip() for name in found.classes)
+
+
 def write_checkpoint(folder: Path) -> None:
     records = [FrameRecord(i, str(i), 0.1 * i, "tracked", pose=scene_pose(i), raw_pose=scene_pose(i)) for i in range(2)]
     leaves = [np.arange(6, dtype=np.float32), np.ones(3, bool)]
@@ -373,5 +394,7 @@ def targets() -> Iterator[Target]:
     yield Target("points", write_cloud, read_points, {".ply": (*BYTES, *TEXT)})
     yield Target("graph", write_graph, read_graph, {".g2o": TEXT})
     yield Target("text embeddings", write_embeddings, read_embeddings, {".npz": BYTES})
+    damages = {".txt": TEXT, ".yaml": TEXT, ".ply": BYTES}
+    yield Target("labelled mesh", write_labelled_mesh, read_classes_and_mesh, damages)
     yield Target("checkpoint", write_checkpoint, read_checkpoint, {".npz": BYTES})
     yield Target("command line", write_words, read_words, {"words": (change_words,)})

@@ -1,0 +1,89 @@
+"""Objects in a map: the Gaussians that are answers to one word, in clusters."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from emgs_jax.ops.ranges import number
+
+
+@dataclass(frozen=True)
+class InstanceConfig:
+    """Which answers belong together.
+
+    Args:
+        reach: in median distances between nearest Gaussians of the map; answers within it of each other are one object.
+        min_gaussians: within `reach` of a Gaussian, itself included, that hold a cluster together (DBSCAN's minPts).
+    """
+
+    reach: float = number(low=1e-6, high=1e6)
+    min_gaussians: int = number(low=1, high=10**6)
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One object, in the frame and unit of the map.
+
+    Args:
+        center: mean of its Gaussians' means, (3,).
+        low: lower corner of the box along the map's axes that holds its Gaussians' means with one standard deviation.
+        high: upper corner.
+        score: mean cosine of its Gaussians with the word.
+        lead: mean lead over everything else.
+        rows: of its Gaussians.
+    """
+
+    center: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    score: float
+    lead: float
+    rows: np.ndarray
+
+
+def reach_of(means: np.ndarray, config: InstanceConfig) -> float:
+    """The distance within which answers belong together, in the unit of means (n, 3); 0 for fewer than two."""
+    if len(means) < 2:
+        return 0.0
+    return config.reach * float(np.median(cKDTree(means).query(means, k=2)[0][:, 1]))
+
+
+def clusters(points: np.ndarray, reach: float, min_points: int) -> np.ndarray:
+    """DBSCAN: the cluster of each point (n, 3), from 0; -1 for noise."""
+    if not len(points) or reach <= 0:
+        return np.full(len(points), -1)
+    import open3d as o3d  # slow to import
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, np.float64)))
+    return np.asarray(cloud.cluster_dbscan(reach, min_points), np.int64)
+
+
+def find_instances(
+    answers: np.ndarray,
+    shape: tuple[np.ndarray, np.ndarray],
+    strength: tuple[np.ndarray, np.ndarray],
+    reach: float,
+    min_gaussians: int,
+) -> list[Instance]:
+    """The objects that one word finds, the one with the largest sum of cosines first.
+
+    Args:
+        answers: rows of the Gaussians that answer to the word.
+        shape: means (n, 3) and covariances (n, 3, 3) of all.
+        strength: cosine and lead (n,) of all with this word.
+        reach: see `reach_of`.
+        min_gaussians: see `InstanceConfig`.
+    """
+    means, covs = (np.asarray(values, np.float64) for values in shape)
+    cosines, leads = (np.asarray(values, np.float64) for values in strength)
+    numbers = clusters(means[answers], reach, min_gaussians)
+    found = []
+    for one in range(numbers.max(initial=-1) + 1):
+        rows = answers[numbers == one]
+        spread = np.sqrt(np.diagonal(covs[rows], axis1=1, axis2=2))
+        low, high = (means[rows] - spread).min(0), (means[rows] + spread).max(0)
+        found.append(
+            Instance(means[rows].mean(0), low, high, float(cosines[rows].mean()), float(leads[rows].mean()), rows)
+        )
+    return sorted(found, key=lambda one: -one.score * len(one.rows))

@@ -1,0 +1,225 @@
+"""Words to a finished map: which Gaussians answer, which objects they are, and the files that say so.
+
+`semantic.npz`, format `emgs_jax.semantic` version 1, is an npz without pickled objects. Of each confirmed Gaussian, in
+the order of the map: `rows` (n,) int32, where it stands in map.npz; `means` (n, 3) float32; `features` (n, f) float16,
+unit or zero; `cosines` and `leads` (n, c) float16; `labels` (n,) int16, the word it answers to, -1 = none; `instances`
+(n,) int32, the object in query.json's list for that word, -1 = none. `header` is a JSON string with `format`,
+`version`, `words`, `against`, `margin`, `min_cosine` and `model`.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+
+from emgs_jax.evaluation.instances import Instance, InstanceConfig, find_instances, reach_of
+from emgs_jax.features.text import TextEmbeddings
+from emgs_jax.gaussian_map import confirmed
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.io.files import atomic_write, write_json
+from emgs_jax.io.npz import read_npz
+from emgs_jax.io.ply import save_points_ply
+from emgs_jax.ops.linalg import safe_normalize
+from emgs_jax.report.overview import class_colors
+from emgs_jax.report.recorded_run import RecordedRun
+from emgs_jax.semantics import Relevance, relevance
+
+QUERY_FILE, SEMANTIC_FILE, SEMANTIC_PLY = "query.json", "semantic.npz", "semantic.ply"
+FORMAT, SEMANTIC_FORMAT, VERSION = "emgs_jax.query", "emgs_jax.semantic", 1
+GREY = 0.75  # of what has no feature
+ARRAYS = ("rows", "means", "features", "cosines", "leads", "labels", "instances")
+_relevance = eqx.filter_jit(relevance)
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked.
+
+    Args:
+        words: with their vectors.
+        against: what is not asked for, in the same space; perhaps none.
+        margin: the lead that an answer needs.
+        min_cosine: the cosine that an answer needs.
+        instances: which answers are one object.
+    """
+
+    words: TextEmbeddings
+    against: TextEmbeddings
+    margin: float
+    min_cosine: float
+    instances: InstanceConfig
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a map says.
+
+    Args:
+        question: what was asked.
+        gaussians: the confirmed ones are valid; on the device.
+        relevance: of all rows of the map, on the host.
+        rows: of the confirmed Gaussians.
+        instances: objects of each word, rows of the map.
+        reach: within which answers are one object, in the unit of the map.
+    """
+
+    question: Question
+    gaussians: Gaussians
+    relevance: Relevance
+    rows: np.ndarray
+    instances: list[list[Instance]]
+    reach: float
+
+
+def ask(run: RecordedRun, question: Question) -> Answer:
+    """Ask the map of a run."""
+    gaussians = confirmed(run.map)
+    vectors = (jnp.asarray(text.vectors, jnp.float32) for text in (question.words, question.against))
+    limits = (jnp.asarray(value, jnp.float32) for value in (question.margin, question.min_cosine))
+    found = jax.device_get(_relevance(gaussians, *vectors, *limits))
+    rows = np.flatnonzero(gaussians.valid)
+    means, covs = np.asarray(gaussians.means), np.asarray(gaussians.covs)
+    reach = reach_of(means[rows].astype(np.float64), question.instances)
+    instances = [
+        find_instances(
+            np.flatnonzero(found.labels == word),
+            (means, covs),
+            (found.cosines[:, word], found.leads[:, word]),
+            reach,
+            question.instances.min_gaussians,
+        )
+        for word in range(len(question.words.names))
+    ]
+    return Answer(question, gaussians, found, rows, instances, reach)
+
+
+def write_answer(folder: Path, source: Path, answer: Answer) -> dict[str, Any]:
+    """Write query.json, semantic.npz and semantic.ply; returns what query.json says.
+
+    Args:
+        folder: of the files.
+        source: folder of the run.
+        answer: to write.
+    """
+    _save_semantic(folder / SEMANTIC_FILE, answer)
+    rows, gaussians = answer.rows, answer.gaussians
+    save_points_ply(
+        folder / SEMANTIC_PLY,
+        np.asarray(gaussians.means)[rows],
+        np.asarray(gaussians.normals)[rows],
+        painted(answer)[rows],
+        answer.relevance.labels[rows],
+        answer.question.words.names,
+    )
+    said = _said(source, answer)
+    write_json(folder / QUERY_FILE, said)
+    return said
+
+
+def _said(source: Path, answer: Answer) -> dict[str, Any]:
+    question, labels = answer.question, answer.relevance.labels[answer.rows]
+    features = np.asarray(answer.gaussians.features)[answer.rows]
+    width = features.shape[1]
+    about = {"model": question.words.model, "templates": question.words.templates, "width": width}
+    about |= {"num_gaussians": len(features), "num_with_feature": int(features.any(1).sum())}
+    about |= {"bytes_per_gaussian": 4 * width, "bytes_per_gaussian_in_semantic_npz": 2 * width}
+    words = [
+        {
+            "word": word,
+            "num_gaussians": int((labels == number).sum()),
+            "instances": [_described(instance) for instance in answer.instances[number]],
+        }
+        for number, word in enumerate(question.words.names)
+    ]
+    limits = {"margin": question.margin, "min_cosine": question.min_cosine}
+    limits |= {"reach_m": answer.reach, "min_gaussians": question.instances.min_gaussians}
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "map": str(source),
+        "frame": "that of map.npz and trajectory.txt",
+        "features": about,
+        "against": question.against.names,
+        **limits,
+        "words": words,
+        "none_of_these": int((labels < 0).sum()),
+    }
+
+
+def _described(instance: Instance) -> dict[str, Any]:
+    about = {"center_m": instance.center, "low_m": instance.low, "high_m": instance.high}
+    about |= {"extent_m": instance.high - instance.low, "score": instance.score, "lead": instance.lead}
+    return about | {"num_gaussians": len(instance.rows)}
+
+
+def heat(answer: Answer, word: int) -> np.ndarray:
+    """Relevance of every Gaussian for a word in [0, 1]: its lead, from the 1st to the 99th percentile; nan without."""
+    leads = answer.relevance.leads[:, word].astype(np.float64)
+    known = np.zeros(len(leads), bool)
+    known[answer.rows] = np.asarray(answer.gaussians.features)[answer.rows].any(1)
+    low, high = np.percentile(leads[known], [1, 99])
+    return np.where(known, ((leads - low) / max(high - low, 1e-9)).clip(0.0, 1.0), np.nan)
+
+
+def painted(answer: Answer) -> np.ndarray:
+    """Colours of all Gaussians (n, 3): the relevance of a single word, else the class; grey where there is none."""
+    names = answer.question.words.names
+    if len(names) > 1:
+        labels = answer.relevance.labels
+        return np.where(labels[:, None] >= 0, class_colors(len(names))[labels], GREY)
+    return hot(heat(answer, 0))
+
+
+def hot(values: np.ndarray) -> np.ndarray:
+    """Colours (…, 3) of numbers in [0, 1]; grey where they are nan."""
+    colors = matplotlib.colormaps["inferno"](np.nan_to_num(values))[..., :3]
+    return np.where(np.isfinite(values)[..., None], colors, GREY)
+
+
+def _save_semantic(path: Path, answer: Answer) -> None:
+    question, rows, found = answer.question, answer.rows, answer.relevance
+    header = {"format": SEMANTIC_FORMAT, "version": VERSION, "words": question.words.names}
+    header |= {"against": question.against.names, "margin": question.margin, "min_cosine": question.min_cosine}
+    header |= {"model": question.words.model}
+    features = np.asarray(safe_normalize(answer.gaussians.features[rows]))
+    arrays = {
+        "rows": rows.astype(np.int32),
+        "means": np.asarray(answer.gaussians.means, np.float32)[rows],
+        "features": features.astype(np.float16),
+        "cosines": found.cosines[rows].astype(np.float16),
+        "leads": found.leads[rows].astype(np.float16),
+        "labels": found.labels[rows].astype(np.int16),
+        "instances": _numbered(answer.instances, len(found.labels))[rows].astype(np.int32),
+    }
+    with atomic_write(path) as handle:
+        np.savez(handle, header=np.array(json.dumps(header)), **arrays)
+
+
+def _numbered(instances: Sequence[Sequence[Instance]], count: int) -> np.ndarray:
+    numbers = np.full(count, -1)
+    for found in instances:
+        for number, instance in enumerate(found):
+            numbers[instance.rows] = number
+    return numbers
+
+
+def load_semantic(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of a semantic.npz; raises ValueError for a file that is none of this version."""
+    try:
+        arrays = read_npz(path.read_bytes(), ("header", *ARRAYS))
+        header = json.loads(str(arrays.pop("header")))
+        if header["format"] != SEMANTIC_FORMAT or header["version"] != VERSION:
+            raise ValueError(f"it is {header['format']} {header['version']}, expected {SEMANTIC_FORMAT} {VERSION}")
+        count, width = len(arrays["rows"]), len(header["words"])
+        if any(len(values) != count for values in arrays.values()) or arrays["cosines"].shape[1:] != (width,):
+            raise ValueError("its arrays do not fit each other")
+    except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
+        raise ValueError(f"{path} is no semantic.npz that can be read ({error}): ask the map again") from error
+    return header, arrays

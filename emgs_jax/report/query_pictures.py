@@ -1,0 +1,141 @@
+"""Pictures of an answer: where a map is relevant for a word, seen from any pose, and the map's features as colours."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from emgs_jax.gaussian_map import confirmed
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.io.files import atomic_write
+from emgs_jax.ops.camera import Camera, downscale
+from emgs_jax.render.composite import RenderConfig, render
+from emgs_jax.report.page import render_config
+from emgs_jax.report.query import GREY, Answer, heat, hot, painted
+from emgs_jax.report.recorded_run import RecordedRun
+from emgs_jax.running.convert import to_se3
+from emgs_jax.semantics import principal_colors
+
+QUERY_PICTURE, FEATURES_PICTURE = "query.png", "features.png"
+MAX_POSES, SMALL_WIDTH = 60, 64  # poses that are looked from, evenly spread, and columns of those images
+_colors = eqx.filter_jit(principal_colors)
+
+
+class View(NamedTuple):
+    """A pose (4, 4), camera -> map, and what to call it."""
+
+    title: str
+    pose: np.ndarray
+
+
+@eqx.filter_jit
+def _drawn(
+    gaussians: Gaussians, values: jax.Array, pose: jaxlie.SE3, camera: Camera, config: RenderConfig
+) -> tuple[jax.Array, jax.Array]:
+    drawing = render(gaussians, values, pose, camera, config)
+    return drawing.values, drawing.alpha
+
+
+def drawn(run: RecordedRun, gaussians: Gaussians, values: np.ndarray, view: View, camera: Camera) -> np.ndarray:
+    """Values (n, v) of the Gaussians as an image (h, w, v); nan where the map shows nothing."""
+    config = render_config(run)
+    values, alpha = jax.device_get(
+        _drawn(gaussians, jnp.asarray(values, jnp.float32), to_se3(view.pose), camera, config)
+    )
+    is_seen = alpha >= max(float(config.min_alpha), 1e-6)
+    return np.where(is_seen[..., None], values / np.where(is_seen, alpha, 1.0)[..., None], np.nan)
+
+
+def views_of(run: RecordedRun) -> list[View]:
+    """Poses of frames that are not lost, at most `MAX_POSES`, evenly spread."""
+    rows = [row for row, line in enumerate(run.frames) if line["status"] != "lost"]
+    chosen = sorted({rows[int(i)] for i in np.linspace(0, len(rows) - 1, min(MAX_POSES, len(rows)))}) if rows else []
+    return [View(f"frame {run.frames[row]['index']}", run.poses[row]) for row in chosen]
+
+
+def frame_view(run: RecordedRun, frame: int) -> View:
+    """The pose of one frame; raises ValueError where the run has none."""
+    known = [line["index"] for line in run.frames]
+    if frame not in known:
+        raise ValueError(f"{run.folder} has no pose of frame={frame}: choose one from {min(known)} to {max(known)}")
+    return View(f"frame {frame}", run.poses[known.index(frame)])
+
+
+def best_views(run: RecordedRun, answer: Answer, count: int) -> list[list[View]]:
+    """Of each word the poses from which most pixels show answers to it, best first; none where there is no answer."""
+    camera = downscale(run.camera, -(-run.camera.width // SMALL_WIDTH))
+    words = len(answer.question.words.names)
+    answers = answer.relevance.labels[:, None] == np.arange(words)
+    views = views_of(run)
+    shown = [
+        np.nansum(drawn(run, answer.gaussians, answers.astype(np.float32), view, camera), axis=(0, 1)) for view in views
+    ]
+    scores = np.array(shown).reshape(len(views), words)
+    order = np.argsort(-scores, axis=0, kind="stable")
+    return [[views[row] for row in order[:count, word] if scores[row, word] > 0] for word in range(words)]
+
+
+def draw_answer(path: Path, run: RecordedRun, answer: Answer, views: Sequence[Sequence[View]], max_words: int) -> int:
+    """Draw a line for each word and view: the map in its colours, the word's relevance, the classes.
+
+    Args:
+        path: of the PNG.
+        run: whose map was asked.
+        answer: to draw.
+        views: of each word.
+        max_words: those with the most answers.
+
+    Returns:
+        How many words are drawn.
+    """
+    counts = [(answer.relevance.labels == word).sum() for word in range(len(views))]
+    words = [int(word) for word in np.argsort(-np.array(counts), kind="stable")[:max_words]]
+    lines = [(word, view) for word in sorted(words) for view in views[word]]
+    colors = np.asarray(answer.gaussians.colors)
+    pictures = []
+    for word, view in lines:
+        relevance = heat(answer, word)
+        layers = np.concatenate([colors, hot(relevance), painted(answer)], axis=1)
+        image = drawn(run, answer.gaussians, layers, view, run.camera)
+        name = answer.question.words.names[word]
+        pictures.append([(view.title, image[..., :3]), (f"relevance: {name}", image[..., 3:6])])
+        if len(views) > 1:
+            pictures[-1].append(("classes", image[..., 6:]))
+    _save(path, pictures)
+    return len({word for word, _ in lines})
+
+
+def draw_features(path: Path, run: RecordedRun, views: Sequence[View]) -> None:
+    """Draw the map's features as colours, see `principal_colors`, beside its own colours."""
+    gaussians = confirmed(run.map)
+    layers = np.concatenate([np.asarray(gaussians.colors), np.asarray(_colors(gaussians))], axis=1)
+    images = [(view, drawn(run, gaussians, layers, view, run.camera)) for view in views]
+    _save(path, [[(view.title, image[..., :3]), ("features", image[..., 3:])] for view, image in images])
+
+
+def _save(path: Path, lines: Sequence[Sequence[tuple[str, np.ndarray]]]) -> None:
+    """Titled images in lines of one length, as PNG; nothing to draw makes a line of text."""
+    columns = max((len(line) for line in lines), default=1)
+    height, width = lines[0][0][1].shape[:2] if lines else (1, 4)
+    size = 3.6 * columns, max(1.0, len(lines) * (3.6 * height / width + 0.35))
+    figure = Figure(figsize=size, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    if not lines:
+        figure.suptitle("no answer is seen from these poses")
+    for axes, (title, image) in zip(
+        figure.subplots(len(lines), columns, squeeze=False).ravel() if lines else (),
+        [panel for line in lines for panel in line],
+        strict=True,
+    ):
+        axes.imshow(np.where(np.isfinite(image), image, GREY).clip(0.0, 1.0))
+        axes.set_title(title, fontsize=9)
+        axes.set_axis_off()
+    with atomic_write(path) as handle:
+        figure.savefig(handle, format="png", dpi=110)

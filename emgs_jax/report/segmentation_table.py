@@ -1,0 +1,198 @@
+"""Finished maps against true classes, scene by scene, and the table that stands beside the paper's Table III."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import cKDTree
+
+from emgs_jax.evaluation.clouds import register
+from emgs_jax.evaluation.protocols import (
+    NAMES,
+    SegmentationProtocol,
+    give_classes,
+    ignored_positions,
+    matrix_metrics,
+    scene_confusion,
+    table_metrics,
+)
+from emgs_jax.evaluation.segmentation import LabelledPoints
+from emgs_jax.evaluation.trajectory import Alignment, align_poses
+from emgs_jax.gaussian_map import confirmed
+from emgs_jax.report.columns import DASH, cell, markdown
+from emgs_jax.report.recorded_run import RecordedRun
+from emgs_jax.semantics import similarities
+
+FORMAT, VERSION = "emgs_jax.segmentation", 1
+ALIGNMENTS = ("trajectory", "points")
+_TITLES = ("method", "source", "protocol", "scenes", "placed by", "mIoU [%]", "f-mIoU [%]", "Acc [%]", "ATE [cm]")
+_NOTES = """
+Acc is the mean recall of the classes under ovo and conceptgraphs, the share of the points under rayfronts. Quoted rows
+are not measured here: they are of eight scenes of Replica. **simulated**: the prior is disturbed ground truth, which
+says nothing about a network and must not be compared with quoted rows; neither must other scenes or protocols.
+"""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How a map is brought into the frame of the truth.
+
+    Args:
+        by: `trajectory`, the alignment of the poses; or `points`, from there a rigid ICP of the centres onto the truth.
+        with_scale: the alignment of the poses estimates a scale, too.
+        icp_distance_m: pairs of ICP are nearer than this.
+        icp_max_steps: of ICP.
+    """
+
+    by: str
+    with_scale: bool
+    icp_distance_m: float
+    icp_max_steps: int
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """One map against the truth of its scene.
+
+    Args:
+        scene: its name.
+        folder: of the run.
+        is_simulated: the prior is made from the truth.
+        confusion: see `scene_confusion`.
+        about: how the map was placed, and counts.
+        ate_m: of the trajectory, Sim(3); None where unknown.
+    """
+
+    scene: str
+    folder: str
+    is_simulated: bool
+    confusion: np.ndarray
+    about: dict[str, Any]
+    ate_m: float | None
+
+
+def place(run: RecordedRun, truth: np.ndarray, how: Placement) -> tuple[np.ndarray, dict[str, Any]]:
+    """The confirmed Gaussians' centres (n, 3) in the frame of true points (m, 3), and how they came there.
+
+    Raises:
+        ValueError: no true pose is known.
+    """
+    known = run.has_truth
+    if not known.any():
+        raise ValueError(
+            f"{run.folder}/frames.jsonl has no true pose to place the map by: map a data set with ground truth"
+        )
+    alignment, note = align_poses(run.poses[known], run.truth[known], how.with_scale)
+    gaussians = jax.device_get(confirmed(run.map))
+    points = alignment.apply(gaussians.means[gaussians.valid].astype(np.float64))
+    about = {"placed_by": how.by, "alignment": _plain(alignment), "alignment_note": note}
+    if how.by == "points":
+        moved = register(points, cKDTree(truth), how.icp_distance_m, how.icp_max_steps)
+        points = moved.apply(points)
+        about["icp"] = _plain(moved)
+    return points, about
+
+
+def score_scene(
+    run: RecordedRun,
+    scene: str,
+    truth: LabelledPoints,
+    vectors: np.ndarray,
+    how: Placement,
+    protocol: SegmentationProtocol,
+) -> SceneResult:
+    """Compare the map of a run with the true points of its scene.
+
+    Args:
+        run: finished.
+        scene: its name.
+        truth: points and classes.
+        vectors: text embeddings of the truth's classes, (c, f).
+        how: the map is placed.
+        protocol: of the comparison.
+    """
+    points, about = place(run, truth.points, how)
+    gaussians = confirmed(run.map)
+    rows = np.flatnonzero(gaussians.valid)
+    cosines = np.asarray(similarities(gaussians, jnp.asarray(vectors, jnp.float32)))[rows]
+    has_feature = np.asarray(gaussians.features)[rows].any(1)
+    ignored = ignored_positions(truth.classes, protocol)
+    labels = give_classes(cosines, has_feature, truth.labels, ignored, protocol)
+    confusion = scene_confusion(LabelledPoints(points, labels, truth.classes), truth, ignored, protocol)
+    distances = cKDTree(points).query(truth.points, workers=-1)[0] if len(points) else np.array([np.inf])
+    about |= {"num_gaussians": len(rows), "num_with_class": int((labels >= 0).sum())}
+    about |= {"num_true_points": len(truth.points), "median_distance_to_map_m": float(np.median(distances))}
+    is_simulated = bool(run.provenance.get("simulated", False))
+    ate = run.metrics.get("trajectory/ate_sim3_m")
+    return SceneResult(scene, str(run.folder), is_simulated, confusion, about, ate)
+
+
+def summary(
+    results: Sequence[SceneResult], classes: Sequence[str], protocol: SegmentationProtocol, how: Placement
+) -> dict[str, Any]:
+    """What the file says: metrics of all scenes and of each, IoU of each class, and the matrices."""
+    ignored = ignored_positions(classes, protocol)
+    total = np.sum([result.confusion for result in results], axis=0)
+    right, true = np.diagonal(total), total.sum(1)
+    union = true + total.sum(0)[: len(classes)] - right
+    by_class = {
+        name: {
+            "iou_percent": 100.0 * right[row] / union[row],
+            "recall_percent": 100.0 * right[row] / true[row] if true[row] else None,
+            "num_true": int(true[row]),
+        }
+        for row, name in enumerate(classes)
+        if union[row] > 0
+    }
+    ates = [result.ate_m for result in results]
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "protocol": asdict(protocol),
+        "placement": asdict(how),
+        "simulated": any(result.is_simulated for result in results),
+        "total": table_metrics([result.confusion for result in results], ignored, protocol)
+        | {"ate_sim3_m": None if None in ates else float(np.mean(ates))},
+        "scenes": [
+            {"scene": result.scene, "map": result.folder, "simulated": result.is_simulated, "ate_sim3_m": result.ate_m}
+            | matrix_metrics(result.confusion, ignored, protocol)
+            | result.about
+            | {"confusion": result.confusion}
+            for result in results
+        ],
+        "classes": list(classes),
+        "by_class": by_class,
+    }
+
+
+def table(found: Mapping[str, Any], published: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown: the mean or sum over the scenes, each scene, and quoted rows.
+
+    Args:
+        found: `summary`.
+        published: method, source, protocol, and `values`: mIoU, f-mIoU, Acc and ATE [cm], null where unknown.
+    """
+    scenes = found["scenes"]
+    over = "one matrix of" if found["protocol"]["scenes"] == "sum" else "mean of"
+    lines = [_line("ours", f"{over} {len(scenes)}", found["total"], found["simulated"], found)]
+    if len(scenes) > 1:
+        lines += [_line("ours", scene["scene"], scene, scene["simulated"], found) for scene in scenes]
+    for row in published:
+        cells = [DASH if value is None else f"{value:g}" for value in row["values"]]
+        lines.append([row["method"], f"quoted: {row['source']}", row["protocol"], "8 of Replica", DASH, *cells])
+    return markdown(_TITLES, lines) + _NOTES
+
+
+def _line(
+    method: str, scenes: str, values: Mapping[str, Any], is_simulated: bool, found: Mapping[str, Any]
+) -> list[str]:
+    cells = [cell(values[name], None, 1.0, 1) for name in NAMES] + [cell(values["ate_sim3_m"], None, 100.0, 1)]
+    source = "**simulated**" if is_simulated else "measured"
+    return [method, source, found["protocol"]["name"], scenes, found["placement"]["by"], *cells]
+
+
+def _plain(alignment: Alignment) -> dict[str, Any]:
+    return {"scale": alignment.scale, "rotation": alignment.rotation, "translation": alignment.translation}

@@ -1,0 +1,126 @@
+"""Words as vectors that the features of a finished map can be compared with, and the errors where they cannot."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from emgs_jax.features.base import FeatureModel
+from emgs_jax.features.text import TextEmbeddings, load_text
+from emgs_jax.report.recorded_run import TEXT_FILE, RecordedRun
+from emgs_jax.running.configure import build
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """What can be said to a map.
+
+    Args:
+        source: where vectors come from, for people.
+        width: of the map's features.
+        known: texts with their vectors; None where `model` embeds any text.
+        model: embeds; None where the texts are those of `known`.
+    """
+
+    source: str
+    width: int
+    known: TextEmbeddings | None
+    model: FeatureModel | None = None
+
+    def embed(self, names: Sequence[str]) -> TextEmbeddings:
+        """Vectors of names, in their order; raises ValueError where there is no vector of one or it is too wide."""
+        names = tuple(names)
+        text = self._find(names) if self.model is None else self.model.embed(names)
+        if text.vectors.shape != (len(names), self.width):
+            raise ValueError(
+                f"{self.source} has embeddings of width {text.vectors.shape[1]}, and the map's features have width "
+                f"{self.width}: embed the words with the model that made the features"
+            )
+        return text
+
+    def _find(self, names: tuple[str, ...]) -> TextEmbeddings:
+        rows = {name: row for row, name in enumerate(self.known.names)}
+        for name in names:
+            if name not in rows:
+                near = difflib.get_close_matches(name, rows, 5, 0.4)
+                there = f"the nearest are {', '.join(near)}" if near else f"there are {', '.join(list(rows)[:20])}"
+                raise ValueError(
+                    f"{name!r} is no word of {self.source}; {there}. For other words give embeddings "
+                    "(features.text=FILE of emgs embed) or the text encoder of the features (features=…)"
+                )
+        vectors = self.known.vectors[[rows[name] for name in names]].reshape(len(names), -1)
+        return TextEmbeddings(names, vectors, self.known.templates, self.known.model)
+
+
+def feature_space(run: RecordedRun) -> dict[str, Any]:
+    """Identity of the model whose features a run's map holds; {"prior": name} for those of a prior without a model."""
+    settings = run.provenance["prior"]["settings"]
+    features = settings.get("features") if isinstance(settings, Mapping) else None
+    if isinstance(features, Mapping) and isinstance(features.get("model"), Mapping):
+        return dict(features["model"])
+    return dict(run.text.model) if run.text is not None else {"prior": run.provenance["prior"]["name"]}
+
+
+def vocabulary(run: RecordedRun, file: str | None, model: FeatureModel | None) -> Vocabulary:
+    """What can be said to the map of a run: what the file has, else what the model embeds, else the run's classes.
+
+    Args:
+        run: finished.
+        file: of `experiments.embed`.
+        model: with a text encoder.
+
+    Raises:
+        ValueError: the map has no features, or file or model are of other features; the message names both.
+    """
+    path = run.folder / "map.npz"
+    features = np.asarray(run.map.gaussians.features)[np.asarray(run.map.gaussians.valid)]
+    if not features.any():
+        raise ValueError(f"{path} has no features to compare words with: map again with features=…")
+    width, space = features.shape[1], feature_space(run)
+    if file is not None:
+        return Vocabulary(str(file), width, load_text(file, space))
+    if model is not None:
+        if model.identity != space:
+            raise ValueError(
+                f"features={model.identity.get('name')} is {model.identity}, but the features of {path} are of "
+                f"{space}: choose the model that made them"
+            )
+        return Vocabulary(f"the model {model.identity.get('name')}", width, None, model)
+    if run.text is None:
+        raise ValueError(
+            f"{run.folder} has no {TEXT_FILE} with words, and its features are of {space}: give embeddings "
+            "(features.text=FILE of emgs embed) or the text encoder (features=…)"
+        )
+    return Vocabulary(str(run.folder / TEXT_FILE), width, run.text)
+
+
+def feature_model(config: DictConfig, words: Sequence[str]) -> FeatureModel | None:
+    """The text encoder of a config; None with features=none, or where `features.text` has the embeddings."""
+    if "_target_" not in config.features or config.features.text is not None:
+        return None
+    return build(config, "features", classes=list(words))
+
+
+def words_of(value: Any, key: str) -> tuple[str, ...]:
+    """One word or a list of them as a tuple; raises ValueError where one is empty, no text or there twice."""
+    words = [value] if isinstance(value, str) else list(value or ())
+    if not all(isinstance(word, str) and word.strip() for word in words) or len(set(words)) < len(words):
+        raise ValueError(f"{key} must be a word or a list of words, none empty and each once, got {value!r}")
+    return tuple(word.strip() for word in words)
+
+
+def check_folder(folder: Path) -> None:
+    """Make the folder of outputs; raises ValueError where nothing can be written into it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".emgs-write-test"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(
+            f"nothing can be written into out={folder} ({error.strerror or error}): choose another out=FOLDER"
+        ) from error

@@ -1,0 +1,136 @@
+"""Ask a finished map: `python -m experiments.query map=FOLDER text=chair`.
+
+Beside the map it writes query.json (objects with centre, box and score), semantic.npz (relevance of each Gaussian),
+semantic.ply, query.png (relevance seen from poses) and features.png.
+"""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from emgs_jax.data.class_file import read_classes
+from emgs_jax.features.text import TextEmbeddings
+from emgs_jax.io.trajectory import load_trajectory_tum
+from emgs_jax.ops.ranges import Range
+from emgs_jax.report.query import Question, ask, write_answer
+from emgs_jax.report.query_pictures import (
+    FEATURES_PICTURE,
+    QUERY_PICTURE,
+    View,
+    best_views,
+    draw_answer,
+    draw_features,
+    frame_view,
+    views_of,
+)
+from emgs_jax.report.recorded_run import RecordedRun, read_run
+from emgs_jax.report.vocabulary import Vocabulary, check_folder, feature_model, vocabulary, words_of
+from emgs_jax.running.configure import build
+from emgs_jax.running.values import Declared, check_value
+
+from .command import command
+
+LIMITS = {  # of the keys that are no parameter of a class
+    "margin": Declared(frozenset({float}), range=Range(0, 2)),
+    "min_cosine": Declared(frozenset({float}), range=Range(-1, 1)),
+    "num_views": Declared(frozenset({int}), range=Range(1, 100)),
+    "max_words": Declared(frozenset({int}), range=Range(1, 1000)),
+    "frame": Declared(frozenset({int, type(None)}), range=Range(0, 10**9)),
+}
+UNLIKE = ("object", "things", "stuff", "texture")  # LERF's canonical phrases: what anything is
+
+
+def query(config: DictConfig) -> dict[str, Any]:
+    """Ask `config.map` and write the answer; returns what query.json says."""
+    for key, field in LIMITS.items():
+        check_value(key, config[key], field)
+    instances = build(config, "instances")
+    words = asked(config)
+    run = read_run(Path(config.map))
+    texts = vocabulary(run, config.features.text, feature_model(config, words))
+    question = Question(
+        texts.embed(words), rivals(config, words, texts), float(config.margin), float(config.min_cosine), instances
+    )
+    views = given_views(config, run)
+    folder = run.folder if config.out is None else Path(config.out)
+    check_folder(folder)
+    start = time.perf_counter()
+    answer = ask(run, question)
+    seconds = time.perf_counter() - start
+    said = write_answer(folder, run.folder, answer)
+    of_words = best_views(run, answer, config.num_views) if views is None else [views] * len(words)
+    count = draw_answer(folder / QUERY_PICTURE, run, answer, of_words, config.max_words)
+    everywhere = views_of(run)
+    chosen = views or [everywhere[len(everywhere) * (2 * i + 1) // 6] for i in range(3) if everywhere]
+    draw_features(folder / FEATURES_PICTURE, run, chosen)
+    print("\n".join(lines_of(said)))
+    about = said["features"]
+    print(
+        f"{about['num_gaussians']} Gaussians, {about['num_with_feature']} with a feature of width {about['width']}: "
+        f"{about['bytes_per_gaussian']} bytes each, {about['bytes_per_gaussian_in_semantic_npz']} in semantic.npz; "
+        f"asked in {seconds:.2f} s, compilation included"
+    )
+    print(f"everything is in {folder}; query.png shows {count} of {len(words)} words")
+    return said
+
+
+def asked(config: DictConfig) -> tuple[str, ...]:
+    """The words of `text` and of the class file."""
+    words = words_of(config.text, "text")
+    words += () if config.classes is None else read_classes(config.classes).names
+    if not words:
+        raise ValueError("nothing is asked: give text=chair, text=[chair,table] or classes=FILE")
+    return words_of(words, "text and classes")
+
+
+def rivals(config: DictConfig, words: tuple[str, ...], texts: Vocabulary) -> TextEmbeddings:
+    """What is not asked for: the words of `against`, else all others of a fixed vocabulary, else what anything is."""
+    if config.against is not None:
+        names = words_of(config.against, "against")
+        both = sorted({*names} & {*words})
+        if both:
+            raise ValueError(f"against names {', '.join(both)}, which is asked for too: leave it out of one")
+    else:
+        names = tuple(name for name in (UNLIKE if texts.known is None else texts.known.names) if name not in words)
+    return texts.embed(names) if names else TextEmbeddings((), texts.embed(words[:1]).vectors[:0], (), {})
+
+
+def given_views(config: DictConfig, run: RecordedRun) -> list[View] | None:
+    """The poses of `pose` or `frame`; None where the best ones are to be found."""
+    if config.pose is not None and config.frame is not None:
+        raise ValueError("pose and frame both say from where to draw: give one of them")
+    if config.frame is not None:
+        return [frame_view(run, config.frame)]
+    if config.pose is None:
+        return None
+    if not Path(config.pose).is_file():
+        raise ValueError(f"pose={config.pose} does not exist: give lines `timestamp tx ty tz qx qy qz qw`")
+    times, poses = load_trajectory_tum(config.pose)
+    if not len(poses):
+        raise ValueError(f"pose={config.pose} has no pose: give lines `timestamp tx ty tz qx qy qz qw`")
+    return [View(f"pose at {time:g}", pose) for time, pose in zip(times, poses, strict=True)]
+
+
+def lines_of(said: dict[str, Any]) -> list[str]:
+    """A line for each word, with its best object."""
+    lines = []
+    for found in said["words"]:
+        line = f"{found['word']}: {found['num_gaussians']} Gaussians, {len(found['instances'])} objects"
+        if found["instances"]:
+            best = found["instances"][0]
+            center, extent = (", ".join(f"{float(x):.2f}" for x in best[key]) for key in ("center_m", "extent_m"))
+            line += f"; the best at ({center}) m, {extent} m large, cosine {best['score']:.2f}, lead {best['lead']:.2f}"
+        lines.append(line)
+    return lines
+
+
+@command("query")
+def main(config: DictConfig) -> None:
+    """Ask, and print what was found."""
+    query(config)
+
+
+if __name__ == "__main__":
+    main()

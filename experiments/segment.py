@@ -1,0 +1,112 @@
+"""Segmentation of finished maps as in the paper's Table III: `python -m experiments.segment 'map=[office0,room0]' …`.
+
+One map a scene, compared with Replica's labelled meshes or with the labels of the data set's own frames.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, ListConfig
+
+from emgs_jax.data.class_file import read_classes
+from emgs_jax.evaluation.labelled_mesh import read_labelled_mesh
+from emgs_jax.evaluation.segmentation import LabelledPoints, label_cells, true_labels
+from emgs_jax.io.files import atomic_write, write_json
+from emgs_jax.ops.ranges import Range
+from emgs_jax.report.recorded_run import RecordedRun, read_run
+from emgs_jax.report.segmentation_table import ALIGNMENTS, Placement, SceneResult, score_scene, summary, table
+from emgs_jax.report.vocabulary import check_folder, feature_model, vocabulary
+from emgs_jax.running.configure import build
+from emgs_jax.running.values import Declared, check_value
+
+from .command import command
+from .report import images_of
+
+LIMITS = {  # of the keys that are no parameter of a class
+    "alignment": Declared(frozenset({str}), choices=ALIGNMENTS),
+    "with_scale": Declared(frozenset({bool})),
+    "icp_distance_m": Declared(frozenset({float}), range=Range(1e-6, 1e6)),
+    "icp_max_steps": Declared(frozenset({int}), range=Range(0, 10000)),
+    "voxel_m": Declared(frozenset({float}), range=Range(1e-6, 1e6)),
+    "max_depth_m": Declared(frozenset({float}), range=Range(1e-6, float("inf"))),
+}
+FRAMES = "frames"  # the word that takes the labels of the data set's own frames for truth
+
+
+def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
+    """Score the maps of `config` and write file and table; returns both."""
+    for key, field in LIMITS.items():
+        check_value(key, config[key], field)
+    protocol = build(config, "protocol", _convert_="all")
+    how = Placement(config.alignment, config.with_scale, config.icp_distance_m, config.icp_max_steps)
+    runs = [read_run(Path(str(folder))) for folder in (config.map if _is_list(config.map) else [config.map])]
+    scenes = scene_names(config, runs)
+    check_folder(Path(config.out))
+    results: list[SceneResult] = []
+    classes: tuple[str, ...] = ()
+    for run, scene in zip(runs, scenes, strict=True):
+        truth = true_points(config, run, scene)
+        if classes and truth.classes != classes:
+            raise ValueError(f"{run.folder} has other classes than {runs[0].folder}: score them by themselves")
+        classes = truth.classes
+        text = vocabulary(run, config.features.text, feature_model(config, classes)).embed(classes)
+        results.append(score_scene(run, scene, truth, text.vectors, how, protocol))
+    found = summary(results, classes, protocol, how) | {"truth": str(config.truth), "templates": text.templates}
+    said = table(found, config.table_iii)
+    write_json(Path(config.out) / f"segmentation_{protocol.name}.json", found)
+    with atomic_write(Path(config.out) / f"segmentation_{protocol.name}.md", "w") as handle:
+        handle.write(said)
+    return found, said
+
+
+def scene_names(config: DictConfig, runs: list[RecordedRun]) -> list[str]:
+    """Names of the scenes: those of `scenes`, else the sequences that were mapped."""
+    if not runs:
+        raise ValueError("map names no folder: give map=[FOLDER,…] of finished runs")
+    if config.scenes is None:
+        return [str(run.provenance["data"]["sequence"]) for run in runs]
+    names = [str(name) for name in (config.scenes if _is_list(config.scenes) else [config.scenes])]
+    if len(names) != len(runs):
+        raise ValueError(f"scenes has {len(names)} names and map {len(runs)} folders: give one name for each map")
+    return names
+
+
+def true_points(config: DictConfig, run: RecordedRun, scene: str) -> LabelledPoints:
+    """The truth of one scene: vertices of its mesh, or voxels that its labelled frames see."""
+    if config.truth != FRAMES:
+        if config.classes is None:
+            raise ValueError(
+                f"truth={config.truth} has ids only: give their class file, for Replica classes=eval_info.yaml of OVO"
+            )
+        return read_labelled_mesh(Path(str(config.truth)), scene, read_classes(config.classes))
+    if config.classes is not None:
+        raise ValueError("classes is the file of a mesh's ids, and truth=frames has the data set's names: leave it out")
+    dataset, note = images_of(run.provenance["config"], len(run.poses))
+    if dataset is None:
+        raise ValueError(f"truth=frames: the frames of {run.folder} cannot be read again. {note}")
+    cells = [
+        label_cells(dataset[row], dataset, config.voxel_m, config.max_depth_m)
+        for row in range(len(dataset) if dataset.classes else 0)
+    ]
+    truth = true_labels(cells, dataset, config.voxel_m)
+    if truth is None:
+        raise ValueError(
+            f"truth=frames: {dataset.name} {dataset.sequence} has no labelled frame with depth and pose: give "
+            "truth=FOLDER with SCENE_mesh.ply and SCENE.txt"
+        )
+    return truth
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, ListConfig | list)
+
+
+@command("segment")
+def main(config: DictConfig) -> None:
+    """Score, and print the table."""
+    _, said = segment(config)
+    print(f"{said}\neverything is in {config.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,150 @@
+"""A map against a labelled mesh; oracle: a hand-made run that is moved by a known similarity."""
+
+import json
+
+import numpy as np
+import pytest
+from hand_run import inverse, random_similarity
+from written_run import written_run
+
+from emgs_jax.io.map_file import load_map
+from emgs_jax.io.ply import structured, write_ply
+from emgs_jax.io.trajectory import load_trajectory_tum, to_tum
+from emgs_jax.running.configure import compose
+from experiments.segment import segment
+
+CLASSES = "5 wall\n9 sofa\n"
+TO_TRUTH = random_similarity(np.random.default_rng(3), 2.5)
+
+
+def write_truth(folder, run, wrong: int = 0, shift=(0.0, 0.0, 0.0)):
+    """Vertices at the centres of the map's Gaussians in the frame of the truth; `wrong` sofas are called wall."""
+    folder.mkdir(exist_ok=True)
+    means = np.asarray(load_map(run / "map.npz").gaussians.means, np.float64)
+    ids = np.where(means[:, 2] == 1.0, 9, 5)
+    ids[np.flatnonzero(ids == 9)[:wrong]] = 5
+    points = TO_TRUTH.apply(means) + shift
+    write_ply(folder / "room_mesh.ply", structured(points.astype(np.float32), ["x", "y", "z"]))
+    (folder / "room.txt").write_text("\n".join(map(str, ids)) + "\n")
+    (folder / "classes.txt").write_text(CLASSES)
+    return ids
+
+
+@pytest.fixture
+def run(tmp_path):
+    """True poses are the estimated ones, moved."""
+    folder = written_run(tmp_path / "run")
+    _, poses = load_trajectory_tum(folder / "trajectory.txt")
+    poses[2, 1, 3] += 0.2  # a straight path leaves the roll about it open
+    text = (folder / "trajectory.txt").read_text().splitlines()
+    text[3] = " ".join([text[3].split()[0], *(f"{value:.9f}" for value in to_tum(poses[2]))])
+    (folder / "trajectory.txt").write_text("\n".join(text) + "\n")
+    lines = [json.loads(line) for line in (folder / "frames.jsonl").read_text().splitlines()]
+    for line, pose in zip(lines, TO_TRUTH.apply_to_poses(poses), strict=True):
+        line["true_pose"] = to_tum(pose)
+    (folder / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder
+
+
+def scored(run, truth, *overrides):
+    words = [f"truth={truth}", f"classes={truth / 'classes.txt'}", f"out={truth / 'out'}", *overrides]
+    return segment(compose(f"map={run}", *words, name="segment"))
+
+
+def test_a_map_in_another_frame_and_scale_is_brought_to_the_truth(run, tmp_path):
+    ids = write_truth(tmp_path / "truth", run)
+    found, said = scored(run, tmp_path / "truth")
+    assert found["total"]["miou"] == found["total"]["acc"] == 100.0
+    (scene,) = found["scenes"]
+    np.testing.assert_allclose(scene["alignment"]["scale"], 2.5, rtol=1e-6)
+    assert scene["median_distance_to_map_m"] < 1e-4 and scene["num_true_points"] == len(ids)
+    assert (scene["placed_by"], scene["scene"], found["truth"]) == ("trajectory", "room", str(tmp_path / "truth"))
+    assert "| ours | **simulated** | ovo | one matrix of 1 | trajectory | 100.0 | 100.0 | 100.0 | 1.2 |" in said
+    assert (
+        "| MonoEM-GS | quoted: MonoEM-GS, Table III | of OMCL and OVO | 8 of Replica | – | 31.5 | 63.2 | 47.4 |" in said
+    )
+    assert (tmp_path / "truth" / "out" / "segmentation_ovo.md").read_text() == said
+    assert json.loads((tmp_path / "truth" / "out" / "segmentation_ovo.json").read_text())["classes"] == ["wall", "sofa"]
+
+
+def test_wrong_labels_count_as_the_matrix_says(run, tmp_path):
+    """Twenty vertices of the sofa are called wall; one neighbour votes."""
+    ids = write_truth(tmp_path / "truth", run, wrong=20)
+    found, _ = scored(run, tmp_path / "truth", "protocol.num_neighbours=1")
+    walls, sofas = (ids == 5).sum(), (ids == 9).sum()
+    np.testing.assert_array_equal(found["scenes"][0]["confusion"], [[walls - 20, 20, 0], [0, sofas, 0]])
+    iou = (walls - 20) / walls, sofas / (sofas + 20)
+    np.testing.assert_allclose(found["total"]["miou"], 100 * np.mean(iou))
+    np.testing.assert_allclose(found["by_class"]["wall"]["iou_percent"], 100 * iou[0])
+    np.testing.assert_allclose(found["total"]["acc"], 100 * np.mean([(walls - 20) / walls, 1]))
+
+
+def test_a_map_beside_the_truth_is_placed_by_its_points(run, tmp_path):
+    """Sideways along the walls nothing holds it, so the truth is off along their normal, by a third of the cells."""
+    normal = TO_TRUTH.rotation @ [0.0, 0.0, 1.0]
+    write_truth(tmp_path / "truth", run, shift=0.06 * normal)
+    by_path, _ = scored(run, tmp_path / "truth")
+    by_points, said = scored(run, tmp_path / "truth", "alignment=points")
+    np.testing.assert_allclose(by_path["scenes"][0]["median_distance_to_map_m"], 0.06, rtol=1e-3)
+    assert by_points["scenes"][0]["median_distance_to_map_m"] < 1e-3
+    np.testing.assert_allclose(by_points["scenes"][0]["icp"]["translation"], 0.06 * normal, atol=1e-3)
+    assert "| points | 100.0 |" in said
+
+
+def test_two_scenes_are_one_matrix_and_have_a_line_each(run, tmp_path):
+    truth = tmp_path / "truth"
+    ids = write_truth(truth, run)
+    for name in ("room_mesh.ply", "room.txt"):
+        (truth / name.replace("room", "hall")).write_bytes((truth / name).read_bytes())
+    (truth / "hall.txt").write_text("\n".join(["5"] * len(ids)) + "\n")
+    found, said = scored(run, truth, f"map=[{run},{run}]", "scenes=[room,hall]")
+    assert "one matrix of 2" in said and "| hall |" in said
+    sofas = (ids == 9).sum()
+    np.testing.assert_allclose(found["total"]["acc"], 100 * np.mean([1 - sofas / (2 * len(ids) - sofas), 1]))
+    with pytest.raises(ValueError, match="scenes has 1 names and map 2 folders"):
+        scored(run, truth, f"map=[{run},{run}]", "scenes=[room]")
+
+
+@pytest.mark.parametrize("name", ["rayfronts", "conceptgraphs"])
+def test_the_other_protocols_are_named_in_file_and_table(run, tmp_path, name):
+    write_truth(tmp_path / "truth", run)
+    found, said = scored(run, tmp_path / "truth", f"protocol={name}")
+    assert f"| {name} |" in said and (tmp_path / "truth" / "out" / f"segmentation_{name}.json").is_file()
+    # RayFronts ignores walls: what is left is the sofa, which is right.
+    assert found["total"]["miou"] == 100.0 and ("wall" in found["by_class"]) == (name == "conceptgraphs")
+
+
+def test_what_is_missing_or_does_not_fit_is_named(run, tmp_path):
+    truth = tmp_path / "truth"
+    ids = write_truth(truth, run)
+    with pytest.raises(ValueError, match=r"has ids only: give their class file"):
+        segment(compose(f"map={run}", f"truth={truth}", f"out={truth}", name="segment"))
+    with pytest.raises(ValueError, match=r"class file .*nowhere.yaml does not exist"):
+        scored(run, truth, "classes=nowhere.yaml")
+    with pytest.raises(ValueError, match=r"lacks attic_mesh.ply, attic.txt"):
+        scored(run, truth, "scenes=attic")
+    with pytest.raises(ValueError, match=r"alignment must be one of trajectory, points; got 'guess'"):
+        scored(run, truth, "alignment=guess")
+    with pytest.raises(ValueError, match=r"map names no folder"):
+        scored(run, truth, "map=[]")
+    (truth / "classes.txt").write_text("5 wall\n9 throne\n")
+    with pytest.raises(ValueError, match=r"'throne' is no word of .*text.npz"):
+        scored(run, truth)
+    (truth / "classes.txt").write_text(CLASSES)
+    (truth / "room.txt").write_text("\n".join(map(str, ids[:-1])))
+    with pytest.raises(ValueError, match=rf"room.txt has {len(ids) - 1} labels and .* {len(ids)} vertices"):
+        scored(run, truth)
+    with pytest.raises(ValueError, match="truth=frames has the data set's names: leave it out"):
+        scored(run, truth, "truth=frames")
+
+
+def test_without_a_true_pose_there_is_no_placement(tmp_path):
+    folder = written_run(tmp_path / "run", has_truth=False)
+    write_truth(tmp_path / "truth", folder)
+    with pytest.raises(ValueError, match=r"frames.jsonl has no true pose to place the map by"):
+        scored(folder, tmp_path / "truth")
+
+
+def test_the_hand_made_similarity_is_one():
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    np.testing.assert_allclose(inverse(TO_TRUTH).apply(TO_TRUTH.apply(points)), points)
