@@ -163,3 +163,13 @@ def test_words_that_are_no_choice_and_other_classes_are_refused():
     points, _, truth = scene()
     with pytest.raises(ValueError, match="same classes"):
         scene_confusion(LabelledPoints(points, np.zeros(25, int), ("sofa",)), truth, [], protocol("ovo"))
+
+
+def test_points_without_a_class_vote_for_none_where_the_protocol_says_so():
+    """Three of the five nearest have none, two are chairs."""
+    points = np.array([[0.01 * i, 0.0, 0.0] for i in range(5)])
+    found = LabelledPoints(points, np.array([-1, 1, -1, 1, -1]), CLASSES)
+    truth = LabelledPoints(points[:1], np.array([1]), CLASSES)
+    for none_votes, column in ((True, 4), (False, 1)):
+        p = protocol("rayfronts", voxel_m=0.0, none_votes=none_votes)
+        assert scene_confusion(found, truth, [], p)[1].tolist() == [int(i == column) for i in range(5)]
