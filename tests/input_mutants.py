@@ -14,8 +14,37 @@ READING = ("tests/data/test_reading.py",)
 TUM = ("tests/data/test_tum.py",)
 CHECKSUMS = ("tests/data/test_checksums.py",)
 VALUES = ("tests/running/test_values.py",)
+EXPORT = ("tests/report/test_export.py",)
 
 MUTANTS = (
+    Mutant(
+        "emgs_jax/io/colmap.py",
+        "_words((fx, fy, cx + 0.5, cy + 0.5))",
+        "_words((fx, fy, cx, cy))",
+        EXPORT,
+        "COLMAP's principal point is half a pixel off",
+    ),
+    Mutant(
+        "emgs_jax/io/nerfstudio.py",
+        "poses = np.asarray(T_world_camera, np.float64) @ FLIP",
+        "poses = np.asarray(T_world_camera, np.float64)",
+        EXPORT,
+        "nerfstudio's cameras look backwards",
+    ),
+    Mutant(
+        "emgs_jax/report/export.py",
+        """if frame["status"] != "lost"]""",
+        "]",
+        EXPORT,
+        "guessed poses of lost frames are exported as good ones",
+    ),
+    Mutant(
+        "emgs_jax/report/recorded_run.py",
+        """known = data.get("frames", data["camera"])""",
+        """known = data["camera"]""",
+        EXPORT,
+        "the camera of a run is that of the images on disk",
+    ),
     Mutant(
         "emgs_jax/data/checksums.py",
         "if self._sound.get(place) == version:",

@@ -29,6 +29,7 @@ FILES = {
     "map.ply": "the Gaussians as 3D Gaussian splatting has them; SuperSplat, rerun",
     "points.ply": "a dense cloud with normals, colours and labels; MeshLab, CloudCompare",
     "mesh.ply": "a mesh from centres and normals; MeshLab, Blender",
+    "cameras.ply": "every camera in the colour of its status, and the path, as a mesh; MeshLab, Blender",
 }
 _OWN = "made by this program, Apache-2.0"
 DATA_LICENCES = {

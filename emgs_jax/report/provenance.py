@@ -50,7 +50,8 @@ def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -
             "name": dataset.name,
             "sequence": dataset.sequence,
             "fingerprint": dataset.fingerprint(),
-            "camera": dict(dataset.calibration),
+            "camera": dict(dataset.calibration),  # of the images on disk
+            "frames": {"size": [*dataset.size], "intrinsics": [*dataset.intrinsics]},
         },
         "seed": prior.settings.get("seed", 0),
         "git": git_revision(Path(__file__).resolve().parents[2]),

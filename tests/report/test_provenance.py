@@ -33,6 +33,7 @@ METRICS = {
 
 class ADataset:
     name, sequence, calibration = "synthetic", "room-0", {"source": "rendered"}
+    size, intrinsics = (40, 30), (1.0, 2.0, 3.0, 4.0)
 
     def fingerprint(self):
         return "abc123"
@@ -47,8 +48,8 @@ def test_provenance_names_protocol_config_data_seed_code_and_machine():
     block = a_provenance(True)
     assert (block["protocol"], block["seed"], block["simulated"]) == ("paper", 7, True)
     assert block["config"] == {"evaluation": {"protocol": "paper"}}
-    camera = {"source": "rendered"}
-    assert block["data"] == {"name": "synthetic", "sequence": "room-0", "fingerprint": "abc123", "camera": camera}
+    cameras = {"camera": {"source": "rendered"}, "frames": {"size": [40, 30], "intrinsics": [1.0, 2.0, 3.0, 4.0]}}
+    assert block["data"] == {"name": "synthetic", "sequence": "room-0", "fingerprint": "abc123"} | cameras
     assert block["prior"] == {"name": "simulated", "settings": {"level": 1, "seed": 7}}
     versions = block["versions"]
     assert set(versions) == {"python", "jax", "jaxlib", "numpy", "optimistix", "equinox", "open3d", "cv2", "emgs_jax"}
