@@ -14,9 +14,31 @@ READING = ("tests/data/test_reading.py",)
 TUM = ("tests/data/test_tum.py",)
 CHECKSUMS = ("tests/data/test_checksums.py",)
 VALUES = ("tests/running/test_values.py",)
+POSED = ("tests/data/test_posed_images.py",)
 EXPORT = ("tests/report/test_export.py",)
 
 MUTANTS = (
+    Mutant(
+        "emgs_jax/io/colmap.py",
+        "Rotation.from_quat(values[[1, 2, 3, 0]])",
+        "Rotation.from_quat(values[:4])",
+        POSED,
+        "COLMAP's quaternions, w first, are read as w last",
+    ),
+    Mutant(
+        "emgs_jax/data/posed_images.py",
+        "times = times_of([solved.images[row] for row in order])",
+        "times = times_of(solved.images)",
+        POSED,
+        "times are those of the order in the file",
+    ),
+    Mutant(
+        "emgs_jax/io/nerfstudio.py",
+        "np.vstack([m, bottom])) @ FLIP)",
+        "np.vstack([m, bottom])))",
+        POSED,
+        "nerfstudio's axes are taken for OpenCV's",
+    ),
     Mutant(
         "emgs_jax/io/colmap.py",
         "_words((fx, fy, cx + 0.5, cy + 0.5))",
