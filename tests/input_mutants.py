@@ -15,9 +15,31 @@ TUM = ("tests/data/test_tum.py",)
 CHECKSUMS = ("tests/data/test_checksums.py",)
 VALUES = ("tests/running/test_values.py",)
 POSED = ("tests/data/test_posed_images.py",)
+SCALING = ("tests/report/test_scaling.py",)
 EXPORT = ("tests/report/test_export.py",)
 
 MUTANTS = (
+    Mutant(
+        "emgs_jax/report/scaling.py",
+        "np.float32(factor**2)",
+        "np.float32(factor)",
+        SCALING,
+        "covariances grow as lengths do",
+    ),
+    Mutant(
+        "emgs_jax/io/ply_reader.py",
+        "rows[name] += math.log(factor)",
+        "rows[name] *= factor",
+        SCALING,
+        "logarithms of standard deviations are multiplied",
+    ),
+    Mutant(
+        "emgs_jax/report/scaling.py",
+        """if frame["index"] == number]""",
+        "if row == number]",
+        SCALING,
+        "frames are counted without those that were left out",
+    ),
     Mutant(
         "emgs_jax/io/colmap.py",
         "Rotation.from_quat(values[[1, 2, 3, 0]])",

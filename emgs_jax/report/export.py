@@ -18,6 +18,7 @@ from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.ops.ranges import number
 from emgs_jax.report.page_strip import OURS, STATUS_COLORS
 from emgs_jax.report.recorded_run import RecordedRun
+from emgs_jax.report.scaling import factor_of
 
 POINTS_FILE = "points.ply"
 FORMATS = {"colmap": "colmap", "nerfstudio": "nerfstudio", "frustums": "cameras.ply"}  # and what is written
@@ -31,10 +32,14 @@ class ExportConfig:
     Args:
         formats: names of FORMATS.
         max_points: of the dense cloud, drawn evenly.
+        scale: factor on all lengths; None = 1.
+        length: instead of it two frames and the metres between their cameras, see `factor_of`.
     """
 
     formats: Sequence[str]
     max_points: int = number(low=1, high=2**26)
+    scale: float | None = number(low=1e-6, high=1e6)
+    length: Sequence[float] | None = number(low=0, high=2**31)
 
 
 def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
@@ -66,6 +71,15 @@ def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: Readab
             write = _colmap if name == "colmap" else _nerfstudio
             write(run, folder / FORMATS[name], dataset, config.max_points)
     return [folder / FORMATS[name] for name in config.formats]
+
+
+def find_factor(run: RecordedRun, config: ExportConfig) -> float | None:
+    """What the lengths of a run are multiplied by; None where nothing is known."""
+    if config.length is None:
+        return config.scale
+    if config.scale is not None:
+        raise ValueError("scale= and length= both say how long things are: give one of them")
+    return factor_of(run, config.length)
 
 
 def tracked_rows(run: RecordedRun) -> list[int]:

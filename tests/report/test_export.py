@@ -25,7 +25,7 @@ from emgs_jax.report.recorded_run import read_run
 from emgs_jax.running import configure
 from experiments.export import export_run
 
-ALL = ExportConfig(("colmap", "nerfstudio", "frustums"), 40)
+ALL = ExportConfig(("colmap", "nerfstudio", "frustums"), 40, None, None)
 LOST = 3  # row of the lost frame of a written run
 
 
@@ -158,13 +158,13 @@ def test_nothing_is_written_over_and_a_failed_export_leaves_nothing(run, monkeyp
 
 def test_bad_input_is_named(run):
     with pytest.raises(ValueError, match="formats=obj is not known: choose of colmap, nerfstudio, frustums"):
-        export(run, run.folder, ExportConfig(("obj",), 10), None)
+        export(run, run.folder, ExportConfig(("obj",), 10, None, None), None)
     with pytest.raises(ValueError, match=r"formats=colmap holds the images.*formats=\[frustums\] needs none"):
-        export(run, run.folder, ExportConfig(("colmap",), 10), None)
+        export(run, run.folder, ExportConfig(("colmap",), 10, None, None), None)
     (run.folder / "points.ply").unlink()
     with pytest.raises(ValueError, match=r"lacks points.ply, which formats=colmap needs: run again"):
-        export(run, run.folder, ExportConfig(("colmap",), 10), Shown())
-    export(run, run.folder, ExportConfig(("frustums",), 10), None)
+        export(run, run.folder, ExportConfig(("colmap",), 10, None, None), Shown())
+    export(run, run.folder, ExportConfig(("frustums",), 10, None, None), None)
 
 
 @pytest.mark.parametrize("override", ["max_points=0", "max_points=1.5", "max_points=.nan"])
