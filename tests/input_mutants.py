@@ -15,10 +15,32 @@ TUM = ("tests/data/test_tum.py",)
 CHECKSUMS = ("tests/data/test_checksums.py",)
 VALUES = ("tests/running/test_values.py",)
 POSED = ("tests/data/test_posed_images.py",)
+VIEWER = ("tests/report/test_viewer.py",)
 SCALING = ("tests/report/test_scaling.py",)
 EXPORT = ("tests/report/test_export.py",)
 
 MUTANTS = (
+    Mutant(
+        "emgs_jax/report/viewer_layers.py",
+        "(best >= min_cosine) & (best > rival)",
+        "best >= min_cosine",
+        VIEWER,
+        "words that are not asked for change nothing",
+    ),
+    Mutant(
+        "emgs_jax/report/viewer_layers.py",
+        "is_met = (along > 0) & ",
+        "is_met = ",
+        VIEWER,
+        "a click tells of what is behind the camera",
+    ),
+    Mutant(
+        "emgs_jax/report/viewer.py",
+        'return "Words of this run: " + escape(", ".join(self._names))',
+        'return "Words of this run: " + ", ".join(self._names)',
+        VIEWER,
+        "names from a file are markup in the browser",
+    ),
     Mutant(
         "emgs_jax/report/scaling.py",
         "np.float32(factor**2)",

@@ -104,7 +104,15 @@ class Viewer:
         fov = 2 * float(np.arctan2(camera.height / 2, float(camera.focal[1])))
         rgb = tuple(round(255 * c) for c in to_rgb(color))
         return self.server.scene.add_camera_frustum(
-            name, fov, camera.width / camera.height, scale=scale, color=rgb, wxyz=_wxyz(pose), position=pose[:3, 3]
+            name,
+            fov,
+            camera.width / camera.height,
+            scale=scale,
+            thickness=1.5,
+            thickness_units="screen",
+            color=rgb,
+            wxyz=_wxyz(pose),
+            position=pose[:3, 3],
         )
 
     def _add_controls(self) -> None:
@@ -114,7 +122,7 @@ class Viewer:
         self.words = gui.add_text("Look for", "", hint=hint)
         self.against = gui.add_text("Against", "", hint="what is closer to one of these words is left out")
         self.threshold = gui.add_slider("At least", 0.0, 1.0, 0.01, 0.5, hint="cosine that an answer needs")
-        self.answer = gui.add_html(self._known())
+        self.answer = gui.add_html(_shown(self._known()))
         self.layer = gui.add_dropdown("Colours", [name for name in LAYERS if name != "class" or names])
         self.kind = gui.add_dropdown("Map as", ["Gaussians", "points"])
         self.show_cameras = gui.add_checkbox("Cameras", True)
@@ -122,8 +130,8 @@ class Viewer:
         last = max(len(self._run.frames) - 1, 1)
         self.frame = gui.add_slider("Frame", 0, last, 1, 0)
         self.go = gui.add_button("Look through its camera")
-        self.facts = gui.add_html(self._facts(0))
-        self.number = gui.add_html("Click a Gaussian for its numbers.")
+        self.facts = gui.add_html(_shown(self._facts(0)))
+        self.number = gui.add_html(_shown("Click a Gaussian for its numbers."))
         for control in (self.words, self.against, self.threshold, self.layer):
             control.on_update(lambda _: self.recolor())
         for control in (self.kind, self.show_cameras, self.show_paths):
@@ -156,14 +164,14 @@ class Viewer:
         with self.server.atomic():
             self.splats.rgbs = colors
             self.points.colors = colors
-        self.answer.content = message
+        self.answer.content = _shown(message)
 
     def pick(self, origin: Any, direction: Any) -> None:
         """Say the numbers of the Gaussian under a ray."""
         layers = self.layers
         row = picked(layers["mean"], self._covs, origin, direction)
         if row is None:
-            self.number.content = "There is no Gaussian."
+            self.number.content = _shown("There is no Gaussian.")
             return
         widths = np.sqrt(np.maximum(np.linalg.eigvalsh(self._covs[row].astype(np.float64)), 0))[::-1]
         lines = [
@@ -175,7 +183,7 @@ class Viewer:
         if self._names and layers["label"][row] >= 0:
             label = layers["label"][row]
             lines.append(f"{escape(self._names[label])} ({layers['similarity'][row][label] / 255:.2f})")
-        self.number.content = "<br>".join(lines)
+        self.number.content = _shown("<br>".join(lines))
 
     def _show(self) -> None:
         self.splats.visible, self.points.visible = self.kind.value == "Gaussians", self.kind.value == "points"
@@ -187,7 +195,7 @@ class Viewer:
     def _choose(self) -> None:
         row = self._row()
         self.chosen.wxyz, self.chosen.position = _wxyz(self._run.poses[row]), self._run.poses[row][:3, 3]
-        self.facts.content = self._facts(row)
+        self.facts.content = _shown(self._facts(row))
 
     def _row(self) -> int:
         return min(int(self.frame.value), len(self._run.frames) - 1)
@@ -231,6 +239,10 @@ def _viser() -> Any:
     except ImportError as error:
         raise ValueError('the viewer needs viser: pip install "emgs_jax[viewer]"') from error
     return viser
+
+
+def _shown(words: str) -> str:
+    return f'<div style="padding: 2px 10px; font-size: 13px">{words}</div>'
 
 
 def _wxyz(pose: np.ndarray) -> np.ndarray:
