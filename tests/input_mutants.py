@@ -14,12 +14,27 @@ READING = ("tests/data/test_reading.py",)
 TUM = ("tests/data/test_tum.py",)
 CHECKSUMS = ("tests/data/test_checksums.py",)
 VALUES = ("tests/running/test_values.py",)
+ROSBAG = ("tests/data/test_rosbag.py",)
 POSED = ("tests/data/test_posed_images.py",)
 VIEWER = ("tests/report/test_viewer.py",)
 SCALING = ("tests/report/test_scaling.py",)
 EXPORT = ("tests/report/test_export.py",)
 
 MUTANTS = (
+    Mutant(
+        "emgs_jax/data/rosbag.py",
+        "K[0]), float(K[4]), float(K[2])",
+        "K[0]), float(K[4]), float(K[3])",
+        ROSBAG,
+        "the centre of a bag's camera is another entry of its matrix",
+    ),
+    Mutant(
+        "emgs_jax/data/rosbag.py",
+        "reshape(message.height, message.step)[:, :width]",
+        "reshape(message.height, message.step)[:, -width:]",
+        ROSBAG,
+        "what fills a row up is taken for picture",
+    ),
     Mutant(
         "emgs_jax/report/viewer_layers.py",
         "(best >= min_cosine) & (best > rival)",

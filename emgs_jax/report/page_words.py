@@ -38,7 +38,7 @@ DATA_LICENCES = {
     "tum": "TUM RGB-D: CC BY 4.0, unless the sequence says otherwise",
     "seven_scenes": "7-Scenes: Microsoft Research's licence, non-commercial use",
     "replica": "Replica: its own research licence, non-commercial use",
-    **dict.fromkeys(("images", "colmap", "nerfstudio"), "your own images, your own licence"),
+    **dict.fromkeys(("images", "colmap", "nerfstudio", "rosbag"), "your own images, your own licence"),
 }
 
 
