@@ -56,7 +56,8 @@ class RosBag:
             self._topic = _topic_of(bag, (RAW, COMPRESSED), topic, self._path, "topic")
             times = [time for _, time, _ in bag.messages(connections=_connections(bag, self._topic))]
             info = None if intrinsics is not None else _camera_info(bag, self._topic, info_topic, self._path)
-        places = [(time, row - times.index(time)) for row, time in enumerate(times)]  # several may have one time
+        first: dict[int, int] = {}  # several may have one time
+        places = [(time, row - first.setdefault(time, row)) for row, time in enumerate(times)]
         chosen = reading.select(len(times), start, stop, stride, f"{self._path}, topic {self._topic},")
         self._places = [places[row] for row in chosen]
         self._raw_size = self._first_size()
