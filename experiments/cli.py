@@ -12,6 +12,8 @@ COMMANDS = {  # name: (what it does, an example)
     "sweep": ("a grid of settings on one sequence", "emgs sweep sweep=gates experiment=smoke"),
     "effects": ("what each value of sweeps changes", "emgs effects folder=multirun/sweep"),
     "report": ("write the page of a finished run anew", "emgs report outputs/synthetic/2026-01-31_12-00-00"),
+    "view": ("look at a finished run in the browser", "emgs view outputs/synthetic/2026-01-31_12-00-00"),
+    "export": ("a run for COLMAP, nerfstudio and others", "emgs export outputs/… 'formats=[colmap,frustums]'"),
     "predict": ("record what a prior says of a sequence", "emgs predict dataset=… prior=mapanything out=predictions"),
     "embed": ("class names to text features", "emgs embed features=dinov3_text 'classes=[wall,floor]' out=text.npz"),
     "query": ("ask a finished map for things", "emgs query map=outputs/monday 'text=[chair,table]'"),

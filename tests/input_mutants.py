@@ -14,8 +14,118 @@ READING = ("tests/data/test_reading.py",)
 TUM = ("tests/data/test_tum.py",)
 CHECKSUMS = ("tests/data/test_checksums.py",)
 VALUES = ("tests/running/test_values.py",)
+ROSBAG = ("tests/data/test_rosbag.py",)
+POSED = ("tests/data/test_posed_images.py",)
+VIEWER = ("tests/report/test_viewer.py",)
+SCALING = ("tests/report/test_scaling.py",)
+EXPORT = ("tests/report/test_export.py",)
 
 MUTANTS = (
+    Mutant(
+        "emgs_jax/data/rosbag.py",
+        "K[0]), float(K[4]), float(K[2])",
+        "K[0]), float(K[4]), float(K[3])",
+        ROSBAG,
+        "the centre of a bag's camera is another entry of its matrix",
+    ),
+    Mutant(
+        "emgs_jax/data/rosbag.py",
+        "reshape(message.height, message.step)[:, :width]",
+        "reshape(message.height, message.step)[:, -width:]",
+        ROSBAG,
+        "what fills a row up is taken for picture",
+    ),
+    Mutant(
+        "emgs_jax/report/viewer_layers.py",
+        "(best >= min_cosine) & (best > rival)",
+        "best >= min_cosine",
+        VIEWER,
+        "words that are not asked for change nothing",
+    ),
+    Mutant(
+        "emgs_jax/report/viewer_layers.py",
+        "is_met = (along > 0) & ",
+        "is_met = ",
+        VIEWER,
+        "a click tells of what is behind the camera",
+    ),
+    Mutant(
+        "emgs_jax/report/viewer.py",
+        'return "Words of this run: " + escape(", ".join(self._names))',
+        'return "Words of this run: " + ", ".join(self._names)',
+        VIEWER,
+        "names from a file are markup in the browser",
+    ),
+    Mutant(
+        "emgs_jax/report/scaling.py",
+        "np.float32(factor**2)",
+        "np.float32(factor)",
+        SCALING,
+        "covariances grow as lengths do",
+    ),
+    Mutant(
+        "emgs_jax/io/ply_reader.py",
+        "rows[name] += math.log(factor)",
+        "rows[name] *= factor",
+        SCALING,
+        "logarithms of standard deviations are multiplied",
+    ),
+    Mutant(
+        "emgs_jax/report/scaling.py",
+        """if frame["index"] == number]""",
+        "if row == number]",
+        SCALING,
+        "frames are counted without those that were left out",
+    ),
+    Mutant(
+        "emgs_jax/io/colmap.py",
+        "Rotation.from_quat(values[[1, 2, 3, 0]])",
+        "Rotation.from_quat(values[:4])",
+        POSED,
+        "COLMAP's quaternions, w first, are read as w last",
+    ),
+    Mutant(
+        "emgs_jax/data/posed_images.py",
+        "times = times_of([solved.images[row] for row in order])",
+        "times = times_of(solved.images)",
+        POSED,
+        "times are those of the order in the file",
+    ),
+    Mutant(
+        "emgs_jax/io/nerfstudio.py",
+        "np.vstack([m, bottom])) @ FLIP)",
+        "np.vstack([m, bottom])))",
+        POSED,
+        "nerfstudio's axes are taken for OpenCV's",
+    ),
+    Mutant(
+        "emgs_jax/io/colmap.py",
+        "_words((fx, fy, cx + 0.5, cy + 0.5))",
+        "_words((fx, fy, cx, cy))",
+        EXPORT,
+        "COLMAP's principal point is half a pixel off",
+    ),
+    Mutant(
+        "emgs_jax/io/nerfstudio.py",
+        "poses = np.asarray(T_world_camera, np.float64) @ FLIP",
+        "poses = np.asarray(T_world_camera, np.float64)",
+        EXPORT,
+        "nerfstudio's cameras look backwards",
+    ),
+    Mutant(
+        "emgs_jax/report/export.py",
+        """if frame["status"] != "lost"]""",
+        "]",
+        EXPORT,
+        "guessed poses of lost frames are exported as good ones",
+    ),
+    Mutant(
+        "emgs_jax/report/recorded_run.py",
+        """known = data.get("frames", data["camera"])""",
+        """known = data["camera"]""",
+        EXPORT,
+        "the camera of a run is that of the images on disk",
+    ),
     Mutant(
         "emgs_jax/data/checksums.py",
         "if self._sound.get(place) == version:",

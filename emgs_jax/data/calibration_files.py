@@ -174,7 +174,12 @@ def _colmap(text: str, path: Path) -> Calibration:
         raise ValueError(f"{path} must have lines CAMERA_ID MODEL WIDTH HEIGHT PARAMS, as COLMAP's cameras.txt")
     if len({tuple(line[1:]) for line in lines}) > 1:
         raise ValueError(f"{path} has {len(lines)} different cameras: leave the line of the one that took the images")
-    _, model, *words = lines[0]
+    return colmap_camera(lines[0][1:], path)
+
+
+def colmap_camera(words: list[str], path: Path) -> Calibration:
+    """The camera of the words MODEL WIDTH HEIGHT PARAMS; raises ValueError where they are of another model."""
+    model, *words = words
     if model not in COLMAP_MODELS:
         _refuse_model(model, COLMAP_MODELS, path)
     names = COLMAP_MODELS[model]

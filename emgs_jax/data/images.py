@@ -103,10 +103,7 @@ class Folder:
         self.folder = folder
         self._paths = sorted(found, key=lambda p: (reading.natural_key(p), p.name))
         self.count = len(self._paths)
-        numbers = [last_number(p.stem) for p in self._paths]
-        is_time = all(n is not None and math.isfinite(n) for n in numbers)
-        is_time = is_time and all(b > a for a, b in zip(numbers, numbers[1:], strict=False))
-        self._times = numbers if is_time else [float(i) for i in range(self.count)]
+        self._times = times_of(self._paths)
 
     def find_size(self, rows: range) -> Size:
         return reading.first_size((self._paths[row] for row in rows), self.folder)
@@ -170,6 +167,13 @@ class Video:
 
     def label(self, row: int) -> str:
         return f"{self._path}, frame {row}"
+
+
+def times_of(paths: Sequence[Path]) -> list[float]:
+    """The numbers in the names of files where they ascend, else their positions."""
+    numbers = [number for path in paths if (number := last_number(path.stem)) is not None and math.isfinite(number)]
+    is_time = len(numbers) == len(paths) and all(b > a for a, b in zip(numbers, numbers[1:], strict=False))
+    return numbers if is_time else [float(i) for i in range(len(paths))]
 
 
 def last_number(name: str) -> float | None:

@@ -95,12 +95,27 @@ def find_lens(given: Given, pictures: Pictures) -> Lens:
         path = Path(given).expanduser()
         what, camera = str(path), read_calibration(path)
         about = {"source": path.name, "note": f"from {path.name}: {[round(v, 2) for v in camera.intrinsics]}"}
-    check_image_size(camera, pictures.size, what)
-    raw = reading.check_intrinsics(camera.intrinsics, pictures.size, what)
-    about |= {"size": [*pictures.size], "intrinsics": [*raw], "distortion": [*camera.distortion]}
+    return to_lens(camera, pictures.size, what, about)
+
+
+def to_lens(camera: Calibration, size: Size, what: str, about: Mapping[str, Any]) -> Lens:
+    """The lens of a calibration.
+
+    Args:
+        camera: calibrated.
+        size: (width, height) of the images on disk.
+        what: names the calibration in errors.
+        about: where it comes from; size, intrinsics and distortion are added.
+
+    Raises:
+        ValueError: it is for images of another size, or the distortion leaves nothing of the image.
+    """
+    check_image_size(camera, size, what)
+    raw = reading.check_intrinsics(camera.intrinsics, size, what)
+    about = {**about, "size": [*size], "intrinsics": [*raw], "distortion": [*camera.distortion]}
     if not any(camera.distortion):
         return Lens(raw, None, about)
-    straight, maps = undistortion(raw, camera.distortion, pictures.size, what)
+    straight, maps = undistortion(raw, camera.distortion, size, what)
     return Lens(straight, maps, about)
 
 

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -31,6 +32,27 @@ def atomic_write(path: str | os.PathLike, mode: str = "wb") -> Iterator[IO]:
         raise _named(error, path) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """A folder beside `path` that becomes `path` if the block succeeds, and is removed if it does not.
+
+    Raises:
+        ValueError: there is something at `path`; it stays.
+    """
+    if path.exists():
+        raise ValueError(f"{path} is there already: remove it, or write elsewhere")
+    partial = path.with_name(f".{path.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)  # of a program that was killed
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        os.rename(partial, path)
+    except OSError as error:
+        raise _named(error, path) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def remove_temporaries(folder: Path) -> list[str]:

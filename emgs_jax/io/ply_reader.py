@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from emgs_jax.io.files import atomic_write
+
 REMEDY = "write the file again"
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _TYPES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"}
@@ -43,6 +45,30 @@ def read_vertices(path: str | os.PathLike) -> dict[str, np.ndarray]:
     skipped = sum(element.count * _row_type(element, order).itemsize for element in elements[:before])
     rows = np.frombuffer(body, _row_type(vertex, order), vertex.count, skipped)
     return {name: rows[name].astype(rows.dtype[name].newbyteorder("=")) for name in vertex.properties}
+
+
+def scale_ply(path: str | os.PathLike, target: str | os.PathLike, factor: float) -> None:
+    """Copy a PLY that begins with its vertices, in binary, with all lengths times `factor`.
+
+    x, y and z, and scale_0 to scale_2 of Gaussians, which are logarithms; all other bytes stay, comments too.
+
+    Raises:
+        ValueError: as `read_vertices`, or a file in ascii or with something before the vertices.
+    """
+    read_vertices(path)
+    content = Path(path).read_bytes()
+    order, elements, start = _header(content, path)
+    if order == "" or elements[0].name != "vertex":
+        raise ValueError(f"{path} is not as this program writes it (binary, vertices first): {REMEDY}")
+    row_type = _row_type(elements[0], order)
+    end = start + elements[0].count * row_type.itemsize
+    rows = np.frombuffer(content[start:end], row_type).copy()
+    for name in ("x", "y", "z"):
+        rows[name] *= factor
+    for name in {"scale_0", "scale_1", "scale_2"} & {*elements[0].properties}:
+        rows[name] += math.log(factor)
+    with atomic_write(target) as handle:
+        handle.write(content[:start] + rows.tobytes() + content[end:])
 
 
 def _header(content: bytes, path: object) -> tuple[str, list[Element], int]:

@@ -29,6 +29,7 @@ FILES = {
     "map.ply": "the Gaussians as 3D Gaussian splatting has them; SuperSplat, rerun",
     "points.ply": "a dense cloud with normals, colours and labels; MeshLab, CloudCompare",
     "mesh.ply": "a mesh from centres and normals; MeshLab, Blender",
+    "cameras.ply": "every camera in the colour of its status, and the path, as a mesh; MeshLab, Blender",
 }
 _OWN = "made by this program, Apache-2.0"
 DATA_LICENCES = {
@@ -37,7 +38,7 @@ DATA_LICENCES = {
     "tum": "TUM RGB-D: CC BY 4.0, unless the sequence says otherwise",
     "seven_scenes": "7-Scenes: Microsoft Research's licence, non-commercial use",
     "replica": "Replica: its own research licence, non-commercial use",
-    "images": "your own images, your own licence",
+    **dict.fromkeys(("images", "colmap", "nerfstudio", "rosbag"), "your own images, your own licence"),
 }
 
 

@@ -50,8 +50,8 @@ def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -
             "name": dataset.name,
             "sequence": dataset.sequence,
             "fingerprint": dataset.fingerprint(),
-            "camera": dict(dataset.calibration),  # of the images as they are found
-            "frames": {"size": [*dataset.size], "intrinsics": [*map(float, dataset.intrinsics)]},  # as they are used
+            "camera": dict(dataset.calibration),  # of the images on disk
+            "frames": {"size": [*dataset.size], "intrinsics": [*map(float, dataset.intrinsics)]},
         },
         "seed": prior.settings.get("seed", 0),
         "git": git_revision(Path(__file__).resolve().parents[2]),

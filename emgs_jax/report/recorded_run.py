@@ -18,6 +18,7 @@ TEXT_FILE = "text.npz"  # classes of a map with features, in the format of `expe
 LOOPS_FILE = "loops.json"
 REPORT_FILE = "report.html"
 FRAMES_FILE = "frames.jsonl"
+EXPORTS = ("colmap", "nerfstudio", "cameras.ply", "scaled")  # what `experiments.export` writes beside them
 _POSES = ("raw_pose", "true_pose")
 _OUTCOMES = ("accepted", "known", "unconfirmed", "refused")
 
@@ -135,12 +136,12 @@ def _online(path: Path, count: int) -> np.ndarray | None:
 
 
 def _camera(path: Path, metrics: dict[str, Any]) -> Camera:
-    """Of the frames as they were used."""
+    """Of the frames, straight and in the size in use."""
     try:
         known = metrics["provenance"]["data"]["frames"]
         fx, fy, cx, cy = (float(value) for value in known["intrinsics"])
         width, height = (int(value) for value in known["size"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(
             f"{path} does not say which camera it was ({error!r}): an older version wrote it, run again"
         ) from error

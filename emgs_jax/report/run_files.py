@@ -16,7 +16,7 @@ from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
-from emgs_jax.report.recorded_run import LOOPS_FILE, REPORT_FILE, TEXT_FILE
+from emgs_jax.report.recorded_run import EXPORTS, LOOPS_FILE, REPORT_FILE, TEXT_FILE
 from emgs_jax.running.back_end import loop_list, metric_graph
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
@@ -28,6 +28,7 @@ OUTPUTS = (
     *("metrics.json", "trajectory.txt", "trajectory_online.txt", "graph.g2o", LOOPS_FILE, "frames.jsonl"),
     *("map.npz", "places.npz", "map.ply", "points.ply", "mesh.ply", "overview.png", TEXT_FILE, REPORT_FILE),
     *(CHECKPOINT_FILE, "query.json", "query.png", "semantic.npz", "semantic.ply", "features.png"),
+    *EXPORTS,
 )
 
 

@@ -88,6 +88,33 @@ def test_a_video_gives_the_right_frame_in_any_order(suffix, tmp_path):
         assert frame.timestamp == pytest.approx(2 * i / 25)
 
 
+def turn_in_its_metadata(path) -> None:
+    """Say in the track's header that a player must turn the picture by 90 degrees clockwise, as a phone does.
+
+    The matrix of tkhd (ISO 14496-12, 8.3.2) sends (x, y) to (a x + c y, b x + d y): right becomes down.
+    """
+    content, unit = path.read_bytes(), (1 << 16).to_bytes(4, "big")
+    minus, end = (-(1 << 16)).to_bytes(4, "big", signed=True), (1 << 30).to_bytes(4, "big")
+    zero = bytes(4)
+    straight = unit + zero * 3 + unit + zero * 3 + end
+    place = content.index(straight, content.index(b"tkhd"))
+    turned = zero + unit + zero + minus + zero * 4 + end
+    path.write_bytes(content[:place] + turned + content[place + len(turned) :])
+
+
+def test_a_video_of_a_phone_that_was_held_upright_comes_upright(tmp_path):
+    path = tmp_path / "clip.mp4"
+    write_video(path)
+    lying = load(path)[3].image
+    turn_in_its_metadata(path)
+    size = SIZE[::-1]
+    upright = load(path, size=size, intrinsics=(128.0, 128.0, 59.5, 79.5))
+    assert upright.intrinsics == (128.0, 128.0, 59.5, 79.5) and upright.size == size
+    for i in (3, 1):  # backwards: the video is opened again
+        assert upright[i].image.shape == (size[1], size[0], 3) and number_of(upright[i]) == i
+    np.testing.assert_array_equal(upright[3].image, np.rot90(lying, -1))
+
+
 def test_a_video_that_ends_early_says_where(tmp_path, monkeypatch):
     path = tmp_path / "clip.avi"
     write_video(path)

@@ -19,6 +19,7 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.data.checksums import SUMS_FILE
 from emgs_jax.data.class_file import read_classes
 from emgs_jax.data.images import Images
+from emgs_jax.data.posed_images import Colmap, Nerfstudio
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.reading import is_rigid
 from emgs_jax.data.replica import Replica
@@ -30,11 +31,14 @@ from emgs_jax.evaluation.labelled_mesh import read_labelled_mesh
 from emgs_jax.features.text import TextEmbeddings, load_text, save_text
 from emgs_jax.gaussian_map import empty_map
 from emgs_jax.graph.measurements import LOOP, WINDOW, Graph, Nodes
+from emgs_jax.io.colmap import save_colmap
 from emgs_jax.io.g2o import load_graph_g2o
 from emgs_jax.io.map_file import load_map, save_map
+from emgs_jax.io.nerfstudio import save_transforms
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.loops.appearance import Keyframe, extend
+from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import windows
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.simulated.prior import Simulated
@@ -151,6 +155,24 @@ def read_listed_images(folder: Path) -> None:
 def write_images(folder: Path) -> None:
     for i, name in enumerate(("img2.png", "img10.jpg", "img33.bmp")):
         _image(folder / name, i, SIZE)
+
+
+POSED = ("img2.png", "img10.jpg", "img33.bmp")  # as write_images names them
+PINHOLE = Camera((60.0, 60.0), (23.5, 17.5), *SIZE)
+
+
+def write_colmap(folder: Path) -> None:
+    (folder / "images").mkdir()
+    write_images(folder / "images")
+    (folder / "sparse").mkdir()
+    poses = np.stack([scene_pose(i) for i in range(NUM_FRAMES)])
+    save_colmap(folder / "sparse", PINHOLE, POSED, poses, np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+def write_nerfstudio(folder: Path) -> None:
+    write_images(folder)
+    poses = np.stack([scene_pose(i) for i in range(NUM_FRAMES)])
+    save_transforms(folder / "transforms.json", PINHOLE, POSED, poses, "points.ply")
 
 
 CALIBRATIONS = {
@@ -383,6 +405,10 @@ def targets() -> Iterator[Target]:
     )
     yield Target(
         "images", write_images, lambda f: check_frames(Images(f, size=SIZE, intrinsics=(60, 60, 23.5, 17.5))), image
+    )
+    yield Target("colmap", write_colmap, lambda f: check_frames(Colmap(f, size=SIZE)), image | {".txt": TEXT})
+    yield Target(
+        "nerfstudio", write_nerfstudio, lambda f: check_frames(Nerfstudio(f, size=SIZE)), image | {".json": TEXT}
     )
     yield Target("checksums", write_listed_images, read_listed_images, image | {SUMS_FILE: TEXT})
     yield Target("calibration", write_calibrations, read_calibrations, {".txt": TEXT, ".json": TEXT, ".yaml": TEXT})

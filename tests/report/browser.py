@@ -40,6 +40,15 @@ class Browser:
                 raise TimeoutError(f"{path} is not ready after {timeout:g} s: {self.log('browser')}")
             time.sleep(0.1)
 
+    def visit(self, address: str) -> None:
+        """Open an address."""
+        self._ask("POST", "/url", {"url": address})
+
+    def type(self, text: str) -> None:
+        """Keys, to what has the focus."""
+        keys = [{"type": kind, "value": letter} for letter in text for kind in ("keyDown", "keyUp")]
+        self._ask("POST", "/actions", {"actions": [{"type": "key", "id": "keys", "actions": keys}]})
+
     def run(self, script: str, *arguments: Any) -> Any:
         """What a script returns."""
         return self._ask("POST", "/execute/sync", {"script": script, "args": list(arguments)})

@@ -213,7 +213,7 @@ def edited(path, change):
     [
         ("metrics.json", lambda text: text.replace('"format": 1', '"format": 9'), "another version"),
         ("metrics.json", lambda text: text[:50], "is not the result of a run"),
-        ("metrics.json", lambda text: text.replace('"intrinsics"', '"other"', 1), "which camera"),
+        ("metrics.json", lambda text: text.replace('"intrinsics"', '"other"'), "which camera"),
         ("metrics.json", lambda text: text.replace("emgs_jax.data.synthetic.Synthetic", "os.system"), "os.system"),
         ("frames.jsonl", lambda text: text + '{"index": 3\n', "frames.jsonl:7 is no record"),
         ("frames.jsonl", lambda text: "".join(text.splitlines(True)[:-1]), "5 poses and trajectory.txt 6"),

@@ -32,8 +32,8 @@ METRICS = {
 
 
 class ADataset:
-    name, sequence, calibration = "synthetic", "room-0", {"source": "rendered", "size": [64, 48]}
-    size, intrinsics = (32, 24), (30.0, 30.0, 15.5, 11.5)  # half of those that are found
+    name, sequence, calibration = "synthetic", "room-0", {"source": "rendered"}
+    size, intrinsics = (40, 30), (1.0, 2.0, 3.0, 4.0)
 
     def fingerprint(self):
         return "abc123"
@@ -48,10 +48,7 @@ def test_provenance_names_protocol_config_data_seed_code_and_machine():
     block = a_provenance(True)
     assert (block["protocol"], block["seed"], block["simulated"]) == ("paper", 7, True)
     assert block["config"] == {"evaluation": {"protocol": "paper"}}
-    cameras = {
-        "camera": {"source": "rendered", "size": [64, 48]},
-        "frames": {"size": [32, 24], "intrinsics": [30.0, 30.0, 15.5, 11.5]},
-    }
+    cameras = {"camera": {"source": "rendered"}, "frames": {"size": [40, 30], "intrinsics": [1.0, 2.0, 3.0, 4.0]}}
     assert block["data"] == {"name": "synthetic", "sequence": "room-0", "fingerprint": "abc123"} | cameras
     assert block["prior"] == {"name": "simulated", "settings": {"level": 1, "seed": 7}}
     versions = block["versions"]

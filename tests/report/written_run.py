@@ -67,7 +67,12 @@ def written_run(folder: Path, *, has_truth: bool = True, sequence: str = "room",
         "protocol": "paper/sim3",
         "simulated": True,
         "prior": {"name": "simulated", "settings": {}},
-        "data": {"name": "synthetic", "sequence": sequence, "frames": {"size": SIZE, "intrinsics": INTRINSICS}},
+        "data": {
+            "name": "synthetic",
+            "sequence": sequence,
+            "camera": {"size": [640, 480], "intrinsics": [500.0, 500.0, 320.0, 240.0]},  # of the images on disk
+            "frames": {"size": SIZE, "intrinsics": INTRINSICS},
+        },
         "git": None,
         "versions": {"emgs_jax": "0"},
         "config": config,

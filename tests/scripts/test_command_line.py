@@ -25,7 +25,7 @@ from experiments.command import check_arguments
         (["slam.em=papre"], r"one of its options \(default, paper\) with slam/em=default$"),
         (["render=bright"], "render=bright is no option of render: there are default"),
         (["slam=paper"], r"slam is chosen by its parts: slam/em=…, slam/existence=…, slam/fit=…"),
-        (["dataset=kitti"], "dataset=kitti is no option of dataset: there are apartment, images, replica"),
+        (["dataset=kitti"], "dataset=kitti is no option of dataset: there are apartment, colmap, images"),
         (["slam/em=paper,nothing"], "slam/em=paper,nothing is no option"),
         (["dataset=1.5"], "^dataset=1.5 is no option of dataset: there are apartment"),
         (["dataset=null"], "^dataset=null: Config group override must be a string"),

@@ -1,0 +1,202 @@
+"""Images whose cameras another program has found: a project of COLMAP, a folder of nerfstudio.
+
+Their poses are a reference for the path, in a unit of their own: only what is aligned with a scale says something
+(`trajectory/ate_sim3_m`). Without depth there is no reference for the map.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from emgs_jax.data import reading
+from emgs_jax.data.base import Frame
+from emgs_jax.data.calibration_files import Calibration, colmap_camera, read_calibration
+from emgs_jax.data.images import times_of
+from emgs_jax.data.intrinsics import to_lens
+from emgs_jax.io.colmap import BINARY, TEXT, load_colmap
+from emgs_jax.io.nerfstudio import load_transforms
+
+Pose = Float[np.ndarray, "4 4"]
+COLMAP_LAYOUT = "root[/sequence]/{images/, sparse/0/{cameras,images}.txt or .bin}"
+NERFSTUDIO_LAYOUT = "root[/sequence]/{transforms.json, images/}"
+MODEL_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0")
+
+
+@dataclass(frozen=True)
+class Solved:
+    """What a program has found of one camera's images.
+
+    Args:
+        images: files.
+        poses: T_world_camera of each, in the program's unit; None where there is none.
+        camera: of all of them.
+        source: the file that says so.
+        files: all that were read.
+    """
+
+    images: list[Path]
+    poses: list[Pose | None]
+    camera: Calibration
+    source: Path
+    files: tuple[Path, ...]
+
+
+class PosedImages:
+    """What the data sets of this file share (a `Dataset`); images in the natural order of their names."""
+
+    name = ""
+    classes: tuple[str, ...] = ()
+    has_ground_truth = False  # no depth
+
+    def __init__(
+        self, folder: Path, solved: Solved, chosen: tuple[int, int | None, int], size: Sequence[int], sequence: str
+    ) -> None:
+        order = sorted(range(len(solved.images)), key=lambda row: (reading.natural_key(solved.images[row]), row))
+        times = times_of([solved.images[row] for row in order])
+        picked = reading.select(len(order), *chosen, solved.source)
+        self._folder, self._files, self._times = folder, solved.files, [times[place] for place in picked]
+        rows = [order[place] for place in picked]
+        self._images, self._poses = [solved.images[row] for row in rows], [solved.poses[row] for row in rows]
+        if not any(path.is_file() for path in self._images):
+            raise FileNotFoundError(
+                f"{solved.source} names {self._images[0].name} and {len(rows) - 1} others, and none of them is in "
+                f"{self._images[0].parent}: put the images there"
+            )
+        self._raw_size = reading.first_size(self._images, self._images[0].parent)
+        about = {"source": solved.source.name}
+        self._lens = to_lens(solved.camera, self._raw_size, str(solved.source), about)
+        self.calibration = self._lens.about
+        self.sequence = sequence
+        self.size = reading.check_size(size)
+        self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __getitem__(self, index: int) -> Frame:
+        reading.check_index(index, len(self))
+        path = self._images[index]
+        image = self._lens.straighten(reading.read_color(path, self._raw_size))
+        image = reading.resize_color(image, self.size)
+        return Frame(index, self._times[index], str(path), image, None, self.pose(index))
+
+    def pose(self, index: int) -> Pose | None:
+        return self._poses[index]
+
+    def files(self, index: int) -> list[Path]:
+        return [self._images[index], *self._files]
+
+    def fingerprint(self) -> str:
+        options = {"dataset": self.name, "size": self.size, "intrinsics": self.intrinsics}
+        options |= {"lens": self.calibration["distortion"], "images": [path.name for path in self._images]}
+        return reading.fingerprint(self._folder, reading.all_files(self), options)
+
+
+class Colmap(PosedImages):
+    """A project of COLMAP: the images that are registered in a sparse model, of one camera.
+
+    Args:
+        root: folder of the project.
+        sequence: folder below root; None = root itself.
+        model: folder of the model below that; None = the first of MODEL_FOLDERS that has one.
+        images: folder of the images below that.
+        start, stop, stride: which of the registered images, in natural order of their names.
+        size: (width, height) of the frames given out.
+    """
+
+    name = "colmap"
+
+    def __init__(
+        self,
+        root: str | None = None,
+        sequence: str | None = None,
+        model: str | None = None,
+        images: str = "images",
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        size: Sequence[int] = (320, 240),
+    ) -> None:
+        folder = reading.find_sequence(root, "." if sequence is None else sequence, COLMAP_LAYOUT, "COLMAP's project")
+        solved = read_colmap(find_model(folder, model), folder / images)
+        super().__init__(folder, solved, (start, stop, stride), size, _name(folder, sequence))
+
+
+class Nerfstudio(PosedImages):
+    """A folder with nerfstudio's transforms.json, of one camera.
+
+    Args:
+        root: folder with transforms.json.
+        sequence: folder below root; None = root itself.
+        start, stop, stride: which of its images, in natural order of their names.
+        size: (width, height) of the frames given out.
+    """
+
+    name = "nerfstudio"
+
+    def __init__(
+        self,
+        root: str | None = None,
+        sequence: str | None = None,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        size: Sequence[int] = (320, 240),
+    ) -> None:
+        what = "written by ns-process-data and by many apps"
+        folder = reading.find_sequence(root, "." if sequence is None else sequence, NERFSTUDIO_LAYOUT, what)
+        solved = read_nerfstudio(folder / "transforms.json")
+        super().__init__(folder, solved, (start, stop, stride), size, _name(folder, sequence))
+
+
+def _name(folder: Path, sequence: str | None) -> str:
+    return folder.resolve().name if sequence is None else str(sequence)
+
+
+def find_model(folder: Path, model: str | None) -> Path:
+    """The folder of a sparse model, or an error that names where one was looked for."""
+    places = [folder / name for name in (MODEL_FOLDERS if model is None else (model,))]
+    for place in places:
+        if any(all((place / name).is_file() for name in names) for names in (TEXT, BINARY)):
+            return place
+    looked = ", ".join(str(place) for place in places)
+    raise FileNotFoundError(f"no cameras and images (.txt or .bin) in {looked}; expected the layout {COLMAP_LAYOUT}")
+
+
+def read_colmap(model: Path, folder: Path) -> Solved:
+    """The images of a sparse model, which are in `folder`.
+
+    Raises:
+        ValueError: no image, images of several cameras, a camera that is not read, a damaged file.
+    """
+    found = load_colmap(model)
+    used = {tuple(found.cameras[camera_id]) for camera_id in found.camera_ids}
+    if len(used) > 1:
+        raise ValueError(
+            f"{found.files[0]}: the images are of {len(used)} different cameras: map those of one, or run COLMAP with "
+            "--ImageReader.single_camera 1 where they were taken by one"
+        )
+    camera = colmap_camera([*used.pop()], found.files[0])
+    for name, pose in zip(found.names, found.T_world_camera, strict=True):
+        reading.check_position(pose[:3, 3], f"{found.files[1]}, image {name},")
+    return Solved([folder / name for name in found.names], [*found.T_world_camera], camera, found.files[1], found.files)
+
+
+def read_nerfstudio(path: Path) -> Solved:
+    """The frames of a transforms.json; a pose of inf or nan is none.
+
+    Raises:
+        ValueError: no frame, a camera for each frame or one that is not read, a damaged file.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist; expected the layout {NERFSTUDIO_LAYOUT}")
+    camera = read_calibration(path)
+    names, rows = load_transforms(path)
+    poses = [
+        reading.as_pose(" ".join(map(repr, row)), f"{path}, frame {name}")
+        for name, row in zip(names, rows, strict=True)
+    ]
+    return Solved([path.parent / name for name in names], poses, camera, path, (path,))

@@ -1,0 +1,196 @@
+"""Images of a bag of ROS 1 or 2, read without ROS by the library rosbags; no ground truth."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from emgs_jax.data import reading
+from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.calibration_files import Calibration
+from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens, to_lens
+
+LAYOUT = "root[/sequence] = a .bag of ROS 1, or the folder of a ROS 2 bag with metadata.yaml"
+RAW, COMPRESSED, INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
+TO_RGB = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "mono8": cv2.COLOR_GRAY2RGB}
+TO_RGB |= {"rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
+CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4}
+STRAIGHT_MODELS = ("plumb_bob", "rational_polynomial", "")
+
+
+class RosBag:
+    """The images of one topic.
+
+    Args:
+        root: bag.
+        sequence: bag below root; None = root itself.
+        topic: of sensor_msgs/Image or CompressedImage; None = the only one.
+        info_topic: of sensor_msgs/CameraInfo; None = camera_info beside the topic, or the only one.
+        intrinsics: as `Images` takes them; None = those of the first CameraInfo.
+        start, stop, stride: which of the images, in the order of the bag.
+        size: (width, height) of the frames given out.
+    """
+
+    name = "rosbag"
+    classes: tuple[str, ...] = ()
+    has_ground_truth = False
+
+    def __init__(
+        self,
+        root: str | None = None,
+        sequence: str | None = None,
+        topic: str | None = None,
+        info_topic: str | None = None,
+        intrinsics: Given | None = None,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        size: Sequence[int] = (320, 240),
+    ) -> None:
+        self._path = reading.find_sequence(root, "." if sequence is None else sequence, LAYOUT, "ros2 bag record")
+        with _opened(self._path) as bag:
+            self._topic = _topic_of(bag, (RAW, COMPRESSED), topic, self._path, "topic")
+            times = [time for _, time, _ in bag.messages(connections=_connections(bag, self._topic))]
+            info = None if intrinsics is not None else _camera_info(bag, self._topic, info_topic, self._path)
+        first: dict[int, int] = {}  # several may have one time
+        places = [(time, row - first.setdefault(time, row)) for row, time in enumerate(times)]
+        chosen = reading.select(len(times), start, stop, stride, f"{self._path}, topic {self._topic},")
+        self._places = [places[row] for row in chosen]
+        self._raw_size = self._first_size()
+        if info is None:
+            pictures = Pictures(self._raw_size, len(self), self._read)
+            self._lens = find_lens(intrinsics, pictures)
+        else:
+            self._lens = to_lens(info, self._raw_size, f"CameraInfo of {self._path}", {"source": "CameraInfo"})
+        self.calibration = self._lens.about
+        self.sequence = self._path.resolve().name if sequence is None else str(sequence)
+        self.size = reading.check_size(size)
+        self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: int) -> Frame:
+        reading.check_index(index, len(self))
+        image = self._read(index)
+        reading.check_raw_size(image, self._raw_size, self._label(index))
+        image = reading.resize_color(self._lens.straighten(image), self.size)
+        return Frame(index, self._places[index][0] / 1e9, self._label(index), image)
+
+    def pose(self, index: int) -> None:
+        return None
+
+    def files(self, index: int) -> list[Path]:
+        return sorted(path for path in self._path.iterdir() if path.is_file()) if self._path.is_dir() else [self._path]
+
+    def fingerprint(self) -> str:
+        options = {"dataset": self.name, "size": self.size, "intrinsics": self.intrinsics, "topic": self._topic}
+        options |= {"lens": self.calibration["distortion"], "frames": self._places}
+        return reading.fingerprint(self._path.parent, self.files(0), options)
+
+    def _label(self, index: int) -> str:
+        return f"{self._path}, {self._topic}, image at {self._places[index][0]} ns"
+
+    def _first_size(self) -> reading.Size:
+        for index in range(len(self)):
+            try:
+                return self._read(index).shape[1::-1]
+            except BadFrameError as error:
+                last = error
+        raise ValueError(f"none of the images of {self._topic} can be read: {last}")
+
+    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        time, ordinal = self._places[index]
+        with _opened(self._path) as bag:
+            found = bag.messages(connections=_connections(bag, self._topic), start=time, stop=time + 1)
+            for number, (connection, _, raw) in enumerate(found):
+                if number == ordinal:
+                    message = bag.deserialize(raw, connection.msgtype)
+                    return to_rgb(message, connection.msgtype == COMPRESSED, self._label(index))
+        raise BadFrameError(f"{self._label(index)} is not there any more: record the bag again")
+
+
+def to_rgb(message: Any, is_compressed: bool, label: str) -> UInt8[np.ndarray, "_ _ 3"]:
+    """The picture of a message; raises BadFrameError where it is damaged or of an encoding that is not read."""
+    if is_compressed:
+        data = bytes(message.data)
+        image = None if reading.damage(data) else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        if image is None:
+            raise BadFrameError(f"{label} is damaged: record it again, or set on_bad_frame=skip")
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    if message.encoding not in CHANNELS:
+        raise BadFrameError(
+            f"{label} has the encoding {str(message.encoding)[:40]!r}, and read are {', '.join(CHANNELS)}: "
+            "choose another dataset.topic, such as the rectified one"
+        )
+    width = message.width * CHANNELS[message.encoding]
+    if message.step < width or len(message.data) != message.step * message.height or not message.height * width:
+        raise BadFrameError(f"{label} is not as large as it says: record it again, or set on_bad_frame=skip")
+    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)[:, :width]
+    image = np.ascontiguousarray(rows).reshape(message.height, message.width, -1)
+    code = TO_RGB[message.encoding]
+    return image if code is None else cv2.cvtColor(image, code)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The bag's reader; what it cannot read is a ValueError that names the bag."""
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.rosbag1 import ReaderError as Ros1Error
+        from rosbags.rosbag2 import ReaderError as Ros2Error
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ValueError('dataset=rosbag needs the library rosbags: pip install "emgs_jax[rosbag]"') from error
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+            yield bag
+    except (AnyReaderError, Ros1Error, Ros2Error) as error:
+        raise ValueError(f"{path} is no bag that can be read ({error}); expected {LAYOUT}") from error
+
+
+def _connections(bag: Any, topic: str) -> list[Any]:
+    return [connection for connection in bag.connections if connection.topic == topic]
+
+
+def _topic_of(bag: Any, kinds: Sequence[str], topic: str | None, path: Path, key: str) -> str:
+    """The topic that is asked for, or the only one of these kinds."""
+    there = sorted({connection.topic for connection in bag.connections if connection.msgtype in kinds})
+    if topic in there:
+        return topic
+    if topic is None and len(there) == 1:
+        return there[0]
+    kind = kinds[0].rsplit("/", 1)[1]
+    if not there:
+        raise ValueError(f"{path} has no topic of sensor_msgs/{kind}")
+    what = (
+        f"{path} has no topic {topic} of sensor_msgs/{kind}" if topic else f"{path} has several of sensor_msgs/{kind}"
+    )
+    raise ValueError(f"{what}: give dataset.{key}= one of {', '.join(there)}")
+
+
+def _camera_info(bag: Any, topic: str, info_topic: str | None, path: Path) -> Calibration:
+    """The camera of the first CameraInfo."""
+    kinds = {connection.topic for connection in bag.connections if connection.msgtype == INFO}
+    beside = f"{topic.removesuffix('/compressed').rsplit('/', 1)[0]}/camera_info"
+    if not kinds:
+        raise ValueError(f"{path} has no camera_info, so dataset.intrinsics must say the camera: give {ALTERNATIVES}")
+    wanted = beside if info_topic is None and beside in kinds else info_topic
+    chosen = _connections(bag, _topic_of(bag, (INFO,), wanted, path, "info_topic"))
+    for connection, _, raw in bag.messages(connections=chosen):
+        message = bag.deserialize(raw, connection.msgtype)
+        K, bent = (getattr(message, name, None) for name in ("k", "d"))
+        K, bent = (message.K if K is None else K), [float(v) for v in (message.D if bent is None else bent)]  # ROS 1
+        if message.distortion_model not in STRAIGHT_MODELS or any(bent[5:]) or len(bent) in (1, 2, 3):
+            raise ValueError(
+                f"{path}: camera_info has the distortion {message.distortion_model!r} with {len(bent)} numbers, and "
+                "read are k1, k2, p1, p2(, k3): take the rectified topic, or give dataset.intrinsics"
+            )
+        size = int(message.width), int(message.height)
+        intrinsics = float(K[0]), float(K[4]), float(K[2]), float(K[5])
+        return Calibration(intrinsics, tuple(bent[:5]) if any(bent) else (), size)
+    raise ValueError(f"{path}: camera_info has no message, so dataset.intrinsics must say the camera: {ALTERNATIVES}")

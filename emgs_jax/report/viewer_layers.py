@@ -1,0 +1,113 @@
+"""What the viewer shows of a map: colours of its Gaussians, answers to words, the Gaussian under a ray."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+
+from emgs_jax.report.overview import class_colors
+from emgs_jax.report.page_map import COV_UNIT
+
+LAYERS = ("colour", "class", "normal", "certainty")
+NO_CLASS = 0.35  # grey of what has none
+REACH = 3.0  # standard deviations from its centre at which a Gaussian still stops a ray
+SURFACE = 0.03  # of the distance; Gaussians that are met so near behind the first are of one surface with it
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+Layers = Mapping[str, np.ndarray]  # as `page_map.map_layers` makes them
+
+
+class Answer(NamedTuple):
+    """What a map says to words.
+
+    Args:
+        cosines: of each Gaussian with the closest word that is asked for, (n,) in [0, 1].
+        is_found: closer to it than to everything that is not asked for, and close enough.
+    """
+
+    cosines: np.ndarray
+    is_found: np.ndarray
+
+
+def covariances(layers: Layers) -> np.ndarray:
+    """(n, 3, 3) in square metres, float32."""
+    covs = np.empty((len(layers["cov"]), 3, 3), np.float32)
+    for column, (i, j) in enumerate(_UPPER):
+        covs[:, i, j] = covs[:, j, i] = layers["cov"][:, column].astype(np.float32) * COV_UNIT
+    return covs
+
+
+def colors_of(layers: Layers, name: str) -> np.ndarray:
+    """RGB of every Gaussian, uint8 (n, 3), in one of LAYERS."""
+    if name == "class" and "label" in layers:
+        known = np.vstack([class_colors(layers["similarity"].shape[1]), np.full(3, NO_CLASS)])  # row -1 is the last
+        return _bytes(known[layers["label"]])
+    if name == "normal":
+        return _bytes(0.5 + layers["normal"] / 254.0)
+    if name == "certainty":
+        return _bytes(matplotlib.colormaps["viridis"](layers["existence"] / 255.0)[:, :3])
+    return layers["color"]
+
+
+def find_words(text: str, names: Sequence[str]) -> tuple[list[int], int]:
+    """Rows of the class names that stand in a text, words apart by commas, and how many of its words are no class.
+
+    A word that is being typed is the class that begins with it, where there is only one.
+    """
+    words = [word.strip().casefold() for word in text.split(",") if word.strip()]
+    known, rows, num_unknown = [name.casefold() for name in names], [], 0
+    for word in words:
+        begun = [row for row, name in enumerate(known) if name.startswith(word)]
+        found = [known.index(word)] if word in known else begun if len(begun) == 1 else []
+        rows += found
+        num_unknown += not found
+    return rows, num_unknown
+
+
+def ask(similarity: np.ndarray, wanted: Sequence[int], against: Sequence[int], min_cosine: float) -> Answer:
+    """Look for words in a map.
+
+    Args:
+        similarity: cosines with all classes, uint8 (n, c), 255 = 1.
+        wanted: rows of the words that are asked for, at least one.
+        against: rows of words that are not.
+        min_cosine: that an answer needs.
+    """
+    cosines = similarity.astype(np.float32) / 255.0
+    best = cosines[:, [*wanted]].max(axis=1)
+    rival = cosines[:, [*against]].max(axis=1) if len(against) else np.full(len(best), -1.0)
+    return Answer(best, (best >= min_cosine) & (best > rival))
+
+
+def highlighted(colors: np.ndarray, answer: Answer) -> np.ndarray:
+    """Colours (n, 3), uint8, with what was found in the colour of its cosine, and everything else dark."""
+    hot = matplotlib.colormaps["inferno"](0.5 + 0.5 * answer.cosines)[:, :3]
+    return _bytes(np.where(answer.is_found[:, None], 0.25 * colors / 255.0 + 0.75 * hot, 0.25 * colors / 255.0))
+
+
+def picked(means: np.ndarray, covs: np.ndarray, origin: Sequence[float], direction: Sequence[float]) -> int | None:
+    """Row of the Gaussian that a ray meets nearest to its centre on the first surface; None where there is none.
+
+    Args:
+        means: (n, 3).
+        covs: (n, 3, 3).
+        origin: of the ray.
+        direction: of the ray; what lies behind the origin is not met.
+    """
+    ray, offsets = np.asarray(direction, np.float64), np.asarray(means, np.float64) - np.asarray(origin, np.float64)
+    if not len(means):
+        return None
+    weighted = np.linalg.solve(np.asarray(covs, np.float64), np.broadcast_to(ray, offsets.shape)[..., None])[..., 0]
+    along = np.einsum("ni,ni->n", weighted, offsets) / (weighted @ ray)  # where the ray is nearest, by the covariance
+    rest = offsets - along[:, None] * ray
+    distances_sq = np.einsum("ni,ni->n", rest, np.linalg.solve(np.asarray(covs, np.float64), rest[..., None])[..., 0])
+    is_met = (along > 0) & (distances_sq <= REACH**2)
+    if not is_met.any():
+        return None
+    is_first = is_met & (along <= (1 + SURFACE) * along[is_met].min())
+    return int(np.argmin(np.where(is_first, distances_sq, np.inf)))
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return np.rint(255 * np.clip(values, 0.0, 1.0)).astype(np.uint8)

@@ -1,0 +1,34 @@
+"""Look at a finished run in the browser: `python -m experiments.view FOLDER`, until Ctrl-C."""
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from emgs_jax.ops.ranges import Range
+from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.viewer import Viewer
+from emgs_jax.running.values import Declared, check_value
+
+from .command import command
+from .report import positional
+
+
+def view(config: DictConfig) -> Viewer:
+    """Serve the run of a config."""
+    check_value("port", config.port, Declared(frozenset({int}), range=Range(1, 65535)))
+    return Viewer(read_run(Path(str(config.folder))), config.port)
+
+
+@command("view", positional)
+def main(config: DictConfig) -> None:
+    """Serve, say where, and wait."""
+    viewer = view(config)
+    print(f"{viewer.address} shows {config.folder} to this machine; Ctrl-C ends it", flush=True)
+    try:
+        viewer.server.sleep_forever()
+    finally:
+        viewer.stop()
+
+
+if __name__ == "__main__":
+    main()

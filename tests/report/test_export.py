@@ -1,0 +1,203 @@
+"""Runs in other programs' formats; oracles: pycolmap, trimesh, nerfstudio's definition of axes, our own readers."""
+
+import json
+import re
+from dataclasses import replace
+
+import cv2
+import hydra
+import numpy as np
+import pytest
+import trimesh
+from hand_run import random_poses
+from tiny_run import compose
+from written_run import INTRINSICS, SIZE, written_run
+
+from emgs_jax.data.calibration_files import read_calibration
+from emgs_jax.io.colmap import load_colmap, save_colmap
+from emgs_jax.io.frustums import save_frustums
+from emgs_jax.io.nerfstudio import load_transforms
+from emgs_jax.io.ply import save_points_ply
+from emgs_jax.io.ply_reader import read_vertices
+from emgs_jax.ops.camera import Camera
+from emgs_jax.report.export import ExportConfig, export
+from emgs_jax.report.recorded_run import read_run
+from emgs_jax.running import configure
+from experiments.export import export_run
+
+ALL = ExportConfig(("colmap", "nerfstudio", "frustums"), 40, None, None)
+LOST = 3  # row of the lost frame of a written run
+
+
+class Shown:
+    """Images that name their frame."""
+
+    def __getitem__(self, row: int):
+        image = np.full((SIZE[1], SIZE[0], 3), 40 * row, np.uint8)
+        image[:, :, 0] = 255  # red, so that channels cannot be swapped
+        return type("Frame", (), {"image": image})()
+
+
+@pytest.fixture
+def run(tmp_path):
+    folder = written_run(tmp_path / "run")
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    save_points_ply(folder / "points.ply", points, points, np.clip(np.abs(points), 0, 1))
+    run = read_run(folder)
+    return replace(run, poses=random_poses(np.random.default_rng(1), len(run.poses)))
+
+
+@pytest.fixture
+def written(run):
+    export(run, run.folder, ALL, Shown())
+    return run
+
+
+def tracked(run):
+    return np.delete(run.poses, LOST, axis=0)
+
+
+def test_pycolmap_reads_the_cameras_where_they_are(written):
+    pycolmap = pytest.importorskip("pycolmap", reason="oracle: pip install -e .[oracles]")
+    model = pycolmap.Reconstruction(str(written.folder / "colmap" / "sparse" / "0"))
+    assert (model.num_images(), model.num_cameras(), model.num_points3D()) == (5, 1, 40)
+    for image, pose in zip((model.images[key] for key in sorted(model.images)), tracked(written), strict=True):
+        np.testing.assert_allclose(image.projection_center(), pose[:3, 3], atol=1e-9)
+        np.testing.assert_allclose(image.cam_from_world().rotation.matrix(), pose[:3, :3].T, atol=1e-9)
+        assert (written.folder / "colmap" / "images" / image.name).is_file() and image.name.count(".") == 1
+    camera = next(iter(model.cameras.values()))
+    # The ray through our principal point, which COLMAP counts from the corner.
+    np.testing.assert_allclose(camera.cam_from_img(np.array(INTRINSICS[2:]) + 0.5), 0, atol=1e-6)
+    np.testing.assert_allclose(camera.cam_from_img([0.5, 0.5])[0], -INTRINSICS[2] / INTRINSICS[0], rtol=1e-6)
+
+
+def test_the_camera_is_that_of_the_frames_and_not_of_the_images_on_disk(run):
+    """Those may be larger, and bent by a lens."""
+    assert (run.camera.width, run.camera.height) == SIZE
+    np.testing.assert_allclose([*run.camera.focal, *run.camera.center], INTRINSICS)
+
+
+def test_points_keep_place_and_colour(written):
+    cloud = read_vertices(written.folder / "points.ply")
+    known = {round(float(x), 5): row for row, x in enumerate(cloud["x"])}
+    lines = (written.folder / "colmap" / "sparse" / "0" / "points3D.txt").read_text().splitlines()[1:]
+    assert len(lines) == 40
+    for line in lines:
+        _, x, y, z, *color, _error = line.split()
+        row = known[round(float(x), 5)]
+        np.testing.assert_allclose([float(y), float(z)], [cloud["y"][row], cloud["z"][row]], rtol=1e-6)
+        assert [int(value) for value in color] == [cloud[name][row] for name in ("red", "green", "blue")]
+    thinned = read_vertices(written.folder / "nerfstudio" / "points.ply")
+    np.testing.assert_allclose(thinned["x"], [float(line.split()[1]) for line in lines], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["colmap", "nerfstudio"])
+def test_images_are_those_of_the_tracked_frames(written, name):
+    images = sorted((written.folder / name / "images").iterdir())
+    assert [path.name for path in images] == [f"{row:06d}.png" for row in (0, 1, 2, 4, 5)]
+    for path in images:
+        image = cv2.imread(str(path))
+        assert image.shape == (SIZE[1], SIZE[0], 3) and image[0, 0, 2] == 255
+        assert image[0, 0, 0] == 40 * int(path.stem)
+
+
+def test_transforms_look_along_minus_z_with_y_up_and_keep_the_unit(written):
+    """nerfstudio's docs/quickstart/data_conventions: +X right, +Y up, +Z back."""
+    folder = written.folder / "nerfstudio"
+    written_down = json.loads((folder / "transforms.json").read_text())
+    for frame, pose in zip(written_down["frames"], tracked(written), strict=True):
+        matrix = np.array(frame["transform_matrix"])
+        np.testing.assert_allclose(matrix[:3, 0], pose[:3, 0])
+        np.testing.assert_allclose(-matrix[:3, 1], pose[:3, 1])
+        np.testing.assert_allclose(-matrix[:3, 2], pose[:3, 2])
+        np.testing.assert_allclose(matrix[:3, 3], pose[:3, 3])
+        assert (folder / frame["file_path"]).is_file()
+    assert (folder / written_down["ply_file_path"]).is_file()
+    found = read_calibration(folder / "transforms.json")  # our reader of other programs' files
+    np.testing.assert_allclose(found.intrinsics, INTRINSICS, rtol=1e-6)
+    assert found.size == SIZE and found.distortion == ()
+
+
+def test_what_we_write_we_read(written):
+    model = load_colmap(written.folder / "colmap" / "sparse" / "0")
+    np.testing.assert_allclose(model.T_world_camera, tracked(written), atol=1e-12)
+    _, rows = load_transforms(written.folder / "nerfstudio" / "transforms.json")
+    np.testing.assert_allclose(np.reshape(rows, (-1, 4, 4)), tracked(written), atol=1e-12)
+
+
+def test_frustums_are_coloured_by_status_and_the_path_is_cut_where_the_camera_was_lost(written):
+    mesh = trimesh.load(written.folder / "cameras.ply")
+    colors = np.asarray(mesh.visual.vertex_colors)[:, :3]
+    counts = {tuple(color): int((colors == color).all(1).sum()) for color in np.unique(colors, axis=0)}
+    bar = 6
+    expected = {(0x4C, 0x7D, 0xE0): 8, (0x2F, 0x9E, 0x6E): 24, (0xE6, 0x9F, 0x2E): 8, (0xD9, 0x41, 0x3F): 8}
+    assert counts == {**{key: bar * value for key, value in expected.items()}, (0xE4, 0x57, 0x2E): bar * 3}
+    assert len(mesh.faces) == 6 * (6 * 8 + 3)
+    # Each apex is where the camera is: three bars of eight begin in it, round it.
+    apex = mesh.vertices[: bar * 8].reshape(8, 2, 3, 3)[:4, 0].mean((0, 1))
+    np.testing.assert_allclose(apex, written.poses[0][:3, 3], atol=1e-6)
+    ends = mesh.vertices[: bar * 8].reshape(8, 2, 3, 3)[:4, 1].mean((0, 1)) - apex
+    assert ends @ written.poses[0][:3, 2] > 0.04, "it opens in the direction of view"
+
+
+def test_nothing_is_written_over_and_a_failed_export_leaves_nothing(run, monkeypatch):
+    (run.folder / "colmap").mkdir()
+    with pytest.raises(ValueError, match=r"colmap is there already: .* out=FOLDER"):
+        export(run, run.folder, ALL, Shown())
+    assert not (run.folder / "nerfstudio").exists() and not any((run.folder / "colmap").iterdir())
+    (run.folder / "colmap").rmdir()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("emgs_jax.report.export.save_colmap", full)
+    with pytest.raises(OSError, match="No space left"):
+        export(run, run.folder, ALL, Shown())
+    assert not [path for path in run.folder.iterdir() if "colmap" in path.name]
+
+
+def test_bad_input_is_named(run):
+    with pytest.raises(ValueError, match="formats=obj is not known: choose of colmap, nerfstudio, frustums"):
+        export(run, run.folder, ExportConfig(("obj",), 10, None, None), None)
+    with pytest.raises(ValueError, match=r"formats=colmap holds the images.*formats=\[frustums\] needs none"):
+        export(run, run.folder, ExportConfig(("colmap",), 10, None, None), None)
+    (run.folder / "points.ply").unlink()
+    with pytest.raises(ValueError, match=r"lacks points.ply, which formats=colmap needs: run again"):
+        export(run, run.folder, ExportConfig(("colmap",), 10, None, None), Shown())
+    export(run, run.folder, ExportConfig(("frustums",), 10, None, None), None)
+
+
+@pytest.mark.parametrize("override", ["max_points=0", "max_points=1.5", "max_points=.nan"])
+def test_values_out_of_their_range_are_refused_by_their_key(run, override):
+    with pytest.raises(ValueError, match=re.escape(override.split("=")[0])):
+        export_run(compose_export(run.folder, override))
+
+
+def compose_export(folder, *overrides):
+    return configure.compose(f"folder='{folder}'", *overrides, name="export")
+
+
+def test_the_command_writes_the_images_that_the_run_was_made_of(tmp_path):
+    """The built-in room makes them again; the frame's picture is that of the data set."""
+    folder = written_run(tmp_path / "run")
+    save_points_ply(folder / "points.ply", np.ones((3, 3)), np.ones((3, 3)), np.ones((3, 3)))
+    found = export_run(compose_export(folder, "formats=[colmap]", f"out='{tmp_path / 'there'}'"))
+    assert found == [tmp_path / "there" / "colmap"]
+    frame = hydra.utils.instantiate(compose().dataset)[4]
+    image = cv2.cvtColor(cv2.imread(str(found[0] / "images" / "000004.png")), cv2.COLOR_BGR2RGB)
+    np.testing.assert_array_equal(image, frame.image)
+
+
+def test_a_camera_that_stands_still_is_written_too(tmp_path):
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    count = save_frustums(
+        tmp_path / "c.ply", Camera((9.0, 9.0), (4.0, 4.0), 9, 9), poses, np.ones((2, 3)), np.array([True]), np.ones(3)
+    )
+    mesh = trimesh.load(tmp_path / "c.ply", process=False)
+    assert count == len(mesh.faces) and np.isfinite(mesh.vertices).all()
+
+
+def test_a_model_keeps_names_with_spaces(tmp_path):
+    camera = Camera((40.0, 42.0), (22.0, 20.5), 48, 40)
+    save_colmap(tmp_path, camera, ["a b.png"], np.eye(4)[None], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    assert load_colmap(tmp_path).names == ["a b.png"]

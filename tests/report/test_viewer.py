@@ -1,0 +1,228 @@
+"""emgs view: what is asked is answered right (hand-made cosines and rays), and in Chromium the words reach the map."""
+
+import io
+import socket
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from browser import MISSING, browser
+from PIL import Image
+from written_run import CLASSES, two_walls, written_run
+
+from emgs_jax.report.page_map import map_layers
+from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.viewer import HOST, Viewer
+from emgs_jax.report.viewer_layers import ask, colors_of, covariances, find_words, highlighted, picked
+from emgs_jax.running import configure
+from experiments.view import view
+
+NAMES = ("wall", "sofa", "sofa table", "Chair")
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind((HOST, 0))
+        return free.getsockname()[1]
+
+
+@pytest.mark.parametrize(
+    "text, rows, num_unknown",
+    [
+        ("wall", [0], 0),
+        (" Sofa , chair", [1, 3], 0),
+        ("sofa", [1], 0),
+        ("sofa t", [2], 0),
+        ("so", [], 1),
+        ("cha", [3], 0),
+        ("lamp,wall", [0], 1),
+        (" , ", [], 0),
+        ("../../etc/passwd", [], 1),
+    ],
+)
+def test_words_are_class_names_also_while_they_are_typed(text, rows, num_unknown):
+    assert find_words(text, NAMES) == (rows, num_unknown)
+
+
+def test_an_answer_is_close_enough_and_closer_than_to_what_is_not_asked_for():
+    similarity = np.array([[255, 0, 0], [204, 230, 0], [100, 0, 0], [204, 204, 0], [0, 0, 255]], np.uint8)
+    assert ask(similarity, [0], [], 0.5).is_found.tolist() == [True, True, False, True, False]
+    assert ask(similarity, [0], [1], 0.5).is_found.tolist() == [True, False, False, False, False]
+    assert ask(similarity, [0, 2], [], 0.5).is_found.tolist() == [True, True, False, True, True]
+    np.testing.assert_allclose(ask(similarity, [0], [1], 0.5).cosines, similarity[:, 0] / 255, rtol=1e-6)
+    colors = np.full((5, 3), 200, np.uint8)
+    shown = highlighted(colors, ask(similarity, [0], [1], 0.5))
+    assert (shown[1:] == 50).all() and shown[0].max() > 150
+
+
+def test_a_ray_meets_the_first_gaussian_and_none_behind_it():
+    """Two discs across the z axis, 1 and 2 m away, half a metre and ten centimetres wide."""
+    means = np.array([[0, 0, 2.0], [0, 0, 1.0]])
+    covs = np.stack([np.diag([0.25, 0.25, 1e-4]), np.diag([0.01, 0.01, 1e-4])])
+    assert picked(means, covs, (0, 0, 0), (0, 0, 1)) == 1
+    assert picked(means, covs, (0, 0, 1.5), (0, 0, 1)) == 0
+    assert picked(means, covs, (0.4, 0, 0), (0, 0, 1)) == 0, "beside the small one"
+    assert picked(means, covs, (0, 0, 3), (0, 0, 1)) is None
+    assert picked(means, covs, (2, 0, 0), (0, 0, 1)) is None
+    assert picked(means[:0], covs[:0], (0, 0, 0), (0, 0, 1)) is None
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return read_run(written_run(tmp_path_factory.mktemp("run")))
+
+
+def test_layers_are_those_of_the_map(run):
+    layers, walls = map_layers(run.map, run.text), two_walls()
+    np.testing.assert_allclose(covariances(layers), walls.covs, atol=2e-6)
+    assert (colors_of(layers, "normal") == [128, 128, 0]).all()  # all face the cameras, -z
+    labels = colors_of(layers, "class")
+    is_sofa = np.asarray(walls.features)[:, 1] > 0.5
+    assert len(np.unique(labels[is_sofa], axis=0)) == len(np.unique(labels[~is_sofa], axis=0)) == 1
+    assert (labels[is_sofa][0] != labels[~is_sofa][0]).any()
+    np.testing.assert_allclose(colors_of(layers, "colour") / 255, walls.colors, atol=0.5 / 255)
+
+
+@pytest.fixture(scope="module")
+def viewer(run):
+    pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
+    viewer = Viewer(run, free_port())
+    yield viewer
+    viewer.stop()
+
+
+def test_it_listens_on_this_machine_only(viewer):
+    assert viewer.server.get_host() == "127.0.0.1"
+    assert viewer.address == f"http://127.0.0.1:{viewer.server.get_port()}"
+
+
+def test_words_and_layers_recolour_what_is_served(viewer):
+    walls = two_walls()
+    is_sofa = np.asarray(walls.features)[:, 1] > 0.5
+    before = np.array(viewer.splats.rgbs)
+    viewer.words.value = "sofa"
+    viewer.recolor()
+    found = np.array(viewer.splats.rgbs)
+    assert found[is_sofa].max(1).min() > 130 and found[~is_sofa].max() < 70
+    assert f"{is_sofa.sum():,} of {len(is_sofa):,}" in viewer.answer.content
+    viewer.against.value = "sofa"
+    viewer.recolor()
+    assert "0 of" in viewer.answer.content
+    viewer.words.value = viewer.against.value = ""
+    viewer.layer.value = "normal"
+    viewer.recolor()
+    np.testing.assert_array_equal(np.array(viewer.points.colors), colors_of(viewer.layers, "normal"))
+    viewer.layer.value = "colour"
+    viewer.recolor()
+    np.testing.assert_array_equal(np.array(viewer.splats.rgbs), before)
+
+
+def test_a_click_tells_the_numbers_of_the_near_wall(viewer):
+    row = np.flatnonzero(np.asarray(two_walls().features)[:, 1] > 0.5)[200]
+    x, y, z = np.asarray(two_walls().means)[row]
+    viewer.pick((x, y, 0.0), (0.0, 0.0, 1.0))
+    assert f"centre {x:.3f}, {y:.3f}, {z:.3f}" in viewer.number.content and "sofa (1.00)" in viewer.number.content
+    assert "normal 0.000, 0.000, -1.000" in viewer.number.content
+    viewer.pick((0.0, 0.0, -1.0), (0.0, 0.0, -1.0))
+    assert "There is no Gaussian." in viewer.number.content
+
+
+def test_names_from_a_file_are_text_and_no_markup(tmp_path):
+    pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
+    folder = written_run(tmp_path / "run")
+    found = read_run(folder)
+    found.frames[0]["reason"] = "<img src=x onerror=alert(1)>"
+    hostile = replace(found, text=found.text.__class__(("<script>", "b"), found.text.vectors, (), {}))
+    viewer = Viewer(hostile, free_port())
+    try:
+        viewer.words.value = "<script>"
+        viewer.recolor()
+        shown = viewer.answer.content + viewer.facts.content + viewer._known()
+        assert "<script" not in shown and "<img" not in shown and "&lt;script&gt;" in shown
+    finally:
+        viewer.stop()
+
+
+def test_a_map_without_features_says_what_a_text_needs(tmp_path):
+    pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
+    folder = written_run(tmp_path / "run")
+    (folder / "text.npz").unlink()
+    viewer = Viewer(read_run(folder), free_port())
+    try:
+        viewer.words.value = "sofa"
+        viewer.recolor()
+        assert "no features" in viewer.answer.content and "features=dinov3_text" in viewer.answer.content
+        assert "class" not in viewer.layer.options
+    finally:
+        viewer.stop()
+
+
+def test_a_taken_port_an_incomplete_run_and_a_missing_extra_are_clear(run, tmp_path, monkeypatch):
+    def config(*words):
+        return configure.compose(*words, name="view")
+
+    with pytest.raises(ValueError, match="port must be a whole number from 1 to 65535"):
+        view(config(f"folder='{run.folder}'", "port=0"))
+    with pytest.raises(ValueError, match=r"holds no finished run: it lacks metrics.json"):
+        view(config(f"folder='{tmp_path}'"))
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "viser", None)
+        with pytest.raises(ValueError, match=r'pip install "emgs_jax\[viewer\]"'):
+            Viewer(run, free_port())
+    pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
+    with socket.socket() as taken:
+        taken.bind((HOST, 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ValueError, match=f"port={port} is taken .*port={port + 1}"):
+            view(config(f"folder='{run.folder}'", f"port={port}"))
+
+
+def wait(condition, what, timeout=120.0):
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end, what
+        time.sleep(0.2)
+
+
+@pytest.mark.skipif(MISSING is not None, reason=str(MISSING))
+def test_in_a_browser_typing_a_word_recolours_and_nothing_is_asked_of_other_machines(viewer):
+    def picture():
+        return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+
+    def settled():
+        """Two pictures alike: the map fades in."""
+        before = picture()
+        for _ in range(40):
+            time.sleep(1.0)
+            after = picture()
+            if np.abs(after - before).max() < 8:
+                break
+            before = after
+        return after[:, :700]  # left of the panel
+
+    with browser() as page:
+        page.visit(viewer.address)
+        wait(viewer.server.get_clients, "no browser has connected")
+        wait(lambda: page.run("return document.querySelectorAll('canvas, input').length") > 2, "no page")
+        before = settled()
+        assert len(np.unique((before // 16).reshape(-1, 3), axis=0)) > 20, "a map is drawn"
+        x, y = page.run(  # the first box that is seen
+            "const shown = [...document.querySelectorAll('input')].map(e => e.getBoundingClientRect());"
+            "const b = shown.find(e => e.width > 0); return [b.x + b.width / 2, b.y + b.height / 2]"
+        )
+        page.pointer(("down", x, y), ("up", x, y))
+        page.type("sof")  # not to its end
+        wait(lambda: viewer.words.value == "sof", "the box does not reach the program")
+        wait(lambda: f"Gaussians: {CLASSES[1]}" in viewer.answer.content, "no answer")
+        after = settled()
+        assert (np.abs(after - before).max(-1) > 40).mean() > 0.05, "the picture is of other colours"
+        assert CLASSES[1] in page.run("return document.body.innerText")
+        assert "Share" not in page.run("return document.body.innerText")
+        asked = {address.split("/")[2] for address in page.requests() if address.startswith(("http", "ws"))}
+        assert asked == {viewer.address.removeprefix("http://")}
+        wrong = [entry["message"] for entry in page.log("browser") if entry["level"] == "SEVERE"]
+        # viser 1.1.1 says the first of any splats.
+        assert not [message for message in wrong if "computeBoundingSphere" not in message], wrong
