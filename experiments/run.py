@@ -64,14 +64,16 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         raw = _map(session, dataset, prior, (baselines, evaluation), folder, keeper)
         save_progress(folder, session)
         with clock.phase("densify"):
-            dense = dense_map(session, dataset, densify, evaluation, labelled_map(session, prior))
+            labelled = labelled_map(session, prior)
+            dense = dense_map(session, dataset, densify, evaluation, labelled)
         with clock.phase("export"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
             notes = save_outputs(folder, session, dense, densify, title)
             save_classes(folder, prior)
         with clock.phase("evaluate"):
             scorer = new_scorer(dataset, evaluation, prior)
-            metrics = score_map(session, dense.cloud, center_cloud(session), dense.labels, scorer)
+            labels = None if labelled is None else labelled.centers
+            metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
             metrics |= dense.rendering | score_prior(session, raw, scorer)
             metrics |= score_baselines(session, baselines, raw, scorer)
         metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()

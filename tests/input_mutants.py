@@ -78,7 +78,7 @@ MUTANTS = (
         "frames are counted without those that were left out",
     ),
     Mutant(
-        "emgs_jax/io/colmap.py",
+        "emgs_jax/data/colmap_model.py",
         "Rotation.from_quat(values[[1, 2, 3, 0]])",
         "Rotation.from_quat(values[:4])",
         POSED,
@@ -92,7 +92,7 @@ MUTANTS = (
         "times are those of the order in the file",
     ),
     Mutant(
-        "emgs_jax/io/nerfstudio.py",
+        "emgs_jax/data/transforms_json.py",
         "np.vstack([m, bottom])) @ FLIP)",
         "np.vstack([m, bottom])))",
         POSED,

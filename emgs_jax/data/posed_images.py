@@ -14,10 +14,10 @@ from jaxtyping import Float
 from emgs_jax.data import reading
 from emgs_jax.data.base import Frame
 from emgs_jax.data.calibration_files import Calibration, colmap_camera, read_calibration
+from emgs_jax.data.colmap_model import BINARY, TEXT, load_colmap
 from emgs_jax.data.images import times_of
 from emgs_jax.data.intrinsics import to_lens
-from emgs_jax.io.colmap import BINARY, TEXT, load_colmap
-from emgs_jax.io.nerfstudio import load_transforms
+from emgs_jax.data.transforms_json import load_transforms
 
 Pose = Float[np.ndarray, "4 4"]
 COLMAP_LAYOUT = "root[/sequence]/{images/, sparse/0/{cameras,images}.txt or .bin}"

@@ -101,7 +101,7 @@ def score_map(
         run: finished.
         dense: the map, densified.
         centers: the Gaussians' means.
-        labels: of the dense map's points.
+        labels: of the centres that have a class.
         scorer: the truth.
     """
     poses, truth, config = with_truth(run, run.poses), scorer.truth, scorer.evaluation
@@ -207,7 +207,8 @@ def score_settings(
             return counts
         labelled = labelled_map(run, scorer.prior)
         dense = dense_map(run, scorer.dataset, config, scorer.evaluation, labelled, num_pictures=0)
-        return score_map(run, dense.cloud, center_cloud(run), dense.labels, scorer) | dense.rendering | counts
+        labels = None if labelled is None else labelled.centers
+        return score_map(run, dense.cloud, center_cloud(run), labels, scorer) | dense.rendering | counts
 
     with ThreadPoolExecutor(num_threads) as threads:
         shared = threads.submit(score_prior, runs[0], raw, scorer)

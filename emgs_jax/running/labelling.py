@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.prior.base import Prior
 from emgs_jax.running.record import MappingRun
@@ -35,6 +36,11 @@ class LabelledMap:
     log_dets: np.ndarray
     labels: np.ndarray
     classes: tuple[str, ...]
+
+    @property
+    def centers(self) -> LabelledPoints:
+        """The means with their classes."""
+        return LabelledPoints(self.means, self.labels, self.classes)
 
     @cached_property
     def tree(self) -> cKDTree:

@@ -170,7 +170,7 @@ def test_the_centres_are_compared_as_they_are():
     assert metrics["reconstruction_centers/alignment_note"] is None
 
 
-def test_labels_of_points_are_compared_where_the_alignment_puts_the_points():
+def test_labels_of_the_centres_are_compared_where_the_alignment_puts_the_centres():
     scene = Scene()
     centers = inverse(scene.ours).apply(scene.cloud.points[::2])
     labels = LabelledPoints(centers, scene.labels.labels[::2], CLASSES)
