@@ -93,7 +93,7 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/data/transforms_json.py",
-        "np.vstack([m, bottom])) @ FLIP)",
+        "np.vstack([m, bottom])) * FLIP)",
         "np.vstack([m, bottom])))",
         POSED,
         "nerfstudio's axes are taken for OpenCV's",
@@ -107,7 +107,7 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/io/nerfstudio.py",
-        "poses = np.asarray(T_world_camera, np.float64) @ FLIP",
+        "poses = np.asarray(T_world_camera, np.float64) * FLIP",
         "poses = np.asarray(T_world_camera, np.float64)",
         EXPORT,
         "nerfstudio's cameras look backwards",

@@ -28,4 +28,4 @@ def load_transforms(path: Path) -> tuple[list[str], list[list[float]]]:
         if not isinstance(name, str) or matrix.shape not in ((3, 4), (4, 4)):
             raise ValueError(f"{path}: frame {name!r} must have a transform_matrix of 4 rows of 4: export it again")
     bottom = [[0.0, 0.0, 0.0, 1.0]]
-    return names, [((m if len(m) == 4 else np.vstack([m, bottom])) @ FLIP).ravel().tolist() for m in matrices]
+    return names, [((m if len(m) == 4 else np.vstack([m, bottom])) * FLIP).ravel().tolist() for m in matrices]

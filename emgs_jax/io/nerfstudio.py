@@ -24,6 +24,6 @@ def save_transforms(path: Path, camera: Camera, names: Sequence[str], T_world_ca
     (fx, fy), (cx, cy) = np.float64(camera.focal), np.float64(camera.center)
     known = {"camera_model": "PINHOLE", "w": camera.width, "h": camera.height}
     known |= {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "ply_file_path": points_file}
-    poses = np.asarray(T_world_camera, np.float64) @ FLIP
+    poses = np.asarray(T_world_camera, np.float64) * FLIP
     frames = [{"file_path": name, "transform_matrix": pose} for name, pose in zip(names, poses, strict=True)]
     write_json(path, known | {"frames": frames})
