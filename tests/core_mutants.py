@@ -213,6 +213,7 @@ STAGES = [
         ("jnp.where(valid, confidence, 1.0)", "confidence", "an invalid row keeps its confidence"),
     ),
     *own("gaussians", "test_gaussians")(
+        ("jnp.where(config.feature > 0, count, 1.0)[:, None]", "1.0", "a new Gaussian has the evidence of one point"),
         ("(0.299, 0.587, 0.114)", "(0.333, 0.333, 0.333)", "luminance as a plain mean"),
         ("-0.5 * dot(white, white)", "-dot(white, white)", "eq. 1's weights with twice the exponent"),
         ("max(spacing // num_neighbours, 1)", "1", "a Gaussian smaller than its cluster"),
@@ -240,6 +241,12 @@ STAGES = [
         ("transform(T, view, jnp.ones(()))", "transform(T.inverse(), view, jnp.ones(()))", "poses the wrong way round"),
     ),
     *own("em", "test_em")(
+        ("config.feature * jnp.ones(owner.shape)", "jnp.ones(owner.shape)", "features accumulate as printed, too"),
+        (
+            "meaning = safe_normalize(gaussians.features)",
+            "meaning = gaussians.features",
+            "cosines grow with the evidence",
+        ),
         ("config.noise * noise", "noise", "the factor on the noise is dropped"),
         ("(logdets[rows] + log_growth)", "logdets[rows]", "the determinant does not know of the noise"),
         (
@@ -262,6 +269,7 @@ STAGES = [
         ("dot(white, noise) ** 2 / growth", "dot(white, noise) ** 2", "Sherman and Morrison without the denominator"),
     ),
     *own("refinement", "test_refinement")(
+        ("jnp.where(is_merged, jnp.sum(omega, axis=-1), 1.0)[:, None]", "1.0", "shared evidence is not all of it"),
         (".at[rows].max(omega)", ".at[rows].add(omega)", "γ from the sum of ω"),
         ("softmax(-0.5 * distance_sq", "softmax(-distance_sq", "eq. 5 with twice the exponent"),
         ("jnp.maximum(cosine, 0.0)", "jnp.abs(cosine)", "opposite meanings merge"),
@@ -283,6 +291,11 @@ STAGES = [
         ("jnp.where(both, jnp.maximum(cosine, 0.0), 1.0)", "jnp.maximum(cosine, 0.0)", "no feature, no merging"),
     ),
     *own("existence", "test_existence")(
+        (
+            "features = old.features + config.feature * other.gaussians.features",
+            "features = old.features",
+            "the evidence of a joined layer is lost",
+        ),
         ("jax.lax.min, (3, 3)", "jax.lax.min, (1, 1)", "the pixel alone"),
         ("(depth < nearest - reach)", "(depth < farthest - reach)", "an edge shows what is behind"),
         ("& is_steep", "", "grazing looks count"),

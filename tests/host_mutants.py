@@ -21,6 +21,7 @@ PAGE = ("tests/report/test_page.py",)
 REPEAT = ("tests/report/test_repeat.py",)
 PROVENANCE = ("tests/report/test_provenance.py",)
 DENSE = ("tests/running/test_dense.py",)
+LABELLING = ("tests/running/test_labelling.py",)
 CONVERT = ("tests/running/test_convert.py",)
 NOISE = ("tests/prior/simulated/test_noise.py",)
 DRIFT = ("tests/prior/simulated/test_simulated_drift.py",)
@@ -81,7 +82,7 @@ LOCATING = ("tests/running/test_locating.py",)
 COMING_BACK = ("tests/running/test_coming_back.py",)
 INSTANCES = ("tests/evaluation/test_instances.py",)
 PROTOCOLS = ("tests/evaluation/test_protocols.py",)
-CLASS_FILE = ("tests/io/test_class_file.py",)
+CLASS_FILE = ("tests/data/test_class_file.py",)
 LABELLED_MESH = ("tests/evaluation/test_labelled_mesh.py",)
 QUERY = ("tests/report/test_query.py",)
 SEGMENTATION_TABLE = ("tests/report/test_segmentation_table.py",)
@@ -1022,11 +1023,60 @@ MUTANTS = (
         "every picture shows the first image",
     ),
     Mutant(
-        "emgs_jax/running/dense.py",
-        "np.float64)[valid], labels[valid], tuple(",
-        "np.float64)[valid], labels[: valid.sum()], tuple(",
-        DENSE,
+        "emgs_jax/running/labelling.py",
+        "labels=labels[known]",
+        "labels=labels[: known.sum()]",
+        LABELLING,
         "labels of free rows shift the others",
+    ),
+    Mutant(
+        "emgs_jax/running/labelling.py",
+        "-0.5 * ((white**2).sum(-1) + self.log_dets[rows])",
+        "-0.5 * (white**2).sum(-1)",
+        LABELLING,
+        "large Gaussians explain everything",
+    ),
+    Mutant(
+        "emgs_jax/running/labelling.py",
+        "classes[part] = self._elected(points[part], rows[part])",
+        "pass",
+        LABELLING,
+        "the nearest mean decides",
+    ),
+    Mutant(
+        "emgs_jax/running/dense.py",
+        "translate(labels, labelled.classes, dataset.classes)",
+        "labels",
+        DENSE,
+        "classes are compared by their numbers",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/segmentation.py",
+        "np.add.reduceat(rows[:, 4], begins)",
+        "rows[begins, 4]",
+        SEGMENTATION,
+        "the views of a voxel are not counted",
+    ),
+    Mutant(
+        "emgs_jax/evaluation/rendering.py",
+        "labels = np.full(frame.labels.shape, -1) if labels is None else labels",
+        "labels = frame.labels if labels is None else labels",
+        ("tests/evaluation/test_rendering.py",),
+        "a lost frame has all classes right",
+    ),
+    Mutant(
+        "emgs_jax/data/labels.py",
+        "dict.fromkeys(unknown, -1) | named",
+        "named",
+        ("tests/data/test_labels.py",),
+        "ids that mean no class are errors",
+    ),
+    Mutant(
+        "emgs_jax/features/labels.py",
+        "features /= np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-12)",
+        "pass",
+        ("tests/features/test_label_features.py",),
+        "sure pixels count more than unsure ones",
     ),
     Mutant(
         "emgs_jax/running/dense.py",

@@ -121,8 +121,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/report/recorded_run.py",
-        """known = data.get("frames", data["camera"])""",
-        """known = data["camera"]""",
+        """known = metrics["provenance"]["data"]["frames"]""",
+        """known = metrics["provenance"]["data"]["camera"]""",
         EXPORT,
         "the camera of a run is that of the images on disk",
     ),

@@ -184,6 +184,13 @@ def test_both_sides_of_a_panel_are_two_surfaces_and_a_missing_feature_says_nothi
     assert joined(unlabelled, unlabelled.gaussians.valid, HERE, NOISE, settings).gaussians.valid.sum() == 1
 
 
+@pytest.mark.parametrize(("reading", "expected"), [(0.0, [1.0, 0.0]), (1.0, [4.0, 1.0])])
+def test_the_evidence_of_both_layers_is_that_of_the_one_as_far_as_evidence_accumulates(settings, reading, expected):
+    map = map_of(discs([(0, 0, 2.0), (0, 0, 2.02)], features=[(1.0, 0), (3.0, 1.0)]))
+    after = joined(map, map.gaussians.valid, HERE, NOISE, at(settings, "feature", reading))
+    np.testing.assert_array_equal(after.gaussians.features[np.asarray(after.gaussians.valid)], [expected])
+
+
 def test_of_three_layers_the_two_that_chose_each_other_become_one(settings):
     map = map_of(discs([(0, 0, 2.0), (0, 0, 2.01), (0, 0, 2.035)]))
     after = joined(map, map.gaussians.valid, HERE, NOISE, settings)
