@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scene import assert_same, pose
+from scene import assert_same, at, pose
 
 from emgs_jax.existence import depth_range, join_layers, judge
 from emgs_jax.gaussian_map import GaussianMap, confirmed, new_map
