@@ -49,7 +49,10 @@ RENDERING = [
     "depth_within_5_percent",
     "psnr_db",
     "num_frames",
+    "label_accuracy_percent",
+    "label_miou_percent",
 ]
+SEGMENTATION = ["miou_percent", "fmiou_percent", "mean_recall_percent", "accuracy_percent", "num_points"]
 COMPARED = [f"trajectory/{name}" for name in TRAJECTORY] + [f"reconstruction/{name}" for name in RECONSTRUCTION]
 PHASES = ("setup", "load", "predict", "map", "raw_prior", "densify", "export", "evaluate", "compile", "total")
 COMPARED += [f"reconstruction_icp/{name}" for name in RECONSTRUCTION]
@@ -57,8 +60,7 @@ COMPARED += [f"rendering/{name}" for name in RENDERING]
 KEYS = {
     *COMPARED,
     *(f"raw_prior/{name}" for name in COMPARED),
-    *(f"segmentation/{name}_percent" for name in ("miou", "fmiou", "mean_recall", "accuracy")),
-    "segmentation/num_points",
+    *(f"{whose}segmentation/{name}" for whose in ("", "raw_prior/") for name in SEGMENTATION),
     *(f"reconstruction_{kind}/{name}" for kind in ("se3", "centers") for name in RECONSTRUCTION),
     *(f"frames/{name}" for name in ("tracked", "degraded", "lost", "initialization", "skipped", "overflow")),
     *("frames/longest_untracked", "frames/longest_untracked_from"),
