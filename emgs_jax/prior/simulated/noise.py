@@ -22,6 +22,7 @@ class Stream(IntEnum):
     FEATURE = 6
     WARP = 7  # one for each correlation length: WARP, WARP + 1, …
     SCALE = 100  # beyond all warps
+    CONFUSION = 101
 
 
 def normals(shape: tuple[int, ...], key: tuple[int, ...]) -> np.ndarray:

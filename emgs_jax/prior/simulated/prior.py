@@ -32,6 +32,7 @@ from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.features.text import random_embeddings
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
+from emgs_jax.prior.simulated.confusion import confused
 from emgs_jax.prior.simulated.covisibility import shared_points
 from emgs_jax.prior.simulated.noise import (
     Stream,
@@ -88,6 +89,7 @@ class Simulated(Prior):
         feature_size: width f of the features, used where there are classes.
         classes: names of the data set's labels (`Dataset.classes`); without them features have width 0.
         version: 1 = the anchor holds every window, so that nothing drifts; 2 = only windows that it shares points with.
+        confusion: at level 1, the probability of a class to be taken for another one from where it is seen.
     """
 
     def __init__(
@@ -97,6 +99,7 @@ class Simulated(Prior):
         feature_size: int = 16,
         classes: Sequence[str] = (),
         version: int = 1,
+        confusion: float | int = 0.0,
     ) -> None:
         if version not in VERSIONS:
             raise ValueError(
@@ -109,11 +112,14 @@ class Simulated(Prior):
                 "prior.seed and prior.feature_size must be whole numbers, from 0 and from 1, got "
                 f"{seed} and {feature_size}"
             )
+        if not 0 <= confusion <= 1:
+            raise ValueError(f"prior.confusion is a probability, from 0 to 1, got {confusion}")
         self.level, self.seed, self.version, self.standard = float(level), int(seed), int(version), Standard()
+        self.confusion = float(confusion)
         self.feature_names = tuple(classes)
         self.text_features = random_embeddings(self.feature_names, feature_size)
         settings = {"version": self.version, "level": self.level, "seed": self.seed}
-        settings |= {"feature_size": self.text_features.shape[1]}
+        settings |= {"feature_size": self.text_features.shape[1]} | ({"confusion": self.confusion} if confusion else {})
         name = "simulated" if self.version == 1 else f"simulated v{self.version}"
         self.provenance = Provenance(name, settings, is_simulated=True)
 
@@ -241,7 +247,8 @@ class Simulated(Prior):
             )
         # The cosine of e and e + n is 1 / sqrt(1 + |n|²) in expectation, and |n|² = sigma² f.
         sigma = self.level * math.sqrt((self.standard.feature_cosine**-2 - 1) / size)
-        features = self.text_features[frame.labels]
+        share = min(1.0, self.level * self.confusion)
+        features = self.text_features[confused(frame.labels, frame.T_world_camera, num_classes, share, self.seed)]
         if sigma > 0:
             features += sigma * normals(features.shape, (self.seed, Stream.FEATURE, inference, frame.index))
             features /= np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-12)
