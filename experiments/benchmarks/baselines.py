@@ -43,7 +43,8 @@ def em(gaussians: Arrays, points: Arrays, noise: np.ndarray, config: Any) -> Upd
     cosine = np.einsum("mkd,md->mk", gaussians["normals"][rows], points["normals"])
     joint = -0.5 * distance_sq + determinant + float(config.normal_weight) * (cosine - 1.0)
     if gaussians["features"].shape[1]:
-        alike = np.einsum("mkf,mf->mk", gaussians["features"][rows], points["features"])
+        lengths = np.maximum(np.linalg.norm(gaussians["features"], axis=1, keepdims=True), 1e-12)
+        alike = np.einsum("mkf,mf->mk", (gaussians["features"] / lengths)[rows], points["features"])
         joint += float(config.feature_weight) * (alike - 1.0)
     best = joint.max(axis=1)
     is_fused = (cosine.mean(axis=1) >= float(config.min_normal_cos)) & (

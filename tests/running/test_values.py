@@ -26,12 +26,21 @@ def check_all(*overrides: str) -> None:
 
 @pytest.mark.parametrize(
     ("group", "option"),
-    [pair for pair in OPTIONS if pair[0] not in ("suite", "sweep", "experiment_on") and pair != ("baseline", "smoke")],
+    [
+        pair
+        for pair in OPTIONS
+        if pair[0] not in ("suite", "sweep", "experiment_on", "protocol") and pair != ("baseline", "smoke")
+    ],
 )
 def test_every_value_of_conf_is_in_its_range(group, option):
     config = configure.compose(f"{group}={option}")
     for part in PARTS:
         check_values(config, part)
+
+
+@pytest.mark.parametrize("option", ["conceptgraphs", "ovo", "rayfronts"])
+def test_every_value_of_a_protocol_is_in_its_range(option):
+    check_values(configure.compose(f"protocol={option}", name="segment"), "protocol")
 
 
 @pytest.mark.parametrize(

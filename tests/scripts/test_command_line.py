@@ -20,7 +20,7 @@ from experiments.command import check_arguments
         (["slam.em.max_mahalanobis=3"], r"is no key of the config; near names: slam\.em\.max_mahalanobis_sq"),
         (["slam.refinement.render.opacity=0.3"], r"near names: .*\brender\.opacity"),
         (["dataset=tum", "dataset.num_frames=3"], r"dataset\.num_frames is no key of the config"),
-        (["prior.nothing=2"], r"near names: prior\.version, prior\.classes, prior\.feature_size, prior\.level"),
+        (["prior.nothing=2"], r"near names: prior\.version, prior\.classes, prior\.confusion, prior\.feature_size"),
         (["slam.em=paper"], r"one of its options \(default, paper\) with slam/em=paper$"),
         (["slam.em=papre"], r"one of its options \(default, paper\) with slam/em=default$"),
         (["render=bright"], "render=bright is no option of render: there are default"),

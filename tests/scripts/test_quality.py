@@ -12,13 +12,17 @@ ROOM = ("dataset.stop=20", "prior.level=1")  # long enough a path for the alignm
 
 @pytest.mark.slow
 def test_a_map_from_noisy_predictions_is_more_accurate_than_these(tmp_path):
-    """Means over seeds: a single draw may be lucky. At level 1 the raw prior is some 16 cm off, the map 11."""
+    """Means over seeds: a single draw may be lucky.
+
+    Placed by the points: twenty small frames are a path so short that where it puts a cloud says more about the path.
+    """
     found = [run(compose(*ROOM, f"prior.seed={seed}"), tmp_path) for seed in SEEDS]
 
     def mean(key):
         return np.mean([metrics[key] for metrics in found])
 
     assert mean("raw_prior/reconstruction/accuracy_m") > 0.1, "the input has to be noisy"
-    assert mean("reconstruction/accuracy_m") < 0.8 * mean("raw_prior/reconstruction/accuracy_m")
+    assert mean("reconstruction_icp/accuracy_m") < 0.7 * mean("raw_prior/reconstruction_icp/accuracy_m")
+    assert mean("reconstruction/accuracy_m") < mean("raw_prior/reconstruction/accuracy_m")
     assert mean("trajectory/ate_sim3_m") < mean("raw_prior/trajectory/ate_sim3_m")
     assert mean("frames/tracked") > 0.7 * 19
