@@ -98,7 +98,8 @@ def test_candidates_take_turns_and_a_ratio_compares_the_same_turn():
 
 @pytest.mark.slow
 def test_em_agrees_with_numpy_and_scipy_on_the_same_points():
-    ours, theirs = time_em(load(benchmark_config(), thin=1), 200, 1)
+    # Of 200, one gets a single point, and whether its 1 exceeds `min_responsibility`, 1, is a matter of rounding.
+    ours, theirs = time_em(load(benchmark_config(), thin=1), 250, 1)
     assert ours.facts["same_neighbours_percent"] >= 99.9 and ours.facts["responsibility_error"] <= 1e-4
     assert ours.facts["mean_error_m_999"] <= 1e-5 and ours.compile_seconds > 0 and theirs.compile_seconds is None
 
