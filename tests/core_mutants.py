@@ -395,7 +395,6 @@ STAGES = [
         ),
         ("directions[:, ::-1]", "directions", "the directions in which features differ least"),
         ("jnp.where(largest < 0, -directions, directions)", "directions", "colours whose sign is the solver's choice"),
-        ("along = centered @", "along = units @", "a blank of the mean in the colours of padding"),
     ),
 ]
 

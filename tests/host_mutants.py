@@ -93,7 +93,7 @@ MUTANTS = (
         "emgs_jax/evaluation/instances.py",
         "rows = answers[numbers == one]",
         "rows = np.flatnonzero(numbers == one)",
-        QUERY,
+        ("tests/evaluation/test_instances.py",),
         "rows among the answers, not of the map",
     ),
     Mutant(

@@ -29,6 +29,8 @@ def test_two_blobs_are_two_objects_with_their_centres_boxes_and_scores():
     np.testing.assert_allclose(second.low, [-0.2, 1.7, -0.4])  # .1 of the means and .1, .2, .3 of a deviation
     np.testing.assert_allclose(second.high, [0.2, 2.3, 0.4])
     np.testing.assert_allclose([second.score, second.lead, first.score], [0.9, 0.3, 0.5])
+    (alone,) = find_instances(np.arange(64, 92), (means, covs), (cosines, leads), reach, 3)
+    np.testing.assert_array_equal(alone.rows, second.rows)  # of the map, not of the answers
 
 
 def test_what_is_within_reach_step_by_step_is_one_object_and_a_gap_parts_it():
