@@ -113,9 +113,9 @@ MUTANTS = (
         "nerfstudio's cameras look backwards",
     ),
     Mutant(
-        "emgs_jax/report/export.py",
-        """if frame["status"] != "lost"]""",
-        "]",
+        "emgs_jax/report/recorded_run.py",
+        """np.array([frame["status"] != "lost" for frame in self.frames], bool)""",
+        "np.ones(len(self.frames), bool)",
         EXPORT,
         "guessed poses of lost frames are exported as good ones",
     ),

@@ -34,6 +34,7 @@ class LabelFolder:
         positions = {row: row for row in range(len(self.names))} if known.positions is None else known.positions
         named = {id_: position for id_, position in positions.items() if position >= 0}
         self._known = replace(known, positions=dict.fromkeys(unknown, -1) | named)
+        self._largest_id = max(self._known.positions or ())
 
     def path(self, image: str | Path) -> Path:
         """The file of an image's classes."""
@@ -57,9 +58,10 @@ class LabelFolder:
                 f"{ids.shape}: write the ids, not their colours"
             )
         reading.check_raw_size(ids, raw_size, path)
-        largest = max(self._known.positions or ())
-        if ids.dtype == np.uint8 and largest > 255:
-            raise BadFrameError(f"{path} has 8 bits, but {self.classes} has ids up to {largest}: write it with 16 bits")
+        if ids.dtype == np.uint8 and self._largest_id > 255:
+            raise BadFrameError(
+                f"{path} has 8 bits, but {self.classes} has ids up to {self._largest_id}: write it with 16 bits"
+            )
         try:
             return self._known.positions_of(ids, path).astype(np.int32)
         except ValueError as error:

@@ -82,48 +82,41 @@ def find_factor(run: RecordedRun, config: ExportConfig) -> float | None:
     return factor_of(run, config.length)
 
 
-def tracked_rows(run: RecordedRun) -> list[int]:
-    """Rows of the frames whose pose means something: a lost one's is a guess."""
-    return [row for row, frame in enumerate(run.frames) if frame["status"] != "lost"]
-
-
 def _colmap(run: RecordedRun, folder: Path, dataset: ReadableFrames, max_points: int) -> None:
     """A project folder: images/ and sparse/0/."""
     with new_folder(folder) as new:
-        rows = tracked_rows(run)
         names = _write_images(new / "images", run, dataset)
         model = new / "sparse" / "0"
         model.mkdir(parents=True)
-        save_colmap(model, run.camera, names, run.poses[rows], *_cloud(run, max_points))
+        save_colmap(model, run.camera, names, run.poses[run.is_placed], *_cloud(run, max_points))
 
 
 def _nerfstudio(run: RecordedRun, folder: Path, dataset: ReadableFrames, max_points: int) -> None:
     """images/, points.ply and transforms.json."""
     with new_folder(folder) as new:
-        rows = tracked_rows(run)
         names = _write_images(new / "images", run, dataset)
         points, colors = _cloud(run, max_points)
         vertices = np.rec.fromarrays(points.T.astype(np.float32), names="x,y,z")
         write_ply(new / POINTS_FILE, with_colors(vertices, colors / 255.0))
         files = [f"images/{name}" for name in names]
-        save_transforms(new / "transforms.json", run.camera, files, run.poses[rows], POINTS_FILE)
+        save_transforms(new / "transforms.json", run.camera, files, run.poses[run.is_placed], POINTS_FILE)
 
 
 def _frustums(run: RecordedRun, path: Path) -> None:
     """A pyramid for every frame in the colour of its status; the path is not drawn where the camera was lost."""
     colors = np.array([to_rgb(STATUS_COLORS.get(frame["status"], OURS)) for frame in run.frames])
-    is_placed = np.isin(np.arange(len(run.frames)), tracked_rows(run))
-    save_frustums(path, run.camera, run.poses, colors, is_placed[1:] & is_placed[:-1], np.array(to_rgb(OURS)))
+    is_joined = run.is_placed[1:] & run.is_placed[:-1]
+    save_frustums(path, run.camera, run.poses, colors, is_joined, np.array(to_rgb(OURS)))
 
 
 def _write_images(folder: Path, run: RecordedRun, dataset: ReadableFrames) -> list[str]:
-    """Write the images of the tracked frames, undistorted and in the run's size; returns their names.
+    """Write the images of the placed frames, undistorted and in the run's size; returns their names.
 
     A name is the frame's number and has one dot: 3DGS cuts at the first one.
     """
     folder.mkdir()
     names = []
-    for row in tracked_rows(run):
+    for row in np.flatnonzero(run.is_placed):
         names.append(f"{run.frames[row]['index']:06d}.png")
         if not cv2.imwrite(str(folder / names[-1]), cv2.cvtColor(dataset[row].image, cv2.COLOR_RGB2BGR)):
             raise OSError(f"{folder / names[-1]} cannot be written: is the disk full?")

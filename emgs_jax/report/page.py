@@ -67,7 +67,7 @@ def write_report(run: RecordedRun, dataset: Dataset | None, note: str = "") -> P
     paths = placed_paths(run, evaluation.get("alignment") == "sim3")
     layers, config = map_layers(run.map, run.text), render_config(run)
     rows = sorted({int(row) for row in np.linspace(0, len(run.poses) - 1, min(_MAX_PICTURES, len(run.poses)))})
-    placed = np.array([line["status"] != "lost" for line in run.frames])
+    placed = run.is_placed
     views = draw_views(run.map, run.poses, rows, placed, run.camera, config, dataset)
     arrays, packing, left_out = _packed(layers, _path_arrays(run, paths))
     about = _about(run, layers, paths) | {"arrays": arrays, "render": _for_shader(config)}

@@ -65,6 +65,11 @@ class RecordedRun:
         """Of each frame, bool (n,)."""
         return np.isfinite(self.truth).all((1, 2))
 
+    @property
+    def is_placed(self) -> np.ndarray:
+        """Of each frame, bool (n,): its pose means something; a lost one's is a guess."""
+        return np.array([frame["status"] != "lost" for frame in self.frames], bool)
+
 
 def read_run(folder: Path) -> RecordedRun:
     """Read the folder of a finished run.

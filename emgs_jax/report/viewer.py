@@ -74,12 +74,11 @@ class Viewer:
 
     def _add_paths(self) -> None:
         run, scene = self._run, self.server.scene
-        placed = np.array([frame["status"] != "lost" for frame in run.frames])
         alignment = run.provenance["config"].get("evaluation", {}).get("alignment")
         truth = placed_paths(run, alignment == "sim3").truth[:, :3, 3]
         known = np.isfinite(truth).all(1)
         self.paths = [
-            self._path("/our path", run.poses[:, :3, 3], placed, OURS),
+            self._path("/our path", run.poses[:, :3, 3], run.is_placed, OURS),
             self._path("/true path", truth, known, TRUTH),
         ]
         self.frustums = []
@@ -95,14 +94,11 @@ class Viewer:
         if not len(joined):
             return None
         ends = np.stack([centers[joined], centers[joined + 1]], axis=1).astype(np.float32)
-        return self.server.scene.add_line_segments(
-            name, ends, tuple(round(255 * c) for c in to_rgb(color)), thickness=2.0, thickness_units="screen"
-        )
+        return self.server.scene.add_line_segments(name, ends, _rgb(color), thickness=2.0, thickness_units="screen")
 
     def _frustum(self, name: str, row: int, color: str, scale: float) -> Any:
         camera, pose = self._run.camera, self._run.poses[row]
         fov = 2 * float(np.arctan2(camera.height / 2, float(camera.focal[1])))
-        rgb = tuple(round(255 * c) for c in to_rgb(color))
         return self.server.scene.add_camera_frustum(
             name,
             fov,
@@ -110,7 +106,7 @@ class Viewer:
             scale=scale,
             thickness=1.5,
             thickness_units="screen",
-            color=rgb,
+            color=_rgb(color),
             wxyz=_wxyz(pose),
             position=pose[:3, 3],
         )
@@ -243,6 +239,10 @@ def _viser() -> Any:
 
 def _shown(words: str) -> str:
     return f'<div style="padding: 2px 10px; font-size: 13px">{words}</div>'
+
+
+def _rgb(color: str) -> tuple[int, ...]:
+    return tuple(round(255 * channel) for channel in to_rgb(color))
 
 
 def _wxyz(pose: np.ndarray) -> np.ndarray:
