@@ -5,11 +5,11 @@ from collections import Counter
 from importlib.metadata import version
 from pathlib import Path
 
-from emgs_jax.running.compilation import MAX_BYTES, cache_folder
+from emgs_jax.running.compilation import cache_folder
 
-# Before JAX is imported, and for the processes that tests start: most of the time of the tests is compilation.
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder()))
-os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(MAX_BYTES))  # else it forgets what commands keep there
+# Before JAX is imported, and for the processes that tests start: most of the time of the tests is compilation. Not
+# where commands keep theirs: that has a limit, for which JAX reads the whole folder, thousands of files, to add one.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder().with_name("jax_tests")))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
@@ -26,6 +26,7 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 
+MANY_MAPS = 20_000
 PACKAGE = Path(__file__).resolve().parents[1] / "emgs_jax"
 # Before anything imports the package: every file that declares shapes of JAX arrays has them checked at every call.
 CHECKED = [path for path in sorted(PACKAGE.rglob("*.py")) if "from jaxtyping import Array" in path.read_text()]
@@ -60,4 +61,6 @@ def camera():
 def drop_executables():
     """Every executable holds memory maps, of which Linux gives a process 65530: past that, compiling segfaults."""
     yield
-    jax.clear_caches()
+    maps = Path("/proc/self/maps")
+    if not maps.exists() or maps.read_bytes().count(b"\n") > MANY_MAPS:
+        jax.clear_caches()

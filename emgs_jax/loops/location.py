@@ -26,6 +26,8 @@ class LocationConfig:
 
     Args:
         patience: frames in a row that are not tracked, from which on it is looked for.
+        max_patience: likewise, from which on the map begins anew where the prior puts the camera, if it is found
+            nowhere. inf: never.
         num_candidates: keyframes that are asked, each of another time span.
         max_distance: between where two of them put the camera, times the distance of the points that it sees.
         max_turn_deg: likewise.
@@ -36,6 +38,7 @@ class LocationConfig:
     """
 
     patience: int = number(low=1)
+    max_patience: float = number(low=1, high=math.inf)
     num_candidates: int = number(low=1, high=1000)
     max_distance: float = number(low=0, high=math.inf)
     max_turn_deg: float = number(low=0, high=math.inf)

@@ -17,7 +17,7 @@ from emgs_jax.running.compilation import use_compilation_cache
 from emgs_jax.running.configure import RunConfig, build_dataset, build_prior
 from emgs_jax.running.convert import FirstWindow
 from emgs_jax.running.correction import correct, finish
-from emgs_jax.running.growth import advance, prepare, start
+from emgs_jax.running.growth import advance, begin_anew, prepare, start
 from emgs_jax.running.inputs import Input, RawView, inputs
 from emgs_jax.running.locating import (
     anchored_by,
@@ -25,6 +25,7 @@ from emgs_jax.running.locating import (
     begun,
     found_at,
     is_missing,
+    is_to_begin_anew,
     look_for,
     moved,
     refusal,
@@ -32,6 +33,7 @@ from emgs_jax.running.locating import (
 )
 from emgs_jax.running.places import load_saved
 from emgs_jax.running.record import (
+    ANEW,
     FOUND,
     FrameRecord,
     MappingRun,
@@ -147,6 +149,8 @@ def take(run: MappingRun, given: Input) -> None:
 def integrate(run: MappingRun, given: Input, prediction: Prediction) -> tuple[StepInfo | None, str | None]:
     """One step; a camera that is missing is looked for, and then the step begins where it is found.
 
+    Where it is found nowhere for long the map goes on from where the step has put it.
+
     Returns:
         What the step did, None where the camera has no place yet; and what became of the search, None without one.
     """
@@ -161,6 +165,8 @@ def integrate(run: MappingRun, given: Input, prediction: Prediction) -> tuple[St
             location = refusal(found[1], again, place, run.back_end.config.location) or FOUND
             if location == FOUND:
                 state, info, config = found
+        if location not in (None, FOUND) and info is not None and is_to_begin_anew(run, given, state, info):
+            location, (state, config) = ANEW, begin_anew(state, run.camera, config)
     if run.is_fixed and state is not None:
         state = with_map(state, run.saved.map, config.submap.map_capacity)
     run.state, run.config = state, config

@@ -12,14 +12,15 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from emgs_jax.gaussian_map import empty_map, grow
-from emgs_jax.observation import Prediction
+from emgs_jax.gaussian_map import empty_map, grow, insert
+from emgs_jax.observation import Prediction, transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.belief import certain
 from emgs_jax.running.convert import FirstWindow
 from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
 
+_insert = eqx.filter_jit(insert)
 _prepared: set[tuple] = set()  # shapes whose step this process has compiled
 
 
@@ -41,6 +42,30 @@ def start(
         )
         state, overflow = init(first.views, first.T_world_views, camera, config)
     return state, config
+
+
+def begin_anew(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[SlamState, SlamConfig]:
+    """The state whose map goes on from its last frame, where that is, as from a first window of this one view.
+
+    For a camera that no longer fits the map and is found nowhere in it. All that the map has stays. Relative to what is
+    new the frame is exact, relative to the first frame it is as uncertain as it was.
+
+    Args:
+        state: after the step of that frame, which has points.
+        camera: of the full images.
+        config: all stages; returned with more room where the map needs it.
+    """
+    T = state.T_world_previous
+    view = transform(T.inverse(), state.previous, jnp.ones(()))
+    first = FirstWindow(*jax.tree.map(lambda leaf: leaf[None], (view, T)))
+    alone, _ = start(first, camera, config)
+    new = replace(alone.map, birth=jnp.full_like(alone.map.birth, state.time - 1))
+    map, _, overflow = _insert(state.map, new)
+    while overflow > 0:
+        config = with_room(config, Overflow(map=overflow, submap=jnp.zeros(()), tiles=jnp.zeros(())))
+        map, _, overflow = _insert(grow(state.map, config.submap.map_capacity), new)
+    belief = replace(state.belief, covariance=jnp.zeros_like(state.belief.covariance))
+    return replace(state, map=map, belief=belief), config
 
 
 def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:

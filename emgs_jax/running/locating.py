@@ -8,10 +8,12 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.gaussian_map import GaussianMap, grow
+from emgs_jax.graph.measurements import WINDOW
 from emgs_jax.loops.location import Location, LocationConfig
 from emgs_jax.observation import Prediction, transform
 from emgs_jax.registration.belief import certain
 from emgs_jax.registration.rigid import pose_row, scale_translation
+from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.convert import FirstWindow, to_se3
 from emgs_jax.running.correction import looks_of
 from emgs_jax.running.inputs import Input
@@ -25,12 +27,43 @@ def is_missing(run: MappingRun, info: StepInfo | None) -> bool:
     """Whether the camera is to be looked for: no place is known, or no frame has been tracked for a while."""
     if run.back_end is None or (run.state is None and run.saved is None):
         return False
-    if info is None:
-        return True
+    return info is None or _num_untracked(run, info) >= run.back_end.config.location.patience
+
+
+def is_to_begin_anew(run: MappingRun, given: Input, state: SlamState, info: StepInfo) -> bool:
+    """Whether the map is to go on from a frame that is found nowhere, where the prior puts it.
+
+    Not before there is little hope, and only where the prior leads from the last frame that was placed to this one and
+    knows what it sees: there are points, and its two predictions of the image before are one thing.
+
+    Args:
+        run: before this frame.
+        given: this frame.
+        state: after its step.
+        info: of its step.
+    """
+    count = _num_untracked(run, info)
+    is_due = not run.is_fixed and count >= run.back_end.config.location.max_patience
+    if not is_due or info.localization.is_lost or not _leads_here(run.back_end, given, count):
+        return False
+    seen, T = state.previous, np.asarray(state.T_world_previous.as_matrix())
+    depth = np.median((np.asarray(seen.points)[np.asarray(seen.valid)] - T[:3, 3]) @ T[:3, 2])
+    return bool(info.localization.repeat_rms <= run.config.localization.max_residual * depth)
+
+
+def _leads_here(end: BackEnd, given: Input, count: int) -> bool:
+    """Whether each of the last `count` frames, the given one included, is predicted together with the one before."""
+    here, before = (given.T_anchor_views.get(given.frames[0].index - offset) for offset in (0, 1))
+    if here is None or before is None or not np.isfinite([here, before]).all():
+        return False
+    linked = {edge.a for edge in end.edges if edge.kind == WINDOW and edge.b == edge.a - 1}
+    return linked.issuperset(range(len(end.poses) + 1 - count, len(end.poses)))
+
+
+def _num_untracked(run: MappingRun, info: StepInfo) -> int:
+    """Frames in a row that are not tracked, the one of `info` included."""
     placed = [row for row, record in enumerate(run.records) if record.status in PLACED]
-    count = len(run.records) - (placed[-1] + 1 if placed else 0)
-    is_tracked = bool(info.localization.is_tracked)
-    return not is_tracked and count + 1 >= run.back_end.config.location.patience
+    return 0 if info.localization.is_tracked else len(run.records) - (placed[-1] if placed else -1)
 
 
 def look_for(run: MappingRun, given: Input) -> tuple[Location | None, str | None]:

@@ -26,7 +26,7 @@ from emgs_jax.slam import SlamConfig, SlamState, StepInfo
 
 Seconds = Mapping[str, float]  # as a `Timer` reads
 PLACED = ("tracked", "initialization")  # statuses of frames that the map holds
-FOUND = "found"
+FOUND, ANEW = "found", "anew"  # what may become of a camera that is looked for
 NOT_FOUND = "its place in the saved map is not found"
 
 
@@ -41,7 +41,8 @@ class FrameRecord:
         status: tracked, degraded (the coarse pose stays, nothing is fused), lost (not even that is known),
             initialization (the map was made from it) or skipped (it cannot be read).
         reason: why it is not tracked.
-        location: `found` where the camera was looked for and the run goes on from there, or what refused every place.
+        location: where the camera was looked for: `found`, and the run goes on from there; `anew`, and the map does so
+            from its coarse pose; or what refused every place.
         pose: T_world_camera; of a lost frame what stands in for it.
         raw_pose: the same as the prior alone says; the one before where it says none.
         true_pose: None where unknown.
@@ -199,6 +200,9 @@ def record_start(run: MappingRun, given: Input, spent: Seconds) -> None:
 def record_step(run: MappingRun, given: Input, info: StepInfo, spent: Seconds, location: str | None = None) -> None:
     """Add what a step did, `info` on the host, and the seconds that it took."""
     kept = {"fused": 0, "updated": 0, "new": 0, "num_gaussians": run.saved.count} if run.is_fixed else {}
+    if location == ANEW:
+        count = int(np.asarray(run.map.gaussians.valid).sum())
+        kept = {"status": "initialization", "new": count - int(info.num_gaussians), "num_gaussians": count}
     _add(run, given, 0, **_described(info) | kept, location=location, **spent)
 
 

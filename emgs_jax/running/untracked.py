@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from emgs_jax.localization import REASONS
-from emgs_jax.running.record import FrameRecord
+from emgs_jax.running.record import ANEW, FrameRecord
 
 MANY_IN_A_ROW = 10  # single frames fail in every long sequence, so many together do not
 UNTRACKED = ("degraded", "lost")
@@ -28,9 +28,14 @@ REMEDIES = dict(
 
 
 def alarm(records: Sequence[FrameRecord]) -> str | None:
-    """What to say after the last record of a run: many frames in a row are not tracked, or one is again after that."""
+    """What to say after the last record of a run: many frames in a row are not tracked, one is again, or a new part."""
     if not records:
         return None
+    if records[-1].location == ANEW:
+        return (
+            f"{called(records[-1])}: the camera is found nowhere, so the map begins anew where the prior puts it; "
+            "loops join the parts where they meet"
+        )
     if records[-1].status in UNTRACKED:
         row = _last_row(records, MANY_IN_A_ROW + 1)
         if len(row) != MANY_IN_A_ROW:

@@ -62,9 +62,28 @@ class Blinded(Prior):
         return replace(found, T_anchor_view=poses, mask=mask)
 
 
-def mapped(frames: ReadableFrames, prior: Prior, saved=None, keeper=None, stop: int | None = None) -> MappingRun:
+class Misled(Prior):
+    """A prior that errs by one motion, always the same, between all frames before a cut and all from it on."""
+
+    motion = matrix((0, 40, 0), (0.0, 0.0, 1.5))
+
+    def __init__(self, prior: Prior, cut: int) -> None:
+        self._prior, self._cut, self.provenance = prior, cut, prior.provenance
+        self.feature_names, self.text_features = prior.feature_names, prior.text_features
+
+    def predict(self, window, frames, intrinsics) -> PriorPrediction:
+        found = self._prior.predict(window, frames, intrinsics)
+        poses = found.T_anchor_view.copy()
+        later = [view >= self._cut for view in window.views]
+        poses[later] = self.motion @ poses[later]
+        return replace(found, T_anchor_view=poses)
+
+
+def mapped(
+    frames: ReadableFrames, prior: Prior, saved=None, keeper=None, stop: int | None = None, words=()
+) -> MappingRun:
     """A run; one that is stopped after so many frames leaves its checkpoint."""
-    run = new_run(frames, config().slam, graph=config().graph, saved=saved)
+    run = new_run(frames, config(*words).slam, graph=config(*words).graph, saved=saved)
     views = map_frames(run, frames, prior, keeper)
     for _ in itertools.islice(views, stop):
         pass
@@ -102,6 +121,39 @@ def test_a_camera_that_was_carried_off_comes_back():
     end = run.back_end
     assert end.since == first + patience - 1 and not end.is_placed[first]
     assert not any(edge.a >= end.since > edge.b and edge.b >= first for edge in end.edges), "lost frames hold nothing"
+
+
+NOWHERE = ("graph.location.min_inliers=100000", "graph.max_known=1e9", "graph.location.max_patience=4")
+
+
+@pytest.mark.slow
+def test_the_map_goes_on_where_the_prior_leads_when_the_camera_is_found_nowhere():
+    """And it is right relative to the frame where it began anew, as the prior is; the frames before stay."""
+    frames, cut = walk((*THERE[:5], *range(1, 17, 2))), 5
+    run = mapped(frames, Misled(build_prior(settings(), frames), cut), words=NOWHERE)
+    anew = cut + 3
+    assert [record.status for record in run.records[cut:anew]] == ["degraded"] * 3
+    assert [record.location for record in run.records[anew:]] == ["anew"] + [None] * 4
+    first = run.records[anew]
+    assert first.status == "initialization" and first.new > 0 and first.reason is not None
+    assert [record.status for record in run.records[anew + 1 :]] == ["tracked"] * 4
+    for row, record in enumerate(run.records):
+        start = run.records[0]
+        path = np.linalg.inv(start.true_pose) @ record.true_pose
+        assert max(gap_between(record.pose, start.pose @ (path if row < cut else Misled.motion @ path))) < 0.02, row
+    births = np.asarray(run.map.birth)[np.asarray(run.map.gaussians.valid)]
+    assert np.sum(births == anew) > first.new // 2  # some were joined with later ones
+    assert not np.any((births >= cut) & (births < anew))
+    assert run.back_end.is_placed == [True] * cut + [False] * 3 + [True] * 5
+
+
+@pytest.mark.slow
+def test_nothing_begins_anew_where_nothing_leads():
+    """The prior knows nothing of the frames before: where these are relative to the map is not known."""
+    frames = walk((*THERE[:5], *range(1, 17, 2)))
+    run = mapped(frames, Blinded(build_prior(settings(), frames), 5), words=NOWHERE)
+    assert {record.status for record in run.records[5:]} <= {"degraded", "lost"}
+    assert "anew" not in {record.location for record in run.records}
 
 
 def same_run(one: MappingRun, other: MappingRun) -> None:
