@@ -285,10 +285,31 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/running/locating.py",
-        "count + 1 >= run.back_end.config.location.patience",
-        "count >= run.back_end.config.location.patience",
+        "len(run.records) - (placed[-1] if placed else -1)",
+        "len(run.records) - (placed[-1] + 1 if placed else 0)",
         LOCATING,
         "the camera is looked for one frame late",
+    ),
+    Mutant(
+        "emgs_jax/running/locating.py",
+        "linked.issuperset(range(len(end.poses) + 1 - count, len(end.poses)))",
+        "True",
+        LOCATING,
+        "a map begins anew beside one that nothing leads from",
+    ),
+    Mutant(
+        "emgs_jax/running/locating.py",
+        "info.localization.repeat_rms <= run.config.localization.max_residual * depth",
+        "True",
+        LOCATING,
+        "a map begins anew with what the prior says differently each time",
+    ),
+    Mutant(
+        "emgs_jax/running/growth.py",
+        "jnp.full_like(alone.map.birth, state.time - 1)",
+        "alone.map.birth",
+        ("tests/running/test_coming_back.py",),
+        "what begins anew moves with the first frame",
     ),
     Mutant(
         "emgs_jax/running/places.py",

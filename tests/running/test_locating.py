@@ -13,6 +13,7 @@ from scene import assert_same, random_gaussians, random_observation
 
 from emgs_jax import load_config
 from emgs_jax.gaussian_map import new_map
+from emgs_jax.graph.measurements import WINDOW
 from emgs_jax.localization import localize_coarse
 from emgs_jax.loops.location import Location
 from emgs_jax.observation import Prediction
@@ -25,6 +26,7 @@ from emgs_jax.running.locating import (
     as_prediction,
     found_at,
     is_missing,
+    is_to_begin_anew,
     moved,
     refusal,
     with_map,
@@ -141,6 +143,42 @@ def test_a_camera_is_looked_for_after_some_frames_that_are_not_tracked(statuses,
     without = run(lost_state(), records=records)
     without.back_end = None
     assert not is_missing(without, info)
+
+
+def begins_anew(chain=(3, 4, 5, 6), here=(6, 7), repeat_rms=0.01, is_lost=False, is_fixed=False, patience=5) -> bool:
+    """The last five of eight frames, the given one included, are not tracked; without changes all speaks for it."""
+    config = load_config("graph=default", f"graph.location.max_patience={patience}")
+    poses = np.stack([matrix((0, 0, 0), (0.1 * k, 0, 0)) for k in range(8)])
+    end = SimpleNamespace(poses=list(poses[:7]), config=config.graph)
+    end.edges = [SimpleNamespace(a=node, b=node - 1, kind=WINDOW) for node in chain]
+    statuses = ["initialization", "tracked", "tracked", *["degraded"] * 4]
+    records = [FrameRecord(row, None, None, status) for row, status in enumerate(statuses)]
+    found = SimpleNamespace(is_tracked=False, is_lost=is_lost, repeat_rms=repeat_rms)
+    given = SimpleNamespace(frames=[SimpleNamespace(index=7)], T_anchor_views={view: poses[view] for view in here})
+    return is_to_begin_anew(
+        SimpleNamespace(back_end=end, records=records, is_fixed=is_fixed, config=config.slam),
+        given,
+        lost_state(),
+        SimpleNamespace(localization=found),
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, True),
+        ({"patience": 6}, False),  # not yet
+        ({"chain": (4, 5, 6)}, False),  # nothing leads from the last frame that was placed
+        ({"chain": (3, 4, 5)}, False),
+        ({"here": (7,)}, False),
+        ({"here": (6,)}, False),
+        ({"repeat_rms": 1.0}, False),  # the prior says something else each time
+        ({"is_lost": True}, False),
+        ({"is_fixed": True}, False),
+    ],
+)
+def test_a_map_begins_anew_only_where_the_prior_leads_and_knows_what_it_sees(changes, expected):
+    assert begins_anew(**changes) is expected
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import itertools
 import random
+from dataclasses import replace
 
 import pytest
 from tqdm import tqdm
@@ -44,6 +45,14 @@ def test_a_few_frames_that_do_not_fit_are_no_alarm(letters):
 
 def test_frames_before_there_is_a_map_count_too():
     assert list(said("l" * 12 + "i")) == [MANY_IN_A_ROW - 1, 12]
+
+
+def test_a_map_that_begins_anew_is_said_once():
+    rows = records("it" + "d" * 5 + "it")
+    rows[7] = replace(rows[7], location="anew")
+    texts = [alarm(rows[: place + 1]) for place in range(len(rows))]
+    assert [place for place, text in enumerate(texts) if text] == [7]
+    assert texts[7].startswith("7.jpg: the camera is found nowhere")
 
 
 @pytest.mark.parametrize("seed", range(20))
