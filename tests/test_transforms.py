@@ -23,13 +23,6 @@ def assert_close(actual, expected, name):
             np.testing.assert_array_equal(a, b, err_msg=name)
 
 
-@pytest.fixture(autouse=True)
-def drop_executables_of_each_verb():
-    """This file compiles more than any other, each verb several times."""
-    yield
-    jax.clear_caches()
-
-
 @pytest.mark.parametrize("name", VERBS)
 def test_jit_equals_eager_and_vmap_equals_a_loop(name):
     verb, arguments = VERBS[name]
