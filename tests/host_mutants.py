@@ -55,6 +55,8 @@ BACKPROJECTION = ("tests/data/test_backprojection.py",)
 READING = ("tests/data/test_reading.py", "tests/data/test_layouts.py")
 READABLE = ("tests/data/test_readable.py",)
 CHECKPOINT = ("tests/running/test_checkpoint.py",)
+TUNE = ("tests/scripts/test_tune.py",)
+TUNING = ("tests/report/test_tuning.py",)
 SWEEP_SCRIPT = ("tests/scripts/test_sweep_script.py",)
 UNTRACKED = ("tests/running/test_untracked.py",)
 IMAGES = ("tests/data/test_images.py", "tests/data/test_layouts.py")
@@ -180,6 +182,49 @@ MUTANTS = (
         "",
         SWEEP_SCRIPT,
         "what a kill left lies beside the results for ever",
+    ),
+    # searches
+    Mutant(
+        "experiments/search.py",
+        "distributions, [seed, number], startup)",
+        "distributions, [seed], startup)",
+        TUNE,
+        "all trials before the search learns are the same one",
+    ),
+    Mutant(
+        "experiments/search.py",
+        "    if known != about and told(study):\n",
+        "    if False:\n",
+        TUNE,
+        "a search of another space is gone on with",
+    ),
+    Mutant(
+        "experiments/tune.py",
+        '_search(study, config, space, objectives, own, sequences["tuned"])',
+        '_search(study, config, space, objectives, own, [*sequences["tuned"], *sequences["held_out"]])',
+        TUNE,
+        "what is held out decides",
+    ),
+    Mutant(
+        "experiments/tune.py",
+        "end = min((done // config.chunk + 1) * config.chunk, config.trials)",
+        "end = min(done + config.chunk, config.trials)",
+        TUNE,
+        "a search that goes on has other batches",
+    ),
+    Mutant(
+        "emgs_jax/report/tuning.py",
+        "for name, values in rows.items() if name != RAW and values[place] is not None",
+        "for name, values in rows.items() if values[place] is not None",
+        TUNING,
+        "where the prior alone is best, no setting is",
+    ),
+    Mutant(
+        "emgs_jax/report/tuning.py",
+        "sign * (after - before) < 0 for before",
+        "after - before < 0 for before",
+        TUNING,
+        "a search that maximizes counts what got worse",
     ),
     # frames that do not fit
     Mutant(
