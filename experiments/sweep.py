@@ -5,6 +5,7 @@ and the truth are made once for the whole grid. An interrupted sweep goes on wit
 its folder.
 """
 
+import shlex
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.io.files import remove_temporaries
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import new_scorer
+from emgs_jax.report.sweep_page import write_sweep_page
 from emgs_jax.report.sweeps import SweepResults, draw, table, write_csv
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import build, build_dataset, build_prior
@@ -28,8 +30,11 @@ from .grid import Variant, notes, read_axes, variants
 from .together import Work, chunks_of, map_and_score, provenance_of, refuse_other_maps, replayed, side_by_side
 
 
-def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
-    """Map and score every setting of `config.axes` that `folder` has not; returns a flat row for each."""
+def sweep(config: DictConfig, folder: Path, command_line: str = "") -> list[dict[str, Any]]:
+    """Map and score every setting of `config.axes` that `folder` has not; returns a flat row for each.
+
+    The page says that `command_line` repeats it.
+    """
     refuse_other_maps(config, "a sweep")
     axes = read_axes(config)
     grid = variants(config, axes)
@@ -40,7 +45,8 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
     with Clock().watching() as clock:
         dataset = build_dataset(config)
         prior = build_prior(config, dataset)
-        results = SweepResults(folder, provenance_of(config, dataset, prior))
+        origin = provenance_of(config, dataset, prior)
+        results = SweepResults(folder, origin)
         chunks = _left(chunks_of(grid, config.chunk), results)
         num_left = sum(map(len, chunks))
         if num_left < len(grid):
@@ -49,7 +55,7 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
         with _replayed(prior, dataset, chunks, folder / "predictions") as priors, _bar(dataset, chunks) as bar:
             for chunk in chunks:
                 window_size = chunk[0].slam.window_size
-                work = Work(dataset, priors[window_size], scorer, clock, *side_by_side(config, len(chunk)))
+                work = Work(dataset, priors[window_size], scorer, clock, *side_by_side(config, len(chunk)), folder)
                 results.add([variant.setting for variant in chunk], map_and_score(work, chunk, bar))
     rows = results.rows([variant.setting for variant in grid])
     write_csv(folder / "sweep.csv", rows)
@@ -58,6 +64,7 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
         no_picture = draw(folder / "heat_map.png", rows, axes, title)
         if no_picture:
             print(f"no heat_map.png: {no_picture}")
+    write_sweep_page(folder, origin, rows, list(axes), command_line)
     print(table(rows, list(axes)))
     print(f"{num_left} settings in {clock.total_seconds:.1f} s, {clock.compile_seconds:.1f} s of it compilation")
     return rows
@@ -94,11 +101,11 @@ def main(config: DictConfig) -> None:
     """Sweep, and say where the results are."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     try:
-        sweep(config, folder)
+        sweep(config, folder, shlex.join(["emgs", "sweep", *HydraConfig.get().overrides.task]))
     except KeyboardInterrupt:
         print(f"what is done is in {folder}; the same command with hydra.run.dir={folder} goes on from there")
         raise
-    print(f"everything is in {folder}")
+    print(f"everything is in {folder}, report.html shows it")
 
 
 if __name__ == "__main__":

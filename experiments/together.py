@@ -7,17 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.io.files import atomic_write
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.report.metrics import Metrics, Scorer, compared_text, score_settings
+from emgs_jax.report.overview import thumbnail
 from emgs_jax.report.provenance import provenance
+from emgs_jax.report.sweeps import picture_path
 from emgs_jax.running.clock import Clock
+from emgs_jax.running.dense import center_cloud
 from emgs_jax.running.gathering import gather
-from emgs_jax.running.record import new_run
+from emgs_jax.running.record import MappingRun, new_run
 from emgs_jax.running.stacked import map_together, programs
 
 from .grid import Variant
@@ -30,7 +35,7 @@ NOT_OF_RESULTS = (  # keys that change no number of a setting
 
 @dataclass(frozen=True)
 class Work:
-    """What all settings share; `at_once` and `num_threads` as in `map_together`."""
+    """What all settings share; `at_once` and `num_threads` as in `map_together`, `folder` for a picture of each map."""
 
     dataset: ReadableFrames
     prior: Prior
@@ -38,6 +43,7 @@ class Work:
     clock: Clock
     at_once: int
     num_threads: int
+    folder: Path | None = None
 
 
 def refuse_other_maps(config: DictConfig, what: str) -> None:
@@ -98,4 +104,16 @@ def map_and_score(work: Work, chunk: Sequence[Variant], bar: tqdm) -> list[Metri
     text = compared_text(work.dataset, work.scorer.prior)
     raw = gather(views, work.scorer.evaluation, work.dataset.has_ground_truth, text=text)
     densify = [variant.densify for variant in chunk]
-    return score_settings(runs, raw, densify, work.scorer, work.num_threads)
+    metrics = score_settings(runs, raw, densify, work.scorer, work.num_threads)
+    if work.folder is not None:
+        for variant, run in zip(chunk, runs, strict=True):
+            _draw(picture_path(work.folder, variant.setting), run)
+    return metrics
+
+
+def _draw(path: Path, run: MappingRun) -> None:
+    """Write the map from above."""
+    centers = center_cloud(run)
+    path.parent.mkdir(exist_ok=True)
+    with atomic_write(path) as handle:
+        thumbnail(centers.points, centers.colors, np.stack(run.poses)).save(handle, "JPEG", quality=85)

@@ -57,6 +57,7 @@ READABLE = ("tests/data/test_readable.py",)
 CHECKPOINT = ("tests/running/test_checkpoint.py",)
 TUNE = ("tests/scripts/test_tune.py",)
 TUNING = ("tests/report/test_tuning.py",)
+TABLE_PAGE = ("tests/report/test_table_page.py",)
 SWEEP_SCRIPT = ("tests/scripts/test_sweep_script.py",)
 UNTRACKED = ("tests/running/test_untracked.py",)
 IMAGES = ("tests/data/test_images.py", "tests/data/test_layouts.py")
@@ -225,6 +226,28 @@ MUTANTS = (
         "after - before < 0 for before",
         TUNING,
         "a search that maximizes counts what got worse",
+    ),
+    # pages of several runs
+    Mutant(
+        "emgs_jax/report/evaluation_page.py",
+        "if found.regressions or done < len(found.jobs):",
+        "if done < len(found.jobs):",
+        TABLE_PAGE,
+        "an evaluation that its gate refuses looks good",
+    ),
+    Mutant(
+        "emgs_jax/report/table_page.py",
+        'quote(os.path.relpath(path, page_folder).replace(os.sep, "/"))',
+        'os.path.relpath(path, page_folder).replace(os.sep, "/")',
+        TABLE_PAGE,
+        "a link to a folder with # in its name leads elsewhere",
+    ),
+    Mutant(
+        "emgs_jax/report/overview.py",
+        "image = np.rint(255 * picture[::-1])",
+        "image = np.rint(255 * picture)",
+        OVERVIEW,
+        "a thumbnail stands on its head, its path does not",
     ),
     # frames that do not fit
     Mutant(

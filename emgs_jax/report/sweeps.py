@@ -1,6 +1,7 @@
 """The files of a sweep: sweep.json after every chunk, from which it is resumed, then sweep.csv and heat_map.png."""
 
 import csv
+import hashlib
 import io
 import json
 from collections.abc import Mapping, Sequence
@@ -70,6 +71,11 @@ class SweepResults:
 
 def _key(setting: Mapping[str, Any]) -> str:
     return json.dumps(jsonable(setting), sort_keys=True)
+
+
+def picture_path(folder: Path, setting: Mapping[str, Any]) -> Path:
+    """Where the picture of a setting lies; its name follows from the values."""
+    return folder / "pictures" / f"{hashlib.sha256(_key(setting).encode()).hexdigest()[:16]}.jpg"
 
 
 def difference(old: Any, new: Any, path: str) -> str:

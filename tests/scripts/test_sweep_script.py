@@ -49,7 +49,8 @@ def test_every_setting_has_the_metrics_of_a_run_with_its_values(tmp_path):
 @pytest.mark.slow
 def test_the_files_hold_every_row_and_the_recorded_predictions_are_removed():
     folder, rows = swept()
-    assert {path.name for path in folder.iterdir()} == {"sweep.json", "sweep.csv", "heat_map.png"}
+    names = {"sweep.json", "sweep.csv", "heat_map.png", "report.html", "pictures"}
+    assert {path.name for path in folder.iterdir()} == names and len(list((folder / "pictures").iterdir())) == 4
     with open(folder / "sweep.csv", newline="") as file:
         lines = list(csv.DictReader(file))
     assert [float(line["trajectory/ate_sim3_m"]) for line in lines] == [row["trajectory/ate_sim3_m"] for row in rows]
@@ -57,6 +58,7 @@ def test_the_files_hold_every_row_and_the_recorded_predictions_are_removed():
     written = json.loads((folder / "sweep.json").read_text())
     assert written["provenance"]["simulated"] is True and len(written["settings"]) == 4
     assert (folder / "heat_map.png").read_bytes()[:4] == b"\x89PNG"
+    assert (folder / "report.html").read_text().count("<img ") == 5  # the heat map and a map of each setting
 
 
 @pytest.mark.slow
@@ -113,6 +115,7 @@ def test_a_sweep_that_is_stopped_and_goes_on_has_the_same_bits_and_the_same_chun
     assert (tmp_path / "sweep.csv").read_bytes() == (folder / "sweep.csv").read_bytes()
     kept, whole = (json.loads((place / "sweep.json").read_text())["settings"] for place in (tmp_path, folder))
     assert kept == whole
+    assert (tmp_path / "report.html").read_bytes() == (folder / "report.html").read_bytes()
 
 
 def test_what_is_left_is_in_the_chunks_of_the_whole_grid():
