@@ -10,6 +10,7 @@ COMMANDS = {  # name: (what it does, an example)
     "evaluate": ("data sets × sequences × variants × seeds, with one table", "emgs evaluate suite=smoke seeds=[0,1,2]"),
     "score": ("any other system under the same protocol", "emgs score trajectory=poses.txt method=peer dataset=tum …"),
     "sweep": ("a grid of settings on one sequence", "emgs sweep sweep=gates experiment=smoke"),
+    "tune": ("a search for better settings", "emgs tune tune=gates experiment=smoke 'held_out={other:{prior.seed:3}}'"),
     "effects": ("what each value of sweeps changes", "emgs effects folder=multirun/sweep"),
     "report": ("write the page of a finished run anew", "emgs report outputs/synthetic/2026-01-31_12-00-00"),
     "view": ("look at a finished run in the browser", "emgs view outputs/synthetic/2026-01-31_12-00-00"),

@@ -60,7 +60,9 @@ def check_arguments(name: str, arguments: list[str]) -> None:
         parsed = OverridesParser.create().parse_overrides(overrides_of(arguments))
     except HydraException:
         return  # Hydra shows the place
-    overrides = [first_of_sweep(override) for override in parsed if not override.key_or_group.startswith("hydra")]
+    # Of Hydra's own keys one has options of the user in it: what emgs tune has found.
+    own = [o for o in parsed if not o.key_or_group.startswith("hydra") or o.key_or_group == "hydra.searchpath"]
+    overrides = [first_of_sweep(override) for override in own]
     compose(*overrides, name=name)
 
 

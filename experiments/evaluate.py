@@ -1,12 +1,13 @@
 """Evaluate data sets × sequences × variants × seeds: `python -m experiments.evaluate suite=smoke seeds=[0,1,2]`.
 
 What is finished is skipped, so the same command resumes; a job that fails does not stop the others. The folder `out`
-gets one folder per job, results.csv, results.json and results.md.
+gets one folder per job, results.csv, results.json, results.md and report.html.
 """
 
 import contextlib
 import copy
 import re
+import shlex
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,10 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.io.files import atomic_write, write_json
+from emgs_jax.report.evaluation_page import Found, JobLine, write_evaluation_page
 from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
 from emgs_jax.report.results import is_finished, read_estimates, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
@@ -86,8 +89,11 @@ def delegated(arguments: Sequence[str]) -> list[str]:
     return [*kept, f"overrides=[{','.join(words)}]"] if rest else kept
 
 
-def evaluate(settings: Mapping[str, Any]) -> list[str]:
-    """Run every job of this shard that is not finished and write the tables; returns what went wrong, line by line."""
+def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
+    """Run every job of this shard that is not finished and write the tables; returns what went wrong, line by line.
+
+    The page says that `command_line` repeats it.
+    """
     out, part, whole = Path(settings["out"]), *_shard(settings["shard"])
     if whole > 1 and (settings["gate"] or settings["write_gate"]):
         raise ValueError("a gate needs the results of all jobs: run once more without shard")
@@ -101,7 +107,9 @@ def evaluate(settings: Mapping[str, Any]) -> list[str]:
     try:
         _run_all(open_jobs, failures)
     finally:
-        rows = _write_tables(out, jobs, failures, settings["published"])
+        rows, found = _write_tables(out, jobs, failures, settings["published"])
+        worse = regressions(baseline, rows)
+        write_evaluation_page(out, found._replace(gate=settings["gate"], regressions=worse), command_line)
     if settings["write_gate"]:
         tolerances = settings["tolerances"]
         if settings["rounded"]:
@@ -109,7 +117,7 @@ def evaluate(settings: Mapping[str, Any]) -> list[str]:
             tolerances = rounding_tolerances(tolerances, read_estimates(out), rounded, len(settings["seeds"]))
         write_gate(settings["write_gate"], rows, tolerances)
     problems = [f"{name}: {message}" for name, message in failures.items()]
-    return problems + [f"regression: {line}" for line in regressions(baseline, rows)]
+    return problems + [f"regression: {line}" for line in worse]
 
 
 def _run_all(jobs: Sequence[Job], failures: dict[str, str]) -> None:
@@ -141,8 +149,8 @@ def _shard(text: str) -> tuple[int, int]:
 
 def _write_tables(
     out: Path, jobs: Sequence[Job], failures: Mapping[str, str], published: Sequence[Mapping[str, Any]]
-) -> list[Row]:
-    """Write results.csv, results.json and results.md; returns the rows by sequence.
+) -> tuple[list[Row], Found]:
+    """Write results.csv, results.json and results.md; returns the rows by sequence, and what the page shows.
 
     They show the jobs of this evaluation and other systems: older results in `out` may have other settings.
     """
@@ -151,8 +159,8 @@ def _write_tables(
     totals, rows = average(estimates, each_sequence=False), average(estimates, each_sequence=True)
     done = {item.folder for item in estimates}
     missing = {job.name: failures.get(job.name, "to do") for job in jobs if job.folder not in done}
-    parts = [paper_table(totals, published)]
-    parts.append(full_table([*rows, *(row for row in totals if len(row.sequences) > 1)]) if rows else "")
+    parts, shown = [paper_table(totals, published)], [*rows, *(row for row in totals if len(row.sequences) > 1)]
+    parts.append(full_table(shown) if rows else "")
     parts.append("".join(f"- not finished: {name}: {reason}\n" for name, reason in missing.items()))
     text = "\n".join(part for part in parts if part)
     out.mkdir(parents=True, exist_ok=True)
@@ -161,13 +169,17 @@ def _write_tables(
             handle.write(content)
     write_json(out / "results.json", {"rows": rows, "totals": totals, "published": published, "missing": missing})
     print(text)
-    return rows
+    lines = [JobLine(job.name, job.folder, missing.get(job.name, "")) for job in jobs]
+    return rows, Found(lines, shown, estimates)
 
 
 @command("evaluate", delegated)
 def main(config: DictConfig) -> None:
     """Evaluate; the exit status is 1 if a job failed or a metric got worse."""
-    problems = evaluate(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    given = HydraConfig.get().overrides.task  # those of the runs are quoted twice in overrides=[…]
+    words = [*(word for word in given if not word.startswith(("shard=", "overrides="))), *settings["overrides"]]
+    problems = evaluate(settings, shlex.join(["emgs", "evaluate", *words]))
     if problems:
         raise ValueError("\n       ".join([f"problems: {len(problems)}", *problems]))
 

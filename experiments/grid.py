@@ -37,7 +37,7 @@ class Variant:
 
 def read_axes(config: DictConfig) -> dict[str, list[Value]]:
     """The axes of a composed config; raises ValueError where one is no key of a stage or has no list of values."""
-    known = sorted(set(_leaf_keys(OmegaConf.to_container(config, resolve=False), "slam")))
+    known = stage_keys(config)
     axes = OmegaConf.to_container(config)["axes"]
     if not axes:
         raise ValueError("the sweep has no axis: choose one with sweep=gates or 'axes={slam.em.normal_weight:[0,5]}'")
@@ -51,6 +51,11 @@ def read_axes(config: DictConfig) -> dict[str, list[Value]]:
         if any(not isinstance(value, Value) for value in values):
             raise ValueError(f"axis {key} must have numbers or names as values, got {values!r}")
     return {key: list(dict.fromkeys(values)) for key, values in axes.items()}
+
+
+def stage_keys(config: DictConfig) -> list[str]:
+    """Dotted keys of the values of all stages, sorted."""
+    return sorted(set(_leaf_keys(OmegaConf.to_container(config, resolve=False), "slam")))
 
 
 def _leaf_keys(root: dict[str, Any], path: str) -> Iterator[str]:
@@ -89,15 +94,20 @@ def variants(config: DictConfig, axes: Axes) -> list[Variant]:
         own = {key: OmegaConf.select(config, key) for key in axes}
         others = [(key, value) for key, values in axes.items() for value in values if value != own[key]]
         settings = [own, *(own | {key: value} for key, value in others)]
-    return [_variant(config, setting) for setting in settings]
+    return [variant_of(config, setting) for setting in settings]
 
 
-def _variant(config: DictConfig, setting: dict[str, Value]) -> Variant:
+def variant_of(config: DictConfig, setting: Mapping[str, Value]) -> Variant:
+    """The config with the values of one setting; raises ValueError where one is refused."""
     changed = config.copy()
     for key, value in setting.items():
         OmegaConf.update(changed, key, value)
-    plain = {key: str(v) if isinstance(v, float) and not math.isfinite(v) else v for key, v in setting.items()}
-    return Variant(plain, build(changed, "slam"), build(changed, "densify"))
+    return Variant(plain_setting(setting), build(changed, "slam"), build(changed, "densify"))
+
+
+def plain_setting(setting: Mapping[str, Value]) -> dict[str, Value]:
+    """A setting as results have it: infinities as text, as JSON has none."""
+    return {key: str(v) if isinstance(v, float) and not math.isfinite(v) else v for key, v in setting.items()}
 
 
 def notes(config: DictConfig, axes: Axes) -> list[str]:

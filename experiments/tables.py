@@ -6,6 +6,7 @@ in which the map is better than the raw prior.
 """
 
 import re
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -141,7 +142,8 @@ def tables(config: Mapping[str, Any]) -> None:
     finished = [path for path in everything if path.is_file()]
     if len(finished) < len(everything):  # in half an hour it would be too late to learn that the code has changes
         revision_of([git_revision(Path(emgs_jax.__file__).resolve().parents[1]), *_code_of(finished)])
-    problems = [line for table in planned.values() for settings in table for line in evaluate(settings)]
+    again = shlex.join(["emgs", "tables", f"root={config['root']}"])
+    problems = [line for table in planned.values() for settings in table for line in evaluate(settings, again)]
     if problems:
         raise ValueError("\n       ".join([f"problems: {len(problems)}", *problems]))
     revision_of(_code_of(everything))

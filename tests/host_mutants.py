@@ -55,6 +55,9 @@ BACKPROJECTION = ("tests/data/test_backprojection.py",)
 READING = ("tests/data/test_reading.py", "tests/data/test_layouts.py")
 READABLE = ("tests/data/test_readable.py",)
 CHECKPOINT = ("tests/running/test_checkpoint.py",)
+TUNE = ("tests/scripts/test_tune.py",)
+TUNING = ("tests/report/test_tuning.py",)
+TABLE_PAGE = ("tests/report/test_table_page.py",)
 SWEEP_SCRIPT = ("tests/scripts/test_sweep_script.py",)
 UNTRACKED = ("tests/running/test_untracked.py",)
 IMAGES = ("tests/data/test_images.py", "tests/data/test_layouts.py")
@@ -180,6 +183,71 @@ MUTANTS = (
         "",
         SWEEP_SCRIPT,
         "what a kill left lies beside the results for ever",
+    ),
+    # searches
+    Mutant(
+        "experiments/search.py",
+        "distributions, [seed, number], startup)",
+        "distributions, [seed], startup)",
+        TUNE,
+        "all trials before the search learns are the same one",
+    ),
+    Mutant(
+        "experiments/search.py",
+        "    if known != about and told(study):\n",
+        "    if False:\n",
+        TUNE,
+        "a search of another space is gone on with",
+    ),
+    Mutant(
+        "experiments/tune.py",
+        '_search(study, config, space, objectives, own, sequences["tuned"])',
+        '_search(study, config, space, objectives, own, [*sequences["tuned"], *sequences["held_out"]])',
+        TUNE,
+        "what is held out decides",
+    ),
+    Mutant(
+        "experiments/tune.py",
+        "end = min((done // config.chunk + 1) * config.chunk, config.trials)",
+        "end = min(done + config.chunk, config.trials)",
+        TUNE,
+        "a search that goes on has other batches",
+    ),
+    Mutant(
+        "emgs_jax/report/tuning.py",
+        "for name, values in rows.items() if name != RAW and values[place] is not None",
+        "for name, values in rows.items() if values[place] is not None",
+        TUNING,
+        "where the prior alone is best, no setting is",
+    ),
+    Mutant(
+        "emgs_jax/report/tuning.py",
+        "sign * (after - before) < 0 for before",
+        "after - before < 0 for before",
+        TUNING,
+        "a search that maximizes counts what got worse",
+    ),
+    # pages of several runs
+    Mutant(
+        "emgs_jax/report/evaluation_page.py",
+        "if found.regressions or done < len(found.jobs):",
+        "if done < len(found.jobs):",
+        TABLE_PAGE,
+        "an evaluation that its gate refuses looks good",
+    ),
+    Mutant(
+        "emgs_jax/report/table_page.py",
+        'quote(os.path.relpath(path, page_folder).replace(os.sep, "/"))',
+        'os.path.relpath(path, page_folder).replace(os.sep, "/")',
+        TABLE_PAGE,
+        "a link to a folder with # in its name leads elsewhere",
+    ),
+    Mutant(
+        "emgs_jax/report/overview.py",
+        "image = np.rint(255 * picture[::-1])",
+        "image = np.rint(255 * picture)",
+        OVERVIEW,
+        "a thumbnail stands on its head, its path does not",
     ),
     # frames that do not fit
     Mutant(

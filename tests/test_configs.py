@@ -17,7 +17,7 @@ from emgs_jax.slam import SlamConfig
 
 ROOT = CONF.parent
 # Studies and suites hold no class; tests/scripts composes them.
-UNTYPED = {CONF, CONF / "experiment", CONF / "experiment_on", CONF / "suite", CONF / "sweep"}
+UNTYPED = {CONF, CONF / "experiment", CONF / "experiment_on", CONF / "suite", CONF / "sweep", CONF / "tune"}
 GATE = CONF / "baseline" / "smoke.yaml"  # results to compare with, no option
 OF_COMMANDS = {"protocol": "segment"}  # groups of another command than a run
 GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent not in UNTYPED and path != GATE)

@@ -11,7 +11,7 @@ from scene import CONF, compose
 
 ROOT = CONF.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
-GROUPS = ("dataset", "prior", "features", "evaluation", "experiment", "suite", "sweep", "protocol")
+GROUPS = ("dataset", "prior", "features", "evaluation", "experiment", "suite", "sweep", "tune", "protocol")
 pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 

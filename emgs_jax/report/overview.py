@@ -12,11 +12,13 @@ from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
+from PIL import Image, ImageDraw
 
 from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.io.files import atomic_write
 
 _ESTIMATE, _TRUTH, _ONLINE, _LOOP, _INK = "#e4572e", "#1b998b", "#8d6a9f", "#2e86e4", "#333333"
+_PAPER = "#e3e6ea"
 
 
 @dataclass(frozen=True)
@@ -119,21 +121,67 @@ def fill_holes(image: np.ndarray) -> np.ndarray:
     return image
 
 
+def seen_from_above(
+    points: np.ndarray, colors: np.ndarray, camera_heights: np.ndarray, cells: tuple[int, int] = (100, 700)
+) -> tuple[np.ndarray, tuple[float, ...]]:
+    """The picture of finite points, at least one (x, y right and up, z height), and its extent, as `paint_from_above`.
+
+    What is above the cameras is left out, as are far points. The longer side has as many `cells` as the points fill.
+    """
+    seen = below_ceiling(points[:, 2], camera_heights)
+    # Far flying points must not shrink the room to a dot.
+    low, high = np.percentile(points[seen, :2], [0.5, 99.5], axis=0)
+    margin = 0.1 * (high - low) + 0.05
+    seen &= ((points[:, :2] >= low - margin) & (points[:, :2] <= high + margin)).all(1)
+    size = float(np.max(high - low + 2 * margin))
+    cell = size / np.clip(1.2 * np.sqrt(seen.sum()), *cells)
+    image, extent = paint_from_above(points[seen], colors[seen], cell)
+    return fill_holes(image), extent
+
+
+def thumbnail(points: np.ndarray, colors: np.ndarray, poses: np.ndarray, width: int = 240) -> Image.Image:
+    """A small picture of a map from above with its path.
+
+    Args:
+        points: (n, 3), in the frame of the poses; rows that are not finite are left out.
+        colors: (n, 3) RGB from 0 to 1.
+        poses: T_world_camera, (f, 4, 4).
+        width: pixels of the longer side.
+    """
+    rotation = view_from_above(poses)
+    path, finite = poses[:, :3, 3] @ rotation.T, np.isfinite(points).all(1)
+    if not finite.any():
+        return Image.new("RGB", (width, width), _PAPER)
+    picture, (left, right, bottom, top) = seen_from_above(
+        points[finite] @ rotation.T, colors[finite].clip(0.0, 1.0), path[:, 2], (40, 100)
+    )
+    low, high = path[:, :2].min(0), path[:, :2].max(0)
+    low, high = np.minimum(low, [left, bottom]), np.maximum(high, [right, top])
+    margin = 0.03 * np.max(high - low)
+    low, high = low - margin, high + margin
+    scale = width / float(np.max(high - low))  # pixels a metre
+
+    def pixels(point: np.ndarray) -> tuple[int, int]:
+        return round(float(point[0] - low[0]) * scale), round(float(high[1] - point[1]) * scale)
+
+    corner, end = pixels(np.array([left, top])), pixels(np.array([right, bottom]))
+    size = max(end[0] - corner[0], 1), max(end[1] - corner[1], 1)
+    image = np.rint(255 * picture[::-1]).astype(np.uint8)  # up is the first row
+    small = Image.fromarray(image, "RGBA").resize(size, Image.Resampling.NEAREST)
+    paper = Image.new("RGB", pixels(np.array([high[0], low[1]])), _PAPER)
+    paper.paste(small, corner, small.getchannel("A"))
+    ImageDraw.Draw(paper).line([pixels(point) for point in path], fill=_ESTIMATE, width=2)
+    return paper
+
+
 def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
     rotation = view_from_above(paths.estimate)
     path = paths.estimate[:, :3, 3] @ rotation.T
     finite = np.isfinite(cloud.points).all(1)
     points, colors = cloud.points[finite] @ rotation.T, cloud.colors[finite].clip(0.0, 1.0)
     if len(points):
-        seen = below_ceiling(points[:, 2], path[:, 2])
-        # Far flying points must not shrink the room to a dot.
-        low, high = np.percentile(points[seen, :2], [0.5, 99.5], axis=0)
-        margin = 0.1 * (high - low) + 0.05
-        seen &= ((points[:, :2] >= low - margin) & (points[:, :2] <= high + margin)).all(1)
-        size = float(np.max(high - low + 2 * margin))
-        cell = size / np.clip(1.2 * np.sqrt(seen.sum()), 100, 700)
-        image, extent = paint_from_above(points[seen], colors[seen], cell)
-        axes.imshow(fill_holes(image), extent=extent, origin="lower", interpolation="nearest", zorder=1)
+        image, extent = seen_from_above(points, colors, path[:, 2])
+        axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=1)
     if paths.truth is not None:
         _draw_path(axes, paths.truth[:, :3, 3] @ rotation.T, _TRUTH, "true path", 5.0)
     if paths.online is not None:
@@ -145,7 +193,7 @@ def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
         axes.plot(*ends[..., :2].T, color=_LOOP, linewidth=1.6, zorder=3)
         axes.plot([], [], color=_LOOP, linewidth=1.6, label=f"{len(ends)} loops")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_facecolor("#e3e6ea")
+    axes.set_facecolor(_PAPER)
     axes.set_xlabel("metres", color=_INK)
     axes.tick_params(colors=_INK, labelsize=9)
     axes.grid(color="white", linewidth=0.8)

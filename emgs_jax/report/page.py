@@ -26,6 +26,7 @@ from emgs_jax.report.recorded_run import REPORT_FILE, RecordedRun
 from emgs_jax.report.repeat import repeat
 
 MAX_BYTES = 5_000_000
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 _MAP_BYTES = 2_800_000  # of base64; the rest is for pictures and words
 _MAX_PICTURES = 120  # frames, evenly spread
 _SOURCE = Path(__file__).parent / "web"
@@ -147,13 +148,13 @@ def _about(run: RecordedRun, layers: dict[str, np.ndarray], paths: PlacedPaths) 
 
 def _page(run: RecordedRun, paths: PlacedPaths, views: Views, about: dict[str, Any], packing: str, note: str) -> str:
     """All of it, with pictures of as many frames as fit."""
-    script = "\n".join(_source(name) for name in _SCRIPTS)
+    script = "\n".join(source(name) for name in _SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     block, again = run.provenance, repeat(run.provenance["config"])
     parts = {
-        "policy": f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'",
+        "policy": f"{POLICY}; script-src 'sha256-{digest}'",
         "title": _text(f"{block['data']['name']} {block['data']['sequence']}: report of a run"),
-        "style": _source("page.css"),
+        "style": source("page.css"),
         "head": page_words.head(run, again),
         "overview": _overview(run),
         "layers": _layers(run),
@@ -168,20 +169,20 @@ def _page(run: RecordedRun, paths: PlacedPaths, views: Views, about: dict[str, A
         + page_words.files(run, note),
         "footer": page_words.licences(run),
         "arrays": packing,
-        "vertex": _source("splats.vert"),
-        "fragment": _source("splats.frag"),
+        "vertex": source("splats.vert"),
+        "fragment": source("splats.frag"),
         "script": script,
     }
     pictures, step = [list(picture) for picture in views.pictures], 1
     while True:
         shown = about | {"pictures": pictures[::step]}
-        page = _filled(_source("page.html"), parts | {"about": _json(shown)})
+        page = filled(source("page.html"), parts | {"about": _json(shown)})
         if len(page.encode()) <= MAX_BYTES or step >= max(len(pictures), 1):
             return page
         step += 1
 
 
-def _filled(template: str, parts: Mapping[str, str]) -> str:
+def filled(template: str, parts: Mapping[str, str]) -> str:
     """The template with its {names} replaced, once: what comes in is not looked at again."""
     return re.sub(r"\{(\w+)\}", lambda match: parts[match[1]], template)
 
@@ -192,7 +193,8 @@ def _json(value: Any) -> str:
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
-def _source(name: str) -> str:
+def source(name: str) -> str:
+    """A file of `web/`."""
     return (_SOURCE / name).read_text(encoding="utf-8").strip()
 
 

@@ -82,29 +82,36 @@ def head(run: RecordedRun, again: Repeated) -> str:
     """What was mapped, by what, how well, and how it is done again."""
     block, (level, words) = run.provenance, verdict(run)
     data, prior = block["data"], block["prior"]
-    badge = ' <span class="badge">SIMULATED</span>' if block["simulated"] else ""
-    title = f"{escape(str(data['name']))} {escape(str(data['sequence']))}"
-    parts = [f"<h1>{title} <small>prior {escape(str(prior['name']))}</small>{badge}</h1>"]
-    parts.append(f'<p class="verdict {level}">{escape(words)}</p>')
-    if block["simulated"]:
-        parts.append(
-            _quiet("Simulated: the prior is the disturbed ground truth. Numbers must not be set beside published ones.")
-        )
+    title = f"{data['name']} {data['sequence']}"
+    parts = [first_words(title, f"prior {prior['name']}", level, words, block["simulated"])]
     if not is_metric(run):
-        parts.append(_quiet("Images alone do not tell the scale: lengths follow from a median depth that was assumed."))
+        parts.append(quiet("Images alone do not tell the scale: lengths follow from a median depth that was assumed."))
     git = block.get("git") or {}
     commit = f"commit {git['revision'][:12]}{' with changes' if git.get('dirty') else ''}" if git else "no checkout"
     device = block.get("device", {}).get("kind", "")
     size = f"{run.camera.width} × {run.camera.height} pixels"
     where = f"emgs_jax {block['versions']['emgs_jax']}, {commit}, on {device}; images of {size}"
-    return "".join([*parts, _quiet(where), f"<p><code>{escape(again.command)}</code></p>"])
+    return "".join([*parts, quiet(where), command_line(again.command)])
+
+
+def first_words(title: str, more: str, level: str, words: str, is_simulated: bool) -> str:
+    """Title with the simulated label, verdict, and what the label means."""
+    badge = ' <span class="badge">SIMULATED</span>' if is_simulated else ""
+    heading = f"<h1>{escape(title)} <small>{escape(more)}</small>{badge}</h1>"
+    note = "Simulated: the prior is the disturbed ground truth. Numbers must not be set beside published ones."
+    return f'{heading}<p class="verdict {level}">{escape(words)}</p>{quiet(note if is_simulated else "")}'
+
+
+def command_line(command: str) -> str:
+    """What is typed to do it again."""
+    return f"<p><code>{escape(command)}</code></p>"
 
 
 def errors(run: RecordedRun) -> str:
     """The table of errors: ours, as placed, the raw prior and baselines."""
     metrics, config = run.metrics, run.provenance["config"].get("evaluation", {})
     if not any(MAIN[0].key in key for key in metrics):
-        return _section("Errors", "<p>None: the data set has no ground truth.</p>")
+        return section("Errors", "<p>None: the data set has no ground truth.</p>")
     names = {prefix: name for prefix, name in ROWS.items() if any(prefix + c.key in metrics for c in _COLUMNS)}
     rows = [(name, [metrics.get(prefix + column.key) for column in _COLUMNS]) for prefix, name in names.items()]
     online = {
@@ -128,7 +135,7 @@ def errors(run: RecordedRun) -> str:
         f"path ({config.get('alignment')}), ICP: by the points; rendered at each one's own poses. "
         f"{metrics.get('trajectory/num_frames')} frames with truth. Raw prior: the same predictions without mapping."
     )
-    return _section("Errors", f"<table><tr><th></th>{titles}</tr>{''.join(lines)}</table>{_quiet(how)}")
+    return section("Errors", f"<table><tr><th></th>{titles}</tr>{''.join(lines)}</table>{quiet(how)}")
 
 
 def loops(run: RecordedRun) -> str:
@@ -140,28 +147,32 @@ def loops(run: RecordedRun) -> str:
     each = "".join(f"<li>{escape(loop_words(loop))}</li>" for loop in run.loops[:500])
     more = f"<li>and {len(run.loops) - 500} more in loops.json</li>" if len(run.loops) > 500 else ""
     closures = f"{run.metrics.get('loops/closures', 0)} closures moved poses and map."
-    table = _table(("candidates", "outcome"), rows)
-    return _section(
-        "Loops", f"{table}{_quiet(closures)}<details><summary>each of them</summary><ul>{each}{more}</ul></details>"
+    outcomes = table(("candidates", "outcome"), rows)
+    return section(
+        "Loops", f"{outcomes}{quiet(closures)}<details><summary>each of them</summary><ul>{each}{more}</ul></details>"
     )
 
 
 def settings(again: Repeated) -> str:
     """What differs from the defaults."""
     rows = [(key, _plain(value), _plain(default)) for key, value, default in again.differences]
-    body = _table(("setting", "here", "default"), rows) if rows else "<p>None: all settings are the defaults.</p>"
-    return _section("Settings that differ from the defaults", body)
+    body = table(("setting", "here", "default"), rows) if rows else "<p>None: all settings are the defaults.</p>"
+    return section("Settings that differ from the defaults", body)
 
 
 def files(run: RecordedRun, note: str) -> str:
     """What lies beside the page, and what opens it."""
     there = [(name, words) for name, words in FILES.items() if name == "report.html" or (run.folder / name).is_file()]
-    return _section("Files of the run", _table(("file", "what it is; what opens it"), there) + _quiet(note))
+    return section("Files of the run", table(("file", "what it is; what opens it"), there) + quiet(note))
 
 
 def licences(run: RecordedRun) -> str:
-    """Of the program, the data and the prior."""
-    name, prior = str(run.provenance["data"]["name"]), str(run.provenance["prior"]["name"])
+    """Of the program, the data and the prior of a run."""
+    return licence_words(str(run.provenance["data"]["name"]), str(run.provenance["prior"]["name"]))
+
+
+def licence_words(name: str, prior: str) -> str:
+    """Of the program, a data set and a prior."""
     data = DATA_LICENCES.get(name, f"{name}: see its publisher")
     is_own = prior.startswith(("simulated", "multiview_stereo"))
     network = "" if is_own else "; its weights have a licence of their own: docs/priors.md"
@@ -169,17 +180,20 @@ def licences(run: RecordedRun) -> str:
     return f"<p>{own} Data: {escape(data)}. Prior: {escape(prior)}{network}.</p>"
 
 
-def _section(title: str, body: str) -> str:
+def section(title: str, body: str) -> str:
+    """A part of the page; `body` is HTML."""
     return f"<section><h2>{escape(title)}</h2>{body}</section>"
 
 
-def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of texts."""
     lines = ["".join(f'<td class="text">{escape(text)}</td>' for text in row) for row in rows]
     top = "".join(f'<th class="text">{escape(title)}</th>' for title in titles)
     return f"<table><tr>{top}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
 
-def _quiet(text: str) -> str:
+def quiet(text: str) -> str:
+    """A side remark; nothing for an empty one."""
     return f'<p class="quiet">{escape(text)}</p>' if text else ""
 
 

@@ -46,7 +46,7 @@ def repeat(settings: Mapping[str, Any]) -> Repeated:
             default = composed.get(key, ...)
             if default != value and (follows_another or not str(own.get(key, "${")).startswith("${")):
                 is_known = OmegaConf.select(config, key, default=...) is not ...
-                words.append(f"{'' if is_known else '+'}{key}={_written(value)}")
+                words.append(f"{'' if is_known else '+'}{key}={written(value)}")
                 differences.append((key, value, default))
     return Repeated(words, differences)
 
@@ -96,12 +96,12 @@ def _read(path: Path) -> dict[str, Any]:
     return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
 
 
-def _written(value: Any) -> str:
+def written(value: Any) -> str:
     """A value as Hydra's grammar reads it back."""
     if isinstance(value, list):
-        return f"[{','.join(_written(item) for item in value)}]"
+        return f"[{','.join(written(item) for item in value)}]"
     if isinstance(value, dict):
-        return "{" + ",".join(f"{key}:{_written(item)}" for key, item in value.items()) + "}"
+        return "{" + ",".join(f"{key}:{written(item)}" for key, item in value.items()) + "}"
     if isinstance(value, str):
         is_plain = _PLAIN.fullmatch(value) and value.lower() not in _WORDS
         return value if is_plain else "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"

@@ -1,6 +1,7 @@
 """The files of a sweep: sweep.json after every chunk, from which it is resumed, then sweep.csv and heat_map.png."""
 
 import csv
+import hashlib
 import io
 import json
 from collections.abc import Mapping, Sequence
@@ -49,7 +50,7 @@ class SweepResults:
         old = read_sweep(self.path)
         for key in ("data", "prior", "config"):
             if old["provenance"][key] != self._header["provenance"][key]:
-                changed = _difference(old["provenance"][key], self._header["provenance"][key], key)
+                changed = difference(old["provenance"][key], self._header["provenance"][key], key)
                 raise ValueError(f"{self.path} holds a sweep with {changed}: {_REMEDY}")
         return old["settings"]
 
@@ -72,12 +73,17 @@ def _key(setting: Mapping[str, Any]) -> str:
     return json.dumps(jsonable(setting), sort_keys=True)
 
 
-def _difference(old: Any, new: Any, path: str) -> str:
-    """The first value that differs, with its path."""
+def picture_path(folder: Path, setting: Mapping[str, Any]) -> Path:
+    """Where the picture of a setting lies; its name follows from the values."""
+    return folder / "pictures" / f"{hashlib.sha256(_key(setting).encode()).hexdigest()[:16]}.jpg"
+
+
+def difference(old: Any, new: Any, path: str) -> str:
+    """The first value that differs, with its path, in words."""
     if isinstance(old, dict) and isinstance(new, dict):
         for name in [*old, *new]:
             if old.get(name) != new.get(name):
-                return _difference(old.get(name), new.get(name), f"{path}.{name}")
+                return difference(old.get(name), new.get(name), f"{path}.{name}")
     return f"{path} {old!r}, and this one has {new!r}"
 
 

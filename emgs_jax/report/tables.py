@@ -20,7 +20,7 @@ _PAPER_COLUMNS = (  # title, key, digits; the order of the paper's Table II
     ("Normals [%]", "reconstruction/normals_abs_cos_percent", 1),
     ("Scale [%]", "trajectory/scale_percent", 1),
 )
-_COLUMNS = (
+COLUMNS = (
     MAIN[0]._replace(title="ATE Sim(3) [cm]"),
     Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True),
     *MAIN[1:],
@@ -95,7 +95,7 @@ def paper_table(rows: Sequence[Row], published: Sequence[Mapping[str, Any]]) -> 
     methods: dict[tuple, dict[str, Row]] = defaultdict(dict)
     for row in rows:
         if row.dataset in _PAPER_DATASETS:
-            methods[(row.kind, row.variant, _source(row), row.protocol)][row.dataset] = row
+            methods[(row.kind, row.variant, source_of(row), row.protocol)][row.dataset] = row
     if not methods:
         return ""
     titles = [f"{name}: {title}" for name in _PAPER_DATASETS.values() for title, _, _ in _PAPER_COLUMNS]
@@ -117,11 +117,11 @@ def full_table(rows: Sequence[Row]) -> str:
     for row in rows:
         sequences = row.sequences[0] if len(row.sequences) == 1 else f"mean of {len(row.sequences)}"
         cells = [
-            cell(row.values.get(key), row.spreads.get(key), factor, digits) for key, _, factor, digits, _ in _COLUMNS
+            cell(row.values.get(key), row.spreads.get(key), factor, digits) for key, _, factor, digits, _ in COLUMNS
         ]
-        what = [row.dataset, sequences, f"{row.kind}, {row.variant}", _source(row), row.protocol]
+        what = [row.dataset, sequences, f"{row.kind}, {row.variant}", source_of(row), row.protocol]
         lines.append([*what, str(len(row.seeds)), *cells])
-    titles = ["data set", "sequence", "method", "source", "protocol", "seeds", *(column.title for column in _COLUMNS)]
+    titles = ["data set", "sequence", "method", "source", "protocol", "seeds", *(column.title for column in COLUMNS)]
     return markdown(titles, lines)
 
 
@@ -141,8 +141,8 @@ def _row(what: tuple, members: list[Estimate]) -> Row:
     return Row(*what, sequences, seeds, values, spreads)
 
 
-def _source(row: Row) -> str:
-    """What the numbers are made from; simulated ones say so in every table."""
+def source_of(row: Row) -> str:
+    """What the numbers are made from; simulated ones say so in every table, in Markdown."""
     label = "**simulated**" if row.is_simulated else "measured"
     return label if row.prior in (None, "simulated") else f"{label}, {row.prior}"
 

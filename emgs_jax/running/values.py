@@ -120,6 +120,12 @@ def _advice(value: Any) -> str:
     return ", which is text (on the command line infinity is written inf)" if is_spelled else ""
 
 
+def field_of(config: DictConfig, key: str) -> Declared:
+    """What the field at a dotted key of a composed config declares; its parent has a `_target_`."""
+    parent, _, name = key.rpartition(".")
+    return declared(get_class(OmegaConf.select(config, parent)["_target_"]))[name]
+
+
 def declared(cls: type) -> dict[str, Declared]:
     """What the fields of a dataclass, or the parameters of another class, declare, by name."""
     return dict(_declarations(cls))

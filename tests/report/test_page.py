@@ -6,11 +6,11 @@ import json
 import re
 import zlib
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from hand_run import random_similarity
+from page_elements import HOSTILE, Elements
 from written_run import CLASSES, two_walls, written_run
 
 from emgs_jax.report import page
@@ -20,28 +20,6 @@ from emgs_jax.report.page_strip import placed_paths
 from emgs_jax.report.page_words import verdict
 from emgs_jax.report.recorded_run import read_run
 from experiments.report import report
-
-HOSTILE = """</script><script>alert(1)</script><img src=x onerror=alert(2)> "'&{head}{about}"""
-
-
-class Elements(HTMLParser):
-    """Elements with their attributes, and the text of scripts by their id."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.found, self.scripts, self._script = [], {}, None
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.found.append((tag, dict(attrs)))
-        self._script = dict(attrs).get("id", "") if tag == "script" else None
-
-    def handle_data(self, data):
-        if self._script is not None:
-            self.scripts[self._script] = self.scripts.get(self._script, "") + data
-
-    def handle_endtag(self, tag):
-        self._script = None
 
 
 @pytest.fixture(scope="module")

@@ -84,6 +84,8 @@ def test_a_job_that_fails_does_not_stop_the_others_and_is_named_at_the_end(evalu
     assert evaluate("seeds=[0]") == ["synthetic/0/default/0: frame 3 is gone"]
     assert evaluate.runs == [(0, 0), (1, 0)]
     assert "- not finished: synthetic/0/default/0: frame 3 is gone" in (evaluate.out / "results.md").read_text()
+    page = (evaluate.out / "report.html").read_text()
+    assert "not finished: frame 3 is gone" in page and "1 of 2 runs are finished" in page and "SIMULATED" in page
     assert "room1" in capsys.readouterr().out
     note = evaluate.out / "synthetic/0/default/0" / experiments.evaluate.ERROR_FILE
     assert "OSError: frame 3 is gone" in note.read_text()
@@ -170,6 +172,8 @@ def test_the_gate_passes_with_the_same_results_and_names_what_is_worse(evaluate,
     gate.write_text(yaml.safe_dump(baseline))
     (problem,) = evaluate("seeds=[0,1]", f"gate={gate}")
     assert problem.startswith("regression: synthetic/room1/default: trajectory/ate_sim3_m is 0.0205, baseline 0.01")
+    page = (evaluate.out / "report.html").read_text()
+    assert "1 is worse than the gate allows" in page and "trajectory/ate_sim3_m is 0.0205, baseline 0.01" in page
 
 
 def test_a_prior_without_a_seed_is_evaluated_with_one(evaluate):

@@ -14,6 +14,7 @@ from tiny_run import CONF, compose
 import experiments.run
 import experiments.sweep
 from experiments.grid import notes, read_axes, variants
+from experiments.together import chunks_of
 
 AXES = "axes={slam.em.max_mahalanobis_sq:[1.0,9.0],slam.em.average.gain:[count,ema_printed]}"
 COMPARED = ("trajectory/", "reconstruction", "raw_prior/", "map/", "frames/")
@@ -48,7 +49,8 @@ def test_every_setting_has_the_metrics_of_a_run_with_its_values(tmp_path):
 @pytest.mark.slow
 def test_the_files_hold_every_row_and_the_recorded_predictions_are_removed():
     folder, rows = swept()
-    assert {path.name for path in folder.iterdir()} == {"sweep.json", "sweep.csv", "heat_map.png"}
+    names = {"sweep.json", "sweep.csv", "heat_map.png", "report.html", "pictures"}
+    assert {path.name for path in folder.iterdir()} == names and len(list((folder / "pictures").iterdir())) == 4
     with open(folder / "sweep.csv", newline="") as file:
         lines = list(csv.DictReader(file))
     assert [float(line["trajectory/ate_sim3_m"]) for line in lines] == [row["trajectory/ate_sim3_m"] for row in rows]
@@ -56,13 +58,14 @@ def test_the_files_hold_every_row_and_the_recorded_predictions_are_removed():
     written = json.loads((folder / "sweep.json").read_text())
     assert written["provenance"]["simulated"] is True and len(written["settings"]) == 4
     assert (folder / "heat_map.png").read_bytes()[:4] == b"\x89PNG"
+    assert (folder / "report.html").read_text().count("<img ") == 5  # the heat map and a map of each setting
 
 
 @pytest.mark.slow
 def test_a_finished_setting_is_not_mapped_again_and_another_sweep_is_not_mixed_in(monkeypatch, tmp_path):
     folder, rows = swept()
     (tmp_path / "sweep.json").write_bytes((folder / "sweep.json").read_bytes())
-    monkeypatch.setattr(experiments.sweep, "_map_and_score", None)  # calling it would fail
+    monkeypatch.setattr(experiments.sweep, "map_and_score", None)  # calling it would fail
     subset = compose("axes={slam.em.max_mahalanobis_sq:[9.0],slam.em.average.gain:[count]}", name="sweep")
     (row,) = experiments.sweep.sweep(subset, tmp_path)
     assert row | {"setting": 2} == rows[2]
@@ -83,7 +86,7 @@ def test_an_interrupted_sweep_keeps_its_chunks(monkeypatch, tmp_path):
         done.extend(variant.setting for variant in chunk)
         return [{"map/num_gaussians": 1}] * len(chunk)
 
-    monkeypatch.setattr(experiments.sweep, "_map_and_score", interrupted)
+    monkeypatch.setattr(experiments.sweep, "map_and_score", interrupted)
     with pytest.raises(KeyboardInterrupt):
         experiments.sweep.sweep(compose(AXES, "chunk=2", name="sweep"), tmp_path)
     kept = json.loads((tmp_path / "sweep.json").read_text())["settings"]
@@ -93,7 +96,7 @@ def test_an_interrupted_sweep_keeps_its_chunks(monkeypatch, tmp_path):
 @pytest.mark.slow
 def test_a_sweep_that_is_stopped_and_goes_on_has_the_same_bits_and_the_same_chunks(monkeypatch, tmp_path, capsys):
     folder, _ = swept()
-    chunks, map_and_score = [], experiments.sweep._map_and_score
+    chunks, map_and_score = [], experiments.sweep.map_and_score
 
     def stopped(work, chunk, bar):
         chunks.append([variant.setting for variant in chunk])
@@ -101,7 +104,7 @@ def test_a_sweep_that_is_stopped_and_goes_on_has_the_same_bits_and_the_same_chun
             raise KeyboardInterrupt
         return map_and_score(work, chunk, bar)
 
-    monkeypatch.setattr(experiments.sweep, "_map_and_score", stopped)
+    monkeypatch.setattr(experiments.sweep, "map_and_score", stopped)
     with pytest.raises(KeyboardInterrupt):
         experiments.sweep.sweep(compose(AXES, "chunk=2", name="sweep"), tmp_path)
     (tmp_path / ".sweep.999999999.tmp.json").write_text("{")  # as a kill leaves it
@@ -112,12 +115,13 @@ def test_a_sweep_that_is_stopped_and_goes_on_has_the_same_bits_and_the_same_chun
     assert (tmp_path / "sweep.csv").read_bytes() == (folder / "sweep.csv").read_bytes()
     kept, whole = (json.loads((place / "sweep.json").read_text())["settings"] for place in (tmp_path, folder))
     assert kept == whole
+    assert (tmp_path / "report.html").read_bytes() == (folder / "report.html").read_bytes()
 
 
 def test_what_is_left_is_in_the_chunks_of_the_whole_grid():
     """On an accelerator a chunk is stacked, and stacks of other sizes may round otherwise."""
     config = compose("axes={slam.em.normal_weight:[0,1,2,3,4,5,6]}", name="sweep")
-    whole = experiments.sweep._chunks(variants(config, read_axes(config)), 3)
+    whole = chunks_of(variants(config, read_axes(config)), 3)
     for count in range(len(whole) + 1):
         done = [variant.setting for chunk in whole[:count] for variant in chunk]
         assert experiments.sweep._left(whole, done) == whole[count:]

@@ -1,0 +1,165 @@
+"""What a search leaves: a table of the default and the best on every sequence, a picture, settings that `run` takes."""
+
+import os
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from emgs_jax.io.files import atomic_write
+from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, cell, markdown
+from emgs_jax.report.provenance import RAW_PRIOR
+
+DEFAULT, RAW = "default", "raw prior"
+
+
+@dataclass(frozen=True)
+class SequenceResults:
+    """What settings came to on one sequence.
+
+    Args:
+        name: of the sequence.
+        is_held_out: it decided nothing.
+        is_simulated: the prior is made from the ground truth.
+        metrics: of DEFAULT and of trials, by name.
+    """
+
+    name: str
+    is_held_out: bool
+    is_simulated: bool
+    metrics: Mapping[str, Mapping[str, Any]]
+
+
+def columns_of(objectives: Mapping[str, str]) -> list[Column]:
+    """The objectives, then the other main metrics; metric -> `minimize` or `maximize`."""
+    known = {column.key: column for column in (*MAIN, *PLACED, *RENDERED)}
+    own = [known.get(key, Column(key, key, 1.0, 4, direction == "minimize")) for key, direction in objectives.items()]
+    return own + [column for column in MAIN if column.key not in objectives]
+
+
+def table(results: Sequence[SequenceResults], objectives: Mapping[str, str]) -> str:
+    """Markdown: the raw prior, the default and the best on each tuned sequence, then on each that was held out.
+
+    Of several sequences of a kind there are means, too, of what all of them have. The best of ours is bold.
+    """
+    columns, lines = columns_of(objectives), []
+    for is_held_out, kind in ((False, "tuned"), (True, "**held out**")):
+        some = [result for result in results if result.is_held_out == is_held_out]
+        blocks = [(result.name + ", simulated" * result.is_simulated, _rows(result, columns)) for result in some]
+        if len(some) > 1:
+            blocks.append((f"mean of {len(some)}", _means([rows for _, rows in blocks])))
+        for name, rows in blocks:
+            marked = _marked(rows, columns)
+            lines += [[kind, name, setting, *cells] for setting, cells in marked.items()]
+    return markdown(["", "sequence", "setting", *(column.title for column in columns)], lines)
+
+
+Rows = dict[str, list[float | None]]
+
+
+def _rows(result: SequenceResults, columns: Sequence[Column]) -> Rows:
+    first = next(iter(result.metrics.values()))
+    raw = [first.get(RAW_PRIOR + column.key) for column in columns]
+    ours = {name: [values.get(column.key) for column in columns] for name, values in result.metrics.items()}
+    return ({RAW: raw} if any(value is not None for value in raw) else {}) | ours
+
+
+def _means(blocks: Sequence[Rows]) -> Rows:
+    names = [name for name in blocks[0] if all(name in rows for rows in blocks)]
+    return {name: [_mean(values) for values in zip(*(rows[name] for rows in blocks), strict=True)] for name in names}
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    return None if None in values else statistics.fmean(values)
+
+
+def _marked(rows: Rows, columns: Sequence[Column]) -> dict[str, list[str]]:
+    """Cells as text, the best of each column but the raw prior's bold."""
+    found: dict[str, list[str]] = {name: [] for name in rows}
+    for place, column in enumerate(columns):
+        known = [values[place] for name, values in rows.items() if name != RAW and values[place] is not None]
+        best = (min if column.is_lower_better else max)(known) if known else None
+        for name, values in rows.items():
+            text = cell(values[place], None, column.factor, column.digits)
+            found[name].append(f"**{text}**" if name != RAW and values[place] == best and best is not None else text)
+    return found
+
+
+def verdict(results: Sequence[SequenceResults], objectives: Mapping[str, str]) -> dict[str, str]:
+    """For each trial that was held out: how its objectives differ from the default's there, in one line."""
+    held_out = [result.metrics for result in results if result.is_held_out]
+    lines = {}
+    for trial in held_out[0] if held_out else ():
+        if trial != DEFAULT:
+            parts = [_compared(held_out, trial, *objective) for objective in objectives.items()]
+            lines[trial] = f"held out, {trial} against the default: {'; '.join(parts)}"
+    return lines
+
+
+def _compared(held_out: Sequence[Mapping[str, Mapping[str, Any]]], trial: str, key: str, direction: str) -> str:
+    pairs = [(metrics[DEFAULT].get(key), metrics[trial].get(key)) for metrics in held_out]
+    known = [pair for pair in pairs if None not in pair]
+    if not known:
+        return f"{key} has no value"
+    sign = 1 if direction == "minimize" else -1
+    better = sum(sign * (after - before) < 0 for before, after in known)
+    before, after = (statistics.fmean(numbers) for numbers in zip(*known, strict=True))
+    return f"{key} {before:.4g} → {after:.4g}, better on {better} of {len(pairs)}"
+
+
+def settings_yaml(setting: Mapping[str, Any], lines: Sequence[str]) -> str:
+    """A setting as an option of Hydra that changes keys wherever they stand, below comments."""
+    tree: dict[str, Any] = {}
+    for key, value in setting.items():
+        node = tree
+        *parents, name = key.split(".")
+        for parent in parents:
+            node = node.setdefault(parent, {})
+        node[name] = value
+    comments = "".join(f"# {line}\n" for line in ("@package _global_", *lines))
+    return comments + yaml.safe_dump(tree, sort_keys=False)
+
+
+def draw_trials(
+    path: str | os.PathLike,
+    rows: Sequence[Mapping[str, Any]],
+    objectives: Mapping[str, str],
+    named: Mapping[int, str],
+    title: str,
+) -> str | None:
+    """Draw the first objective over the second, or over the trials where there is but one, and write it as PNG.
+
+    Args:
+        path: of the picture.
+        rows: of trials: `trial`, its number, and the objectives, which may be None.
+        objectives: metric -> direction.
+        named: number -> words, of the trials that are marked.
+        title: of the picture.
+
+    Returns:
+        None, or why there is no picture.
+    """
+    shown = columns_of(objectives)[: min(len(objectives), 2)]
+    known = [row for row in rows if all(row.get(column.key) is not None for column in shown)]
+    if not known:
+        return "no trial has all objectives"
+    y = [shown[0].factor * row[shown[0].key] for row in known]
+    x = [shown[1].factor * row[shown[1].key] for row in known] if len(shown) > 1 else [row["trial"] for row in known]
+    figure = Figure(figsize=(6.4, 4.8), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    axes.scatter(x, y, c=["#e4572e" if row["trial"] in named else "#9aa5b1" for row in known], s=28)
+    for row, across, up in zip(known, x, y, strict=True):
+        if row["trial"] in named:
+            words = named[row["trial"]]
+            axes.annotate(words, (across, up), textcoords="offset points", xytext=(5, 4), fontsize=8)
+    axes.set_ylabel(shown[0].title)
+    axes.set_xlabel(shown[1].title if len(shown) > 1 else "trial")
+    axes.set_title(title, fontsize=10)
+    with atomic_write(path) as handle:
+        figure.savefig(handle, format="png", dpi=110)
+    return None

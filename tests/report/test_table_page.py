@@ -1,0 +1,213 @@
+"""Pages of evaluations and sweeps as text, and in Chromium; oracles: an HTML parser, runs made by hand, known sizes."""
+
+import base64
+import io
+import json
+import re
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+import pytest
+from browser import MISSING, browser
+from page_elements import HOSTILE, Elements
+from PIL import Image
+from written_run import written_run
+
+from emgs_jax.io.files import write_json
+from emgs_jax.report import table_page
+from emgs_jax.report.evaluation_page import Found, JobLine, verdict, write_evaluation_page
+from emgs_jax.report.page import MAX_BYTES
+from emgs_jax.report.results import estimates_of
+from emgs_jax.report.sweep_page import write_sweep_page
+from emgs_jax.report.sweeps import picture_path
+from emgs_jax.report.table_page import thumbnails
+from emgs_jax.report.tables import average
+
+ATE, F1 = "trajectory/ate_sim3_m", "reconstruction/f1_5cm_percent"
+COMMAND = "emgs evaluate suite=smoke"
+
+
+def picture_at(path: Path, size: tuple[int, int] = (800, 500), noise: int = 0) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.random.default_rng(0).integers(0, 1 + noise, (*size[::-1], 3), np.uint8)
+    Image.fromarray(pixels).save(path, path.suffix[1:].replace("jpg", "jpeg"))
+
+
+def evaluation(out: Path, *, missing: str = "disk full", gate=None, regressions=(), name: str = "room 0/a b") -> Found:
+    """Two finished runs of which one is worse than the prior, and one without a result."""
+    jobs = []
+    for seed, ours in ((0, 0.012), (1, 0.04)):
+        folder = written_run(out / "synthetic" / "room #0" / "default" / str(seed), **{ATE: ours, F1: 60.0})
+        picture_at(folder / "overview.png")
+        (folder / "report.html").write_text("a page")
+        jobs.append(JobLine(f"{name}/{seed}", folder, ""))
+    jobs.append(JobLine("third", out / "third", missing))
+    estimates = [item for job in jobs[:2] for item in estimates_of(job.folder / "metrics.json")]
+    return Found(jobs, average(estimates, each_sequence=True), estimates, gate, regressions)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("evaluation")
+    return write_evaluation_page(out, evaluation(out, gate="gate.yaml", regressions=["ATE is 4, baseline 3"]), COMMAND)
+
+
+def words_of(path: Path) -> str:
+    """The text of a page, its elements left out."""
+    return re.sub(r"<[^>]*>", " ", re.sub(r"<style.*?</style>", "", path.read_text(), flags=re.DOTALL))
+
+
+def test_an_evaluation_says_what_became_of_every_run_and_what_is_worse(page):
+    text = " ".join(words_of(page).split())
+    assert "2 of 3 runs are finished" in text and "in 1 of 2; 1 is worse than the gate allows" in text
+    assert "path off by 1.2 cm (prior alone: 3.0 cm)" in text and "not finished: disk full" in text
+    assert "ATE is 4, baseline 3" in text and "SIMULATED" in text and COMMAND in text
+    assert re.search(r"ours simulated paper/sim3 2 2\.60 ± 1\.98", text)  # 1.2 and 4 cm: deviation 2.8 / √2
+    assert re.search(r"raw prior simulated paper/sim3 2 3\.00 ± 0\.00", text)
+
+
+def test_the_better_one_is_marked_in_the_table_of_errors(page):
+    (line,) = re.findall(r"<tr>(?:(?!<tr>).)*>ours<.*?</tr>", page.read_text())
+    assert '<td class="best">2.60 ± 1.98</td>' in line
+    assert page.read_text().count('class="best"') == 1  # no other metric has two values
+
+
+def test_links_are_relative_and_lead_to_the_runs(page):
+    links = [attributes["href"] for tag, attributes in Elements(page.read_text()).found if tag == "a"]
+    assert len(links) == 4  # report and folder of each finished run
+    for link in links:
+        assert link.startswith("./") and (page.parent / unquote(link)).exists(), link
+    assert "%230" in links[0], "a # would end the address"
+
+
+def test_pages_ask_for_nothing_and_run_nothing(page):
+    text = page.read_text()
+    elements = Elements(text)
+    assert not elements.scripts and "http:" not in text.replace("http-equiv", "") and "https:" not in text
+    for tag, attributes in elements.found:
+        assert not any(name.startswith("on") for name in attributes), (tag, attributes)
+        assert tag == "a" or all(
+            str(attributes.get(name) or "data:").startswith("data:") for name in ("src", "href", "action", "srcset")
+        )
+    (policy,) = [a["content"] for _, a in elements.found if a.get("http-equiv") == "Content-Security-Policy"]
+    assert policy == "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+
+def test_hostile_words_stay_text(tmp_path):
+    found = evaluation(tmp_path, missing=HOSTILE, gate=HOSTILE, regressions=[HOSTILE], name=HOSTILE)
+    elements = Elements(write_evaluation_page(tmp_path, found, HOSTILE).read_text())
+    assert not elements.scripts and not any("onerror" in attributes for _, attributes in elements.found)
+
+
+def test_the_verdict_is_bad_where_something_is_missing_or_worse_and_mixed_where_a_run_is_worse_than_the_prior(tmp_path):
+    found = evaluation(tmp_path)
+    assert verdict(found)[0] == "bad"
+    both = found._replace(jobs=found.jobs[:2])
+    assert verdict(both)[0] == "mixed" and verdict(both._replace(jobs=found.jobs[:1]))[0] == "good"
+    assert verdict(both._replace(gate="g", regressions=["worse"]))[0] == "bad"
+    assert verdict(both._replace(gate="g")) == (
+        "mixed",
+        verdict(both)[1][:-1] + "; nothing is worse than the gate allows.",
+    )
+    assert verdict(Found([], [], [])) == ("unknown", "0 of 0 runs are finished.")
+
+
+def test_an_evaluation_without_any_result_is_a_page_that_says_why(tmp_path):
+    found = Found([JobLine("first", tmp_path / "first", "to do")], [], [])
+    text = words_of(write_evaluation_page(tmp_path, found, ""))
+    assert "0 of 1 runs are finished" in text and "not finished: to do" in text
+
+
+def test_pictures_are_as_large_as_all_of_them_fit(tmp_path, monkeypatch):
+    paths = [tmp_path / f"{number}.png" for number in range(4)]
+    for path in paths[:3]:
+        picture_at(path, noise=255)
+    paths[2].write_bytes(b"no picture")
+    widths = {}
+    for budget in (10**7, 40_000, 10_000):
+        monkeypatch.setattr(table_page, "PICTURE_BYTES", budget)
+        found = thumbnails(paths)
+        assert found[2:] == ["", ""] and sum(map(len, found)) <= budget
+        widths[budget] = [Image.open(io.BytesIO(base64.b64decode(text))).width for text in found if text]
+    assert widths[10**7] == [360, 360] and widths[40_000][0] < 360 and len(widths[10_000]) == 2
+    monkeypatch.setattr(table_page, "PICTURE_BYTES", int(1.5 * len(found[0])))
+    assert [bool(text) for text in thumbnails(paths)] == [True, False, False, False]  # the first that fit
+
+
+BLOCK = {
+    "protocol": "paper/sim3",
+    "simulated": True,
+    "prior": {"name": "simulated"},
+    "data": {"name": "synthetic", "sequence": "room0"},
+    "device": {"kind": "cpu"},
+    "git": {"revision": "0123456789abcdef", "dirty": True},
+}
+AXES = ("slam.em.noise", "slam.em.max_log_gap")
+
+
+def swept(folder: Path, settings: dict, **more) -> Path:
+    from tiny_run import compose
+
+    from experiments.together import shared_settings
+
+    rows = [dict(zip(AXES, values, strict=True)) | metrics for values, metrics in settings.items()]
+    block = json.loads(json.dumps(BLOCK | {"config": shared_settings(compose("dataset.seed=7", name="sweep"))} | more))
+    return write_sweep_page(folder, block, rows, AXES, "emgs sweep sweep=gates")
+
+
+def test_a_sweep_shows_every_setting_with_its_map_and_how_the_best_becomes_a_run(tmp_path):
+    raw = {f"raw_prior/{ATE}": 0.03}
+    settings = {(0.5, 8.0): {ATE: 0.02} | raw, (0.5, "inf"): {ATE: 0.01} | raw, (1.0, 8.0): raw}
+    picture_at(picture_path(tmp_path, dict(zip(AXES, (0.5, "inf"), strict=True))), (200, 100))
+    picture_at(tmp_path / "heat_map.png")
+    path = swept(tmp_path, settings)
+    text = " ".join(words_of(path).split())
+    assert "3 settings; best ATE [cm]: 1.00 with slam.em.noise=0.5, slam.em.max_log_gap=inf." in text
+    assert "raw prior 3.00" in text and "0.5 8.0 2.00" in text and "1.0 8.0 –" in text
+    assert "SIMULATED" in text and "emgs sweep sweep=gates" in text and "0123456789ab with changes" in text
+    command = re.search(r"emgs run .*?slam\.em\.max_log_gap=inf", text)[0]
+    assert "dataset.seed=7" in command and "slam.em.noise=0.5" in command
+    images = [attributes["src"] for tag, attributes in Elements(path.read_text()).found if tag == "img"]
+    sizes = [Image.open(io.BytesIO(base64.b64decode(source.partition(",")[2]))).size for source in images]
+    assert sizes == [(800, 500), (200, 100)]
+    assert path.read_text().count('class="best"') == 1
+
+
+def test_a_sweep_without_truth_shows_its_frames(tmp_path):
+    path = swept(tmp_path, {(0.5, 8.0): {"frames/tracked": 5, "frames/lost": 2, "frames/degraded": 0}}, git=None)
+    text = " ".join(words_of(path).split())
+    assert "no ground truth, 5 tracked, 2 lost" in text and "no checkout" in text and "raw prior" not in text
+
+
+def test_a_large_sweep_stays_below_the_size_of_a_page_and_says_what_is_left_out(tmp_path):
+    settings = {(number / 7, 8.0): {ATE: 0.01 * number, F1: 1.0 * number} for number in range(700)}
+    for number in range(700):
+        picture_at(picture_path(tmp_path, dict(zip(AXES, (number / 7, 8.0), strict=True))), (240, 180), 255)
+    path = swept(tmp_path, settings)
+    assert path.stat().st_size < MAX_BYTES and "sweep.csv has 200 more settings" in path.read_text()
+
+
+@pytest.mark.skipif(MISSING is not None, reason=str(MISSING))
+def test_the_page_opens_in_a_browser_without_a_request_or_an_error(page):
+    with browser() as chromium:
+        chromium.visit(page.resolve().as_uri())
+        assert chromium.run("return [...document.images].map((i) => i.naturalWidth)") == [360, 360]
+        assert {address.split(":")[0] for address in chromium.requests()} <= {"file", "data"}
+        wrong = [entry for entry in chromium.log("browser") if entry["level"] == "SEVERE"]
+        assert not wrong, json.dumps(wrong)
+        chromium.run("document.querySelector('a').click()")
+        assert chromium.run("return document.body.textContent") == "a page"
+
+
+def test_the_results_of_another_program_are_no_job(tmp_path):
+    """A scored system has no folder of a run: its row is in the table, and nothing claims a report of it."""
+    found = evaluation(tmp_path)
+    folder = tmp_path / "synthetic" / "room0" / "peer" / "0"
+    metrics = json.loads((found.jobs[0].folder / "metrics.json").read_text())
+    metrics["provenance"]["prior"] = None
+    folder.mkdir(parents=True)
+    write_json(folder / "metrics.json", {ATE: 0.5, "provenance": metrics["provenance"]})
+    estimates = [*found.estimates, *estimates_of(folder / "metrics.json")]
+    found = found._replace(estimates=estimates, rows=average(estimates, each_sequence=True))
+    assert "peer scored" in " ".join(words_of(write_evaluation_page(tmp_path, found, COMMAND)).split())
