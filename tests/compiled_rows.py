@@ -40,6 +40,7 @@ def random_problem(rng: np.random.Generator) -> tuple[Matches, Problem]:
         normals=unit(NUM_POINTS, 3),
         triangle=50.0 * (diagonal + 0.1 * normal(NUM_POINTS, 6)),
         noise=normal(NUM_POINTS, 3),
+        plane_vars=jnp.full(NUM_POINTS, 1e-4),
         plane_std=jnp.full(NUM_POINTS, 0.02),
         light=jnp.asarray(rng.random(NUM_POINTS), jnp.float32),
         gradients=normal(NUM_POINTS, 3),
@@ -48,7 +49,8 @@ def random_problem(rng: np.random.Generator) -> tuple[Matches, Problem]:
     one, zeros = jnp.ones(()), jnp.zeros((1, 3))
     nothing = Gaussians(zeros, jnp.eye(3)[None], zeros, zeros, jnp.zeros((1, 0)), jnp.zeros(1, bool))
     surface = Surface(nothing, jnp.zeros((1, 6)), one[None], one[None], zeros)  # what is matched does not look at it
-    return matches, Problem(source, surface, T, jnp.zeros((NUM_POINTS, 3)), 0.005 * one, jnp.eye(7), 0.01 * one)
+    noise = jnp.full(NUM_POINTS, 0.01), jnp.zeros((NUM_POINTS, 3))
+    return matches, Problem(source, surface, T, *noise, 0.005 * one, jnp.eye(7), 0.01 * one)
 
 
 def largest_difference(matches: Matches, problem: Problem) -> float:

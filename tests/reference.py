@@ -1,6 +1,7 @@
 """Slow, readable NumPy truth in float64: what the paper's equations say, one item at a time."""
 
 import numpy as np
+from scipy.optimize import least_squares
 
 
 def knn(queries, points, valid, k):
@@ -204,16 +205,19 @@ def matched(points, normals, noise, g, gates):
 def registered(points, normals, light, noise, g, gradients, config, pose_std):
     """The translation that ICP's cost asks for where rotation and scale are held, for matches that do not change.
 
-    Rows of a point: distance to the plane (`colored`) or whitened offset (`distribution`), and its intensity. All
+    Rows of a point: distance to the plane (`colored`), logarithm of its depth over the plane's along its ray (`ray`,
+    about a camera that moves with it) or whitened offset (`distribution`), and its intensity. All
     points together weigh as much as 16, for nothing is known of how alike their errors are, against the prior's
     information over the coarse pose's variance.
     """
-    residual = ("colored", "distribution", "colored+distribution")[int(config.residual)]
+    residual = ("colored", "distribution", "colored+distribution", "colored+ray")[int(config.residual)]
     rows, is_inlier = matched(
         points, normals, noise, g, (float(config.max_mahalanobis_sq), float(config.min_normal_cos))
     )
     hessian, force = float(config.prior_information) / pose_std**2 * np.eye(3), np.zeros(3)
     share = 16.0 / len(points)
+    if residual == "colored+ray":
+        return _along_rays(points, light, noise, g, gradients, config, hessian, (rows, is_inlier))
     for i in np.flatnonzero(is_inlier):
         k, nu = rows[i], noise[i]
         offset, normal, gradient = points[i] - g["means"][k], g["normals"][k], gradients[k]
@@ -228,6 +232,26 @@ def registered(points, normals, light, noise, g, gradients, config, pose_std):
             hessian = hessian + share * np.outer(gradient, gradient) / float(config.color_std) ** 2
             force = force - share * shade * gradient / float(config.color_std)
     return np.linalg.solve(hessian, force)
+
+
+def _along_rays(points, light, noise, g, gradients, config, information, matches):
+    """The same by a general solver, since the rows are no linear ones."""
+    share, edge = 16.0 / len(points), np.sqrt(float(config.max_mahalanobis_sq))
+
+    def rows(x):
+        found = list(np.sqrt(information.diagonal()) * x)
+        for i in np.flatnonzero(matches[1]):
+            k, sigma = matches[0][i], np.linalg.norm(noise[i]) / np.linalg.norm(points[i])
+            normal, mean = g["normals"][k], g["means"][k]
+            reached = points[i] * (normal @ (mean - x)) / (normal @ points[i])  # where the ray meets the plane
+            thickness = normal @ g["covs"][k] @ normal / (normal @ reached) ** 2
+            found.append(np.sqrt(share) * np.log(points[i][2] / reached[2]) / np.sqrt(sigma**2 + thickness))
+            luminance = g["colors"][k] @ [0.299, 0.587, 0.114]
+            shade = (luminance + gradients[k] @ (points[i] + x - mean) - light[i]) / float(config.color_std)
+            found.append(np.sqrt(share) * np.clip(shade, -edge, edge))
+        return found
+
+    return least_squares(rows, np.zeros(3), xtol=1e-12, ftol=1e-12, gtol=1e-12).x
 
 
 def splat(mean, cov, pose, camera, scale, blur):

@@ -33,12 +33,16 @@ class Surface(eqx.Module):
 
 
 class Matches(eqx.Module):
-    """The Gaussian of every point: its surface's rows, the point's whitened noise, and whether the two agree."""
+    """The Gaussian of every point: its surface's rows, the point's whitened noise, and whether the two agree.
+
+    `plane_std` (m) has the point's noise in it, `plane_vars` (m²) has not.
+    """
 
     means: Float[Array, "p 3"]
     normals: Float[Array, "p 3"]
     triangle: Float[Array, "p 6"]
     noise: Float[Array, "p 3"]
+    plane_vars: Float[Array, "p"]
     plane_std: Float[Array, "p"]
     light: Float[Array, "p"]
     gradients: Float[Array, "p 3"]
@@ -96,6 +100,7 @@ def match(
         normals=normals,
         triangle=triangle,
         noise=jnp.stack(white_noise, axis=-1),
+        plane_vars=surface.plane_vars[row],
         plane_std=jnp.sqrt(surface.plane_vars[row] + jnp.sum(normals * noise, axis=-1) ** 2 + 1e-12),
         light=surface.light[row],
         gradients=surface.gradients[row],

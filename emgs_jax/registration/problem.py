@@ -17,8 +17,9 @@ from emgs_jax.ops.pytree import choice, static, traced
 from emgs_jax.registration.matching import Candidates, Matches, Surface, match
 
 Noise: TypeAlias = tuple[Float[Array, ""], Float[Array, ""]]  # standard deviations in m, and in rad or over the depth
-RESIDUALS = ("colored", "distribution", "colored+distribution")
-COLORED, DISTRIBUTION = 0, 1
+RESIDUALS = ("colored", "distribution", "colored+distribution", "colored+ray")
+COLORED, DISTRIBUTION, COLORED_DISTRIBUTION, COLORED_RAY = range(4)
+LEAST_RATIO = 1e-3  # of a point's depth over that of a plane; less is behind the camera
 
 
 class IcpConfig(eqx.Module):
@@ -27,7 +28,8 @@ class IcpConfig(eqx.Module):
     Args:
         residual: `colored` (printed): distance to the Gaussian's plane and intensity difference (Park et al.,
             "Colored point cloud registration revisited", ICCV 2017); `distribution`: offset from the mean, whitened by
-            the Gaussian's covariance; or `colored+distribution`: offset and intensity difference.
+            the Gaussian's covariance; `colored+distribution`: offset and intensity difference; or `colored+ray`: depth
+            along the viewing ray over that of the Gaussian's plane, and intensity difference.
         color_std: standard deviation of intensity.
         noise: factor on the points' noise along their viewing rays, which widens every Gaussian for them.
         max_misfit: fraction of the depth; a point farther from its Gaussian's plane shows something else, and says
@@ -76,6 +78,7 @@ class Problem(eqx.Module):
     source: Observation  # camera frame
     surface: Surface
     T_world_coarse: jaxlie.SE3
+    depth_noise: Float[Array, "p"]  # as a fraction
     rays: Float[Array, "p 3"]  # noise of every point along its viewing ray, camera frame
     scale_unit: Float[Array, ""]  # of the scale's logarithm, which is the seventh unknown
     prior: Float[Array, "7 7"]  # root of the information that is there before
@@ -108,6 +111,7 @@ def pose_problem(
         source=source,
         surface=surface,
         T_world_coarse=T_world_coarse,
+        depth_noise=config.noise * uncertainty.depth,
         rays=config.noise * uncertainty.depth[:, None] * source.points,
         scale_unit=config.scale_noise * scale_unit,
         prior=prior,
@@ -162,11 +166,12 @@ def residuals(
 
 
 def rows_of(y: Float[Array, "7"], matches: Matches, problem: Problem, config: IcpConfig) -> Float[Array, "p 5"]:
-    """Plane, colour and whitened offset of every point for given matches, in standard deviations."""
+    """Plane or ray, colour and whitened offset of every point for given matches, in standard deviations."""
     T, scale = pose_of(y, problem)
     placed = transform(T, problem.source, scale)
     offset = placed.points - matches.means
-    plane = jnp.sum(offset * matches.normals, axis=-1) / matches.plane_std
+    distance = jnp.sum(offset * matches.normals, axis=-1)
+    plane, ray = distance / matches.plane_std, _along_ray(distance, T, matches, problem)
     light = matches.light + jnp.sum(matches.gradients * offset, axis=-1)
     shade = (light - intensity(placed.colors)) / config.color_std
     # The noise is the prediction's and grows with its scale; else a scale that shrinks all noisy points fits best.
@@ -176,16 +181,32 @@ def rows_of(y: Float[Array, "7"], matches: Matches, problem: Problem, config: Ic
     # A point beyond the gate costs what it would at the gate and pulls nowhere.
     edge = jnp.sqrt(config.max_mahalanobis_sq)
     is_inlier = matches.is_inlier[:, None]
+    has_plane, has_ray = config.residual == COLORED, config.residual == COLORED_RAY
+    across = jnp.where(has_ray, jnp.clip(ray, -edge, edge), plane)
     rows = jnp.concatenate(
         [
-            (config.residual == COLORED) * jnp.where(is_inlier, plane[:, None], edge),
+            (has_plane | has_ray) * jnp.where(is_inlier, across[:, None], edge),
             (config.residual != DISTRIBUTION) * jnp.where(is_inlier, jnp.clip(shade, -edge, edge)[:, None], edge),
-            (config.residual != COLORED) * jnp.where(is_inlier, white, edge / jnp.sqrt(3.0)),
+            ~(has_plane | has_ray) * jnp.where(is_inlier, white, edge / jnp.sqrt(3.0)),
         ],
         axis=-1,
     )
     valid = placed.valid
     return jnp.sqrt(problem.weight) * jnp.where(valid[:, None], rows, 0.0)
+
+
+def _along_ray(distance: Float[Array, "p"], T: jaxlie.SE3, matches: Matches, problem: Problem) -> Float[Array, "p"]:
+    """log of a point's depth over that at which its ray meets its Gaussian's plane, in standard deviations.
+
+    A prediction errs by a factor along the ray, and this is that factor's logarithm. Its derivatives by scale and
+    rotation have only the ray's direction in them. Those of `distance` have the point itself, and with it the very
+    error that they are multiplied by: in the mean that shrinks a frame by the square of its depth noise (errors in
+    variables).
+    """
+    depth = jnp.sum((matches.means - T.translation()) * matches.normals, axis=-1)  # of the plane, along its normal
+    depth = jnp.where(jnp.abs(depth) > 1e-6, depth, 1e-6)
+    std = jnp.sqrt(problem.depth_noise**2 + matches.plane_vars / depth**2)
+    return jnp.log(jnp.maximum(1.0 + distance / depth, LEAST_RATIO)) / std
 
 
 def data_information(

@@ -25,7 +25,7 @@ from emgs_jax.registration.icp import icp
 from emgs_jax.registration.noise import NUM_CELLS
 
 pytestmark = pytest.mark.slow  # the solver compiles for 10 s; the quick subset has test_localization
-RESIDUALS = {"colored": 0, "distribution": 1, "colored+distribution": 2}
+RESIDUALS = {"colored": 0, "distribution": 1, "colored+distribution": 2, "colored+ray": 3}
 NOISE = jnp.asarray(0.02), jnp.asarray(0.01)
 STARTS = [
     pose((0.02, -0.02, 0.01), (0.03, 0.02, -0.03)),

@@ -9,7 +9,15 @@ from scene import at
 
 from emgs_jax.ops.linalg import whitening
 from emgs_jax.registration.belief import root_information
-from emgs_jax.registration.problem import IcpConfig, Uncertainty, data_information, pose_problem, rows_of
+from emgs_jax.registration.problem import (
+    COLORED,
+    COLORED_RAY,
+    IcpConfig,
+    Uncertainty,
+    data_information,
+    pose_problem,
+    rows_of,
+)
 
 DISTRIBUTION, STD, DEPTH_NOISE = 1, 0.01, 0.03
 
@@ -49,6 +57,30 @@ def test_noise_along_the_rays_pulls_the_scale_nowhere(config):
     cost = lambda y: 0.5 * jnp.sum(rows_of(y, matches, problem, settings) ** 2)  # noqa: E731
     gradient = jax.grad(cost)(jnp.zeros(7))[6] / jnp.sum(problem.source.valid)
     assert abs(float(gradient)) < 0.1
+
+
+def test_depths_that_err_by_a_factor_pull_the_pose_nowhere_along_their_rays(config):
+    """Points at p exp(± ν ε): half of the squares have no gradient. By their distances in metres all shrinks by ν²."""
+    settings = config("slam/localization=default").localization.icp
+    settings = at(settings, "color_std", 1e9)
+    matches, problem = noisy_problem()
+    true = (matches.means - problem.T_world_coarse.translation()) @ problem.T_world_coarse.rotation().as_matrix()
+    half = len(true) // 2
+    errors = jnp.exp(DEPTH_NOISE * jnp.asarray(np.random.default_rng(0).normal(size=(half, 1)), jnp.float32))
+    noisy = true * jnp.concatenate([errors, 1.0 / errors])
+    problem = eqx.tree_at(lambda p: (p.source.points, p.depth_noise), problem, (noisy, jnp.full(2 * half, DEPTH_NOISE)))
+    twice = jnp.tile(matches.normals[:half], (2, 1))
+    matches = eqx.tree_at(lambda m: (m.normals, m.plane_vars), matches, (twice, jnp.zeros(2 * half)))
+
+    def step(residual: int) -> np.ndarray:
+        """Of Gauss and Newton, with all of the solve's seven unknowns."""
+        chosen = at(settings, "residual", residual)
+        rows, jacobian = (f(jnp.zeros(7), matches, problem, chosen) for f in (rows_of, jax.jacfwd(rows_of)))
+        rows, jacobian = np.asarray(rows, float).reshape(-1), np.asarray(jacobian, float).reshape(-1, 7)
+        return np.linalg.lstsq(jacobian, -rows, rcond=None)[0]
+
+    assert np.abs(step(COLORED_RAY)).max() < 0.01 * DEPTH_NOISE**2
+    assert step(COLORED)[6] * float(problem.scale_unit) < -0.5 * DEPTH_NOISE**2
 
 
 def test_the_information_of_the_points_does_not_depend_on_the_unit_of_the_seventh_unknown(config):
