@@ -109,7 +109,7 @@ REGISTRATION = [
             "the weight of the intensity inverted",
         ),
         ("problem.rays @ T.rotation().as_matrix().T", "problem.rays", "rays stay in the camera's frame"),
-        ("(config.residual != COLORED) * jnp", "1.0 * jnp", "`colored` with the offset"),
+        ("~(has_plane | has_ray) * jnp", "1.0 * jnp", "`colored` with the offset"),
     ),
     *own("registration/icp", "registration/test_icp")(
         ("candidates_at(y, problem, config)", "candidates_at(0.0 * y, problem, config)", "it never follows the points"),
