@@ -57,6 +57,8 @@ def sweep(config: DictConfig, folder: Path) -> list[dict[str, Any]]:
         raise ValueError("map= is for run and evaluate: a sweep makes its own maps")
     if config.graph:
         raise ValueError("graph= is for run and evaluate: a sweep steps many maps at once, and no loop closes in them")
+    if config.view:
+        raise ValueError("view= is for run and evaluate: a sweep maps many settings at once")
     axes = read_axes(config)
     grid = variants(config, axes)
     for note in notes(config, axes):

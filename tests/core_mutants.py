@@ -385,9 +385,10 @@ STAGES = [
     ),
     *own("semantics", "test_semantics")(
         ("(leads >= margin) &", "", "an answer that is hardly closer than another"),
-        ("& (cosines >= min_cosine)", "", "an answer that is far from every word"),
+        ("& (words >= min_cosine)", "", "an answer that is far from every word"),
         ("jnp.where(is_best, second, highest)", "highest", "a word is its own rival"),
-        ("jnp.concatenate([words, rivals])", "words", "rivals are not heard"),
+        ("known[:, count:], _is_known", "known[:, :0], _is_known", "rivals are not heard"),
+        ("jnp.concatenate([rivals, words], axis=-1)", "jnp.concatenate([words, rivals[:, :0]], axis=-1)", "likewise"),
         (
             "jnp.where(is_best, -1.0, known)",
             "jnp.where(is_best, 0.0, known)",
