@@ -1,6 +1,7 @@
 """The notebooks: how they are kept, and that each runs from a new folder and finds what its stages promise."""
 
 import ast
+import html
 import json
 from pathlib import Path
 
@@ -111,6 +112,7 @@ def test_own_images_become_a_map_of_the_room_that_they_show(monkeypatch, tmp_pat
     scale = (aligned * truth).sum() / (path**2).sum()
     np.testing.assert_allclose(scale * aligned, truth, atol=0.1 * np.linalg.norm(truth, axis=1).max())
     assert found["metrics"]["frames/lost"] == 0 and found["valid"].sum() > 100
+    assert html.unescape(found["report"].data).count((found["results"] / "report.html").read_text()) == 1
 
 
 def _rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
