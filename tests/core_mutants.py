@@ -273,6 +273,7 @@ STAGES = [
         (".at[rows].max(omega)", ".at[rows].add(omega)", "γ from the sum of ω"),
         ("softmax(-0.5 * distance_sq", "softmax(-distance_sq", "eq. 5 with twice the exponent"),
         ("jnp.maximum(cosine, 0.0)", "jnp.abs(cosine)", "opposite meanings merge"),
+        ("+ (1.0 - config.cosine_weight)", "", "features that decide nothing merge nothing"),
         ("map_splats.covs[rows] + candidate_splats.covs[:, None]", "map_splats.covs[rows]", "one of two covariances"),
         ("(relative >= -config.front_margin)", "(relative >= -config.back_margin)", "one margin for both sides"),
         ("depth / surface - 1.0", "depth - surface", "margins in metres"),
