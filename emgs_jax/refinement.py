@@ -31,6 +31,7 @@ class RefinementConfig(eqx.Module):
         depth_condition: where a candidate has to lie within the margins: of the rendered depth at its own `pixel`
             (printed); or there and of each Gaussian's plane, so that `pairs` never join two sides of a depth edge.
         min_normal_cos: a pair whose normals differ more does not merge; `-inf` as printed.
+        cosine_weight: how much of ω is the features' cosine: 1 as printed; 0: features decide nothing here.
         max_splat_std: pixels of the rendered image; a wider candidate is scattered points, not a surface, and is
             dropped; `inf` as printed.
         render: how both sets are drawn.
@@ -44,6 +45,7 @@ class RefinementConfig(eqx.Module):
     back_margin: Float[Array, "*b"] = traced(low=0, high=math.inf)
     depth_condition: Float[Array, "*b"] = choice("pixel", "pairs")
     min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
+    cosine_weight: Float[Array, "*b"] = traced(low=0, high=1)
     max_splat_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
     render: RenderConfig
     average: AverageConfig
@@ -118,7 +120,8 @@ def merge_weights(
         mapped, fresh = (safe_normalize(g.features) for g in (old, candidates))
         cosine = jnp.einsum("gkf,gf->gk", mapped[rows], fresh)
         both = has_feature(candidates.features)[:, None] & has_feature(old.features)[rows]
-        omega = omega * jnp.where(both, jnp.maximum(cosine, 0.0), 1.0)  # opposite meanings do not merge
+        share = config.cosine_weight * jnp.maximum(cosine, 0.0) + (1.0 - config.cosine_weight)
+        omega = omega * jnp.where(both, share, 1.0)  # opposite meanings do not merge
     is_match = found & (candidates.valid & on_surface)[:, None] & (distance_sq < config.max_mahalanobis_sq_2d)
     return jnp.where(is_match, omega, 0.0)
 

@@ -64,18 +64,37 @@ def relevance(
         ValueError: the embeddings' width differs from the map's, or there is no word.
     """
     _check_width(gaussians, words)
-    texts = jnp.concatenate([words, rivals])
-    known = similarities(gaussians, texts)
-    best = jnp.argmax(known, axis=-1)
-    is_best = jnp.arange(texts.shape[0]) == best[:, None]
+    known, count = similarities(gaussians, jnp.concatenate([words, rivals])), words.shape[0]
+    return answers(known[:, :count], known[:, count:], _is_known(gaussians), margin, min_cosine)
+
+
+def answers(
+    words: Float[Array, "n c"],
+    rivals: Float[Array, "n r"],
+    is_known: Bool[Array, "n"],
+    margin: Float[Array, ""],
+    min_cosine: Float[Array, ""],
+) -> Relevance:
+    """`relevance` by the cosines alone; a rival that is as close as the closest word wins.
+
+    Args:
+        words: cosine of every Gaussian with each word that is asked for, at least one.
+        rivals: likewise with what is not asked for; perhaps none.
+        is_known: what is False answers to nothing.
+        margin: the lead that an answer needs.
+        min_cosine: the cosine that an answer needs.
+    """
+    count, known = rivals.shape[-1], jnp.concatenate([rivals, words], axis=-1)
+    best = jnp.argmax(known, axis=-1)  # the first of equals
+    is_best = jnp.arange(known.shape[-1]) == best[:, None]
     highest = jnp.max(known, axis=-1, keepdims=True)
     second = jnp.max(jnp.where(is_best, -1.0, known), axis=-1, keepdims=True)
-    cosines, is_best = known[:, : words.shape[0]], is_best[:, : words.shape[0]]
-    leads = cosines - jnp.where(is_best, second, highest)
-    is_answer = is_best & (leads >= margin) & (cosines >= min_cosine)
-    is_answer &= _is_known(gaussians)[:, None]
+    is_best = is_best[:, count:]
+    leads = words - jnp.where(is_best, second, highest)
+    is_answer = is_best & (leads >= margin) & (words >= min_cosine)
+    is_answer &= is_known[:, None]
     labels = jnp.where(jnp.any(is_answer, axis=-1), jnp.argmax(is_answer, axis=-1), -1)
-    return Relevance(cosines, leads, labels)
+    return Relevance(words, leads, labels)
 
 
 @full_precision

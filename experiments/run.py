@@ -13,6 +13,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog
 from emgs_jax.prior.base import Prior
+from emgs_jax.report.live import LiveView, live_view
 from emgs_jax.report.metrics import (
     compared_text,
     describe,
@@ -47,21 +48,24 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         raise ValueError(
             "baseline= fuses every frame where it was placed, and graph= moves poses afterwards: use graph=none with it"
         )
-    with Clock().watching() as clock:
+    with contextlib.ExitStack() as stack:
+        clock = stack.enter_context(Clock().watching())
         with clock.phase("setup"):
             slam, evaluation, densify = (build(config, name) for name in ("slam", "evaluation", "densify"))
             graph, fused = graph_config(config), baseline_configs(config)
             dataset = build_dataset(config)
             prior = build_prior(config, dataset)
             saved = load_saved(config.map, config.map_mode, graph, dataset.intrinsics, float(slam.fit.min_std))
-        session = new_run(dataset, slam, clock, graph=graph, saved=saved)
+            session = new_run(dataset, slam, clock, graph=graph, saved=saved)
+            watched = build(config, "view") if config.view else None
+            live = stack.enter_context(live_view(watched, session, densify.render, prior, dataset.kept))
         baselines = Baselines(fused, session, dataset)
         settings = OmegaConf.to_container(config, resolve=True)
         origin = provenance(settings, dataset, prior.provenance)
         keeper = Keeper(folder / CHECKPOINT_FILE, build(config, "checkpoint"), signature(origin))
         for note in [*filter(None, [keeper.note]), *claim_folder(folder, keeper.found is not None)]:
             tqdm.write(note)
-        raw = _map(session, dataset, prior, (baselines, evaluation), folder, keeper)
+        raw = _map(session, dataset, prior, (baselines, evaluation), folder, keeper, live)
         save_progress(folder, session)
         with clock.phase("densify"):
             labelled = labelled_map(session, prior)
@@ -81,6 +85,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     write_metrics(folder / "metrics.json", metrics)
     keeper.drop()
     write_report(read_run(folder), dataset)
+    if live is not None:
+        notes = [*notes, f"the live view has ended; emgs view {folder} shows the finished run"]
     for note in [*frame_lines(session.records, len(dataset.skipped)), *notes]:
         tqdm.write(note)
     return metrics
@@ -93,6 +99,7 @@ def _map(
     compared: tuple[Baselines, EvaluationConfig],
     folder: Path,
     keeper: Keeper,
+    live: LiveView | None,
 ) -> RawPrior:
     """Map all frames and log each; returns what the prior alone says. What an interrupted run has is written."""
     if keeper.found is not None:
@@ -108,9 +115,10 @@ def _map(
         for index, reason in dataset.skipped.items():
             log.append(to_line(FrameRecord(index, None, None, "skipped", reason)))
         try:
+            views = map_frames(session, dataset, prior, keeper)
             with session.clock.phase("raw_prior"):
                 return gather(
-                    map_frames(session, dataset, prior, keeper),
+                    views if live is None else live.watch(views, session),
                     evaluation,
                     dataset.has_ground_truth,
                     baselines,

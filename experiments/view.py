@@ -7,6 +7,7 @@ from omegaconf import DictConfig
 from emgs_jax.ops.ranges import Range
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.viewer import Viewer
+from emgs_jax.report.viewer_run import shown
 from emgs_jax.running.values import Declared, check_value
 
 from .command import command
@@ -16,7 +17,7 @@ from .report import positional
 def view(config: DictConfig) -> Viewer:
     """Serve the run of a config."""
     check_value("port", config.port, Declared(frozenset({int}), range=Range(1, 65535)))
-    return Viewer(read_run(Path(str(config.folder))), config.port)
+    return Viewer(shown(read_run(Path(str(config.folder)))), config.port)
 
 
 @command("view", positional)

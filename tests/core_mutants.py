@@ -277,6 +277,7 @@ STAGES = [
         (".at[rows].max(omega)", ".at[rows].add(omega)", "γ from the sum of ω"),
         ("softmax(-0.5 * distance_sq", "softmax(-distance_sq", "eq. 5 with twice the exponent"),
         ("jnp.maximum(cosine, 0.0)", "jnp.abs(cosine)", "opposite meanings merge"),
+        ("+ (1.0 - config.cosine_weight)", "", "features that decide nothing merge nothing"),
         ("map_splats.covs[rows] + candidate_splats.covs[:, None]", "map_splats.covs[rows]", "one of two covariances"),
         ("(relative >= -config.front_margin)", "(relative >= -config.back_margin)", "one margin for both sides"),
         ("depth / surface - 1.0", "depth - surface", "margins in metres"),
@@ -389,9 +390,10 @@ STAGES = [
     ),
     *own("semantics", "test_semantics")(
         ("(leads >= margin) &", "", "an answer that is hardly closer than another"),
-        ("& (cosines >= min_cosine)", "", "an answer that is far from every word"),
+        ("& (words >= min_cosine)", "", "an answer that is far from every word"),
         ("jnp.where(is_best, second, highest)", "highest", "a word is its own rival"),
-        ("jnp.concatenate([words, rivals])", "words", "rivals are not heard"),
+        ("known[:, count:], _is_known", "known[:, :0], _is_known", "rivals are not heard"),
+        ("jnp.concatenate([rivals, words], axis=-1)", "jnp.concatenate([words, rivals[:, :0]], axis=-1)", "likewise"),
         (
             "jnp.where(is_best, -1.0, known)",
             "jnp.where(is_best, 0.0, known)",

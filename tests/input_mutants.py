@@ -17,6 +17,7 @@ VALUES = ("tests/running/test_values.py",)
 ROSBAG = ("tests/data/test_rosbag.py",)
 POSED = ("tests/data/test_posed_images.py",)
 VIEWER = ("tests/report/test_viewer.py",)
+LIVE = ("tests/report/test_live.py",)
 SCALING = ("tests/report/test_scaling.py",)
 EXPORT = ("tests/report/test_export.py",)
 
@@ -37,8 +38,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/report/viewer_layers.py",
-        "(best >= min_cosine) & (best > rival)",
-        "best >= min_cosine",
+        "for rows in (wanted, against)),",
+        "for rows in (wanted, against[:0])),",
         VIEWER,
         "words that are not asked for change nothing",
     ),
@@ -55,6 +56,27 @@ MUTANTS = (
         'return "Words of this run: " + ", ".join(self._names)',
         VIEWER,
         "names from a file are markup in the browser",
+    ),
+    Mutant(
+        "emgs_jax/report/live.py",
+        "time.monotonic() >= self._due and self._is_idle()",
+        "time.monotonic() >= self._due",
+        LIVE,
+        "pictures queue up behind one that takes long",
+    ),
+    Mutant(
+        "emgs_jax/report/live.py",
+        "end + max(self._every_s, (end - begin) / SHARE)",
+        "end",
+        LIVE,
+        "a run is drawn all the time",
+    ),
+    Mutant(
+        "emgs_jax/report/viewer.py",
+        "            if is_last:",
+        "            if run.frames:",
+        LIVE,
+        "who looks at an earlier frame is taken to the last",
     ),
     Mutant(
         "emgs_jax/report/scaling.py",

@@ -349,7 +349,8 @@ def refine(g, weight, candidates, pose, camera, config):
         exponent = np.exp(-0.5 * np.array(distances_sq))
         for k, distance_sq, omega in zip(nearest, distances_sq, exponent / exponent.sum(), strict=True):
             features = g["features"][k], candidates["features"][j]
-            omega *= max(np.dot(*features), 0.0) if all(f.any() for f in features) else 1.0
+            told = float(config.cosine_weight) * (max(np.dot(*features), 0.0) - 1.0)
+            omega *= 1.0 + told if all(f.any() for f in features) else 1.0
             if distance_sq < config.max_mahalanobis_sq_2d and omega > 0:
                 shares.setdefault(k, []).append((j, omega))
                 is_fresh[j] = False

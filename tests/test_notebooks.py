@@ -1,6 +1,7 @@
 """The notebooks: how they are kept, and that each runs from a new folder and finds what its stages promise."""
 
 import ast
+import html
 import json
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from tiny_run import TINY
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
 IDS = [path.stem for path in NOTEBOOKS]
 AXES = "grid=one_at_a_time axes={slam.em.support:[printed,normalized],slam.em.noise:[0.0,1.0]}"
+MUTE = "slam.em.feature_weight=0.0 slam.refinement.cosine_weight=0.0 axes={slam.em.feature_weight:[0.0,20.0]}"
 GRID = "axes={slam.em.max_mahalanobis_sq:[1.0,9.0],slam.em.max_log_gap:[8.0,inf]}"
 
 
@@ -37,8 +39,8 @@ def execute(number: int, overrides: str, monkeypatch, folder: Path) -> dict:
     return variables
 
 
-def test_there_are_four_notebooks_in_the_order_of_reading():
-    assert IDS == ["01_one_step", "02_readings", "03_threshold_sweep", "04_own_images"]
+def test_there_are_five_notebooks_in_the_order_of_reading():
+    assert IDS == ["01_one_step", "02_readings", "03_threshold_sweep", "04_own_images", "05_semantics"]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=IDS)
@@ -111,6 +113,20 @@ def test_own_images_become_a_map_of_the_room_that_they_show(monkeypatch, tmp_pat
     scale = (aligned * truth).sum() / (path**2).sum()
     np.testing.assert_allclose(scale * aligned, truth, atol=0.1 * np.linalg.norm(truth, axis=1).max())
     assert found["metrics"]["frames/lost"] == 0 and found["valid"].sum() > 100
+    assert html.unescape(found["report"].data).count((found["results"] / "report.html").read_text()) == 1
+
+
+@pytest.mark.slow
+def test_wrong_features_cost_classes_and_move_geometry_only_where_they_have_a_weight(monkeypatch, tmp_path):
+    """Oracle: where nothing looks at features but the layers' sign, wrong ones move nothing but that."""
+    found = execute(5, " ".join((*TINY, MUTE)), monkeypatch, tmp_path)
+    shares, seeds, rows = found["shares"], found["seeds"], found["rows"]
+    assert set(rows) == {(share, seed) for share in shares for seed in seeds}
+    for seed in seeds:
+        mute, loud = ([rows[share, seed][place] for share in shares] for place in (0, 1))
+        assert mute[0]["segmentation/accuracy_percent"] > mute[-1]["segmentation/accuracy_percent"] + 10
+        assert len({row["trajectory/ate_sim3_m"] for row in mute}) == 1
+        assert loud[-1]["map/num_gaussians"] > mute[-1]["map/num_gaussians"]  # what is not fused is new
 
 
 def _rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -223,6 +223,18 @@ def test_the_distance_gate_is_on_the_squared_distance_under_both_covariances(set
         assert info.num_merged == expected
 
 
+@pytest.mark.parametrize("feature, cosine", [((0.8, 0.6), 0.8), ((-1.0, 0.0), 0.0)])
+def test_the_weight_of_the_cosine_says_how_much_features_decide(settings, camera, feature, cosine):
+    """One Gaussian, one candidate: what α = 1 gains is ω, of which 1 - w is there whatever the features are."""
+    old, new = discs((0, 0, 2.0), std=0.3), discs((0.02, 0.01, 2.01), std=0.3, feature=feature)
+    counted = at(settings, "average.gain", 1.0)
+    for share in (0.0, 0.25, 1.0):
+        merged, _, info = run(at(counted, "cosine_weight", share), camera, new, old)
+        omega = share * cosine + 1.0 - share
+        np.testing.assert_allclose(merged.weight, [1.0 + omega], rtol=1e-6)
+        assert info.num_merged == (omega > 0)
+
+
 def test_opposite_features_never_merge(settings, camera):
     merged, fresh, info = run(settings, camera, discs((0.02, 0, 2.0), feature=(-1.0, 0.0)))
     assert info.num_merged == 0 and fresh.valid.all()

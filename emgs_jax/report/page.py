@@ -7,7 +7,7 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from emgs_jax.io.files import atomic_write, jsonable
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report import page_words
 from emgs_jax.report.overview import class_colors, view_from_above
-from emgs_jax.report.page_map import COV_UNIT, map_layers, packed, thinned
+from emgs_jax.report.page_map import COV_UNIT, feature_layer, map_layers, packed, thinned
 from emgs_jax.report.page_pictures import Views, draw_views, jpeg
 from emgs_jax.report.page_strip import PlacedPaths, key_of, placed_paths, strip
 from emgs_jax.report.recorded_run import REPORT_FILE, RecordedRun
@@ -35,6 +35,7 @@ LAYERS = {
     "color": "colour",
     "class": "class",
     "similarity": "similarity to a class",
+    "feature": "features (main directions)",
     "normal": "normals",
     "existence": "certainty",
     "updates": "updates",
@@ -66,7 +67,7 @@ def write_report(run: RecordedRun, dataset: Dataset | None, note: str = "") -> P
     """
     evaluation = run.provenance["config"].get("evaluation", {})
     paths = placed_paths(run, evaluation.get("alignment") == "sim3")
-    layers, config = map_layers(run.map, run.text), render_config(run)
+    layers, config = map_layers(run.map, run.text) | feature_layer(run.map), render_config(run)
     rows = sorted({int(row) for row in np.linspace(0, len(run.poses) - 1, min(_MAX_PICTURES, len(run.poses)))})
     placed = run.is_placed
     views = draw_views(run.map, run.poses, rows, placed, run.camera, config, dataset)
@@ -157,7 +158,7 @@ def _page(run: RecordedRun, paths: PlacedPaths, views: Views, about: dict[str, A
         "style": source("page.css"),
         "head": page_words.head(run, again),
         "overview": _overview(run),
-        "layers": _layers(run),
+        "layers": _layers(run, {array["name"] for array in about["arrays"]}),
         "words": _options({-1: "all"} | dict(enumerate(about["classes"]))),
         "paths": _path_boxes(about),
         "depths": f"{views.near:.1f} to {views.far:.1f} m",
@@ -206,11 +207,10 @@ def _options(values: Mapping[Any, str]) -> str:
     return "".join(f'<option value="{_text(str(value))}">{_text(name)}</option>' for value, name in values.items())
 
 
-def _layers(run: RecordedRun) -> str:
+def _layers(run: RecordedRun, there: Collection[str]) -> str:
     """Without features there are no classes to show, and the page says so."""
-    known = {
-        name: words for name, words in LAYERS.items() if run.text is not None or name not in ("class", "similarity")
-    }
+    unknown = {"feature"} - {*there} | ({"class", "similarity"} if run.text is None else set())
+    known = {name: words for name, words in LAYERS.items() if name not in unknown}
     missing = "" if run.text is not None else "<option disabled>class: the map has no classes</option>"
     return _options(known) + missing
 

@@ -13,11 +13,11 @@ import numpy as np
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.gaussian_map import GaussianMap, confirmed
 from emgs_jax.gaussians import has_feature
-from emgs_jax.semantics import similarities
+from emgs_jax.semantics import principal_colors, similarities
 
 COV_UNIT = 1e-4  # m²; float16 then holds standard deviations from .1 mm to 2.5 m
 _LARGEST_HALF = 65504.0
-_similarities = eqx.filter_jit(similarities)
+_similarities, _feature_colors = eqx.filter_jit(similarities), eqx.filter_jit(principal_colors)
 _UPPER = np.triu_indices(3)
 
 
@@ -53,6 +53,18 @@ def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.nd
     is_known = np.asarray(has_feature(map.gaussians.features))[rows]
     labels = np.where(is_known, cosines.argmax(1), -1).astype(np.int16)
     return layers | {"label": labels, "similarity": _bytes(cosines)}
+
+
+def feature_layer(map: GaussianMap) -> dict[str, np.ndarray]:
+    """`feature` uint8 (n, 3), the main directions of the features as RGB (`principal_colors`); empty without features.
+
+    Rows as in `map_layers`.
+    """
+    gaussians = confirmed(map)
+    rows = np.flatnonzero(gaussians.valid)
+    if not np.asarray(gaussians.features)[rows].any():
+        return {}
+    return {"feature": _bytes(np.asarray(_feature_colors(gaussians))[rows])}
 
 
 def thinned(layers: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarray]:

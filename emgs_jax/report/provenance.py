@@ -63,8 +63,8 @@ def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -
 
 
 def signature(block: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a provenance decides the bits of a result: all but where things are and when to write."""
-    ignored = ("compilation_cache", "checkpoint", "checksums")
+    """What of a provenance decides the bits of a result: all but where things are, when to write and who watches."""
+    ignored = ("compilation_cache", "checkpoint", "checksums", "view")
     return {**block, "config": {key: value for key, value in block["config"].items() if key not in ignored}}
 
 

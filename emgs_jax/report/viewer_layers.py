@@ -3,19 +3,23 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import matplotlib
 import numpy as np
 
 from emgs_jax.report.overview import class_colors
 from emgs_jax.report.page_map import COV_UNIT
+from emgs_jax.semantics import answers
 
-LAYERS = ("colour", "class", "normal", "certainty")
+LAYERS = ("colour", "class", "features", "normal", "certainty")
 NO_CLASS = 0.35  # grey of what has none
 REACH = 3.0  # standard deviations from its centre at which a Gaussian still stops a ray
 SURFACE = 0.03  # of the distance; Gaussians that are met so near behind the first are of one surface with it
+_answers = eqx.filter_jit(answers)
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
-Layers = Mapping[str, np.ndarray]  # as `page_map.map_layers` makes them
+Layers = Mapping[str, np.ndarray]  # as `page_map.map_layers` makes them, perhaps with `feature_layer`
 
 
 class Answer(NamedTuple):
@@ -43,6 +47,8 @@ def colors_of(layers: Layers, name: str) -> np.ndarray:
     if name == "class" and "label" in layers:
         known = np.vstack([class_colors(layers["similarity"].shape[1]), np.full(3, NO_CLASS)])  # row -1 is the last
         return _bytes(known[layers["label"]])
+    if name == "features":
+        return layers["feature"]
     if name == "normal":
         return _bytes(0.5 + layers["normal"] / 254.0)
     if name == "certainty":
@@ -65,19 +71,25 @@ def find_words(text: str, names: Sequence[str]) -> tuple[list[int], int]:
     return rows, num_unknown
 
 
-def ask(similarity: np.ndarray, wanted: Sequence[int], against: Sequence[int], min_cosine: float) -> Answer:
-    """Look for words in a map.
+def ask(layers: Layers, wanted: Sequence[int], against: Sequence[int], min_cosine: float) -> Answer:
+    """Look for words in a map, as `semantics.answers` does without a margin.
 
     Args:
-        similarity: cosines with all classes, uint8 (n, c), 255 = 1.
+        layers: with classes.
         wanted: rows of the words that are asked for, at least one.
         against: rows of words that are not.
         min_cosine: that an answer needs.
     """
-    cosines = similarity.astype(np.float32) / 255.0
-    best = cosines[:, [*wanted]].max(axis=1)
-    rival = cosines[:, [*against]].max(axis=1) if len(against) else np.full(len(best), -1.0)
-    return Answer(best, (best >= min_cosine) & (best > rival))
+    count = len(layers["label"])
+    fill = (0, (1 << (count - 1).bit_length()) - count)  # few sizes, as each compiles once
+    cosines = np.pad(layers["similarity"], (fill, (0, 0))).astype(np.float32) / 255.0
+    is_known = np.pad(layers["label"] >= 0, fill)
+    found = _answers(
+        *(jnp.asarray(cosines[:, [*rows]]) for rows in (wanted, against)),
+        jnp.asarray(is_known),
+        *(jnp.asarray(value, jnp.float32) for value in (0.0, min_cosine)),
+    )
+    return Answer(cosines[:count, [*wanted]].max(axis=1), np.asarray(found.labels)[:count] >= 0)
 
 
 def highlighted(colors: np.ndarray, answer: Answer) -> np.ndarray:

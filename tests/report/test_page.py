@@ -54,6 +54,9 @@ def test_the_page_holds_the_map_as_it_is(folder):
     np.testing.assert_array_equal(arrays["normal"], np.tile([0, 0, -127], (len(walls.means), 1)))
     np.testing.assert_array_equal(arrays["label"][:, 0], np.asarray(walls.features).argmax(1))
     np.testing.assert_array_equal(arrays["similarity"], 255 * np.asarray(walls.features))
+    sofa = np.asarray(walls.features)[:, 1] > 0.5  # two features differ along one direction, from one end to the other
+    shown = [{tuple(color.tolist()) for color in arrays["feature"][rows]} for rows in (sofa, ~sofa)]
+    assert shown in ([{(255, 128, 128)}, {(0, 128, 128)}], [{(0, 128, 128)}, {(255, 128, 128)}])
     np.testing.assert_allclose(arrays["poses"].reshape(6, 3, 4)[:, 0, 3], np.linspace(0, 0.5, 6), atol=1e-6)
     assert np.isnan(arrays["online"][0]).all() and np.isfinite(arrays["online"][1:]).all()
 

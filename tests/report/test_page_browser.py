@@ -118,14 +118,14 @@ def test_another_class_recolours_the_map(page):
 
 def test_every_layer_is_drawn(page):
     pictures = []
-    for name in ("color", "class", "similarity", "normal", "existence", "birth"):
+    for name in ("color", "class", "similarity", "feature", "normal", "existence", "birth"):
         page.run(
             "const s = document.getElementById('layer'); s.value = arguments[0]; s.dispatchEvent(new Event('input'))",
             name,
         )
         pictures.append(drawn_by_the_page(page, 0, SIZE, INTRINSICS))
     different = [np.abs(a - b).mean() > 0.02 for k, a in enumerate(pictures) for b in pictures[:k]]
-    assert sum(different) >= 14  # of 15 pairs: in this map certainty and birth are each the same everywhere
+    assert sum(different) >= 20  # of 21 pairs: in this map certainty and birth are each the same everywhere
     page.run("const s = document.getElementById('layer'); s.value = 'color'; s.dispatchEvent(new Event('input'))")
 
 

@@ -16,6 +16,7 @@ from emgs_jax.report.page_map import map_layers
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.viewer import HOST, Viewer
 from emgs_jax.report.viewer_layers import ask, colors_of, covariances, find_words, highlighted, picked
+from emgs_jax.report.viewer_run import shown
 from emgs_jax.running import configure
 from experiments.view import view
 
@@ -48,13 +49,21 @@ def test_words_are_class_names_also_while_they_are_typed(text, rows, num_unknown
 
 def test_an_answer_is_close_enough_and_closer_than_to_what_is_not_asked_for():
     similarity = np.array([[255, 0, 0], [204, 230, 0], [100, 0, 0], [204, 204, 0], [0, 0, 255]], np.uint8)
-    assert ask(similarity, [0], [], 0.5).is_found.tolist() == [True, True, False, True, False]
-    assert ask(similarity, [0], [1], 0.5).is_found.tolist() == [True, False, False, False, False]
-    assert ask(similarity, [0, 2], [], 0.5).is_found.tolist() == [True, True, False, True, True]
-    np.testing.assert_allclose(ask(similarity, [0], [1], 0.5).cosines, similarity[:, 0] / 255, rtol=1e-6)
-    colors = np.full((5, 3), 200, np.uint8)
-    shown = highlighted(colors, ask(similarity, [0], [1], 0.5))
-    assert (shown[1:] == 50).all() and shown[0].max() > 150
+    layers = {"similarity": similarity, "label": np.array([0, 1, 0, 0, 2], np.int16)}
+
+    def found(*question):
+        return ask(layers, *question).is_found.tolist()
+
+    assert found([0], [], 0.5) == [True, True, False, True, False]
+    assert found([0], [1], 0.5) == [True, False, False, False, False], "as close to both is no answer"
+    assert found([0, 2], [], 0.5) == [True, True, False, True, True]
+    assert found([0], [0], 0.5) == [False] * 5
+    layers["label"][0] = -1  # without a feature
+    assert found([0], [], 0.0) == [False, True, True, True, True]
+    np.testing.assert_allclose(ask(layers, [0], [1], 0.5).cosines, similarity[:, 0] / 255, rtol=1e-6)
+    layers["label"][0] = 0
+    colors = highlighted(np.full((5, 3), 200, np.uint8), ask(layers, [0], [1], 0.5))
+    assert (colors[1:] == 50).all() and colors[0].max() > 150
 
 
 def test_a_ray_meets_the_first_gaussian_and_none_behind_it():
@@ -88,7 +97,7 @@ def test_layers_are_those_of_the_map(run):
 @pytest.fixture(scope="module")
 def viewer(run):
     pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
-    viewer = Viewer(run, free_port())
+    viewer = Viewer(shown(run), free_port())
     yield viewer
     viewer.stop()
 
@@ -101,10 +110,10 @@ def test_it_listens_on_this_machine_only(viewer):
 def test_words_and_layers_recolour_what_is_served(viewer):
     walls = two_walls()
     is_sofa = np.asarray(walls.features)[:, 1] > 0.5
-    before = np.array(viewer.splats.rgbs)
+    before = np.array(viewer.scene.splats.rgbs)
     viewer.words.value = "sofa"
     viewer.recolor()
-    found = np.array(viewer.splats.rgbs)
+    found = np.array(viewer.scene.splats.rgbs)
     assert found[is_sofa].max(1).min() > 130 and found[~is_sofa].max() < 70
     assert f"{is_sofa.sum():,} of {len(is_sofa):,}" in viewer.answer.content
     viewer.against.value = "sofa"
@@ -113,10 +122,10 @@ def test_words_and_layers_recolour_what_is_served(viewer):
     viewer.words.value = viewer.against.value = ""
     viewer.layer.value = "normal"
     viewer.recolor()
-    np.testing.assert_array_equal(np.array(viewer.points.colors), colors_of(viewer.layers, "normal"))
+    np.testing.assert_array_equal(np.array(viewer.scene.points.colors), colors_of(viewer.layers, "normal"))
     viewer.layer.value = "colour"
     viewer.recolor()
-    np.testing.assert_array_equal(np.array(viewer.splats.rgbs), before)
+    np.testing.assert_array_equal(np.array(viewer.scene.splats.rgbs), before)
 
 
 def test_a_click_tells_the_numbers_of_the_near_wall(viewer):
@@ -135,12 +144,12 @@ def test_names_from_a_file_are_text_and_no_markup(tmp_path):
     found = read_run(folder)
     found.frames[0]["reason"] = "<img src=x onerror=alert(1)>"
     hostile = replace(found, text=found.text.__class__(("<script>", "b"), found.text.vectors, (), {}))
-    viewer = Viewer(hostile, free_port())
+    viewer = Viewer(shown(hostile), free_port())
     try:
         viewer.words.value = "<script>"
         viewer.recolor()
-        shown = viewer.answer.content + viewer.facts.content + viewer._known()
-        assert "<script" not in shown and "<img" not in shown and "&lt;script&gt;" in shown
+        said = viewer.answer.content + viewer.facts.content + viewer._known()
+        assert "<script" not in said and "<img" not in said and "&lt;script&gt;" in said
     finally:
         viewer.stop()
 
@@ -149,7 +158,7 @@ def test_a_map_without_features_says_what_a_text_needs(tmp_path):
     pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
     folder = written_run(tmp_path / "run")
     (folder / "text.npz").unlink()
-    viewer = Viewer(read_run(folder), free_port())
+    viewer = Viewer(shown(read_run(folder)), free_port())
     try:
         viewer.words.value = "sofa"
         viewer.recolor()
@@ -170,7 +179,7 @@ def test_a_taken_port_an_incomplete_run_and_a_missing_extra_are_clear(run, tmp_p
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "viser", None)
         with pytest.raises(ValueError, match=r'pip install "emgs_jax\[viewer\]"'):
-            Viewer(run, free_port())
+            Viewer(shown(run), free_port())
     pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
     with socket.socket() as taken:
         taken.bind((HOST, 0))

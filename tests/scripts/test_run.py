@@ -1,6 +1,7 @@
 """The script: files, metrics, interruption, bad input; oracle: the truth, reloading, and a second process."""
 
 import json
+import socket
 import subprocess
 import sys
 from functools import cache
@@ -132,6 +133,19 @@ def test_baselines_stand_beside_ours_and_change_nothing_else(tmp_path):
         assert metrics[f"{prefix}rendering/coverage_percent"] > 80.0
     same = [key for key in KEYS if key.startswith(("trajectory/", "reconstruction", "rendering/"))]
     assert {key: metrics[key] for key in same} == {key: exact_run()[1][key] for key in same}
+
+
+@pytest.mark.slow
+def test_a_run_that_is_watched_has_the_bits_of_one_that_is_not(tmp_path, capsys):
+    pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    experiments.run.run(compose("prior.level=0", "view=live", f"view.port={port}"), tmp_path)
+    for name in ("map.npz", "trajectory.txt"):
+        assert (tmp_path / name).read_bytes() == (exact_run()[0] / name).read_bytes()
+    said = capsys.readouterr().out
+    assert f"http://127.0.0.1:{port} shows the run" in said and f"emgs view {tmp_path} shows the finished" in said
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-// What a Gaussian's colour says: its own colour, class, similarity to a class, normal, and how sure it is.
+// What a Gaussian's colour says: its own colour, class, similarity to a class, feature, normal, and how sure it is.
 "use strict";
 
 // Turbo (A. Mikhailov, 2019) as polynomials; share in [0, 1] to RGB in [0, 255].
@@ -51,6 +51,8 @@ class Layers {
         const label = arrays.label[row];
         color = label < 0 ? NO_CLASS : ABOUT.classColors[label];
         if (word >= 0 && label !== word) color = faded(own);
+      } else if (name === "feature") {
+        color = arrays.feature.subarray(3 * row, 3 * row + 3);
       } else if (name === "normal") {
         color = [0, 1, 2].map((k) => 127.5 + arrays.normal[3 * row + k]);
       } else if (values) {

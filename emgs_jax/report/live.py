@@ -1,0 +1,141 @@
+"""A run in the browser while it maps: how far it has come, every few seconds, from a thread of its own.
+
+A step makes new arrays and leaves the old ones as they are, so that the thread reads those of the last step while the
+next one is made. The run waits for nothing that is drawn.
+"""
+
+import contextlib
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from tqdm import tqdm
+
+from emgs_jax.features.text import TextEmbeddings
+from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.ops.ranges import number
+from emgs_jax.prior.base import Prior
+from emgs_jax.render.composite import RenderConfig
+from emgs_jax.report.page_map import map_layers
+from emgs_jax.report.viewer import Viewer
+from emgs_jax.report.viewer_run import Shown
+from emgs_jax.running.inputs import RawView
+from emgs_jax.running.record import FrameRecord, MappingRun
+
+SHARE = 0.05  # of the time in which the thread draws, at most
+IMAGE_WIDTH = 320  # pixels
+
+
+@dataclass(frozen=True)
+class LiveConfig:
+    """How a run is shown while it maps.
+
+    Args:
+        port: on 127.0.0.1.
+        every_s: seconds between two pictures, at least.
+    """
+
+    port: int = number(low=1, high=65535)
+    every_s: float = number(low=0.1, high=3600)
+
+
+class LiveView:
+    """A run that is watched until `stop`.
+
+    Args:
+        config: of the server.
+        start: the run before its first frame.
+        text: classes that features are compared with; None without.
+        kept: index in the data set of each frame in use.
+
+    Raises:
+        ValueError: the port is taken, or viser is not installed.
+    """
+
+    def __init__(self, config: LiveConfig, start: Shown, text: TextEmbeddings | None, kept: Sequence[int]) -> None:
+        self.viewer, self._every_s = Viewer(start, config.port), config.every_s
+        self._start, self._text, self._kept = start, text, kept
+        self._thread, self._due = ThreadPoolExecutor(1, "live view"), 0.0
+        self._drawing: Future | None = None
+        self._failure: BaseException | None = None
+
+    def watch(self, views: Iterator[RawView], run: MappingRun) -> Iterator[RawView]:
+        """Pass on the views of a run; on the way, and at its end, it is shown as it is."""
+        image = None
+        for view in views:
+            image = view.image
+            if time.monotonic() >= self._due and self._is_idle():
+                self._show(run, image)
+            yield view
+        if self._drawing is not None:
+            self._drawing.exception()  # waits for its end
+        if self._is_idle() and image is not None:
+            self._show(run, image)
+            self._drawing.exception()
+            self._is_idle()
+
+    def stop(self) -> None:
+        """End the server."""
+        self._thread.shutdown()
+        self.viewer.stop()
+
+    def _is_idle(self) -> bool:
+        """Whether the thread can draw; where it has failed it is said, once, and the run goes on without it."""
+        if self._failure is None and self._drawing is not None and self._drawing.done():
+            self._failure = self._drawing.exception()
+            if self._failure is not None:
+                tqdm.write(f"the live view stays as it is, and the run goes on: {self._failure!r}")
+        return self._failure is None and (self._drawing is None or self._drawing.done())
+
+    def _show(self, run: MappingRun, image: np.ndarray) -> None:
+        if run.map is not None:
+            self._drawing = self._thread.submit(self._draw, run.map, list(run.records), image)
+
+    def _draw(self, map: GaussianMap, records: list[FrameRecord], image: np.ndarray) -> None:
+        begin = time.monotonic()
+        step = -(-image.shape[1] // IMAGE_WIDTH)
+        self.viewer.update(
+            replace(
+                self._start,
+                layers=map_layers(map, self._text),
+                frames=[vars(record) | {"index": self._kept[record.index]} for record in records],
+                poses=np.stack([record.pose for record in records]),
+                truth=np.full((len(records), 3), np.nan),
+                image=np.ascontiguousarray(image[::step, ::step]),
+            )
+        )
+        end = time.monotonic()
+        self._due = end + max(self._every_s, (end - begin) / SHARE)
+
+
+@contextlib.contextmanager
+def live_view(
+    config: LiveConfig | None, run: MappingRun, render: RenderConfig, prior: Prior, kept: Sequence[int]
+) -> Iterator[LiveView | None]:
+    """Serve a run inside the `with`, and say where; None, and nothing is served, without a config.
+
+    Args:
+        config: of the server.
+        run: before its first frame.
+        render: how the map is drawn.
+        prior: whose classes can be looked for.
+        kept: index in the data set of each frame in use.
+
+    Raises:
+        ValueError: the port is taken, or viser is not installed.
+    """
+    if config is None:
+        yield None
+        return
+    names, text = tuple(prior.feature_names), None
+    if names:
+        text = TextEmbeddings(names, np.asarray(prior.text_features, np.float32), (), {})
+    start = Shown({}, names, [], np.zeros((0, 4, 4)), np.zeros((0, 3)), run.camera, render)
+    live = LiveView(config, start, text, kept)
+    try:
+        tqdm.write(f"{live.viewer.address} shows the run to this machine while it maps; it ends with the run")
+        yield live
+    finally:
+        live.stop()

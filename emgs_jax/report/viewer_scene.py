@@ -1,0 +1,135 @@
+"""What stands in the viewer's scene: the map, both paths, the cameras; and how it changes as a run goes on."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import to_rgb
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.report.overview import view_from_above
+from emgs_jax.report.page_strip import OURS, STATUS_COLORS
+from emgs_jax.report.viewer_layers import covariances
+from emgs_jax.report.viewer_run import Shown
+
+TRUTH = "#2b8a3e"
+MAX_FRUSTUMS = 300  # more are a carpet; the chosen frame has its own
+
+
+class Scene:
+    """The scene of a viser server.
+
+    Args:
+        server: whose scene is empty.
+    """
+
+    def __init__(self, server: Any) -> None:
+        self._server, self._scene = server, server.scene
+        self.splats: Any = None
+        self.points: Any = None
+        self.chosen: Any = None  # the frustum of one frame
+        self.paths: list[Any] = []
+        self.frustums: dict[int, Any] = {}
+        self.covs = np.zeros((0, 3, 3), np.float32)  # of the Gaussians as they are drawn
+
+    def draw(self, run: Shown, colors: np.ndarray) -> None:
+        """Show a run that has frames, in the place of what stands there, with colours (n, 3) of its Gaussians."""
+        self.covs = covariances(run.layers) * float(run.render.covariance_scale)
+        self._draw_map(run, colors)
+        self.paths = [
+            self._path("/our path", run.poses[:, :3, 3], run.is_placed, OURS),
+            self._path("/true path", run.truth, np.isfinite(run.truth).all(1), TRUTH),
+        ]
+        self._draw_cameras(run)
+        if self.chosen is None:
+            self.chosen = self._frustum(run, "/frame", 0, "#ffffff", 0.1)
+            self._scene.set_up_direction(view_from_above(run.poses)[2])
+            self._place_views(run.poses[0])
+
+    def recolor(self, colors: np.ndarray) -> None:
+        """Colours (n, 3) of all Gaussians, if there are any."""
+        if self.splats is not None:
+            self.splats.rgbs = colors
+            self.points.colors = colors
+
+    def show(self, kind: str, cameras: bool, paths: bool) -> None:
+        """What of it is seen: the map as `Gaussians` or as `points`, cameras, paths."""
+        if self.splats is not None:
+            self.splats.visible, self.points.visible = kind == "Gaussians", kind == "points"
+        for path in filter(None, self.paths):
+            path.visible = paths
+        for frustum in filter(None, (*self.frustums.values(), self.chosen)):
+            frustum.visible = cameras
+
+    def choose(self, pose: np.ndarray, image: np.ndarray | None) -> None:
+        """Put the frustum of the chosen frame at its pose, with its image if there is one."""
+        _place(self.chosen, pose)
+        self.chosen.image = image
+
+    def _draw_map(self, run: Shown, colors: np.ndarray) -> None:
+        means = run.layers["mean"]
+        if not len(means):
+            return
+        opacities = np.full((len(means), 1), float(run.render.opacity), np.float32)
+        if self.splats is None:
+            self.splats = self._scene.add_gaussian_splats("/map", means, self.covs, colors, opacities)
+        else:
+            self.splats.set_gaussians(means, self.covs, colors, opacities)
+        self.points = self._scene.add_point_cloud("/points", means, colors, point_size=0.01, precision="float32")
+
+    def _draw_cameras(self, run: Shown) -> None:
+        """Those that stand there are moved, as a back end moves poses."""
+        count = len(run.poses)
+        rows = {int(row) for row in np.linspace(0, count - 1, min(count, MAX_FRUSTUMS))}
+        for row in set(self.frustums) - rows:
+            self.frustums.pop(row).remove()
+        for row in sorted(rows):
+            if row in self.frustums:
+                _place(self.frustums[row], run.poses[row])
+            else:
+                color = STATUS_COLORS.get(run.frames[row]["status"], OURS)
+                self.frustums[row] = self._frustum(run, f"/cameras/{row}", row, color, 0.04)
+
+    def _path(self, name: str, centers: np.ndarray, is_known: np.ndarray, color: str) -> Any:
+        """Segments between neighbours that are both known; None where there are none."""
+        joined = np.flatnonzero(is_known[1:] & is_known[:-1])
+        if not len(joined):
+            return None
+        ends = np.stack([centers[joined], centers[joined + 1]], axis=1).astype(np.float32)
+        return self._scene.add_line_segments(name, ends, _rgb(color), thickness=2.0, thickness_units="screen")
+
+    def _frustum(self, run: Shown, name: str, row: int, color: str, scale: float) -> Any:
+        camera, pose = run.camera, run.poses[row]
+        fov = 2 * float(np.arctan2(camera.height / 2, float(camera.focal[1])))
+        return self._scene.add_camera_frustum(
+            name,
+            fov,
+            camera.width / camera.height,
+            scale=scale,
+            thickness=1.5,
+            thickness_units="screen",
+            color=_rgb(color),
+            wxyz=wxyz(pose),
+            position=pose[:3, 3],
+        )
+
+    def _place_views(self, pose: np.ndarray) -> None:
+        """Behind the first camera, a little, looking as it does."""
+        first = self._server.initial_camera
+        first.position = pose[:3, 3] - 0.3 * pose[:3, 2]
+        first.look_at, first.up = pose[:3, 3] + pose[:3, 2], -pose[:3, 1]
+        for client in self._server.get_clients().values():  # who waits for the first frame
+            client.camera.up_direction = first.up
+            client.camera.position, client.camera.look_at = first.position, first.look_at
+
+
+def wxyz(pose: np.ndarray) -> np.ndarray:
+    """Quaternion of a pose (4, 4), as viser takes it."""
+    return Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
+
+
+def _place(frustum: Any, pose: np.ndarray) -> None:
+    frustum.wxyz, frustum.position = wxyz(pose), pose[:3, 3]
+
+
+def _rgb(color: str) -> tuple[int, ...]:
+    return tuple(round(255 * channel) for channel in to_rgb(color))
