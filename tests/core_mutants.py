@@ -96,8 +96,6 @@ REGISTRATION = [
         ("jnp.clip(ray, -edge, edge)", "plane", "metres are fitted where the logarithm was asked for"),
         ("scale_unit=config.scale_noise * scale_unit", "scale_unit=config.scale_noise", "scale in absolute units"),
         ("jnp.sqrt(config.prior_information) /", "config.prior_information /", "information for its root"),
-        ("noise = scale * matches.noise", "noise = matches.noise", "a scale that shrinks noisy points fits best"),
-        ("* (scale_unit / uncertainty.pose[1])", "", "what is known counts in full where the points do not fit"),
         ("jnp.abs(distance) <= config.max_misfit", "jnp.abs(distance) >= 0", "what is far away counts as noise"),
         ("matches.normals, axis=-1) / depth", "matches.normals, axis=-1)", "distances in metres"),
         ("jnp.cross(jnp.concatenate([points, points]), axes)", "axes", "turning tells what moving tells"),
@@ -110,6 +108,10 @@ REGISTRATION = [
         ),
         ("problem.rays @ T.rotation().as_matrix().T", "problem.rays", "rays stay in the camera's frame"),
         ("~(has_plane | has_ray) * jnp", "1.0 * jnp", "`colored` with the offset"),
+    ),
+    *own("registration/problem", "registration/test_problem")(
+        ("noise = scale * matches.noise", "noise = matches.noise", "a scale that shrinks noisy points fits best"),
+        ("* (scale_unit / uncertainty.pose[1])", "", "what is known counts in full where the points do not fit"),
     ),
     *own("registration/icp", "registration/test_icp")(
         ("candidates_at(y, problem, config)", "candidates_at(0.0 * y, problem, config)", "it never follows the points"),
@@ -293,7 +295,7 @@ STAGES = [
         ("found &= show_one_surface", "_ = show_one_surface", "pairs across a depth edge"),
         ("is_near & (normal_cos", "(normal_cos", "pairs at any depth"),
         ("is_near & (normal_cos >= config.min_normal_cos)", "is_near", "pairs that face different ways"),
-        ("jnp.where(both, jnp.maximum(cosine, 0.0), 1.0)", "jnp.maximum(cosine, 0.0)", "no feature, no merging"),
+        ("jnp.where(both, share, 1.0)", "share", "no feature, no merging"),
     ),
     *own("existence", "test_existence")(
         (
