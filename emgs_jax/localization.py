@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation, Prediction, transform
 from emgs_jax.ops.camera import Camera
-from emgs_jax.ops.linalg import Whitening
+from emgs_jax.ops.linalg import Whitening, safe_normalize
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
 from emgs_jax.registration.belief import Belief, certain, measured, moved, next_belief, root_information
@@ -264,7 +264,8 @@ def localize_fine(
     known = root_information(coarse.belief.covariance)
     fine, scale, info = icp(scaled, submap, coarse.T_world_camera, noise, config.icp, white, known)
     step = (coarse.T_world_camera.inverse() @ fine).log()
-    step_m, step_rad = jnp.linalg.norm(step[:3]), jnp.linalg.norm(step[3:])
+    # The length has no gradient where a step is zero, which it is to the bit with an exact prior; this has.
+    step_m, step_rad = (part @ safe_normalize(part) for part in (step[:3], step[3:]))
     failed = jnp.stack(
         [
             ~coarse.is_usable,
