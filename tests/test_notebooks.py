@@ -13,7 +13,7 @@ NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.i
 IDS = [path.stem for path in NOTEBOOKS]
 AXES = "grid=one_at_a_time axes={slam.em.support:[printed,normalized],slam.em.noise:[0.0,1.0]}"
 MUTE = "slam.em.feature_weight=0.0 slam.refinement.cosine_weight=0.0 axes={slam.em.feature_weight:[0.0,20.0]}"
-GRID = "axes={slam.em.max_mahalanobis_sq:[1.0,9.0],slam.em.max_log_gap:[1.0,inf]}"
+GRID = "axes={slam.em.max_mahalanobis_sq:[4.0,25.0],slam.em.max_log_gap:[3.0,inf]}"
 
 
 def cells(path: Path) -> list[dict]:
@@ -96,7 +96,7 @@ def test_the_heat_maps_show_the_metrics_of_each_setting_at_its_place(monkeypatch
     found = execute(3, " ".join((*TINY, GRID)), monkeypatch, tmp_path)
     drawn = found["values"]("trajectory/ate_sim3_m")
     for row in found["rows"]:
-        place = [1.0, 9.0].index(row["slam.em.max_mahalanobis_sq"]), [1.0, "inf"].index(row["slam.em.max_log_gap"])
+        place = [4.0, 25.0].index(row["slam.em.max_mahalanobis_sq"]), [3.0, "inf"].index(row["slam.em.max_log_gap"])
         assert drawn[place] == row["trajectory/ate_sim3_m"]
     assert len(np.unique(drawn)) == 4
 
