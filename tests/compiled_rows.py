@@ -49,8 +49,7 @@ def random_problem(rng: np.random.Generator) -> tuple[Matches, Problem]:
     one, zeros = jnp.ones(()), jnp.zeros((1, 3))
     nothing = Gaussians(zeros, jnp.eye(3)[None], zeros, zeros, jnp.zeros((1, 0)), jnp.zeros(1, bool))
     surface = Surface(nothing, jnp.zeros((1, 6)), one[None], one[None], zeros)  # what is matched does not look at it
-    noise = jnp.full(NUM_POINTS, 0.01), jnp.zeros((NUM_POINTS, 3))
-    return matches, Problem(source, surface, T, *noise, 0.005 * one, jnp.eye(7), 0.01 * one)
+    return matches, Problem(source, surface, T, jnp.full(NUM_POINTS, 0.01), 0.005 * one, jnp.eye(7), 0.01 * one)
 
 
 def largest_difference(matches: Matches, problem: Problem) -> float:

@@ -89,7 +89,7 @@ REGISTRATION = [
             "1 / jnp.maximum(jnp.sum(source.valid), 1)",
             "points as one",
         ),
-        ("config.noise * uncertainty.depth[", "uncertainty.depth[", "the factor on the points' noise is dropped"),
+        ("config.noise * uncertainty.depth,", "uncertainty.depth,", "the factor on the points' noise is dropped"),
         ("matches.plane_vars / depth**2", "matches.plane_vars", "a plane's thickness in metres beside a log"),
         ("problem.depth_noise**2 +", "problem.depth_noise +", "a noise for its square"),
         ("1.0 + distance / depth, LEAST", "1.0 - distance / depth, LEAST", "points are pulled away from their planes"),
@@ -106,7 +106,7 @@ REGISTRATION = [
             "(placed.colors)) * config.color_std",
             "the weight of the intensity inverted",
         ),
-        ("problem.rays @ T.rotation().as_matrix().T", "problem.rays", "rays stay in the camera's frame"),
+        ("rays @ T.rotation().as_matrix().T", "rays", "rays stay in the camera's frame"),
         ("~(has_plane | has_ray) * jnp", "1.0 * jnp", "`colored` with the offset"),
     ),
     *own("registration/problem", "registration/test_problem")(

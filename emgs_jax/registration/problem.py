@@ -18,7 +18,7 @@ from emgs_jax.registration.matching import Candidates, Matches, Surface, match
 
 Noise: TypeAlias = tuple[Float[Array, ""], Float[Array, ""]]  # standard deviations in m, and in rad or over the depth
 RESIDUALS = ("colored", "distribution", "colored+distribution", "colored+ray")
-COLORED, DISTRIBUTION, COLORED_DISTRIBUTION, COLORED_RAY = range(4)
+COLORED, DISTRIBUTION, _, COLORED_RAY = range(len(RESIDUALS))
 LEAST_RATIO = 1e-3  # of a point's depth over that of a plane; less is behind the camera
 
 
@@ -78,8 +78,7 @@ class Problem(eqx.Module):
     source: Observation  # camera frame
     surface: Surface
     T_world_coarse: jaxlie.SE3
-    depth_noise: Float[Array, "p"]  # as a fraction
-    rays: Float[Array, "p 3"]  # noise of every point along its viewing ray, camera frame
+    depth_noise: Float[Array, "p"]  # of every point along its viewing ray, as a fraction
     scale_unit: Float[Array, ""]  # of the scale's logarithm, which is the seventh unknown
     prior: Float[Array, "7 7"]  # root of the information that is there before
     weight: Float[Array, ""]  # of a point
@@ -112,7 +111,6 @@ def pose_problem(
         surface=surface,
         T_world_coarse=T_world_coarse,
         depth_noise=config.noise * uncertainty.depth,
-        rays=config.noise * uncertainty.depth[:, None] * source.points,
         scale_unit=config.scale_noise * scale_unit,
         prior=prior,
         weight=uncertainty.num_effective / jnp.maximum(jnp.sum(source.valid), 1),
@@ -134,7 +132,8 @@ def candidates_at(y: Float[Array, "7"], problem: Problem, config: IcpConfig) -> 
 def matches_at(y: Float[Array, "7"], candidates: Candidates, problem: Problem, config: IcpConfig) -> Matches:
     """The Gaussian of every point at y."""
     T, scale = pose_of(y, problem)
-    placed, noise = transform(T, problem.source, scale), problem.rays @ T.rotation().as_matrix().T
+    rays = problem.depth_noise[:, None] * problem.source.points
+    placed, noise = transform(T, problem.source, scale), rays @ T.rotation().as_matrix().T
     return match(placed, noise, candidates, problem.surface, (config.max_mahalanobis_sq, config.min_normal_cos))
 
 

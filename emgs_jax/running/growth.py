@@ -37,9 +37,7 @@ def start(
     """
     state, overflow = init(first.views, first.T_world_views, camera, config)
     while np.any(overflow):
-        config = with_room(
-            config, Overflow(map=overflow, submap=jnp.zeros_like(overflow), tiles=jnp.zeros_like(overflow))
-        )
+        config = with_room(config, _of_map(overflow))
         state, overflow = init(first.views, first.T_world_views, camera, config)
     return state, config
 
@@ -62,7 +60,7 @@ def begin_anew(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[Sl
     new = replace(alone.map, birth=jnp.full_like(alone.map.birth, state.time - 1))
     map, _, overflow = _insert(state.map, new)
     while overflow > 0:
-        config = with_room(config, Overflow(map=overflow, submap=jnp.zeros(()), tiles=jnp.zeros(())))
+        config = with_room(config, _of_map(overflow))
         map, _, overflow = _insert(grow(state.map, config.submap.map_capacity), new)
     belief = replace(state.belief, covariance=jnp.zeros_like(state.belief.covariance))
     return replace(state, map=map, belief=belief), config
@@ -99,6 +97,12 @@ def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         list(threads.map(run, calls))
     _prepared.add(key)
+
+
+def _of_map(overflow: jax.Array) -> Overflow:
+    """Rows that did not fit into the map, where nothing else is filled."""
+    nothing = jnp.zeros_like(overflow)
+    return Overflow(map=overflow, submap=nothing, tiles=nothing)
 
 
 def _zeros(shapes: Any) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 from emgs_jax.gaussian_map import GaussianMap, grow
 from emgs_jax.graph.measurements import WINDOW
 from emgs_jax.loops.location import Location, LocationConfig
-from emgs_jax.observation import Prediction, transform
+from emgs_jax.observation import Prediction, depth_in, transform
 from emgs_jax.registration.belief import certain
 from emgs_jax.registration.rigid import pose_row, scale_translation
 from emgs_jax.running.back_end import BackEnd
@@ -46,8 +46,8 @@ def is_to_begin_anew(run: MappingRun, given: Input, state: SlamState, info: Step
     is_due = not run.is_fixed and count >= run.back_end.config.location.max_patience
     if not is_due or info.localization.is_lost or not _leads_here(run.back_end, given, count):
         return False
-    seen, T = state.previous, np.asarray(state.T_world_previous.as_matrix())
-    depth = np.median((np.asarray(seen.points)[np.asarray(seen.valid)] - T[:3, 3]) @ T[:3, 2])
+    depths = np.asarray(depth_in(state.T_world_previous, state.previous))
+    depth = np.median(depths[np.asarray(state.previous.valid)])
     return bool(info.localization.repeat_rms <= run.config.localization.max_residual * depth)
 
 
