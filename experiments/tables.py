@@ -1,8 +1,9 @@
-"""Write the tables of README.md: `python -m experiments.tables root=FOLDER`.
+"""Write the tables of README.md and docs/results.md: `python -m experiments.tables root=FOLDER`.
 
 The rows are the evaluations of conf/tables.yaml; what is finished is not run again. Nothing is written unless all of
-them are finished and of the same commit. The line above a table says where it comes from, those below count the runs
-in which the map is better than the raw prior.
+them are finished and of the same commit. The line above a table says where it comes from. The first page has the rows
+and columns that most people look for, with the best of each data set in bold; the second has all, and counts the runs
+in which the map is better than each other estimate.
 """
 
 import re
@@ -19,7 +20,7 @@ from emgs_jax.io.files import atomic_write
 from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, cell, markdown
 from emgs_jax.report.provenance import git_revision
 from emgs_jax.report.results import METRICS_FILE, Estimate, estimates_of, read_metrics
-from emgs_jax.report.tables import average
+from emgs_jax.report.tables import Row, average
 
 from .command import command
 from .evaluate import Job, evaluate, plan
@@ -30,6 +31,15 @@ COLUMNS = (
     Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 1, True),
     *(column._replace(digits=1) for column in (*MAIN[1:], *PLACED, *RENDERED)),
 )
+_SHORT = {  # of the first page: lengths and shares by the points
+    "trajectory/ate_sim3_m": "ATE [cm]",
+    "reconstruction_icp/accuracy_m": "accuracy [cm]",
+    "reconstruction_icp/completion_m": "completion [cm]",
+    "reconstruction_icp/f1_5cm_percent": "F1@.05 [%]",
+    "reconstruction_icp/normals_abs_cos_percent": "normals [%]",
+    "rendering/depth_within_5_percent": "depth within 5 % [%]",
+}
+SHORT = tuple(column._replace(title=_SHORT[column.key]) for column in COLUMNS if column.key in _SHORT)
 
 
 def evaluations(config: Mapping[str, Any], table: str) -> Iterator[Settings]:
@@ -61,7 +71,14 @@ def _code_of(paths: Iterable[Path]) -> list[Mapping[str, Any] | None]:
 def block(paths: Sequence[Path], titles: Mapping[str, str]) -> str:
     """The Markdown between two markers: where the results come from, the table, and how often ours is better."""
     estimates = [item for path in paths for item in estimates_of(path)]
-    return f"\n{_about(paths)}\n\n{_table(estimates, titles)}\n{_better(estimates)}\n\n"
+    return f"\n{_about(paths)}\n\n{_table(estimates, titles, COLUMNS)}\n{_better(estimates)}\n\n"
+
+
+def short_block(paths: Sequence[Path], titles: Mapping[str, str], short: Mapping[str, Sequence[str]]) -> str:
+    """Likewise with the columns of `SHORT`, and of the rows those of the `settings` and `kinds` that `short` names."""
+    estimates = [item for path in paths for item in estimates_of(path)]
+    shown = [item for item in estimates if item.variant in short["settings"] and item.kind in short["kinds"]]
+    return f"\n{_about(paths)}\n\n{_table(shown, titles, SHORT, is_best_bold=True)}\n"
 
 
 def _about(paths: Sequence[Path]) -> str:
@@ -89,14 +106,28 @@ def _distinct(values: Iterable[Any]) -> str:
     return ", ".join(map(str, dict.fromkeys(values)))
 
 
-def _table(estimates: Sequence[Estimate], titles: Mapping[str, str]) -> str:
+def _table(
+    estimates: Sequence[Estimate], titles: Mapping[str, str], columns: Sequence[Column], is_best_bold: bool = False
+) -> str:
+    """A line for each data set, setting and kind; with `is_best_bold` the best of each data set and setting is bold."""
     rows = sorted(average(estimates, each_sequence=True), key=lambda row: list(titles).index(row.dataset))
     lines = []
     for row in rows:
-        numbers = [(row.values.get(key), row.spreads.get(key), factor, digits) for key, _, factor, digits, _ in COLUMNS]
+        rivals = [other for other in rows if (other.dataset, other.variant) == (row.dataset, row.variant)]
+        cells = []
+        for column in columns:
+            text = cell(row.values.get(column.key), row.spreads.get(column.key), column.factor, column.digits)
+            cells.append(f"**{text}**" if is_best_bold and _is_best(row, rivals, column) else text)
         name = titles[row.dataset] + ("" if row.variant == "default" else f", {row.variant}")
-        lines.append([name, row.kind, str(len(row.seeds)), *(cell(*number) for number in numbers)])
-    return markdown(["data, setting", "", "runs", *(column.title for column in COLUMNS)], lines)
+        lines.append([name, row.kind, str(len(row.seeds)), *cells])
+    return markdown(["data, setting", "", "runs", *(column.title for column in columns)], lines)
+
+
+def _is_best(row: Row, rivals: Sequence[Row], column: Column) -> bool:
+    """Whether no rival, of which the row is one, is better; False where it has no value."""
+    values = [rival.values.get(column.key) for rival in rivals]
+    best = (min if column.is_lower_better else max)((value for value in values if value is not None), default=None)
+    return best is not None and row.values.get(column.key) == best
 
 
 def _better(estimates: Sequence[Estimate]) -> str:
@@ -135,7 +166,7 @@ def write_blocks(page: Path, blocks: Mapping[str, str]) -> None:
 
 
 def tables(config: Mapping[str, Any]) -> None:
-    """Run what is not finished and write all tables of the page; `config` is a resolved conf/tables.yaml."""
+    """Run what is not finished and write all tables of both pages; `config` is a resolved conf/tables.yaml."""
     planned = {table: list(evaluations(config, table)) for table in config["tables"]}
     paths = {name: [_result(job) for settings in table for job in plan(settings)] for name, table in planned.items()}
     everything = [path for found in paths.values() for path in found]
@@ -147,7 +178,9 @@ def tables(config: Mapping[str, Any]) -> None:
     if problems:
         raise ValueError("\n       ".join([f"problems: {len(problems)}", *problems]))
     revision_of(_code_of(everything))
-    write_blocks(Path(config["page"]), {table: block(found, config["titles"]) for table, found in paths.items()})
+    titles, short = config["titles"], config["short"]
+    write_blocks(Path(config["page"]), {name: short_block(found, titles, short) for name, found in paths.items()})
+    write_blocks(Path(config["full_page"]), {name: block(found, titles) for name, found in paths.items()})
 
 
 def _result(job: Job) -> Path:
@@ -158,7 +191,7 @@ def _result(job: Job) -> Path:
 def main(config: DictConfig) -> None:
     """Write the tables."""
     tables(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-    print(f"the tables of {config.page} are written")
+    print(f"the tables of {config.page} and {config.full_page} are written")
 
 
 if __name__ == "__main__":

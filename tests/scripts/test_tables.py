@@ -1,4 +1,4 @@
-"""The tables of README.md from made-up runs: numbers worked out by hand, and nothing else on the page changes."""
+"""The tables of the pages from made-up runs: numbers worked out by hand, and nothing else on a page changes."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ import experiments.tables
 from emgs_jax.io.files import write_json
 from emgs_jax.report.provenance import RAW_PRIOR, RESULT_FORMAT, prefixed
 from emgs_jax.report.results import METRICS_FILE
-from experiments.tables import COLUMNS, block, tables, write_blocks
+from experiments.tables import COLUMNS, SHORT, block, short_block, tables, write_blocks
 
 PAGE = "before\n<!-- table: some -->\nold\n<!-- end -->\nbetween\n<!-- table: other -->\n<!-- end -->\nafter\n"
 ONE_COMMIT = {"revision": "0123456789abcdef", "dirty": False}
@@ -49,6 +49,21 @@ def test_rows_are_mean_and_deviation_over_the_seeds_and_the_map_is_counted_again
     ]
     counts = next(line for line in text.splitlines() if line.startswith("Runs of 2"))
     assert counts.count(" 1,") + counts.count(" 1.") == len(COLUMNS)
+
+
+def test_the_short_table_has_what_is_named_and_the_best_of_each_column_in_bold(tmp_path):
+    """Lengths of ours are the smaller ones, and so are its shares, which is worse."""
+    paths = [written(tmp_path / "default", 3, ours=0.02, raw=0.03), written(tmp_path / "level 2", 3, ours=0.01)]
+    text = short_block(paths, {"synthetic": "room"}, {"settings": ["default"], "kinds": ["ours", "raw prior"]})
+    rows = [cells(line) for line in text.splitlines() if line.startswith("| room")]
+    lower = [column.is_lower_better for column in SHORT]
+    assert any(lower) and not all(lower)
+    assert rows == [
+        ["room", "ours", "1", *["**2.0**" if is_lower else "2.0" for is_lower in lower]],
+        ["room", "raw prior", "1", *["3.0" if is_lower else "**3.0**" for is_lower in lower]],
+    ]
+    alone = short_block(paths, {"synthetic": "room"}, {"settings": ["level 2"], "kinds": ["ours"]})
+    assert [cells(line)[0] for line in alone.splitlines() if "ours" in line] == ["room, level 2"]
 
 
 def test_the_line_above_a_table_says_where_it_comes_from(tmp_path):
@@ -95,11 +110,13 @@ def test_a_page_without_its_markers_stays_as_it_is(tmp_path, page):
 def settings(tmp_path):
     """conf/tables.yaml with the built-in room alone."""
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        config = hydra.compose("tables", ["root=nowhere", f"out={tmp_path / 'out'}", f"page={tmp_path / 'page.md'}"])
+        pages = [f"page={tmp_path / 'page.md'}", f"full_page={tmp_path / 'full.md'}"]
+        config = hydra.compose("tables", ["root=nowhere", f"out={tmp_path / 'out'}", *pages])
         config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
         settings = {"default": {}, "level 2": {"prior.level": 2}}
         config["tables"] = {"some": [{"data": ["synthetic"], "seeds": [3, 4], "settings": settings}]}
         (tmp_path / "page.md").write_text(PAGE)
+        (tmp_path / "full.md").write_text(PAGE)
         yield config
 
 
@@ -126,18 +143,27 @@ def test_what_is_finished_is_not_run_again_and_the_page_is_written_when_all_is_t
     assert page.read_text() == PAGE
     tables(settings)
     assert runs == [(1.0, 3), (1.0, 4), (2.0, 3), (2.0, 4), (2.0, 3)]
-    text = page.read_text()
-    assert "Runs of 2" in text and "(default):" in text and "(level 2):" in text and "old" not in text
+    text, full = page.read_text(), Path(settings["full_page"]).read_text()
+    assert "Runs of 2" in full and "(default):" in full and "(level 2):" in full and "old" not in full
+    assert "| room | ours |" in text and "level 2" not in text and "Runs of" not in text and "old" not in text
     # What is there can be written again by other code, which did not make it.
     monkeypatch.setattr(experiments.tables, "git_revision", lambda folder: None)
     tables(settings)
-    assert len(runs) == 5 and page.read_text() == text
+    assert len(runs) == 5 and (page.read_text(), Path(settings["full_page"]).read_text()) == (text, full)
 
 
-def test_the_readme_has_the_places_of_all_tables_and_every_row_has_a_title():
+@pytest.mark.parametrize("key", ["page", "full_page"])
+def test_both_pages_have_the_places_of_all_tables_and_every_row_has_a_title(key):
     config = OmegaConf.load(CONF / "tables.yaml")
-    text = (CONF.parent / config.page).read_text()
+    text = (CONF.parent / config[key]).read_text()
     for name, entries in config.tables.items():
         assert text.count(f"<!-- table: {name} -->") == 1
         assert {data for entry in entries for data in entry.data} <= set(config.titles)
     assert text.count("<!-- end -->") == len(config.tables)
+
+
+def test_both_pages_are_of_one_commit():
+    config = OmegaConf.load(CONF / "tables.yaml")
+    pages = [(CONF.parent / config[key]).read_text() for key in ("page", "full_page")]
+    about = [[line for line in page.splitlines() if line.startswith("Prior ") and "commit `" in line] for page in pages]
+    assert about[0] == about[1] and len(about[0]) == len(config.tables)
