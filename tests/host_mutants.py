@@ -1113,10 +1113,10 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/running/labelling.py",
-        "labels=labels[known]",
-        "labels=labels[: known.sum()]",
+        "evidence=cosines[known]",
+        "evidence=cosines[: known.sum()]",
         LABELLING,
-        "labels of free rows shift the others",
+        "what free rows say shifts the others",
     ),
     Mutant(
         "emgs_jax/running/labelling.py",
@@ -1131,6 +1131,13 @@ MUTANTS = (
         "pass",
         LABELLING,
         "the nearest mean decides",
+    ),
+    Mutant(
+        "emgs_jax/running/labelling.py",
+        " * np.linalg.norm(rows.features[known], axis=-1, keepdims=True)",
+        "",
+        LABELLING,
+        "what was seen once counts like what was seen often",
     ),
     Mutant(
         "emgs_jax/running/dense.py",

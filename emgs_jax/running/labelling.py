@@ -1,4 +1,4 @@
-"""Classes of points of the surface: each Gaussian that explains a point votes with its responsibility for it."""
+"""Classes of points of the surface: each Gaussian that explains a point says what it knows, by its responsibility."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,29 +13,35 @@ from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.prior.base import Prior
 from emgs_jax.running.record import MappingRun
-from emgs_jax.semantics import classify
+from emgs_jax.semantics import classify, similarities
 
 NUM_NEIGHBOURS = 8  # Gaussians that may explain a point
-MAX_POINTS = 50_000  # at once; bounds the memory, does not change the result
+MAX_POINTS = 10_000  # at once; bounds the memory, does not change the result
 
 
 @dataclass(frozen=True)
 class LabelledMap:
-    """Gaussians with a class each.
+    """Gaussians with what they know of classes.
 
     Args:
         means: (n, 3), m.
         whiten: (n, 3, 3), inverse of the Cholesky factors of the covariances.
         log_dets: (n,), of the covariances.
-        labels: (n,), position in `classes`; all have one.
-        classes: their names.
+        evidence: (n, c), the feature's projection on the text of each class. Features are sums over the points of all
+            views (R16), so its size says how much is known.
+        classes: names of the c.
     """
 
     means: np.ndarray
     whiten: np.ndarray
     log_dets: np.ndarray
-    labels: np.ndarray
+    evidence: np.ndarray
     classes: tuple[str, ...]
+
+    @cached_property
+    def labels(self) -> Int[np.ndarray, "n"]:
+        """The class of each Gaussian by itself, a position in `classes`."""
+        return self.evidence.argmax(1)
 
     @property
     def centers(self) -> LabelledPoints:
@@ -48,10 +54,11 @@ class LabelledMap:
         return cKDTree(self.means)
 
     def classes_of(self, points: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
-        """The class that has most of the responsibility for each point (eq. 3, by place alone); -1 without Gaussians.
+        """The class with most evidence at each point: argmax_c Σ_k r_k e_kc; -1 without Gaussians.
 
-        Nearest Gaussians by their means, as in the E-step. A wall's Gaussian whose mean is near to a cup does not
-        explain the cup, because it is flat.
+        r_k is the responsibility (eq. 3, by place alone) of one of the nearest Gaussians by their means, as in the
+        E-step. A wall's Gaussian whose mean is near to a cup does not explain the cup, because it is flat; and one that
+        was seen once does not outvote its neighbours, which were seen from all sides.
         """
         if not len(self.means):
             return np.full(len(points), -1)
@@ -68,13 +75,12 @@ class LabelledMap:
     def _elected(self, points: Float[np.ndarray, "m 3"], rows: Int[np.ndarray, "m k"]) -> Int[np.ndarray, "m"]:
         white = np.matvec(self.whiten[rows], points[:, None] - self.means[rows])
         log_density = -0.5 * ((white**2).sum(-1) + self.log_dets[rows])
-        responsibility, votes = np.exp(log_density - log_density.max(1, keepdims=True)), self.labels[rows]
-        share = ((votes[:, :, None] == votes[:, None, :]) * responsibility[:, None, :]).sum(-1)
-        return np.take_along_axis(votes, share.argmax(1)[:, None], axis=1)[:, 0]
+        responsibility = np.exp(log_density - log_density.max(1, keepdims=True))  # its sum over k changes no argmax
+        return np.vecmat(responsibility, self.evidence[rows]).argmax(1)
 
 
 def labelled_map(run: MappingRun, prior: Prior) -> LabelledMap | None:
-    """The confirmed Gaussians that have a feature, with the class whose text is nearest to it; None without classes.
+    """The confirmed Gaussians that have a feature, with its projection on each class's text; None without classes.
 
     Raises:
         ValueError: the embeddings' width differs from the features'.
@@ -82,14 +88,15 @@ def labelled_map(run: MappingRun, prior: Prior) -> LabelledMap | None:
     gaussians = confirmed(run.state.map)
     if not prior.feature_names or not gaussians.features.shape[-1]:
         return None
-    labels = np.asarray(classify(gaussians, jnp.asarray(prior.text_features, jnp.float32)))
+    text = jnp.asarray(prior.text_features, jnp.float32)
+    labels, cosines = jax.device_get((classify(gaussians, text), similarities(gaussians, text)))
     rows = jax.device_get(gaussians)
-    known = rows.valid & (labels >= 0)
+    known = labels >= 0
     factors = np.linalg.cholesky(rows.covs[known].astype(np.float64))
     return LabelledMap(
         means=rows.means[known].astype(np.float64),
         whiten=np.linalg.inv(factors),
         log_dets=2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(-1),
-        labels=labels[known],
+        evidence=cosines[known] * np.linalg.norm(rows.features[known], axis=-1, keepdims=True),
         classes=tuple(prior.feature_names),
     )

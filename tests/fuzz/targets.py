@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -42,6 +43,8 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import windows
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.simulated.prior import Simulated
+from emgs_jax.report.page import write_report
+from emgs_jax.report.recorded_run import read_run
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from emgs_jax.running.configure import compose, keys_of
@@ -349,6 +352,23 @@ def read_checkpoint(folder: Path) -> None:
     assert len(found.leaves) == 2 and len(found.records) == 2 and found.num_inputs == 2
 
 
+def write_finished_run(folder: Path) -> None:
+    beside = str(Path(__file__).resolve().parents[1])
+    if beside not in sys.path:  # where pytest looks for what tests share
+        sys.path.append(beside)
+    from tests.report.written_run import written_run
+
+    written_run(folder / "room")
+
+
+def read_finished_run(folder: Path) -> None:
+    """What is accepted as a run has a page, and poses and frames that belong together."""
+    run = read_run(folder / "room")
+    assert is_rigid(run.poses) and len(run.poses) == len(run.frames) == len(run.raw) == len(run.truth)
+    text = write_report(run, None).read_text(encoding="utf-8")
+    assert text.lstrip().lower().startswith("<!doctype html>") and text.rstrip().endswith("</html>")
+
+
 @cache
 def _keys() -> tuple[str, ...]:
     names = ("dataset=synthetic", "graph=default", "baseline=all")
@@ -423,4 +443,6 @@ def targets() -> Iterator[Target]:
     damages = {".txt": TEXT, ".yaml": TEXT, ".ply": BYTES}
     yield Target("labelled mesh", write_labelled_mesh, read_classes_and_mesh, damages)
     yield Target("checkpoint", write_checkpoint, read_checkpoint, {".npz": BYTES})
+    damages = {".npz": BYTES, ".json": TEXT, ".jsonl": TEXT, "trajectory.txt": TEXT, "trajectory_online.txt": TEXT}
+    yield Target("finished run", write_finished_run, read_finished_run, damages)
     yield Target("command line", write_words, read_words, {"words": (change_words,)})

@@ -35,7 +35,7 @@ def run():
 def labels():
     """Two round Gaussians of two classes: at the wall's two ends."""
     means, round_ = np.array([[0.0, 0.0, 2.0], [LENGTH, 0.0, 2.0]]), np.stack([np.eye(3)] * 2)
-    return LabelledMap(means, round_, np.zeros(2), np.array([1, 0]), ("right", "left"))
+    return LabelledMap(means, round_, np.zeros(2), np.array([[0.0, 1.0], [1.0, 0.0]]), ("right", "left"))
 
 
 @pytest.fixture(scope="module")
