@@ -21,8 +21,15 @@ LOOPBACK = "0100007F"  # 127.0.0.1 there
 
 
 def share_of_the_map(page) -> float:
-    """Of the page beside the panel and below viser's notice: what is not as white as where nothing is."""
-    image = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))[200:, :880]
+    """Of the page beside the panel and below viser's notice: what is not as white as where nothing is.
+
+    None yet where the browser, which draws in software, had no time for a picture.
+    """
+    try:
+        picture = page.screenshot()
+    except RuntimeError:
+        return 0.0
+    image = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB"))[200:, :880]
     return float((image.min(-1) < 240).mean())
 
 
@@ -41,7 +48,7 @@ def shown_frame(page) -> int:
 
 
 def wait(condition, what):
-    end = time.monotonic() + 120.0
+    end = time.monotonic() + 300.0
     while not condition():
         assert time.monotonic() < end, what
         time.sleep(0.2)
