@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from functools import wraps
@@ -21,6 +22,8 @@ from emgs_jax.running.gpu import leave_memory_to_torch
 
 from .interrupt import clear_interrupt
 
+RUN = "config"  # conf/config.yaml, whose help lists every choice, by Hydra
+
 
 def command(
     name: str, rewritten: Callable[[list[str]], list[str]] = list
@@ -37,6 +40,9 @@ def command(
                 return task(config)
 
         def main() -> None:
+            if name != RUN and {"-h", "--help"} & {*sys.argv[1:]}:
+                print(help_of(name))
+                return
             with clear_interrupt():
                 with clear_errors():
                     sys.argv[1:] = rewritten(sys.argv[1:])
@@ -47,6 +53,26 @@ def command(
         return main
 
     return decorate
+
+
+def help_of(name: str) -> str:
+    """What conf/`name`.yaml says of itself: its first comment, and its own keys and choices as they stand there."""
+    lines = (CONF / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
+    blocks: dict[str, list[str]] = {}  # key at the left margin -> its lines; "" -> the comment above all of them
+    key = ""
+    for line in lines:
+        key = found[0] if (found := re.match(r"\w+", line)) else key
+        blocks.setdefault(key, []).append(line)
+    head, (_, *defaults) = (blocks.pop(key) for key in ("", "defaults"))
+    blocks.pop("hydra", None)
+    chosen = [line.strip("- ") for line in defaults if re.match(r"  - \w+: ", line)]
+    body = [*chosen, *(line for block in blocks.values() for line in block)]
+    needed = "".join(f" {line.partition(':')[0]}=…" for line in chosen if ": ???" in line)
+    more = [f"emgs {name}{needed} --cfg job shows every key with its value."]
+    if f"  - {RUN}" in defaults:
+        more.append("Every choice and key of a run is one here too: emgs run --help")
+    parts = ["\n".join(line.removeprefix("# ") for line in head), "\n".join(body).strip(), "\n".join(more)]
+    return "\n\n".join(parts)
 
 
 def overrides_of(arguments: list[str]) -> list[str]:

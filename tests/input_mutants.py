@@ -58,6 +58,20 @@ MUTANTS = (
         "names from a file are markup in the browser",
     ),
     Mutant(
+        "emgs_jax/report/viewer.py",
+        'HOST = "127.0.0.1"',
+        'HOST = "0.0.0.0"',
+        ("tests/report/test_live_browser.py",),
+        "a run that is watched can be watched from the network",
+    ),
+    Mutant(
+        "experiments/command.py",
+        "body = [*chosen, *(line",
+        "body = [*(line",
+        ("tests/scripts/test_command_line.py",),
+        "the help of a command leaves out what has to be chosen",
+    ),
+    Mutant(
         "emgs_jax/report/live.py",
         "time.monotonic() >= self._due and self._is_idle()",
         "time.monotonic() >= self._due",

@@ -157,6 +157,9 @@ def _page(run: RecordedRun, paths: PlacedPaths, views: Views, about: dict[str, A
         "title": _text(f"{block['data']['name']} {block['data']['sequence']}: report of a run"),
         "style": source("page.css"),
         "head": page_words.head(run, again),
+        "footer": page_words.licences(run),
+    }
+    stage = {
         "overview": _overview(run),
         "layers": _layers(run, {array["name"] for array in about["arrays"]}),
         "words": _options({-1: "all"} | dict(enumerate(about["classes"]))),
@@ -168,16 +171,15 @@ def _page(run: RecordedRun, paths: PlacedPaths, views: Views, about: dict[str, A
         + page_words.loops(run)
         + page_words.settings(again)
         + page_words.files(run, note),
-        "footer": page_words.licences(run),
-        "arrays": packing,
-        "vertex": source("splats.vert"),
-        "fragment": source("splats.frag"),
-        "script": script,
     }
+    parts["main"] = filled(source("page.html"), stage)
+    programs = {"arrays": packing, "script": script}
+    programs |= {"vertex": source("splats.vert"), "fragment": source("splats.frag")}
     pictures, step = [list(picture) for picture in views.pictures], 1
     while True:
         shown = about | {"pictures": pictures[::step]}
-        page = filled(source("page.html"), parts | {"about": _json(shown)})
+        parts["programs"] = "\n" + filled(source("programs.html"), programs | {"about": _json(shown)})
+        page = filled(source("shell.html"), parts)
         if len(page.encode()) <= MAX_BYTES or step >= max(len(pictures), 1):
             return page
         step += 1

@@ -22,22 +22,22 @@ FILES = {
     "trajectory.txt": "the pose of every frame, TUM format; evo",
     "trajectory_online.txt": "the poses as they were when the frames were placed, TUM format; evo",
     "frames.jsonl": "a line per frame; any editor, pandas.read_json(…, lines=True)",
-    "graph.g2o": "poses and measurements; g2o_viewer, GTSAM",
+    "graph.g2o": "poses and measurements; what reads g2o files",
     "loops.json": "candidates of loops and what became of them; any editor",
     "map.npz": "the map itself: emgs_jax.load_map",
     "text.npz": "classes that the map's features are compared with; features.text=",
-    "map.ply": "the Gaussians as 3D Gaussian splatting has them; SuperSplat, rerun",
-    "points.ply": "a dense cloud with normals, colours and labels; MeshLab, CloudCompare",
-    "mesh.ply": "a mesh from centres and normals; MeshLab, Blender",
-    "cameras.ply": "every camera in the colour of its status, and the path, as a mesh; MeshLab, Blender",
+    "map.ply": "the Gaussians as 3D Gaussian splatting has them; splat-transform, rerun",
+    "points.ply": "a dense cloud with normals, colours and labels; MeshLab, CloudCompare, Open3D",
+    "mesh.ply": "a mesh from centres and normals; MeshLab, CloudCompare, Open3D",
+    "cameras.ply": "every camera in the colour of its status, and the path, as a mesh; MeshLab, CloudCompare",
 }
 _OWN = "made by this program, Apache-2.0"
 DATA_LICENCES = {
     "synthetic": _OWN,
     "apartment": _OWN,
-    "tum": "TUM RGB-D: CC BY 4.0, unless the sequence says otherwise",
-    "seven_scenes": "7-Scenes: Microsoft Research's licence, non-commercial use",
-    "replica": "Replica: its own research licence, non-commercial use",
+    "tum": "TUM RGB-D: CC BY 4.0; another folder of this layout: see its publisher",
+    "seven_scenes": "7-Scenes: see the data set's page at Microsoft Research",
+    "replica": "Replica: Replica Dataset Research Terms, for research and education that is not commercial",
     **dict.fromkeys(("images", "colmap", "nerfstudio", "rosbag"), "your own images, your own licence"),
 }
 

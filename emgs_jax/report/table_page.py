@@ -40,11 +40,12 @@ def write_page(folder: Path, title: str, head: str, sections: Sequence[str], nam
         "title": escape(title),
         "style": f"{source('page.css')}\n{source('table.css')}",
         "head": head,
-        "sections": "".join(sections),
+        "main": "".join(sections),
         "footer": "".join(licence_words(*name) for name in names),
+        "programs": "",
     }
     with atomic_write(folder / REPORT_FILE) as handle:
-        handle.write(filled(source("table.html"), parts).encode())
+        handle.write(filled(source("shell.html"), parts).encode())
     return folder / REPORT_FILE
 
 

@@ -17,8 +17,9 @@ from emgs_jax.report import page
 from emgs_jax.report.page import MAX_BYTES, write_report
 from emgs_jax.report.page_map import COV_UNIT, packed, thinned
 from emgs_jax.report.page_strip import placed_paths
-from emgs_jax.report.page_words import verdict
+from emgs_jax.report.page_words import DATA_LICENCES, verdict
 from emgs_jax.report.recorded_run import read_run
+from emgs_jax.running.configure import groups
 from experiments.report import report
 
 
@@ -226,3 +227,7 @@ def test_settings_of_older_code_make_a_page_without_images_that_says_so(tmp_path
     report(folder)
     assert "the run is of another version (Missing key on_bad_frame)" in capsys.readouterr().out
     assert "of another version" in (folder / "report.html").read_text()
+
+
+def test_every_data_set_has_a_word_on_its_licence():
+    assert {*groups()["dataset"]} == {*DATA_LICENCES}

@@ -17,7 +17,8 @@ from written_run import written_run
 from emgs_jax.io.files import write_json
 from emgs_jax.report import table_page
 from emgs_jax.report.evaluation_page import Found, JobLine, verdict, write_evaluation_page
-from emgs_jax.report.page import MAX_BYTES
+from emgs_jax.report.page import MAX_BYTES, write_report
+from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.results import estimates_of
 from emgs_jax.report.sweep_page import write_sweep_page
 from emgs_jax.report.sweeps import picture_path
@@ -71,6 +72,14 @@ def test_the_better_one_is_marked_in_the_table_of_errors(page):
     (line,) = re.findall(r"<tr>(?:(?!<tr>).)*>ours<.*?</tr>", page.read_text())
     assert '<td class="best">2.60 ± 1.98</td>' in line
     assert page.read_text().count('class="best"') == 1  # no other metric has two values
+
+
+def test_a_page_of_one_run_has_the_head_of_a_page_of_several(page, tmp_path):
+    """But for what each may do and is called."""
+    one = write_report(read_run(written_run(tmp_path)), None)
+    own = r'content="default-src[^"]*"|<title>[^<]*</title>'
+    heads = [re.sub(own, "", path.read_text().split("<style>")[0]) for path in (page, one)]
+    assert heads[0] == heads[1] and 'name="viewport"' in heads[0]
 
 
 def test_links_are_relative_and_lead_to_the_runs(page):

@@ -1,13 +1,20 @@
 """What the command line says: the choices in its help, and one line with the remedy for a word that is wrong."""
 
+import re
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 from tiny_run import CONF
 
 from emgs_jax.running.configure import compose, groups
+from experiments.cli import COMMANDS, main
 from experiments.command import check_arguments
+from experiments.evaluate import delegated
+from experiments.report import positional
 
 
 @pytest.mark.parametrize(
@@ -61,6 +68,34 @@ def test_the_help_of_a_run_lists_every_choice():
     for group in ("dataset", "prior", "features", "experiment", "evaluation", "render", "slam/em"):
         assert f"{group}=" in said and all(name in said for name in groups()[group]), group
     assert all(name in said for name in groups() if name.startswith("slam/"))
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "run"])
+def test_the_help_of_a_command_names_its_keys_and_its_examples_are_ones(name, monkeypatch, capsys):
+    """Oracles: what a YAML reader finds in its file, and Hydra, which takes the examples as they are typed."""
+    monkeypatch.setattr(sys, "argv", ["emgs", name, "--help"])
+    main()
+    said = capsys.readouterr().out
+    known = OmegaConf.load(CONF / f"{name}.yaml")
+    choices = [key for choice in known.pop("defaults") if OmegaConf.is_config(choice) for key in choice]
+    keys = {*known, *(key for key in choices if not key.startswith("override "))} - {"hydra"}
+    assert keys and all(re.search(rf"^{key}:", said, re.MULTILINE) for key in keys)
+    assert not any(str(path) in said for path in (CONF.parent, Path.home(), Path(sys.prefix)))
+    examples = [shlex.split(line) for line in said.splitlines() if line.startswith(f"  emgs {name} ")]
+    assert len(examples) >= 2
+    rewritten = delegated if name == "evaluate" else positional
+    for _, _, *words in examples:
+        check_arguments(name, rewritten(words))
+
+
+def test_a_key_in_an_example_that_is_none_would_be_found():
+    with pytest.raises(ValueError, match=r"^prot is no key of the config; near names: port"):
+        check_arguments("view", positional(["outputs/monday", "prot=8081"]))
+
+
+def test_the_help_of_a_command_ends_well_and_reads_nothing_else():
+    done = run("experiments.cli", "view", "nowhere", "port=0", "--help")
+    assert done.returncode == 0 and done.stdout.startswith("emgs view: ") and not done.stderr
 
 
 def test_the_wrong_word_ends_a_command_with_one_line():
