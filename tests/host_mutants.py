@@ -83,6 +83,8 @@ LOCATION = ("tests/loops/test_location.py",)
 PLACES = ("tests/running/test_places.py",)
 LOCATING = ("tests/running/test_locating.py",)
 COMING_BACK = ("tests/running/test_coming_back.py",)
+SEGMENTS = ("tests/running/test_segments.py",)
+INPUTS = ("tests/running/test_inputs.py",)
 INSTANCES = ("tests/evaluation/test_instances.py",)
 PROTOCOLS = ("tests/evaluation/test_protocols.py",)
 CLASS_FILE = ("tests/data/test_class_file.py",)
@@ -406,6 +408,42 @@ MUTANTS = (
         "pass",
         COMING_BACK,
         "a map in which frames are only located changes",
+    ),
+    # segments
+    Mutant(
+        "emgs_jax/running/inputs.py",
+        "known = here or known",
+        "known = here",
+        INPUTS,
+        "an answer without any pose hides that the frame is another one",
+    ),
+    Mutant(
+        "emgs_jax/running/segments.py",
+        "end.log_scales[row] += float(np.log(scale_of(similarity)))",
+        "pass",
+        SEGMENTS,
+        "a segment that is joined keeps its unit",
+    ),
+    Mutant(
+        "emgs_jax/running/segments.py",
+        "    if here < there:\n        similarity = np.linalg.inv(similarity)\n",
+        "",
+        SEGMENTS,
+        "an older segment's similarity moves the newer one",
+    ),
+    Mutant(
+        "emgs_jax/running/segments.py",
+        "map = replace(alone.map, birth=jnp.full_like(alone.map.birth, time))",
+        "map = alone.map",
+        SEGMENTS,
+        "Gaussians of a segment follow the first frame of the run",
+    ),
+    Mutant(
+        "emgs_jax/running/segments.py",
+        "end.is_placed = [placed and here for placed, here in zip(end.is_placed, is_kept, strict=True)]",
+        "pass",
+        SEGMENTS,
+        "frames of another world are saved as places",
     ),
     # loops
     Mutant(

@@ -31,9 +31,14 @@ class Window:
 class PriorPrediction:
     """The answer of a prior to one window. Poses are in the frame of view 0, geometry in each view's own camera.
 
+    A prior that has lost view 0 may still know how others are to each other. Then view 0 has no pose, and the frame of
+    those that have one is the answer's own. It is the same from answer to answer as long as two in a row (answers
+    without any pose left out) have a pose for the same view.
+
     Args:
         window: the question.
-        T_anchor_view: camera -> camera of view 0, OpenCV axes, metres, float64 (v, 4, 4); the first is the identity.
+        T_anchor_view: camera -> camera of view 0, OpenCV axes, metres, float64 (v, 4, 4), NaN where it is not known;
+            the first is the identity, or NaN: then the others are camera -> a frame of their own.
         points: camera-frame points, metres, float32 (d, h, w, 3), rows as in `window.dense`; 0 where the mask is off.
         confidence: float32 (d, h, w), at least 1; higher is better.
         mask: bool (d, h, w), True where the point can be used.

@@ -31,13 +31,13 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
+from emgs_jax.report.back_end import counts
 from emgs_jax.report.provenance import RAW_PRIOR, prefixed
-from emgs_jax.running.back_end import counts
 from emgs_jax.running.clock import Clock, peak_memory_mb
 from emgs_jax.running.dense import center_cloud, dense_map
 from emgs_jax.running.gathering import Baselines, RawPrior, Text
 from emgs_jax.running.labelling import labelled_map
-from emgs_jax.running.record import FrameRecord, MappingRun, row_of_first_node, with_truth
+from emgs_jax.running.record import UNJOINED, FrameRecord, MappingRun, row_of_first_node, with_truth
 from emgs_jax.running.untracked import longest_row
 
 Metrics = dict[str, Any]
@@ -226,6 +226,7 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     metrics["map/capacity"] = run.config.submap.map_capacity
     metrics |= {f"frames/{status}": statuses[status] for status in STATUSES}
     metrics["frames/skipped"] = len(dataset.skipped)
+    metrics["segments/unjoined_frames"] = sum(record.reason == UNJOINED for record in run.records)
     row = longest_row(run.records)
     metrics["frames/longest_untracked"] = len(row)
     metrics["frames/longest_untracked_from"] = dataset.kept[run.records[row[0]].index] if row else None

@@ -39,4 +39,6 @@ def last_words(metrics: Mapping[str, Any]) -> str:
         return ""
     whole = count + sum(metrics[f"frames/{status}"] for status in ("tracked", "initialization", "skipped"))
     row, start = metrics["frames/longest_untracked"], metrics["frames/longest_untracked_from"]
-    return f"{count} of {whole} frames are degraded or lost, {row} in a row from frame {start} on; "
+    apart = metrics["segments/unjoined_frames"]
+    words = f", {apart} of them because their part was never joined with the map" if apart else ""
+    return f"{count} of {whole} frames are degraded or lost, {row} in a row from frame {start} on{words}; "

@@ -1,6 +1,7 @@
 """The files of a run: trajectory, map, Gaussians, densified points, mesh and the overview."""
 
 import itertools
+import json
 from pathlib import Path
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.gaussian_map import confirmed
-from emgs_jax.io.files import remove_temporaries, write_json
+from emgs_jax.io.files import atomic_write, remove_temporaries, write_json
 from emgs_jax.io.g2o import save_graph_g2o
 from emgs_jax.io.map_file import save_map_npz
 from emgs_jax.io.mesh import save_mesh_ply
@@ -16,12 +17,12 @@ from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
-from emgs_jax.report.recorded_run import EXPORTS, LOOPS_FILE, REPORT_FILE, TEXT_FILE
-from emgs_jax.running.back_end import loop_list, metric_graph
+from emgs_jax.report.back_end import loop_list, metric_graph
+from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, REPORT_FILE, TEXT_FILE
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.places import save_places
-from emgs_jax.running.record import MappingRun, row_of_first_node
+from emgs_jax.running.record import UNJOINED, MappingRun, row_of_first_node
 
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (
@@ -52,8 +53,10 @@ def save_progress(folder: Path, run: MappingRun) -> None:
     """Write trajectory.txt and map.npz of the frames so far; nothing before there is a map.
 
     With a back end also places.npz, by which another run goes on in the map; trajectory_online.txt, the poses as they
-    were when the frames were placed (in the unit of the finished map), graph.g2o and loops.json.
+    were when the frames were placed (in the unit of the finished map), graph.g2o and loops.json. Frames that are left
+    out are marked in frames.jsonl.
     """
+    _mark_unjoined(folder / FRAMES_FILE, run)
     if run.state is not None:
         save_trajectory_tum(
             folder / "trajectory.txt", [record.timestamp for record in run.records], np.stack(run.poses)
@@ -68,6 +71,19 @@ def save_progress(folder: Path, run: MappingRun) -> None:
         save_trajectory_tum(folder / "trajectory_online.txt", placed, np.stack(online))
         save_graph_g2o(folder / "graph.g2o", metric_graph(end))
         write_json(folder / LOOPS_FILE, loop_list(end))
+
+
+def _mark_unjoined(path: Path, run: MappingRun) -> None:
+    """Say in frames.jsonl, which was written as the frames were placed, which of them are left out after all."""
+    if not path.exists() or all(record.reason != UNJOINED for record in run.records):
+        return
+    lines, records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()], iter(run.records)
+    for line in lines:
+        record = None if line["status"] == "skipped" else next(records)
+        if record is not None and record.reason == UNJOINED:
+            line |= {name: getattr(record, name) for name in ("status", "reason", "covariance")}
+    with atomic_write(path, "w") as handle:
+        handle.writelines(json.dumps(line, allow_nan=False) + "\n" for line in lines)
 
 
 def save_classes(folder: Path, prior: Prior) -> None:

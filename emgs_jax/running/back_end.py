@@ -4,10 +4,9 @@ Nodes are the frames from the first of the map on, in the order of `SlamState.ti
 """
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,8 +19,8 @@ from emgs_jax.graph.measurements import LOOP, Graph, Nodes
 from emgs_jax.graph.optimize import GraphConfig, GraphInfo, optimize
 from emgs_jax.graph.problem import bucket
 from emgs_jax.loops.agreement import AgreementConfig, agreeing
-from emgs_jax.loops.appearance import AppearanceConfig, Database, Keyframe, describe, extend, propose
-from emgs_jax.loops.location import Location, LocationConfig, Places, locate
+from emgs_jax.loops.appearance import AppearanceConfig, Database, Keyframe, describe, extend, nearest, propose
+from emgs_jax.loops.location import NO_CANDIDATE, Location, LocationConfig, Places, locate
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement, VerificationConfig, VerifyInfo, neighbours_of, verify
 from emgs_jax.ops.ranges import number
@@ -92,6 +91,7 @@ class BackEnd:
         online: poses as they were when the frames were placed, in the unit of `poses`.
         frames: index in the data set of every node.
         is_placed: whether the map holds each of them: those that are neither degraded nor lost.
+        segments: of each of them; how those of two are to each other is not known.
         edges: what was measured.
         database: keyframes; their `frame` is the node.
         verified: loops that passed every gate of two keyframes.
@@ -101,6 +101,8 @@ class BackEnd:
         closures: what was solved.
         first: node of this run's first frame; those before are of the run that its map was saved by.
         since: node since which one frame leads to the next; before it the camera was lost.
+        segment: of the next node.
+        has_one_unit: what the inferences of all nodes give has one unit, as far as the prior has.
     """
 
     config: BackEndConfig
@@ -111,6 +113,7 @@ class BackEnd:
     online: list[np.ndarray] = field(default_factory=list)
     frames: list[int] = field(default_factory=list)
     is_placed: list[bool] = field(default_factory=list)
+    segments: list[int] = field(default_factory=list)
     edges: list[Edge] = field(default_factory=list)
     database: Database = field(default_factory=Database)
     verified: list[LoopMeasurement] = field(default_factory=list)
@@ -120,6 +123,8 @@ class BackEnd:
     closures: list[Closure] = field(default_factory=list)
     first: int = 0
     since: int = 0
+    segment: int = 0
+    has_one_unit: bool = True
 
     def add(self, look: Look, pose: np.ndarray, scale: float, origin: int | None, is_placed: bool = True) -> None:
         """One node more, with what its window and the map measure.
@@ -137,6 +142,7 @@ class BackEnd:
         self.log_scales.append(float(np.log(scale)))
         self.frames.append(look.frame)
         self.is_placed.append(is_placed)
+        self.segments.append(self.segment)
         noise, offsets = self.config.noise, self.config.offsets
         has_anchor = self.frames[self.first] == 0 and self.since == self.first
         self.edges += window_edges(look, time, self.log_scales, self.since, has_anchor, offsets, noise)
@@ -153,18 +159,47 @@ class BackEnd:
         self.database = extend(self.database, keyframe, appearance)
         row = len(self.database.keyframes) - 1
         for candidate in propose(self.database, row, appearance):
-            self._verify(row, candidate.row)
+            if self._segment_of(candidate.row) == self.segment:
+                self._verify(row, candidate.row)
         return self.new(self.agreed(since=time - self.config.agreement.max_query_gap))
 
     def _described(self, time: int, look: Look) -> Keyframe:
         return describe(time, look.image, look.points, look.mask, self.intrinsics, self.config.appearance)
 
-    def locate(self, look: Look) -> tuple[Location | None, str | None]:
-        """Where a frame that is no node yet was taken, by the keyframes that the map holds; else why that is open."""
+    def locate(self, look: Look, elsewhere: bool = False) -> tuple[Location | None, str | None]:
+        """Where a frame was taken, by the keyframes of its segment that the map holds; else why that is open.
+
+        Args:
+            look: of a frame that is no node yet, or is no keyframe.
+            elsewhere: by those of the other segment that has the one most alike, whatever the ratio of the units.
+        """
         query = self._described(len(self.poses), look)
-        places = Places(self.database, self.poses, self.log_scales, self.is_placed)
+        segment = self._most_alike(query) if elsewhere else self.segment
+        if segment is None:
+            return None, NO_CANDIDATE
+        is_there = [placed and one == segment for placed, one in zip(self.is_placed, self.segments, strict=True)]
+        places = Places(self.database, self.poses, self.log_scales, is_there)
         config = self.config
-        return locate(query, places, config.appearance, config.verification, config.location)
+        return locate(query, places, config.appearance, self._verification(elsewhere), config.location)
+
+    def _most_alike(self, query: Keyframe) -> int | None:
+        """The other segment with the placed keyframe that looks most like a query."""
+        keyframes = self.database.keyframes
+        others = [row for row in range(len(keyframes)) if self._segment_of(row) != self.segment]
+        others = [row for row in others if self.is_placed[keyframes[row].frame]]
+        found = nearest(self.database, query, others, 1, self.config.appearance)
+        return self._segment_of(found[0].row) if found else None
+
+    def _segment_of(self, row: int) -> int:
+        """Of a keyframe."""
+        return self.segments[self.database.keyframes[row].frame]
+
+    def _verification(self, is_free: bool) -> VerificationConfig:
+        """Of two keyframes; with the ratio of their units free where it must be."""
+        config = self.config.verification
+        if self.has_one_unit and not is_free:
+            return config
+        return replace(config, alignment=replace(config.alignment, scale_std=math.inf))
 
     def agreed(self, since: int = 0) -> list[LoopMeasurement]:
         """Loops of queries from `since` on that others agree with."""
@@ -189,9 +224,9 @@ class BackEnd:
     def _verify(self, row: int, other: int) -> None:
         keyframes = self.database.keyframes
         candidate = keyframes[other]
-        beside = [keyframes[k] for k in (other - 1, other + 1) if 0 <= k < row]
+        beside = [keyframes[k] for k in (other - 1, other + 1) if 0 <= k < row and self._segment_of(k) == self.segment]
         neighbours = neighbours_of(candidate, beside, self.poses, self.log_scales)
-        loop, info = verify(keyframes[row], candidate, neighbours, self.config.verification)
+        loop, info = verify(keyframes[row], candidate, neighbours, self._verification(is_free=False))
         self._note((candidate.frame, keyframes[row].frame), loop, info)
 
     def _note(self, nodes: tuple[int, int], loop: LoopMeasurement | None, info: VerifyInfo) -> None:
@@ -219,8 +254,10 @@ class BackEnd:
     def close(self, state: SlamState, loops: Sequence[LoopMeasurement] = ()) -> SlamState:
         """Solve with `loops` as edges, and move poses and map; if that is refused all stays, and they are no edges."""
         edges = [*self.edges, *map(loop_edge, loops)]
-        before = self.nodes()
-        after, info = optimize(Graph(before, stacked(edges)), self.config.solver)
+        before, solver = self.nodes(self.segment), self.config.solver
+        if not self.has_one_unit:  # the scales are not all about 1
+            solver = replace(solver, scale_std=jnp.asarray(math.inf))
+        after, info = optimize(Graph(before, stacked(edges)), solver)
         self.closures.append(Closure(len(self.poses) - 1, tuple(loops), info))
         if info.reason:
             return state
@@ -231,22 +268,14 @@ class BackEnd:
         self.log_scales = list(np.asarray(after.log_scale, np.float64)[:count])
         return follow(state, before, after, self.min_std)
 
-    def nodes(self) -> Nodes:
-        """All nodes, with free rows up to a power of two: the map's part compiles rarely."""
+    def nodes(self, segment: int | None = None) -> Nodes:
+        """All nodes, or those of a segment, with free rows up to a power of two: the map's part compiles rarely."""
         count = len(self.poses)
         room = bucket(count)
         poses = to_se3(np.stack([*self.poses, *[np.eye(4)] * (room - count)]))
         scales = jnp.asarray([*self.log_scales, *[0.0] * (room - count)], jnp.float32)
-        return Nodes(poses, scales, jnp.arange(room) < count)
-
-
-def metric_graph(end: BackEnd) -> Graph:
-    """Poses and measurements in the map's scale, without scales of their own: what other solvers read."""
-    scaled = [
-        edge._replace(Z_a_b=rescaled(edge.Z_a_b, np.exp(end.log_scales[edge.a])), log_ratio=0.0) for edge in end.edges
-    ]
-    nodes = end.nodes()
-    return Graph(replace(nodes, log_scale=jnp.zeros_like(nodes.log_scale)), stacked(scaled))
+        is_asked = [segment in (None, one) for one in self.segments]
+        return Nodes(poses, scales, jnp.asarray(is_asked + [False] * (room - count)))
 
 
 def follow(state: SlamState, before: Nodes, after: Nodes, min_std: float) -> SlamState:
@@ -264,35 +293,3 @@ def _moved_pose(T: jaxlie.SE3, before: Nodes, after: Nodes, row: int) -> jaxlie.
     """The node's new pose; T itself, bit for bit, where the node stays."""
     old, new = before.T_world.wxyz_xyz[row], after.T_world.wxyz_xyz[row]
     return jaxlie.SE3(jnp.where(jnp.all(old == new), T.wxyz_xyz, new))
-
-
-def loop_list(end: BackEnd) -> list[dict[str, Any]]:
-    """What became of every candidate, for loops.json, in the order of the frames.
-
-    `frame` and `other` are places among the frames in use, the later first; `outcome` is accepted, known (the poses
-    said so already), unconfirmed (others do not agree) or refused, and then `gate` and `measured` say by what.
-    """
-    accepted = {(loop.a, loop.b) for loop in end.accepted}
-    found = [Refusal(loop.a, loop.b, "", math.nan) for loop in end.verified]
-    agreed = {(loop.a, loop.b) for loop in end.agreed()}
-    lines = []
-    known = (item for item in [*found, *end.refusals] if item.a >= end.first)  # what is older is of another run
-    for a, b, gate, measured in sorted(known, key=lambda item: (item.b, item.a)):
-        verified = "accepted" if (a, b) in accepted else "known" if (a, b) in agreed else "unconfirmed"
-        line = {"frame": end.frames[b], "other": end.frames[a], "outcome": "refused" if gate else verified}
-        lines.append(line | ({"gate": gate, "measured": measured} if gate else {}))
-    return lines
-
-
-def counts(end: BackEnd) -> dict[str, Any]:
-    """What became of the candidates, for metrics.json."""
-    gates = Counter(refusal.gate for refusal in end.refusals)
-    refused = {f"loops/refused_{gate}": count for gate, count in sorted(gates.items())}
-    solved = [closure for closure in end.closures if closure.loops]
-    return {
-        "loops/verified": len(end.verified),
-        "loops/contradicted": len(end.contradicted),
-        "loops/accepted": len(end.accepted),
-        "loops/closures": sum(not closure.info.reason for closure in solved),
-        "loops/closures_refused": sum(bool(closure.info.reason) for closure in solved),
-    } | refused

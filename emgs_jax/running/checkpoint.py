@@ -7,7 +7,7 @@ and records come from the file, so that the result has the same bits as that of 
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,9 @@ from emgs_jax.running.record import FrameRecord, MappingRun
 from emgs_jax.slam import SlamConfig, SlamState
 
 CHECKPOINT_FILE = "checkpoint.npz"
-FORMAT, VERSION = "emgs_jax.checkpoint", 2
+FORMAT, VERSION = "emgs_jax.checkpoint", 3
 POSES = tuple(field.name for field in fields(FrameRecord) if field.name.endswith("pose"))
-MATRICES = dict.fromkeys(POSES, 4) | {"covariance": 6}  # of a record, and how many rows they have
+MATRICES = dict.fromkeys(POSES, 4) | {"covariance": 6, "similarity": 4}  # of a record, and how many rows they have
 
 
 @dataclass(frozen=True)
@@ -47,20 +47,27 @@ class Checkpoint:
         leaves: of the state, in the order of `jax.tree.leaves`; none before there is a map.
         capacities: of map and submap.
         records: as the frames were placed.
+        aside: leaves of the states that are set aside, by their segment.
     """
 
     num_inputs: int
     leaves: Sequence[np.ndarray]
     capacities: tuple[int, int]
     records: Sequence[FrameRecord]
+    aside: Mapping[int, Sequence[np.ndarray]] = field(default_factory=dict)
 
-    def restored(self, like: SlamState | None, config: SlamConfig) -> tuple[SlamState | None, SlamConfig]:
-        """State and config; `like` is a state of the same run, of any size."""
+    def restored(
+        self, like: SlamState | None, config: SlamConfig
+    ) -> tuple[SlamState | None, dict[int, SlamState], SlamConfig]:
+        """State, those that are set aside, and config; `like` is a state of the same run, of any size."""
         names = ("map_capacity", "submap_capacity")
         submap = replace(config.submap, **dict(zip(names, self.capacities, strict=True)))
-        leaves = [jnp.asarray(leaf) for leaf in self.leaves]
-        state = jax.tree.unflatten(jax.tree.structure(like), leaves) if leaves else None
-        return state, replace(config, submap=submap)
+
+        def state(leaves: Sequence[np.ndarray]) -> SlamState:
+            return jax.tree.unflatten(jax.tree.structure(like), [jnp.asarray(leaf) for leaf in leaves])
+
+        aside = {segment: state(leaves) for segment, leaves in self.aside.items()}
+        return state(self.leaves) if len(self.leaves) else None, aside, replace(config, submap=submap)
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint, signature: Mapping[str, Any]) -> None:
@@ -72,9 +79,12 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, signature: Mapping[str, 
         "num_inputs": checkpoint.num_inputs,
         "capacities": checkpoint.capacities,
         "num_leaves": len(checkpoint.leaves),
+        "aside": list(checkpoint.aside),
         "records": [{k: v for k, v in vars(record).items() if k not in MATRICES} for record in checkpoint.records],
     }
     arrays = {f"leaf_{row}": np.asarray(leaf) for row, leaf in enumerate(checkpoint.leaves)}
+    for segment, leaves in checkpoint.aside.items():
+        arrays |= {f"aside_{segment}_{row}": np.asarray(leaf) for row, leaf in enumerate(leaves)}
     for name, size in MATRICES.items():
         nothing = np.full((size, size), np.nan)  # stands for None
         found = [nothing if getattr(r, name) is None else getattr(r, name) for r in checkpoint.records]
@@ -103,8 +113,10 @@ def load_checkpoint(path: Path, signature: Mapping[str, Any]) -> Checkpoint:
             FrameRecord(**line, **{name: None if np.isnan(rows).any() else rows for name, rows in found.items()})
             for line, found in zip(header["records"], matrices, strict=True)
         ]
-        leaves = [arrays[f"leaf_{row}"] for row in range(header["num_leaves"])]
-        return Checkpoint(header["num_inputs"], leaves, tuple(header["capacities"]), records)
+        rows = range(header["num_leaves"])
+        aside = {segment: [arrays[f"aside_{segment}_{row}"] for row in rows] for segment in header["aside"]}
+        leaves = [arrays[f"leaf_{row}"] for row in rows]
+        return Checkpoint(header["num_inputs"], leaves, tuple(header["capacities"]), records, aside)
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror or error}") from error
     except (ValueError, KeyError, TypeError) as error:
@@ -134,7 +146,7 @@ class Keeper:
         self.found: Checkpoint | None = None
         self.note: str | None = None  # why a file that is there is of no use
         self._placed: list[FrameRecord] = []
-        self._done: tuple[int, SlamState | None, SlamConfig, int] | None = None
+        self._done: tuple[int, tuple[SlamState | None, dict[int, SlamState]], SlamConfig, int] | None = None
         self._num_saved = 0
         if self._every and path.exists():
             try:
@@ -155,7 +167,7 @@ class Keeper:
 
     def keep(self, run: MappingRun, num_inputs: int) -> None:
         """Take notice that a run has taken so many inputs, and write it if it is time."""
-        self._done = num_inputs, run.state, run.config, len(self._placed)
+        self._done = num_inputs, (run.state, run.aside), run.config, len(self._placed)
         if len(self._placed) >= self._num_saved + self._every:
             self.save()
 
@@ -163,10 +175,11 @@ class Keeper:
         """Write the run as it was after its last complete input, if that is not written yet."""
         if not self._every or self._done is None or self._done[-1] <= self._num_saved:
             return
-        num_inputs, state, config, count = self._done
+        num_inputs, (state, aside), config, count = self._done
         capacities = config.submap.map_capacity, config.submap.submap_capacity
         leaves = jax.device_get(jax.tree.leaves(state))
-        checkpoint = Checkpoint(num_inputs, leaves, capacities, self._placed[:count])
+        others = {segment: jax.device_get(jax.tree.leaves(one)) for segment, one in aside.items()}
+        checkpoint = Checkpoint(num_inputs, leaves, capacities, self._placed[:count], others)
         save_checkpoint(self.path, checkpoint, self._signature)
         self._num_saved = count
 

@@ -3,8 +3,9 @@
 from dataclasses import replace
 
 from emgs_jax.running.inputs import Input
-from emgs_jax.running.measuring import Look
-from emgs_jax.running.record import FOUND, PLACED, MappingRun, row_of_first_node
+from emgs_jax.running.locating import looks_of
+from emgs_jax.running.record import FOUND, PLACED, SEGMENT, MappingRun, row_of_first_node
+from emgs_jax.running.segments import join
 
 
 def correct(run: MappingRun, given: Input) -> None:
@@ -16,23 +17,17 @@ def correct(run: MappingRun, given: Input) -> None:
     """
     end, added, looks = run.back_end, run.records[-len(given.frames) :], looks_of(given)
     for look, record in zip(looks, added, strict=True):
-        if record.location == FOUND:
+        if record.location in (FOUND, SEGMENT):
             end.since = len(end.poses)
         end.add(look, record.pose, record.scale or 1.0, record.origin, record.status in PLACED)
+    if added[-1].similarity is not None:
+        join(run, given)
     num_contradicted = len(end.contradicted)
     found = end.look_for_loops(looks[-1])
     has_retracted = len(end.contradicted) > num_contradicted and end.retract(end.agreed()) > 0
     if has_retracted or end.wants_to_close(found):
         run.state = end.close(run.state, found)
         _take_poses(run)
-
-
-def looks_of(given: Input) -> list[Look]:
-    """What the back end takes of each frame."""
-    return [
-        Look(frame.index, frame.image, raw.points, raw.mask, given.T_anchor_views)
-        for frame, raw in zip(given.frames, given.raw, strict=True)
-    ]
 
 
 def finish(run: MappingRun) -> None:

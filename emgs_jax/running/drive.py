@@ -28,6 +28,7 @@ from emgs_jax.running.locating import (
     is_to_begin_anew,
     look_for,
     moved,
+    nowhere,
     refusal,
     with_map,
 )
@@ -35,14 +36,17 @@ from emgs_jax.running.places import load_saved
 from emgs_jax.running.record import (
     ANEW,
     FOUND,
+    JOINED,
+    SEGMENT,
     FrameRecord,
     MappingRun,
     new_run,
-    nowhere,
     record_lost,
+    record_segment,
     record_start,
     record_step,
 )
+from emgs_jax.running.segments import begun_segment, enter, leave_out, meeting, predicted
 from emgs_jax.running.unit import in_own_unit
 from emgs_jax.running.untracked import alarm
 from emgs_jax.slam import StepInfo
@@ -110,12 +114,14 @@ def map_frames(run: MappingRun, dataset: Dataset, prior: Prior, keeper: Keeper |
         keeper.save()
         if run.saved is not None and run.state is None:
             raise ValueError(nowhere(run))
+        leave_out(run)
         if run.back_end is not None and not run.is_fixed:
             with run.clock.phase("back_end"):
                 finish(run)
     except BaseException:
         with contextlib.suppress(OSError):  # the first error is the one to show
             keeper.save()
+        leave_out(run)
         raise
     finally:  # what an interrupted run leaves has the same unit
         in_own_unit(run)
@@ -135,15 +141,29 @@ def take(run: MappingRun, given: Input) -> None:
         case taken:
             if isinstance(taken, FirstWindow):
                 prepare(taken, run.camera, run.config)
-            info, location = integrate(run, given, as_prediction(taken))
-            if info is None:
-                record_lost(run, given, location)
+            before, new = run.state, begun_segment(run, given)
+            if new is not None:
+                run.state, run.config = new
+                record_segment(run, given, spent(given, timer))
+                enter(run, given, before)
+            elif not go_on(run, given, timer):
                 return
-            record_step(run, given, jax.device_get(info), spent(given, timer), location)
-            anchor_anew(run, given)
     if run.back_end is not None and not run.is_fixed:
         with run.clock.phase("back_end"):
             correct(run, given)
+
+
+def go_on(run: MappingRun, given: Input, timer: Timer) -> bool:
+    """One step, recorded; False where the camera has no place yet."""
+    info, location = integrate(run, given, predicted(run, given))
+    if info is None:
+        record_lost(run, given, location)
+        return False
+    similarity = meeting(run, given, info) if location is None else None
+    location = location if similarity is None else JOINED
+    record_step(run, given, jax.device_get(info), spent(given, timer), location, similarity)
+    anchor_anew(run, given)
+    return True
 
 
 def integrate(run: MappingRun, given: Input, prediction: Prediction) -> tuple[StepInfo | None, str | None]:
@@ -176,7 +196,7 @@ def integrate(run: MappingRun, given: Input, prediction: Prediction) -> tuple[St
 def anchor_anew(run: MappingRun, given: Input) -> None:
     """From the last frame on the prior's world is where that was found, if it was."""
     if run.records[-1].location == FOUND:
-        run.prior_motion = anchored_by(run.records[-1], as_prediction(given.taken))
+        run.prior_motion = anchored_by(run.records[-1], predicted(run, given))
 
 
 def repeat(run: MappingRun, given: Input, checkpoint: Checkpoint, is_last: bool) -> None:
@@ -189,6 +209,8 @@ def repeat(run: MappingRun, given: Input, checkpoint: Checkpoint, is_last: bool)
     for record in checkpoint.records[first : first + len(given.frames)]:
         run.records.append(record)
         run.on_record(record)
+    if run.records[-1].location == SEGMENT:
+        enter(run, given, run.state)
     anchor_anew(run, given)
     if run.state is None and run.records[-1].location == FOUND:
         run.state = begun(run, as_prediction(given.taken))
@@ -196,7 +218,7 @@ def repeat(run: MappingRun, given: Input, checkpoint: Checkpoint, is_last: bool)
         with run.clock.phase("back_end"):
             correct(run, given)  # moves the map of the first window, in which nobody looks
     if is_last:
-        run.state, run.config = checkpoint.restored(run.state, run.config)
+        run.state, run.aside, run.config = checkpoint.restored(run.state, run.config)
 
 
 def spent(given: Input, timer: Timer, num_sharing: int = 1) -> Mapping[str, float]:

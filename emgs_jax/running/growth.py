@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from emgs_jax.gaussian_map import empty_map, grow, insert
+from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert
 from emgs_jax.observation import Prediction, transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.precision import full_precision
@@ -58,12 +58,18 @@ def begin_anew(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[Sl
     first = FirstWindow(*jax.tree.map(lambda leaf: leaf[None], (view, T)))
     alone, _ = start(first, camera, config)
     new = replace(alone.map, birth=jnp.full_like(alone.map.birth, state.time - 1))
-    map, _, overflow = _insert(state.map, new)
-    while overflow > 0:
-        config = with_room(config, _of_map(overflow))
-        map, _, overflow = _insert(grow(state.map, config.submap.map_capacity), new)
+    map, config = with_part(state.map, new, config)
     belief = replace(state.belief, covariance=jnp.zeros_like(state.belief.covariance))
     return replace(state, map=map, belief=belief), config
+
+
+def with_part(map: GaussianMap, part: GaussianMap, config: SlamConfig) -> tuple[GaussianMap, SlamConfig]:
+    """A map with all Gaussians of another one beside its own, and the config with the room that it needs."""
+    both, _, overflow = _insert(map, part)
+    while overflow > 0:
+        config = with_room(config, _of_map(overflow))
+        both, _, overflow = _insert(grow(map, config.submap.map_capacity), part)
+    return both, config
 
 
 def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:

@@ -1,7 +1,7 @@
 """What a run takes, one input after the other: frames are read, predicted and converted when their turn comes."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,9 +35,11 @@ class Input:
         frames: one; several where the map is made from all of them.
         raw: what the prior alone says of each.
         taken: what the map starts from, or the prediction of a step; None where there is nothing to start from yet.
-        T_world_anchor: known pose of the first frame.
+        T_world_anchor: known pose of the first frame; NaN where the inference is not related to it.
         T_anchor_views: what the inference says of every view of its window, by frame index.
         spent: seconds of the conversion.
+        structure: number of the frame that `T_anchor_views` are in, see `PriorPrediction`; 0: that of the first frame.
+            Where it is another one `taken` has no pose: nothing says where the camera is in the world.
     """
 
     frames: tuple[Frame, ...]
@@ -46,6 +48,22 @@ class Input:
     T_world_anchor: np.ndarray
     T_anchor_views: Mapping[int, np.ndarray]
     spent: Mapping[str, float]
+    structure: int = 0
+
+
+@dataclass(frozen=True)
+class PlacedStructure:
+    """Where a frame of the prior's own is in the world of the part that was begun in it.
+
+    Args:
+        number: `Input.structure`.
+        T_world_structure: (4, 4).
+        T_world_anchor: (4, 4), of the frame by which the part began.
+    """
+
+    number: int
+    T_world_structure: np.ndarray
+    T_world_anchor: np.ndarray
 
 
 def inputs(dataset: Dataset, prior: Prior, config: SlamConfig, clock: Clock | None = None) -> Iterator[Input]:
@@ -56,19 +74,23 @@ def inputs(dataset: Dataset, prior: Prior, config: SlamConfig, clock: Clock | No
     Raises:
         ValueError: no frame has a point and a pose from which a map can start.
     """
-    num_done, last, is_started, clock = 0, np.eye(4), False, clock or Clock()
+    done: dict[int, np.ndarray] = {}  # raw poses
+    is_started, clock, structure, known = False, clock or Clock(), 0, set()
     for prediction, frames in predictions(dataset, prior, config.window_size, clock):
+        here = {index for index, pose in _poses(prediction).items() if np.isfinite(pose).all()}
+        structure += bool(is_started and known and here and not here & known)
+        known = here or known
         with clock.phase("map"):
             anchor = first_pose(frames)
-            raw = _raw_views(prediction, frames, anchor, (num_done, last if num_done else anchor), config)
-            convert = _step if is_started else _opening
-            found = convert(prediction, frames, anchor, raw, config, clock)
-        yield from found
-        num_done, last = prediction.window.current + 1, found[-1].raw[-1].T_world_camera
+            raw = _raw_views(prediction, frames, anchor, structure, done, config)
+            convert, unknown = _step if is_started else _opening, np.full((4, 4), np.nan)
+            found = convert(prediction, frames, unknown if structure else anchor, raw, config, clock)
+        yield from (replace(one, structure=structure) for one in found)
+        done |= {index: view.T_world_camera for index, view in raw.items()}
         is_started = found[-1].taken is not None
     if not is_started:
         raise ValueError(
-            f"none of the {num_done} frames of {dataset.name} {dataset.sequence} has a valid point and a "
+            f"none of the {len(done)} frames of {dataset.name} {dataset.sequence} has a valid point and a "
             "pose, so there is nothing to start a map from: take frames farther apart or closer together "
             "(dataset.stride=...), larger images (dataset.size=...) or another prior"
         )
@@ -137,19 +159,32 @@ def _raw_views(
     prediction: PriorPrediction,
     frames: Mapping[int, Frame],
     anchor: np.ndarray,
-    done: tuple[int, np.ndarray],
+    structure: int,
+    done: Mapping[int, np.ndarray],
     config: SlamConfig,
 ) -> dict[int, RawView]:
-    """Pose and points of each new frame as predicted; `done`: how many frames there were, and the last one's pose."""
-    window, (num_done, pose_before), views = prediction.window, done, {}
+    """Pose and points of each new frame as predicted; `done`: raw poses of those before."""
+    window, known, views = prediction.window, dict(done), {}
     for row, index in enumerate(window.dense):
-        if index < num_done:
+        if index in known:
             continue
-        pose = anchor @ prediction.T_anchor_view[window.views.index(index)]
         mask = prediction.mask[row] & (prediction.confidence[row] >= float(config.observation.min_confidence))
+        pose = anchor @ _poses(prediction)[index] if structure == 0 else _pose_after(prediction, index, known)
         if not np.isfinite(pose).all():
-            pose, mask = pose_before, np.zeros_like(mask)
+            pose, mask = known.get(index - 1, anchor), np.zeros_like(mask)
         image, features = frames[index].image, prediction.features[row]
         views[index] = RawView(prediction.points[row], mask, image, pose, features)
-        pose_before = pose
+        known[index] = pose
     return views
+
+
+def _pose_after(prediction: PriorPrediction, index: int, known: Mapping[int, np.ndarray]) -> np.ndarray:
+    """T_world_camera by the last frame before that the answer knows, as if that were in the world where it stands in.
+
+    Of the first that is known at all that is the frame before it; NaN where nothing is known of this one.
+    """
+    poses = _poses(prediction)
+    before = [other for other in poses if other in known and np.isfinite(poses[other]).all()]
+    if not before:
+        return known[index - 1] if np.isfinite(poses[index]).all() else poses[index]
+    return known[before[-1]] @ np.linalg.inv(poses[before[-1]]) @ poses[index]

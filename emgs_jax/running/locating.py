@@ -1,5 +1,6 @@
 """A camera that is lost, or new in a saved map: it is looked for among the keyframes, and goes on where it is found."""
 
+from collections import Counter
 from dataclasses import replace
 
 import jax
@@ -15,8 +16,8 @@ from emgs_jax.registration.belief import certain
 from emgs_jax.registration.rigid import pose_row, scale_translation
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.convert import FirstWindow, to_se3
-from emgs_jax.running.correction import looks_of
 from emgs_jax.running.inputs import Input
+from emgs_jax.running.measuring import Look
 from emgs_jax.running.record import PLACED, FrameRecord, MappingRun
 from emgs_jax.slam import SlamState, StepInfo
 
@@ -69,6 +70,14 @@ def _num_untracked(run: MappingRun, info: StepInfo) -> int:
 def look_for(run: MappingRun, given: Input) -> tuple[Location | None, str | None]:
     """Where the first frame of `given` was taken, or what refuses every place; see `loops.location`."""
     return run.back_end.locate(looks_of(given)[0])
+
+
+def looks_of(given: Input) -> list[Look]:
+    """What the back end takes of each frame."""
+    return [
+        Look(frame.index, frame.image, raw.points, raw.mask, given.T_anchor_views)
+        for frame, raw in zip(given.frames, given.raw, strict=True)
+    ]
 
 
 def as_prediction(taken: FirstWindow | Prediction) -> Prediction:
@@ -146,6 +155,16 @@ def refusal(info: StepInfo, prediction: Prediction, location: Location, config: 
     agrees = bool(found.is_tracked) and float(found.icp.inlier_fraction) >= config.min_inlier_fraction
     stays = found.step_m <= config.max_step * depth and np.degrees(found.step_rad) <= config.max_step_deg
     return None if agrees and stays else FINE_POSE
+
+
+def nowhere(run: MappingRun) -> str:
+    """That no frame was found in the saved map, and why."""
+    counts = Counter(record.location for record in run.records if record.location is not None)
+    reasons = ", ".join(f"{name} {count}" for name, count in counts.most_common())
+    return (
+        f"none of the {len(run.records)} frames is found in the saved map ({reasons or 'none has points and a pose'}): "
+        "take images of the same place, or map it anew without map="
+    )
 
 
 def with_map(state: SlamState, map: GaussianMap, capacity: int) -> SlamState:

@@ -104,7 +104,7 @@ def window_edges(
         ratio = log_scales[row] - log_scales[time]
         edges.append(Edge(time, row, np.linalg.inv(here) @ there, ratio, weights, WINDOW))
     anchor = poses.get(0)
-    if has_anchor and anchor is not None and look.frame > max(offsets):
+    if has_anchor and anchor is not None and np.isfinite(anchor).all() and look.frame > max(offsets):
         measured = np.linalg.inv(here) @ anchor
         reach = 1.0 + np.linalg.norm(measured[:3, 3])
         edges.append(Edge(time, since, measured, 0.0, _weights(reach * noise.anchor, reach * noise.anchor_deg), WINDOW))

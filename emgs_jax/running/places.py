@@ -151,6 +151,7 @@ def _fill(end: BackEnd, arrays: Mapping[str, np.ndarray], num_trained: int) -> N
         rows = _rows(name, arrays, LoopMeasurement.__annotations__, count)
         setattr(end, name, [LoopMeasurement(**row) for row in rows])
     end.first = end.since = count
+    end.segments = [0] * count
 
 
 def _keyframes(arrays: Mapping[str, np.ndarray]) -> tuple[Keyframe, ...]:

@@ -3,7 +3,6 @@
 A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; files write it as TUM's seven numbers.
 """
 
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -20,14 +19,15 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.running.back_end import BackEnd, BackEndConfig
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.convert import to_camera
-from emgs_jax.running.inputs import Input
+from emgs_jax.running.inputs import Input, PlacedStructure
 from emgs_jax.running.places import SavedMap
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
 
 Seconds = Mapping[str, float]  # as a `Timer` reads
 PLACED = ("tracked", "initialization")  # statuses of frames that the map holds
-FOUND, ANEW = "found", "anew"  # what may become of a camera that is looked for
+FOUND, ANEW, SEGMENT, JOINED = "found", "anew", "segment", "joined"  # what may become of a camera that is looked for
 NOT_FOUND = "its place in the saved map is not found"
+UNJOINED = "its part was never joined with the map (unjoined)"
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,8 @@ class FrameRecord:
             initialization (the map was made from it) or skipped (it cannot be read).
         reason: why it is not tracked.
         location: where the camera was looked for: `found`, and the run goes on from there; `anew`, and the map does so
-            from its coarse pose; or what refused every place.
+            from its coarse pose; or what refused every place. `segment`: a part begins whose relation to the others is
+            not known; `joined`: it is known by this frame.
         pose: T_world_camera; of a lost frame what stands in for it.
         raw_pose: the same as the prior alone says; the one before where it says none.
         true_pose: None where unknown.
@@ -55,6 +56,7 @@ class FrameRecord:
         depth_noise: how much the points differ from the map, as a fraction of their depth.
         step_m: between the coarse and the fine pose.
         step_rad: likewise.
+        similarity: where it is `joined`, what takes its part to the other: (4, 4) with e^σ R in the place of R.
         origin: place in the run of the frame by whose Gaussians it was placed (median of their births).
         repeat_rms: how far the two predictions of the previous image are apart, m.
         fused: points that moved Gaussians.
@@ -86,6 +88,7 @@ class FrameRecord:
     depth_noise: float | None = None
     step_m: float | None = None
     step_rad: float | None = None
+    similarity: np.ndarray | None = None
     origin: int | None = None
     repeat_rms: float | None = None
     fused: int | None = None
@@ -114,6 +117,8 @@ class MappingRun:
         back_end: what moves poses and map after the fact; None: what is placed stays.
         saved: what the run begins in; None: it makes its own map.
         prior_motion: what moves the prior's world since the camera was found; None: nothing.
+        structure: where the prior's frame is, if it is not related to the first frame any more.
+        aside: states of the other parts, by their segment; see `running/segments.py`.
     """
 
     camera: Camera
@@ -125,6 +130,8 @@ class MappingRun:
     back_end: BackEnd | None = None
     saved: SavedMap | None = None
     prior_motion: jaxlie.SE3 | None = None
+    structure: PlacedStructure | None = None
+    aside: dict[int, SlamState] = field(default_factory=dict)
 
     @property
     def is_fixed(self) -> bool:
@@ -197,13 +204,20 @@ def record_start(run: MappingRun, given: Input, spent: Seconds) -> None:
         _add(run, given, row, status="initialization", pose=to_matrix(pose), num_gaussians=count, **share)
 
 
-def record_step(run: MappingRun, given: Input, info: StepInfo, spent: Seconds, location: str | None = None) -> None:
-    """Add what a step did, `info` on the host, and the seconds that it took."""
+def record_segment(run: MappingRun, given: Input, spent: Seconds) -> None:
+    """Add the frame that a part of `run` begins with; it stands in where the one before is."""
+    count = int(np.asarray(run.map.gaussians.valid).sum())
+    kept = {"status": "initialization", "pose": run.records[-1].pose, "new": count, "num_gaussians": count}
+    _add(run, given, 0, **kept, location=SEGMENT, **spent)
+
+
+def record_step(run: MappingRun, given: Input, info: StepInfo, spent: Seconds, location=None, similarity=None) -> None:
+    """Add what a step did, `info` on the host, the seconds that it took, and what else the record says."""
     kept = {"fused": 0, "updated": 0, "new": 0, "num_gaussians": run.saved.count} if run.is_fixed else {}
     if location == ANEW:
         count = int(np.asarray(run.map.gaussians.valid).sum())
         kept = {"status": "initialization", "new": count - int(info.num_gaussians), "num_gaussians": count}
-    _add(run, given, 0, **_described(info) | kept, location=location, **spent)
+    _add(run, given, 0, **_described(info) | kept, location=location, similarity=similarity, **spent)
 
 
 def _add(run: MappingRun, given: Input, row: int, **described: Any) -> None:
@@ -252,16 +266,6 @@ def _described(info: StepInfo) -> dict[str, Any]:
 def row_of_first_node(run: MappingRun) -> int:
     """The record of the first frame that the back end has as a node of this run; it has all later ones, too."""
     return len(run.records) - (len(run.back_end.poses) - run.back_end.first)
-
-
-def nowhere(run: MappingRun) -> str:
-    """That no frame was found in the saved map, and why."""
-    counts = Counter(record.location for record in run.records if record.location is not None)
-    reasons = ", ".join(f"{name} {count}" for name, count in counts.most_common())
-    return (
-        f"none of the {len(run.records)} frames is found in the saved map ({reasons or 'none has points and a pose'}): "
-        "take images of the same place, or map it anew without map="
-    )
 
 
 def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

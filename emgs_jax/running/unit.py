@@ -27,8 +27,13 @@ def own_unit(state: SlamState, origin: np.ndarray) -> SlamState:
 
 
 def in_own_unit(run: MappingRun) -> None:
-    """`own_unit` of a run that ends, its poses and those of the back end included; a saved map keeps its own."""
+    """`own_unit` of a run that ends, its poses and those of the back end included.
+
+    A saved map keeps its own, and so does one of segments that were joined: the mean is of the last one's inferences.
+    """
     if run.state is None or run.saved is not None or not run.state.belief.log_scale:
+        return
+    if run.back_end is not None and not run.back_end.has_one_unit:
         return
     factor = np.exp(-float(run.state.belief.log_scale))
     origin = next(record.pose for record in run.records if record.pose is not None)[:3, 3]  # the anchor's

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from emgs_jax.localization import REASONS
-from emgs_jax.running.record import ANEW, FrameRecord
+from emgs_jax.running.record import ANEW, JOINED, NOT_FOUND, SEGMENT, UNJOINED, FrameRecord
 
 MANY_IN_A_ROW = 10  # single frames fail in every long sequence, so many together do not
 UNTRACKED = ("degraded", "lost")
@@ -24,7 +24,10 @@ REMEDIES = dict(
         ),
         strict=True,
     )
-)
+) | {
+    NOT_FOUND: "take images of the same place, or map it anew without map=",
+    UNJOINED: "take images that lead from there to the rest, closer together (dataset.stride=…)",
+}
 
 
 def alarm(records: Sequence[FrameRecord]) -> str | None:
@@ -36,6 +39,13 @@ def alarm(records: Sequence[FrameRecord]) -> str | None:
             f"{called(records[-1])}: the camera is found nowhere, so the map begins anew where the prior puts it; "
             "loops join the parts where they meet"
         )
+    if records[-1].location == SEGMENT:
+        return (
+            f"{called(records[-1])}: the prior goes on in a frame of its own, so a new map begins; it is joined with "
+            "what there is where a frame fits both, and left out if none does"
+        )
+    if records[-1].location == JOINED:
+        return f"{called(records[-1])} fits what was mapped before, and both are one map from here on"
     if records[-1].status in UNTRACKED:
         row = _last_row(records, MANY_IN_A_ROW + 1)
         if len(row) != MANY_IN_A_ROW:

@@ -15,7 +15,8 @@ from emgs_jax.gaussian_map import new_map
 from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.registration.belief import certain
-from emgs_jax.running.back_end import BackEnd, counts, metric_graph
+from emgs_jax.report.back_end import counts, metric_graph
+from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.correction import correct
 from emgs_jax.running.measuring import Look, window_edges
 from emgs_jax.running.record import FrameRecord, MappingRun
@@ -154,6 +155,10 @@ def test_a_window_measures_earlier_frames_and_the_anchor_once_each(graph):
     for edge in found:
         np.testing.assert_allclose(edge.Z_a_b, np.linalg.inv(poses[30]) @ poses[edge.b], atol=1e-12)
     assert window_edges(look(poses, 30), 30, [0.0] * 31, 0, False, graph.offsets, graph.noise)[-1].b != 0
+    measured = look(poses, 30)
+    measured.T_anchor_views[0][:] = np.nan
+    found = window_edges(measured, 30, [0.0] * 31, 0, True, graph.offsets, graph.noise)
+    assert [edge.b for edge in found] == [30 - offset for offset in graph.offsets], "the anchor is not known"
     measured = look(poses, 30)
     measured.T_anchor_views[29][:] = np.nan
     found = window_edges(measured, 30, [0.0] * 31, 0, True, graph.offsets, graph.noise)

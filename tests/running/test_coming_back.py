@@ -46,7 +46,7 @@ def walk(numbers) -> ReadableFrames:
 
 
 class Blinded(Prior):
-    """A prior that is in another world from one frame on, and knows nothing there of the frames before."""
+    """A prior that is in another world from one frame on, and knows there of the frames before where the first is."""
 
     def __init__(self, prior: Prior, cut: int) -> None:
         self._prior, self._cut, self.provenance = prior, cut, prior.provenance
@@ -57,7 +57,8 @@ class Blinded(Prior):
         if window.current < self._cut:
             return found
         poses, mask = matrix((20, 60, 10), (4.0, 1.0, -3.0)) @ found.T_anchor_view, found.mask.copy()
-        poses[[view < self._cut for view in window.views]] = np.nan
+        poses[[0 < view < self._cut for view in window.views]] = np.nan
+        poses[0] = np.eye(4)
         mask[[view < self._cut for view in window.dense]] = False
         return replace(found, T_anchor_view=poses, mask=mask)
 

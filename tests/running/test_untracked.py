@@ -55,6 +55,14 @@ def test_a_map_that_begins_anew_is_said_once():
     assert texts[7].startswith("7.jpg: the camera is found nowhere")
 
 
+@pytest.mark.parametrize(("location", "words"), [("segment", "a new map begins"), ("joined", "both are one map")])
+def test_where_a_part_begins_and_where_it_is_joined_is_said_once(location, words):
+    rows = records("it" + "l" * 4 + "ittt")
+    rows[6] = replace(rows[6], location=location)
+    texts = [alarm(rows[: place + 1]) for place in range(len(rows))]
+    assert [place for place, text in enumerate(texts) if text] == [6] and words in texts[6]
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_the_longest_row_is_that_of_a_search_over_all_of_them(seed):
     letters = "".join(random.Random(seed).choices("tdl", k=12))

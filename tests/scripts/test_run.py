@@ -64,7 +64,7 @@ KEYS = {
     *(f"{whose}segmentation/{name}" for whose in ("", "raw_prior/") for name in SEGMENTATION),
     *(f"reconstruction_{kind}/{name}" for kind in ("se3", "centers") for name in RECONSTRUCTION),
     *(f"frames/{name}" for name in ("tracked", "degraded", "lost", "initialization", "skipped", "overflow")),
-    *("frames/longest_untracked", "frames/longest_untracked_from"),
+    *("frames/longest_untracked", "frames/longest_untracked_from", "segments/unjoined_frames"),
     *(f"time/{name}_seconds" for name in PHASES),
     *(
         "time/seconds_per_frame",

@@ -2,10 +2,10 @@
 
 The first window in which that succeeds is built from its best pair of views (Schönberger and Frahm,
 "Structure-from-motion revisited", CVPR 2016); each later view is placed by the landmarks that it shows. Bundle
-adjustment refines the views of the window.
+adjustment refines the views of the window. Views that have lost the structure begin one of their own.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -43,6 +43,8 @@ class StructureConfig:
         distortion_std: what the radial distortion of the lens is expected to be, as k of x (1 + k |x|²) with x on the
             plane z = 1; it is measured in the first window. 0 = the images have none.
         median_depth: m; what the median landmark of the first view is taken for: images alone do not tell the scale.
+        max_lost: newest views of a window, one after the other, that cannot be placed, from which on they begin a
+            structure of their own.
     """
 
     matching: MatchingConfig
@@ -52,6 +54,7 @@ class StructureConfig:
     num_rounds: int = number(low=1, high=100)
     distortion_std: float = number(low=0, high=1000)
     median_depth: float = number(low=1e-6)
+    max_lost: int = number(low=3)  # fewer are no structure
 
 
 def initialize(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> bool:
@@ -88,6 +91,31 @@ def extend(structure: Structure, camera: Camera, num_views: int, config: Structu
     num_fixed = min(config.num_fixed, len(frames) - 2)
     if num_fixed >= 2:
         refine(structure, camera, num_views, frames[:num_fixed], config)
+
+
+def begin_again(
+    structure: Structure, current: int, camera: Camera, num_views: int, config: StructureConfig
+) -> Structure | None:
+    """A structure of the newest views alone, where these have lost the one that there is; None where they have not.
+
+    Nothing relates it to the other, of which it has neither views nor landmarks: its frame is that of its first view,
+    its scale that of its own `median_depth`. The lens is the same.
+
+    Args:
+        structure: after `extend`; it stays as it is.
+        current: a view that must be placed by then.
+        camera: of the images.
+        num_views: at most, in a window.
+        config: of both.
+    """
+    last = max(structure.placed(), default=-1)
+    lost = {frame: view for frame, view in structure.views.items() if frame > last}
+    if current not in lost or len(lost) < config.max_lost:
+        return None
+    views = {frame: replace(view, landmark=view.landmark.copy()) for frame, view in lost.items()}
+    new = Structure(structure.K, views, np.full_like(structure.points, np.nan), structure.distortion)
+    has_begun = initialize(new, camera, num_views, replace(config, distortion_std=0.0))
+    return new if has_begun and current in new.placed() else None
 
 
 def refine(

@@ -13,6 +13,9 @@ known, more the smaller the expected error is.
 The frame is that of the first image that could be placed (image 0, unless the camera rests at first), and the scale
 that of its window, which is fixed by `median_depth`; images alone do not tell it. The radial distortion of the lens is
 measured in that window too: points lie on the rays of the lens then, not on those of the pinhole.
+
+Where the camera has lost all that the structure knows, the newest views begin another one, with a frame and a scale of
+its own. What is known of the views before is of no use then: they have no pose any more, the anchor included.
 """
 
 import math
@@ -32,7 +35,7 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate_depth
-from emgs_jax.prior.multiview.incremental import StructureConfig, extend, initialize
+from emgs_jax.prior.multiview.incremental import StructureConfig, begin_again, extend, initialize
 from emgs_jax.prior.multiview.landmarks import Structure, detect, forget, link
 from emgs_jax.prior.multiview.lens import as_shown, points_shown, rectify, straight
 from emgs_jax.prior.multiview.planar import PlanarConfig, fill_planes
@@ -85,7 +88,7 @@ class MultiviewStereo(Prior):
     def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:
         self._structure_config, self._dense_config = structure, dense
         settings = {"structure": _values(structure), "dense": _values(dense)}
-        self.provenance = Provenance("multiview_stereo", {"version": 3} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 4} | settings)
         self._next = 0
         self._structure = Structure(np.eye(3))
 
@@ -111,13 +114,9 @@ class MultiviewStereo(Prior):
         self._next = window.inference + 1
         self._forget(window)
         for frame in frames:
-            if frame.index not in self._structure.views:
+            if frame.index >= self._oldest and frame.index not in self._structure.views:
                 self._add(frame)
-        place_views = extend if self._has_begun else initialize
-        place_views(self._structure, self._camera, self._num_views, self._structure_config)
-        if not self._has_begun and self._structure.placed():
-            self._has_begun, lens = True, self._structure.lens()
-            self._grays = {frame: rectify(gray, lens) for frame, gray in self._grays.items()}
+        self._place_views(window.current)
         return self._answer(window)
 
     def _begin(self, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
@@ -126,11 +125,23 @@ class MultiviewStereo(Prior):
         self._camera = Camera(focal, center, width, height)
         self._structure = Structure(calibration(intrinsics))
         self._has_begun = False
+        self._oldest = 0  # view of this structure
         self._grays: dict[int, np.ndarray] = {}
         self._depths: dict[int, np.ndarray] = {}
         self._spreads: dict[int, np.ndarray] = {}
         # A later window sees the anchor, the FIFO, the current and the newest image.
         self._num_views = len(frames) + 3
+
+    def _place_views(self, current: int) -> None:
+        given = self._camera, self._num_views, self._structure_config
+        if self._has_begun:
+            extend(self._structure, *given)
+            other = begin_again(self._structure, current, *given)
+            if other is not None:
+                self._structure, self._oldest = other, min(other.views)
+        elif initialize(self._structure, *given):
+            self._has_begun, lens = True, self._structure.lens()
+            self._grays = {frame: rectify(gray, lens) for frame, gray in self._grays.items()}
 
     def _forget(self, window: Window) -> None:
         gone = [frame for frame in self._structure.views if frame not in window.views]
@@ -153,7 +164,7 @@ class MultiviewStereo(Prior):
         link(self._structure, frame.index, self._structure_config.matching)
 
     def _answer(self, window: Window) -> PriorPrediction:
-        views, lens = [self._structure.views[frame] for frame in window.views], self._structure.lens()
+        placed, lens = self._structure.placed(), self._structure.lens()
         for frame in window.dense:
             if frame not in self._depths or not self._depths[frame].any():  # it may have been placed since
                 self._depths[frame], self._spreads[frame] = self._depth(frame)
@@ -163,11 +174,12 @@ class MultiviewStereo(Prior):
         mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_support)
         points = points_shown(np.where(mask, depth, 0.0), lens).astype(np.float32)
         features = np.zeros((*mask.shape, 0), np.float16)
-        T_anchor_view = np.full((len(views), 4, 4), np.nan)
-        T_anchor_view[0] = np.eye(4)  # also where it is not known
-        for row, view in enumerate(views[1:], start=1):
-            if view.T_ref_view is not None:
-                T_anchor_view[row] = view.T_ref_view
+        T_anchor_view = np.full((len(window.views), 4, 4), np.nan)
+        if self._oldest <= window.views[0]:
+            T_anchor_view[0] = np.eye(4)  # also where it is not known
+        for row, frame in enumerate(window.views[1:], start=1):
+            if frame in placed:
+                T_anchor_view[row] = placed[frame].T_ref_view
         return PriorPrediction(window, T_anchor_view, points, confidence, mask, features)
 
     def _depth(self, frame: int) -> tuple[np.ndarray, np.ndarray]:

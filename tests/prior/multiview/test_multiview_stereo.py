@@ -216,8 +216,72 @@ def test_after_a_loss_a_known_place_is_found_again(room):
     for index, same in enumerate(back, start=NUM_FRAMES + gap):
         np.testing.assert_allclose(after[index], before[same], atol=0.02)
     assert found[-1].mask[-1].any()
-    without = answers(make_prior("prior.structure.matching.max_remembered=0"), images)
+    forgetful = "prior.structure.matching.max_remembered=0", "prior.structure.max_lost=100"
+    without = answers(make_prior(*forgetful), images)
     assert np.isnan(without[-1].T_anchor_view[-1]).all()
+
+
+@pytest.fixture(scope="module")
+def two_rooms(room):
+    """The room, and from frame `NUM_FRAMES` on another one, of which nothing is known."""
+    other = Synthetic(num_frames=40, stop=NUM_FRAMES, size=(128, 96), seed=5)
+    frames = [*(room[index] for index in range(NUM_FRAMES)), *(other[index] for index in range(NUM_FRAMES))]
+    return Edited([replace(frame, index=index) for index, frame in enumerate(frames)], like=room)
+
+
+@pytest.fixture(scope="module")
+def answered_in_two(two_rooms):
+    return answers(make_prior("prior.structure.max_lost=4"), two_rooms)
+
+
+@pytest.mark.slow
+def test_a_camera_in_another_room_begins_a_structure_of_its_own(room, two_rooms, answered, answered_in_two):
+    """Oracle: the true motion in the second room, up to its own scale; the answers before are those without it."""
+    assert all(same_bits(a, b) for a, b in zip(answered[:-1], answered_in_two, strict=False))
+    poses, begun = {}, None
+    for answer in answered_in_two:
+        known = dict(zip(answer.window.views, answer.T_anchor_view, strict=True))
+        known = {index: pose for index, pose in known.items() if np.isfinite(pose).all()}
+        if 0 in known:
+            assert begun is None and not any(index >= NUM_FRAMES for index in known), "related to nothing yet"
+            continue
+        if begun is None:  # with the fourth image that could not be placed, the newest of its window
+            begun = answer.window.current
+            assert begun == NUM_FRAMES + 2
+            np.testing.assert_array_equal(known[NUM_FRAMES], np.eye(4))  # the frame is that of its first view
+        assert min(known) >= NUM_FRAMES and answer.window.current in known and answer.mask[1].any()
+        poses |= known
+    assert sorted(poses) == list(range(NUM_FRAMES, 2 * NUM_FRAMES))
+    estimate = np.stack([poses[index][:3, 3] for index in sorted(poses)])
+    truth = np.stack([two_rooms[index].T_world_camera[:3, 3] for index in sorted(poses)])
+    assert similarity_error(estimate, truth) < 0.01  # m
+    scale = np.linalg.norm(truth[-1] - truth[0]) / np.linalg.norm(estimate[-1] - estimate[0])
+    depth, truth = answered_in_two[-1].points[1, ..., 2], two_rooms[2 * NUM_FRAMES - 1].depth
+    mask = answered_in_two[-1].mask[1]
+    assert mask.mean() > 0.4 and np.median(np.abs(scale * depth / truth - 1)[mask]) < 0.06
+
+
+@pytest.mark.slow
+def test_the_lens_is_measured_once(two_rooms):
+    prior = make_prior("prior.structure.max_lost=4")
+    found = predictions(two_rooms, prior, WINDOW_SIZE, Clock())
+    measured = [prior.report()["prior/distortion"] for _ in found]
+    assert measured[0] != 0 and len(measured) > NUM_FRAMES and len(set(measured)) == 1
+
+
+@pytest.mark.slow
+def test_few_lost_images_begin_nothing(two_rooms, answered_in_two):
+    patient = answers(make_prior("prior.structure.max_lost=7"), two_rooms)
+    for found, other in zip(patient, answered_in_two, strict=True):
+        num_lost = min(found.window.current + 2, 2 * NUM_FRAMES) - NUM_FRAMES
+        assert np.isfinite(found.T_anchor_view[0]).all() == (num_lost < 7), found.window
+        assert np.isfinite(other.T_anchor_view[0]).all() == (num_lost < 4), other.window
+
+
+@pytest.mark.slow
+def test_a_recording_of_a_structure_without_a_relation_has_the_same_bits(tmp_path, two_rooms, answered_in_two):
+    record(make_prior("prior.structure.max_lost=4"), two_rooms, WINDOW_SIZE, tmp_path)
+    assert all(same_bits(a, b) for a, b in zip(answers(Recorded(tmp_path), two_rooms), answered_in_two, strict=True))
 
 
 def test_windows_out_of_order_are_refused(room):
@@ -250,5 +314,5 @@ def test_the_provenance_holds_every_value_of_the_config_as_it_was_written():
     def without_targets(node):
         return {k: without_targets(v) for k, v in node.items() if k != "_target_"} if hasattr(node, "items") else node
 
-    assert settings == {"version": 3} | without_targets(config.prior)
+    assert settings == {"version": 4} | without_targets(config.prior)
     assert settings != make_prior("prior.dense.depth.max_cost=0.11").provenance.settings

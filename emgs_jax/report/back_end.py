@@ -1,0 +1,55 @@
+"""What a back end has measured, and what became of the candidates of loops: for graph.g2o, loops.json, metrics.json."""
+
+import math
+from collections import Counter
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from emgs_jax.graph.measurements import Graph
+from emgs_jax.loops.two_views import rescaled
+from emgs_jax.running.back_end import BackEnd, Refusal
+from emgs_jax.running.measuring import stacked
+
+
+def metric_graph(end: BackEnd) -> Graph:
+    """Poses and measurements in the map's scale, without scales of their own: what other solvers read."""
+    scaled = [
+        edge._replace(Z_a_b=rescaled(edge.Z_a_b, np.exp(end.log_scales[edge.a])), log_ratio=0.0) for edge in end.edges
+    ]
+    nodes = end.nodes()
+    return Graph(replace(nodes, log_scale=jnp.zeros_like(nodes.log_scale)), stacked(scaled))
+
+
+def loop_list(end: BackEnd) -> list[dict[str, Any]]:
+    """What became of every candidate, for loops.json, in the order of the frames.
+
+    `frame` and `other` are places among the frames in use, the later first; `outcome` is accepted, known (the poses
+    said so already), unconfirmed (others do not agree) or refused, and then `gate` and `measured` say by what.
+    """
+    accepted = {(loop.a, loop.b) for loop in end.accepted}
+    found = [Refusal(loop.a, loop.b, "", math.nan) for loop in end.verified]
+    agreed = {(loop.a, loop.b) for loop in end.agreed()}
+    lines = []
+    known = (item for item in [*found, *end.refusals] if item.a >= end.first)  # what is older is of another run
+    for a, b, gate, measured in sorted(known, key=lambda item: (item.b, item.a)):
+        verified = "accepted" if (a, b) in accepted else "known" if (a, b) in agreed else "unconfirmed"
+        line = {"frame": end.frames[b], "other": end.frames[a], "outcome": "refused" if gate else verified}
+        lines.append(line | ({"gate": gate, "measured": measured} if gate else {}))
+    return lines
+
+
+def counts(end: BackEnd) -> dict[str, Any]:
+    """What became of the candidates, for metrics.json."""
+    gates = Counter(refusal.gate for refusal in end.refusals)
+    refused = {f"loops/refused_{gate}": count for gate, count in sorted(gates.items())}
+    solved = [closure for closure in end.closures if closure.loops]
+    return {
+        "loops/verified": len(end.verified),
+        "loops/contradicted": len(end.contradicted),
+        "loops/accepted": len(end.accepted),
+        "loops/closures": sum(not closure.info.reason for closure in solved),
+        "loops/closures_refused": sum(bool(closure.info.reason) for closure in solved),
+    } | refused

@@ -1,0 +1,207 @@
+"""Segments: parts of a run of which nobody knows how they are to each other, until the camera sees both.
+
+A prior that has lost the first view may go on in a frame of its own. There a new map begins, and the one before is set
+aside. Where a frame fits a map that is set aside, the similarity between its two places makes one segment of both: the
+newer one moves, poses, scales and Gaussians. What never met is left out at the end.
+"""
+
+from collections import Counter
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emgs_jax.graph.deform import deform
+from emgs_jax.graph.measurements import WINDOW
+from emgs_jax.loops.location import Location
+from emgs_jax.loops.two_views import rescaled
+from emgs_jax.observation import Prediction
+from emgs_jax.registration.belief import Belief
+from emgs_jax.running.back_end import BackEnd, follow
+from emgs_jax.running.convert import FirstWindow, to_se3
+from emgs_jax.running.growth import advance, start, with_part
+from emgs_jax.running.inputs import Input, PlacedStructure
+from emgs_jax.running.locating import anchored_by, as_prediction, found_at, looks_of, refusal
+from emgs_jax.running.measuring import Edge
+from emgs_jax.running.record import UNJOINED, FrameRecord, MappingRun, row_of_first_node, to_matrix
+from emgs_jax.slam import SlamConfig, SlamState, StepInfo
+
+_deform = eqx.filter_jit(deform)
+
+
+def predicted(run: MappingRun, given: Input) -> Prediction:
+    """What is given as a step's input, in the world of the map; without poses where that is not related to it."""
+    prediction, placed = as_prediction(given.taken), run.structure
+    if placed is None or placed.number != given.structure:
+        return prediction
+    here = given.frames[0].index
+    rows = here - 1, here, here + int(prediction.has_newest)
+    T_world_views = placed.T_world_structure @ np.stack([given.T_anchor_views[row] for row in rows])
+    return replace(prediction, T_world_views=to_se3(T_world_views), T_world_anchor=to_se3(placed.T_world_anchor))
+
+
+def begun_segment(run: MappingRun, given: Input) -> tuple[SlamState, SlamConfig] | None:
+    """A map of this frame alone, where the one before stands in; None where nothing new begins.
+
+    Its unit is the prior's own: another one says nothing of it.
+    """
+    number = 0 if run.structure is None else run.structure.number
+    pose = given.T_anchor_views.get(given.frames[0].index)
+    is_new = run.back_end is not None and run.state is not None and not run.is_fixed and given.structure != number
+    if not is_new or pose is None or not np.isfinite(pose).all():
+        return None
+    view = jax.tree.map(lambda leaf: leaf[None], as_prediction(given.taken).current)
+    alone, config = start(FirstWindow(view, to_se3(run.records[-1].pose[None])), run.camera, run.config)
+    if not bool(alone.map.gaussians.valid.any()):
+        return None
+    time = run.state.time
+    map = replace(alone.map, birth=jnp.full_like(alone.map.birth, time))
+    return replace(alone, map=map, time=time + 1), config
+
+
+def enter(run: MappingRun, given: Input, before: SlamState) -> None:
+    """Go on in the segment that the last frame has begun; the state `before` it is set aside."""
+    pose = run.records[-1].pose
+    T_world_structure = pose @ np.linalg.inv(given.T_anchor_views[given.frames[0].index])
+    run.aside = run.aside | {run.back_end.segment: before}
+    run.back_end.segment = given.structure
+    run.structure, run.prior_motion = PlacedStructure(given.structure, T_world_structure, pose), None
+
+
+def meeting(run: MappingRun, given: Input, info: StepInfo) -> np.ndarray | None:
+    """The similarity (4, 4) from the world of a frame to that of another segment, if it is seen there, else None.
+
+    Its place there must pass what a lost camera's must, the map's word included.
+
+    Args:
+        run: before this frame.
+        given: this frame.
+        info: of its step, in its own segment.
+    """
+    if not run.aside or not bool(info.localization.is_tracked):
+        return None
+    place, _ = run.back_end.locate(looks_of(given)[0], elsewhere=True)
+    if place is None:
+        return None
+    other = run.aside[run.back_end.segments[place.by]]
+    # The prior's unit in that map is what this frame says.
+    belief = replace(other.belief, log_scale=jnp.asarray(place.log_scale, jnp.float32))
+    visiting = replace(run, state=replace(other, belief=belief))
+    begin, again = found_at(visiting, predicted(run, given), place)
+    _, there, _ = advance(begin, again, run.camera, run.config)
+    if refusal(there, again, place, run.back_end.config.location) is not None:
+        return None
+    return similarity_between(info, there)
+
+
+def similarity_between(here: StepInfo, there: StepInfo) -> np.ndarray:
+    """(4, 4) with e^σ R in the place of R: what takes a frame and its lengths from one of its places to the other."""
+    before, after = (to_matrix(np.asarray(info.T_world_camera.wxyz_xyz)) for info in (here, there))
+    before[:3, :3] *= float(here.localization.scale)
+    after[:3, :3] *= float(there.localization.scale)
+    return after @ np.linalg.inv(before)
+
+
+def moved_pose(similarity: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
+    """A pose (4, 4) where a similarity takes it."""
+    moved = similarity @ T_world_camera
+    moved[:3, :3] /= scale_of(similarity)
+    return moved
+
+
+def scale_of(similarity: np.ndarray) -> float:
+    """By which a similarity multiplies lengths."""
+    return float(np.cbrt(np.linalg.det(similarity[:3, :3])))
+
+
+def join(run: MappingRun, given: Input) -> None:
+    """Make one segment of that of the last frame, which is a node already, and of the one in which it was found.
+
+    The newer one moves, by the similarity of the record or its inverse.
+    """
+    end, similarity = run.back_end, run.records[-1].similarity
+    place, _ = end.locate(looks_of(given)[-1], elsewhere=True)  # where `meeting` has found it
+    here, there = end.segment, end.segments[place.by]
+    if here < there:
+        similarity = np.linalg.inv(similarity)
+    newer, older, before = max(here, there), min(here, there), end.nodes()
+    rows = [row for row, one in enumerate(end.segments) if one == newer]
+    for row in rows:
+        end.poses[row] = moved_pose(similarity, end.poses[row])
+        end.log_scales[row] += float(np.log(scale_of(similarity)))
+    after, first = end.nodes(), row_of_first_node(run) - end.first
+    for row in rows:
+        run.records[first + row] = _moved_record(similarity, run.records[first + row])
+    end.segments = [older if one == newer else one for one in end.segments]
+    end.segment, end.has_one_unit = older, False
+    end.edges.append(_edge(end, place))
+    other = run.aside[there]
+    run.aside = {one: state for one, state in run.aside.items() if one != there}
+    state = follow(run.state, before, after, end.min_std)
+    map, run.config = with_part(state.map, _deform(other.map, before, after, jnp.asarray(end.min_std)), run.config)
+    run.state = replace(state, map=map)
+    if here == newer:
+        run.state = replace(run.state, belief=_moved_belief(similarity, state.belief))
+        run.prior_motion = anchored_by(run.records[-1], predicted(run, given))
+
+
+def _edge(end: BackEnd, place: Location) -> Edge:
+    """What holds two segments together: the last node relative to the keyframe by which it was found, as it is now."""
+    a, b = place.by, len(end.poses) - 1
+    scale = np.exp(end.log_scales[a])
+    units = np.array([scale] * 3 + [1.0] * 4)
+    information = np.linalg.inv(place.covariance / units[:, None] / units)
+    measured = rescaled(np.linalg.inv(end.poses[a]) @ end.poses[b], 1.0 / scale)
+    ratio = end.log_scales[b] - end.log_scales[a]
+    return Edge(a, b, measured, ratio, np.linalg.cholesky(information).T, WINDOW)
+
+
+def _moved_record(similarity: np.ndarray, record: FrameRecord) -> FrameRecord:
+    scale = scale_of(similarity)
+    units = np.array([scale] * 3 + [1.0] * 3)
+    poses = {name: getattr(record, name) for name in ("pose", "newest_pose")}
+    return replace(
+        record,
+        **{name: None if pose is None else moved_pose(similarity, pose) for name, pose in poses.items()},
+        covariance=None if record.covariance is None else units[:, None] * record.covariance * units,
+        scale=None if record.scale is None else scale * record.scale,
+    )
+
+
+def _moved_belief(similarity: np.ndarray, belief: Belief) -> Belief:
+    scale = scale_of(similarity)
+    units = jnp.asarray([scale] * 3 + [1.0] * 4, jnp.float32)
+    return replace(
+        belief,
+        covariance=units[:, None] * belief.covariance * units,
+        world_covariance=units[:, None] * belief.world_covariance * units,
+        log_scale=belief.log_scale + jnp.log(jnp.asarray(scale, jnp.float32)),
+    )
+
+
+def leave_out(run: MappingRun) -> None:
+    """Keep the segment of most placed frames, or the saved map's; nothing fuses what was never joined with it.
+
+    The other frames are lost: their poses are relative to where each segment stood in.
+    """
+    if not run.aside:
+        return
+    end = run.back_end
+    counts = Counter(one for one, is_placed in zip(end.segments, end.is_placed, strict=True) if is_placed)
+    kept = 0 if run.saved is not None else max(sorted(counts), key=lambda one: counts[one])
+    run.state, run.aside = ({end.segment: run.state} | run.aside)[kept], {}
+    is_kept = [one == kept for one in end.segments]
+    end.is_placed = [placed and here for placed, here in zip(end.is_placed, is_kept, strict=True)]
+    end.segment = kept
+    for name in ("edges", "verified", "contradicted", "accepted"):
+        setattr(end, name, [one for one in getattr(end, name) if is_kept[one.a] and is_kept[one.b]])
+    known = end.database
+    rows = [row for row, one in enumerate(known.keyframes) if is_kept[one.frame]]
+    end.database = replace(known, keyframes=tuple(known.keyframes[row] for row in rows), vectors=known.vectors[rows])
+    first = row_of_first_node(run) - end.first
+    for row in range(end.first, len(is_kept)):
+        if not is_kept[row]:
+            lost = {"status": "lost", "reason": UNJOINED, "covariance": None}
+            run.records[first + row] = replace(run.records[first + row], **lost)
