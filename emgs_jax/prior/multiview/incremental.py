@@ -5,6 +5,7 @@ The first window in which that succeeds is built from its best pair of views (Sc
 adjustment refines the views of the window. Views that have lost the structure begin one of their own.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -44,7 +45,7 @@ class StructureConfig:
             plane z = 1; it is measured in the first window. 0 = the images have none.
         median_depth: m; what the median landmark of the first view is taken for: images alone do not tell the scale.
         max_lost: newest views of a window, one after the other, that cannot be placed, from which on they begin a
-            structure of their own.
+            structure of their own; what is forgotten then is not found again. inf: never.
     """
 
     matching: MatchingConfig
@@ -54,7 +55,7 @@ class StructureConfig:
     num_rounds: int = number(low=1, high=100)
     distortion_std: float = number(low=0, high=1000)
     median_depth: float = number(low=1e-6)
-    max_lost: int = number(low=3)  # fewer are no structure
+    max_lost: float = number(low=3, high=math.inf)  # fewer are no structure
 
 
 def initialize(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> bool:

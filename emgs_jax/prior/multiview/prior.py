@@ -71,8 +71,9 @@ class DenseConfig:
 
 
 def _values(config: StructureConfig | DenseConfig) -> dict:
-    """What a config was given, as JSON holds it: a device's .1 is .1 again."""
-    return jax.tree.map(lambda v: float(str(np.float32(v))) if isinstance(v, jax.Array) else v, asdict(config))
+    """What a config was given, as JSON holds it: a device's .1 is .1 again, and infinity is null."""
+    given = jax.tree.map(lambda v: float(str(np.float32(v))) if isinstance(v, jax.Array) else v, asdict(config))
+    return jax.tree.map(lambda v: None if v == math.inf else v, given)
 
 
 class MultiviewStereo(Prior):

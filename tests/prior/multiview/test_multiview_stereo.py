@@ -216,8 +216,7 @@ def test_after_a_loss_a_known_place_is_found_again(room):
     for index, same in enumerate(back, start=NUM_FRAMES + gap):
         np.testing.assert_allclose(after[index], before[same], atol=0.02)
     assert found[-1].mask[-1].any()
-    forgetful = "prior.structure.matching.max_remembered=0", "prior.structure.max_lost=100"
-    without = answers(make_prior(*forgetful), images)
+    without = answers(make_prior("prior.structure.matching.max_remembered=0"), images)
     assert np.isnan(without[-1].T_anchor_view[-1]).all()
 
 
