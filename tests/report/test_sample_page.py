@@ -1,4 +1,4 @@
-"""docs/report.html, the page that README links to: of the form that pages have now, small, and of no machine."""
+"""docs/report.html, the page that README links to: of the form that pages have now, and of no machine."""
 
 import re
 from pathlib import Path
@@ -17,8 +17,8 @@ def test_it_has_the_form_of_the_pages_that_are_written_now():
     assert all(part in TEXT for part in [*whole, *pieces]), AGAIN
 
 
-def test_it_is_small_simulated_and_names_neither_a_machine_nor_an_address():
-    assert len(TEXT.encode()) <= 300_000 and "SIMULATED" in TEXT
+def test_it_is_simulated_not_large_and_names_neither_a_machine_nor_an_address():
+    assert len(TEXT.encode()) <= 2_000_000 and "SIMULATED" in TEXT
     words = re.sub(r"[A-Za-z0-9+/=]{300,}", "", TEXT)  # without pictures and the map, which are base64
     assert len(words) < 100_000, "what is left is words and programs"
     assert not re.search(r"/(root|home|tmp|usr|work|mnt|Users)\b|[A-Z]:\\|https?://|\d+\.\d+\.\d+\.\d+", words)
@@ -27,4 +27,4 @@ def test_it_is_small_simulated_and_names_neither_a_machine_nor_an_address():
 def test_readme_has_the_command_that_writes_it():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     (command,) = re.findall(r"^(emgs run .*) && cp .*docs/report\.html$", readme, re.MULTILINE)
-    assert "experiment=smoke" in command
+    assert command == "emgs run hydra.run.dir=outputs/sample", "what the first command writes"
