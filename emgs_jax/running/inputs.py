@@ -1,5 +1,6 @@
 """What a run takes, one input after the other: frames are read, predicted and converted when their turn comes."""
 
+from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -160,11 +161,11 @@ def _raw_views(
     frames: Mapping[int, Frame],
     anchor: np.ndarray,
     structure: int,
-    done: Mapping[int, np.ndarray],
+    done: dict[int, np.ndarray],
     config: SlamConfig,
 ) -> dict[int, RawView]:
     """Pose and points of each new frame as predicted; `done`: raw poses of those before."""
-    window, known, views = prediction.window, dict(done), {}
+    window, known, views = prediction.window, ChainMap({}, done), {}
     for row, index in enumerate(window.dense):
         if index in known:
             continue

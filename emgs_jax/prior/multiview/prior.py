@@ -30,6 +30,7 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.io.files import jsonable
 from emgs_jax.keypoints.poses import calibration
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
@@ -73,7 +74,7 @@ class DenseConfig:
 def _values(config: StructureConfig | DenseConfig) -> dict:
     """What a config was given, as JSON holds it: a device's .1 is .1 again, and infinity is null."""
     given = jax.tree.map(lambda v: float(str(np.float32(v))) if isinstance(v, jax.Array) else v, asdict(config))
-    return jax.tree.map(lambda v: None if v == math.inf else v, given)
+    return jsonable(given)
 
 
 class MultiviewStereo(Prior):
