@@ -1,6 +1,6 @@
 """Pictures of an answer: where a map is relevant for a word, seen from any pose, and the map's features as colours."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,12 +11,14 @@ import jaxlie
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import atomic_write
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
+from emgs_jax.report.overview import class_colors
 from emgs_jax.report.page import render_config
 from emgs_jax.report.query import GREY, Answer, heat, hot, painted
 from emgs_jax.report.recorded_run import RecordedRun
@@ -25,6 +27,7 @@ from emgs_jax.semantics import principal_colors
 
 QUERY_PICTURE, FEATURES_PICTURE = "query.png", "features.png"
 MAX_POSES, SMALL_WIDTH = 60, 64  # poses that are looked from, evenly spread, and columns of those images
+MAX_LEGEND, KEYS_PER_LINE = 24, 6  # words of a legend
 _colors = eqx.filter_jit(principal_colors)
 
 
@@ -85,7 +88,7 @@ def best_views(run: RecordedRun, answer: Answer, count: int) -> list[list[View]]
 
 
 def draw_answer(path: Path, run: RecordedRun, answer: Answer, views: Sequence[Sequence[View]], max_words: int) -> int:
-    """Draw a line for each word and view: the map in its colours, the word's relevance, the classes.
+    """Draw a line for each word and view: the map in its colours, the word's relevance, the classes with a legend.
 
     Args:
         path: of the PNG.
@@ -97,6 +100,7 @@ def draw_answer(path: Path, run: RecordedRun, answer: Answer, views: Sequence[Se
     Returns:
         How many words are drawn.
     """
+    names = answer.question.words.names
     counts = [(answer.relevance.labels == word).sum() for word in range(len(views))]
     words = [int(word) for word in np.argsort(-np.array(counts), kind="stable")[:max_words]]
     lines = [(word, view) for word in sorted(words) for view in views[word]]
@@ -106,11 +110,10 @@ def draw_answer(path: Path, run: RecordedRun, answer: Answer, views: Sequence[Se
         relevance = heat(answer, word)
         layers = np.concatenate([colors, hot(relevance), painted(answer)], axis=1)
         image = drawn(run, answer.gaussians, layers, view, run.camera)
-        name = answer.question.words.names[word]
-        pictures.append([(view.title, image[..., :3]), (f"relevance: {name}", image[..., 3:6])])
+        pictures.append([(view.title, image[..., :3]), (f"relevance: {names[word]}", image[..., 3:6])])
         if len(views) > 1:
             pictures[-1].append(("classes", image[..., 6:]))
-    _save(path, pictures)
+    _save(path, pictures, legend(names, counts) if len(views) > 1 else {})
     return len({word for word, _ in lines})
 
 
@@ -122,11 +125,21 @@ def draw_features(path: Path, run: RecordedRun, views: Sequence[View]) -> None:
     _save(path, [[(view.title, image[..., :3]), ("features", image[..., 3:])] for view, image in images])
 
 
-def _save(path: Path, lines: Sequence[Sequence[tuple[str, np.ndarray]]]) -> None:
-    """Titled images in lines of one length, as PNG; nothing to draw makes a line of text."""
+def legend(names: Sequence[str], counts: Sequence[int]) -> dict[str, np.ndarray]:
+    """The colours of `painted` by word: those with the most answers, in the order of the words."""
+    most = sorted(np.argsort(-np.array(counts), kind="stable")[:MAX_LEGEND])
+    return {names[word]: class_colors(len(names))[word] for word in most if counts[word]}
+
+
+def _save(
+    path: Path, lines: Sequence[Sequence[tuple[str, np.ndarray]]], legend: Mapping[str, np.ndarray] | None = None
+) -> None:
+    """Titled images in lines of one length above a legend, as PNG; nothing to draw makes a line of text."""
     columns = max((len(line) for line in lines), default=1)
     height, width = lines[0][0][1].shape[:2] if lines else (1, 4)
-    size = 3.6 * columns, max(1.0, len(lines) * (3.6 * height / width + 0.35))
+    handles = [Patch(color=color, label=name) for name, color in (legend or {}).items()] if lines else []
+    keys = -(-len(handles) // KEYS_PER_LINE)  # lines of the legend
+    size = 3.6 * columns, max(1.0, len(lines) * (3.6 * height / width + 0.35) + 0.25 * keys)
     figure = Figure(figsize=size, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     if not lines:
@@ -139,5 +152,7 @@ def _save(path: Path, lines: Sequence[Sequence[tuple[str, np.ndarray]]]) -> None
         axes.imshow(np.where(np.isfinite(image), image, GREY).clip(0.0, 1.0))
         axes.set_title(title, fontsize=9)
         axes.set_axis_off()
+    if handles:
+        figure.legend(handles=handles, loc="outside lower center", ncols=KEYS_PER_LINE, fontsize=9, frameon=False)
     with atomic_write(path) as handle:
         figure.savefig(handle, format="png", dpi=110)

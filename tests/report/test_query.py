@@ -14,8 +14,9 @@ from emgs_jax.features.random import RandomFeatures
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.io.map_file import load_map, save_map
 from emgs_jax.io.trajectory import save_trajectory_tum
+from emgs_jax.report.overview import class_colors
 from emgs_jax.report.query import load_semantic
-from emgs_jax.report.query_pictures import drawn, frame_view
+from emgs_jax.report.query_pictures import MAX_LEGEND, drawn, frame_view, legend
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.running.configure import compose
 from experiments.query import query
@@ -197,3 +198,10 @@ def test_a_damaged_semantic_file_is_refused(folder, tmp_path):
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(ValueError, match="semantic.npz is no semantic.npz that can be read .*: ask the map again"):
         load_semantic(path)
+
+
+def test_the_legend_of_the_classes_has_the_words_that_are_drawn_in_their_colours() -> None:
+    names, counts = [f"word {i}" for i in range(40)], [0, 7] + [100] * (MAX_LEGEND - 1) + [3] * 15
+    shown = legend(names, counts)
+    assert list(shown) == names[1 : MAX_LEGEND + 1]  # no answer, or fewer than others: not there
+    np.testing.assert_array_equal(shown["word 1"], class_colors(40)[1])
