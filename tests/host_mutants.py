@@ -1719,7 +1719,7 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/prior/multiview/landmarks.py",
-        "(parallax_sq > config.min_parallax_rad**2)",
+        "(parallax_sq > (config.min_parallax / structure.K[0, 0]) ** 2)",
         "(parallax_sq > 0)",
         LANDMARKS,
         "points without parallax",

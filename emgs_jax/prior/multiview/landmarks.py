@@ -26,7 +26,8 @@ class MatchingConfig:
         max_epipolar_error: of a match that fits the essential matrix.
         max_reprojection_error: of an observation that fits its landmark.
         min_matches: that a pair of images, or an image and the landmarks, must have.
-        min_parallax_rad: between the rays of a landmark, as the root of the rays' smallest variance.
+        min_parallax: pixels between the rays of a landmark, as the root of the rays' smallest variance. A landmark with
+            little has an uncertain depth, but it holds a camera that turns where it stands.
         min_refound: landmarks that a view which shows none of its neighbours' must find again to be placed by them.
         max_remembered: landmarks that no view of the window shows any more; the oldest go.
     """
@@ -37,7 +38,7 @@ class MatchingConfig:
     max_epipolar_error: float = number(low=0, high=1000)
     max_reprojection_error: float = number(low=0, high=1000)
     min_matches: int = number(low=1)
-    min_parallax_rad: float = number(low=0, high=4)
+    min_parallax: float = number(low=0, high=1000)
     min_refound: int = number(low=0)
     max_remembered: int = number(low=0, high=1e8)
 
@@ -229,7 +230,7 @@ def triangulate(structure: Structure, config: MatchingConfig) -> None:
     np.add.at(hessian, track, across)
     np.add.at(right, track, np.einsum("nij,nj->ni", across, poses[views, :3, 3]))
     parallax_sq = np.linalg.eigvalsh(hessian)[:, 0] / count
-    good = (count >= 2) & (parallax_sq > config.min_parallax_rad**2)
+    good = (count >= 2) & (parallax_sq > (config.min_parallax / structure.K[0, 0]) ** 2)
     points = np.full((len(ids), 3), np.nan)
     points[good] = np.linalg.solve(hessian[good], right[good][..., None])[..., 0]
     local = np.einsum("nji,nj->ni", poses[views, :3, :3], points[track] - poses[views, :3, 3])

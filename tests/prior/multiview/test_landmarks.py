@@ -241,7 +241,7 @@ def placed_structure(poses, points, seen_by):
 
 
 def test_exact_rays_meet_in_the_point_and_one_ray_or_none_gives_none(config):
-    poses, points = arc(3), cloud(12)
+    poses, points = arc(3, step=0.2), cloud(12)
     seen_by = np.ones((3, 12), bool)
     seen_by[1:, 0] = False
     structure = placed_structure(poses, points, seen_by)
