@@ -29,7 +29,9 @@ class Relevance(eqx.Module):
 @full_precision
 def similarities(gaussians: Gaussians, text_features: Float[Array, "c f"]) -> Float[Array, "n c"]:
     """Cosine of every Gaussian's feature and every class's text embedding; 0 for a Gaussian without a feature."""
-    return safe_normalize(gaussians.features) @ safe_normalize(text_features).T
+    products = gaussians.features @ safe_normalize(text_features).T
+    squared = gaussians.features**2 @ jnp.ones((text_features.shape[-1], 1))  # a sum would take longer than the product
+    return jnp.where(squared > 0, products / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
 
 @full_precision

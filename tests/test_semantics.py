@@ -119,17 +119,22 @@ def test_features_that_do_not_differ_are_grey(three):
 
 
 @pytest.mark.slow
-def test_twenty_words_to_twenty_thousand_gaussians_of_width_1024_take_a_moment():
-    """The bar is .2 s on two cores: .4 s of processor time, whatever else the machine does."""
+def test_twenty_words_to_twenty_thousand_gaussians_of_width_1024_cost_a_few_products():
+    """The bar is .2 s on two quiet cores, which the bare product needs a tenth of; how busy they are cancels."""
     rng = np.random.default_rng(0)
     features = jnp.asarray(rng.normal(size=(20000, 1024)), jnp.float32)
     gaussians = eqx.tree_at(
         lambda g: (g.features, g.valid), empty_gaussians(20000, 1024), (features, jnp.ones(20000, bool))
     )
-    words = jnp.asarray(rng.normal(size=(20, 1024)), jnp.float32)
-    seconds = []
+    words, nothing = jnp.asarray(rng.normal(size=(20, 1024)), jnp.float32), jnp.zeros(())
+    question, fast = (gaussians, words, words[:4], nothing, nothing), {"xla_backend_optimization_level": 3}
+    ask = jax.jit(relevance).lower(*question).compile(fast)
+    multiply = jax.jit(jnp.matmul).lower(features, words.T).compile(fast)
+    asking, multiplying = [], []
     for _ in range(6):
         begin = time.process_time()
-        jax.block_until_ready(_relevance(gaussians, words, words[:4], jnp.asarray(0.0), jnp.asarray(-1.0)).labels)
-        seconds.append(time.process_time() - begin)
-    assert min(seconds[1:]) < 0.4, seconds
+        jax.block_until_ready(ask(*question).labels)
+        asking.append(time.process_time() - begin)
+        jax.block_until_ready(multiply(features, words.T))
+        multiplying.append(time.process_time() - begin - asking[-1])
+    assert min(asking[1:]) < 6 * min(multiplying[1:]), (asking, multiplying)
