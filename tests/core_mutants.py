@@ -344,7 +344,7 @@ STAGES = [
         (")[..., 0]\n    axes =", ")[..., 1]\n    axes =", "across the shorter axis"),
     ),
     *own("semantics", "test_semantics")(
-        ("safe_normalize(gaussians.features) @", "gaussians.features @", "features by their length"),
+        ("products / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))", "products", "features by their length"),
         ("gaussians.valid & has_feature", "has_feature", "free rows have a class"),
     ),
     *own("slam", "test_slam")(
