@@ -15,17 +15,17 @@ from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.linalg import inverse_3x3, mahalanobis_sq, outer
 from emgs_jax.ops.neighbours import knn
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import choice, static, take_rows, traced, where_rows
+from emgs_jax.ops.pytree import choice, put_rows, static, take_rows, traced, where_rows
 
 
 class ExistenceConfig(eqx.Module):
     """How much a look says, and when two Gaussians say the same.
 
     Args:
-        birth: log-odds of a new Gaussian. At 0 it is tentative until another frame sees it; above, as printed, it is
-            not.
-        hit: log-odds that a look adds which finds the Gaussian where it is expected.
-        miss: log-odds that a look takes away which sees through it.
+        birth: log-odds of a new Gaussian. At 0 it is tentative until it explains points of another frame; above, as
+            printed, it is not.
+        hit: log-odds that a look adds some of whose points the Gaussian explains.
+        miss: log-odds that a look takes away which sees through the Gaussian, or to which a tentative one is of no use.
         max_log_odds: which no number of looks exceeds, so that a change of mind takes a bounded number of them.
         refuted: log-odds below which a Gaussian is removed; `-inf` never, as printed.
         num_std: standard deviations of the depth between a Gaussian and what is seen that say nothing.
@@ -63,9 +63,22 @@ def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -
     return jnp.where(valid, jnp.stack([least(depth), -least(-depth)]), jnp.nan).reshape(2, -1)
 
 
+def usefulness(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> Int[Array, "n"]:
+    """What every Gaussian was to a frame: 1 where points of it were fused into the Gaussian, -1 where none were, and 0
+    where the Gaussian was not in the submap.
+
+    Args:
+        map: before the frame.
+        submap: after it, with its rows in the map.
+    """
+    use = jnp.where(submap.num_updates > take_rows(map.num_updates, rows), 1, -1)
+    return put_rows(jnp.zeros(map.weight.shape, jnp.int32), rows, use)
+
+
 @full_precision
 def judge(
     map: GaussianMap,
+    use: Int[Array, "n"],
     view: Observation,
     T_world_camera: jaxlie.SE3,
     camera: Camera,
@@ -77,9 +90,12 @@ def judge(
     With d the depths that the frame shows round the Gaussian's pixel, z its own and
     σ² = (depth_noise · z)² + n'Σn, it is seen where |z - min d| <= kσ or |z - max d| <= kσ, and seen through where
     z < min d - kσ. What is behind is occluded, and what is between, at an edge, may be either: that says nothing.
+    One that is seen is confirmed by what it explains. A tentative one that is seen, while others explain all points
+    there, only repeats what the map knows: that speaks against it, or a map would grow for as long as one looks.
 
     Args:
         map: all Gaussians, world frame.
+        use: of each to this frame, see `usefulness`.
         view: the frame as it was aligned, world frame; a frame that is not tracked has no valid row.
         T_world_camera: its pose.
         camera: of its rows.
@@ -101,7 +117,8 @@ def judge(
     is_seen = is_looked_at & (jnp.minimum(jnp.abs(depth - nearest), jnp.abs(depth - farthest)) <= reach)
     is_seen_through = is_looked_at & (depth < nearest - reach)
 
-    change = config.hit * is_seen - config.miss * is_seen_through
+    is_superfluous = is_seen & (use < 0) & (map.existence <= 0)
+    change = config.hit * (is_seen & (use > 0)) - config.miss * (is_seen_through | is_superfluous)
     existence = jnp.clip(map.existence + change, -config.max_log_odds, config.max_log_odds)
     existence = jnp.where(change == 0, map.existence, existence)
     judged = eqx.tree_at(lambda m: m.existence, map, existence)

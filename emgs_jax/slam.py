@@ -9,7 +9,7 @@ import jaxlie
 from jaxtyping import Array, Float, Int
 
 from emgs_jax.em import EmConfig, EmInfo, em_update, owners
-from emgs_jax.existence import ExistenceConfig, join_layers, judge
+from emgs_jax.existence import ExistenceConfig, join_layers, judge, usefulness
 from emgs_jax.gaussian_map import (
     AverageConfig,
     GaussianMap,
@@ -142,8 +142,8 @@ def _first_state(
     time = jnp.asarray(world.valid.shape[0], jnp.int32)
     new = new_map(gaussians, _first_weight(weight, config.em.average), existence, time - 1)
     map, _, overflow = insert(empty_map(config.submap.map_capacity, world.features.shape[-1]), new)
-    previous = jax.tree.map(lambda leaf: leaf[-1], world)
-    return SlamState(map, previous, pose_row(T_world_views, -1), certain(), time), overflow
+    state = SlamState(map, jax.tree.map(lambda leaf: leaf[-1], world), pose_row(T_world_views, -1), certain(), time)
+    return state, overflow
 
 
 @full_precision
@@ -262,12 +262,7 @@ def _order(camera: Camera, thin: int) -> Int[Array, "p"]:
 
 @eqx.filter_jit
 def _refine(
-    submap: GaussianMap,
-    candidates: Gaussians,
-    T: jaxlie.SE3,
-    camera: Camera,
-    thin: int,
-    config: RefinementConfig,
+    submap: GaussianMap, candidates: Gaussians, T: jaxlie.SE3, camera: Camera, thin: int, config: RefinementConfig
 ) -> tuple[GaussianMap, Gaussians, RefinementInfo]:
     return refine(submap, candidates, T, downscale(camera, thin), config)
 
@@ -291,7 +286,8 @@ def _store(
     (aligned, T, localization), (fresh, weight, halves) = place, new
     thinned, noise = downscale(camera, config.observation.thin), localization.depth_noise
     trusted = _trusted(aligned, localization)
-    map, is_seen = judge(write_back(map, submap, rows), trusted, T, thinned, noise, config.existence)
+    use = usefulness(map, submap, rows)
+    map, is_seen = judge(write_back(map, submap, rows), use, trusted, T, thinned, noise, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
     submap = join_layers(take_rows(map, rows), is_seen, T, noise, config.existence)
     born = new_map(fresh, _first_weight(weight, config.em.average), config.existence.birth, time)

@@ -317,6 +317,10 @@ STAGES = [
             "no limit",
         ),
         ("existence < config.refuted", "existence < 0.0", "one look refutes"),
+        ("config.hit * (is_seen & (use > 0))", "config.hit * is_seen", "what explains nothing is confirmed"),
+        ("is_seen_through | is_superfluous", "is_seen_through", "what is of no use stays"),
+        ("is_seen & (use < 0)", "is_seen & (use <= 0)", "what is outside the submap is of no use"),
+        ("& (map.existence <= 0)", "", "what is confirmed goes when others explain more"),
         (
             "share * (1.0 - share))[:, None, None] * outer(along)",
             "share * (1.0 - share))[:, None, None] * outer(difference)",

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from scene import assert_same, at, pose
 
-from emgs_jax.existence import depth_range, join_layers, judge
+from emgs_jax.existence import depth_range, join_layers, judge, usefulness
 from emgs_jax.gaussian_map import GaussianMap, confirmed, new_map
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
 from emgs_jax.ops.camera import Camera, pixel_grid, rays
+from emgs_jax.ops.pytree import take_rows
 
 judged, joined = eqx.filter_jit(judge), eqx.filter_jit(join_layers)
 CAMERA = Camera([40.0, 44.0], [31.5, 23.5], 64, 48)
@@ -46,6 +47,11 @@ def map_of(*parts: Gaussians, existence=0.5, weight=1.0) -> GaussianMap:
     return new_map(gaussians, weight * one, jnp.asarray(existence), jnp.asarray(0))
 
 
+def used(map: GaussianMap):
+    """As if the frame had been fused into every Gaussian."""
+    return jnp.ones(map.existence.shape, jnp.int32)
+
+
 def look(depth, valid=True) -> Observation:
     """What a camera at the origin sees of a depth image (h, w)."""
     depth = jnp.broadcast_to(jnp.asarray(depth, jnp.float32), (CAMERA.height, CAMERA.width))
@@ -70,25 +76,55 @@ def test_a_slab_before_a_mapped_wall_goes_within_20_looks_and_wall_and_pole_stay
     rng = np.random.default_rng(0)
     for _ in range(20):
         noisy = depth * np.exp(0.02 * rng.normal(size=depth.shape))
-        map, _ = judged(map, look(noisy), HERE, CAMERA, NOISE, settings)
+        map, _ = judged(map, used(map), look(noisy), HERE, CAMERA, NOISE, settings)
     wall, slab, pole = np.split(np.asarray(map.gaussians.valid), [len(WALL), len(WALL) + len(SLAB)])
     assert not slab.any() and wall.mean() >= 0.99 and pole.all()
     assert_same(jax.tree.map(lambda x: x[len(WALL)], map.gaussians).means, jnp.zeros(3))  # the row is free
 
 
-def test_a_fresh_wrong_gaussian_goes_sooner_and_a_seen_one_is_confirmed(settings):
-    map = map_of(discs([(0, 0, 3.0), (0.2, 0, 1.5)]), existence=0.0)
+def test_a_fresh_wrong_gaussian_goes_sooner_and_one_that_explains_is_confirmed(settings):
+    map = map_of(discs([(0, 0, 3.0), (0.2, 0, 1.5)]), existence=float(settings.birth))
     assert not confirmed(map).valid.any()
-    map, is_seen = judged(map, look(3.0), HERE, CAMERA, NOISE, settings)
-    np.testing.assert_array_equal(confirmed(map).valid, [True, False])
+    map, is_seen = judged(map, used(map), look(3.0), HERE, CAMERA, NOISE, settings)
     np.testing.assert_array_equal(is_seen, [True, False])
+    np.testing.assert_array_equal(confirmed(map).valid, [True, False])
     np.testing.assert_allclose(map.existence, [settings.hit, -settings.miss])
     for _ in range(5):
-        map, _ = judged(map, look(3.0), HERE, CAMERA, NOISE, settings)
+        map, _ = judged(map, used(map), look(3.0), HERE, CAMERA, NOISE, settings)
     np.testing.assert_array_equal(map.gaussians.valid, [True, False])
     for _ in range(9):
-        map, _ = judged(map, look(3.0), HERE, CAMERA, NOISE, settings)
+        map, _ = judged(map, used(map), look(3.0), HERE, CAMERA, NOISE, settings)
     assert map.existence[0] == settings.max_log_odds
+
+
+def test_a_tentative_one_on_the_surface_that_explains_nothing_goes_and_a_confirmed_one_stays(settings):
+    """All at one place: of no use, of use, not in the submap, and of no use once it was confirmed."""
+    birth = float(settings.birth)
+    map = map_of(discs([(0, 0, 3.0)] * 4))
+    map = eqx.tree_at(lambda m: m.existence, map, jnp.array([birth, birth, birth, 0.1]))
+    use = jnp.array([-1, 1, 0, -1])
+    after, is_seen = judged(map, use, look(3.0), HERE, CAMERA, NOISE, settings)
+    assert is_seen.all()
+    expected = [birth - settings.miss, birth + settings.hit, birth, 0.1]
+    np.testing.assert_allclose(after.existence, expected, rtol=1e-6)
+    for _ in range(9):
+        after, _ = judged(after, use, look(3.0), HERE, CAMERA, NOISE, settings)
+    np.testing.assert_array_equal(after.gaussians.valid, [False, True, True, True])
+
+
+@pytest.mark.parametrize("use", [-1, 1])
+def test_use_elsewhere_says_nothing_of_what_is_hidden(settings, use):
+    map = map_of(discs((0, 0, 4.0)), existence=-1.9)
+    after, _ = judged(map, jnp.array([use]), look(3.0), HERE, CAMERA, NOISE, settings)
+    assert_same(after, map)
+
+
+def test_usefulness_is_what_a_frame_fused_into_each_row_of_its_submap():
+    map = map_of(discs(WALL[:5]))
+    rows = jnp.array([3, 1, 5])  # the last is padding
+    submap = take_rows(map, rows)
+    submap = eqx.tree_at(lambda m: m.num_updates, submap, submap.num_updates + jnp.array([2, 0, 1]))
+    np.testing.assert_array_equal(usefulness(map, submap, rows), [0, -1, 0, 1, 0])
 
 
 EDGE = jnp.where(jnp.arange(CAMERA.width) < 32, 1.5, 3.0)
@@ -106,7 +142,7 @@ SILENT = {
 def test_a_look_that_says_nothing_changes_nothing(settings, reason):
     mean, normal, depth, valid = SILENT[reason]
     map = map_of(discs(mean, normal, std=0.02), existence=-1.9)
-    after, is_seen = judged(map, look(depth, valid), HERE, CAMERA, NOISE, settings)
+    after, is_seen = judged(map, used(map), look(depth, valid), HERE, CAMERA, NOISE, settings)
     assert_same(after, map)
     assert not is_seen.any()
 
@@ -114,7 +150,8 @@ def test_a_look_that_says_nothing_changes_nothing(settings, reason):
 @pytest.mark.parametrize(("offset", "change"), [(-0.25, -1), (-0.15, 1), (0.15, 1), (0.25, 0)])
 def test_three_standard_deviations_decide(settings, offset, change):
     """Two percent of 3 m and 3 mm of the Gaussian: 3σ = 18 cm; a pixel and its neighbours differ by nothing."""
-    map, _ = judged(map_of(discs((0, 0, 3.0 + offset)), existence=0.0), look(3.0), HERE, CAMERA, NOISE, settings)
+    map = map_of(discs((0, 0, 3.0 + offset)), existence=0.0)
+    map, _ = judged(map, used(map), look(3.0), HERE, CAMERA, NOISE, settings)
     expected = {-1: -settings.miss, 0: 0.0, 1: settings.hit}[change]
     np.testing.assert_allclose(map.existence, expected)
 
@@ -201,7 +238,7 @@ def test_of_three_layers_the_two_that_chose_each_other_become_one(settings):
 def test_as_printed_nothing_changes_by_a_bit(config):
     printed = config("slam/existence=paper").existence
     map = map_of(discs(WALL), discs(SLAB), existence=float(printed.birth))
-    after, is_seen = judged(map, look(3.0), HERE, CAMERA, NOISE, printed)
+    after, is_seen = judged(map, -used(map), look(3.0), HERE, CAMERA, NOISE, printed)
     assert_same(after, map)
     assert is_seen[: len(WALL)].any()  # it looks, but draws no conclusion
     assert_same(joined(map, is_seen, HERE, NOISE, printed), map)
@@ -210,6 +247,6 @@ def test_as_printed_nothing_changes_by_a_bit(config):
 
 def test_a_frame_that_is_not_tracked_says_nothing(settings):
     map = map_of(discs(WALL), discs(SLAB), existence=-1.9)
-    after, is_seen = judged(map, look(3.0, valid=False), HERE, CAMERA, jnp.asarray(0.0), settings)
+    after, is_seen = judged(map, used(map), look(3.0, valid=False), HERE, CAMERA, jnp.asarray(0.0), settings)
     assert_same(after, map)
     assert not is_seen.any()

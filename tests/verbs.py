@@ -180,7 +180,7 @@ VERBS = {
         lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),
     ),
     "judge": (
-        lambda m, o, T: existence.judge(m, o, T, CAMERA, ONE * 0.02, CONFIG.existence),
+        lambda m, o, T: existence.judge(m, jnp.arange(32) % 3 - 1, o, T, CAMERA, ONE * 0.02, CONFIG.existence),
         lambda s: (map_of(s), random_observation(192, s, 2), pose(translation=(0.1 * s, 0, 0))),
     ),
     "join_layers": (
