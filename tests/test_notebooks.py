@@ -119,12 +119,14 @@ def test_own_images_become_a_map_of_the_room_that_they_show(monkeypatch, tmp_pat
 @pytest.mark.slow
 def test_wrong_features_cost_classes_and_move_geometry_only_where_they_have_a_weight(monkeypatch, tmp_path):
     """Oracle: where nothing looks at features but the layers' sign, wrong ones move nothing but that."""
-    found = execute(5, " ".join((*TINY, MUTE)), monkeypatch, tmp_path)
+    # The prior is exact: errors of 1 cm over 40 cm of path turn a noisy map so far that classes fall beside their things.
+    found = execute(5, " ".join((*TINY, MUTE, "prior.level=0.0")), monkeypatch, tmp_path)
     shares, seeds, rows = found["shares"], found["seeds"], found["rows"]
     assert set(rows) == {(share, seed) for share in shares for seed in seeds}
     for seed in seeds:
         mute, loud = ([rows[share, seed][place] for share in shares] for place in (0, 1))
-        assert mute[0]["segmentation/accuracy_percent"] > mute[-1]["segmentation/accuracy_percent"] + 10
+        accuracy = [row["segmentation/accuracy_percent"] for row in mute]
+        assert accuracy[0] > 94 and accuracy[-1] < accuracy[0] - 10
         assert len({row["trajectory/ate_sim3_m"] for row in mute}) == 1
         assert loud[-1]["map/num_gaussians"] > mute[-1]["map/num_gaussians"]  # what is not fused is new
 
