@@ -119,7 +119,7 @@ def test_own_images_become_a_map_of_the_room_that_they_show(monkeypatch, tmp_pat
 @pytest.mark.slow
 def test_wrong_features_cost_classes_and_move_geometry_only_where_they_have_a_weight(monkeypatch, tmp_path):
     """Oracle: where nothing looks at features but the layers' sign, wrong ones move nothing but that."""
-    # The prior is exact: errors of 1 cm over 40 cm of path turn a noisy map so far that classes fall beside their things.
+    # The prior is exact: 1 cm of error over 40 cm of path turns a noisy map until classes fall beside their things.
     found = execute(5, " ".join((*TINY, MUTE, "prior.level=0.0")), monkeypatch, tmp_path)
     shares, seeds, rows = found["shares"], found["seeds"], found["rows"]
     assert set(rows) == {(share, seed) for share in shares for seed in seeds}
