@@ -67,6 +67,12 @@ def test_keys_of_the_stages_are_keys_of_the_config(page):
 
 
 @pages
+def test_infinity_is_written_as_a_command_line_reads_it(page):
+    """`inf`; YAML's own `.inf` would be text there, and no run starts with it."""
+    assert not re.search(r"=-?\.(inf|nan)", code(page))
+
+
+@pages
 def test_files_of_the_project_are_there(page):
     for name in re.findall(r"^((?:emgs_jax|conf|tests|docs|notebooks|experiments)/[\w./]+)$", code(page), re.MULTILINE):
         assert (ROOT / name).exists(), name
