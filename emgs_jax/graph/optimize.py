@@ -28,7 +28,8 @@ class GraphConfig(eqx.Module):
     Args:
         scale_std: s_p: standard deviation of every σ about 0; 0: scales stay as they are (SE(3)); inf: no prior.
         kernel: φ of dynamic covariance scaling on loops, in χ²; inf: quadratic.
-        start: `given`, or `spread` (errors spread over the paths, where that costs less).
+        start: `given`, or `spread` (errors spread over the paths, where that costs less; and, where a loop would be
+            left out, what all loops in full make of them).
         max_iterations: of Levenberg and Marquardt; 0: nothing moves.
         damping: λ at the start, times the Hessian's diagonal.
         min_decrease: relative, of the cost; less has converged.
@@ -150,6 +151,22 @@ def _begin(problem: Problem, given: Linear, config: GraphConfig) -> Linear:
     return other if other.cost < given.cost else given
 
 
+def _solve(problem: Problem, given: Linear, config: GraphConfig) -> tuple[Linear, int, bool]:
+    """The best of two searches, where a loop is left out by the first: the other begins where all loops count in full.
+
+    The cost of a loop is bounded, so what the first begins too far from pulls no more, and stays out for good.
+    """
+    found = _minimize(problem, _begin(problem, given, config), config)
+    is_loop = np.asarray(problem.graph.edges.kind) == LOOP
+    if config.start == "given" or not np.any(found[0].weights[is_loop] < 1):
+        return found
+    full = eqx.tree_at(lambda c: c.kernel, config, np.inf)
+    begin = linear(problem, problem.graph.nodes, np.inf)
+    begin = _minimize(problem, _begin(problem, begin, full), full)[0]
+    other = _minimize(problem, linear(problem, begin.nodes, float(config.kernel)), config)
+    return other if other[0].cost < found[0].cost else found
+
+
 def _objection(problem: Problem, given: Linear, end: Linear, converged: bool, config: GraphConfig) -> str:
     """Why a result is not to be used; empty where it is."""
     if end is given and not converged:
@@ -191,7 +208,7 @@ def optimize(graph: Graph, config: GraphConfig) -> tuple[Nodes, GraphInfo]:
         is_settled = given.cost <= NOTHING_TO_GAIN * num_rows(problem.graph.edges)
         if is_settled or config.max_iterations == 0:
             return graph.nodes, _info(problem, given.cost, given, (0, is_settled), num_edges)
-        end, num_iterations, converged = _minimize(problem, _begin(problem, given, config), config)
+        end, num_iterations, converged = _solve(problem, given, config)
         reason = _objection(problem, given, end, converged, config)
         info = _info(problem, given.cost, end, (num_iterations, converged), num_edges, reason)
         keeps = bool(reason) or end is given
