@@ -153,6 +153,8 @@ GRAPH = [
         ("keeps = bool(reason) or", "keeps =", "what is refused moves the nodes"),
         ("if gain > 0:  # not", "if True:  # not", "a step that costs more is taken"),
         ("other if other.cost < given.cost else given", "given", "the errors are never spread"),
+        ("other if other[0].cost < found[0].cost else found", "found", "loops are never tried in full"),
+        ("other if other[0].cost < found[0].cost else found", "other", "what costs more is taken"),
     ),
 ]
 

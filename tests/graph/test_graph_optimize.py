@@ -302,6 +302,34 @@ def test_spreading_the_errors_first_keeps_true_loops_after_metres_of_drift():
     assert rmse(found, truth) < rmse(given, truth)
 
 
+def stretched(num_nodes: int, seed: int) -> tuple[Nodes, Graph]:
+    """Odometry whose scale walks by 2 % a frame and that measures no change of it; three loops."""
+    rng, truth = np.random.default_rng(seed), walk(num_nodes)
+    scales = np.concatenate([[0.0], np.cumsum(0.02 * rng.normal(size=num_nodes - 1))])
+    truth = eqx.tree_at(lambda n: n.log_scale, truth, jnp.asarray(scales))
+    window = measure(truth, window_pairs(num_nodes), WINDOW, STD * np.where(np.arange(7) == 6, 2.0, 1.0), rng)
+    window = eqx.tree_at(lambda e: e.log_ratio, window, 0 * window.log_ratio)
+    edges = join(window, measure(truth, loop_pairs(num_nodes, 3), LOOP, STD, rng))
+    return truth, Graph(chain(truth, edges), edges)
+
+
+def test_where_a_loop_would_be_left_out_the_search_begins_with_all_of_them_in_full_too():
+    """Errors spread over poses know nothing of the scale: from there the kernel refuses true loops."""
+    truth, graph = stretched(160, 2)
+    _, stuck = optimize(graph, config(scale_std=np.inf, start="given"))
+    found, info = optimize(graph, config(scale_std=np.inf))
+    assert stuck.edge_weights[-3:].min() < 0.01
+    assert info.edge_weights[-3:].min() > 0.99 and info.cost < stuck.cost - 10
+    assert rmse(found, truth) < 0.05 < 0.4 < rmse(graph.nodes, truth)
+
+
+def test_of_both_searches_the_cheaper_one_is_taken():
+    """Here the one that begins with all loops in full ends at a hundred more."""
+    _, graph = stretched(160, 0)
+    costs = [optimize(graph, config(scale_std=np.inf, start=start))[1].cost for start in ("given", "spread")]
+    assert costs[1] <= costs[0] * (1 + 1e-9)
+
+
 def test_a_step_that_costs_more_is_not_taken():
     """From far away, undamped: more steps never cost more, and some of them are refused."""
     truth = walk(30, laps=1.0)
