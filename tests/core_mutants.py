@@ -442,6 +442,8 @@ RENDER = [
         ("+ blur * jnp.eye(2)", "", "no low-pass filter"),
         ("SMALLEST_COSINE * jnp", "SMALLEST_COSINE / 2 * jnp", "slopes at grazing angles"),
         ("scale * jnp.einsum", "jnp.einsum", "covariances without the factor that closes surfaces"),
+        (" & (z > NEAREST_STD * depth_std)", "", "splats of what reaches the camera's plane"),
+        (" & (facing <= limit)", "", "surfaces that are seen from behind"),
     ),
     *own("render/tiles", "render/test_tiles")(
         ("(tile_size - 1)", "tile_size", "a tile a pixel too wide"),

@@ -270,6 +270,14 @@ def splat(mean, cov, pose, camera, scale, blur):
     return pixel, jacobian @ camera_cov @ jacobian.T + blur * np.eye(2), point, camera_cov
 
 
+def is_drawn(mean, cov, normal, pose, scale):
+    """Whether a Gaussian lies before the camera by two standard deviations, and not with its normal away (cos .1)."""
+    rotation = pose[:3, :3]
+    point = rotation.T @ (mean - pose[:3, 3])
+    depth_std = np.sqrt(scale * (rotation.T @ cov @ rotation)[2, 2])
+    return point[2] > max(1e-3, 2 * depth_std) and normal @ rotation @ point <= 0.1 * np.linalg.norm(point)
+
+
 def plane_depth(pixel, point, normal, reach, camera):
     """Depth at a pixel of the plane through a camera-frame point, kept within `reach` of the point's own."""
     ray = np.append((pixel - np.asarray(camera.center, float)) / np.asarray(camera.focal, float), 1.0)
@@ -286,8 +294,9 @@ def render(g, values, pose, camera, config):
     light, image, alpha, depth = np.ones(shape), np.zeros((*shape, values.shape[1])), np.zeros(shape), np.zeros(shape)
     depth_sq, scale, radius = np.zeros(shape), float(config.covariance_scale), float(config.radius)
     rows = [k for k in range(len(g["means"])) if g["valid"][k]]
+    rows = [k for k in rows if is_drawn(g["means"][k], g["covs"][k], g["normals"][k], pose, scale)]
     depth_of = {k: (pose[:3, :3].T @ (g["means"][k] - pose[:3, 3]))[2] for k in rows}
-    for k in sorted((k for k in rows if depth_of[k] > 1e-3), key=depth_of.get):
+    for k in sorted(rows, key=depth_of.get):
         pixel, cov_2d, point, cov = splat(g["means"][k], g["covs"][k], pose, camera, scale, float(config.blur))
         normal, reach = pose[:3, :3].T @ g["normals"][k], radius * np.sqrt(cov[2, 2])
         precision = np.linalg.inv(cov_2d)
@@ -317,7 +326,7 @@ def refine(g, weight, candidates, pose, camera, config):
     def seen(h):
         found = {}
         for k in np.flatnonzero(h["valid"]):
-            if (pose[:3, :3].T @ (h["means"][k] - pose[:3, 3]))[2] > 1e-3:
+            if is_drawn(h["means"][k], h["covs"][k], h["normals"][k], pose, scale):
                 pixel, cov_2d, point, cov = splat(h["means"][k], h["covs"][k], pose, camera, scale, blur)
                 column, row = np.round(pixel).astype(int)
                 is_inside = 0 <= column < camera.width and 0 <= row < camera.height

@@ -12,6 +12,9 @@ from emgs_jax.ops.precision import full_precision
 
 # A splat that is seen at a grazing angle has no depth slope that its linearisation could hold.
 SMALLEST_COSINE = 0.1
+# Standard deviations of its depth by which a Gaussian must lie before the camera: of one that reaches the camera's
+# plane, as that of a door frame does in passing, the affine approximation makes a splat that hides everything.
+NEAREST_STD = 2.0
 # Pixels; points far outside the image project with unbounded Jacobians, so the Jacobian is taken at most this far out.
 FRUSTUM_MARGIN = 0.3  # of the image's size
 
@@ -26,11 +29,11 @@ class Splats(eqx.Module):
     means: Float[Array, "n 2"]  # pixels
     covs: Float[Array, "n 2 2"]  # pixels²
     precisions: Float[Array, "n 2 2"]  # 1/pixels²
-    depth: Float[Array, "n"]  # camera-space z of the mean, m; 1 where invalid, for finite gradients
+    depth: Float[Array, "n"]  # camera-space z of the mean, m; 1 where it is not in front, for finite gradients
     depth_std: Float[Array, "n"]  # standard deviation of z over the Gaussian, m
     inverse_depth: Float[Array, "n"]  # 1/m
     depth_slope: Float[Array, "n 2"]  # 1/m per pixel
-    valid: Bool[Array, "n"]  # in front of the camera
+    valid: Bool[Array, "n"]  # in front of the camera, and seen from the side to which the normal points
 
 
 @full_precision
@@ -38,6 +41,9 @@ def project_gaussians(
     gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, scale: Float[Array, ""], blur: Float[Array, ""]
 ) -> Splats:
     """Project with the local affine approximation (Zwicker et al., "EWA splatting", 2002).
+
+    A surface is seen from the side that it was mapped from: of a Gaussian whose normal points away from the camera
+    nothing is drawn, or the other side of a thin wall would show through it where both are a little off.
 
     Args:
         scale: by which the covariances are multiplied, so that neighbouring Gaussians close the surface.
@@ -48,8 +54,8 @@ def project_gaussians(
     covs = scale * jnp.einsum("ji,njk,kl->nil", rotation, gaussians.covs, rotation)
     normals = gaussians.normals @ rotation
     means, depth = project(camera, points)
-    valid = gaussians.valid & (depth > NEAREST_DEPTH)
-    z = jnp.where(valid, depth, 1.0)
+    is_in_front = gaussians.valid & (depth > NEAREST_DEPTH)
+    z = jnp.where(is_in_front, depth, 1.0)
 
     size = jnp.array([camera.width, camera.height], means.dtype)
     low, high = -FRUSTUM_MARGIN * size, (1.0 + FRUSTUM_MARGIN) * size
@@ -65,9 +71,10 @@ def project_gaussians(
     )
     covs_2d = jnp.einsum("nai,nij,nbj->nab", jacobian, covs, jacobian) + blur * jnp.eye(2)
 
+    depth_std = jnp.sqrt(jnp.maximum(covs[:, 2, 2], 1e-12))
     # The plane n·X = n·μ meets the ray d = (x, y, 1) at 1/z = n·d / n·μ, which is linear in the pixel.
     facing = jnp.einsum("ni,ni->n", normals, points)
-    limit = SMALLEST_COSINE * jnp.linalg.norm(jnp.where(valid[:, None], points, 1.0), axis=-1)
+    limit = SMALLEST_COSINE * jnp.linalg.norm(jnp.where(is_in_front[:, None], points, 1.0), axis=-1)
     is_flat = jnp.abs(facing) > limit
     slope = normals[:, :2] / (camera.focal * jnp.where(is_flat, facing, 1.0)[:, None])
     return Splats(
@@ -75,8 +82,8 @@ def project_gaussians(
         covs=covs_2d,
         precisions=inverse_2x2(covs_2d),
         depth=z,
-        depth_std=jnp.sqrt(jnp.maximum(covs[:, 2, 2], 1e-12)),
+        depth_std=depth_std,
         inverse_depth=1.0 / z,
-        depth_slope=jnp.where((is_flat & valid)[:, None], slope, 0.0),
-        valid=valid,
+        depth_slope=jnp.where((is_flat & is_in_front)[:, None], slope, 0.0),
+        valid=is_in_front & (z > NEAREST_STD * depth_std) & (facing <= limit),
     )

@@ -56,6 +56,37 @@ def test_the_map_is_drawn_with_the_coverage_of_densification(camera, densify_con
     assert 0 < view.valid.sum() < view.valid.size
 
 
+def joined(*parts: Gaussians) -> Gaussians:
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+def beside(distance: float, std=0.12) -> Gaussians:
+    """A wall that runs along the viewing direction to the right of the camera, from behind it to 2 m before it."""
+    z, y = (a.reshape(-1) for a in np.meshgrid(np.arange(-1, 2, std), np.arange(-1.5, 1.5, std)))
+    rows = np.stack([np.full(len(z), distance), y, z], -1), np.tile(np.diag([0.02, std, std]) ** 2, (len(z), 1, 1))
+    rows += np.tile([0.9, 0.1, 0.1], (len(z), 1)), np.tile([-1.0, 0, 0], (len(z), 1))
+    return Gaussians(*(jnp.asarray(a, jnp.float32) for a in rows), jnp.zeros((len(z), 0)), jnp.ones(len(z), bool))
+
+
+def test_a_door_frame_in_passing_hides_nothing_that_it_does_not_cover(camera, densify_config):
+    """The picture that showed it: a frame of a walk in a doorway, filled by a door frame 8 cm before the camera."""
+    config = at(densify_config, "render.blur", 0.0)
+    alone, passing = (dense(map, pose(), camera, config) for map in (wall(2.0), joined(wall(2.0), beside(0.5))))
+    column = float(camera.center[0] + camera.focal[0] * 0.5 / 2.0)  # where the wall beside meets the far one
+    is_far = np.asarray(alone.valid & (jnp.arange(camera.width) < column - 4))
+    assert is_far.sum() > 100
+    np.testing.assert_allclose(np.asarray(passing.depth)[is_far], 2.0, atol=0.05)  # its own points are 8 cm wide
+
+
+def test_the_other_side_of_a_thin_wall_does_not_show_through(camera, densify_config):
+    """Seen from the other side it was mapped 3 cm too near to this one."""
+    other = eqx.tree_at(lambda g: g.colors, wall(1.97, (0.0, 0.0, 1.0)), jnp.ones_like(wall(1.97).colors))
+    view = dense(joined(wall(2.0), other), pose(), camera, densify_config)
+    alone = dense(wall(2.0), pose(), camera, densify_config)
+    np.testing.assert_allclose(view.colors[alone.valid], alone.colors[alone.valid], atol=1e-5)
+    np.testing.assert_allclose(view.depth[alone.valid], alone.depth[alone.valid], atol=1e-5)
+
+
 def discs(depths, colors, std=0.3) -> Gaussians:
     """Discs that face the camera, behind each other on the ray of pixel (15, 12); the rest of the rows is free."""
     base, count = wall(2.0), len(depths)

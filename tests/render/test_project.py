@@ -102,3 +102,22 @@ def test_moving_gaussians_and_camera_together_changes_no_splat(camera):
     moved = project(move_gaussians(motion, GAUSSIANS), motion @ T, camera, SCALE, BLUR)
     for name in ("means", "covs", "depth", "depth_slope"):
         np.testing.assert_allclose(getattr(moved, name), getattr(still, name), rtol=1e-3, atol=1e-3)  # 2 m in float32
+
+
+@pytest.mark.parametrize(("ratio", "is_drawn"), [(1.9, False), (2.1, True)])
+def test_what_reaches_the_plane_of_the_camera_is_not_drawn(camera, ratio, is_drawn):
+    """Of depths of 1.9 and 2.1 of its standard deviations, which the scale of the covariances counts in."""
+    covs = jnp.diag(jnp.array([1e-4, 1e-4, (0.5 / ratio) ** 2 / SCALE]))[None]
+    near = eqx.tree_at(lambda g: (g.means, g.covs), random_gaussians(1), (jnp.array([[0.1, 0, 0.5]]), covs))
+    assert project(near, pose(), camera, SCALE, BLUR).valid.all() == is_drawn
+
+
+@pytest.mark.parametrize(("cosine", "is_drawn"), [(-0.9, True), (0.09, True), (0.11, False), (0.9, False)])
+def test_a_gaussian_is_not_seen_from_behind(camera, cosine, is_drawn):
+    """A cosine of a tenth, of the angle between the ray to it and its normal, may be the error of a grazing look."""
+    ray = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
+    across = np.cross(ray, [0, 1, 0]) / np.linalg.norm(np.cross(ray, [0, 1, 0]))
+    normal = cosine * ray + np.sqrt(1 - cosine**2) * across
+    changed = (jnp.asarray(values, jnp.float32)[None] for values in (2.5 * ray, normal))
+    turned = eqx.tree_at(lambda g: (g.means, g.normals), random_gaussians(1), tuple(changed))
+    assert project(turned, pose(), camera, SCALE, BLUR).valid.all() == is_drawn
