@@ -1,4 +1,4 @@
-"""The back end of a run: what windows, map and loops measure, the best poses for all of it, and a map that follows.
+"""The back end of a run: where frames were placed, what loops say, the best poses for both, and a map that follows.
 
 Nodes are the frames from the first of the map on, in the order of `SlamState.time`.
 """
@@ -25,7 +25,7 @@ from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement, VerificationConfig, VerifyInfo, neighbours_of, verify
 from emgs_jax.ops.ranges import number
 from emgs_jax.running.convert import to_se3
-from emgs_jax.running.measuring import Edge, Look, NoiseConfig, loop_edge, map_edge, stacked, window_edges
+from emgs_jax.running.measuring import Edge, Look, NoiseConfig, chain_edge, loop_edge, map_edge, stacked
 from emgs_jax.slam import SlamState
 
 _deform, _deform_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)
@@ -36,7 +36,6 @@ class BackEndConfig:
     """What is measured, how loops are found, and how all is solved.
 
     Args:
-        offsets: earlier frames of a window that its current one is measured to.
         noise: of these measurements.
         appearance: keyframes and candidates.
         verification: of a candidate.
@@ -48,7 +47,6 @@ class BackEndConfig:
         location: of a camera that is lost.
     """
 
-    offsets: tuple[int, ...] = number(low=1, high=1000)
     noise: NoiseConfig
     appearance: AppearanceConfig
     verification: VerificationConfig
@@ -127,7 +125,7 @@ class BackEnd:
     has_one_unit: bool = True
 
     def add(self, look: Look, pose: np.ndarray, scale: float, origin: int | None, is_placed: bool = True) -> None:
-        """One node more, with what its window and the map measure.
+        """One node more, and where it was placed.
 
         Args:
             look: of the frame.
@@ -143,12 +141,11 @@ class BackEnd:
         self.frames.append(look.frame)
         self.is_placed.append(is_placed)
         self.segments.append(self.segment)
-        noise, offsets = self.config.noise, self.config.offsets
-        has_anchor = self.frames[self.first] == 0 and self.since == self.first
-        self.edges += window_edges(look, time, self.log_scales, self.since, has_anchor, offsets, noise)
+        chain = chain_edge(look, self.poses, self.log_scales, self.since, self.config.noise)
+        if chain is not None:
+            self.edges.append(chain)
         if origin is not None and origin < time:
-            measured = np.linalg.inv(self.poses[time]) @ self.poses[origin]
-            self.edges.append(map_edge(time, origin, rescaled(measured, np.exp(-self.log_scales[time])), noise))
+            self.edges.append(map_edge(self.poses, self.log_scales, origin, self.config.noise))
 
     def look_for_loops(self, look: Look) -> list[LoopMeasurement]:
         """Describe the last node, and verify what it looks like; returns the new loops that are agreed upon."""

@@ -1,4 +1,4 @@
-"""What a frame measures, as edges of the graph: its window's poses, and the Gaussians that it was placed by."""
+"""What a frame measures, as edges of the graph: where it was placed, relative to the frame before and to the map."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ import numpy as np
 
 from emgs_jax.graph.measurements import LOOP, WINDOW, Edges
 from emgs_jax.graph.problem import bucket
+from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.ops.ranges import number
 from emgs_jax.running.convert import to_se3
@@ -19,17 +20,13 @@ class NoiseConfig:
     """Standard deviations of what is measured, m, degrees and log-scale.
 
     Args:
-        pair, pair_deg: of the relative pose of two neighbours in a window; those k apart: √k times.
-        anchor, anchor_deg: of the pose relative to the anchor, times 1 + the distance to it in metres. Its errors last
-            for many windows, so one window counts as less than its own error would say.
+        pair, pair_deg: of the relative pose of two neighbours; those k apart: √k times.
         map, map_deg: of a frame placed in the map, relative to the frame of whose Gaussians it was placed by.
-        log_scale: of the ratio of two neighbours' scales.
+        log_scale: of the ratio of two neighbours' scales, likewise.
     """
 
     pair: float = number(low=1e-9, high=1000)
     pair_deg: float = number(low=1e-9, high=1000)
-    anchor: float = number(low=1e-9, high=1000)
-    anchor_deg: float = number(low=1e-9, high=1000)
     map: float = number(low=1e-9, high=1000)
     map_deg: float = number(low=1e-9, high=1000)
     log_scale: float = number(low=1e-9, high=1000)
@@ -70,50 +67,41 @@ def _weights(distance: float, turn_deg: float, log_scale: float = np.inf) -> np.
     return np.diag(1.0 / np.array([distance] * 3 + [np.radians(turn_deg)] * 3 + [log_scale]))
 
 
-def window_edges(
-    look: Look,
-    time: int,
-    log_scales: Sequence[float],
-    since: int,
-    has_anchor: bool,
-    offsets: Sequence[int],
-    noise: NoiseConfig,
-) -> list[Edge]:
-    """What an inference says of its current frame and earlier ones of its window, and of the anchor.
+def chain_edge(
+    look: Look, poses: Sequence[np.ndarray], log_scales: Sequence[float], since: int, noise: NoiseConfig
+) -> Edge | None:
+    """Where the last frame was placed, relative to the nearest one before it that its window shows; None without one.
+
+    It is measured as placed, not as predicted. The map was made at these poses: a prediction that differs from them by
+    its noise would move every frame by that, each with the Gaussians of its birth, and roughen all surfaces.
 
     Args:
         look: of the frame.
-        time: its node; that of a frame k before it is k less.
-        log_scales: of all nodes, this one's included.
+        poses: T_world_camera (4, 4) of all nodes, the last one its own; that of a frame k before it is k before.
+        log_scales: σ of all nodes, likewise.
         since: the first node that it may be measured to: before it the camera was lost.
-        has_anchor: that node is the anchor.
-        offsets: of the earlier frames.
         noise: of the measurements.
     """
-    poses = look.T_anchor_views
-    here = poses.get(look.frame)
-    if here is None or not np.isfinite(here).all():
-        return []
-    edges = []
-    for offset in offsets:
-        there, row = poses.get(look.frame - offset), time - offset
-        if there is None or row < since or not np.isfinite(there).all():
-            continue
-        spread, is_next = np.sqrt(offset), offset == 1
-        weights = _weights(spread * noise.pair, spread * noise.pair_deg, noise.log_scale if is_next else np.inf)
-        ratio = log_scales[row] - log_scales[time]
-        edges.append(Edge(time, row, np.linalg.inv(here) @ there, ratio, weights, WINDOW))
-    anchor = poses.get(0)
-    if has_anchor and anchor is not None and np.isfinite(anchor).all() and look.frame > max(offsets):
-        measured = np.linalg.inv(here) @ anchor
-        reach = 1.0 + np.linalg.norm(measured[:3, 3])
-        edges.append(Edge(time, since, measured, 0.0, _weights(reach * noise.anchor, reach * noise.anchor_deg), WINDOW))
-    return edges
+    time = len(poses) - 1
+    known = {frame for frame, pose in look.T_anchor_views.items() if np.isfinite(pose).all()}
+    before = [look.frame - frame for frame in known if 0 < look.frame - frame <= time - since]
+    if look.frame not in known or not before:
+        return None
+    offset = min(before)
+    row, spread = time - offset, np.sqrt(offset)
+    weights = _weights(spread * noise.pair, spread * noise.pair_deg, spread * noise.log_scale)
+    return Edge(time, row, _as_placed(poses, log_scales, row), log_scales[row] - log_scales[time], weights, WINDOW)
 
 
-def map_edge(time: int, origin: int, T_time_origin: np.ndarray, noise: NoiseConfig) -> Edge:
-    """Where a frame was placed, relative to the frame `origin` of whose Gaussians it was placed by."""
-    return Edge(time, origin, T_time_origin, 0.0, _weights(noise.map, noise.map_deg), WINDOW)
+def map_edge(poses: Sequence[np.ndarray], log_scales: Sequence[float], origin: int, noise: NoiseConfig) -> Edge:
+    """Where the last frame was placed, relative to the frame `origin` of whose Gaussians it was placed by."""
+    measured = _as_placed(poses, log_scales, origin)
+    return Edge(len(poses) - 1, origin, measured, 0.0, _weights(noise.map, noise.map_deg), WINDOW)
+
+
+def _as_placed(poses: Sequence[np.ndarray], log_scales: Sequence[float], row: int) -> np.ndarray:
+    """Node `row` relative to the last one, in the unit of the last one's inference."""
+    return rescaled(np.linalg.inv(poses[-1]) @ poses[row], np.exp(-log_scales[-1]))
 
 
 def loop_edge(loop: LoopMeasurement) -> Edge:

@@ -18,7 +18,7 @@ from emgs_jax.registration.belief import certain
 from emgs_jax.report.back_end import counts, metric_graph
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.correction import correct
-from emgs_jax.running.measuring import Look, window_edges
+from emgs_jax.running.measuring import Look, chain_edge, map_edge
 from emgs_jax.running.record import FrameRecord, MappingRun
 from emgs_jax.slam import SlamState
 
@@ -83,10 +83,8 @@ def test_what_was_measured_without_error_moves_nothing(graph):
 
 
 def test_a_loop_brings_poses_map_and_last_frame_back(graph):
-    """The anchor holds nothing here: its edges are left out, as with a prior that has lost it."""
     truth, drifted = ring(), ring(1.95 * np.pi)
     end = walked(graph, drifted)
-    end.edges = [edge for edge in end.edges if edge.b > 0 or edge.a <= 8]
     state = state_of(drifted)
     loops = [loop(truth, row) for row in range(1, 9)]
     assert end.misfit(loops[0]) > graph.max_known and end.wants_to_close(loops)
@@ -148,23 +146,41 @@ def test_a_loop_that_cannot_be_solved_changes_nothing(graph):
     assert counts(end)["loops/closures_refused"] == 1
 
 
-def test_a_window_measures_earlier_frames_and_the_anchor_once_each(graph):
-    poses = ring()
-    found = window_edges(look(poses, 30), 30, [0.0] * 31, 0, True, graph.offsets, graph.noise)
-    assert [edge.b for edge in found] == [30 - offset for offset in graph.offsets] + [0]
-    for edge in found:
-        np.testing.assert_allclose(edge.Z_a_b, np.linalg.inv(poses[30]) @ poses[edge.b], atol=1e-12)
-    assert window_edges(look(poses, 30), 30, [0.0] * 31, 0, False, graph.offsets, graph.noise)[-1].b != 0
-    measured = look(poses, 30)
-    measured.T_anchor_views[0][:] = np.nan
-    found = window_edges(measured, 30, [0.0] * 31, 0, True, graph.offsets, graph.noise)
-    assert [edge.b for edge in found] == [30 - offset for offset in graph.offsets], "the anchor is not known"
-    measured = look(poses, 30)
-    measured.T_anchor_views[29][:] = np.nan
-    found = window_edges(measured, 30, [0.0] * 31, 0, True, graph.offsets, graph.noise)
-    assert 29 not in [edge.b for edge in found]
+def test_a_frame_is_held_where_it_was_placed_and_not_where_it_was_predicted(graph):
+    """Both edges, in the unit of the frame's inference, whatever the window says of the two frames."""
+    placed, scales = list(ring(1.95 * np.pi)[:31]), [0.0] * 30 + [np.log(1.1)]
+    chain = chain_edge(look(ring(), 30), placed, scales, 0, graph.noise)
+    held = map_edge(placed, scales, 12, graph.noise)
+    assert (chain.a, chain.b, held.a, held.b) == (30, 29, 30, 12)
+    for edge in (chain, held):
+        expected = np.linalg.inv(placed[30]) @ placed[edge.b]
+        expected[:3, 3] /= 1.1
+        np.testing.assert_allclose(edge.Z_a_b, expected, atol=1e-12)
+    assert chain.log_ratio == pytest.approx(-np.log(1.1)) and held.sqrt_info[6, 6] == 0
+
+
+def test_the_frame_before_is_the_nearest_that_the_window_knows(graph):
+    poses, scales = list(ring()[:31]), [0.0] * 31
+    measured = look(ring(), 30)
+    next_to = chain_edge(measured, poses, scales, 0, graph.noise)
+    for frame in (29, 28):
+        measured.T_anchor_views[frame][:] = np.nan
+    edge = chain_edge(measured, poses, scales, 0, graph.noise)
+    assert edge.b == 27
+    np.testing.assert_allclose(edge.sqrt_info * np.sqrt(3), next_to.sqrt_info)
+    assert chain_edge(measured, poses, scales, 28, graph.noise) is None, "before that the camera was lost"
     measured.T_anchor_views[30][:] = np.nan
-    assert window_edges(measured, 30, [0.0] * 31, 0, True, graph.offsets, graph.noise) == []
+    assert chain_edge(measured, poses, scales, 0, graph.noise) is None, "it is not known itself"
+
+
+def test_without_a_loop_nothing_moves_however_the_predictions_differ(graph):
+    """With the window's own poses as edges the solution of a walk was of the raw prior's, and every surface rough."""
+    placed = ring(1.95 * np.pi)
+    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
+    for index, pose in enumerate(placed):
+        end.add(look(ring(), index), pose, 1.0, max(index - 3, 0))
+    state = state_of(placed)
+    assert_same(end.close(state).map, state.map)
 
 
 def test_other_solvers_read_the_graph_in_the_scale_of_the_map(graph, tmp_path):
