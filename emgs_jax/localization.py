@@ -49,6 +49,7 @@ class LocalizationConfig(eqx.Module):
         anchor_noise: of `fused`: variance of the prior's own pose near the anchor, over that of its motion.
         anchor_range: m; of `fused`: distance from the anchor at which its standard deviation has doubled.
         num_alike: frames that see one part of the map and share the error of its scale, see `next_belief`.
+        num_shared: frames whose windows share images and err alike, see `measured`.
         icp: the fine step.
         min_inlier_fraction: of the points, below which the fine pose is not accepted.
         max_residual: root mean square distance to the map's planes, as a fraction of the depth.
@@ -64,6 +65,7 @@ class LocalizationConfig(eqx.Module):
     anchor_noise: Float[Array, "*b"] = traced(low=1e-6, high=math.inf)
     anchor_range: Float[Array, "*b"] = traced(low=1e-6, high=math.inf)
     num_alike: Float[Array, "*b"] = traced(low=1, high=math.inf)
+    num_shared: Float[Array, "*b"] = traced(low=1, high=math.inf)
     icp: IcpConfig
     min_inlier_fraction: Float[Array, "*b"] = traced(low=0, high=1)
     max_residual: Float[Array, "*b"] = traced(low=0, high=math.inf)
@@ -194,7 +196,8 @@ def _measured(
     chi_sq = apart @ jnp.linalg.solve(belief.covariance[:-1, :-1] + jnp.diag(std**2), apart)
     weights = is_used / (std**2 * (1.0 + chi_sq / apart.shape[0]))
     difference = jnp.append(apart, belief.log_scale - jnp.log(scale))
-    step, belief = measured(belief, difference, jnp.diag(jnp.append(weights, config.scale_std**-2)))
+    information = jnp.diag(jnp.append(weights, config.scale_std**-2))
+    step, belief = measured(belief, difference, information, config.num_shared)
     return T_world_camera @ jaxlie.SE3.exp(step[:-1]), scale * jnp.exp(step[-1]), belief
 
 

@@ -199,6 +199,7 @@ STAGES = [
         ("jnp.diag(noise**2)", "jnp.diag(noise)", "deviations for variances"),
         ("found.misfit / depth_noise, 1.0) ** 2", "found.misfit / depth_noise, 1.0)", "a deviation for its variance"),
         ("nothing, found.information / num_alike)", "nothing, found.information)", "a map without errors of its own"),
+        ("difference, information / num_shared", "difference, information", "each frame's window is of other images"),
         ("update(belief.world_covariance, difference", "update(belief.covariance, difference", "one P for both"),
         ("set(num_alike**-0.5)", "set(1.0)", "a scale of one map as if of many"),
         ("jnp.where(is_tracked, new, old)", "new", "a frame that is not tracked counts"),

@@ -79,11 +79,15 @@ def moved(belief: Belief, T_previous_current: jaxlie.SE3, noise: Float[Array, "7
 
 
 def measured(
-    belief: Belief, difference: Float[Array, "7"], information: Float[Array, "7 7"]
+    belief: Belief, difference: Float[Array, "7"], information: Float[Array, "7 7"], num_shared: Float[Array, ""]
 ) -> tuple[Float[Array, "7"], Belief]:
-    """The step to the mean of what is known relative to the map and what is measured, and the belief; see `update`."""
+    """The step to the mean of what is known relative to the map and what is measured, and the belief; see `update`.
+
+    What a prior says of its own pose is wrong alike in all frames whose windows share images: of the place in the world
+    each of these `num_shared` says so much less.
+    """
     step, covariance = update(belief.covariance, difference, information)
-    _, world = update(belief.world_covariance, difference, information)
+    _, world = update(belief.world_covariance, difference, information / num_shared)
     return step, eqx.tree_at(lambda b: (b.covariance, b.world_covariance), belief, (covariance, world))
 
 
