@@ -48,8 +48,8 @@ class LocalizationConfig(eqx.Module):
         max_pair_distance: fraction of the depth; farther points are no pair.
         anchor_noise: of `fused`: variance of the prior's own pose near the anchor, over that of its motion.
         anchor_range: m; of `fused`: distance from the anchor at which its standard deviation has doubled.
-        num_alike: frames that see one part of the map and share the error of its scale, see `next_belief`.
-        num_shared: frames whose windows share images and err alike, see `measured`.
+        num_alike, num_shared: frames that see one part of the map, and whose windows share images: they err alike, see
+            `next_belief` and `measured`.
         icp: the fine step.
         min_inlier_fraction: of the points, below which the fine pose is not accepted.
         max_residual: root mean square distance to the map's planes, as a fraction of the depth.
@@ -154,8 +154,7 @@ def _readings(
 ) -> tuple[jaxlie.SE3, jaxlie.SE3, jaxlie.SE3, Bool[Array, ""]]:
     """The prior's motion from the previous frame, its own pose of the current one, and where each reading begins (R7).
 
-    Last, whether the previous frame leads here at all.
-    After a frame that could not be placed the chain is broken, and the prior's own pose stands in for it.
+    Last, whether the previous frame leads here at all. If not, the prior's own pose stands in for the broken chain.
     """
     anchor, paired = prediction.T_world_anchor, prediction.previous.valid & previous.valid
     raw_previous, raw_current = pose_row(prediction.T_world_views, 0), pose_row(prediction.T_world_views, 1)
@@ -179,8 +178,8 @@ def _measured(
 ) -> tuple[jaxlie.SE3, Float[Array, ""], Belief]:
     """Pose, scale and belief after the prior's own pose (`fused` only) and the prior's own unit.
 
-    Where a prior has lost its anchor its pose is wrong altogether, and then lasting. So it counts by a Cauchy weight of
-    its distance from what is known, w = 1 / (1 + χ² / 6).
+    A prior that has lost its anchor is wrong altogether, and for long: its pose counts by a Cauchy weight of its
+    distance from what is known, w = 1 / (1 + χ² / 6).
 
     Args:
         T_world_camera: what is known.
@@ -196,8 +195,8 @@ def _measured(
     chi_sq = apart @ jnp.linalg.solve(belief.covariance[:-1, :-1] + jnp.diag(std**2), apart)
     weights = is_used / (std**2 * (1.0 + chi_sq / apart.shape[0]))
     difference = jnp.append(apart, belief.log_scale - jnp.log(scale))
-    information = jnp.diag(jnp.append(weights, config.scale_std**-2))
-    step, belief = measured(belief, difference, information, config.num_shared)
+    weights = jnp.append(weights, config.scale_std**-2)
+    step, belief = measured(belief, difference, jnp.diag(weights), config.num_shared)
     return T_world_camera @ jaxlie.SE3.exp(step[:-1]), scale * jnp.exp(step[-1]), belief
 
 

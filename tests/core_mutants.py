@@ -126,7 +126,7 @@ GRAPH = [
         ("ends.log_scale[1] - ends.log_scale[0] -", "ends.log_scale[0] - ends.log_scale[1] -", "scales swapped"),
         ("2.0 / (1.0 + excess)", "1.0 / (1.0 + excess)", "half the scaling, with a jump at φ"),
         ("edges.valid & exists & both", "edges.valid & exists", "an edge to a node that is not in use"),
-        ("kind == LOOP, chi2 / kernel", "kind == WINDOW, chi2 / kernel", "the window's edges may be wrong, loops not"),
+        ("kind == LOOP, chi2 / kernel", "kind == ODOMETRY, chi2 / kernel", "odometry may be wrong, loops not"),
     ),
     *own("graph/sparse", "graph/test_graph_optimize")(
         ("jacobians * free.ravel()[unknowns][:, None]", "jacobians", "the gauge moves"),

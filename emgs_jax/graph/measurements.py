@@ -10,7 +10,7 @@ from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.registration.rigid import pose_row, scale_translation
 
-WINDOW, LOOP = 0, 1  # kinds of edges: only those of a loop may be wrong altogether
+ODOMETRY, LOOP = 0, 1  # kinds of edges: only those of a loop may be wrong altogether
 DEGREES = 7  # of a node: translation, rotation (jaxlie's order), log-scale
 
 
@@ -37,7 +37,7 @@ class Edges(eqx.Module):
         Z_a_b: T_a⁻¹ T_b, its translation in the units of a's inference (the map's, times e^{−σ_a}).
         log_ratio: measured σ_b − σ_a: log of the median ratio of the same points' depths in a's inference and in b's.
         sqrt_info: W, with WᵀW the information of (translation, rotation, log-scale); a zero row is not measured.
-        kind: WINDOW (the inference's own frames, odometry) or LOOP.
+        kind: ODOMETRY (where frames were placed) or LOOP.
         valid: rows in use; the others may hold anything. An edge with a node that is not in use is not either.
     """
 
@@ -131,7 +131,7 @@ def robust(
 
     Args:
         chi2: squared norm of the residuals.
-        kind: WINDOW or LOOP; a window's edges are quadratic.
+        kind: ODOMETRY or LOOP; odometry is quadratic.
         kernel: φ > 0; inf: quadratic.
     """
     excess = jnp.where(kind == LOOP, chi2 / kernel, 0.0)

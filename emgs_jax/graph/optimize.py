@@ -10,7 +10,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from emgs_jax.graph.measurements import DEGREES, LOOP, WINDOW, Graph, Nodes
+from emgs_jax.graph.measurements import DEGREES, LOOP, ODOMETRY, Graph, Nodes
 from emgs_jax.graph.problem import Linear, Problem, linear, moved, num_rows, problem_of
 from emgs_jax.graph.sparse import columns_of_inverse, damped_step
 from emgs_jax.graph.start import spread
@@ -33,7 +33,7 @@ class GraphConfig(eqx.Module):
         max_iterations: of Levenberg and Marquardt; 0: nothing moves.
         damping: λ at the start, times the Hessian's diagonal.
         min_decrease: relative, of the cost; less has converged.
-        max_misfit: χ² per measured row of the window's edges: a result that bends them more, and more than they were,
+        max_misfit: χ² per measured row of the odometry: a result that bends it more, and more than it was,
             is refused.
     """
 
@@ -61,10 +61,10 @@ class GraphInfo:
         num_iterations: tried steps.
         converged: the last step gained next to nothing.
         edge_chi2: (e,) χ² of every edge at the end, unweighted; 0 where it is not in use.
-        edge_weights: (e,) share of that χ² that counts: s² of dynamic covariance scaling, 1 for a window's edges.
-        window_chi2: sum over the window's edges.
+        edge_weights: (e,) share of that χ² that counts: s² of dynamic covariance scaling, 1 for odometry.
+        odometry_chi2: sum over the odometry.
         loop_chi2: weighted sum over loops.
-        num_window_rows: measured rows of the window's edges.
+        num_odometry_rows: measured rows of the odometry.
         num_loop_rows: likewise of loops.
         dof: measured rows, those of the scale prior included, minus free unknowns.
         num_disconnected: nodes without a path to the gauge, which stay where they are.
@@ -77,9 +77,9 @@ class GraphInfo:
     converged: bool
     edge_chi2: np.ndarray
     edge_weights: np.ndarray
-    window_chi2: float
+    odometry_chi2: float
     loop_chi2: float
-    num_window_rows: int
+    num_odometry_rows: int
     num_loop_rows: int
     dof: int
     num_disconnected: int
@@ -116,7 +116,7 @@ def _info(
     edge_chi2, edge_weights = np.zeros(num_edges), np.ones(num_edges)
     edge_chi2[problem.used], edge_weights[problem.used] = end.chi2[:count], end.weights[:count]
     is_loop = np.asarray(edges.kind) == LOOP
-    num_window_rows, num_loop_rows = num_rows(edges, WINDOW), num_rows(edges, LOOP)
+    num_odometry_rows, num_loop_rows = num_rows(edges, ODOMETRY), num_rows(edges, LOOP)
     num_prior = int(np.sum(problem.free[:, 6])) if problem.scale_information > 0 else 0
     return GraphInfo(
         reason=reason,
@@ -126,11 +126,11 @@ def _info(
         converged=tried[1],
         edge_chi2=edge_chi2,
         edge_weights=edge_weights,
-        window_chi2=float(np.sum(end.chi2[~is_loop])),
+        odometry_chi2=float(np.sum(end.chi2[~is_loop])),
         loop_chi2=float(np.sum((end.weights * end.chi2)[is_loop])),
-        num_window_rows=num_window_rows,
+        num_odometry_rows=num_odometry_rows,
         num_loop_rows=num_loop_rows,
-        dof=num_window_rows + num_loop_rows + num_prior - int(np.sum(end.equations.measured)),
+        dof=num_odometry_rows + num_loop_rows + num_prior - int(np.sum(end.equations.measured)),
         num_disconnected=problem.num_disconnected,
     )
 
@@ -171,11 +171,11 @@ def _objection(problem: Problem, given: Linear, end: Linear, converged: bool, co
     """Why a result is not to be used; empty where it is."""
     if end is given and not converged:
         return "no step lowers the cost"
-    is_window = np.asarray(problem.graph.edges.kind) == WINDOW
-    allowed = float(config.max_misfit) * num_rows(problem.graph.edges, WINDOW)
-    bent = float(np.sum(end.chi2[is_window]))
-    if bent > max(allowed, float(np.sum(given.chi2[is_window]))):
-        return f"the loops contradict the window's edges: their χ² would be {bent:.4g}, more than {allowed:.4g}"
+    is_odometry = np.asarray(problem.graph.edges.kind) == ODOMETRY
+    allowed = float(config.max_misfit) * num_rows(problem.graph.edges, ODOMETRY)
+    bent = float(np.sum(end.chi2[is_odometry]))
+    if bent > max(allowed, float(np.sum(given.chi2[is_odometry]))):
+        return f"the loops contradict the odometry: their χ² would be {bent:.4g}, more than {allowed:.4g}"
     return ""
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from emgs_jax.graph.measurements import LOOP, WINDOW, Edges, Graph, Nodes
+from emgs_jax.graph.measurements import LOOP, ODOMETRY, Edges, Graph, Nodes
 from emgs_jax.io.files import atomic_write
 
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
@@ -20,7 +20,7 @@ ROUNDING = 1e-6
 
 
 def load_graph_g2o(path: str | os.PathLike, half_angles: bool = False) -> Graph:
-    """Read nodes, in the order of the file, and edges; those between neighbours in it are WINDOW, all others LOOP.
+    """Read nodes, in the order of the file, and edges; those between neighbours in it are ODOMETRY, all others LOOP.
 
     Z of an edge `a b` is T_a⁻¹ T_b. Scales are not part of the format: log_scale is 0, the scale row not measured;
     solve with scale_std = 0. Lines that begin with # or FIX are read over (the first node is the gauge).
@@ -99,7 +99,7 @@ def _roots(upper: np.ndarray, half_angles: bool, places: list[str]) -> np.ndarra
 
 
 def _graph(vertices: np.ndarray, ends: np.ndarray, poses: np.ndarray, roots: np.ndarray) -> Graph:
-    kind = np.where(np.abs(ends[:, 1] - ends[:, 0]) == 1, WINDOW, LOOP)
+    kind = np.where(np.abs(ends[:, 1] - ends[:, 0]) == 1, ODOMETRY, LOOP)
     with jax.enable_x64(True):
         a, b = jnp.asarray(ends, jnp.int32).T
         nodes = Nodes(_to_poses(vertices), jnp.zeros(len(vertices)), jnp.ones(len(vertices), bool))

@@ -9,7 +9,7 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.gaussian_map import GaussianMap, grow
-from emgs_jax.graph.measurements import WINDOW
+from emgs_jax.graph.measurements import ODOMETRY
 from emgs_jax.loops.location import Location, LocationConfig
 from emgs_jax.observation import Prediction, depth_in, transform
 from emgs_jax.registration.belief import certain
@@ -57,7 +57,7 @@ def _leads_here(end: BackEnd, given: Input, count: int) -> bool:
     here, before = (given.T_anchor_views.get(given.frames[0].index - offset) for offset in (0, 1))
     if here is None or before is None or not np.isfinite([here, before]).all():
         return False
-    linked = {edge.a for edge in end.edges if edge.kind == WINDOW and edge.b == edge.a - 1}
+    linked = {edge.a for edge in end.edges if edge.kind == ODOMETRY and edge.b == edge.a - 1}
     return linked.issuperset(range(len(end.poses) + 1 - count, len(end.poses)))
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.graph.measurements import LOOP, WINDOW, Edges
+from emgs_jax.graph.measurements import LOOP, ODOMETRY, Edges
 from emgs_jax.graph.problem import bucket
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement
@@ -90,13 +90,13 @@ def chain_edge(
     offset = min(before)
     row, spread = time - offset, np.sqrt(offset)
     weights = _weights(spread * noise.pair, spread * noise.pair_deg, spread * noise.log_scale)
-    return Edge(time, row, _as_placed(poses, log_scales, row), log_scales[row] - log_scales[time], weights, WINDOW)
+    return Edge(time, row, _as_placed(poses, log_scales, row), log_scales[row] - log_scales[time], weights, ODOMETRY)
 
 
 def map_edge(poses: Sequence[np.ndarray], log_scales: Sequence[float], origin: int, noise: NoiseConfig) -> Edge:
     """Where the last frame was placed, relative to the frame `origin` of whose Gaussians it was placed by."""
     measured = _as_placed(poses, log_scales, origin)
-    return Edge(len(poses) - 1, origin, measured, 0.0, _weights(noise.map, noise.map_deg), WINDOW)
+    return Edge(len(poses) - 1, origin, measured, 0.0, _weights(noise.map, noise.map_deg), ODOMETRY)
 
 
 def _as_placed(poses: Sequence[np.ndarray], log_scales: Sequence[float], row: int) -> np.ndarray:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.graph.deform import deform
-from emgs_jax.graph.measurements import WINDOW
+from emgs_jax.graph.measurements import ODOMETRY
 from emgs_jax.loops.location import Location
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.observation import Prediction
@@ -155,7 +155,7 @@ def _edge(end: BackEnd, place: Location) -> Edge:
     information = np.linalg.inv(place.covariance / units[:, None] / units)
     measured = rescaled(np.linalg.inv(end.poses[a]) @ end.poses[b], 1.0 / scale)
     ratio = end.log_scales[b] - end.log_scales[a]
-    return Edge(a, b, measured, ratio, np.linalg.cholesky(information).T, WINDOW)
+    return Edge(a, b, measured, ratio, np.linalg.cholesky(information).T, ODOMETRY)
 
 
 def _moved_record(similarity: np.ndarray, record: FrameRecord) -> FrameRecord:

@@ -31,7 +31,7 @@ from emgs_jax.evaluation.clouds import read_cloud
 from emgs_jax.evaluation.labelled_mesh import read_labelled_mesh
 from emgs_jax.features.text import TextEmbeddings, load_text, save_text
 from emgs_jax.gaussian_map import empty_map
-from emgs_jax.graph.measurements import LOOP, WINDOW, Graph, Nodes
+from emgs_jax.graph.measurements import LOOP, ODOMETRY, Graph, Nodes
 from emgs_jax.io.colmap import save_colmap
 from emgs_jax.io.g2o import load_graph_g2o
 from emgs_jax.io.map_file import load_map, save_map
@@ -308,7 +308,7 @@ def read_graph(folder: Path) -> None:
     graph: Graph = load_graph_g2o(folder / "graph.g2o")
     nodes: Nodes = graph.nodes
     assert np.isfinite(np.asarray(nodes.T_world.wxyz_xyz)).all()
-    assert set(np.asarray(graph.edges.kind).tolist()) <= {WINDOW, LOOP}
+    assert set(np.asarray(graph.edges.kind).tolist()) <= {ODOMETRY, LOOP}
     assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(graph.edges))
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from emgs_jax.graph.measurements import LOOP, WINDOW, Edges, Graph, Nodes, move
+from emgs_jax.graph.measurements import LOOP, ODOMETRY, Edges, Graph, Nodes, move
 from emgs_jax.graph.optimize import GraphConfig
 
 OFFSETS = (1, 2, 3, 5, 8)
@@ -29,7 +29,7 @@ def walk(num_nodes: int, laps: float = 2.0, radius: float = 4.0, scale_std: floa
     return Nodes(T, jnp.asarray(scales), jnp.ones(num_nodes, bool))
 
 
-def measure(nodes: Nodes, pairs, kind=WINDOW, std=STD, rng=None) -> Edges:
+def measure(nodes: Nodes, pairs, kind=ODOMETRY, std=STD, rng=None) -> Edges:
     """Edges of pairs (e, 2), exact without `rng`; the information is that of `std`."""
     a, b = np.asarray(pairs).T
     count = len(a)
@@ -75,7 +75,7 @@ def chain(nodes: Nodes, edges: Edges) -> Nodes:
 def noisy_laps(num_nodes: int, num_loops: int, seed: int, std=STD) -> tuple[Nodes, Graph]:
     """Truth, and the graph of two laps as it stands before a closure: the chain of its odometry. SE(3)."""
     rng, truth = np.random.default_rng(seed), walk(num_nodes)
-    edges = measure(truth, window_pairs(num_nodes), WINDOW, std, rng)
+    edges = measure(truth, window_pairs(num_nodes), ODOMETRY, std, rng)
     loops = measure(truth, loop_pairs(num_nodes, num_loops), LOOP, std, rng)
     edges = without_scale(join(edges, loops))
     return truth, Graph(chain(truth, edges), edges)

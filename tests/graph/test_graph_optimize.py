@@ -29,7 +29,7 @@ from rings import (
 )
 from scipy import stats
 
-from emgs_jax.graph.measurements import LOOP, WINDOW, Edges, Graph, Nodes
+from emgs_jax.graph.measurements import LOOP, ODOMETRY, Edges, Graph, Nodes
 from emgs_jax.graph.optimize import GraphConfig, marginal_covariances, optimize
 from emgs_jax.io.g2o import load_graph_g2o
 
@@ -226,8 +226,8 @@ def test_chi2_of_noisy_measurements_has_its_distribution():
     low, high = stats.chi2.interval(0.99, info.dof)
     assert low < 2 * info.cost < high
     assert info.dof == 7 * edges.a.shape[0] + 59 - 7 * 59
-    assert (info.num_window_rows, info.num_loop_rows) == (7 * (edges.a.shape[0] - 10), 70)
-    assert info.window_chi2 + info.loop_chi2 == pytest.approx(np.sum(info.edge_chi2))
+    assert (info.num_odometry_rows, info.num_loop_rows) == (7 * (edges.a.shape[0] - 10), 70)
+    assert info.odometry_chi2 + info.loop_chi2 == pytest.approx(np.sum(info.edge_chi2))
 
 
 def test_marginal_covariances_are_those_of_the_errors():
@@ -287,7 +287,7 @@ def test_ten_false_loops_among_thirty_hardly_matter(closures):
 def drifted(num_nodes: int, seed: int) -> tuple[Nodes, Graph]:
     """Odometry five times as noisy as its loops, of which there are three: metres of drift."""
     rng, truth = np.random.default_rng(seed), walk(num_nodes)
-    window = measure(truth, window_pairs(num_nodes), WINDOW, 5 * STD, rng)
+    window = measure(truth, window_pairs(num_nodes), ODOMETRY, 5 * STD, rng)
     edges = without_scale(join(window, measure(truth, loop_pairs(num_nodes, 3), LOOP, STD, rng)))
     return truth, Graph(chain(truth, edges), edges)
 
@@ -307,7 +307,7 @@ def stretched(num_nodes: int, seed: int) -> tuple[Nodes, Graph]:
     rng, truth = np.random.default_rng(seed), walk(num_nodes)
     scales = np.concatenate([[0.0], np.cumsum(0.02 * rng.normal(size=num_nodes - 1))])
     truth = eqx.tree_at(lambda n: n.log_scale, truth, jnp.asarray(scales))
-    window = measure(truth, window_pairs(num_nodes), WINDOW, STD * np.where(np.arange(7) == 6, 2.0, 1.0), rng)
+    window = measure(truth, window_pairs(num_nodes), ODOMETRY, STD * np.where(np.arange(7) == 6, 2.0, 1.0), rng)
     window = eqx.tree_at(lambda e: e.log_ratio, window, 0 * window.log_ratio)
     edges = join(window, measure(truth, loop_pairs(num_nodes, 3), LOOP, STD, rng))
     return truth, Graph(chain(truth, edges), edges)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rings import disturb, measure, walk, window_pairs
 
-from emgs_jax.graph.measurements import LOOP, WINDOW, Edges, Graph, Nodes, linearize, move, residuals, robust
+from emgs_jax.graph.measurements import LOOP, ODOMETRY, Edges, Graph, Nodes, linearize, move, residuals, robust
 
 
 @pytest.fixture
@@ -113,7 +113,7 @@ def test_the_kernel_s_weight_is_the_derivative_of_its_cost(double):
 
 def test_a_window_s_edges_and_an_infinite_kernel_are_quadratic(double):
     chi2 = jnp.asarray([0.0, 1e3, 1e6])
-    for kind, phi in ((WINDOW, 16.8), (LOOP, np.inf)):
+    for kind, phi in ((ODOMETRY, 16.8), (LOOP, np.inf)):
         cost, weight = robust(chi2, jnp.full(3, kind), jnp.asarray(phi))
         np.testing.assert_array_equal(cost, 0.5 * chi2)
         np.testing.assert_array_equal(weight, 1.0)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.graph.measurements import LOOP, WINDOW, residuals
+from emgs_jax.graph.measurements import LOOP, ODOMETRY, residuals
 from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
 
 RNG = np.random.default_rng(0)
@@ -40,7 +40,7 @@ def test_vertices_and_edges_are_what_the_lines_say(tmp_path):
     np.testing.assert_array_equal([graph.edges.a, graph.edges.b], [[0, 2], [1, 0]])
     turned = matrix([1, 0, 0], [0, 0, 0.6, 0.8])
     np.testing.assert_allclose(graph.edges.Z_a_b.as_matrix(), [matrix([1, 2, 3], [0, 0, 0, 1]), turned], atol=1e-6)
-    np.testing.assert_array_equal(graph.edges.kind, [WINDOW, LOOP])
+    np.testing.assert_array_equal(graph.edges.kind, [ODOMETRY, LOOP])
     roots = np.asarray(graph.edges.sqrt_info)
     np.testing.assert_allclose((roots.transpose(0, 2, 1) @ roots)[:, :6, :6], [INFORMATION] * 2, atol=1e-9)
     assert not roots[:, 6].any() and not roots[:, :, 6].any()

@@ -13,7 +13,7 @@ from scene import assert_same, random_gaussians, random_observation
 
 from emgs_jax import load_config
 from emgs_jax.gaussian_map import new_map
-from emgs_jax.graph.measurements import WINDOW
+from emgs_jax.graph.measurements import ODOMETRY
 from emgs_jax.localization import localize_coarse
 from emgs_jax.loops.location import Location
 from emgs_jax.observation import Prediction
@@ -150,7 +150,7 @@ def begins_anew(chain=(3, 4, 5, 6), here=(6, 7), repeat_rms=0.01, is_lost=False,
     config = load_config("graph=default", f"graph.location.max_patience={patience}")
     poses = np.stack([matrix((0, 0, 0), (0.1 * k, 0, 0)) for k in range(8)])
     end = SimpleNamespace(poses=list(poses[:7]), config=config.graph)
-    end.edges = [SimpleNamespace(a=node, b=node - 1, kind=WINDOW) for node in chain]
+    end.edges = [SimpleNamespace(a=node, b=node - 1, kind=ODOMETRY) for node in chain]
     statuses = ["initialization", "tracked", "tracked", *["degraded"] * 4]
     records = [FrameRecord(row, None, None, status) for row, status in enumerate(statuses)]
     found = SimpleNamespace(is_tracked=False, is_lost=is_lost, repeat_rms=repeat_rms)
