@@ -19,6 +19,7 @@ out vec2 offset; // from the centre, in standard deviations
 flat out vec4 color;
 
 const float NEAREST = 1e-3; // m
+const float NEAREST_STD = 2.0; // what reaches the plane of the camera is not drawn
 const float MARGIN = 0.3; // of the size: farther out the Jacobian is that of the margin
 
 vec4 texel(sampler2D image, uint index) {
@@ -39,6 +40,7 @@ void main() {
   vec3 b = texel(covs, 2u * row + 1u).xyz;
   mat3 cov = covScale * mat3(a.x, a.y, a.z, a.y, b.x, b.y, a.z, b.y, b.z);
   mat3 seen = rotation * cov * transpose(rotation);
+  if (point.z <= NEAREST_STD * sqrt(seen[2].z)) return;
   vec3 jx = vec3(scale.x, 0.0, -scale.x * tangent.x);
   vec3 jy = vec3(0.0, scale.y, -scale.y * tangent.y);
   float xx = dot(jx, seen * jx) + blur;
