@@ -36,7 +36,7 @@ class BackEndConfig:
     """What is measured, how loops are found, and how all is solved.
 
     Args:
-        noise: of these measurements.
+        noise: of where frames are placed.
         appearance: keyframes and candidates.
         verification: of a candidate.
         agreement: of verified loops with each other.
