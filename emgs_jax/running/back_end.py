@@ -263,7 +263,9 @@ class BackEnd:
         count = len(self.poses)
         self.poses = list(np.asarray(after.T_world.as_matrix(), np.float64)[:count])
         self.log_scales = list(np.asarray(after.log_scale, np.float64)[:count])
-        return follow(state, before, after, self.min_std)
+        change = jnp.mean(after.log_scale - before.log_scale, where=before.valid)
+        belief = replace(state.belief, log_scale=state.belief.log_scale + change)
+        return follow(replace(state, belief=belief), before, after, self.min_std)
 
     def nodes(self, segment: int | None = None) -> Nodes:
         """All nodes, or those of a segment, with free rows up to a power of two: the map's part compiles rarely."""

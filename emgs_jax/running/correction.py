@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from emgs_jax.running.inputs import Input
 from emgs_jax.running.locating import looks_of
 from emgs_jax.running.record import FOUND, PLACED, SEGMENT, MappingRun, row_of_first_node
@@ -45,6 +47,10 @@ def finish(run: MappingRun) -> None:
 
 
 def _take_poses(run: MappingRun) -> None:
-    """The back end's poses into the records of its frames, which are the last ones."""
-    poses, first = run.back_end.poses[run.back_end.first :], row_of_first_node(run)
-    run.records[first:] = [replace(record, pose=pose) for record, pose in zip(run.records[first:], poses, strict=True)]
+    """The back end's poses and scales into the records of its frames, which are the last ones."""
+    end, first = run.back_end, row_of_first_node(run)
+    found = zip(end.poses[end.first :], np.exp(end.log_scales[end.first :]).tolist(), strict=True)
+    run.records[first:] = [
+        replace(record, pose=pose, scale=None if record.scale is None else scale)
+        for record, (pose, scale) in zip(run.records[first:], found, strict=True)
+    ]

@@ -17,7 +17,7 @@ from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.registration.belief import certain
 from emgs_jax.report.back_end import counts, metric_graph
 from emgs_jax.running.back_end import BackEnd
-from emgs_jax.running.correction import correct
+from emgs_jax.running.correction import correct, finish
 from emgs_jax.running.measuring import Look, chain_edge, map_edge
 from emgs_jax.running.record import FrameRecord, MappingRun
 from emgs_jax.slam import SlamState
@@ -55,6 +55,12 @@ def state_of(poses: np.ndarray) -> SlamState:
     map = eqx.tree_at(lambda m: m.birth, map, jnp.arange(COUNT, dtype=jnp.int32))
     last = jaxlie.SE3.from_matrix(jnp.asarray(poses[-1], jnp.float32))
     return SlamState(map, random_observation(20), last, certain(), jnp.asarray(COUNT))
+
+
+def rescaled_path(poses: np.ndarray, factor: float) -> np.ndarray:
+    poses = poses.copy()
+    poses[:, :3, 3] *= factor
+    return poses
 
 
 def walked(graph, poses: np.ndarray) -> BackEnd:
@@ -97,6 +103,26 @@ def test_a_loop_brings_poses_map_and_last_frame_back(graph):
         np.testing.assert_allclose(mean, pose[:3, :3] @ [0, 0, 1.5 * np.exp(scale)] + pose[:3, 3], atol=1e-4)
     np.testing.assert_allclose(closed.T_world_previous.as_matrix(), end.poses[-1], atol=1e-5)
     assert error(end.online, drifted) == 0
+
+
+def test_the_mean_of_the_scales_that_the_unit_of_a_run_is_made_of_follows_a_closure(graph):
+    """Inferences that are all 5 % too small: what the closure grows of the map, a finished run must not grow again."""
+    truth, log_scale = ring(), 0.05
+    poses = truth.copy()
+    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
+    for index, pose in enumerate(poses):
+        end.add(look(poses, index), pose, np.exp(log_scale), max(index - 3, 0))
+    state = state_of(poses)
+    state = eqx.tree_at(lambda s: s.belief.log_scale, state, jnp.asarray(log_scale))
+    records = [FrameRecord(row, None, None, "tracked", pose=pose, scale=1.05) for row, pose in enumerate(poses)]
+    records[0] = FrameRecord(0, None, None, "initialization", pose=poses[0])
+    run = MappingRun(None, None, state=state, records=records, back_end=end)
+    end.verified = [loop(rescaled_path(truth, 0.9), row) for row in range(1, 9)]
+    finish(run)
+    assert end.accepted and log_scale - np.mean(end.log_scales) > 1e-3  # `scale_std` asks for scales of one
+    assert float(run.state.belief.log_scale) == pytest.approx(np.mean(end.log_scales), abs=1e-5)
+    np.testing.assert_allclose([record.scale for record in run.records[1:]], np.exp(end.log_scales[1:]))
+    assert run.records[0].scale is None
 
 
 def test_loops_that_are_contradicted_later_are_no_edges_any_more(graph):
