@@ -29,7 +29,7 @@ from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.linalg import Whitening, whitening
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import static, take_rows
+from emgs_jax.ops.pytree import static, static_choice, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
 from emgs_jax.registration.belief import Belief, certain
 from emgs_jax.registration.rigid import median, pose_row
@@ -54,7 +54,7 @@ class SlamConfig(eqx.Module):
     """
 
     window_size: int = static(low=1, high=1000)
-    initialization: str = static()
+    initialization: str = static_choice("merged", "incremental")
     observation: ObservationConfig
     fit: FitConfig
     submap: SubmapConfig
@@ -63,10 +63,6 @@ class SlamConfig(eqx.Module):
     splitting: SplittingConfig
     refinement: RefinementConfig
     existence: ExistenceConfig
-
-    def __check_init__(self) -> None:
-        if self.initialization not in ("merged", "incremental"):
-            raise ValueError(f"slam.initialization must be merged or incremental; got {self.initialization!r}")
 
 
 class SlamState(eqx.Module):

@@ -14,7 +14,7 @@ from emgs_jax.graph.measurements import DEGREES, LOOP, ODOMETRY, Graph, Nodes
 from emgs_jax.graph.problem import Linear, Problem, linear, moved, num_rows, problem_of
 from emgs_jax.graph.sparse import columns_of_inverse, damped_step
 from emgs_jax.graph.start import spread
-from emgs_jax.ops.pytree import static, traced
+from emgs_jax.ops.pytree import static, static_choice, traced
 
 # χ² of a measured row that nothing is to be gained from: errors of a thousandth of their standard deviation.
 NOTHING_TO_GAIN = 1e-6
@@ -39,15 +39,11 @@ class GraphConfig(eqx.Module):
 
     scale_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
     kernel: Float[Array, "*b"] = traced(low=1e-6, high=math.inf)
-    start: str = static()
+    start: str = static_choice("given", "spread")
     max_iterations: int = static(low=0, high=10000)
     damping: Float[Array, "*b"] = traced(low=0)
     min_decrease: Float[Array, "*b"] = traced(low=0, high=1)
     max_misfit: Float[Array, "*b"] = traced(low=0, high=math.inf)
-
-    def __check_init__(self) -> None:
-        if self.start not in ("given", "spread"):
-            raise ValueError(f"graph.start must be given or spread; got {self.start!r}")
 
 
 @dataclass(frozen=True)

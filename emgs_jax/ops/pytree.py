@@ -27,13 +27,20 @@ def choice(*names: str) -> Any:
     """A traced config field, written as one of `names` and held as its position, so that readings can be swept."""
 
     def convert(value: Any) -> Any:
-        if isinstance(value, str):
-            if value not in names:
-                raise ValueError(f"must be one of {', '.join(names)}; got {value!r}")
-            value = names.index(value)
-        return _as_float32(value)
+        return _as_float32(names.index(_one_of(names, value)) if isinstance(value, str) else value)
 
     return eqx.field(converter=convert, metadata={"choices": names})
+
+
+def static_choice(*names: str) -> Any:
+    """A config field that is one of `names`, a choice of code: each compiles once."""
+    return eqx.field(static=True, converter=lambda value: _one_of(names, value), metadata={"choices": names})
+
+
+def _one_of(names: Sequence[str], value: Any) -> str:
+    if value not in names:
+        raise ValueError(f"must be one of {', '.join(names)}; got {value!r}")
+    return value
 
 
 def static(low: float | int | None = None, high: float | int | None = None) -> Any:

@@ -20,6 +20,24 @@ REPORT_FILE = "report.html"
 FRAMES_FILE = "frames.jsonl"
 EXPORTS = ("colmap", "nerfstudio", "cameras.ply", "scaled")  # what `experiments.export` writes beside them
 _POSES = ("raw_pose", "true_pose")
+_PROVENANCE = {  # what of `provenance.provenance` is read again, by dotted key
+    "protocol": (str, type(None)),
+    "simulated": bool,
+    "prior": dict,
+    "prior.name": str,
+    "prior.settings": dict,
+    "data": dict,
+    "data.name": str,
+    "data.sequence": str,
+    "git": (dict, type(None)),
+    "versions": dict,
+    "versions.emgs_jax": str,
+    "device": dict,
+    "device.kind": str,
+    "config": dict,
+    "config.densify": dict,
+    "config.densify.render": dict,
+}
 _OUTCOMES = ("accepted", "known", "unconfirmed", "refused")
 
 
@@ -85,6 +103,7 @@ def read_run(folder: Path) -> RecordedRun:
     if missing:
         raise ValueError(f"{folder} holds no finished run: it lacks {', '.join(missing)}; run it to its end")
     metrics = read_metrics(folder / METRICS_FILE)
+    _check_provenance(folder / METRICS_FILE, metrics["provenance"])
     lines = _lines(folder / FRAMES_FILE)
     frames = [line for line in lines if line.get("pose") is not None]
     _, poses = load_trajectory_tum(folder / "trajectory.txt")
@@ -108,6 +127,17 @@ def read_run(folder: Path) -> RecordedRun:
         text=read_text(folder / TEXT_FILE) if (folder / TEXT_FILE).is_file() else None,
         loops=_loops(folder / LOOPS_FILE, len(poses)),
     )
+
+
+def _check_provenance(path: Path, block: dict[str, Any]) -> None:
+    for key, kinds in _PROVENANCE.items():
+        value: Any = block
+        for name in key.split("."):
+            value = value.get(name)
+        if not isinstance(value, kinds):
+            raise ValueError(f"{path} is not the result of a run (provenance.{key} is {value!r}): run again")
+    if block["git"] is not None and not isinstance(block["git"].get("revision"), str):
+        raise ValueError(f"{path} is not the result of a run (provenance.git has no revision): run again")
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:

@@ -400,7 +400,7 @@ def test_the_solver_of_conf_is_a_config_and_without_iterations_nothing_moves():
     on, off = (hydra.utils.instantiate(default, **changes) for changes in ({}, {"max_iterations": 0}))
     assert isinstance(on, GraphConfig) and rmse(optimize(graph, on)[0], graph.nodes) > 0.01
     assert same(optimize(graph, off)[0], graph.nodes)
-    with pytest.raises(hydra.errors.InstantiationException, match="given or spread"):
+    with pytest.raises(hydra.errors.InstantiationException, match="one of given, spread"):
         hydra.utils.instantiate(default, start="chordal")
 
 

@@ -75,6 +75,7 @@ def written_run(folder: Path, *, has_truth: bool = True, sequence: str = "room",
         },
         "git": None,
         "versions": {"emgs_jax": "0"},
+        "device": {"kind": "cpu"},
         "config": config,
     }
     errors = {"trajectory/ate_sim3_m": 0.012, "raw_prior/trajectory/ate_sim3_m": 0.03} if has_truth else {}

@@ -56,6 +56,7 @@ def test_every_value_of_a_protocol_is_in_its_range(option):
         ("slam.em.max_log_gap=.nan", "slam.em.max_log_gap must be a number from 0 to inf, got '.nan'"),
         ("slam.em.max_log_gap=.inf", r"'.inf', which is text \(on the command line infinity is written inf\)"),
         ("slam.em.support=both", "slam.em.support must be one of printed, normalized; got 'both'"),
+        ("slam.initialization=random", "slam.initialization must be one of merged, incremental; got 'random'"),
         ("slam.em.support=1", "slam.em.support must be one of printed, normalized; got 1"),
         ("slam.em.average.forgetting=2", "slam.em.average.forgetting must be a number from 0 to 1, got 2"),
         ("slam.em.num_neighbours=0", "slam.em.num_neighbours must be a whole number from 1 to 256, got 0"),
