@@ -79,10 +79,10 @@ def check_size(size: Sequence[int]) -> Size:
     return values[0], values[1]
 
 
-def check_depth_scale(depth_scale: Number) -> float:
-    """`depth_scale` as a positive finite number."""
+def check_depth_scale(depth_scale: Number, what: str = "dataset.depth_scale") -> float:
+    """`depth_scale` as a positive finite number; `what` says where it stands."""
     if not (math.isfinite(depth_scale) and depth_scale > 0):
-        raise ValueError(f"dataset.depth_scale must be raw units per metre (5000 for TUM), got {depth_scale}")
+        raise ValueError(f"{what} must be raw units per metre (5000 for TUM), got {depth_scale}")
     return float(depth_scale)
 
 

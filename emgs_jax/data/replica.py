@@ -128,4 +128,5 @@ def read_calibration(path: Path) -> tuple[Size, Intrinsics, float]:
         raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise ValueError(f'{path} must hold {{"camera": {{w, h, fx, fy, cx, cy, scale}}}}: {error!r}') from error
+    scale = reading.check_depth_scale(scale, f"{path}: scale")
     return size, reading.check_intrinsics((fx, fy, cx, cy), size, str(path)), scale

@@ -24,6 +24,7 @@ from emgs_jax.report.page_pictures import Views, draw_views, jpeg
 from emgs_jax.report.page_strip import PlacedPaths, key_of, placed_paths, strip
 from emgs_jax.report.recorded_run import REPORT_FILE, RecordedRun
 from emgs_jax.report.repeat import repeat
+from emgs_jax.running.values import check_value, declared
 
 MAX_BYTES = 5_000_000
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -84,8 +85,10 @@ def render_config(run: RecordedRun) -> RenderConfig:
     """As the run drew its map."""
     settings = {key: value for key, value in run.provenance["config"]["densify"]["render"].items() if key != "_target_"}
     try:
+        for name, field in declared(RenderConfig).items():
+            check_value(f"densify.render.{name}", settings.get(name), field)
         return RenderConfig(**settings)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(f"{run.folder}/metrics.json has settings of another version ({error}): run again") from error
 
 

@@ -59,6 +59,9 @@ def test_missing_or_broken_calibration_names_the_file(replica_root):
     path.write_text('{"camera": {"w": 1, "h": 68, "fx": 60, "fy": 60, "cx": 59.5, "cy": 33.5, "scale": 1000}}')
     with pytest.raises(ValueError, match="cam_params.json .* principal point outside of the 1x68 images"):
         load(replica_root)
+    path.write_text('{"camera": {"w": 120, "h": 68, "fx": 60, "fy": 60, "cx": 59.5, "cy": 33.5, "scale": -1}}')
+    with pytest.raises(ValueError, match="cam_params.json: scale must be raw units per metre .* got -1"):
+        load(replica_root)
     path.unlink()
     with pytest.raises(FileNotFoundError, match="cam_params.json is missing"):
         load(replica_root)

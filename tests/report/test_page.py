@@ -195,8 +195,17 @@ def edited(path, change):
     [
         ("metrics.json", lambda text: text.replace('"format": 1', '"format": 9'), "another version"),
         ("metrics.json", lambda text: text[:50], "is not the result of a run"),
-        ("metrics.json", lambda text: text.replace('"emgs_jax": ', '"emgs_jaz": '), "provenance.versions.emgs_jax is None"),
+        (
+            "metrics.json",
+            lambda text: text.replace('"emgs_jax": ', '"emgs_jaz": '),
+            "provenance.versions.emgs_jax is None",
+        ),
         ("metrics.json", lambda text: text.replace('"git": null', '"git": {"a": 1}'), "git has no revision"),
+        (
+            "metrics.json",
+            lambda text: re.sub('"tile_batch": [0-9]+', '"tile_batch": null', text),
+            "render.tile_batch must be",
+        ),
         ("metrics.json", lambda text: text.replace('"intrinsics"', '"other"'), "which camera"),
         ("metrics.json", lambda text: text.replace("emgs_jax.data.synthetic.Synthetic", "os.system"), "os.system"),
         ("frames.jsonl", lambda text: text + '{"index": 3\n', "frames.jsonl:7 is no record"),
