@@ -103,7 +103,7 @@ def read_run(folder: Path) -> RecordedRun:
     if missing:
         raise ValueError(f"{folder} holds no finished run: it lacks {', '.join(missing)}; run it to its end")
     metrics = read_metrics(folder / METRICS_FILE)
-    _check_provenance(folder / METRICS_FILE, metrics["provenance"])
+    _check_metrics(folder / METRICS_FILE, metrics)
     lines = _lines(folder / FRAMES_FILE)
     frames = [line for line in lines if line.get("pose") is not None]
     _, poses = load_trajectory_tum(folder / "trajectory.txt")
@@ -129,7 +129,13 @@ def read_run(folder: Path) -> RecordedRun:
     )
 
 
-def _check_provenance(path: Path, block: dict[str, Any]) -> None:
+def _check_metrics(path: Path, metrics: dict[str, Any]) -> None:
+    """Raise ValueError where a value is neither a number nor unknown, or what is said of the run lacks something."""
+    said = {key: value for key, value in metrics.items() if key != "provenance" and value is not None}
+    for key, value in said.items():
+        if not isinstance(value, str if key.endswith("_note") else int | float):
+            raise ValueError(f"{path} is not the result of a run ({key} is {value!r}): run again")
+    block = metrics["provenance"]
     for key, kinds in _PROVENANCE.items():
         value: Any = block
         for name in key.split("."):
