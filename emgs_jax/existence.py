@@ -25,7 +25,7 @@ class ExistenceConfig(eqx.Module):
         birth: log-odds of a new Gaussian. At 0 it is tentative until it explains points of another frame; above, as
             printed, it is not.
         hit: log-odds that a look adds some of whose points the Gaussian explains.
-        miss: log-odds that a look takes away which sees through the Gaussian, or to which a tentative one is of no use.
+        miss: log-odds that a look takes away which sees through the Gaussian, or to which it is of no use.
         max_log_odds: which no number of looks exceeds, so that a change of mind takes a bounded number of them.
         refuted: log-odds below which a Gaussian is removed; `-inf` never, as printed.
         num_std: standard deviations of the depth between a Gaussian and what is seen that say nothing.
@@ -90,8 +90,9 @@ def judge(
     With d the depths that the frame shows round the Gaussian's pixel, z its own and
     σ² = (depth_noise · z)² + n'Σn, it is seen where |z - min d| <= kσ or |z - max d| <= kσ, and seen through where
     z < min d - kσ. What is behind is occluded, and what is between, at an edge, may be either: that says nothing.
-    One that is seen is confirmed by what it explains. A tentative one that is seen, while others explain all points
-    there, only repeats what the map knows: that speaks against it, or a map would grow for as long as one looks.
+    One that is seen is confirmed by what it explains. One that is seen while others explain all points there only
+    repeats what the map knows, as the second layer of a wall does: that speaks against it, or a map would grow for as
+    long as one looks. What is confirmed must be as wide as a pixel for that: a view from afar has no point for each.
 
     Args:
         map: all Gaussians, world frame.
@@ -117,7 +118,9 @@ def judge(
     is_seen = is_looked_at & (jnp.minimum(jnp.abs(depth - nearest), jnp.abs(depth - farthest)) <= reach)
     is_seen_through = is_looked_at & (depth < nearest - reach)
 
-    is_superfluous = is_seen & (use < 0) & (map.existence <= 0)
+    spread = 0.5 * (jnp.trace(gaussians.covs, axis1=-2, axis2=-1) - variance)  # variance along the surface
+    has_points = spread >= (depth / camera.focal[0]) ** 2
+    is_superfluous = is_seen & (use < 0) & (has_points | (map.existence <= 0))
     change = config.hit * (is_seen & (use > 0)) - config.miss * (is_seen_through | is_superfluous)
     existence = jnp.clip(map.existence + change, -config.max_log_odds, config.max_log_odds)
     existence = jnp.where(change == 0, map.existence, existence)

@@ -323,7 +323,9 @@ STAGES = [
         ("config.hit * (is_seen & (use > 0))", "config.hit * is_seen", "what explains nothing is confirmed"),
         ("is_seen_through | is_superfluous", "is_seen_through", "what is of no use stays"),
         ("is_seen & (use < 0)", "is_seen & (use <= 0)", "what is outside the submap is of no use"),
-        ("& (map.existence <= 0)", "", "what is confirmed goes when others explain more"),
+        ("(has_points | (map.existence <= 0))", "has_points", "what is tentative and small stays"),
+        ("(has_points | (map.existence <= 0))", "(map.existence <= 0)", "a second layer stays once it is confirmed"),
+        ("(depth / camera.focal[0]) ** 2", "0.0", "what a view from afar has no point for goes"),
         (
             "share * (1.0 - share))[:, None, None] * outer(along)",
             "share * (1.0 - share))[:, None, None] * outer(difference)",

@@ -97,19 +97,22 @@ def test_a_fresh_wrong_gaussian_goes_sooner_and_one_that_explains_is_confirmed(s
     assert map.existence[0] == settings.max_log_odds
 
 
-def test_a_tentative_one_on_the_surface_that_explains_nothing_goes_and_a_confirmed_one_stays(settings):
-    """All at one place: of no use, of use, not in the submap, and of no use once it was confirmed."""
-    birth = float(settings.birth)
-    map = map_of(discs([(0, 0, 3.0)] * 4))
-    map = eqx.tree_at(lambda m: m.existence, map, jnp.array([birth, birth, birth, 0.1]))
-    use = jnp.array([-1, 1, 0, -1])
+def test_what_is_on_the_surface_and_explains_nothing_goes_but_what_a_view_from_afar_cannot_resolve(settings):
+    """All at one place, the first four tentative: of no use, and so small, of use, not in the submap; then confirmed
+    ones of no use: as wide as a pixel (3 m / 40), and a little less."""
+    birth, pixel = float(settings.birth), 3.0 / 40.0
+    stds = 0.05, 0.1, 0.1, 0.1, 1.01 * pixel, 0.99 * pixel
+    map = map_of(*(discs((0, 0, 3.0), std=std) for std in stds))
+    known = [birth] * 4 + [0.1] * 2
+    map = eqx.tree_at(lambda m: m.existence, map, jnp.array(known))
+    use = jnp.array([-1, -1, 1, 0, -1, -1])
     after, is_seen = judged(map, use, look(3.0), HERE, CAMERA, NOISE, settings)
     assert is_seen.all()
-    expected = [birth - settings.miss, birth + settings.hit, birth, 0.1]
-    np.testing.assert_allclose(after.existence, expected, rtol=1e-6)
+    change = np.array([-settings.miss, -settings.miss, settings.hit, 0.0, -settings.miss, 0.0])
+    np.testing.assert_allclose(after.existence, known + change, atol=1e-6)
     for _ in range(9):
         after, _ = judged(after, use, look(3.0), HERE, CAMERA, NOISE, settings)
-    np.testing.assert_array_equal(after.gaussians.valid, [False, True, True, True])
+    np.testing.assert_array_equal(after.gaussians.valid, [False, False, True, True, False, True])
 
 
 @pytest.mark.parametrize("use", [-1, 1])
