@@ -331,6 +331,20 @@ MUTANTS = (
         BACK_END,
         "scales stay",
     ),
+    Mutant(
+        "emgs_jax/running/back_end.py",
+        "state.belief.log_scale + change",
+        "state.belief.log_scale",
+        BACK_END,
+        "the unit of a run is corrected twice",
+    ),
+    Mutant(
+        "emgs_jax/running/correction.py",
+        "scale=None if record.scale is None else scale",
+        "scale=record.scale",
+        BACK_END,
+        "frames keep the scales of before",
+    ),
     # coming back
     Mutant(
         "emgs_jax/loops/location.py",
