@@ -38,6 +38,7 @@ _PROVENANCE = {  # what of `provenance.provenance` is read again, by dotted key
     "config.densify": dict,
     "config.densify.render": dict,
 }
+_WORDS = ("_note", "/reason")  # how metrics end that are no numbers
 _OUTCOMES = ("accepted", "known", "unconfirmed", "refused")
 
 
@@ -133,7 +134,7 @@ def _check_metrics(path: Path, metrics: dict[str, Any]) -> None:
     """Raise ValueError where a value is neither a number nor unknown, or what is said of the run lacks something."""
     said = {key: value for key, value in metrics.items() if key != "provenance" and value is not None}
     for key, value in said.items():
-        if not isinstance(value, str if key.endswith("_note") else int | float):
+        if not isinstance(value, str if key.endswith(_WORDS) else int | float):
             raise ValueError(f"{path} is not the result of a run ({key} is {value!r}): run again")
     block = metrics["provenance"]
     for key, kinds in _PROVENANCE.items():
