@@ -24,13 +24,13 @@ def leaves(config):
 
 
 def choices(module, prefix=""):
-    """Dotted paths of the choice fields of a config and their number of names."""
+    """Dotted paths of the traced choice fields of a config and their number of names."""
     found = {}
     for name, field in module.__dataclass_fields__.items():
         value, path = getattr(module, name), f"{prefix}.{name}"
         if isinstance(value, eqx.Module):
             found |= choices(value, path)
-        elif "choices" in field.metadata:
+        elif "choices" in field.metadata and not field.metadata.get("static"):
             found[path] = len(field.metadata["choices"])
     return found
 
