@@ -412,5 +412,5 @@ def test_a_window_opens_whole_or_view_by_view(window, config):
 
 
 def test_an_unknown_initialisation_is_refused(config):
-    with pytest.raises(Exception, match="merged or incremental.*'random'"):
+    with pytest.raises(Exception, match="one of merged, incremental.*'random'"):
         config("slam.initialization=random")
