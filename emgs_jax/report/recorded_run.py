@@ -2,6 +2,8 @@
 
 import json
 from dataclasses import dataclass
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -138,11 +140,10 @@ def _check_metrics(path: Path, metrics: dict[str, Any]) -> None:
             raise ValueError(f"{path} is not the result of a run ({key} is {value!r}): run again")
     block = metrics["provenance"]
     for key, kinds in _PROVENANCE.items():
-        value: Any = block
-        for name in key.split("."):
-            value = value.get(name)
-        if not isinstance(value, kinds):
-            raise ValueError(f"{path} is not the result of a run (provenance.{key} is {value!r}): run again")
+        *parents, name = key.split(".")
+        parent = reduce(getitem, parents, block)  # the rows before have checked these
+        if name not in parent or not isinstance(parent[name], kinds):
+            raise ValueError(f"{path} is not the result of a run (provenance.{key} is {parent.get(name)!r}): run again")
     if block["git"] is not None and not isinstance(block["git"].get("revision"), str):
         raise ValueError(f"{path} is not the result of a run (provenance.git has no revision): run again")
 

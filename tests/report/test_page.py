@@ -201,6 +201,12 @@ def edited(path, change):
             "provenance.versions.emgs_jax is None",
         ),
         ("metrics.json", lambda text: text.replace('"git": null', '"git": {"a": 1}'), "git has no revision"),
+        ("metrics.json", lambda text: text.replace('"git": null', '"gut": null'), "provenance.git is None"),
+        (
+            "metrics.json",
+            lambda text: text.replace('"protocol": "', '"prottocol": "', 1),
+            "provenance.protocol is None",
+        ),
         (
             "metrics.json",
             lambda text: re.sub('"tile_batch": [0-9]+', '"tile_batch": null', text),

@@ -13,6 +13,7 @@ from scene import assert_same, random_gaussians, random_observation
 from emgs_jax import load_config
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
+from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.registration.belief import certain
 from emgs_jax.report.back_end import counts, metric_graph
@@ -57,16 +58,10 @@ def state_of(poses: np.ndarray) -> SlamState:
     return SlamState(map, random_observation(20), last, certain(), jnp.asarray(COUNT))
 
 
-def rescaled_path(poses: np.ndarray, factor: float) -> np.ndarray:
-    poses = poses.copy()
-    poses[:, :3, 3] *= factor
-    return poses
-
-
-def walked(graph, poses: np.ndarray) -> BackEnd:
+def walked(graph, poses: np.ndarray, scale: float = 1.0) -> BackEnd:
     end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
     for index, pose in enumerate(poses):
-        end.add(look(poses, index), pose, 1.0, max(index - 3, 0))
+        end.add(look(poses, index), pose, scale, max(index - 3, 0))
     return end
 
 
@@ -107,17 +102,14 @@ def test_a_loop_brings_poses_map_and_last_frame_back(graph):
 
 def test_the_mean_of_the_scales_that_the_unit_of_a_run_is_made_of_follows_a_closure(graph):
     """Inferences that are all 5 % too small: what the closure grows of the map, a finished run must not grow again."""
-    truth, log_scale = ring(), 0.05
-    poses = truth.copy()
-    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
-    for index, pose in enumerate(poses):
-        end.add(look(poses, index), pose, np.exp(log_scale), max(index - 3, 0))
-    state = state_of(poses)
-    state = eqx.tree_at(lambda s: s.belief.log_scale, state, jnp.asarray(log_scale))
+    poses, log_scale = ring(), 0.05
+    end = walked(graph, poses, np.exp(log_scale))
+    state = eqx.tree_at(lambda s: s.belief.log_scale, state_of(poses), jnp.asarray(log_scale))
     records = [FrameRecord(row, None, None, "tracked", pose=pose, scale=1.05) for row, pose in enumerate(poses)]
     records[0] = FrameRecord(0, None, None, "initialization", pose=poses[0])
     run = MappingRun(None, None, state=state, records=records, back_end=end)
-    end.verified = [loop(rescaled_path(truth, 0.9), row) for row in range(1, 9)]
+    smaller = np.stack([rescaled(pose, 0.9) for pose in poses])
+    end.verified = [loop(smaller, row) for row in range(1, 9)]
     finish(run)
     assert end.accepted and log_scale - np.mean(end.log_scales) > 1e-3  # `scale_std` asks for scales of one
     assert float(run.state.belief.log_scale) == pytest.approx(np.mean(end.log_scales), abs=1e-5)
