@@ -11,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
+    from emgs_jax.continuation import ContinuationConfig, continued
     from emgs_jax.data.base import BadFrameError, Dataset, Frame
     from emgs_jax.em import EmConfig, EmInfo, em_update
     from emgs_jax.evaluation.reconstruction import EvaluationConfig
@@ -60,6 +61,7 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.splitting import SplittingConfig, split
 
 _HOMES = {
+    "continuation": ("ContinuationConfig", "continued"),
     "data.base": ("BadFrameError", "Dataset", "Frame"),
     "em": ("EmConfig", "EmInfo", "em_update"),
     "evaluation.reconstruction": ("EvaluationConfig",),

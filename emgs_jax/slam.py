@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
+from emgs_jax.continuation import ContinuationConfig, continued
 from emgs_jax.em import EmConfig, EmInfo, em_update, owners
 from emgs_jax.existence import ExistenceConfig, join_layers, judge, usefulness
 from emgs_jax.gaussian_map import (
@@ -48,6 +49,7 @@ class SlamConfig(eqx.Module):
         submap: what a step works on, and capacities.
         localization: coarse and fine.
         em: E- and M-step.
+        continuation: where points that no Gaussian explains go on from the map.
         splitting: of Gaussians that are too coarse for a nearer view.
         refinement: on the image plane.
         existence: what later frames say of a Gaussian.
@@ -60,6 +62,7 @@ class SlamConfig(eqx.Module):
     submap: SubmapConfig
     localization: LocalizationConfig
     em: EmConfig
+    continuation: ContinuationConfig
     splitting: SplittingConfig
     refinement: RefinementConfig
     existence: ExistenceConfig
@@ -167,7 +170,7 @@ def step(
     submap, white, rows, submap_overflow = call(_select, state.map, (state.previous, guess), config.submap)
     T, aligned, localization = call(_place, prediction.current, submap, coarse, config.localization, white)
     rows_each, place = spacing(camera, thin, config.fit), (aligned, T, localization)
-    fine = rows_each, config.em, config.splitting
+    fine = rows_each, downscale(camera, thin), config.em, config.continuation, config.splitting
     submap, rest, em, halves, origin = call(_fuse, submap, white, *place, state.time, *fine)
     candidates, weight = call(cluster, rest, call(_order, camera, thin), rows_each, config.fit)
     submap, fresh, refinement = call(_refine, submap, candidates, T, camera, thin, config.refinement)
@@ -226,22 +229,27 @@ def _fuse(
     localization: LocalizationInfo,
     time: Int[Array, ""],
     spacing: int,
+    view: Camera,
     config: EmConfig,
+    continuation: ContinuationConfig,
     splitting: SplittingConfig,
 ) -> tuple[GaussianMap, Observation, EmInfo, GaussianMap, Int[Array, ""]]:
     """Fuse the points of a frame that is tracked, and split what they show to be too coarse.
 
-    Returns the submap, the points that no Gaussian explains, counts, the second halves of what was split, and the
-    median birth of what explains the others.
+    Returns the submap, the points that no Gaussian explains (they go on from the map), counts, the second halves of
+    what was split, and the median birth of what explains the others.
     """
     trusted = _trusted(aligned, localization)
     noise = localization.noise[:, None] * (trusted.points - T.translation())
+    before = submap
     submap, explained, em = em_update(submap, trusted, noise, config, white)
     owned = owners(explained, submap.birth.shape[0])
     births = take_rows(submap.birth, owned).astype(jnp.float32)
     origin = jnp.where(em.num_fused > 0, median(births, explained.is_fused), time).astype(jnp.int32)
     submap, halves = split(submap, trusted, noise, owned, spacing, splitting)
-    rest = eqx.tree_at(lambda o: o.valid, trusted, trusted.valid & ~explained.is_fused)
+    explained_by, spread = take_rows(before, owned), (localization.noise, T, view)
+    rest = continued(trusted, explained_by, explained.is_fused, *spread, continuation)
+    rest = eqx.tree_at(lambda o: o.valid, rest, trusted.valid & ~explained.is_fused)
     return submap, rest, em, halves, origin
 
 

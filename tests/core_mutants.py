@@ -300,6 +300,17 @@ STAGES = [
         ("is_near & (normal_cos >= config.min_normal_cos)", "is_near", "pairs that face different ways"),
         ("jnp.where(both, share, 1.0)", "share", "no feature, no merging"),
     ),
+    *own("continuation", "test_continuation")(
+        ("* own_share", "", "the map's own error is taken for the frame's"),
+        ("jnp.clip(slope, 0.0, 1.0)", "1.0", "errors that are not alike move points"),
+        ("& ~is_fused & (expected", "& (expected", "what is fused is moved"),
+        ("jnp.exp(-expected)", "jnp.exp(expected)", "away from the map"),
+        (" - weighted) / (1.0 + near - precision)", ") / (1.0 + near)", "a point foretells itself"),
+        ("(least / jnp.where(noise > 0, noise, 1.0)) ** 2", "1.0", "all points tell alike"),
+        ("is_known &= jnp.abs(error) <= config.max_error", "is_known &= True", "another surface is an error"),
+        ("config.min_cos * ", "0.0 * ", "flat looks tell"),
+        ("/ (1.0 + near)\n    is_moved", "/ jnp.maximum(near, 1e-9)\n    is_moved", "what is far tells as much"),
+    ),
     *own("existence", "test_existence")(
         (
             "features = old.features + config.feature * other.gaussians.features",

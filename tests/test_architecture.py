@@ -16,12 +16,13 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # From the bottom: a room imports rooms to its left and itself, never one to its right.
 CORE_ROOMS = (
     *("ops", "observation", "gaussians", "gaussian_map", "registration", "graph", "render"),
-    *("initialization", "localization", "em", "splitting", "refinement", "existence", "semantics", "slam"),
+    *("initialization", "localization", "em", "continuation", "splitting", "refinement", "existence"),
+    *("semantics", "slam"),
 )
 # What is solved between frames, by SciPy; the core does not import it.
 HOST_FILES = {"graph.sparse", "graph.start", "graph.problem", "graph.optimize"}
 HOST = ("io", "data", "features", "keypoints", "loops", "prior", "evaluation", "running", "report")
-STAGES = {"initialization", "localization", "em", "splitting", "refinement", "existence", "semantics"}
+STAGES = {"initialization", "localization", "em", "continuation", "splitting", "refinement", "existence", "semantics"}
 HOST_PACKAGES = {"numpy", "cv2", "open3d", "trimesh", "matplotlib", "scipy", "torch", "tqdm", "hydra", "omegaconf"}
 MAX_FUNCTION_LINES, MAX_FILE_LINES = 60, 300
 

@@ -16,7 +16,7 @@ CALLS = VERBS | {"classify": (classify, lambda s: (random_gaussians(9, s, 2), jn
 WITH_PRODUCTS = {
     *("transform", "fit_to_points", "cluster", "fit_rigid", "icp", "initialize", "localize_coarse", "localize_fine"),
     *("em_update", "split", "project_gaussians", "render", "densify", "refine", "judge", "join_layers", "classify"),
-    "relevance",
+    *("relevance", "continued"),
     *("predict", "update", "deform", "move", "residuals", "linearize"),
 }
 

@@ -16,12 +16,22 @@ from scene import (
     stack_poses,
 )
 
-from emgs_jax import em, existence, gaussian_map, gaussians, initialization, localization, semantics, splitting
+from emgs_jax import (
+    continuation,
+    em,
+    existence,
+    gaussian_map,
+    gaussians,
+    initialization,
+    localization,
+    semantics,
+    splitting,
+)
 from emgs_jax import observation as obs
 from emgs_jax.graph import deform, measurements
 from emgs_jax.ops import camera as cam
 from emgs_jax.ops import clustering, linalg, neighbours
-from emgs_jax.ops.pytree import stack
+from emgs_jax.ops.pytree import stack, take_rows
 from emgs_jax.refinement import refine
 from emgs_jax.registration import belief, icp, noise, rigid
 from emgs_jax.render import composite, densify, project
@@ -29,6 +39,7 @@ from emgs_jax.render import composite, densify, project
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
 CONFIG = slam_config("slam.submap.map_capacity=48", "slam.submap.submap_capacity=32", "render.tile_capacity=32")
 ONE = jnp.ones(())
+ROWS = jnp.arange(192)
 
 
 def map_of(seed: int) -> gaussian_map.GaussianMap:
@@ -178,6 +189,12 @@ VERBS = {
     "densify": (
         lambda g, T: densify.densify(g, T, CAMERA, densify.DensifyConfig(0.05, 0.3, CONFIG.refinement.render)),
         lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),
+    ),
+    "continued": (
+        lambda m, o, T: continuation.continued(
+            o, take_rows(m, ROWS % 32), ROWS % 3 > 0, o.confidence, T, CAMERA, CONFIG.continuation
+        ),
+        lambda s: (map_of(s), random_observation(192, s, 2), pose(translation=(0.1 * s, 0, 0))),
     ),
     "judge": (
         lambda m, o, T: existence.judge(m, jnp.arange(32) % 3 - 1, o, T, CAMERA, ONE * 0.02, CONFIG.existence),

@@ -31,7 +31,7 @@ from experiments.report import positional
         (["slam.em=paper"], r"one of its options \(default, paper\) with slam/em=paper$"),
         (["slam.em=papre"], r"one of its options \(default, paper\) with slam/em=default$"),
         (["render=bright"], "render=bright is no option of render: there are default"),
-        (["slam=paper"], r"slam is chosen by its parts: slam/em=…, slam/existence=…, slam/fit=…"),
+        (["slam=paper"], r"slam is chosen by its parts: slam/continuation=…, slam/em=…, slam/existence=…"),
         (["dataset=kitti"], "dataset=kitti is no option of dataset: there are apartment, colmap, images"),
         (["slam/em=paper,nothing"], "slam/em=paper,nothing is no option"),
         (["dataset=1.5"], "^dataset=1.5 is no option of dataset: there are apartment"),
