@@ -1,5 +1,7 @@
 """The map M: Gaussians of fixed capacity with the weight of their running average, and its submaps."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -38,11 +40,14 @@ class AverageConfig(eqx.Module):
         gain: `ema_printed`, α_t = δ / (α_{t-1} + δ), an exponential average; or `count`, W += δ, α = δ / W, which
             tends to the mean of all frames (R4; West 1979).
         forgetting: factor on the kept α or W before each update; 1 = the printed form.
+        max_weight: which what is kept never exceeds, so that a camera that stands still does not become certain: what
+            its predictions have in common does not average out. `inf` as printed.
         blend: of covariances: `linear` (printed) or `moment_matched` (R13).
     """
 
     gain: Float[Array, "*b"] = choice("ema_printed", "count")
     forgetting: Float[Array, "*b"] = traced(low=0, high=1)
+    max_weight: Float[Array, "*b"] = traced(low=1, high=math.inf)
     blend: Float[Array, "*b"] = choice("linear", "moment_matched")
 
 
@@ -90,7 +95,7 @@ def without(map: GaussianMap, is_gone: Bool[Array, "n"]) -> GaussianMap:
 def update_average(
     map: GaussianMap, new: Gaussians, evidence: Float[Array, "n"], config: AverageConfig
 ) -> tuple[GaussianMap, Float[Array, "n"]]:
-    """(1 - α) M + α M_new with the gain α = δ / (forgetting · w + δ) of every Gaussian (eq. 4).
+    """(1 - α) M + α M_new with the gain α = δ / (min(forgetting · w, max_weight) + δ) of every Gaussian (eq. 4).
 
     Args:
         new: parameters that this frame suggests, row by row.
@@ -99,7 +104,7 @@ def update_average(
     Returns:
         The map and the gain.
     """
-    kept = config.forgetting * map.weight + evidence
+    kept = jnp.minimum(config.forgetting * map.weight, config.max_weight) + evidence
     has_evidence = (evidence > 0) & map.gaussians.valid
     gain = jnp.where(has_evidence, evidence / jnp.where(has_evidence, kept, 1.0), 0.0)
     weight = jnp.where(has_evidence, jnp.where(config.gain > 0, kept, gain), map.weight)

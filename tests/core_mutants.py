@@ -235,6 +235,7 @@ STAGES = [
     ),
     *own("gaussian_map", "test_gaussian_map")(
         ("config.forgetting * map.weight", "map.weight", "nothing is forgotten"),
+        ("config.max_weight)", "jnp.inf)", "certainty without end"),
         ("axis=0) + config.margin", "axis=0)", "no margin above"),
         ("jnp.where(config.gain > 0, kept, gain)", "kept", "the printed gain keeps the sum"),
         ("(evidence > 0) & map", "(evidence >= 0) & map", "no evidence counts as an update"),

@@ -108,7 +108,7 @@ def support(responsibilities, points, mean, cov, normal, k, kind):
 
 def gain_and_weight(weight, evidence, config):
     """α of eq. 4 and what is kept of it (R4)."""
-    total = float(config.forgetting) * weight + evidence
+    total = min(float(config.forgetting) * weight, float(config.max_weight)) + evidence
     return evidence / total, total if config.gain > 0 else evidence / total
 
 

@@ -93,6 +93,7 @@ def test_the_paper_preset_takes_every_printed_reading():
         "em.max_log_gap": float("inf"),  # R3
         "em.average.gain": "ema_printed",  # R4
         "em.average.forgetting": 1.0,
+        "em.average.max_weight": float("inf"),
         "em.support": "printed",  # R5
         "refinement.front_margin": 0.0,  # R6
         "localization.coarse": "via_previous",  # R7

@@ -78,6 +78,13 @@ def test_forgetting_shrinks_the_kept_weight_before_each_update(average):
     np.testing.assert_allclose(map.weight, 1.75, rtol=1e-6)
 
 
+def test_certainty_ends_at_the_largest_weight(average):
+    """A camera that stands still for long must not make a map that no later view can move."""
+    _, gains, map = averaged([1.0] * 5, [1.0] * 5, at(average["count"], "max_weight", 3.0))
+    np.testing.assert_allclose(gains, [1 / 2, 1 / 3, 1 / 4, 1 / 4, 1 / 4], rtol=1e-6)
+    np.testing.assert_allclose(map.weight, 4.0)
+
+
 @pytest.mark.parametrize("kind", ["ema_printed", "count"])
 def test_a_gaussian_without_evidence_or_that_is_invalid_stays_bit_for_bit(average, kind):
     map = map_of(6, 8)

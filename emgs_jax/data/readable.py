@@ -47,8 +47,7 @@ class ReadableFrames:
             what = f"{dataset.name} {dataset.sequence}"
             first = next(iter(self.skipped.values()), "there are none")
             raise ValueError(f"{what} has no frame that can be read: {first}")
-        if self.has_ground_truth:
-            _check_truth(dataset, self.kept)
+        _check_truth(dataset, self.kept)
 
     def __len__(self) -> int:
         return len(self.kept)
@@ -86,9 +85,9 @@ def _unreadable(read: Callable[[int], Frame], indices: Iterable[int]) -> dict[in
 
 
 def _check_truth(dataset: Dataset, kept: Sequence[int]) -> None:
-    """Raise BadFrameError for the first true pose that is damaged, and ValueError where no frame has one."""
+    """Raise BadFrameError for the first true pose that is damaged, and ValueError where no frame of a truth has one."""
     poses = [dataset.pose(index) for index in kept]  # all of them, before the first frame
-    if all(pose is None for pose in poses):
+    if dataset.has_ground_truth and all(pose is None for pose in poses):
         raise ValueError(
             f"{dataset.name} {dataset.sequence}: 0 of {len(kept)} images have a true pose: fetch the trajectory again, "
             "or choose other images (dataset.start, stop, stride)"

@@ -13,6 +13,10 @@ from emgs_jax.data.labels import LabelFolder, as_unknown
 from emgs_jax.features.text import TextEmbeddings, read_text
 
 
+MAX_CHANNELS = 128  # CV_CN_MAX of OpenCV 5; 4 has 512
+MAX_ENLARGED = 32  # times; a network gives a class for each of its patches at least
+
+
 class LabelFeatures:
     """Reads what a segmenter said of each image (implements `FeatureModel`).
 
@@ -84,7 +88,7 @@ class LabelFeatures:
         if path.suffix == ".npy":
             scores = _read_scores(path, len(vectors))
             _check_shape(scores.shape[1::-1], size, path)
-            features = cv2.resize(scores, size, interpolation=cv2.INTER_AREA).reshape(*size[::-1], -1) @ vectors
+            features = _resize_scores(scores, size) @ vectors
             features /= np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-12)
             return features.astype(np.float16)
         labels = self._labels.read(frame.name)
@@ -104,14 +108,24 @@ def _check_shape(found: tuple[int, int], size: tuple[int, int], path: Path) -> N
         raise BadFrameError(
             f"{path} is {w}x{h}, which is not of the shape of the {width}x{height} frame: give whole ones"
         )
+    if min(w, h) * MAX_ENLARGED < min(width, height):
+        raise BadFrameError(f"{path} is {w}x{h}, too coarse for a frame of {width}x{height}: give larger ones")
+
+
+def _resize_scores(scores: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Scores (h, w, c) at another (width, height); OpenCV takes so many channels at once and drops a single one."""
+    parts = np.split(scores, range(MAX_CHANNELS, scores.shape[2], MAX_CHANNELS), axis=-1)
+    resized = [cv2.resize(part, size, interpolation=cv2.INTER_AREA).reshape(*size[::-1], -1) for part in parts]
+    return np.concatenate(resized, axis=-1)
 
 
 def _read_scores(path: Path, num_classes: int) -> np.ndarray:
     try:
-        scores = np.load(path, allow_pickle=False)
+        # Mapped, so that a header which announces more than there is is an error and not a large array.
+        scores = np.lib.format.open_memmap(path, mode="r")
     except (ValueError, OSError, EOFError) as error:
         raise BadFrameError(f"{path} is no array of scores, or damaged ({error}): write it again") from error
-    if scores.ndim != 3 or scores.shape[2] != num_classes or scores.dtype.kind not in "fiu":
+    if scores.ndim != 3 or scores.shape[2] != num_classes or scores.dtype.kind not in "fiu" or scores.size == 0:
         raise BadFrameError(
             f"{path} must hold scores (h, w, {num_classes}), one a class, got {scores.dtype} {scores.shape}"
         )

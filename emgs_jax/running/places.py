@@ -54,7 +54,7 @@ class SavedMap:
 def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
     """Write what `load_places` reads."""
     keyframes, header = end.database.keyframes, {"format": FORMAT, "version": VERSION, "descriptors": DESCRIPTORS}
-    header |= {"depth_noise": depth_noise, "num_trained": end.database.num_trained}
+    header |= {"depth_noise": depth_noise, "num_trained": end.database.num_trained, "has_one_unit": end.has_one_unit}
     arrays = {name: np.asarray(getattr(end, name)) for name in NODES} | {"words": end.database.words}
     arrays |= {f"keyframes.{name}": np.stack([getattr(one, name) for one in keyframes]) for name in OF_KEYFRAMES}
     arrays |= {f"keyframes.{name}": np.concatenate([getattr(one, name) for one in keyframes]) for name in OF_POINTS}
@@ -83,6 +83,7 @@ def load_places(path: Path, end: BackEnd) -> float:
             if array.dtype.kind == "f" and name != "keyframes.points" and not np.isfinite(array).all():
                 raise ValueError(f"{name} is not finite")
         _fill(end, arrays, int(header["num_trained"]))
+        end.has_one_unit = bool(header.get("has_one_unit", True))  # files of before do not say
         return float(header["depth_noise"])
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror or error}") from error

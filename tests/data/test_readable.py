@@ -28,6 +28,9 @@ class Damaged:
             raise BadFrameError(f"{index}.png is truncated")
         return Frame(index, 10.0 * index, f"{index}.png", np.zeros((3, 4, 3), np.uint8))
 
+    def pose(self, index: int) -> None:
+        return None
+
     def fingerprint(self) -> str:
         return "whole"
 
@@ -86,3 +89,7 @@ def test_all_true_poses_are_read_before_the_first_frame():
     assert [frames.pose(i) is None for i in range(len(frames))] == [True, False, True, False]
     with pytest.raises(ValueError, match="damaged one: 0 of 5 images have a true pose"):
         ReadableFrames(WithTruth(lost=range(5)))
+    without_depth = WithTruth(damaged=(4,))
+    without_depth.has_ground_truth = False
+    with pytest.raises(BadFrameError, match=r"poses\.txt, line 4"):
+        ReadableFrames(without_depth)

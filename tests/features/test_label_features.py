@@ -1,5 +1,6 @@
 """Features from class images: the vector of each pixel's class, zero where there is none, and bad files by name."""
 
+import io
 import re
 from types import SimpleNamespace
 
@@ -71,6 +72,7 @@ def test_scores_give_the_mean_of_the_vectors(folder):
         (np.full((2, 4, 2), -0.1), "negative"),
         (np.zeros((4, 4, 2)), "not of the shape of the 4x2 frame"),
         (np.array([[["a", "b"]]]), "must hold scores"),
+        (np.zeros((0, 0, 2)), "must hold scores"),
     ],
 )
 def test_bad_scores_are_named(folder, scores, problem):
@@ -83,9 +85,39 @@ def test_scores_that_are_no_array_and_labels_of_another_shape_are_named(folder):
     cv2.imwrite(str(folder / "a.png"), np.full((4, 4), 2, np.uint8))
     with pytest.raises(BadFrameError, match=r"a\.png is 4x4, which is not of the shape of the 4x2 frame"):
         model_of(folder).extract(FRAME)
-    (folder / "a.npy").write_bytes(b"\x93NUMPY\x01\x00\x10")
-    with pytest.raises(BadFrameError, match=r"a\.npy is no array of scores, or damaged"):
-        model_of(folder).extract(FRAME)
+    for content in (b"\x93NUMPY\x01\x00\x10", _archive(), _announcing(2**40)):
+        (folder / "a.npy").write_bytes(content)
+        with pytest.raises(BadFrameError, match=r"a\.npy is no array of scores, or damaged"):
+            model_of(folder).extract(FRAME)
+
+
+def _archive() -> bytes:
+    file = io.BytesIO()
+    np.savez(file, scores=np.zeros((2, 4, 2)))
+    return file.getvalue()
+
+
+def _announcing(rows: int) -> bytes:
+    """A file whose header says that there are more rows than a computer holds."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (rows, 4, 2)})
+    return file.getvalue() + bytes(64)
+
+
+def test_more_classes_than_opencv_has_channels(folder):
+    names = [f"class {i}" for i in range(700)]
+    (folder / "classes.txt").write_text("".join(f"{i + 1} {name}\n" for i, name in enumerate(names)))
+    scores = np.zeros((1, 2, 700), np.float32)
+    scores[0, 0, 650], scores[0, 1, 3] = 1.0, 1.0
+    np.save(folder / "a.npy", scores)
+    np.testing.assert_array_equal(model_of(folder).extract(FRAME).argmax(-1), [[650, 650, 3, 3]] * 2)
+
+
+def test_labels_of_a_few_pixels_are_no_class_image(folder):
+    cv2.imwrite(str(folder / "a.png"), np.full((3, 4), 2, np.uint8))
+    frame = Frame(0, 0.0, "images/a.jpg", np.zeros((120, 160, 3), np.uint8))
+    with pytest.raises(BadFrameError, match=r"a\.png is 4x3, too coarse for a frame of 160x120"):
+        model_of(folder).extract(frame)
 
 
 class Dataset(list):

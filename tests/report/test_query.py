@@ -123,6 +123,8 @@ def test_pictures_are_drawn_from_given_poses_and_frames(folder, tmp_path):
         ([], "nothing is asked: give text=chair"),
         (["text=[]"], "nothing is asked"),
         (["text=' '"], "text must be a word or a list of words, none empty"),
+        (["text=1"], "text must be a word or a list of words, none empty and each once, got 1"),
+        (["text=sofa", "against=true"], "against must be a word or a list of words"),
         (["text=[sofa,sofa]"], "each once, got"),
         (["text=soaf"], r"'soaf' is no word of .*text.npz; the nearest are sofa\. .*features.text=FILE"),
         (["text=xyz"], r"'xyz' is no word of .*text.npz; there are wall, sofa\. "),

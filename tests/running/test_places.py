@@ -73,6 +73,7 @@ def test_what_is_read_is_what_was_written(end, graph, folder):
     np.testing.assert_array_equal(read.database.words, end.database.words)
     np.testing.assert_array_equal(read.database.vectors, end.database.vectors)
     assert read.database.num_trained == end.database.num_trained
+    assert read.has_one_unit
     _same(read.database.keyframes, end.database.keyframes)
 
 
@@ -85,13 +86,14 @@ def _same(records, others) -> None:
     assert len(records) > 0
 
 
-def test_a_run_without_loops_comes_back_too(graph, end, tmp_path):
+def test_a_run_without_loops_and_of_several_units_comes_back_too(graph, end, tmp_path):
     plain = walked(graph, ring())
+    plain.has_one_unit = False
     plain.database = extend(plain.database, end.database.keyframes[0], graph.appearance)
     save_places(tmp_path / "places.npz", plain, 0.0)
     read = BackEnd(graph, CAMERA, 0.01)
     load_places(tmp_path / "places.npz", read)
-    assert read.accepted == [] and len(read.edges) == len(plain.edges)
+    assert read.accepted == [] and len(read.edges) == len(plain.edges) and not read.has_one_unit
 
 
 def test_a_folder_is_loaded_with_its_next_node_as_the_first(graph, folder, end):
