@@ -9,13 +9,15 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import GaussianMap, without
-from emgs_jax.gaussians import Gaussians, blend, has_feature
+from emgs_jax.gaussians import blend, has_feature
 from emgs_jax.observation import Observation, depth_in
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.linalg import inverse_3x3, mahalanobis_sq, outer
 from emgs_jax.ops.neighbours import knn
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, put_rows, static, take_rows, traced, where_rows
+
+MIN_GAP = 2.0  # standard deviations along the normal; what is nearer is one sheet, as thick as it is
 
 
 class ExistenceConfig(eqx.Module):
@@ -31,7 +33,9 @@ class ExistenceConfig(eqx.Module):
         num_std: standard deviations of the depth between a Gaussian and what is seen that say nothing.
         min_cos: between its normal and the ray; a flatter look says nothing.
         num_neighbours: nearest seen Gaussians among which another layer of the same surface is looked for.
-        max_mahalanobis_sq: between two layers, the look's noise along the normal included; 0 joins none, as printed.
+        max_mahalanobis_sq: between two that are one, the look's noise along the normal included; 0 joins none, as
+            printed.
+        max_layer_sq: likewise between two of which one stands behind the other, see `nearest_layers`.
         min_normal_cos: between their normals.
         feature: of what two become: that of the heavier (`medoid`), or the sum of both (`accumulated`), see `EmConfig`.
     """
@@ -45,6 +49,7 @@ class ExistenceConfig(eqx.Module):
     min_cos: Float[Array, "*b"] = traced(low=-1, high=1)
     num_neighbours: int = static(low=1, high=256)
     max_mahalanobis_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    max_layer_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
     min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
     feature: Float[Array, "*b"] = choice("medoid", "accumulated")
 
@@ -111,7 +116,7 @@ def judge(
     pixels, depth = project(camera, rays @ rotation)
     index, inside = nearest_pixel(pixels, (camera.height, camera.width))
     nearest, farthest = depth_range(view, T_world_camera, camera)[:, index]
-    variance = jnp.einsum("ni,nij,nj->n", gaussians.normals, gaussians.covs, gaussians.normals)
+    variance = _along(gaussians.normals, gaussians.covs)
     reach = config.num_std * jnp.sqrt((depth_noise * depth) ** 2 + variance)
     is_steep = jnp.abs(_inner(gaussians.normals, rays)) >= config.min_cos * jnp.linalg.norm(rays, axis=-1)
     is_looked_at = gaussians.valid & inside & (depth > NEAREST_DEPTH) & is_steep
@@ -148,7 +153,7 @@ def join_layers(
         depth_noise: as a fraction of the depth.
         config: gates.
     """
-    partner, is_pair = nearest_layers(map.gaussians, is_seen, T_world_camera, depth_noise, config)
+    partner, is_pair = nearest_layers(map, is_seen, T_world_camera, depth_noise, config)
     old, other, rows = map.gaussians, take_rows(map, partner), jnp.arange(partner.shape[0])
     is_heavier = (map.weight > other.weight) | ((map.weight == other.weight) & (rows < partner))
     share = other.weight / jnp.maximum(map.weight + other.weight, jnp.finfo(jnp.float32).tiny)
@@ -169,7 +174,7 @@ def join_layers(
 
 
 def nearest_layers(
-    gaussians: Gaussians,
+    map: GaussianMap,
     is_seen: Bool[Array, "n"],
     T_world_camera: jaxlie.SE3,
     depth_noise: Float[Array, ""],
@@ -178,15 +183,27 @@ def nearest_layers(
     """The nearest other layer of every Gaussian, and whether it is that one's nearest, too.
 
     The squared distance of the means is taken under Σ_a + Σ_b + ν²nn', where ν is the noise of the look along the
-    normal n of the Gaussian that asks.
+    normal n of the Gaussian that asks: a look cannot tell the two apart. Where one stands behind the other, by more
+    than `MIN_GAP` standard deviations of either, they may be two sheets of one surface that different frames made, each
+    with its own error. Then it is taken under ν² (1 / W_a + 1 / W_b), what the means of so many frames differ by.
     """
-    count = is_seen.shape[0]
+    gaussians, count = map.gaussians, is_seen.shape[0]
     rows, found = knn(gaussians.means, gaussians.means, is_seen, config.num_neighbours, is_seen)
     near = jax.tree.map(lambda leaf: leaf[rows], gaussians)
-    noise = depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - T_world_camera.translation()))
-    covs = gaussians.covs + (noise**2)[:, None, None] * outer(gaussians.normals)
-    distance_sq = mahalanobis_sq(near.means - gaussians.means[:, None], inverse_3x3(covs[:, None] + near.covs))
-    found &= is_seen[:, None] & (rows != jnp.arange(count)[:, None]) & (distance_sq < config.max_mahalanobis_sq)
+    offsets, normals = near.means - gaussians.means[:, None], gaussians.normals[:, None]
+    both = gaussians.covs[:, None] + near.covs
+    noise = depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - T_world_camera.translation()))[:, None]
+
+    def distance_under(variance: Float[Array, "n #k"]) -> Float[Array, "n k"]:
+        return mahalanobis_sq(offsets, inverse_3x3(both + variance[..., None, None] * outer(normals)))
+
+    frames = jnp.maximum(map.weight, 1.0)
+    distance_sq = distance_under(noise**2)
+    of_means_sq = distance_under(noise**2 * (1.0 / frames[:, None] + 1.0 / frames[rows]))
+    thickest = jnp.maximum(_along(normals, gaussians.covs[:, None]), _along(normals, near.covs))
+    is_behind = _inner(offsets, normals) ** 2 > MIN_GAP**2 * thickest
+    is_one = (distance_sq < config.max_mahalanobis_sq) | is_behind & (of_means_sq < config.max_layer_sq)
+    found &= is_seen[:, None] & (rows != jnp.arange(count)[:, None]) & is_one
     found &= _inner(near.normals, gaussians.normals[:, None]) >= config.min_normal_cos
     has_both = has_feature(near.features) & has_feature(gaussians.features)[:, None]
     found &= ~has_both | (_inner(near.features, gaussians.features[:, None]) > 0)
@@ -199,3 +216,8 @@ def nearest_layers(
 
 def _inner(first: Float[Array, "*b d"], second: Float[Array, "*#b d"]) -> Float[Array, "*b"]:
     return jnp.sum(first * second, axis=-1)
+
+
+def _along(directions: Float[Array, "*#b 3"], covs: Float[Array, "*#b 3 3"]) -> Float[Array, "*b"]:
+    """Variance along unit directions."""
+    return jnp.einsum("...i,...ij,...j->...", directions, covs, directions)

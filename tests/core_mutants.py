@@ -346,7 +346,10 @@ STAGES = [
         ("partner[partner] == jnp.arange(count)", "partner >= 0", "whom nobody chose"),
         ("(rows != jnp.arange(count)[:, None])", "True", "with itself"),
         (">= config.min_normal_cos", ">= -1.0", "both sides of a panel"),
-        ("(noise**2)[:, None, None]", "noise[:, None, None]", "a deviation for a variance"),
+        ("distance_under(noise**2)", "distance_under(noise)", "a deviation for a variance"),
+        ("is_behind & (of", "(of", "neighbours of one sheet"),
+        ("1.0 / frames[:, None] + 1.0 / frames[rows]", "1.0", "as if one frame had made each"),
+        ("jnp.maximum(_along(normals, gaussians.covs[:, None]), ", "(", "the thickness of the other alone"),
     ),
     Mutant(
         "emgs_jax/em.py",

@@ -216,6 +216,28 @@ def test_what_a_look_can_tell_apart_is_not_joined(settings, reason):
     assert_same(after, map)
 
 
+SHEETS = {  # positions, weights, whether they are one surface to a look with 4 cm of noise
+    "half a spacing apart along the wall": ([(0, 0, 2.0), (0.05, 0, 2.06)], (2.0, 2.0), True),
+    "two that many frames made": ([(0, 0, 2.0), (0.05, 0, 2.06)], (50.0, 50.0), False),
+    "one that many frames made": ([(0, 0, 2.0), (0.05, 0, 2.055)], (50.0, 2.0), True),
+    "neighbours of one sheet": ([(0, 0, 2.0), (0.09, 0, 2.004)], (2.0, 2.0), False),
+    "far behind": ([(0, 0, 2.0), (0, 0, 2.1)], (2.0, 2.0), False),
+}
+
+
+@pytest.mark.parametrize("case", SHEETS)
+def test_two_sheets_are_one_where_the_frames_that_made_them_may_differ_so_much(settings, case):
+    """d² = δ'(Σ_a + Σ_b + ν² (1/W_a + 1/W_b) nn')⁻¹δ: about .5 along the wall, and 2.2, 44 and 3.6 across it, limit 4.6."""
+    positions, weights, is_one = SHEETS[case]
+    map = eqx.tree_at(lambda m: m.weight, map_of(discs(positions)), jnp.array(weights))
+    after = joined(map, map.gaussians.valid, HERE, jnp.asarray(0.02), settings)
+    assert (after.gaussians.valid.sum() == 1) == is_one
+    if is_one:
+        np.testing.assert_allclose(after.gaussians.covs[0, 2, 2], 0.003**2, rtol=1e-3)
+    else:
+        assert_same(after, map)
+
+
 def test_both_sides_of_a_panel_are_two_surfaces_and_a_missing_feature_says_nothing(settings):
     both = [discs((0, 0, 2.0)), discs((0, 0, 2.02), normal=(0.0, 0, 1.0))]
     map = map_of(*both)

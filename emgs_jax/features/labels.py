@@ -12,7 +12,6 @@ from emgs_jax.data.base import BadFrameError, Dataset, Frame
 from emgs_jax.data.labels import LabelFolder, as_unknown
 from emgs_jax.features.text import TextEmbeddings, read_text
 
-
 MAX_CHANNELS = 128  # CV_CN_MAX of OpenCV 5; 4 has 512
 MAX_ENLARGED = 32  # times; a network gives a class for each of its patches at least
 
