@@ -1,7 +1,7 @@
 """Ask a finished map: `python -m experiments.query map=FOLDER text=chair`.
 
 Beside the map it writes query.json (objects with centre, box and score), semantic.npz (relevance of each Gaussian),
-semantic.ply, query.png (relevance seen from poses) and features.png.
+semantic.ply, query.png (relevance seen from poses) and features.png, and with label_images=true class images.
 """
 
 import time
@@ -17,12 +17,15 @@ from emgs_jax.ops.ranges import Range
 from emgs_jax.report.query import Question, ask, write_answer
 from emgs_jax.report.query_pictures import (
     FEATURES_PICTURE,
+    LABELS_FOLDER,
     QUERY_PICTURE,
     View,
     best_views,
     draw_answer,
     draw_features,
     frame_view,
+    placed_rows,
+    save_labels,
     views_of,
 )
 from emgs_jax.report.recorded_run import RecordedRun, read_run
@@ -65,6 +68,8 @@ def query(config: DictConfig) -> dict[str, Any]:
     everywhere = views_of(run)
     chosen = views or [everywhere[len(everywhere) * (2 * i + 1) // 6] for i in range(3) if everywhere]
     draw_features(folder / FEATURES_PICTURE, run, chosen)
+    if config.label_images:
+        save_labels(folder / LABELS_FOLDER, run, answer, named_views(run, views))
     print("\n".join(lines_of(said)))
     about = said["features"]
     print(
@@ -111,6 +116,17 @@ def given_views(config: DictConfig, run: RecordedRun) -> list[View] | None:
     if not len(poses):
         raise ValueError(f"pose={config.pose} has no pose: give lines `timestamp tx ty tz qx qy qz qw`")
     return [View(f"pose at {time:g}", pose) for time, pose in zip(times, poses, strict=True)]
+
+
+def named_views(run: RecordedRun, views: list[View] | None) -> dict[str, View]:
+    """The poses that class images are drawn from: the given ones by their numbers, else all frames by their images."""
+    if views is not None:
+        return {f"{number:06d}": view for number, view in enumerate(views)}
+    frames = [run.frames[row] for row in placed_rows(run)]
+    names = [Path(frame["name"]).stem for frame in frames]
+    if len(set(names)) < len(names):  # an image a folder, say
+        names = [f"{frame['index']:06d}" for frame in frames]
+    return {name: View(name, run.poses[row]) for name, row in zip(names, placed_rows(run), strict=True)}
 
 
 def lines_of(said: dict[str, Any]) -> list[str]:

@@ -227,7 +227,7 @@ SHEETS = {  # positions, weights, whether they are one surface to a look with 4 
 
 @pytest.mark.parametrize("case", SHEETS)
 def test_two_sheets_are_one_where_the_frames_that_made_them_may_differ_so_much(settings, case):
-    """d² = δ'(Σ_a + Σ_b + ν² (1/W_a + 1/W_b) nn')⁻¹δ: about .5 along the wall, and 2.2, 44 and 3.6 across it, limit 4.6."""
+    """d² = δ'(Σ_a + Σ_b + ν² (1/W_a + 1/W_b) nn')⁻¹δ < 4.6: about .5 along the wall, and 2.2, 44 and 3.6 across it."""
     positions, weights, is_one = SHEETS[case]
     map = eqx.tree_at(lambda m: m.weight, map_of(discs(positions)), jnp.array(weights))
     after = joined(map, map.gaussians.valid, HERE, jnp.asarray(0.02), settings)

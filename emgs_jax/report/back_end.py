@@ -27,8 +27,10 @@ def loop_list(end: BackEnd) -> list[dict[str, Any]]:
     """What became of every candidate, for loops.json, in the order of the frames.
 
     `frame` and `other` are places among the frames in use, the later first; `outcome` is accepted, known (the poses
-    said so already), unconfirmed (others do not agree) or refused, and then `gate` and `measured` say by what.
+    said so already), unconfirmed (others do not agree), unsolved (no better poses were found with it, and `reason` says
+    why) or refused, and then `gate` and `measured` say by what.
     """
+    unsolved = {(loop.a, loop.b): one.info.reason for one in end.closures if one.info.reason for loop in one.loops}
     accepted = {(loop.a, loop.b) for loop in end.accepted}
     found = [Refusal(loop.a, loop.b, "", math.nan) for loop in end.verified]
     agreed = {(loop.a, loop.b) for loop in end.agreed()}
@@ -36,20 +38,23 @@ def loop_list(end: BackEnd) -> list[dict[str, Any]]:
     known = (item for item in [*found, *end.refusals] if item.a >= end.first)  # what is older is of another run
     for a, b, gate, measured in sorted(known, key=lambda item: (item.b, item.a)):
         verified = "accepted" if (a, b) in accepted else "known" if (a, b) in agreed else "unconfirmed"
+        if verified == "known" and (a, b) in unsolved:
+            verified = "unsolved"
         line = {"frame": end.frames[b], "other": end.frames[a], "outcome": "refused" if gate else verified}
+        line |= {"reason": unsolved[a, b]} if line["outcome"] == "unsolved" else {}
         lines.append(line | ({"gate": gate, "measured": measured} if gate else {}))
     return lines
 
 
 def counts(end: BackEnd) -> dict[str, Any]:
-    """What became of the candidates, for metrics.json."""
+    """What became of the candidates of this run, for metrics.json; what its map was saved with does not count."""
     gates = Counter(refusal.gate for refusal in end.refusals)
     refused = {f"loops/refused_{gate}": count for gate, count in sorted(gates.items())}
     solved = [closure for closure in end.closures if closure.loops]
     return {
-        "loops/verified": len(end.verified),
-        "loops/contradicted": len(end.contradicted),
-        "loops/accepted": len(end.accepted),
+        "loops/verified": sum(loop.b >= end.first for loop in end.verified),
+        "loops/contradicted": sum(loop.b >= end.first for loop in end.contradicted),
+        "loops/accepted": sum(loop.b >= end.first for loop in end.accepted),
         "loops/closures": sum(not closure.info.reason for closure in solved),
         "loops/closures_refused": sum(bool(closure.info.reason) for closure in solved),
     } | refused

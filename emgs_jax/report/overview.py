@@ -47,6 +47,7 @@ def draw_overview(
     frames: Sequence[Mapping[str, Any]],
     title: str,
     classes: Sequence[str] = (),
+    features: PointCloud | None = None,
 ) -> None:
     """Draw the picture and write it as PNG.
 
@@ -58,12 +59,16 @@ def draw_overview(
             int (h, w), -1 = none.
         title: of the whole picture.
         classes: names of the labels.
+        features: points in the colours of their features, drawn from above below the map; None without features.
     """
     figure = Figure(figsize=(16, max(6.0, 0.8 + 2.05 * len(frames))), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=13, color=_INK)
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.05)) if frames else (figure, None)
-    _draw_map(left.subplots(), cloud, paths)
+    axes = left.subplots(1 if features is None else 2, squeeze=False)[:, 0]
+    _draw_map(axes[0], cloud, paths)
+    if features is not None:
+        _draw_features(axes[1], features, paths)
     if right is not None:
         grid = right.subplots(len(frames), 4 if classes else 3, squeeze=False)
         _draw_frames(grid[:, [0, 1, -1]], frames)
@@ -202,6 +207,18 @@ def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
     axes.set_title(f"map from above, {len(points):,} points", fontsize=11, color=_INK)
     axes.legend(loc="upper right", fontsize=10, framealpha=0.9)
     _draw_scale_bar(axes)
+
+
+def _draw_features(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
+    rotation = view_from_above(paths.estimate)
+    finite = np.isfinite(cloud.points).all(1)
+    if finite.any():
+        heights = (paths.estimate[:, :3, 3] @ rotation.T)[:, 2]
+        image, extent = seen_from_above(cloud.points[finite] @ rotation.T, cloud.colors[finite], heights, (40, 250))
+        axes.imshow(image, extent=extent, origin="lower", interpolation="nearest")
+    axes.set_aspect("equal", adjustable="datalim")
+    _bare(axes)
+    axes.set_title("features of the map, their main directions as colours", fontsize=11, color=_INK)
 
 
 def _draw_path(axes: Axes, path: np.ndarray, color: str, label: str, width: float) -> None:

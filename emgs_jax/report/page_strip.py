@@ -193,13 +193,15 @@ OUTCOMES = {
     "accepted": "accepted",
     "known": "verified; the poses said so already",
     "unconfirmed": "verified, but others do not agree",
+    "unsolved": "verified, but no better poses were found with it",
 }
 
 
 def loop_why(loop: dict[str, Any]) -> str:
     """Outcome and reason."""
     gate = str(loop.get("gate", ""))
-    return f"refused: {GATES.get(gate, gate)}" if loop["outcome"] == "refused" else OUTCOMES[loop["outcome"]]
+    why = f"refused: {GATES.get(gate, gate)}" if loop["outcome"] == "refused" else OUTCOMES[loop["outcome"]]
+    return f"{why}: {loop['reason']}" if loop.get("reason") else why
 
 
 def loop_words(loop: dict[str, Any]) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,8 @@ from emgs_jax.running.convert import to_se3
 from emgs_jax.semantics import principal_colors
 
 QUERY_PICTURE, FEATURES_PICTURE = "query.png", "features.png"
+LABELS_FOLDER, CLASSES_FILE = "labels", "classes.txt"
+WORDS_AT_ONCE = 16  # that are drawn together
 MAX_POSES, SMALL_WIDTH = 60, 64  # poses that are looked from, evenly spread, and columns of those images
 MAX_LEGEND, KEYS_PER_LINE = 24, 6  # words of a legend
 _colors = eqx.filter_jit(principal_colors)
@@ -58,11 +61,16 @@ def drawn(run: RecordedRun, gaussians: Gaussians, values: np.ndarray, view: View
 
 def views_of(run: RecordedRun) -> list[View]:
     """Poses of frames that are not lost, at most `MAX_POSES`, evenly spread."""
-    rows = np.flatnonzero(run.is_placed)
+    rows = placed_rows(run)
     chosen = (
         sorted({rows[int(i)] for i in np.linspace(0, len(rows) - 1, min(MAX_POSES, len(rows)))}) if len(rows) else []
     )
     return [View(f"frame {run.frames[row]['index']}", run.poses[row]) for row in chosen]
+
+
+def placed_rows(run: RecordedRun) -> np.ndarray:
+    """The frames that are not lost."""
+    return np.flatnonzero(run.is_placed)
 
 
 def frame_view(run: RecordedRun, frame: int) -> View:
@@ -115,6 +123,40 @@ def draw_answer(path: Path, run: RecordedRun, answer: Answer, views: Sequence[Se
             pictures[-1].append(("classes", image[..., 6:]))
     _save(path, pictures, legend(names, counts) if len(views) > 1 else {})
     return len({word for word, _ in lines})
+
+
+def save_labels(folder: Path, run: RecordedRun, answer: Answer, views: Mapping[str, View]) -> None:
+    """Write which word the map answers with at each pixel, as class images that `features.folder` and others read.
+
+    NAME.png holds 16-bit ids, 1 for the first word and so on, 0 where the map shows nothing or none of the words;
+    classes.txt has a line `id word` for each.
+
+    Args:
+        folder: of the files, made here.
+        run: whose map was asked.
+        answer: with the words.
+        views: by name.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    names = answer.question.words.names
+    for name, view in views.items():
+        labels = label_image(run, answer, view)
+        with atomic_write(folder / f"{name}.png") as handle:
+            handle.write(cv2.imencode(".png", labels.astype(np.uint16))[1].tobytes())
+    with atomic_write(folder / CLASSES_FILE) as handle:
+        handle.write("".join(f"{number} {name}\n" for number, name in enumerate(names, start=1)).encode())
+
+
+def label_image(run: RecordedRun, answer: Answer, view: View) -> np.ndarray:
+    """The word (h, w) with the largest share of each pixel, from 1; 0 where that is none of them, or nothing."""
+    labels, count = answer.relevance.labels + 1, len(answer.question.words.names) + 1
+    best, found = np.zeros((run.camera.height, run.camera.width)), np.zeros((run.camera.height, run.camera.width), int)
+    for first in range(0, count, WORDS_AT_ONCE):
+        words = np.arange(first, first + WORDS_AT_ONCE)  # as many each time: one compilation
+        share = np.nan_to_num(drawn(run, answer.gaussians, labels[:, None] == words, view, run.camera))
+        found = np.where(share.max(-1) > best, words[share.argmax(-1)], found)
+        best = np.maximum(best, share.max(-1))
+    return found
 
 
 def draw_features(path: Path, run: RecordedRun, views: Sequence[View]) -> None:

@@ -41,7 +41,7 @@ _PROVENANCE = {  # what of `provenance.provenance` is read again, by dotted key
     "config.densify.render": dict,
 }
 _WORDS = ("_note", "/reason")  # how metrics end that are no numbers
-_OUTCOMES = ("accepted", "known", "unconfirmed", "refused")
+_OUTCOMES = ("accepted", "known", "unconfirmed", "unsolved", "refused")
 
 
 @dataclass(frozen=True)

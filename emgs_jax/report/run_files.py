@@ -5,10 +5,13 @@ import json
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.gaussian_map import confirmed
+from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import atomic_write, remove_temporaries, write_json
 from emgs_jax.io.g2o import save_graph_g2o
 from emgs_jax.io.map_file import save_map_npz
@@ -23,6 +26,7 @@ from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.places import save_places
 from emgs_jax.running.record import UNJOINED, MappingRun, row_of_first_node
+from emgs_jax.semantics import principal_colors
 
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (
@@ -113,8 +117,17 @@ def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: Densify
     no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, centers.colors)
     paths = Paths(np.stack(run.poses), np.array([record.status != "lost" for record in run.records]), *_moved(run))
     classes = () if dense.labels is None else dense.labels.classes
-    draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes)
+    draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes, feature_cloud(gaussians))
     return [] if no_mesh is None else [f"no mesh.ply: {no_mesh}"]
+
+
+def feature_cloud(gaussians: Gaussians) -> PointCloud | None:
+    """The means of those that are valid, in the colours of their features; None where none has any."""
+    valid = np.asarray(gaussians.valid)
+    if not np.asarray(gaussians.features)[valid].any():
+        return None
+    colors = np.asarray(principal_colors(jax.tree.map(jnp.asarray, gaussians)))
+    return PointCloud(*(np.asarray(values)[valid] for values in (gaussians.means, gaussians.normals, colors)))
 
 
 def _moved(run: MappingRun) -> tuple[np.ndarray | None, np.ndarray | None, tuple[tuple[int, int], ...]]:

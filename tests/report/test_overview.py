@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.evaluation.clouds import PointCloud
@@ -146,6 +147,23 @@ def test_labels_are_drawn_in_the_colours_of_their_classes_with_a_legend_of_those
     assert [bool(share.sum() > 50) for share in shares] == [False, False, True]
     rows = np.nonzero(shares[2].any(1))[0]
     assert rows.max() > 0.9 * len(image)  # the legend is below the frames
+
+
+def test_features_are_drawn_from_above_below_the_map(tmp_path):
+    x, z = (values.ravel() for values in np.meshgrid(np.linspace(-2, 2, 100), np.linspace(-2, 2, 100)))
+    points = np.stack([x, np.zeros_like(x), z], axis=1)
+    cloud = PointCloud(points, np.zeros_like(points), np.full_like(points, 0.5))
+    teal = PointCloud(points, np.zeros_like(points), np.tile([0.0, 0.6, 0.4], (len(points), 1)))
+    paths = Paths(path_along([1.0, -0.5, 0.0]), np.ones(5, bool))
+
+    def rows_of_teal(name, *features):
+        draw_overview(tmp_path / name, cloud, paths, [], "a run", (), *features)
+        image = np.asarray(Image.open(tmp_path / name).convert("RGB")).astype(int)
+        return np.nonzero(np.all(np.abs(image - [0, 153, 102]) <= 2, axis=-1))[0], len(image)
+
+    rows, height = rows_of_teal("with.png", teal)
+    assert len(rows) > 1000 and rows.min() > height / 2
+    assert not len(rows_of_teal("without.png")[0])
 
 
 def test_colours_of_many_classes_differ():

@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import equinox as eqx
 import jax.numpy as jnp
 import matplotlib.image
@@ -10,6 +11,7 @@ import pytest
 import trimesh
 from written_run import written_run
 
+from emgs_jax.data.labels import LabelFolder
 from emgs_jax.features.random import RandomFeatures
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.io.map_file import load_map, save_map
@@ -76,6 +78,21 @@ def test_negative_words_a_margin_and_a_least_cosine_say_none_of_these(folder, tm
     assert count("text=a", f"features.text={tmp_path / 'e.npz'}", "margin=.19") == both[:1]
     assert count("text=a", f"features.text={tmp_path / 'e.npz'}", "margin=.21") == [0]
     assert count("text=a", f"features.text={tmp_path / 'e.npz'}", "against=b", "margin=.21") == [0]
+
+
+def test_class_images_show_each_word_where_it_is_and_are_read_as_labels(folder, tmp_path):
+    """The sofa hides the wall as far as column 36 of 64, see above; with ids from 1, and 0 where nothing is asked."""
+    said(folder, "text=[sofa,wall]", "label_images=true", "frame=0", f"out={tmp_path}")
+    read = LabelFolder(tmp_path / "labels", tmp_path / "labels" / "classes.txt", (0,))
+    assert read.names == ("sofa", "wall")
+    image = read.read("000000.jpg")
+    assert (image[8:32, 4:36] == 0).all() and (image[8:32, 46:49] == 1).all()
+    said(folder, "text=wall", "label_images=true", f"out={tmp_path / 'all'}")
+    run = read_run(folder)
+    images = sorted((tmp_path / "all" / "labels").glob("*.png"))
+    assert len(images) == run.is_placed.sum()
+    pixels = cv2.imread(str(images[0]), cv2.IMREAD_UNCHANGED)
+    assert pixels.dtype == np.uint16 and (pixels[8:32, 4:36] == 0).all() and (pixels[8:32, 46:49] == 1).all()
 
 
 def test_words_of_a_class_file_are_asked_for(folder, tmp_path):

@@ -1,5 +1,6 @@
 """Measurements of a walk on a ring, exact: nothing moves; after a drift one loop brings poses and map back."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -16,7 +17,8 @@ from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.registration.belief import certain
-from emgs_jax.report.back_end import counts, metric_graph
+from emgs_jax.report.back_end import counts, loop_list, metric_graph
+from emgs_jax.report.page_strip import loop_why
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.correction import correct, finish
 from emgs_jax.running.measuring import Look, chain_edge, map_edge
@@ -162,6 +164,32 @@ def test_a_loop_that_cannot_be_solved_changes_nothing(graph):
     assert_same(same, state)
     assert not end.accepted and end.closures[-1].info.reason and error(end.poses, poses) == 0
     assert counts(end)["loops/closures_refused"] == 1
+
+
+def test_a_loop_that_others_agree_with_and_that_cannot_be_solved_says_why(graph, monkeypatch):
+    """The page called it known, as if the poses had said so already."""
+    poses = ring()
+    end, state = walked(graph, poses), state_of(poses)
+    known, broken = loop(poses), loop(poses)
+    broken = replace(broken, b=broken.b - 1)
+    end.verified = [known, broken]
+    monkeypatch.setattr(end, "agreed", lambda since=0: end.verified)
+    assert [line["outcome"] for line in loop_list(end)] == ["known", "known"]
+    bad = replace(broken, Z_a_b=np.full((4, 4), np.nan))
+    end.close(state, [bad])
+    unsolved, other = loop_list(end)
+    assert (unsolved["outcome"], other["outcome"]) == ("unsolved", "known")
+    assert unsolved["reason"] == end.closures[-1].info.reason and "reason" not in other
+    assert loop_why(unsolved) == f"verified, but no better poses were found with it: {unsolved['reason']}"
+
+
+def test_the_loops_of_a_map_that_was_loaded_do_not_count(graph):
+    poses = ring()
+    end = walked(graph, poses)
+    old, new = replace(loop(poses), b=10), loop(poses)
+    end.verified, end.accepted, end.contradicted, end.first = [old, new], [old, new], [old], 20
+    found = counts(end)
+    assert (found["loops/verified"], found["loops/accepted"], found["loops/contradicted"]) == (1, 1, 0)
 
 
 def test_a_frame_is_held_where_it_was_placed_and_not_where_it_was_predicted(graph):
