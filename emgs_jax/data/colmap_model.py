@@ -5,14 +5,22 @@ centres at integers.
 """
 
 import math
+import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 TEXT, BINARY = ("cameras.txt", "images.txt"), ("cameras.bin", "images.bin")
 MAX_NORM_ERROR = 1e-2  # of a quaternion: files of others have few digits
+MODELS = (  # of cameras.bin, by number, and how many parameters each has
+    *(("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8)),
+    *(("OPENCV_FISHEYE", 8), ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5)),
+    *(("THIN_PRISM_FISHEYE", 12), ("RAD_TAN_THIN_PRISM_FISHEYE", 16)),
+)
+POINT_SIZE = 24  # bytes of a point in images.bin: x, y and the number of its landmark
 
 
 @dataclass(frozen=True)
@@ -35,32 +43,64 @@ class SparseModel:
 
 
 def load_colmap(folder: Path) -> SparseModel:
-    """Read the cameras and images of a model, from text, or from binary files with pycolmap.
+    """Read the cameras and images of a model, from text or from binary files.
 
     Raises:
-        ValueError: a line is damaged, there is no image, or the files are binary and pycolmap is not installed.
+        ValueError: a line or a record is damaged, or there is no image with a pose.
     """
-    if all((folder / name).is_file() for name in TEXT):
-        return _load_text(folder)
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise ValueError(
-            f'{folder} holds binary files: pip install "emgs_jax[colmap]", which reads them, or write text with '
-            "colmap model_converter --output_type TXT"
-        ) from error
-    try:
-        model = pycolmap.Reconstruction(str(folder))
-        cameras = {
-            int(key): [found.model.name, str(found.width), str(found.height), *(f"{v:.17g}" for v in found.params)]
-            for key, found in model.cameras.items()
-        }
-        images = [image for _, image in sorted(model.images.items()) if image.has_pose]
-        poses = [np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images]
-    except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
-        raise ValueError(f"{folder} is no model that pycolmap can read: {str(error).splitlines()[0][:200]}") from error
-    names, ids = [image.name for image in images], [int(image.camera_id) for image in images]
-    return _checked(SparseModel(cameras, names, ids, _inverted(poses), tuple(folder / name for name in BINARY)), folder)
+    return (_load_text if all((folder / name).is_file() for name in TEXT) else _load_binary)(folder)
+
+
+class _Records:
+    """A binary file, read from its beginning; what ends before it should is a ValueError that names it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._data, self._place = path, path.read_bytes(), 0
+
+    def values(self, layout: str) -> tuple[Any, ...]:
+        """The next values; little-endian and without gaps."""
+        size = struct.calcsize(f"<{layout}")
+        return struct.unpack(f"<{layout}", self.skip(size))
+
+    def text(self) -> str:
+        """As far as the next zero byte."""
+        return self.skip(self._data.find(b"\0", self._place) + 1 - self._place)[:-1].decode("utf-8", "replace")
+
+    def skip(self, size: int) -> bytes:
+        if not 0 <= size <= len(self._data) - self._place:
+            raise ValueError(f"{self._path} is damaged: it ends within a record; export the model again")
+        self._place += size
+        return self._data[self._place - size : self._place]
+
+    def end(self) -> None:
+        if self._place < len(self._data):
+            raise ValueError(f"{self._path} is damaged: it goes on after its last record; export the model again")
+
+
+def _load_binary(folder: Path) -> SparseModel:
+    """Read cameras.bin and images.bin, whose layout is in COLMAP's documentation of its output format."""
+    cameras_file, images_file = (folder / name for name in BINARY)
+    records, cameras = _Records(cameras_file), {}
+    for _ in range(*records.values("Q")):
+        key, number, width, height = records.values("IiQQ")
+        if not 0 <= number < len(MODELS) or key in cameras:
+            raise ValueError(f"{cameras_file} is damaged: camera {key} is there twice or of no model; export it again")
+        model, count = MODELS[number]
+        cameras[key] = [model, str(width), str(height), *(f"{value:.17g}" for value in records.values(f"{count}d"))]
+    records.end()
+    records, names, ids, poses = _Records(images_file), [], [], []
+    images = []
+    for _ in range(*records.values("Q")):
+        number, *values = records.values("I7dI")
+        name, place = records.text(), f"{images_file}, image {number}"
+        records.skip(POINT_SIZE * records.values("Q")[0])
+        images.append((number, name, values[-1], _pose(np.array(values[:-1]), place)))
+    records.end()
+    for _, name, camera, pose in sorted(images, key=lambda image: image[0]):
+        names.append(name)
+        ids.append(camera)
+        poses.append(pose)
+    return _checked(SparseModel(cameras, names, ids, _inverted(poses), (cameras_file, images_file)), folder)
 
 
 def _load_text(folder: Path) -> SparseModel:
@@ -104,16 +144,21 @@ def _image(line: str, place: str) -> tuple[str, int, np.ndarray]:
     try:
         values = np.array([float(word) for word in words[1:8]])
         camera_id, name = int(words[8]), words[9]
-        if not np.isfinite(values).all() or abs(math.hypot(*values[:4]) - 1) > MAX_NORM_ERROR:
-            raise ValueError("the quaternion has not length 1")
     except (ValueError, IndexError) as error:
         raise ValueError(
             f"{place}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {line[:80]!r} ({error}): "
             "export the model again"
         ) from error
+    return name, camera_id, _pose(values, place)
+
+
+def _pose(values: np.ndarray, place: str) -> np.ndarray:
+    """World → camera (4, 4) of QW QX QY QZ TX TY TZ."""
+    if not np.isfinite(values).all() or abs(math.hypot(*values[:4]) - 1) > MAX_NORM_ERROR:
+        raise ValueError(f"{place}: the pose is not finite or its quaternion has not length 1: export the model again")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix(), values[4:]
-    return name, camera_id, pose
+    return pose
 
 
 def _inverted(poses: list[np.ndarray]) -> np.ndarray:

@@ -128,21 +128,11 @@ def test_binary_and_text_of_pycolmap_are_read_alike(second, tmp_path):
         np.testing.assert_allclose(text.pose(row)[:3, 3], image.projection_center(), atol=1e-9)
 
 
-def test_binary_without_pycolmap_says_what_to_do(tmp_path, monkeypatch):
-    write_colmap(tmp_path)
-    for path in (tmp_path / "sparse" / "0").iterdir():
-        path.rename(path.with_suffix(".bin"))
-    monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)  # import raises ImportError
-    with pytest.raises(ValueError, match=r"binary.*emgs_jax\[colmap\].*model_converter --output_type TXT"):
-        Colmap(str(tmp_path))
-
-
 def test_a_binary_that_is_none_is_a_clear_error(tmp_path):
-    pytest.importorskip("pycolmap", reason="reads binary models: pip install -e .[colmap]")
     write_colmap(tmp_path)
     for path in (tmp_path / "sparse" / "0").iterdir():
         path.rename(path.with_suffix(".bin"))
-    with pytest.raises(ValueError, match="is no model that pycolmap can read"):
+    with pytest.raises(ValueError, match=r"cameras\.bin is damaged: "):
         Colmap(str(tmp_path))
 
 
@@ -162,7 +152,7 @@ def replaced(path, old, new):
         ("images.txt", " 7 img33", " 8 img33", "of camera 8, which has no line"),
         ("images.txt", "img2.png", "img10.png", "has img10.png twice"),
         ("images.txt", "img2.png\n\n", "img2.png\n", "images.txt:5: expected the points of image img2.png"),
-        ("images.txt", "\n4 0", "\n4 7", "images.txt:4: expected IMAGE_ID QW"),
+        ("images.txt", "\n4 0", "\n4 7", "images.txt:4: the pose is not finite or its quaternion"),
         ("images.txt", "img10.png", "", "images.txt:2: expected IMAGE_ID QW"),
     ],
 )

@@ -12,51 +12,7 @@ from emgs_jax.data.images import Images
 from emgs_jax.data.rosbag import RosBag, to_rgb
 
 rosbags = pytest.importorskip("rosbags", reason="reads bags: pip install -e .[rosbag]")
-from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
-from rosbags.rosbag2 import Writer as Writer2  # noqa: E402
-from rosbags.typesys import Stores, get_typestore  # noqa: E402
-
-SIZE = (160, 120)
-K = [130.0, 0, 80.5, 0, 128.0, 59.0, 0, 0, 1]
-D = [0.02, -0.004, 0.001, -0.002, 0.0]
-
-
-def messages(store, version, kind, info=True, encoding="bgr8", model="plumb_bob", bent=D):
-    """(topic, type, message, nanoseconds) of three images and a camera_info."""
-    types = store.types
-    time = types["builtin_interfaces/msg/Time"](1, 0)
-    extra = {"seq": 0} if version == 1 else {}
-    header = types["std_msgs/msg/Header"](stamp=time, frame_id="cam", **extra)
-    if info:
-        letters = dict(zip("dkrp" if version == 2 else "DKRP", (bent, K, np.eye(3).ravel(), np.zeros(12)), strict=True))
-        roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        values = {name: np.array(value, np.float64) for name, value in letters.items()}
-        info_type = types["sensor_msgs/msg/CameraInfo"]
-        found = info_type(header, SIZE[1], SIZE[0], model, **values, binning_x=0, binning_y=0, roi=roi)
-        yield "/cam/camera_info", "sensor_msgs/msg/CameraInfo", found, 5
-    for i in range(3):
-        image = color_image(i, SIZE)
-        if kind == "Image":
-            padded = np.pad(image.reshape(SIZE[1], -1), ((0, 0), (0, 4)))  # rows may be longer than the picture
-            found = types["sensor_msgs/msg/Image"](header, *SIZE[::-1], encoding, 0, 3 * SIZE[0] + 4, padded.ravel())
-            yield "/cam/image_raw", "sensor_msgs/msg/Image", found, int((1 + i / 10) * 1e9)
-        else:
-            data = cv2.imencode(".png", image)[1].ravel()
-            found = types["sensor_msgs/msg/CompressedImage"](header, "png", data)
-            yield "/cam/image_raw/compressed", "sensor_msgs/msg/CompressedImage", found, int((1 + i / 10) * 1e9)
-
-
-def write_bag(folder, version=2, kind="Image", **options):
-    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
-    path = folder / ("walk.bag" if version == 1 else "walk")
-    topics = {}
-    with Writer1(path) if version == 1 else Writer2(path, version=9) as bag:
-        for topic, msgtype, message, time in messages(store, version, kind, **options):
-            if topic not in topics:
-                topics[topic] = bag.add_connection(topic, msgtype, typestore=store)
-            encode = store.serialize_ros1 if version == 1 else store.serialize_cdr
-            bag.write(topics[topic], time, encode(message, msgtype))
-    return path
+from tests.data.written_bag import SIZE, D, K, write_bag  # noqa: E402
 
 
 @pytest.mark.parametrize("version", [1, 2])

@@ -2,9 +2,11 @@
 
 import hashlib
 import json
+import struct
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from omegaconf import OmegaConf
+from scipy.spatial.transform import Rotation
 
 from emgs_jax import load_config
 from emgs_jax.data.base import Dataset
@@ -24,6 +27,7 @@ from emgs_jax.data.posed_images import Colmap, Nerfstudio
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.reading import is_rigid
 from emgs_jax.data.replica import Replica
+from emgs_jax.data.rosbag import RosBag
 from emgs_jax.data.seven_scenes import SevenScenes
 from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.data.tum import Tum
@@ -170,6 +174,35 @@ def write_colmap(folder: Path) -> None:
     (folder / "sparse").mkdir()
     poses = np.stack([scene_pose(i) for i in range(NUM_FRAMES)])
     save_colmap(folder / "sparse", PINHOLE, POSED, poses, np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+def write_binary_colmap(folder: Path) -> None:
+    """cameras.bin and images.bin of one PINHOLE camera, each image with two points."""
+    write_colmap(folder)
+    for path in (folder / "sparse").iterdir():
+        path.unlink()
+    camera = struct.pack("<QIiQQ4d", 1, 1, 1, *SIZE, 60.0, 60.0, 24.0, 18.0)
+    (folder / "sparse" / "cameras.bin").write_bytes(camera)
+    images = struct.pack("<Q", len(POSED))
+    for number, name in enumerate(POSED, start=1):
+        inverse = np.linalg.inv(scene_pose(number - 1))
+        x, y, z, w = Rotation.from_matrix(inverse[:3, :3]).as_quat()
+        images += struct.pack("<I7dI", number, w, x, y, z, *inverse[:3, 3], 1) + name.encode() + b"\0"
+        images += struct.pack("<Q2dQ2dQ", 2, 3.0, 4.0, 7, 5.0, 6.0, 2**64 - 1)
+    (folder / "sparse" / "images.bin").write_bytes(images)
+
+
+def write_video(folder: Path) -> None:
+    writer = cv2.VideoWriter(str(folder / "a.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10, SIZE)
+    for index in range(2 * NUM_FRAMES):
+        writer.write(color_image(index, SIZE))
+    writer.release()
+
+
+def write_rosbag(folder: Path, version: int) -> None:
+    from tests.data.written_bag import write_bag
+
+    write_bag(folder, version, "CompressedImage" if version == 1 else "Image")
 
 
 def write_nerfstudio(folder: Path) -> None:
@@ -430,6 +463,19 @@ def targets() -> Iterator[Target]:
     yield Target(
         "nerfstudio", write_nerfstudio, lambda f: check_frames(Nerfstudio(f, size=SIZE)), image | {".json": TEXT}
     )
+    yield Target(
+        "colmap binary", write_binary_colmap, lambda f: check_frames(Colmap(f, size=SIZE)), image | {".bin": BYTES}
+    )
+    yield Target(
+        "video",
+        write_video,
+        lambda f: check_frames(Images(f / "a.mp4", size=SIZE, intrinsics=(60, 60, 23.5, 17.5))),
+        {".mp4": BYTES},
+    )
+    if find_spec("rosbags") is not None:
+        bag = lambda name: lambda f: check_frames(RosBag(f, name, size=SIZE))  # noqa: E731
+        yield Target("bag of ROS 1", lambda f: write_rosbag(f, 1), bag("walk.bag"), {".bag": BYTES})
+        yield Target("bag of ROS 2", lambda f: write_rosbag(f, 2), bag("walk"), {".db3": BYTES, ".yaml": TEXT})
     yield Target("checksums", write_listed_images, read_listed_images, image | {SUMS_FILE: TEXT})
     yield Target("calibration", write_calibrations, read_calibrations, {".txt": TEXT, ".json": TEXT, ".yaml": TEXT})
     yield Target("trajectory", write_trajectory, read_trajectory, {".txt": TEXT})
