@@ -21,6 +21,7 @@ from emgs_jax.running.configure import CONF, compose, first_of_sweep, message_of
 from emgs_jax.running.gpu import leave_memory_to_torch
 
 from .interrupt import clear_interrupt
+from .keys import check_keys
 
 RUN = "config"  # conf/config.yaml, whose help lists every choice, by Hydra
 
@@ -34,6 +35,7 @@ def command(
         @wraps(task)
         def job(config: DictConfig) -> Any:
             with clear_errors():
+                check_keys(name, config)
                 leave_memory_to_torch(config)
                 if "compilation_cache" in config:
                     use_compilation_cache(config.compilation_cache)

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
-from emgs_jax.io.files import FrameLog
+from emgs_jax.io.files import FrameLog, owned
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.live import LiveView, live_view
 from emgs_jax.report.metrics import (
@@ -49,6 +49,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             "baseline= fuses every frame where it was placed, and graph= moves poses afterwards: use graph=none with it"
         )
     with contextlib.ExitStack() as stack:
+        stack.enter_context(owned(folder))
         clock = stack.enter_context(Clock().watching())
         with clock.phase("setup"):
             slam, evaluation, densify = (build(config, name) for name in ("slam", "evaluation", "densify"))

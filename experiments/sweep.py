@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.io.files import remove_temporaries
+from emgs_jax.io.files import owned, remove_temporaries
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import new_scorer
 from emgs_jax.report.sweep_page import write_sweep_page
@@ -40,9 +40,8 @@ def sweep(config: DictConfig, folder: Path, command_line: str = "") -> list[dict
     grid = variants(config, axes)
     for note in notes(config, axes):
         print(note)
-    folder.mkdir(parents=True, exist_ok=True)
-    remove_temporaries(folder)  # of writes that were killed
-    with Clock().watching() as clock:
+    with owned(folder), Clock().watching() as clock:
+        remove_temporaries(folder)  # of writes that were killed
         dataset = build_dataset(config)
         prior = build_prior(config, dataset)
         origin = provenance_of(config, dataset, prior)

@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from emgs_jax.io.files import atomic_write, remove_temporaries
+from emgs_jax.io.files import atomic_write, owned, remove_temporaries
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import Scorer, new_scorer
 from emgs_jax.report.repeat import written
@@ -119,10 +119,9 @@ def tune(words: Sequence[str], folder: Path) -> list[dict[str, Any]]:
         if len(programs([variant_of(config, {key: value}).slam for value in allowed.ends])) > 1:
             print(f"{key} shares no program: what has another value of it is compiled or mapped by itself")
     about = {"space": space, "objectives": objectives, "tuned": list(configs["tuned"]), "seed": config.search_seed}
-    folder.mkdir(parents=True, exist_ok=True)
-    remove_temporaries(folder)
-    study = open_study(folder / "study.jsonl", about, objectives)
-    with Clock().watching() as clock:
+    with owned(folder), Clock().watching() as clock:
+        remove_temporaries(folder)
+        study = open_study(folder / "study.jsonl", about, objectives)
         sequences = {
             kind: [Measured(name, one, folder / kind / name, clock) for name, one in some.items()]
             for kind, some in configs.items()

@@ -34,12 +34,18 @@ class PointCloud:
         return len(self.points)
 
 
+MAX_LENGTH_M = 1e6  # of a coordinate; what is farther is damaged, or no length in metres
+
+
 def read_cloud(path: str | os.PathLike, normal_neighbours: int) -> PointCloud:
     """Read a PLY; a cloud without normals gets those of planes through so many nearest points, sign unknown."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path} does not exist: give a PLY file with the points in the trajectory's frame")
     vertices = read_vertices(path)
     points = _columns(vertices, ("x", "y", "z"), path)
+    far = np.abs(points).max(initial=0.0)
+    if far > MAX_LENGTH_M:
+        raise ValueError(f"{path} has a point {far:g} m away: give the points in metres, and without stray ones")
     if not len(points):
         raise ValueError(f"{path} has no points: write the points of the map as PLY")
     has_normals, has_colors = ({*names} <= vertices.keys() for names in (_NORMALS, _COLORS))

@@ -55,6 +55,37 @@ def new_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
+@contextlib.contextmanager
+def owned(folder: Path) -> Iterator[None]:
+    """Hold a folder, made here, for this process: of two programs that write into one folder the second is refused.
+
+    The system lets go of it when the process ends, however it does. Where it knows no such locks nothing is refused.
+
+    Raises:
+        ValueError: another program holds it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        import fcntl
+    except ImportError:  # not on this system
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(descriptor)
+        raise ValueError(
+            f"another program is writing into {folder}: wait until it has ended, or name another folder"
+        ) from error
+    except OSError:  # a file system without locks
+        pass
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def remove_temporaries(folder: Path) -> list[str]:
     """Remove what an `atomic_write` into `folder` left that was killed; returns the names. One process owns a folder.
 

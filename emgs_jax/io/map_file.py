@@ -16,6 +16,7 @@ from emgs_jax.io.files import atomic_write
 from emgs_jax.io.npz import read_npz
 
 MAP_FORMAT, MAP_VERSION = "emgs_jax.map", 3
+MAX_LENGTH_M = 1e6
 
 
 def save_map(path: str | os.PathLike, map: GaussianMap) -> None:
@@ -43,6 +44,11 @@ def check_map(path: str | os.PathLike, map: GaussianMap) -> None:
             raise ValueError(f"{path}: {_name(key)} is {leaf.dtype} {leaf.shape}, expected {wanted}: map again")
         if not bool(jnp.all(jnp.isfinite(leaf[valid]))):
             raise ValueError(f"{path}: {_name(key)} is not finite where there is a Gaussian: map again")
+    covs, means = np.asarray(map.gaussians.covs[valid], np.float64), np.asarray(map.gaussians.means[valid])
+    if np.abs(means).max(initial=0.0) > MAX_LENGTH_M or np.abs(covs).max(initial=0.0) > MAX_LENGTH_M**2:
+        raise ValueError(f"{path} has a Gaussian {MAX_LENGTH_M:g} m away or large: it is damaged, map again")
+    if not np.allclose(covs, covs.mT, rtol=1e-3, atol=1e-12) or not (np.linalg.eigvalsh(covs) > 0).all():
+        raise ValueError(f"{path}: gaussians.covs has one that is no covariance: map again")
 
 
 def save_map_npz(path: str | os.PathLike, tree: eqx.Module) -> None:
@@ -120,5 +126,8 @@ def _build(cls: type, prefix: str, arrays: dict[str, np.ndarray], static: dict[s
         elif isinstance(hint, type) and issubclass(hint, eqx.Module):
             fields[field.name] = _build(hint, f"{name}.", arrays, static)
         else:
-            fields[field.name] = jnp.asarray(arrays.pop(name))
+            given = arrays.pop(name)
+            fields[field.name] = jnp.asarray(given)
+            if fields[field.name].dtype != given.dtype:
+                raise ValueError(f"{name} is {given.dtype}, which this code does not write")
     return cls(**fields)

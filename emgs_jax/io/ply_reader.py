@@ -86,7 +86,7 @@ def _header(content: bytes, path: object) -> tuple[str, list[Element], int]:
                 continue
             case ["format", name, "1.0"] if name in _BYTE_ORDERS:
                 order = _BYTE_ORDERS[name]
-            case ["element", name, count] if count.isdecimal() and name not in [other.name for other in elements]:
+            case ["element", name, count] if _is_count(count) and name not in [other.name for other in elements]:
                 elements.append(Element(name, int(count), {}))
             case ["property", *kinds, name] if elements and name not in elements[-1].properties and _is_type(kinds):
                 elements[-1].properties[name] = None if kinds[0] == "list" else _TYPES[kinds[0]]
@@ -95,6 +95,11 @@ def _header(content: bytes, path: object) -> tuple[str, list[Element], int]:
     if order is None:
         raise ValueError(f"{path} does not say its format (ascii, binary_little_endian or _big_endian): {REMEDY}")
     return order, elements, start
+
+
+def _is_count(word: str) -> bool:
+    """Whether a word is a number of rows that a file can have."""
+    return word.isdecimal() and len(word) < 19
 
 
 def _is_type(words: list[str]) -> bool:
@@ -145,4 +150,12 @@ def _read_text(body: bytes, elements: list[Element], before: int, path: object) 
                 f"{lines[first + row][:80]!r}: {REMEDY}"
             )
     table = np.array(columns, np.float64).reshape(vertex.count, len(vertex.properties))
-    return {name: table[:, i].astype(kind) for i, (name, kind) in enumerate(vertex.properties.items())}
+    read = {}
+    for name, column in zip(vertex.properties, table.T, strict=True):
+        with np.errstate(invalid="ignore"):  # of what is no number
+            read[name] = column.astype(vertex.properties[name])
+        if read[name].dtype.kind in "iu" and not (fits := read[name] == column).all():
+            row = int(np.argmin(fits))
+            what = f"{name} is {column[row]:g} and not {read[name].dtype}, as the header says"
+            raise ValueError(f"{path}, vertex {row} (from 0): {what}: {REMEDY}")
+    return read

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from emgs_jax.io.files import FrameLog, atomic_write, jsonable, remove_temporaries, write_json
+from emgs_jax.io.files import FrameLog, atomic_write, jsonable, owned, remove_temporaries, write_json
 from emgs_jax.io.ply import save_points_ply
 
 
@@ -32,6 +32,21 @@ def test_an_interrupted_or_full_write_leaves_the_old_file_alone(tmp_path, monkey
         save_points_ply(tmp_path / "points.ply", np.ones((2, 3)), np.ones((2, 3)), np.ones((2, 3)))
     assert json.loads(path.read_text()) == {"a": 1}
     assert os.listdir(tmp_path) == ["metrics.json"]
+
+
+def test_a_folder_is_held_by_one_program_at_a_time_and_let_go_when_it_dies(tmp_path):
+    """Two runs in one folder mixed their outputs."""
+    folder, code = tmp_path / "run", "import sys, time; from pathlib import Path; from emgs_jax.io.files import owned\n"
+    code += "with owned(Path(sys.argv[1])):\n    print('held', flush=True); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", code, str(folder)], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(ValueError, match=r"another program is writing into .*run: wait"), owned(folder):
+            pass
+        other.kill()
+    with owned(folder):
+        assert os.listdir(folder) == []
+    with owned(folder):  # once more, after it was let go
+        pass
 
 
 def test_every_line_of_the_frame_log_is_on_disk_at_once_and_a_cut_one_is_taken_back(tmp_path):

@@ -117,6 +117,15 @@ def test_a_map_of_gaussians_reloads_and_what_stands_in_rows_that_are_free_does_n
     assert_same(load_map(tmp_path / "map.npz"), poison)
 
 
+def test_doubles_are_not_cast_without_a_word(tmp_path):
+    save_map(tmp_path / "map.npz", gaussian_map())
+    with np.load(tmp_path / "map.npz") as file:
+        arrays = dict(file)
+    np.savez(tmp_path / "map.npz", **arrays | {"weight": arrays["weight"].astype(np.float64)})
+    with pytest.raises(ValueError, match=r"map\.npz.*weight is float64.*map again"):
+        load_map(tmp_path / "map.npz")
+
+
 @pytest.mark.parametrize(
     ("where", "change", "message"),
     [
@@ -130,6 +139,13 @@ def test_a_map_of_gaussians_reloads_and_what_stands_in_rows_that_are_free_does_n
             r"gaussians.colors is int8 \(5, 3\), ",
         ),
         (lambda m: m.num_updates, lambda a: a.astype(jnp.int8), r"num_updates is int8 \(5,\), expected int32"),
+        (lambda m: m.gaussians.means, lambda a: a.at[1, 0].set(1e30), "has a Gaussian 1e.06 m away or large"),
+        (
+            lambda m: m.gaussians.covs,
+            lambda a: a.at[1].set(-jnp.eye(3)),
+            "covs has one that is no covariance",
+        ),
+        (lambda m: m.gaussians.covs, lambda a: a.at[1, 0, 1].set(0.5), "covs has one that is no covariance"),
         (lambda m: m.gaussians.valid, lambda a: a.astype(jnp.int32), "is no map: gaussians.valid is int32"),
         (lambda m: m.gaussians.valid, lambda a: a[None], r"is no map: gaussians.valid is bool \(1, 5\)"),
     ],

@@ -115,6 +115,29 @@ def test_rows_of_text_are_counted(tmp_path, rows, message):
         read_vertices(tmp_path / "a.ply")
 
 
+@pytest.mark.parametrize(
+    ("kind", "row", "message"),
+    [
+        ("int", "1 2.5 3", "vertex 0 .*: y is 2.5 and not int32, as the header says"),
+        ("uchar", "1 2 nan", "z is nan and not uint8"),
+        ("uchar", "1 2 -5", "z is -5 and not uint8"),
+        ("float", "1 2 1e30", "has a point 1e.30 m away"),
+    ],
+)
+def test_numbers_that_are_not_of_their_kind_or_no_lengths_are_named(tmp_path, kind, row, message):
+    """They were cut to whole ones, or to 8 bits, and scored."""
+    header = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property {kind} {name}\n" for name in "xyz")
+    (tmp_path / "a.ply").write_text(f"{header}end_header\n{row}\n")
+    with pytest.raises(ValueError, match=rf"a\.ply.*{message}"):
+        read_cloud(tmp_path / "a.ply", 3)
+
+
+def test_a_count_of_thousands_of_digits_is_no_count(tmp_path):
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex {'9' * 6000}\nend_header\n")
+    with pytest.raises(ValueError, match=r"a\.ply, line 3: .* is no line of a PLY header"):
+        read_vertices(tmp_path / "a.ply")
+
+
 def test_normals_that_are_not_finite_are_named(tmp_path, points):
     normals = -points
     header = "ply\nformat binary_little_endian 1.0\nelement vertex 40\n"

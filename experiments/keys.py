@@ -1,0 +1,99 @@
+"""The keys of the commands themselves, which are no parameter of a class: of what kind each is."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from omegaconf import DictConfig, OmegaConf
+
+from emgs_jax.running.configure import CONF
+
+
+class Kind(NamedTuple):
+    """What a value must be, in words and as a check."""
+
+    words: str
+    fits: Callable[[Any], bool]
+
+
+def whole(low: int, or_null: bool = False) -> Kind:
+    """A whole number from `low` on."""
+    words = f"a whole number from {low} on{' or null' * or_null}"
+    return Kind(words, lambda value: (or_null and value is None) or _is_whole(value, low))
+
+
+def many(words: str, fits: Callable[[Any], bool]) -> Kind:
+    """A list of one or more."""
+    return Kind(f"a list of {words}", lambda value: _is_list(value) and len(value) > 0 and all(map(fits, value)))
+
+
+def _is_whole(value: Any, low: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= low
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str)
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip())
+
+
+def _is_change(value: Any) -> bool:
+    return _is_text(value) and "=" in value
+
+
+TEXT = Kind("text", _is_text)
+COUNTS = many("whole numbers from 1 on", lambda value: _is_whole(value, 1))
+SIZES = many(
+    "[width,height]", lambda value: _is_list(value) and len(value) == 2 and all(_is_whole(v, 1) for v in value)
+)
+OFFSET = Kind(
+    "[m,rad]",
+    lambda value: (
+        _is_list(value) and len(value) == 2 and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
+    ),
+)
+SIDE_BY_SIDE = {"chunk": whole(1), "at_once": whole(1, or_null=True)}
+KEYS: dict[str, dict[str, Kind]] = {
+    "sweep": SIDE_BY_SIDE,
+    "tune": SIDE_BY_SIDE,
+    "evaluate": {
+        "seeds": many("whole numbers", lambda value: _is_whole(value, 0)),
+        "overrides": Kind("a list of KEY=VALUE", lambda value: _is_list(value) and all(map(_is_change, value))),
+        "variants": Kind(
+            "NAME: {KEY: VALUE}, one or more", lambda value: isinstance(value, Mapping) and len(value) > 0
+        ),
+        "shard": TEXT,
+    },
+    "export": {"formats": many("names", _is_text), "max_points": whole(1)},
+    "effects": {"repetitions": Kind("a list of keys", lambda value: _is_list(value) and all(map(_is_text, value)))},
+    "embed": {
+        "classes": Kind(
+            "a list of names", lambda value: _is_list(value) and len(value) > 0 and all(map(_is_text, value))
+        )
+    },
+    "benchmark": {
+        "parts": many("names", _is_text),
+        "benchmark.repetitions": whole(1),
+        "benchmark.num_gaussians": whole(1),
+        "benchmark.num_settings": COUNTS,
+        "benchmark.map_sizes": COUNTS,
+        "benchmark.image_sizes": SIZES,
+        "benchmark.icp_offset": OFFSET,
+    },
+}
+FOLDERS = ("out", "folder", "map", "root")  # of commands, where they have to be given
+
+
+def check_keys(name: str, config: DictConfig) -> None:
+    """Raise ValueError with the key where a value of conf/`name`.yaml's own keys is of another kind."""
+    own = OmegaConf.load(CONF / f"{name}.yaml")
+    kinds = KEYS.get(name, {}) | {key: TEXT for key in FOLDERS if OmegaConf.is_missing(own, key)}
+    for key, kind in kinds.items():
+        value = OmegaConf.select(config, key)
+        if OmegaConf.is_config(value):
+            value = OmegaConf.to_container(value)
+        if not kind.fits(value) and not (value is None and OmegaConf.is_missing(config, key)):
+            shown = "null" if value is None else repr(value)
+            raise ValueError(f"{key} must be {kind.words}, got {shown}: give such a value")
