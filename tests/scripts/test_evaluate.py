@@ -204,7 +204,7 @@ def test_every_suite_makes_jobs_that_know_their_sequence_and_name_no_path_of_a_m
         config = hydra.compose("evaluate", [f"suite={name}", *root])
         jobs = list(experiments.evaluate.plan(OmegaConf.to_container(config, resolve=True, throw_on_missing=True)))
     sequences = [job.config.dataset.get("sequence", job.config.dataset.get("seed")) for job in jobs]
-    count = {"seven_scenes": 7, "tum": 9, "replica": 8, "slices": 4, "smoke": 1}[name]
+    count = {"seven_scenes": 7, "tum": 9, "tum_loops": 3, "replica": 8, "slices": 4, "smoke": 1}[name]
     assert len({job.folder for job in jobs}) == len(set(sequences)) == count
     assert all(job.config.dataset.get("root", "some folder").startswith("some folder") for job in jobs)
 
