@@ -143,9 +143,9 @@ def test_doubles_are_not_cast_without_a_word(tmp_path):
         (
             lambda m: m.gaussians.covs,
             lambda a: a.at[1].set(-jnp.eye(3)),
-            "covs has one that is no covariance",
+            "gaussians.covs has one that is no",
         ),
-        (lambda m: m.gaussians.covs, lambda a: a.at[1, 0, 1].set(0.5), "covs has one that is no covariance"),
+        (lambda m: m.gaussians.covs, lambda a: a.at[1, 0, 1].set(0.5), "gaussians.covs has one that is no"),
         (lambda m: m.gaussians.valid, lambda a: a.astype(jnp.int32), "is no map: gaussians.valid is int32"),
         (lambda m: m.gaussians.valid, lambda a: a[None], r"is no map: gaussians.valid is bool \(1, 5\)"),
     ],
