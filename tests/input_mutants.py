@@ -262,7 +262,7 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/data/readable.py",
-        "        if self.has_ground_truth:\n            _check_truth(dataset, self.kept)\n",
+        "        _check_truth(dataset, self.kept)\n",
         "",
         READABLE,
         "a bad true pose is found when its frame comes up",
