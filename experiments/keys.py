@@ -54,10 +54,11 @@ OFFSET = Kind(
         _is_list(value) and len(value) == 2 and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
     ),
 )
-SIDE_BY_SIDE = {"chunk": whole(1), "at_once": whole(1, or_null=True)}
+NAMES = many("names", _is_text)
+AT_ONCE = {"at_once": whole(1, or_null=True)}
 KEYS: dict[str, dict[str, Kind]] = {
-    "sweep": SIDE_BY_SIDE,
-    "tune": SIDE_BY_SIDE,
+    "sweep": AT_ONCE | {"chunk": whole(1)},
+    "tune": AT_ONCE,  # the others it checks itself
     "evaluate": {
         "seeds": many("whole numbers", lambda value: _is_whole(value, 0)),
         "overrides": Kind("a list of KEY=VALUE", lambda value: _is_list(value) and all(map(_is_change, value))),
@@ -66,15 +67,11 @@ KEYS: dict[str, dict[str, Kind]] = {
         ),
         "shard": TEXT,
     },
-    "export": {"formats": many("names", _is_text), "max_points": whole(1)},
+    "export": {"formats": NAMES, "max_points": whole(1)},
     "effects": {"repetitions": Kind("a list of keys", lambda value: _is_list(value) and all(map(_is_text, value)))},
-    "embed": {
-        "classes": Kind(
-            "a list of names", lambda value: _is_list(value) and len(value) > 0 and all(map(_is_text, value))
-        )
-    },
+    "embed": {"classes": NAMES},
     "benchmark": {
-        "parts": many("names", _is_text),
+        "parts": NAMES,
         "benchmark.repetitions": whole(1),
         "benchmark.num_gaussians": whole(1),
         "benchmark.num_settings": COUNTS,

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig
 
 from emgs_jax.data.class_file import read_classes
@@ -24,7 +25,6 @@ from emgs_jax.report.query_pictures import (
     draw_answer,
     draw_features,
     frame_view,
-    placed_rows,
     save_labels,
     views_of,
 )
@@ -122,11 +122,12 @@ def named_views(run: RecordedRun, views: list[View] | None) -> dict[str, View]:
     """The poses that class images are drawn from: the given ones by their numbers, else all frames by their images."""
     if views is not None:
         return {f"{number:06d}": view for number, view in enumerate(views)}
-    frames = [run.frames[row] for row in placed_rows(run)]
+    rows = np.flatnonzero(run.is_placed)
+    frames = [run.frames[row] for row in rows]
     names = [Path(frame["name"]).stem for frame in frames]
     if len(set(names)) < len(names):  # an image a folder, say
         names = [f"{frame['index']:06d}" for frame in frames]
-    return {name: View(name, run.poses[row]) for name, row in zip(names, placed_rows(run), strict=True)}
+    return {name: View(name, run.poses[row]) for name, row in zip(names, rows, strict=True)}
 
 
 def lines_of(said: dict[str, Any]) -> list[str]:

@@ -88,18 +88,15 @@ def _load_binary(folder: Path) -> SparseModel:
         model, count = MODELS[number]
         cameras[key] = [model, str(width), str(height), *(f"{value:.17g}" for value in records.values(f"{count}d"))]
     records.end()
-    records, names, ids, poses = _Records(images_file), [], [], []
-    images = []
+    records, images = _Records(images_file), []
     for _ in range(*records.values("Q")):
         number, *values = records.values("I7dI")
         name, place = records.text(), f"{images_file}, image {number}"
         records.skip(POINT_SIZE * records.values("Q")[0])
         images.append((number, name, values[-1], _pose(np.array(values[:-1]), place)))
     records.end()
-    for _, name, camera, pose in sorted(images, key=lambda image: image[0]):
-        names.append(name)
-        ids.append(camera)
-        poses.append(pose)
+    images.sort(key=lambda image: image[0])
+    names, ids, poses = ([image[column] for image in images] for column in (1, 2, 3))
     return _checked(SparseModel(cameras, names, ids, _inverted(poses), (cameras_file, images_file)), folder)
 
 

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from emgs_jax.evaluation.trajectory import Alignment, align
 from emgs_jax.io.ply_reader import read_vertices
+from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 _NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
 _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
@@ -32,9 +33,6 @@ class PointCloud:
 
     def __len__(self) -> int:
         return len(self.points)
-
-
-MAX_LENGTH_M = 1e6  # of a coordinate; what is farther is damaged, or no length in metres
 
 
 def read_cloud(path: str | os.PathLike, normal_neighbours: int) -> PointCloud:

@@ -14,9 +14,9 @@ import numpy as np
 from emgs_jax.gaussian_map import GaussianMap, empty_map
 from emgs_jax.io.files import atomic_write
 from emgs_jax.io.npz import read_npz
+from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 MAP_FORMAT, MAP_VERSION = "emgs_jax.map", 3
-MAX_LENGTH_M = 1e6
 
 
 def save_map(path: str | os.PathLike, map: GaussianMap) -> None:

@@ -61,16 +61,11 @@ def drawn(run: RecordedRun, gaussians: Gaussians, values: np.ndarray, view: View
 
 def views_of(run: RecordedRun) -> list[View]:
     """Poses of frames that are not lost, at most `MAX_POSES`, evenly spread."""
-    rows = placed_rows(run)
+    rows = np.flatnonzero(run.is_placed)
     chosen = (
         sorted({rows[int(i)] for i in np.linspace(0, len(rows) - 1, min(MAX_POSES, len(rows)))}) if len(rows) else []
     )
     return [View(f"frame {run.frames[row]['index']}", run.poses[row]) for row in chosen]
-
-
-def placed_rows(run: RecordedRun) -> np.ndarray:
-    """The frames that are not lost."""
-    return np.flatnonzero(run.is_placed)
 
 
 def frame_view(run: RecordedRun, frame: int) -> View:

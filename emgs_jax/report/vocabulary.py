@@ -107,8 +107,8 @@ def feature_model(config: DictConfig, words: Sequence[str]) -> FeatureModel | No
 
 def words_of(value: Any, key: str) -> tuple[str, ...]:
     """One word or a list of them as a tuple; raises ValueError where one is empty, no text or there twice."""
-    words = [value] if not isinstance(value, Sequence) or isinstance(value, str) else list(value)
-    words = [] if value is None else words
+    is_list = isinstance(value, Sequence) and not isinstance(value, str)
+    words = list(value) if is_list else [] if value is None else [value]
     if not all(isinstance(word, str) and word.strip() for word in words) or len(set(words)) < len(words):
         raise ValueError(f"{key} must be a word or a list of words, none empty and each once, got {value!r}")
     return tuple(word.strip() for word in words)
