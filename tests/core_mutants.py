@@ -133,10 +133,13 @@ GRAPH = [
         ("solved[rows, i]", "solved[rows, 0]", "covariances with the first node"),
     ),
     *own("graph/deform", "graph/test_deform")(
-        ("scales[:, None] * (gaussians.means - old)", "gaussians.means - old", "the scale leaves the means"),
-        ("scales[:, None, None] ** 2 * shapes", "scales[:, None, None] * shapes", "covariances by the scale once"),
+        ("self.scale[..., None] * (self.turn", "(self.turn", "the scale leaves the means"),
+        ("scale[:, None, None] ** 2 * shapes", "scale[:, None, None] * shapes", "covariances by the scale once"),
+        ("(jnp.abs(births - own) <= config.max_gap)", "(births >= 0)", "two visits move as one"),
+        ("exists & (rows !=", "(rows !=", "free rows are neighbours"),
+        ("share * sides, turns", "share, turns", "quaternions of either side cancel"),
         ("where_rows(has_moved & gaussians.valid, moved, gaussians)", "moved", "free rows move"),
-        ("view, jnp.ones(())), scale)", "view, scale), jnp.ones(()))", "a view scaled about the world's origin"),
+        ("view, jnp.ones(())), motions.scale[row])", "view, motions.scale[row]), jnp.ones(()))", "a view scaled about the world's origin"),
     ),
     *own("graph/start", "graph/test_graph_optimize")(
         ("turns.transpose(0, 2, 1)", "turns", "loops are spread against their direction"),

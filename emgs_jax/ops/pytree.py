@@ -48,7 +48,7 @@ def static(low: float | int | None = None, high: float | int | None = None) -> A
     return eqx.field(static=True, metadata=ranged(low, high))
 
 
-def take_rows(tree: Tree, rows: Int[Array, "r"]) -> Tree:
+def take_rows(tree: Tree, rows: Int[Array, "*r"]) -> Tree:
     """Rows of every leaf; a row number past the end gives the last row, to be masked by the caller."""
     return jax.tree.map(lambda leaf: jnp.take(leaf, rows, axis=0, mode="clip"), tree)
 

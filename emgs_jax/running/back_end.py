@@ -14,7 +14,7 @@ import jaxlie
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.graph.deform import deform, deform_view
+from emgs_jax.graph.deform import DeformConfig, deform, deform_view
 from emgs_jax.graph.measurements import LOOP, Graph, Nodes
 from emgs_jax.graph.optimize import GraphConfig, GraphInfo, optimize
 from emgs_jax.graph.problem import bucket
@@ -44,6 +44,7 @@ class BackEndConfig:
         max_known: χ² of a loop at the poses as they are, up to which it says what is so already and is left out.
         min_frames: between two closures.
         solver: of the graph.
+        deform: how the map follows what was solved.
         location: of a camera that is lost.
     """
 
@@ -55,6 +56,7 @@ class BackEndConfig:
     max_known: float = number(low=0, high=math.inf)
     min_frames: int = number(low=0)
     solver: GraphConfig
+    deform: DeformConfig
     location: LocationConfig
 
 
@@ -265,7 +267,7 @@ class BackEnd:
         self.log_scales = list(np.asarray(after.log_scale, np.float64)[:count])
         change = jnp.mean(after.log_scale - before.log_scale, where=before.valid)
         belief = replace(state.belief, log_scale=state.belief.log_scale + change)
-        return follow(replace(state, belief=belief), before, after, self.min_std)
+        return follow(replace(state, belief=belief), before, after, self.min_std, self.config.deform)
 
     def nodes(self, segment: int | None = None) -> Nodes:
         """All nodes, or those of a segment, with free rows up to a power of two: the map's part compiles rarely."""
@@ -277,12 +279,12 @@ class BackEnd:
         return Nodes(poses, scales, jnp.asarray(is_asked + [False] * (room - count)))
 
 
-def follow(state: SlamState, before: Nodes, after: Nodes, min_std: float) -> SlamState:
+def follow(state: SlamState, before: Nodes, after: Nodes, min_std: float, config: DeformConfig) -> SlamState:
     """The state whose map and last frame conform to other poses."""
     last = state.time - 1
     return replace(
         state,
-        map=_deform(state.map, before, after, jnp.asarray(min_std, jnp.float32)),
+        map=_deform(state.map, before, after, jnp.asarray(min_std, jnp.float32), config),
         previous=_deform_view(state.previous, before, after, last),
         T_world_previous=_moved_pose(state.T_world_previous, before, after, int(last)),
     )

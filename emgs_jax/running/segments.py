@@ -139,8 +139,9 @@ def join(run: MappingRun, given: Input) -> None:
     end.edges.append(_edge(end, place))
     other = run.aside[there]
     run.aside = {one: state for one, state in run.aside.items() if one != there}
-    state = follow(run.state, before, after, end.min_std)
-    map, run.config = with_part(state.map, _deform(other.map, before, after, jnp.asarray(end.min_std)), run.config)
+    state = follow(run.state, before, after, end.min_std, end.config.deform)
+    moved = _deform(other.map, before, after, jnp.asarray(end.min_std), end.config.deform)
+    map, run.config = with_part(state.map, moved, run.config)
     run.state = replace(state, map=map)
     if here == newer:
         run.state = replace(run.state, belief=_moved_belief(similarity, state.belief))
