@@ -70,6 +70,7 @@ KEYS: dict[str, dict[str, Kind]] = {
     "export": {"formats": NAMES, "max_points": whole(1)},
     "effects": {"repetitions": Kind("a list of keys", lambda value: _is_list(value) and all(map(_is_text, value)))},
     "embed": {"classes": NAMES},
+    "segment": {"map": Kind("a folder or a list of folders", lambda value: _is_text(value) or NAMES.fits(value))},
     "benchmark": {
         "parts": NAMES,
         "benchmark.repetitions": whole(1),
@@ -86,7 +87,7 @@ FOLDERS = ("out", "folder", "map", "root")  # of commands, where they have to be
 def check_keys(name: str, config: DictConfig) -> None:
     """Raise ValueError with the key where a value of conf/`name`.yaml's own keys is of another kind."""
     own = OmegaConf.load(CONF / f"{name}.yaml")
-    kinds = KEYS.get(name, {}) | {key: TEXT for key in FOLDERS if OmegaConf.is_missing(own, key)}
+    kinds = {key: TEXT for key in FOLDERS if OmegaConf.is_missing(own, key)} | KEYS.get(name, {})
     for key, kind in kinds.items():
         value = OmegaConf.select(config, key)
         if OmegaConf.is_config(value):

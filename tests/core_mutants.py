@@ -139,7 +139,11 @@ GRAPH = [
         ("exists & (rows !=", "(rows !=", "free rows are neighbours"),
         ("share * sides, turns", "share, turns", "quaternions of either side cancel"),
         ("where_rows(has_moved & gaussians.valid, moved, gaussians)", "moved", "free rows move"),
-        ("view, jnp.ones(())), motions.scale[row])", "view, motions.scale[row]), jnp.ones(()))", "a view scaled about the world's origin"),
+        (
+            "view, jnp.ones(())), motions.scale[row])",
+            "view, motions.scale[row]), jnp.ones(()))",
+            "a view scaled about the world's origin",
+        ),
     ),
     *own("graph/start", "graph/test_graph_optimize")(
         ("turns.transpose(0, 2, 1)", "turns", "loops are spread against their direction"),

@@ -63,7 +63,8 @@ class Images:
 
     def _pictures(self) -> Pictures:
         files = [] if isinstance(self._source, Video) else [self._source.file(row) for row in self._chosen]
-        return Pictures(self._raw_size, len(self), lambda index: self._source.read(self._chosen[index]), files)
+        name = f"images of {self._source.label(self._chosen[0])}" if len(self) else "images"
+        return Pictures(self._raw_size, len(self), lambda index: self._source.read(self._chosen[index]), files, name)
 
     def __len__(self) -> int:
         return len(self._chosen)

@@ -38,12 +38,14 @@ class Pictures:
         count: how many.
         read: RGB image 0..count-1 as it is on disk; raises BadFrameError.
         files: their files; empty for a video.
+        name: of them all, for messages.
     """
 
     size: Size
     count: int
     read: Callable[[int], UInt8[np.ndarray, "_ _ 3"]]
     files: Sequence[Path] = ()
+    name: str = "images"
 
 
 @dataclass(frozen=True)
@@ -95,10 +97,10 @@ def find_lens(given: Given, pictures: Pictures) -> Lens:
         path = Path(given).expanduser()
         what, camera = str(path), read_calibration(path)
         about = {"source": path.name, "note": f"from {path.name}: {[round(v, 2) for v in camera.intrinsics]}"}
-    return to_lens(camera, pictures.size, what, about)
+    return to_lens(camera, pictures.size, what, about, pictures.name)
 
 
-def to_lens(camera: Calibration, size: Size, what: str, about: Mapping[str, Any]) -> Lens:
+def to_lens(camera: Calibration, size: Size, what: str, about: Mapping[str, Any], images: str = "images") -> Lens:
     """The lens of a calibration.
 
     Args:
@@ -106,12 +108,13 @@ def to_lens(camera: Calibration, size: Size, what: str, about: Mapping[str, Any]
         size: (width, height) of the images on disk.
         what: names the calibration in errors.
         about: where it comes from; size, intrinsics and distortion are added.
+        images: names them, likewise.
 
     Raises:
         ValueError: it is for images of another size, or the distortion leaves nothing of the image.
     """
     check_image_size(camera, size, what)
-    raw = reading.check_intrinsics(camera.intrinsics, size, what)
+    raw = reading.check_intrinsics(camera.intrinsics, size, what, images)
     about = {**about, "size": [*size], "intrinsics": [*raw], "distortion": [*camera.distortion]}
     if not any(camera.distortion):
         return Lens(raw, None, about)

@@ -1,6 +1,7 @@
 """A data set without the frames that cannot be read."""
 
 import hashlib
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,8 @@ import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
 from emgs_jax.data.checksums import find_checksums
+
+MAX_STEP_M = 100.0  # between frames in use: two that are farther apart show nothing in common
 
 
 class ReadableFrames:
@@ -85,10 +88,19 @@ def _unreadable(read: Callable[[int], Frame], indices: Iterable[int]) -> dict[in
 
 
 def _check_truth(dataset: Dataset, kept: Sequence[int]) -> None:
-    """Raise BadFrameError for the first true pose that is damaged, and ValueError where no frame of a truth has one."""
+    """Raise BadFrameError for the first true pose that is damaged or far from the one before, ValueError if none is."""
     poses = [dataset.pose(index) for index in kept]  # all of them, before the first frame
     if dataset.has_ground_truth and all(pose is None for pose in poses):
         raise ValueError(
             f"{dataset.name} {dataset.sequence}: 0 of {len(kept)} images have a true pose: fetch the trajectory again, "
             "or choose other images (dataset.start, stop, stride)"
         )
+    known = [(index, pose[:3, 3]) for index, pose in zip(kept, poses, strict=True) if pose is not None]
+    for (index, place), (other, next_place) in itertools.pairwise(known):
+        step = float(np.linalg.norm(next_place - place))
+        if step > MAX_STEP_M:
+            raise BadFrameError(
+                f"{dataset.name} {dataset.sequence}: the true pose of frame {other} is {step:.0f} m from that of frame "
+                f"{index}, and a walk has no step of more than {MAX_STEP_M:g} m: correct the trajectory, or write nan "
+                "where the pose is not known"
+            )

@@ -87,9 +87,9 @@ def check_depth_scale(depth_scale: Number, what: str = "dataset.depth_scale") ->
 
 
 def check_intrinsics(
-    intrinsics: str | Sequence[Number], raw_size: Size, what: str = "dataset.intrinsics"
+    intrinsics: str | Sequence[Number], raw_size: Size, what: str = "dataset.intrinsics", images: str = "images"
 ) -> Intrinsics:
-    """`intrinsics` as four numbers that fit an image of raw_size; `what` names them in errors."""
+    """`intrinsics` as four numbers that fit an image of raw_size; `what` names them in errors, `images` the images."""
     if isinstance(intrinsics, str):
         raise ValueError(f"{what} must be [fx, fy, cx, cy] in pixels for this data set, got {intrinsics!r}")
     values = tuple(float(v) for v in intrinsics)
@@ -98,7 +98,7 @@ def check_intrinsics(
     if not (0 <= values[2] < raw_size[0] and 0 <= values[3] < raw_size[1]):
         raise ValueError(
             f"{what} {list(values)} has its principal point outside of the {raw_size[0]}x{raw_size[1]} "
-            "images: give [fx, fy, cx, cy] at the size of the images on disk, not at dataset.size"
+            f"{images}: give [fx, fy, cx, cy] at the size of the images on disk, not at dataset.size"
         )
     return values
 

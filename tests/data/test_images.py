@@ -130,3 +130,10 @@ def test_a_file_that_is_no_video_is_an_error(tmp_path):
     path.write_bytes(b"nothing")
     with pytest.raises(ValueError, match="clip.mp4 is no video"):
         load(path)
+
+
+def test_a_calibration_that_does_not_fit_a_video_names_it(tmp_path):
+    """A damaged header gave a video of 32x4, and the message named no file."""
+    write_video(tmp_path / "clip.mp4")
+    with pytest.raises(ValueError, match=r"principal point outside of the 160x120 images of .*clip\.mp4"):
+        load(tmp_path / "clip.mp4", intrinsics=(128.0, 128.0, 500.0, 59.5))

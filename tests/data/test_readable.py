@@ -93,3 +93,23 @@ def test_all_true_poses_are_read_before_the_first_frame():
     without_depth.has_ground_truth = False
     with pytest.raises(BadFrameError, match=r"poses\.txt, line 4"):
         ReadableFrames(without_depth)
+
+
+def test_a_step_of_the_truth_that_no_walk_has_is_named_before_the_first_frame():
+    """A jump of 900 m between two frames was taken for a walk."""
+
+    class Jump(WithTruth):
+        far = 900.0
+
+        def pose(self, index):
+            pose = super().pose(index)
+            if pose is not None and index > 2:
+                pose[0, 3] = self.far
+            return pose
+
+    with pytest.raises(BadFrameError, match=r"damaged one: the true pose of frame 3 is 900 m from that of frame 2, "):
+        ReadableFrames(Jump())
+    with pytest.raises(BadFrameError, match=r"frame 3 is 900 m from that of frame 1, "):  # one between has none
+        ReadableFrames(Jump(lost=(2,)))
+    Jump.far = 99.0
+    assert len(ReadableFrames(Jump())) == 5

@@ -1,4 +1,6 @@
-"""`python -m tests.kills --kills 50 --seed 0`: stop runs with SIGKILL, SIGTERM and SIGINT at random times.
+"""`python -m tests.kills --kills 50 --seed 0`: stop programs with SIGKILL, SIGTERM and SIGINT at random times.
+
+Runs without and with a back end, a run of `multiview_stereo`, a sweep and a search, in turn.
 
 After each stop every file that is there must be whole, and nothing of an earlier run lost; the same command must then
 come to the same bits of map, trajectory, clouds, log and metrics (all but times) as a run that nobody stopped. With a
@@ -14,7 +16,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from .stops import VARIANTS, run_case, run_whole
+from .stops import PROGRAMS, run_case, run_whole
 
 
 def main() -> int:
@@ -26,11 +28,11 @@ def main() -> int:
     work, faults, counts = Path(tempfile.mkdtemp(prefix="kills")), 0, Counter()
     wholes = {}
     for number in tqdm(range(given.first, given.first + given.kills), unit="run"):
-        variant = number % len(VARIANTS)
+        variant = number % len(PROGRAMS)
         if variant not in wholes:
-            wholes[variant] = run_whole(work / f"whole_{variant}", VARIANTS[variant])
+            wholes[variant] = run_whole(work / f"whole_{variant}", PROGRAMS[variant])
         folder = work / f"run_{number}"
-        case = run_case(number, given.seed, wholes[variant], VARIANTS[variant], folder)
+        case = run_case(number, given.seed, wholes[variant], PROGRAMS[variant], folder)
         counts.update(stop.split()[0] for stop in case.stops)
         for stop in case.stops:
             tqdm.write(f"run {number}: {stop}")

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from emgs_jax import load_map
@@ -31,15 +31,19 @@ def outputs(folder: Path) -> list[Path]:
     return [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.endswith(".log")]
 
 
-def digest(folder: Path) -> dict[str, str]:
-    """Digest of each output by name; of the log and the metrics without times, of what shows those that it is there."""
+def digest(folder: Path, names: Collection[str] | None = None) -> dict[str, str]:
+    """Digest of each output by name, or of some of them; of the log and the metrics without times, of what shows those that it is there."""
     read = {
         "frames.jsonl": lambda path: json.dumps(log_lines(folder)).encode(),
         "metrics.json": lambda path: json.dumps(metrics(folder), sort_keys=True).encode(),
         "overview.png": lambda path: b"",
         "report.html": lambda path: b"",
     }
-    contents = {path.name: read.get(path.name, Path.read_bytes)(path) for path in outputs(folder)}
+    contents = {
+        path.name: read.get(path.name, Path.read_bytes)(path)
+        for path in outputs(folder)
+        if names is None or path.name in names
+    }
     return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
 
 
@@ -75,6 +79,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "mesh.ply": read_vertices,
     "overview.png": _picture,
     "report.html": _page,
+    "sweep.json": lambda path: json.loads(path.read_text()),
     "loops.json": lambda path: json.loads(path.read_text()),
     "places.npz": _arrays,
     "text.npz": _arrays,

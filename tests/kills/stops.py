@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +15,35 @@ from tests.tiny_run import TINY
 from .folders import digest, faults, lost, outputs
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclass(frozen=True)
+class Program:
+    """A command that is stopped: its name and words, and which of its files are compared (all: None)."""
+
+    name: str
+    words: tuple[str, ...]
+    compared: tuple[str, ...] | None = None
+
+
 SETTINGS = ("dataset.stop=12", "prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=256")
-VARIANTS = ((), ("graph=default", "graph.every=1"))
+STEREO = (  # a prior with a memory
+    *("prior=multiview_stereo", "prior.structure.max_landmarks=192", "prior.structure.num_fixed=3"),
+    *("prior.dense.depth.sweep.num_planes=40", "prior.structure.matching.num_features=600"),
+    *("dataset.size=[128,96]", "dataset.stop=10", "slam.window_size=5", "checkpoint.every=2"),
+)
+GATE = "slam.em.max_mahalanobis_sq"
+PROGRAMS = (
+    Program("run", SETTINGS),
+    Program("run", (*SETTINGS, "graph=default", "graph.every=1")),
+    Program("run", STEREO),
+    Program("sweep", (f"axes={{{GATE}:[1.0,4.6,9.0,16.0]}}", "chunk=1"), ("sweep.csv", "report.html")),
+    Program(
+        "tune",
+        (f"space={{{GATE}:{{low:1,high:20}}}}", "trials=4", "startup=2", "chunk=1", "held_out={other:{prior.seed:3}}"),
+        ("trials.csv", "tune.md"),
+    ),
+)
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 SECONDS = 900.0  # that a run may take
 
@@ -46,9 +72,10 @@ class Case:
     faults: tuple[str, ...]
 
 
-def begin(folder: Path, more: Sequence[str], log: Path) -> subprocess.Popen:
-    """A run in a process of its own."""
-    command = [sys.executable, "-m", "experiments.run", *TINY, *SETTINGS, *more, f"hydra.run.dir={folder}"]
+def begin(folder: Path, program: Program, log: Path) -> subprocess.Popen:
+    """The program in a process of its own."""
+    module = f"experiments.{program.name}"
+    command = [sys.executable, "-m", module, *TINY, *program.words, f"hydra.run.dir={folder}"]
     with open(log, "a") as said:  # a pipe that nobody reads is full at some time
         return subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=subprocess.STDOUT)
 
@@ -61,12 +88,12 @@ def event(folder: Path) -> str:
     return f"{name} {(folder / name).read_bytes().count(bytes([10]))}" if is_log else name
 
 
-def watch(program: subprocess.Popen, folder: Path, until: str | None = None) -> list[tuple[str, float]]:
+def watch(process: subprocess.Popen, folder: Path, until: str | None = None) -> list[tuple[str, float]]:
     """What is new in a folder and when, until the process ends or `until` is there."""
     start, seen = time.monotonic(), [("start", 0.0)]
-    while program.poll() is None and seen[-1][0] != until:
+    while process.poll() is None and seen[-1][0] != until:
         if time.monotonic() - start > SECONDS:
-            program.kill()
+            process.kill()
             raise TimeoutError(f"no end after {SECONDS} s; {folder} has {seen}")
         try:
             now = event(folder)
@@ -78,17 +105,17 @@ def watch(program: subprocess.Popen, folder: Path, until: str | None = None) -> 
     return [*seen, ("end", time.monotonic() - start)]
 
 
-def run_whole(folder: Path, more: Sequence[str]) -> Whole:
+def run_whole(folder: Path, program: Program) -> Whole:
     """The run to compare with; its process has ended well, else RuntimeError."""
     log = folder.with_suffix(".txt")
-    program = begin(folder, more, log)
-    events = watch(program, folder)
-    if program.wait() != 0:
-        raise RuntimeError(f"the run that nobody stops ended with {program.returncode}: {log.read_text()[-2000:]}")
-    return Whole(folder, digest(folder), events)
+    process = begin(folder, program, log)
+    events = watch(process, folder)
+    if process.wait() != 0:
+        raise RuntimeError(f"the run that nobody stops ended with {process.returncode}: {log.read_text()[-2000:]}")
+    return Whole(folder, digest(folder, program.compared), events)
 
 
-def run_case(number: int, seed: int, whole: Whole, more: Sequence[str], folder: Path) -> Case:
+def run_case(number: int, seed: int, whole: Whole, program: Program, folder: Path) -> Case:
     """Stop a run once, twice or three times, look at its folder each time, and let it go on to its end."""
     rng, log, stops, found = np.random.default_rng((seed, number)), folder.with_suffix(".txt"), [], []
     earlier = {}
@@ -97,21 +124,21 @@ def run_case(number: int, seed: int, whole: Whole, more: Sequence[str], folder: 
         earlier = {path.name: path.read_bytes() for path in outputs(folder)}
     for _ in range(1 + (rng.integers(3) == 0) + (rng.integers(9) == 0)):
         name, wait, sign = _moment(whole, rng)
-        program = begin(folder, more, log)
-        watch(program, folder, name)
+        process = begin(folder, program, log)
+        watch(process, folder, name)
         time.sleep(wait)
         before = event(folder)
-        program.send_signal(sign)
-        code = program.wait(SECONDS)
+        process.send_signal(sign)
+        code = process.wait(SECONDS)
         stops.append(f"{sign.name} {wait:.2f} s after {name}, at {before}: ended with {code}")
         if code not in (0, -sign, 128 + sign):
             found.append(f"{sign.name} ended with {code}")
         found += faults(folder, sign == signal.SIGKILL) if folder.exists() else []
         found += [f"{name} of the earlier run is lost" for name in lost(folder, earlier)]
-    program = begin(folder, more, log)
-    if program.wait(SECONDS) != 0:
-        return Case(number, tuple(stops), (*found, f"the same command ended with {program.returncode}"))
-    after = digest(folder)
+    process = begin(folder, program, log)
+    if process.wait(SECONDS) != 0:
+        return Case(number, tuple(stops), (*found, f"the same command ended with {process.returncode}"))
+    after = digest(folder, program.compared)
     names = sorted({*after, *whole.digest})
     found += [f"{name} is different" for name in names if after.get(name) != whole.digest.get(name)]
     found += [f"{name} of the earlier run is lost" for name in lost(folder, earlier)]

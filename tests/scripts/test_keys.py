@@ -12,6 +12,7 @@ NEEDED = {
     "export": ["folder=a"],
     "effects": ["folder=a"],
     "predict": ["out=a"],
+    "segment": ["map=a", "truth=frames"],
 }
 
 
@@ -30,6 +31,8 @@ NEEDED = {
         ("evaluate", "overrides=[abc]", "overrides must be a list of KEY=VALUE"),
         ("export", "formats=3", "formats must be a list of names, got 3"),
         ("effects", "folder=3", "folder must be text, got 3"),
+        ("segment", "map=[a,3]", r"map must be a folder or a list of folders, got \['a', 3\]"),
+        ("segment", "map=[]", r"map must be a folder or a list of folders, got \[\]"),
         ("predict", "out=null", "out must be text, got null"),
         ("embed", "classes=3", "classes must be a list of names, got 3"),
         ("benchmark", "benchmark.repetitions=0", "benchmark.repetitions must be a whole number from 1 on, got 0"),
@@ -47,6 +50,12 @@ def test_a_value_of_another_kind_is_named_with_its_key(name, override, message):
 @pytest.mark.parametrize("name", sorted({*KEYS, *NEEDED, "config"}))
 def test_what_conf_says_passes(name):
     check_keys(name, compose(*NEEDED.get(name, []), name=name))
+
+
+def test_segment_takes_one_folder_or_several():
+    """A list, as docs/semantics.md has it, was refused."""
+    for given in ("map=a", "map=[a,b]"):
+        check_keys("segment", compose(given, "truth=frames", name="segment"))
 
 
 @pytest.mark.parametrize("name", KEYS)

@@ -1,7 +1,7 @@
 """A long run in this process, with what it costs at each step; and what must be true of a map whatever was seen."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -79,3 +79,8 @@ def ratio(values: Sequence[float]) -> float:
     """Median of the last tenth over that of the second tenth, before which programs are compiled and rooms grow."""
     tenth = len(values) // 10
     return float(np.median(values[-tenth:]) / np.median(values[tenth : 2 * tenth]))
+
+
+def grown(ratios: Mapping[str, float], most: float) -> list[str]:
+    """What became more than it may: a name and its `ratio` each."""
+    return [f"{name} grew to {value:.3f} times, {most:g} is allowed" for name, value in ratios.items() if value > most]

@@ -9,7 +9,7 @@ import pytest
 from emgs_jax.running.record import FrameRecord
 from tests.hand_run import hand_run, poses_along
 from tests.soak.scenes import NUM_FRAMES, SCENES, ToAndFro, to_and_fro
-from tests.soak.soak import faults, ratio, soak
+from tests.soak.soak import faults, grown, ratio, soak
 
 SHORT = 14
 
@@ -56,3 +56,5 @@ def test_what_is_poisoned_is_a_fault():
 
 def test_growth_is_the_last_tenth_over_the_second():
     assert ratio([9.0] * 10 + [2.0] * 10 + [5.0] * 70 + [3.0] * 10) == 1.5
+    ratios = {"memory": 1.06, "step": 1.05}
+    assert grown(ratios, 1.05) == ["memory grew to 1.060 times, 1.05 is allowed"]
