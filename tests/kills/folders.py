@@ -32,7 +32,7 @@ def outputs(folder: Path) -> list[Path]:
 
 
 def digest(folder: Path, names: Collection[str] | None = None) -> dict[str, str]:
-    """Digest of each output by name, or of some of them; of the log and the metrics without times, of what shows those that it is there."""
+    """Digest of each output by name, or of some; of the log and the metrics without times, of what shows those none."""
     read = {
         "frames.jsonl": lambda path: json.dumps(log_lines(folder)).encode(),
         "metrics.json": lambda path: json.dumps(metrics(folder), sort_keys=True).encode(),
