@@ -1,10 +1,12 @@
 """Ctrl-C, and the SIGTERM of a scheduler, end a command with one word after it has written what it has."""
 
 import contextlib
+import gc
 import os
 import signal
 import sys
 import threading
+import weakref
 from collections.abc import Iterator
 from types import FrameType
 
@@ -13,15 +15,34 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM, which what waits for Ctrl-C takes as that."""
 
 
-def _terminate(number: int, frame: FrameType | None) -> None:
-    raise Terminated
+RAISED = {signal.SIGTERM: Terminated, signal.SIGINT: KeyboardInterrupt}
+AGAIN = 0.01  # s
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise what the signal stands for; a little later where Python would print that and go on."""
+    if _is_lost(frame):
+        threading.Timer(AGAIN, os.kill, (os.getpid(), number)).start()
+    else:
+        raise RAISED[signal.Signals(number)]
+
+
+def _is_lost(frame: FrameType | None) -> bool:
+    """Whether a frame is inside a callback of the garbage collector (JAX has one) or of an object that goes."""
+    callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
+    callbacks.add(weakref.finalize.__call__.__code__)
+    while frame is not None:
+        if frame.f_code in callbacks or frame.f_code.co_name == "__del__":
+            return True
+        frame = frame.f_back
+    return False
 
 
 @contextlib.contextmanager
 def clear_interrupt() -> Iterator[None]:
     """End the program with one word on Ctrl-C or SIGTERM; HYDRA_FULL_ERROR=1 shows where it was."""
     is_main = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGTERM, _terminate) if is_main else None
+    before = {number: signal.signal(number, _interrupt) for number in RAISED} if is_main else {}
     try:
         yield
     except KeyboardInterrupt as interrupt:
@@ -31,5 +52,5 @@ def clear_interrupt() -> Iterator[None]:
         print("terminated" if is_terminated else "interrupted", file=sys.stderr)
         raise SystemExit(128 + (signal.SIGTERM if is_terminated else signal.SIGINT)) from None  # as shells have it
     finally:
-        if is_main:
-            signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,8 +1,9 @@
 """Record what a prior says of a sequence: `python -m experiments.predict dataset=… prior=… features=… out=DIR`.
 
 `prior=recorded prior.folder=DIR` replays it in `experiments.run`. An interrupted recording is completed by the same
-command. This script needs no JAX, unless the prior does, and mapping a recording needs no PyTorch: each may have its
-own environment.
+command. With `graph=default` it holds what the back end asks for beside the windows of the sequence: views of both
+visits of a place. Without that this script needs no JAX, unless the prior does, and mapping a recording needs no
+PyTorch: each may have its own environment.
 """
 
 from collections.abc import Iterable, Sequence
@@ -11,9 +12,11 @@ from pathlib import Path
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from emgs_jax.prior.base import Window
-from emgs_jax.prior.recorded import record
-from emgs_jax.running.configure import build_dataset, build_prior
+from emgs_jax.data.base import Dataset
+from emgs_jax.prior.base import Prior, Window
+from emgs_jax.prior.recorded import Recorded, record
+from emgs_jax.prior.recorded_visits import places_seen_twice, record_visits
+from emgs_jax.running.configure import build_dataset, build_prior, graph_config
 
 from .command import command
 
@@ -28,6 +31,8 @@ def predict(config: DictConfig) -> Path:
 
     folder = Path(config.out)
     record(prior, dataset, config.slam.window_size, folder, progress)
+    if config.graph is not None:
+        _record_visits(prior, dataset, config, folder)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 2**20
     per_frame = f"{size / len(dataset):.2f} a frame"
     print(f"{folder}: {size:.1f} MiB, {per_frame}, {dataset.name} {dataset.sequence}, {len(dataset)} frames")
@@ -35,6 +40,26 @@ def predict(config: DictConfig) -> Path:
     for key, value in prior.report().items():
         print(f"{key} {value:.4g}")
     return folder
+
+
+def _record_visits(prior: Prior, dataset: Dataset, config: DictConfig, folder: Path) -> None:
+    """What the back end of a run will ask for beside the windows of the sequence."""
+    end, size = graph_config(config), config.slam.window_size
+    if not end.revisit.is_asked or prior.is_sequential:
+        return
+    pairs = places_seen_twice(
+        Recorded(folder),
+        dataset,
+        size,
+        end.appearance,
+        end.verification.alignment,
+        end.every,
+        lambda windows: tqdm(windows, unit="frame", desc="places seen twice"),
+    )
+    count = record_visits(
+        prior, dataset, size, folder, pairs, end.revisit.spacing, lambda some: tqdm(some, unit="pair", desc="visits")
+    )
+    print(f"{count} windows with both visits of a place, for loops")
 
 
 @command("predict")

@@ -17,12 +17,9 @@ SIZE, INTRINSICS = (320, 240), (250.0, 260.0, 155.0, 122.5)
 @cache
 def loops_config(*overrides: str) -> dict:
     """What conf/graph/default.yaml says of loops, changed by words like `appearance.min_gap=5`."""
-    config = OmegaConf.merge(
-        OmegaConf.masked_copy(
-            OmegaConf.load(CONF / "graph" / "default.yaml"), ["appearance", "verification", "agreement", "location"]
-        ),
-        OmegaConf.from_dotlist(list(overrides)),
-    )
+    parts = ["appearance", "verification", "agreement", "revisit", "location"]
+    given = OmegaConf.masked_copy(OmegaConf.load(CONF / "graph" / "default.yaml"), parts)
+    config = OmegaConf.merge(given, OmegaConf.from_dotlist(list(overrides)))
     return hydra.utils.instantiate(config, _convert_="all")
 
 

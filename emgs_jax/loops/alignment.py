@@ -41,6 +41,7 @@ class Gate(StrEnum):
     NEIGHBOURS = "neighbours"  # too few of the candidate's neighbours were verified
     NEIGHBOURS_DISAGREE = "neighbours_disagree"
     CONTRADICTED = "contradicted"  # the one looks through what the other sees
+    REVISIT = "revisit"  # an inference with views of both says otherwise
 
 
 @dataclass(frozen=True)

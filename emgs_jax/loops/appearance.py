@@ -131,7 +131,7 @@ def describe(
     pixels, descriptors = np.float32(pixels[: config.num_features]), descriptors[: config.num_features]
     as_bytes = np.uint8(np.clip(np.round(BYTES_PER_UNIT * descriptors), 0, 255))
     at_pixels = _interpolated(points, mask, pixels, config.max_depth_step)
-    depths = _sampled(np.where(mask, points[..., 2], 0.0), config.grid)
+    depths = sampled_depths(points, mask, config.grid)
     return Keyframe(frame, pixels, as_bytes, at_pixels, tuple(map(float, intrinsics)), mask.shape[::-1], depths)
 
 
@@ -141,10 +141,12 @@ def grid_pixels(size: tuple[int, int], grid: tuple[int, int]) -> tuple[Int[np.nd
     return x, y
 
 
-def _sampled(depth: np.ndarray, grid: tuple[int, int]) -> Float16[np.ndarray, "y x"]:
-    """Depth (h, w) at the centres of a grid."""
-    x, y = grid_pixels(depth.shape[::-1], grid)
-    return np.float16(depth[np.ix_(y, x)])
+def sampled_depths(
+    points: Float32[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], grid: tuple[int, int]
+) -> Float16[np.ndarray, "y x"]:
+    """Depth of camera-frame points at the centres of a grid of so many columns and rows; 0 where the mask is off."""
+    x, y = grid_pixels(mask.shape[::-1], grid)
+    return np.float16(np.where(mask, points[..., 2], 0.0)[np.ix_(y, x)])
 
 
 def _interpolated(

@@ -119,11 +119,11 @@ def refine(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float, conf
         kinds = _kinds(pairs)
 
         def weighted(step, start=(T_a_b, log_ratio), std=stds[kinds]):
-            return _errors(pairs, *_stepped(*start, step)) / std
+            return _errors(pairs, *moved_by_step(*start, step)) / std
 
         with _libraries().limit(limits=1, user_api="blas"):  # for seven unknowns threads cost more than they do
             found = least_squares(weighted, np.zeros(7), loss="huber", f_scale=HUBER, x_scale="jac")
-        T_a_b, log_ratio = _stepped(T_a_b, log_ratio, found.x)
+        T_a_b, log_ratio = moved_by_step(T_a_b, log_ratio, found.x)
         errors = np.abs(_errors(pairs, T_a_b, log_ratio))
         scatter = [MAD_TO_STD * np.median(errors[kinds == kind]) for kind in (0, 1)]
         stds = np.maximum(scatter, [config.min_pixel_std, config.min_depth_std])
@@ -138,7 +138,7 @@ def _libraries() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def _stepped(
+def moved_by_step(
     T_a_b: Float[np.ndarray, "4 4"], log_ratio: float, step: Float[np.ndarray, "7"]
 ) -> tuple[Float[np.ndarray, "4 4"], float]:
     """T (I + step) to first order, its rotation exact: the order and side of `jaxlie`'s tangents."""

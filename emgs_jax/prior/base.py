@@ -84,6 +84,10 @@ class Prior(ABC):
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Predict for `frames`, which are in the order of `window.views`."""
 
+    def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
+        """Predict for views of two visits of a place, see `visits`; None where that is not known."""
+        return None if self.is_sequential else self.predict(window, frames, intrinsics)
+
     def check(self, dataset: Dataset, window_size: int) -> None:  # noqa: B027 (most can answer for any data set)
         """Raise ValueError where the prior cannot answer for the data set."""
 
@@ -106,6 +110,16 @@ def windows(num_frames: int, window_size: int) -> Iterator[Window]:
     for inference, current in enumerate(range(len(first), num_frames), start=1):
         recent = range(max(current - window_size, 0), min(current + 2, num_frames))
         yield Window(inference, tuple(dict.fromkeys((0, *recent))), (current - 1, current), current)
+
+
+def visits(a: int, b: int, spacing: int, window_size: int) -> Window:
+    """The call that shows two visits of a place together: frame a, which is the anchor, and b, which comes later.
+
+    Beside them it has the frames `spacing` before and after a, and before b: none that is later than b. Its number is
+    that of the step that integrates b.
+    """
+    views = [index for index in (a, a - spacing, a + spacing, b - spacing, b) if 0 <= index <= b]
+    return Window(max(b - window_size + 1, 0), tuple(dict.fromkeys(views)), (a, b), b)
 
 
 def with_frames(calls: Iterable[Window], dataset: Dataset) -> Iterator[tuple[Window, dict[int, Frame]]]:

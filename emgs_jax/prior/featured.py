@@ -50,6 +50,10 @@ class Featured(Prior):
         self._known = known
         return replace(prediction, features=np.stack([features for _, features in known]))
 
+    def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
+        """What the prior says of two visits, with features of its own: geometry is all that is asked for."""
+        return self._prior.revisit(window, frames, intrinsics)
+
     def _features(self, frame: Frame) -> np.ndarray:
         for known, features in self._known:
             is_same = known.image is frame.image or np.array_equal(known.image, frame.image)
@@ -91,3 +95,7 @@ class Requeried(Prior):
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """What the prior predicts."""
         return self._prior.predict(window, frames, intrinsics)
+
+    def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
+        """What the prior says of two visits."""
+        return self._prior.revisit(window, frames, intrinsics)

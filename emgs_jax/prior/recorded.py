@@ -7,6 +7,8 @@ The format `emgs_jax.predictions`, version 2, is a folder; nothing in it is ever
   `complete` (all inferences are there), `files` (file name -> SHA-256 of its content) and `sha256` (of all the other
   keys, as JSON with sorted keys and without spaces), so that no changed bit goes unnoticed.
 - `text_features.npz`: the array `text_features` (classes, f).
+- `visits_A_…_B.npz`, for pairs of frames that show one place twice, named by all its views: as below, of one more
+  inference with views of both visits (`recorded_visits`). A folder may have none.
 - `000000.npz`, …, one file per inference: `inference` (), `views` (v,), `dense` (d,), `current` () and the arrays of
   `PriorPrediction` in the dtypes stated there: about d·(17·h·w + 2·y·x·f) bytes. Features are float16; points are
   not, because a float16 step is 2 mm at 2 to 4 m. Version 1, whose features have one cell per pixel, is read as well.
@@ -72,6 +74,19 @@ def record(
     _write_manifest(folder, header | {"complete": True}, files)
 
 
+def visits_file(window: Window) -> str:
+    """Name of the file of an inference with two visits."""
+    return f"visits_{'_'.join(f'{view:06d}' for view in window.views)}.npz"
+
+
+def add_visits(folder: Path, prediction: PriorPrediction) -> None:
+    """Write what a prior says of two visits into a recording that is complete."""
+    manifest, name = _read_manifest(folder), visits_file(prediction.window)
+    files = manifest.pop("files")
+    files[name] = _write(folder / name, _npz(_arrays(prediction)))
+    _write_manifest(folder, manifest, files)
+
+
 class Recorded(Prior):
     """A prior that replays a folder written by `record`.
 
@@ -103,7 +118,21 @@ class Recorded(Prior):
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Return the recorded prediction of `window`; of `frames` only the number and size are looked at."""
-        data, name = self._manifest["dataset"], f"{window.inference:06d}.npz"
+        return self._answer(f"{window.inference:06d}.npz", window, frames, intrinsics)
+
+    def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
+        """Return what was recorded of two visits; None where that was not."""
+        name = visits_file(window)
+        return self._answer(name, window, frames, intrinsics) if name in self._manifest["files"] else None
+
+    def has_whole(self, name: str) -> bool:
+        """Whether a file is there as it was written."""
+        return _digest_of(self.folder / name) == self._manifest["files"].get(name, "")
+
+    def _answer(
+        self, name: str, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]
+    ) -> PriorPrediction:
+        data = self._manifest["dataset"]
         shape, size = frames[0].image.shape[:2], tuple(data["size"])
         if [*intrinsics] != data["intrinsics"] or shape != size[::-1] or len(frames) != len(window.views):
             raise ValueError(

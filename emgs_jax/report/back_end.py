@@ -55,6 +55,7 @@ def counts(end: BackEnd) -> dict[str, Any]:
         "loops/verified": sum(loop.b >= end.first for loop in end.verified),
         "loops/contradicted": sum(loop.b >= end.first for loop in end.contradicted),
         "loops/accepted": sum(loop.b >= end.first for loop in end.accepted),
+        "loops/measured_again": sum(end.asked.values()),
         "loops/closures": sum(not closure.info.reason for closure in solved),
         "loops/closures_refused": sum(bool(closure.info.reason) for closure in solved),
     } | refused

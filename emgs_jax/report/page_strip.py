@@ -188,6 +188,7 @@ GATES = {
     "neighbours": "too few of the neighbouring frames are verified as well",
     "neighbours_disagree": "the neighbouring frames say otherwise",
     "contradicted": "the one looks through what the other sees",
+    "revisit": "the prior, asked for both together, says otherwise",
 }
 OUTCOMES = {
     "accepted": "accepted",

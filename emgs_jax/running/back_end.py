@@ -8,27 +8,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.graph.deform import DeformConfig, deform, deform_view
+from emgs_jax.graph.deform import DeformConfig
 from emgs_jax.graph.measurements import LOOP, Graph, Nodes
 from emgs_jax.graph.optimize import GraphConfig, GraphInfo, optimize
 from emgs_jax.graph.problem import bucket
 from emgs_jax.loops.agreement import AgreementConfig, agreeing
 from emgs_jax.loops.appearance import AppearanceConfig, Database, Keyframe, describe, extend, nearest, propose
 from emgs_jax.loops.location import NO_CANDIDATE, Location, LocationConfig, Places, locate
+from emgs_jax.loops.revisit import RevisitConfig
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement, VerificationConfig, VerifyInfo, neighbours_of, verify
 from emgs_jax.ops.ranges import number
 from emgs_jax.running.convert import to_se3
+from emgs_jax.running.following import follow
 from emgs_jax.running.measuring import Edge, Look, NoiseConfig, chain_edge, loop_edge, map_edge, stacked
 from emgs_jax.slam import SlamState
-
-_deform, _deform_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)
 
 
 @dataclass(frozen=True)
@@ -40,6 +38,7 @@ class BackEndConfig:
         appearance: keyframes and candidates.
         verification: of a candidate.
         agreement: of verified loops with each other.
+        revisit: how they are measured once more.
         every: frames between keyframes.
         max_known: χ² of a loop at the poses as they are, up to which it says what is so already and is left out.
         min_frames: between two closures.
@@ -52,6 +51,7 @@ class BackEndConfig:
     appearance: AppearanceConfig
     verification: VerificationConfig
     agreement: AgreementConfig
+    revisit: RevisitConfig
     every: int = number(low=1, high=1000)
     max_known: float = number(low=0, high=math.inf)
     min_frames: int = number(low=0)
@@ -98,6 +98,7 @@ class BackEnd:
         contradicted: loops that something speaks against.
         accepted: loops that are edges.
         refusals: why candidates were no loops.
+        asked: loops, by their nodes, for which the prior was asked once more, and whether it said something.
         closures: what was solved.
         first: node of this run's first frame; those before are of the run that its map was saved by.
         since: node since which one frame leads to the next; before it the camera was lost.
@@ -120,6 +121,7 @@ class BackEnd:
     contradicted: list[LoopMeasurement] = field(default_factory=list)
     accepted: list[LoopMeasurement] = field(default_factory=list)
     refusals: list[Refusal] = field(default_factory=list)
+    asked: dict[tuple[int, int], bool] = field(default_factory=dict)
     closures: list[Closure] = field(default_factory=list)
     first: int = 0
     since: int = 0
@@ -160,7 +162,11 @@ class BackEnd:
         for candidate in propose(self.database, row, appearance):
             if self._segment_of(candidate.row) == self.segment:
                 self._verify(row, candidate.row)
-        return self.new(self.agreed(since=time - self.config.agreement.max_query_gap))
+        return self.recent()
+
+    def recent(self) -> list[LoopMeasurement]:
+        """Loops of the last queries that are agreed upon and no edges yet."""
+        return self.new(self.agreed(since=len(self.poses) - 1 - self.config.agreement.max_query_gap))
 
     def _described(self, time: int, look: Look) -> Keyframe:
         return describe(time, look.image, look.points, look.mask, self.intrinsics, self.config.appearance)
@@ -277,20 +283,3 @@ class BackEnd:
         scales = jnp.asarray([*self.log_scales, *[0.0] * (room - count)], jnp.float32)
         is_asked = [segment in (None, one) for one in self.segments]
         return Nodes(poses, scales, jnp.asarray(is_asked + [False] * (room - count)))
-
-
-def follow(state: SlamState, before: Nodes, after: Nodes, min_std: float, config: DeformConfig) -> SlamState:
-    """The state whose map and last frame conform to other poses."""
-    last = state.time - 1
-    return replace(
-        state,
-        map=_deform(state.map, before, after, jnp.asarray(min_std, jnp.float32), config),
-        previous=_deform_view(state.previous, before, after, last),
-        T_world_previous=_moved_pose(state.T_world_previous, before, after, int(last)),
-    )
-
-
-def _moved_pose(T: jaxlie.SE3, before: Nodes, after: Nodes, row: int) -> jaxlie.SE3:
-    """The node's new pose; T itself, bit for bit, where the node stays."""
-    old, new = before.T_world.wxyz_xyz[row], after.T_world.wxyz_xyz[row]
-    return jaxlie.SE3(jnp.where(jnp.all(old == new), T.wxyz_xyz, new))

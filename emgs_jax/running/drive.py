@@ -46,6 +46,7 @@ from emgs_jax.running.record import (
     record_start,
     record_step,
 )
+from emgs_jax.running.revisiting import asking
 from emgs_jax.running.segments import begun_segment, enter, leave_out, meeting, predicted
 from emgs_jax.running.unit import in_own_unit
 from emgs_jax.running.untracked import alarm
@@ -102,6 +103,9 @@ def map_frames(run: MappingRun, dataset: Dataset, prior: Prior, keeper: Keeper |
     """
     keeper = keeper or Keeper()
     keeper.attend(run)
+    if run.back_end is not None and run.back_end.config.revisit.is_asked:
+        spacing = run.back_end.config.revisit.spacing
+        run.ask = asking(prior, dataset, spacing, run.config.window_size, run.clock)
     try:
         for position, given in enumerate(inputs(dataset, prior, run.config, run.clock)):
             with run.clock.phase("map"):

@@ -15,6 +15,7 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.trajectory import to_tum
 from emgs_jax.localization import REASONS
+from emgs_jax.loops.revisit import Ask
 from emgs_jax.ops.camera import Camera
 from emgs_jax.running.back_end import BackEnd, BackEndConfig
 from emgs_jax.running.clock import Clock
@@ -119,6 +120,7 @@ class MappingRun:
         prior_motion: what moves the prior's world since the camera was found; None: nothing.
         structure: where the prior's frame is, if it is not related to the first frame any more.
         aside: states of the other parts, by their segment; see `running/segments.py`.
+        ask: the prior, for both visits of a loop; see `running/revisiting.py`.
     """
 
     camera: Camera
@@ -132,6 +134,7 @@ class MappingRun:
     prior_motion: jaxlie.SE3 | None = None
     structure: PlacedStructure | None = None
     aside: dict[int, SlamState] = field(default_factory=dict)
+    ask: Ask = lambda a, b: None
 
     @property
     def is_fixed(self) -> bool:

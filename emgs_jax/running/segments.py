@@ -19,8 +19,9 @@ from emgs_jax.loops.location import Location
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.observation import Prediction
 from emgs_jax.registration.belief import Belief
-from emgs_jax.running.back_end import BackEnd, follow
+from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.convert import FirstWindow, to_se3
+from emgs_jax.running.following import follow
 from emgs_jax.running.growth import advance, start, with_part
 from emgs_jax.running.inputs import Input, PlacedStructure
 from emgs_jax.running.locating import anchored_by, as_prediction, found_at, looks_of, refusal

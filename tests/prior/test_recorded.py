@@ -8,8 +8,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from emgs_jax.prior.base import windows
+from emgs_jax.prior.base import visits, windows
 from emgs_jax.prior.recorded import Recorded, record
+from emgs_jax.prior.recorded_visits import record_visits
 from emgs_jax.prior.simulated.prior import Simulated
 
 WINDOW_SIZE = 3
@@ -331,3 +332,35 @@ def test_forged_text_features_are_refused(folder):
     forge(folder, "text_features.npz", with_array("text_features", lambda a: poisoned(a, np.inf)))
     with pytest.raises(ValueError, match=r"text_features\.npz must hold a finite vector for each of 2 names"):
         Recorded(folder)
+
+
+def test_both_visits_of_a_place_are_replayed_bit_for_bit_and_what_is_not_recorded_is_none(folder, prior, room):
+    window = visits(0, 4, 1, WINDOW_SIZE)
+    assert window.views == (0, 1, 3, 4) and window.dense == (0, 4) and window.inference == 2
+    frames = [room[index] for index in window.views]
+    assert Recorded(folder).revisit(window, frames, room.intrinsics) is None
+    assert record_visits(prior, room, WINDOW_SIZE, folder, [(0, 4)], 1) == 1
+    live = prior.revisit(window, frames, room.intrinsics)
+    assert_same_bits(Recorded(folder).revisit(window, frames, room.intrinsics), live)
+    other = visits(0, 4, 2, WINDOW_SIZE)
+    assert Recorded(folder).revisit(other, [room[index] for index in other.views], room.intrinsics) is None
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    refusing = Interrupted(seed=5, feature_size=4, classes=room.classes)
+    assert record_visits(refusing, room, WINDOW_SIZE, folder, [(0, 4)], 1) == 1 and refusing.num_calls == 0
+    record(refusing, room, WINDOW_SIZE, folder)  # completing it again loses nothing
+    assert refusing.num_calls == 0 and {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    next(folder.glob("visits_*")).write_bytes(b"")
+    with pytest.raises(ValueError, match=r"visits_000000_000001_000003_000004\.npz is damaged"):
+        Recorded(folder).revisit(window, frames, room.intrinsics)
+
+
+def test_views_of_both_visits_are_of_the_past():
+    assert visits(5, 90, 3, 10).views == (5, 2, 8, 87, 90) and visits(5, 90, 3, 10).inference == 81
+    assert visits(1, 3, 3, 10).views == (1, 0, 3) and visits(1, 3, 3, 10).inference == 0
+
+
+def test_a_prior_with_a_memory_is_not_asked_out_of_order(folder, room):
+    prior = Simulated()
+    prior.is_sequential = True
+    assert prior.revisit(visits(0, 4, 1, WINDOW_SIZE), [], room.intrinsics) is None
+    assert record_visits(prior, room, WINDOW_SIZE, folder, [(0, 4)], 1) == 0

@@ -13,7 +13,10 @@ from scene import assert_same, random_gaussians, random_observation
 
 from emgs_jax import load_config
 from emgs_jax.gaussian_map import new_map
+from emgs_jax.graph.deform import DeformConfig
 from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
+from emgs_jax.loops.appearance import Database, Keyframe
+from emgs_jax.loops.revisit import Revisit
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.registration.belief import certain
@@ -23,6 +26,7 @@ from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.correction import correct, finish
 from emgs_jax.running.measuring import Look, chain_edge, map_edge
 from emgs_jax.running.record import FrameRecord, MappingRun
+from emgs_jax.running.revisiting import ask_again
 from emgs_jax.slam import SlamState
 
 COUNT, WINDOW = 60, 10
@@ -86,6 +90,8 @@ def test_what_was_measured_without_error_moves_nothing(graph):
 
 
 def test_a_loop_brings_poses_map_and_last_frame_back(graph):
+    """Each Gaussian with its own camera: they are 20 cm apart, no surface that must not be torn."""
+    graph = replace(graph, deform=DeformConfig(num_neighbours=1, max_gap=0))
     truth, drifted = ring(), ring(1.95 * np.pi)
     end = walked(graph, drifted)
     state = state_of(drifted)
@@ -243,3 +249,87 @@ def test_other_solvers_read_the_graph_in_the_scale_of_the_map(graph, tmp_path):
 def test_without_a_graph_there_is_no_back_end():
     assert load_config().graph is None
     assert OmegaConf.create(load_config().settings).graph == {}
+
+
+def told_again(poses: np.ndarray, off: float = 0.0):
+    """A prior that knows the true poses, or one of another place `off` m away; and which frames it was asked for."""
+    calls = []
+
+    def ask(a: int, b: int) -> Revisit:
+        calls.append((a, b))
+        T = np.linalg.inv(poses[a]) @ poses[b]
+        T[0, 3] += off
+        points = np.float32(np.dstack([np.zeros((48, 64, 2)), np.full((48, 64), 2.0)]))
+        return Revisit(T, (points, points), (np.ones((48, 64), bool),) * 2)
+
+    return ask, calls
+
+
+def with_keyframes(end: BackEnd) -> BackEnd:
+    """All nodes are keyframes that show a wall 2 m away."""
+    none = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32)
+    wall = np.full((60, 80), 2.0, np.float16)
+    keyframes = tuple(Keyframe(row, *none, end.intrinsics, (64, 48), wall) for row in range(len(end.poses)))
+    end.database = Database(keyframes)
+    return end
+
+
+def test_a_loop_that_the_prior_sees_too_is_more_certain_and_asked_for_once(graph):
+    truth = ring()
+    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
+    end.frames = [100 + row for row in range(COUNT)]  # numbers of the data set
+    ask, calls = told_again(np.concatenate([np.tile(np.eye(4), (100, 1, 1)), truth]))
+    end.verified = [loop(truth, row) for row in range(1, 5)]
+    loops = list(end.verified)
+    ask_again(end, loops[:2], ask)
+    assert calls == [(101, 158), (102, 157)] and counts(end)["loops/measured_again"] == 2
+    for before, now in zip(loops[:2], end.verified[:2], strict=True):
+        np.testing.assert_allclose(now.Z_a_b, before.Z_a_b, atol=1e-6)
+        assert (np.diag(now.sqrt_info) > np.diag(before.sqrt_info)).all()
+    ask_again(end, end.verified, ask)
+    assert len(calls) == 4 and len(end.verified) == 4
+
+
+def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
+    truth = ring()
+    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
+    end.verified = [loop(truth, row) for row in range(1, 5)]
+    ask, _ = told_again(truth, off=6.0)
+    ask_again(end, end.verified[:1], ask)
+    assert [known.a for known in end.verified] == [2, 3, 4]
+    (refusal,) = end.refusals
+    assert (refusal.a, refusal.b, refusal.gate) == (1, 58, "revisit") and refusal.measured > graph.revisit.max_misfit
+    assert counts(end)["loops/refused_revisit"] == 1
+    (line,) = [one for one in loop_list(end) if one["outcome"] == "refused"]
+    assert "the prior, asked for both together, says otherwise" in loop_why(line)
+
+
+def test_a_loop_for_which_the_prior_has_no_word_and_one_of_another_run_stay(graph):
+    truth = ring()
+    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
+    end.verified = [loop(truth, row) for row in range(1, 5)]
+    loops = list(end.verified)
+    ask_again(end, loops[:2], lambda a, b: None)
+    assert counts(end)["loops/measured_again"] == 0
+    ask, calls = told_again(truth)
+    end.first = 10
+    ask_again(end, loops[2:], ask)
+    assert calls == [] and all(now is before for now, before in zip(end.verified, loops, strict=True))
+
+
+def test_what_moves_the_poses_was_asked_for_before(graph, monkeypatch):
+    """Of four loops that agree the prior refuses one: three are edges, and as the prior measures them, too."""
+    truth, drifted = ring(), ring(1.95 * np.pi)
+    end = with_keyframes(walked(graph, drifted))
+    run = MappingRun(None, None, state=state_of(drifted), back_end=end)
+    run.records = [FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0) for i, pose in enumerate(drifted)]
+    loops = [loop(truth, row) for row in range(1, 5)]
+    end.verified = list(loops)
+    right, _ = told_again(truth)
+    wrong, _ = told_again(truth, off=6.0)
+    run.ask = lambda a, b: wrong(a, b) if a == 2 else right(a, b)
+    monkeypatch.setattr(BackEnd, "agreed", lambda end, since=0: list(end.verified))
+    finish(run)
+    assert [one.a for one in end.accepted] == [1, 3, 4] and [refusal.a for refusal in end.refusals] == [2]
+    assert end.accepted[0].sqrt_info[0, 0] > loops[0].sqrt_info[0, 0]
+    assert error(end.poses, truth) < 0.5 * error(drifted, truth)

@@ -1,9 +1,13 @@
 """What the command line says: the choices in its help, and one line with the remedy for a word that is wrong."""
 
+import gc
+import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -14,6 +18,7 @@ from emgs_jax.running.configure import compose, groups
 from experiments.cli import COMMANDS, main
 from experiments.command import check_arguments
 from experiments.evaluate import delegated
+from experiments.interrupt import clear_interrupt
 from experiments.report import positional
 
 
@@ -121,3 +126,43 @@ def test_an_interrupt_is_one_word_and_no_traceback(arguments):
         check=False,
     )
     assert (done.returncode, done.stderr) == (130, "interrupted\n")
+
+
+class Going:
+    """An object that sends a signal while it goes."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def __del__(self) -> None:
+        os.kill(os.getpid(), self.number)
+        sum(range(10))  # the handler runs here
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize("place", ["collector", "object", "program"])
+def test_a_signal_is_not_lost_wherever_the_program_is(number, code, place):
+    """Python prints what is raised in a callback of the collector, as JAX has one, and the run went on to its end."""
+
+    sent = []
+
+    def callback(phase, info):
+        if phase == "start" and not sent:
+            sent.append(number)
+            os.kill(os.getpid(), number)
+            sum(range(10))
+
+    before = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)]
+    with pytest.raises(SystemExit) as ended, clear_interrupt():
+        match place:
+            case "collector":
+                gc.callbacks.append(callback)
+                gc.collect()
+            case "object":
+                Going(number)
+            case "program":
+                os.kill(os.getpid(), number)
+        time.sleep(5)
+    gc.callbacks[:] = [one for one in gc.callbacks if one is not callback]
+    assert ended.value.code == code
+    assert [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)] == before

@@ -1,0 +1,67 @@
+"""Windows of two visits of a place in a recording: which these are is found from images and recorded depths alone."""
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from emgs_jax.data.base import Dataset
+from emgs_jax.loops.alignment import AlignmentConfig, RefusedError, align
+from emgs_jax.loops.appearance import AppearanceConfig, Database, describe, extend, propose
+from emgs_jax.prior.base import Prior, Window, visits, windows, with_frames
+from emgs_jax.prior.recorded import Recorded, add_visits, visits_file
+
+
+def places_seen_twice(
+    replay: Recorded,
+    dataset: Dataset,
+    window_size: int,
+    appearance: AppearanceConfig,
+    alignment: AlignmentConfig,
+    every: int = 1,
+    progress: Callable[[Sequence[Window]], Iterable[Window]] = iter,
+) -> list[tuple[int, int]]:
+    """Pairs of frames, the earlier first, that look alike and whose keypoints fit one motion of the camera.
+
+    A run finds its loops among the same candidates, and asks more of them.
+    """
+    database, pairs, seen = Database(), [], set()
+    for window, frames in with_frames(progress(list(windows(len(dataset), window_size))), dataset):
+        prediction = replay.predict(window, list(frames.values()), dataset.intrinsics)
+        for row, index in enumerate(window.dense):
+            if index in seen or index % every:
+                continue
+            seen.add(index)
+            image, points, mask = frames[index].image, prediction.points[row], prediction.mask[row]
+            query = describe(index, image, points, mask, dataset.intrinsics, appearance)
+            database = extend(database, query, appearance)
+            for candidate in propose(database, len(database.keyframes) - 1, appearance):
+                try:
+                    align(database.keyframes[candidate.row], query, alignment)
+                except RefusedError:
+                    continue
+                pairs.append((database.keyframes[candidate.row].frame, index))
+    return pairs
+
+
+def record_visits(
+    prior: Prior,
+    dataset: Dataset,
+    window_size: int,
+    folder: Path | str,
+    pairs: Sequence[tuple[int, int]],
+    spacing: int,
+    progress: Callable[[Sequence[tuple[int, int]]], Iterable[tuple[int, int]]] = iter,
+) -> int:
+    """Add what `prior` says of both visits of each pair to a recording that is complete; returns how many it holds.
+
+    Those that are there already are kept; a prior that cannot be asked out of order leaves none.
+    """
+    replay, known = Recorded(folder), 0
+    for a, b in progress(pairs):
+        window = visits(a, b, spacing, window_size)
+        if not replay.has_whole(visits_file(window)):
+            found = prior.revisit(window, [dataset[index] for index in window.views], dataset.intrinsics)
+            if found is None:
+                continue
+            add_visits(Path(folder), found)
+        known += 1
+    return known

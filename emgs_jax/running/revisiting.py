@@ -1,0 +1,51 @@
+"""Loops that are to move the poses: the prior is asked once more, for views of both visits."""
+
+from collections.abc import Sequence
+
+from emgs_jax.data.base import Dataset
+from emgs_jax.loops.alignment import Gate
+from emgs_jax.loops.revisit import Ask, Revisit, combined, measured_again
+from emgs_jax.loops.verification import LoopMeasurement
+from emgs_jax.prior.base import Prior, visits
+from emgs_jax.running.back_end import BackEnd, Refusal
+from emgs_jax.running.clock import Clock
+
+
+def asking(prior: Prior, dataset: Dataset, spacing: int, window_size: int, clock: Clock) -> Ask:
+    """How a run asks its prior for both visits of a loop; the frames are read again."""
+
+    def ask(a: int, b: int) -> Revisit | None:
+        window = visits(a, b, spacing, window_size)
+        with clock.phase("load"):
+            frames = [dataset[index] for index in window.views]
+        with clock.phase("predict"):
+            found = prior.revisit(window, frames, dataset.intrinsics)
+        if found is None:
+            return None
+        return Revisit(found.T_anchor_view[window.views.index(b)], tuple(found.points), tuple(found.mask))
+
+    return ask
+
+
+def ask_again(end: BackEnd, loops: Sequence[LoopMeasurement], ask: Ask) -> None:
+    """Measure loops once more, each once: what fits becomes more certain, what does not is no loop any more.
+
+    A loop that the prior cannot be asked for stays as it is; so does one of a frame of another run.
+    """
+    keyframes = {keyframe.frame: keyframe for keyframe in end.database.keyframes}
+    for loop in loops:
+        pair = loop.a, loop.b
+        if pair in end.asked or loop.a < end.first:
+            continue
+        told = ask(*(end.frames[node] for node in pair))
+        other = None if told is None else measured_again(told, *(keyframes[node] for node in pair), end.config.revisit)
+        end.asked[pair] = other is not None
+        if other is None:
+            continue
+        both, misfit = combined(loop, other)
+        row = [(known.a, known.b) for known in end.verified].index(pair)
+        if misfit <= end.config.revisit.max_misfit:
+            end.verified[row] = both
+        else:
+            del end.verified[row]
+            end.refusals.append(Refusal(*pair, Gate.REVISIT.value, misfit))
