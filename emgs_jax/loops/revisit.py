@@ -24,7 +24,8 @@ class RevisitConfig:
     """Whether the prior is asked once more, for which views, and what its answer is worth.
 
     Args:
-        is_asked: measure every loop that is to move the poses in this way, too, where the prior can be asked.
+        is_asked: measure loops that are to move the poses in this way, too, where the prior can be asked.
+        num_asked: loops of a closure that are, those with most inliers.
         spacing: frames between the two visits' frames and those beside them that it is shown as well.
         std, std_share: of each axis of the pose between the two visits: m of the inference, and of its length.
         std_deg: of its rotation, about each axis.
@@ -34,6 +35,7 @@ class RevisitConfig:
     """
 
     is_asked: bool
+    num_asked: int = number(low=1, high=1000)
     spacing: int = number(low=1, high=1000)
     std: float = number(low=1e-6, high=1000)
     std_share: float = number(low=0, high=10)

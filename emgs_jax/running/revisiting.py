@@ -28,15 +28,14 @@ def asking(prior: Prior, dataset: Dataset, spacing: int, window_size: int, clock
 
 
 def ask_again(end: BackEnd, loops: Sequence[LoopMeasurement], ask: Ask) -> None:
-    """Measure loops once more, each once: what fits becomes more certain, what does not is no loop any more.
+    """Measure some loops once more, each once: what fits becomes more certain, what does not is no loop any more.
 
     A loop that the prior cannot be asked for stays as it is; so does one of a frame of another run.
     """
+    new = [loop for loop in loops if (loop.a, loop.b) not in end.asked and loop.a >= end.first]
     keyframes = {keyframe.frame: keyframe for keyframe in end.database.keyframes}
-    for loop in loops:
+    for loop in sorted(new, key=lambda loop: -loop.num_inliers)[: end.config.revisit.num_asked]:
         pair = loop.a, loop.b
-        if pair in end.asked or loop.a < end.first:
-            continue
         told = ask(*(end.frames[node] for node in pair))
         other = None if told is None else measured_again(told, *(keyframes[node] for node in pair), end.config.revisit)
         end.asked[pair] = other is not None

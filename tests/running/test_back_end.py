@@ -290,6 +290,15 @@ def test_a_loop_that_the_prior_sees_too_is_more_certain_and_asked_for_once(graph
     assert len(calls) == 4 and len(end.verified) == 4
 
 
+def test_of_a_closure_the_loops_with_most_inliers_are_asked_for(graph):
+    truth = ring()
+    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
+    end.verified = [replace(loop(truth, row), num_inliers=40 + 10 * (row % 3)) for row in range(1, 7)]
+    ask, calls = told_again(truth)
+    ask_again(end, end.verified, ask)
+    assert [a for a, _ in calls] == [2, 5, 1] and graph.revisit.num_asked == 3
+
+
 def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
     truth = ring()
     end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
