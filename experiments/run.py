@@ -13,6 +13,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog, owned
 from emgs_jax.prior.base import Prior
+from emgs_jax.report.back_end import revisit_note
 from emgs_jax.report.live import LiveView, live_view
 from emgs_jax.report.metrics import (
     compared_text,
@@ -88,6 +89,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     write_report(read_run(folder), dataset)
     if live is not None:
         notes = [*notes, f"the live view has ended; emgs view {folder} shows the finished run"]
+    notes = [*notes, *revisit_note(session.back_end, prior.is_sequential)]
     for note in [*frame_lines(session.records, len(dataset.skipped)), *notes]:
         tqdm.write(note)
     return metrics

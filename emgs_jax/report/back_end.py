@@ -46,6 +46,16 @@ def loop_list(end: BackEnd) -> list[dict[str, Any]]:
     return lines
 
 
+def revisit_note(end: BackEnd | None, is_sequential: bool) -> list[str]:
+    """A line where the prior could be asked for no loop, and how it can; none where it was asked, or never can be."""
+    if end is None or is_sequential or not end.asked or any(end.asked.values()):
+        return []
+    return [
+        f"loops: {len(end.asked)} were measured by keypoints alone, because this prior has no answer for both visits; "
+        "a recording has them if it is made with `python -m experiments.predict … graph=default`"
+    ]
+
+
 def counts(end: BackEnd) -> dict[str, Any]:
     """What became of the candidates of this run, for metrics.json; what its map was saved with does not count."""
     gates = Counter(refusal.gate for refusal in end.refusals)

@@ -69,12 +69,13 @@ def save_progress(folder: Path, run: MappingRun) -> None:
     end = run.back_end
     if end is not None and end.database.keyframes and run.state is not None:
         save_places(folder / "places.npz", end, float(run.state.belief.depth_noise))
-    if end is not None and end.edges and len(end.online) > end.first:
+    if end is not None and len(end.online) > end.first:
         online = end.online[end.first :]
         placed = [record.timestamp for record in run.records[-len(online) :]]
         save_trajectory_tum(folder / "trajectory_online.txt", placed, np.stack(online))
-        save_graph_g2o(folder / "graph.g2o", metric_graph(end))
         write_json(folder / LOOPS_FILE, loop_list(end))
+        if end.edges:  # of a single frame nothing was measured
+            save_graph_g2o(folder / "graph.g2o", metric_graph(end))
 
 
 def _mark_unjoined(path: Path, run: MappingRun) -> None:

@@ -20,7 +20,7 @@ from emgs_jax.loops.revisit import Revisit
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.registration.belief import certain
-from emgs_jax.report.back_end import counts, loop_list, metric_graph
+from emgs_jax.report.back_end import counts, loop_list, metric_graph, revisit_note
 from emgs_jax.report.page_strip import loop_why
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.correction import correct, finish
@@ -287,7 +287,7 @@ def test_a_loop_that_the_prior_sees_too_is_more_certain_and_asked_for_once(graph
         np.testing.assert_allclose(now.Z_a_b, before.Z_a_b, atol=1e-6)
         assert (np.diag(now.sqrt_info) > np.diag(before.sqrt_info)).all()
     ask_again(end, end.verified, ask)
-    assert len(calls) == 4 and len(end.verified) == 4
+    assert len(calls) == 4 and len(end.verified) == 4 and revisit_note(end, is_sequential=False) == []
 
 
 def test_of_a_closure_the_loops_with_most_inliers_are_asked_for(graph):
@@ -320,6 +320,9 @@ def test_a_loop_for_which_the_prior_has_no_word_and_one_of_another_run_stay(grap
     loops = list(end.verified)
     ask_again(end, loops[:2], lambda a, b: None)
     assert counts(end)["loops/measured_again"] == 0
+    (note,) = revisit_note(end, is_sequential=False)
+    assert note.startswith("loops: 2 were measured by keypoints alone") and "graph=default" in note
+    assert revisit_note(end, is_sequential=True) == revisit_note(None, is_sequential=False) == []
     ask, calls = told_again(truth)
     end.first = 10
     ask_again(end, loops[2:], ask)

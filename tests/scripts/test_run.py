@@ -245,7 +245,8 @@ def test_a_bad_frame_is_left_out_and_listed_or_ends_the_run(tmp_path, monkeypatc
 
 @pytest.mark.slow
 def test_one_single_frame_is_mapped_and_says_why_it_has_no_trajectory_error(tmp_path):
-    metrics = experiments.run.run(compose("prior.level=0", "dataset.stop=1"), tmp_path)
+    metrics = experiments.run.run(compose("prior.level=0", "dataset.stop=1", "graph=default"), tmp_path)
+    assert json.loads((tmp_path / "loops.json").read_text()) == [] and not (tmp_path / "graph.g2o").exists()
     assert metrics["trajectory/ate_sim3_m"] is None and "poses" in metrics["trajectory/reason"]
     assert metrics["map/num_gaussians"] > 100 and metrics["reconstruction/accuracy_m"] < 0.05
     assert metrics["time/seconds_per_frame"] > 0 and {path.name for path in tmp_path.iterdir()} >= FILES
