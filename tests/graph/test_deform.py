@@ -153,3 +153,21 @@ def test_a_free_row_is_no_neighbour_and_stays(map, before):
     used = np.asarray(some.gaussians.valid)
     np.testing.assert_array_equal(new.gaussians.means[used], other.gaussians.means[used])
     np.testing.assert_array_equal(new.gaussians.means[~used], some.gaussians.means[~used])
+
+
+def test_where_few_are_left_nothing_stands_in_for_the_missing_neighbours(before):
+    """Row 0 is what a search without an answer gives."""
+    map = strip(jnp.asarray([1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0], jnp.int32))
+    map = eqx.tree_at(lambda m: m.gaussians.valid, map, jnp.arange(12) >= 9)
+    after = Nodes(stack_poses([path_pose(0), path_pose(7), path_pose(2)]), before.log_scale, before.valid)
+    new = moved_map(map, before, after, FLOOR, TOGETHER)
+    assert_same(new, map)  # those that are left were born with a node that stays
+
+
+def test_a_rotation_is_the_same_with_either_sign_of_its_quaternion(map, before):
+    after = nodes([path_pose(i + 4) for i in range(3)])
+    signs = jnp.asarray([[1.0] * 7, [-1.0] * 4 + [1.0] * 3, [1.0] * 7])
+    other = Nodes(jaxlie.SE3(after.T_world.wxyz_xyz * signs), after.log_scale, after.valid)
+    one, two = (moved_map(map, before, known, FLOOR, TOGETHER).gaussians for known in (after, other))
+    for name in ("means", "covs", "normals"):
+        np.testing.assert_allclose(getattr(one, name), getattr(two, name), atol=1e-5)

@@ -121,7 +121,8 @@ def run_case(number: int, seed: int, whole: Whole, program: Program, folder: Pat
     earlier = {}
     if rng.integers(3) == 0:  # the folder holds the outputs of an earlier run, of which nothing may be lost
         shutil.copytree(whole.folder, folder)
-        earlier = {path.name: path.read_bytes() for path in outputs(folder)}
+        kept = [path for path in outputs(folder) if program.compared is None or path.name in program.compared]
+        earlier = {path.name: path.read_bytes() for path in kept}  # a search goes on in its own journal
     for _ in range(1 + (rng.integers(3) == 0) + (rng.integers(9) == 0)):
         name, wait, sign = _moment(whole, rng)
         process = begin(folder, program, log)
