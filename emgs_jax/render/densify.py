@@ -39,13 +39,18 @@ class DensifyConfig(eqx.Module):
 
 
 class DenseView(eqx.Module):
-    """Points of one view. World frame; rows of pixels that are not valid hold finite values of no meaning."""
+    """Points of one view. World frame; rows of pixels that are not valid hold finite values of no meaning.
+
+    Where a pixel is `covered` its point is about where the map begins, also where the coverage is too little for a depth
+    to count: enough to ask what is there.
+    """
 
     points: Float[Array, "h w 3"]
     normals: Float[Array, "h w 3"]
     colors: Float[Array, "h w 3"]
-    depth: Float[Array, "h w"]  # m, camera-space z of the points
+    depth: Float[Array, "h w"]  # m, camera-space z of the points; 0 where nothing covers the pixel
     valid: Bool[Array, "h w"]
+    covered: Bool[Array, "h w"]  # by any splat
     rendering: Rendering  # of all splats
 
 
@@ -70,15 +75,16 @@ def densify(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, co
     (whole, surface), overflow = draw_tiles(splats, values, camera, drawn, blend)
     rendering = rendering_of(*whole, overflow, drawn)
     values_sum, weight, depth_sum, _ = surface
-    valid = (rendering.depth > 0) & (weight > 0)
-    weight = jnp.where(valid, weight, 1.0)
-    depth = jnp.where(valid, depth_sum / weight, 0.0)
+    covered = weight > 0
+    weight = jnp.where(covered, weight, 1.0)
+    depth = jnp.where(covered, depth_sum / weight, 0.0)
     return DenseView(
         points=unproject(camera, depth) @ T_world_camera.rotation().as_matrix().T + T_world_camera.translation(),
         normals=safe_normalize(values_sum[..., 3:]),
         colors=values_sum[..., :3] / weight[..., None],
         depth=depth,
-        valid=valid,
+        valid=(rendering.depth > 0) & covered,
+        covered=covered,
         rendering=rendering,
     )
 

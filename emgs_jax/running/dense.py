@@ -109,16 +109,19 @@ def _picture(run: MappingRun, dataset: Dataset, row: int, view: Any) -> dict[str
     return {
         "image": dataset[row].image,
         "rendered_color": view.colors,
-        "rendered_depth": view.depth,
+        "rendered_depth": np.where(view.valid, view.depth, 0.0),
         "valid": view.valid,
         "title": f"frame {run.records[row].index}",
     }
 
 
 def _label_image(view: Any, labelled: LabelledMap | None) -> np.ndarray | None:
-    """Class of each pixel (h, w), -1 = none; None without classes."""
+    """Class of each pixel (h, w) that anything covers, -1 = none; None without classes.
+
+    At the rim of what was seen the coverage is too little for a depth, and enough for a class.
+    """
     if labelled is None:
         return None
-    labels = np.full(view.valid.shape, -1)
-    labels[view.valid] = labelled.classes_of(view.points[view.valid].astype(np.float64))
+    labels = np.full(view.covered.shape, -1)
+    labels[view.covered] = labelled.classes_of(view.points[view.covered].astype(np.float64))
     return labels

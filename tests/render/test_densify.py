@@ -54,6 +54,10 @@ def test_the_map_is_drawn_with_the_coverage_of_densification(camera, densify_con
         np.testing.assert_allclose(getattr(view.rendering, name), getattr(expected, name), atol=1e-3, err_msg=name)
     np.testing.assert_array_equal(view.valid, view.rendering.depth > 0)
     assert 0 < view.valid.sum() < view.valid.size
+    covered = np.asarray(view.covered)
+    assert (covered | ~np.asarray(view.valid)).all() and covered.sum() > view.valid.sum()
+    np.testing.assert_allclose(np.asarray(view.points)[covered][:, 2], 2.0, atol=2e-3)  # about where the map begins
+    np.testing.assert_array_equal(np.asarray(view.depth) > 0, covered)
 
 
 def joined(*parts: Gaussians) -> Gaussians:
@@ -182,5 +186,5 @@ def test_the_front_surface_is_a_part_of_the_depth_about_the_weighted_median(weig
 def test_pixels_without_depth_are_invalid_and_finite(camera, densify_config):
     nothing = eqx.tree_at(lambda g: g.valid, wall(2.0), jnp.zeros(wall(2.0).valid.shape, bool))
     view = dense(nothing, pose(), camera, densify_config)
-    assert not view.valid.any()
+    assert not view.valid.any() and not view.covered.any()
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(view))

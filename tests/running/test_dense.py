@@ -2,6 +2,8 @@
 
 from types import SimpleNamespace
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hand_run import STATUSES, densify_config, hand_run, poses_along, wall
@@ -120,6 +122,13 @@ def test_points_and_pictures_have_the_class_of_the_gaussians_there(dense, labels
     np.testing.assert_array_equal(dense.labels.labels, dense.cloud.points[:, 0] < LENGTH / 2)
     for picture, label in zip(dense.pictures, (1, 1, 0), strict=True):
         np.testing.assert_array_equal(picture["labels"], np.where(picture["valid"], label, -1))
+
+
+def test_a_pixel_that_is_covered_too_little_for_a_depth_has_a_class(run, labels):
+    config = eqx.tree_at(lambda c: c.min_alpha, densify_config(), jnp.asarray(0.9999))
+    (picture, *_) = dense_map(run, Pictures(), config, evaluation_config(), labels, num_pictures=3).pictures
+    rim = ~picture["valid"]
+    assert rim.any() and (picture["labels"][rim] == 1).mean() > 0.5 and (picture["rendered_depth"][rim] == 0).all()
 
 
 def test_without_labels_and_without_a_frame_that_is_known_there_is_nothing_to_show(run):
