@@ -41,8 +41,8 @@ class DensifyConfig(eqx.Module):
 class DenseView(eqx.Module):
     """Points of one view. World frame; rows of pixels that are not valid hold finite values of no meaning.
 
-    Where a pixel is `covered` its point is about where the map begins, also where the coverage is too little for a depth
-    to count: enough to ask what is there.
+    Where a pixel is `covered` its point is about where the map begins, also where that is too little for a depth to
+    count: enough to ask what is there.
     """
 
     points: Float[Array, "h w 3"]
