@@ -52,7 +52,8 @@ def revisit_note(end: BackEnd | None, is_sequential: bool) -> list[str]:
         return []
     return [
         f"loops: {len(end.asked)} were measured by keypoints alone, because this prior has no answer for both visits; "
-        "a recording has them if it is made with `python -m experiments.predict … graph=default`"
+        "a recording has them if it is made with `python -m experiments.predict … graph=default`, but for a prior that "
+        "answers in order only, as multiview_stereo does"
     ]
 
 
