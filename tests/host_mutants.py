@@ -504,7 +504,9 @@ MUTANTS = (
         for old, new, words in (
             ("not in end.asked and", "is not None and", "each loop is asked for again and again"),
             ("key=lambda loop: -loop", "key=lambda loop: loop", "those with fewest inliers"),
-            ("            del end.verified[row]\n", "", "a loop that the prior refuses stays one"),
+            ("sorted(new, key=lambda loop: loop", "sorted(new, key=lambda loop: -loop", "the worst of a query"),
+            ("end.verified.pop(row)", "end.verified[row]", "a loop that the prior refuses stays one"),
+            ("end.contradicted.append(end.verified.pop(row))", "end.verified.pop(row)", "its company stays"),
             ("ask(*(end.frames[node] for node in pair))", "ask(*pair)", "nodes are taken for frames"),
         )
     ),

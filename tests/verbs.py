@@ -210,7 +210,7 @@ VERBS = {
     ),
     "move": (measurements.move, lambda s: (graph_of(s).nodes, 0.1 * jnp.ones((5, 7)))),
     "deform": (
-        lambda m, before, after: deform.deform(m, before, after, ONE * 0.01),
+        lambda m, before, after: deform.deform(m, before, after, ONE * 0.01, deform.DeformConfig(4, 40.0)),
         lambda s: (map_of(s), graph_of(s).nodes, graph_of(s + 5).nodes),
     ),
     "residuals": (measurements.residuals, lambda s: (graph_of(s),)),

@@ -25,7 +25,7 @@ class RevisitConfig:
 
     Args:
         is_asked: measure loops that are to move the poses in this way, too, where the prior can be asked.
-        num_asked: loops of a closure that are, those with most inliers.
+        num_asked: loops of a closure that are, each of another query, those with most inliers.
         spacing: frames between the two visits' frames and those beside them that it is shown as well.
         std, std_share: of each axis of the pose between the two visits: m of the inference, and of its length.
         std_deg: of its rotation, about each axis.

@@ -30,11 +30,11 @@ def asking(prior: Prior, dataset: Dataset, spacing: int, window_size: int, clock
 def ask_again(end: BackEnd, loops: Sequence[LoopMeasurement], ask: Ask) -> None:
     """Measure some loops once more, each once: what fits becomes more certain, what does not is no loop any more.
 
-    A loop that the prior cannot be asked for stays as it is; so does one of a frame of another run.
+    What does not fit speaks against all loops that imply the same correction, as a contradiction that is seen does. A
+    loop that the prior cannot be asked for stays as it is; so does one of a frame of another run.
     """
-    new = [loop for loop in loops if (loop.a, loop.b) not in end.asked and loop.a >= end.first]
     keyframes = {keyframe.frame: keyframe for keyframe in end.database.keyframes}
-    for loop in sorted(new, key=lambda loop: -loop.num_inliers)[: end.config.revisit.num_asked]:
+    for loop in _chosen(end, loops):
         pair = loop.a, loop.b
         told = ask(*(end.frames[node] for node in pair))
         other = None if told is None else measured_again(told, *(keyframes[node] for node in pair), end.config.revisit)
@@ -46,5 +46,12 @@ def ask_again(end: BackEnd, loops: Sequence[LoopMeasurement], ask: Ask) -> None:
         if misfit <= end.config.revisit.max_misfit:
             end.verified[row] = both
         else:
-            del end.verified[row]
+            end.contradicted.append(end.verified.pop(row))
             end.refusals.append(Refusal(*pair, Gate.REVISIT.value, misfit))
+
+
+def _chosen(end: BackEnd, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
+    """Of each query the loop with most inliers that was not asked for yet; of these the best."""
+    new = [loop for loop in loops if (loop.a, loop.b) not in end.asked and loop.a >= end.first]
+    best = {loop.b: loop for loop in sorted(new, key=lambda loop: loop.num_inliers)}
+    return sorted(best.values(), key=lambda loop: -loop.num_inliers)[: end.config.revisit.num_asked]

@@ -297,6 +297,11 @@ def test_of_a_closure_the_loops_with_most_inliers_are_asked_for(graph):
     ask, calls = told_again(truth)
     ask_again(end, end.verified, ask)
     assert [a for a, _ in calls] == [2, 5, 1] and graph.revisit.num_asked == 3
+    end.asked.clear(), calls.clear()
+    same = [replace(one, b=50, num_inliers=40 + one.a) for one in end.verified]  # all of one query: one witness
+    end.verified = list(same)
+    ask_again(end, same, ask)
+    assert len(calls) == 1 and calls[0][0] == 6
 
 
 def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
@@ -305,7 +310,7 @@ def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
     end.verified = [loop(truth, row) for row in range(1, 5)]
     ask, _ = told_again(truth, off=6.0)
     ask_again(end, end.verified[:1], ask)
-    assert [known.a for known in end.verified] == [2, 3, 4]
+    assert [known.a for known in end.verified] == [2, 3, 4] and [known.a for known in end.contradicted] == [1]
     (refusal,) = end.refusals
     assert (refusal.a, refusal.b, refusal.gate) == (1, 58, "revisit") and refusal.measured > graph.revisit.max_misfit
     assert counts(end)["loops/refused_revisit"] == 1
@@ -330,7 +335,7 @@ def test_a_loop_for_which_the_prior_has_no_word_and_one_of_another_run_stay(grap
 
 
 def test_what_moves_the_poses_was_asked_for_before(graph, monkeypatch):
-    """Of four loops that agree the prior refuses one: three are edges, and as the prior measures them, too."""
+    """Of four loops that agree the prior refuses one: the others are edges, and as the prior measures them, too."""
     truth, drifted = ring(), ring(1.95 * np.pi)
     end = with_keyframes(walked(graph, drifted))
     run = MappingRun(None, None, state=state_of(drifted), back_end=end)
@@ -340,8 +345,19 @@ def test_what_moves_the_poses_was_asked_for_before(graph, monkeypatch):
     right, _ = told_again(truth)
     wrong, _ = told_again(truth, off=6.0)
     run.ask = lambda a, b: wrong(a, b) if a == 2 else right(a, b)
+    agreed = BackEnd.agreed
     monkeypatch.setattr(BackEnd, "agreed", lambda end, since=0: list(end.verified))
     finish(run)
     assert [one.a for one in end.accepted] == [1, 3, 4] and [refusal.a for refusal in end.refusals] == [2]
     assert end.accepted[0].sqrt_info[0, 0] > loops[0].sqrt_info[0, 0]
     assert error(end.poses, truth) < 0.5 * error(drifted, truth)
+    # Two of them against it, and all that imply the same correction fall.
+    end = with_keyframes(walked(graph, drifted))
+    end.verified = [loop(truth, row) for row in range(1, 9)]
+    run.back_end, run.state = end, state_of(drifted)
+    run.ask = lambda a, b: wrong(a, b)
+    monkeypatch.setattr(BackEnd, "agreed", agreed)
+    assert len(end.agreed()) == 8
+    finish(run)
+    assert end.accepted == [] and len(end.refusals) == 3 and end.agreed() == []
+    assert error(end.poses, drifted) == 0
