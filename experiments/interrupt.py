@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import weakref
+from collections import Counter
 from collections.abc import Iterator
 from types import FrameType
 
@@ -16,14 +17,17 @@ class Terminated(KeyboardInterrupt):
 
 
 RAISED = {signal.SIGTERM: Terminated, signal.SIGINT: KeyboardInterrupt}
-AGAIN = 0.01  # s
+_delays: Counter[int] = Counter()
+AGAIN, MOST = 0.01, 100  # s, and how often
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise what the signal stands for; a little later where Python would print that and go on."""
-    if _is_lost(frame):
+    """Raise what the signal stands for; a little later where Python would print that and go on, but not for ever."""
+    _delays[number] += 1
+    if _is_lost(frame) and _delays[number] < MOST:
         threading.Timer(AGAIN, os.kill, (os.getpid(), number)).start()
     else:
+        _delays[number] = 0
         raise RAISED[signal.Signals(number)]
 
 
@@ -42,7 +46,8 @@ def _is_lost(frame: FrameType | None) -> bool:
 def clear_interrupt() -> Iterator[None]:
     """End the program with one word on Ctrl-C or SIGTERM; HYDRA_FULL_ERROR=1 shows where it was."""
     is_main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.signal(number, _interrupt) for number in RAISED} if is_main else {}
+    heard = [number for number in RAISED if is_main and signal.getsignal(number) not in (signal.SIG_IGN, None)]
+    before = {number: signal.signal(number, _interrupt) for number in heard}  # who started it may have it ignored
     try:
         yield
     except KeyboardInterrupt as interrupt:

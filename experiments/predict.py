@@ -53,7 +53,6 @@ def _record_visits(prior: Prior, dataset: Dataset, config: DictConfig, folder: P
         size,
         end.appearance,
         end.verification.alignment,
-        end.every,
         lambda windows: tqdm(windows, unit="frame", desc="places seen twice"),
     )
     count = record_visits(

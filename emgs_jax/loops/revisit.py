@@ -27,7 +27,7 @@ class RevisitConfig:
         is_asked: measure loops that are to move the poses in this way, too, where the prior can be asked.
         num_asked: loops of a closure that are, each of another query, those with most inliers.
         spacing: frames between the two visits' frames and those beside them that it is shown as well.
-        std, std_share: of each axis of the pose between the two visits: m of the inference, and of its length.
+        std, std_share: of each axis of the pose between the two visits: in units of the earlier one, and of its length.
         std_deg: of its rotation, about each axis.
         log_ratio_std: of the ratio of the units of the two inferences that the loop is between.
         min_cells: of the grid of depths that an image of either must have in common with its own inference.
@@ -77,7 +77,7 @@ def measured_again(told: Revisit, a: Keyframe, b: Keyframe, config: RevisitConfi
     ratios = []
     for keyframe, points, mask in zip((a, b), told.points, told.masks, strict=True):
         new, own = np.float64(sampled_depths(points, mask, keyframe.depths.shape[::-1])), np.float64(keyframe.depths)
-        both = (new > 0) & (own > 0)
+        both = (new > 0) & (own > 0) & np.isfinite(new) & np.isfinite(own)  # float16 ends at 65504
         if both.sum() < config.min_cells:
             return None
         ratios.append(float(np.median(np.log(new[both] / own[both]))))

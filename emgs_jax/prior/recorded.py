@@ -98,7 +98,8 @@ class Recorded(Prior):
         self.folder = Path(folder)
         self._manifest = _read_manifest(self.folder)
         if not self._manifest["complete"]:
-            done, total = len(self._manifest["files"]) - 1, self._manifest["num_inferences"]
+            total = self._manifest["num_inferences"]
+            done = sum(self.has_whole(f"{number:06d}.npz") for number in range(total))
             raise ValueError(f"{self.folder} holds {done} of {total} inferences: finish it, {REMEDY}")
         self.provenance = Provenance(**self._manifest["provenance"])
         self.feature_names = tuple(self._manifest["feature_names"])

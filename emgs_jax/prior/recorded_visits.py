@@ -16,18 +16,18 @@ def places_seen_twice(
     window_size: int,
     appearance: AppearanceConfig,
     alignment: AlignmentConfig,
-    every: int = 1,
     progress: Callable[[Sequence[Window]], Iterable[Window]] = iter,
 ) -> list[tuple[int, int]]:
     """Pairs of frames, the earlier first, that look alike and whose keypoints fit one motion of the camera.
 
-    A run finds its loops among the same candidates, and asks more of them.
+    A run looks for its loops in the same way, and asks more of them. What it finds beside these, because it began with
+    other key frames (a saved map, frames that were lost at first, `slam.initialization=merged`), is not recorded.
     """
     database, pairs, seen = Database(), [], set()
     for window, frames in with_frames(progress(list(windows(len(dataset), window_size))), dataset):
         prediction = replay.predict(window, list(frames.values()), dataset.intrinsics)
         for row, index in enumerate(window.dense):
-            if index in seen or index % every:
+            if index in seen:
                 continue
             seen.add(index)
             image, points, mask = frames[index].image, prediction.points[row], prediction.mask[row]

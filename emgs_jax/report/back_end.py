@@ -12,6 +12,7 @@ from emgs_jax.graph.measurements import Graph
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.running.back_end import BackEnd, Refusal
 from emgs_jax.running.measuring import stacked
+from emgs_jax.running.revisiting import MEASURED, SILENT
 
 
 def metric_graph(end: BackEnd) -> Graph:
@@ -48,7 +49,7 @@ def loop_list(end: BackEnd) -> list[dict[str, Any]]:
 
 def revisit_note(end: BackEnd | None, is_sequential: bool) -> list[str]:
     """A line where the prior could be asked for no loop, and how it can; none where it was asked, or never can be."""
-    if end is None or is_sequential or not end.asked or any(end.asked.values()):
+    if end is None or is_sequential or set(end.asked.values()) != {SILENT}:
         return []
     return [
         f"loops: {len(end.asked)} were measured by keypoints alone, because this prior has no answer for both visits; "
@@ -66,7 +67,7 @@ def counts(end: BackEnd) -> dict[str, Any]:
         "loops/verified": sum(loop.b >= end.first for loop in end.verified),
         "loops/contradicted": sum(loop.b >= end.first for loop in end.contradicted),
         "loops/accepted": sum(loop.b >= end.first for loop in end.accepted),
-        "loops/measured_again": sum(end.asked.values()),
+        "loops/measured_again": sum(told == MEASURED for told in end.asked.values()),
         "loops/closures": sum(not closure.info.reason for closure in solved),
         "loops/closures_refused": sum(bool(closure.info.reason) for closure in solved),
     } | refused

@@ -98,7 +98,7 @@ class BackEnd:
         contradicted: loops that something speaks against.
         accepted: loops that are edges.
         refusals: why candidates were no loops.
-        asked: loops, by their nodes, for which the prior was asked once more, and whether it said something.
+        asked: loops, by their nodes, for which the prior was asked once more, and what came of it, see `revisiting`.
         closures: what was solved.
         first: node of this run's first frame; those before are of the run that its map was saved by.
         since: node since which one frame leads to the next; before it the camera was lost.
@@ -121,7 +121,7 @@ class BackEnd:
     contradicted: list[LoopMeasurement] = field(default_factory=list)
     accepted: list[LoopMeasurement] = field(default_factory=list)
     refusals: list[Refusal] = field(default_factory=list)
-    asked: dict[tuple[int, int], bool] = field(default_factory=dict)
+    asked: dict[tuple[int, int], str] = field(default_factory=dict)
     closures: list[Closure] = field(default_factory=list)
     first: int = 0
     since: int = 0

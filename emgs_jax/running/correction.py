@@ -30,7 +30,7 @@ def correct(run: MappingRun, given: Input) -> None:
     num_contradicted = len(end.contradicted)
     found = end.look_for_loops(looks[-1])
     if end.wants_to_close(found):
-        ask_again(end, found, run.ask)
+        ask_again(end, [loop for loop in found if end.misfit(loop) > end.config.max_known], run.ask)
         found = end.recent()
     has_retracted = len(end.contradicted) > num_contradicted and end.retract(end.agreed()) > 0
     if has_retracted or end.wants_to_close(found):

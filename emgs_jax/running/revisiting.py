@@ -10,6 +10,9 @@ from emgs_jax.prior.base import Prior, visits
 from emgs_jax.running.back_end import BackEnd, Refusal
 from emgs_jax.running.clock import Clock
 
+# What becomes of a question: a second measurement, no answer, or one without a pose or enough depths.
+MEASURED, SILENT, UNUSABLE = "measured", "silent", "unusable"
+
 
 def asking(prior: Prior, dataset: Dataset, spacing: int, window_size: int, clock: Clock) -> Ask:
     """How a run asks its prior for both visits of a loop; the frames are read again."""
@@ -38,7 +41,7 @@ def ask_again(end: BackEnd, loops: Sequence[LoopMeasurement], ask: Ask) -> None:
         pair = loop.a, loop.b
         told = ask(*(end.frames[node] for node in pair))
         other = None if told is None else measured_again(told, *(keyframes[node] for node in pair), end.config.revisit)
-        end.asked[pair] = other is not None
+        end.asked[pair] = MEASURED if other is not None else SILENT if told is None else UNUSABLE
         if other is None:
             continue
         both, misfit = combined(loop, other)

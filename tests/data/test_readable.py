@@ -111,5 +111,10 @@ def test_a_step_of_the_truth_that_no_walk_has_is_named_before_the_first_frame():
         ReadableFrames(Jump())
     with pytest.raises(BadFrameError, match=r"frame 3 is 900 m from that of frame 1, "):  # one between has none
         ReadableFrames(Jump(lost=(2,)))
+    without = Jump()
+    without.has_ground_truth = False  # poses of a unit of its own
+    assert len(ReadableFrames(without)) == 5
+    Jump.far = 120.0
+    assert len(ReadableFrames(Jump(lost=(2,)))) == 5  # two steps
     Jump.far = 99.0
     assert len(ReadableFrames(Jump())) == 5

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from emgs_jax.prior.base import visits, windows
+from emgs_jax.prior.base import Prior, visits, windows
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.recorded_visits import record_visits
 from emgs_jax.prior.simulated.prior import Simulated
@@ -354,13 +354,31 @@ def test_both_visits_of_a_place_are_replayed_bit_for_bit_and_what_is_not_recorde
         Recorded(folder).revisit(window, frames, room.intrinsics)
 
 
+def test_what_the_simulated_prior_says_again_is_another_draw_about_the_same_truth(prior, room):
+    """It was the step's own answer, bit for bit: a second measurement without an error of its own."""
+    window = visits(0, 4, 1, WINDOW_SIZE)
+    again = prior.revisit(window, [room[index] for index in window.views], room.intrinsics)
+    (step,) = [call for call in calls(room) if call[0].current == 4]
+    first = prior.predict(*step, room.intrinsics)
+    now, before = again.points[1][..., 2], first.points[step[0].dense.index(4)][..., 2]
+    both = (now > 0) & (before > 0)
+    change = np.log(now[both] / before[both])
+    assert 0.002 < np.median(np.abs(change)) < 0.1
+    exact = Simulated(level=0)
+    frames = [room[index] for index in window.views]
+    truth = np.linalg.inv(room[0].T_world_camera) @ room[4].T_world_camera
+    np.testing.assert_allclose(exact.revisit(window, frames, room.intrinsics).T_anchor_view[-1], truth, atol=1e-9)
+
+
 def test_views_of_both_visits_are_of_the_past():
     assert visits(5, 90, 3, 10).views == (5, 2, 8, 87, 90) and visits(5, 90, 3, 10).inference == 81
     assert visits(1, 3, 3, 10).views == (1, 0, 3) and visits(1, 3, 3, 10).inference == 0
 
 
 def test_a_prior_with_a_memory_is_not_asked_out_of_order(folder, room):
-    prior = Simulated()
-    prior.is_sequential = True
+    class Remembering(Interrupted):
+        is_sequential, revisit = True, Prior.revisit
+
+    prior = Remembering()
     assert prior.revisit(visits(0, 4, 1, WINDOW_SIZE), [], room.intrinsics) is None
     assert record_visits(prior, room, WINDOW_SIZE, folder, [(0, 4)], 1) == 0

@@ -22,6 +22,7 @@ from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.registration.belief import certain
 from emgs_jax.report.back_end import counts, loop_list, metric_graph, revisit_note
 from emgs_jax.report.page_strip import loop_why
+from emgs_jax.running import correction
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.correction import correct, finish
 from emgs_jax.running.measuring import Look, chain_edge, map_edge
@@ -302,6 +303,25 @@ def test_of_a_closure_the_loops_with_most_inliers_are_asked_for(graph):
     end.verified = list(same)
     ask_again(end, same, ask)
     assert len(calls) == 1 and calls[0][0] == 6
+
+
+def test_what_is_known_already_takes_nobodys_turn(graph, monkeypatch):
+    """Four loops that the poses fit, with more inliers, were asked for, and a false one with less moved the poses."""
+    poses = ring()
+    end = with_keyframes(walked(graph, poses))
+    run = MappingRun(None, None, state=state_of(poses), back_end=end)
+    run.records = [FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0) for i, pose in enumerate(poses)]
+    known = [replace(loop(poses, row), num_inliers=90) for row in range(1, 5)]
+    false = [replace(loop(ring(1.9 * np.pi), row), num_inliers=40) for row in range(5, 9)]
+    end.verified = [*known, *false]
+    run.ask, calls = told_again(poses)
+    monkeypatch.setattr(BackEnd, "look_for_loops", lambda end, look: end.recent())
+    monkeypatch.setattr(BackEnd, "recent", lambda end: end.new(end.agreed()))
+    monkeypatch.setattr(correction, "looks_of", lambda given: [look(poses, COUNT - 1)])
+    monkeypatch.setattr(BackEnd, "add", lambda *_: None)
+    correct(run, SimpleNamespace(frames=[None]))
+    assert sorted(a for a, _ in calls) == [5, 6, 7] and end.accepted == []
+    assert error(end.poses, poses) == 0
 
 
 def test_a_loop_of_another_place_is_refused_by_the_prior(graph):

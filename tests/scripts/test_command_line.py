@@ -166,3 +166,15 @@ def test_a_signal_is_not_lost_wherever_the_program_is(number, code, place):
     gc.callbacks[:] = [one for one in gc.callbacks if one is not callback]
     assert ended.value.code == code
     assert [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)] == before
+
+
+def test_a_signal_that_is_ignored_stays_so():
+    """As of a job in the background of a script."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with clear_interrupt():
+            os.kill(os.getpid(), signal.SIGINT)
+            sum(range(10))
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)

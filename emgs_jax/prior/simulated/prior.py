@@ -22,7 +22,7 @@ is a sum of the beginning of one stream. So one inference alone gives the same b
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -44,8 +44,10 @@ from emgs_jax.prior.simulated.noise import (
     shared_normals,
     smooth_field,
 )
+from emgs_jax.prior.simulated.truth import check_frames, no_truth
 
 VERSIONS = (1, 2)
+REVISITS = 2**24  # more than any sequence has inferences
 MAX_LEVEL = 100.0  # depths are then off by a factor of twenty; far beyond, nothing is finite
 
 
@@ -126,7 +128,7 @@ class Simulated(Prior):
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Raise ValueError, before any work is done, where the data set has no truth to disturb."""
         if not dataset.has_ground_truth:
-            raise ValueError(_no_truth(f"{dataset.name} {dataset.sequence} has none"))
+            raise ValueError(no_truth(f"{dataset.name} {dataset.sequence} has none"))
         missing = [index for index in range(len(dataset)) if dataset.pose(index) is None]
         if missing:
             raise ValueError(
@@ -137,6 +139,16 @@ class Simulated(Prior):
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Disturb the truth of `frames` (in the order of `window.views`); see the module for how."""
+        return self._answer(window, frames, intrinsics, window.inference)
+
+    def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
+        """As `predict`, with noise of its own: the step that integrates the last view has the same number."""
+        return self._answer(window, frames, intrinsics, REVISITS * (1 + window.views[0]) + window.inference)
+
+    def _answer(
+        self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float], draw: int
+    ) -> PriorPrediction:
+        """The answer whose noise beside scale and window pose, which go on over inferences, is number `draw`."""
         compared = () if self.version == 1 else (window.views[0], window.views[_middle(window)])
         by_index = check_frames(window, frames, {*window.dense, *compared})
         drift = autoregressive(self.seed, window.inference, self.standard.autocorrelation, 7)
@@ -144,11 +156,11 @@ class Simulated(Prior):
         if self.version == 2:
             scale *= math.exp(self.level * self.standard.scale_walk * random_walk(self.seed, window.inference))
         is_held = self.version == 1 or self._is_held(frames[0], frames[_middle(window)], intrinsics)
-        T_anchor_view = self._poses(window, [frame.T_world_camera for frame in frames], drift[1:], is_held)
+        T_anchor_view = self._poses(window, [frame.T_world_camera for frame in frames], drift[1:], is_held, draw)
         T_anchor_view[:, :3, 3] *= scale
-        views = [self._geometry(window.inference, by_index[index], intrinsics, scale) for index in window.dense]
+        views = [self._geometry(draw, by_index[index], intrinsics, scale) for index in window.dense]
         points, confidence, mask = (np.stack(parts) for parts in zip(*views, strict=True))
-        features = np.stack([self._features(window.inference, by_index[index]) for index in window.dense])
+        features = np.stack([self._features(draw, by_index[index]) for index in window.dense])
         return PriorPrediction(window, T_anchor_view, points, confidence, mask, features)
 
     def _is_held(self, anchor: Frame, middle: Frame, intrinsics: Sequence[float]) -> bool:
@@ -157,7 +169,9 @@ class Simulated(Prior):
         shared = shared_points(anchor, middle, intrinsics, noise.shared_tolerance, noise.shared_columns)
         return shared >= noise.min_shared
 
-    def _poses(self, window: Window, truth: Sequence[np.ndarray], drift: np.ndarray, is_held: bool) -> np.ndarray:
+    def _poses(
+        self, window: Window, truth: Sequence[np.ndarray], drift: np.ndarray, is_held: bool, draw: int
+    ) -> np.ndarray:
         """Return the disturbed camera -> anchor poses (v, 4, 4), before the scale.
 
         Args:
@@ -165,6 +179,7 @@ class Simulated(Prior):
             truth: T_world_camera of its views.
             drift: (6,), of unit variance: the window's pose error.
             is_held: by the anchor.
+            draw: number of its noise.
         """
         noise, views = self.standard, window.views
         T_true = np.linalg.inv(np.asarray(truth[0], np.float64)) @ np.asarray(truth, np.float64)
@@ -179,15 +194,15 @@ class Simulated(Prior):
             rotation = max(rotation, self.level * noise.unheld_rotation)
         T_out[middle] = T_true[middle] @ rigid(drift, translation, rotation)
         for left in range(middle, len(views) - 1):
-            T_out[left + 1] = T_out[left] @ self._pair(window, left, T_true)
+            T_out[left + 1] = T_out[left] @ self._pair(window, left, T_true, draw)
         for left in range(middle - 1, 0, -1):
-            T_out[left] = T_out[left + 1] @ np.linalg.inv(self._pair(window, left, T_true))
+            T_out[left] = T_out[left + 1] @ np.linalg.inv(self._pair(window, left, T_true, draw))
         return T_out
 
-    def _pair(self, window: Window, left: int, T_true: np.ndarray) -> np.ndarray:
+    def _pair(self, window: Window, left: int, T_true: np.ndarray, draw: int) -> np.ndarray:
         """Return the disturbed relative pose (4, 4) of the views `left` and `left + 1`."""
         noise, pair = self.standard, window.views[left : left + 2]
-        xi = shared_normals((6,), (self.seed, Stream.PAIR, window.inference, *pair), noise.image_share)
+        xi = shared_normals((6,), (self.seed, Stream.PAIR, draw, *pair), noise.image_share)
         T_left_right = np.linalg.inv(T_true[left]) @ T_true[left + 1]
         return T_left_right @ rigid(xi, self.level * noise.pair_translation, self.level * noise.pair_rotation)
 
@@ -256,42 +271,6 @@ class Simulated(Prior):
         return features.astype(np.float16)
 
 
-def _no_truth(what: str) -> str:
-    return f"prior=simulated needs a data set with ground truth; use prior=recorded or another data set: {what}"
-
-
 def _middle(window: Window) -> int:
     """Place in `window.views` of the middle of the views after the anchor; of a lone view its own."""
     return min(1 + (len(window.views) - 1) // 2, len(window.views) - 1)
-
-
-def check_frames(window: Window, frames: Sequence[Frame], needed: Collection[int]) -> dict[int, Frame]:
-    """Return the frames by index; raise ValueError naming the first one whose truth cannot be used.
-
-    Args:
-        window: the question.
-        frames: of its views.
-        needed: indices of the frames whose depth is looked at.
-    """
-    indices = tuple(frame.index for frame in frames)
-    if indices != window.views:
-        raise ValueError(f"frames must be those of window.views {window.views} in that order, got {indices}")
-    for frame in frames:
-        label, pose, depth = f"frame {frame.index} ({frame.name})", frame.T_world_camera, frame.depth
-        if pose is None:
-            raise ValueError(_no_truth(f"{label} has no true pose"))
-        if np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
-            raise ValueError(f"the true pose of {label} must be a finite (4, 4) matrix: leave the frame out")
-        if frame.index in needed and depth is None:
-            raise ValueError(_no_truth(f"{label} has no depth"))
-        if depth is not None and depth.shape != frame.image.shape[:2]:
-            raise ValueError(
-                f"the depth of {label} must have its image's size {frame.image.shape[:2]}, got {depth.shape}"
-            )
-    if window.inference == 0 and not any((frame.depth > 0).any() for frame in frames if frame.index in needed):
-        raise ValueError(
-            _no_truth(
-                f"0 of the first {len(needed)} images, from {frames[0].name} on, have a true depth: it is 0 everywhere"
-            )
-        )
-    return dict(zip(indices, frames, strict=True))
