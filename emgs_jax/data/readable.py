@@ -103,6 +103,6 @@ def _check_truth(dataset: Dataset, kept: Sequence[int]) -> None:
         if step > MAX_STEP_M * (other - index):
             raise BadFrameError(
                 f"{dataset.name} {dataset.sequence}: the true pose of frame {kept[other]} is {step:.0f} m from that of "
-                f"frame {kept[index]}, and a walk has no step of more than {MAX_STEP_M:g} m: correct the trajectory, or "
-                "write nan where the pose is not known"
+                f"frame {kept[index]}, and a walk has no step of more than {MAX_STEP_M:g} m: correct the trajectory, "
+                "or write nan where the pose is not known"
             )
