@@ -31,7 +31,7 @@ def predict(config: DictConfig) -> Path:
 
     folder = Path(config.out)
     record(prior, dataset, config.slam.window_size, folder, progress)
-    if config.graph is not None:
+    if config.graph:
         _record_visits(prior, dataset, config, folder)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 2**20
     per_frame = f"{size / len(dataset):.2f} a frame"

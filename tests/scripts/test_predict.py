@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, compose, dataset
 
+import experiments.predict
 from emgs_jax.prior.base import windows
 from emgs_jax.prior.simulated.prior import Simulated
 from experiments.predict import predict
@@ -33,6 +34,16 @@ def test_the_recording_holds_what_the_prior_says_of_every_window(tmp_path, capsy
             np.testing.assert_array_equal(arrays["points"], expected.points)
             np.testing.assert_array_equal(arrays["T_anchor_view"], expected.T_anchor_view)
     assert len(list((tmp_path / "out").glob("0*.npz"))) == len(calls)
+
+
+def test_with_a_back_end_places_that_are_seen_twice_are_recorded_too(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(experiments.predict, "places_seen_twice", lambda *_: [(0, 4), (1, 5)])
+    folder = record(tmp_path / "out", "graph=default", "graph.revisit.spacing=1")
+    assert "2 windows with both visits of a place" in capsys.readouterr().out
+    names = sorted(path.name for path in folder.glob("visits_*"))
+    assert names == ["visits_000000_000001_000003_000004.npz", "visits_000001_000000_000002_000004_000005.npz"]
+    none = record(tmp_path / "none", "graph=default", "graph.revisit.is_asked=false")
+    assert not list(none.glob("visits_*")) and "visits" not in capsys.readouterr().out
 
 
 def test_recording_again_asks_only_for_what_is_missing(tmp_path):
