@@ -9,6 +9,7 @@ fault the exit status is 1 and the folder stays. `--first N --kills 1` repeats o
 
 import argparse
 import shutil
+import signal
 import sys
 import tempfile
 from collections import Counter
@@ -25,6 +26,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # programs inherit that it is ignored in the background
     work, faults, counts = Path(tempfile.mkdtemp(prefix="kills")), 0, Counter()
     wholes = {}
     for number in tqdm(range(given.first, given.first + given.kills), unit="run"):

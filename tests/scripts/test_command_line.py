@@ -1,5 +1,6 @@
 """What the command line says: the choices in its help, and one line with the remedy for a word that is wrong."""
 
+import contextlib
 import gc
 import os
 import re
@@ -139,6 +140,16 @@ class Going:
         sum(range(10))  # the handler runs here
 
 
+@contextlib.contextmanager
+def heard():
+    """Ctrl-C as in a terminal: what is started in the background of a script has it ignored, tests too."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 @pytest.mark.parametrize("place", ["collector", "object", "program"])
 def test_a_signal_is_not_lost_wherever_the_program_is(number, code, place):
@@ -153,7 +164,7 @@ def test_a_signal_is_not_lost_wherever_the_program_is(number, code, place):
             sum(range(10))
 
     before = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)]
-    with pytest.raises(SystemExit) as ended, clear_interrupt():
+    with heard(), pytest.raises(SystemExit) as ended, clear_interrupt():
         match place:
             case "collector":
                 gc.callbacks.append(callback)
