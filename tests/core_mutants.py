@@ -1,13 +1,6 @@
 """Plausible bugs of the core: small algebra, search, registration, the stages, rendering, and the step."""
 
-from mutant import Mutant
-
-
-def own(file: str, *tests: str):
-    """Mutants of one file: its own tests, then (text, what stands there instead, the bug) of each."""
-    paths = tuple(f"tests/{test}.py" for test in tests)
-    return lambda *changes: [Mutant(f"emgs_jax/{file}.py", before, after, paths, bug) for before, after, bug in changes]
-
+from mutant import Mutant, own
 
 OPS = [
     *own("ops/camera", "ops/test_camera")(

@@ -1,6 +1,6 @@
 """Plausible bugs of the host rooms: files, data, priors, evaluation, running, reports."""
 
-from mutant import Mutant
+from mutant import Mutant, own
 
 TRAJECTORY = ("tests/evaluation/test_trajectory.py",)
 LAYERS = ("tests/evaluation/test_layers.py",)
@@ -78,7 +78,6 @@ PATCHES = ("tests/features/test_patches.py",)
 STACKED = ("tests/running/test_stacked.py",)
 APPEARANCE = ("tests/loops/test_appearance.py",)
 VERIFICATION = ("tests/loops/test_verification.py",)
-REVISIT = ("tests/loops/test_revisit.py",)
 BACK_END = ("tests/running/test_back_end.py",)
 LOCATION = ("tests/loops/test_location.py",)
 PLACES = ("tests/running/test_places.py",)
@@ -489,26 +488,20 @@ MUTANTS = (
         VERIFICATION,
         "the reverse pose is brought into the wrong unit",
     ),
-    *(
-        Mutant("emgs_jax/loops/revisit.py", old, new, REVISIT, words)
-        for old, new, words in (
-            ("rescaled(told.T_a_b, np.exp(-ratios[0]))", "told.T_a_b", "the pose in the unit of the new inference"),
-            ("ratios[1] - ratios[0]", "ratios[0] - ratios[1]", "the ratio of the units is upside down"),
-            ("information = own + theirs", "information = own", "what the prior says makes a loop no more certain"),
-            ("np.linalg.inv(own) + other.covariance, error", "np.linalg.inv(own), error", "χ² of one of two errors"),
-            ("config.std_share * np.linalg.norm(T_a_b[:3, 3])", "0.0", "far visits are as sure as near ones"),
-        )
+    *own("loops/revisit", "loops/test_revisit")(
+        ("rescaled(told.T_a_b, np.exp(-ratios[0]))", "told.T_a_b", "the pose in the unit of the new inference"),
+        ("ratios[1] - ratios[0]", "ratios[0] - ratios[1]", "the ratio of the units is upside down"),
+        ("information = own + theirs", "information = own", "what the prior says makes a loop no more certain"),
+        ("np.linalg.inv(own) + other.covariance, error", "np.linalg.inv(own), error", "χ² of one of two errors"),
+        ("config.std_share * np.linalg.norm(T_a_b[:3, 3])", "0.0", "far visits are as sure as near ones"),
     ),
-    *(
-        Mutant("emgs_jax/running/revisiting.py", old, new, ("tests/running/test_back_end.py",), words)
-        for old, new, words in (
-            ("not in end.asked and", "is not None and", "each loop is asked for again and again"),
-            ("key=lambda loop: -loop", "key=lambda loop: loop", "those with fewest inliers"),
-            ("sorted(new, key=lambda loop: loop", "sorted(new, key=lambda loop: -loop", "the worst of a query"),
-            ("end.verified.pop(row)", "end.verified[row]", "a loop that the prior refuses stays one"),
-            ("end.contradicted.append(end.verified.pop(row))", "end.verified.pop(row)", "its company stays"),
-            ("ask(*(end.frames[node] for node in pair))", "ask(*pair)", "nodes are taken for frames"),
-        )
+    *own("running/revisiting", "running/test_back_end")(
+        ("not in end.asked and", "is not None and", "each loop is asked for again and again"),
+        ("key=lambda loop: -loop", "key=lambda loop: loop", "those with fewest inliers"),
+        ("sorted(new, key=lambda loop: loop", "sorted(new, key=lambda loop: -loop", "the worst of a query"),
+        ("end.verified.pop(row)", "end.verified[row]", "a loop that the prior refuses stays one"),
+        ("end.contradicted.append(end.verified.pop(row))", "end.verified.pop(row)", "its company stays"),
+        ("ask(*(end.frames[node] for node in pair))", "ask(*pair)", "nodes are taken for frames"),
     ),
     Mutant(
         "emgs_jax/loops/verification.py",

@@ -11,3 +11,9 @@ class Mutant(NamedTuple):
     after: str
     tests: tuple[str, ...]
     bug: str
+
+
+def own(file: str, *tests: str):
+    """Mutants of one file: its own tests, then (text, what stands there instead, the bug) of each."""
+    paths = tuple(f"tests/{test}.py" for test in tests)
+    return lambda *changes: [Mutant(f"emgs_jax/{file}.py", before, after, paths, bug) for before, after, bug in changes]

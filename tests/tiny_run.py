@@ -22,6 +22,10 @@ TINY = (
     *("render.tile_size=16", "render.tile_capacity=192", "slam.localization.icp.num_points=512"),
     f"slam.window_size={WINDOW_SIZE}",
 )
+SMALL_STEREO = (  # for images of 128 by 96; at this size a first window of 4 images leaves depths 15 % wrong
+    *("prior=multiview_stereo", "prior.structure.max_landmarks=192", "prior.structure.num_fixed=3"),
+    *("prior.dense.depth.sweep.num_planes=40", "prior.structure.matching.num_features=600"),
+)
 
 
 def compose(*overrides: str, name: str = "config"):

@@ -90,13 +90,13 @@ def _unreadable(read: Callable[[int], Frame], indices: Iterable[int]) -> dict[in
 def _check_truth(dataset: Dataset, kept: Sequence[int]) -> None:
     """Raise BadFrameError for the first true pose that is damaged or far from the one before, ValueError if none is."""
     poses = [dataset.pose(index) for index in kept]  # all of them, before the first frame
-    if dataset.has_ground_truth and all(pose is None for pose in poses):
+    if not dataset.has_ground_truth:  # what is known may have another unit
+        return
+    if all(pose is None for pose in poses):
         raise ValueError(
             f"{dataset.name} {dataset.sequence}: 0 of {len(kept)} images have a true pose: fetch the trajectory again, "
             "or choose other images (dataset.start, stop, stride)"
         )
-    if not dataset.has_ground_truth:  # what is known may have another unit
-        return
     known = [(row, pose[:3, 3]) for row, pose in enumerate(poses) if pose is not None]
     for (index, place), (other, next_place) in itertools.pairwise(known):
         step = float(np.linalg.norm(next_place - place))

@@ -246,7 +246,11 @@ class BackEnd:
         """Whether some loop says what is not so, and the last closure is long enough ago."""
         last = self.closures[-1].time if self.closures else -self.config.min_frames
         is_due = len(self.poses) - 1 - last >= self.config.min_frames
-        return is_due and any(self.misfit(loop) > self.config.max_known for loop in loops)
+        return is_due and bool(self.news(loops))
+
+    def news(self, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
+        """Those that say what is not so at the poses as they are."""
+        return [loop for loop in loops if self.misfit(loop) > self.config.max_known]
 
     def misfit(self, loop: LoopMeasurement) -> float:
         """χ² of a loop at the poses and scales as they are."""

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from emgs_jax.loops.verification import LoopMeasurement
-from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.inputs import Input
 from emgs_jax.running.locating import looks_of
 from emgs_jax.running.record import FOUND, PLACED, SEGMENT, MappingRun, row_of_first_node
@@ -30,7 +28,7 @@ def correct(run: MappingRun, given: Input) -> None:
     num_contradicted = len(end.contradicted)
     found = end.look_for_loops(looks[-1])
     if end.wants_to_close(found):
-        ask_again(end, [loop for loop in found if end.misfit(loop) > end.config.max_known], run.ask)
+        ask_again(end, end.news(found), run.ask)
         found = end.recent()
     has_retracted = len(end.contradicted) > num_contradicted and end.retract(end.agreed()) > 0
     if has_retracted or end.wants_to_close(found):
@@ -44,17 +42,13 @@ def finish(run: MappingRun) -> None:
     Nothing where no loop says what is not so: among themselves frames and map fit better as they were placed.
     """
     end = run.back_end
-    ask_again(end, _news(end), run.ask)
-    has_retracted = end.retract(end.agreed()) > 0
-    loops = _news(end)
+    ask_again(end, end.news(end.new(end.agreed())), run.ask)
+    agreed = end.agreed()
+    has_retracted = end.retract(agreed) > 0
+    loops = end.news(end.new(agreed))
     if has_retracted or end.accepted or loops:
         run.state = end.close(run.state, loops)
         _take_poses(run)
-
-
-def _news(end: BackEnd) -> list[LoopMeasurement]:
-    """Loops that others agree with and that say what is not so."""
-    return [loop for loop in end.new(end.agreed()) if end.misfit(loop) > end.config.max_known]
 
 
 def _take_poses(run: MappingRun) -> None:

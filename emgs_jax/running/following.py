@@ -10,7 +10,7 @@ from emgs_jax.graph.deform import DeformConfig, deform, deform_view
 from emgs_jax.graph.measurements import Nodes
 from emgs_jax.slam import SlamState
 
-_deform, _deform_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)
+move_map, _move_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)  # a map is compiled for once
 
 
 def follow(state: SlamState, before: Nodes, after: Nodes, min_std: float, config: DeformConfig) -> SlamState:
@@ -18,8 +18,8 @@ def follow(state: SlamState, before: Nodes, after: Nodes, min_std: float, config
     last = state.time - 1
     return replace(
         state,
-        map=_deform(state.map, before, after, jnp.asarray(min_std, jnp.float32), config),
-        previous=_deform_view(state.previous, before, after, last),
+        map=move_map(state.map, before, after, jnp.asarray(min_std, jnp.float32), config),
+        previous=_move_view(state.previous, before, after, last),
         T_world_previous=_moved_pose(state.T_world_previous, before, after, int(last)),
     )
 

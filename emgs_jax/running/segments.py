@@ -8,12 +8,10 @@ newer one moves, poses, scales and Gaussians. What never met is left out at the 
 from collections import Counter
 from dataclasses import replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.graph.deform import deform
 from emgs_jax.graph.measurements import ODOMETRY
 from emgs_jax.loops.location import Location
 from emgs_jax.loops.two_views import rescaled
@@ -21,15 +19,13 @@ from emgs_jax.observation import Prediction
 from emgs_jax.registration.belief import Belief
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.convert import FirstWindow, to_se3
-from emgs_jax.running.following import follow
+from emgs_jax.running.following import follow, move_map
 from emgs_jax.running.growth import advance, start, with_part
 from emgs_jax.running.inputs import Input, PlacedStructure
 from emgs_jax.running.locating import anchored_by, as_prediction, found_at, looks_of, refusal
 from emgs_jax.running.measuring import Edge
 from emgs_jax.running.record import UNJOINED, FrameRecord, MappingRun, row_of_first_node, to_matrix
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
-
-_deform = eqx.filter_jit(deform)
 
 
 def predicted(run: MappingRun, given: Input) -> Prediction:
@@ -141,7 +137,7 @@ def join(run: MappingRun, given: Input) -> None:
     other = run.aside[there]
     run.aside = {one: state for one, state in run.aside.items() if one != there}
     state = follow(run.state, before, after, end.min_std, end.config.deform)
-    moved = _deform(other.map, before, after, jnp.asarray(end.min_std), end.config.deform)
+    moved = move_map(other.map, before, after, jnp.asarray(end.min_std, jnp.float32), end.config.deform)
     map, run.config = with_part(state.map, moved, run.config)
     run.state = replace(state, map=map)
     if here == newer:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.tiny_run import TINY
+from tests.tiny_run import SMALL_STEREO, TINY
 
 from .folders import digest, faults, lost, outputs
 
@@ -28,8 +28,7 @@ class Program:
 
 SETTINGS = ("dataset.stop=12", "prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=256")
 STEREO = (  # a prior with a memory
-    *("prior=multiview_stereo", "prior.structure.max_landmarks=192", "prior.structure.num_fixed=3"),
-    *("prior.dense.depth.sweep.num_planes=40", "prior.structure.matching.num_features=600"),
+    *SMALL_STEREO,
     *("dataset.size=[128,96]", "dataset.stop=10", "slam.window_size=5", "checkpoint.every=2"),
 )
 GATE = "slam.em.max_mahalanobis_sq"

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scene import compose
 from stereo_scene import similarity_error
+from tiny_run import SMALL_STEREO
 
 from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.io.files import jsonable
@@ -17,11 +18,7 @@ from emgs_jax.running.clock import Clock
 from emgs_jax.running.convert import to_first_window, to_se3
 from emgs_jax.running.inputs import predictions
 
-WINDOW_SIZE, NUM_FRAMES = 5, 8  # at this size a first window of 4 images leaves depths 15 % wrong
-SMALL = (
-    *("prior=multiview_stereo", "prior.structure.max_landmarks=192", "prior.structure.num_fixed=3"),
-    *("prior.dense.depth.sweep.num_planes=40", "prior.structure.matching.num_features=600"),
-)
+WINDOW_SIZE, NUM_FRAMES = 5, 8
 
 
 class Edited:
@@ -46,7 +43,7 @@ class Edited:
 
 
 def make_prior(*overrides):
-    return hydra.utils.instantiate(compose(*SMALL, *overrides).prior)
+    return hydra.utils.instantiate(compose(*SMALL_STEREO, *overrides).prior)
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +111,7 @@ def test_an_answer_obeys_the_protocol(room, answered, answered_by):
         got = {name: (getattr(answer, name).dtype, getattr(answer, name).shape) for name in expected}
         assert got == expected
         assert answer.confidence.min() >= 1 and not answer.points[~answer.mask].any()
-        confirmed = 1 + compose(*SMALL).prior.dense.min_support
+        confirmed = 1 + compose(*SMALL_STEREO).prior.dense.min_support
         assert answer.mask.any() and (answer.confidence[answer.mask] >= confirmed).all()
         x, y, z = np.moveaxis(answer.points, -1, 0)
         z_or_1 = np.where(answer.mask, z, 1)
@@ -157,7 +154,7 @@ def test_a_recording_that_was_interrupted_is_completed_to_the_same_bits(tmp_path
                 raise KeyboardInterrupt
             return super().predict(window, frames, intrinsics)
 
-    config = compose(*SMALL).prior
+    config = compose(*SMALL_STEREO).prior
     parts = [hydra.utils.instantiate(config[name]) for name in ("structure", "dense")]
     with pytest.raises(KeyboardInterrupt):
         record(Interrupted(*parts), room, WINDOW_SIZE, tmp_path)
@@ -308,7 +305,7 @@ def test_a_window_too_short_to_confirm_a_depth_is_refused(room):
 
 
 def test_the_provenance_holds_every_value_of_the_config_as_json_writes_it():
-    config = compose(*SMALL)
+    config = compose(*SMALL_STEREO)
     settings = make_prior().provenance.settings
 
     def without_targets(node):
