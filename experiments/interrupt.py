@@ -6,9 +6,10 @@ import os
 import signal
 import sys
 import threading
+import time
 import weakref
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from types import FrameType
 
 
@@ -42,6 +43,18 @@ def _is_lost(frame: FrameType | None) -> bool:
     return False
 
 
+def _wait_for_threads(numbers: Iterable[int]) -> None:
+    """Wait for threads that Python has given up; it waits for all others itself. The same signal again ends at once.
+
+    Python before 3.13 takes a thread for ended where the `join` of it was interrupted. What such a thread computes is
+    taken from under it as the program ends, and the program ends with SIGSEGV.
+    """
+    for number in numbers:
+        signal.signal(number, lambda number, _: os._exit(128 + number))
+    while not all(thread.is_alive() for thread in threading.enumerate()):
+        time.sleep(AGAIN)
+
+
 @contextlib.contextmanager
 def clear_interrupt() -> Iterator[None]:
     """End the program with one word on Ctrl-C or SIGTERM; HYDRA_FULL_ERROR=1 shows where it was."""
@@ -55,6 +68,7 @@ def clear_interrupt() -> Iterator[None]:
             raise
         is_terminated = isinstance(interrupt, Terminated)
         print("terminated" if is_terminated else "interrupted", file=sys.stderr)
+        _wait_for_threads(heard)
         raise SystemExit(128 + (signal.SIGTERM if is_terminated else signal.SIGINT)) from None  # as shells have it
     finally:
         for number, handler in before.items():

@@ -8,7 +8,9 @@ import shlex
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -177,6 +179,36 @@ def test_a_signal_is_not_lost_wherever_the_program_is(number, code, place):
     gc.callbacks[:] = [one for one in gc.callbacks if one is not callback]
     assert ended.value.code == code
     assert [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)] == before
+
+
+def test_no_thread_computes_after_an_interrupt():
+    """Python 3.11 takes a thread for ended whose `join` was interrupted, and the program ended with SIGSEGV."""
+    done = threading.Event()
+
+    def compute():
+        time.sleep(0.5)
+        done.set()
+
+    with heard(), pytest.raises(SystemExit), clear_interrupt(), ThreadPoolExecutor(1) as threads:
+        threads.submit(compute)
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+    assert done.is_set()
+
+
+def test_the_same_signal_again_ends_at_once():
+    """Who presses Ctrl-C twice does not wait for a thread."""
+    words = "import threading, time; from experiments.interrupt import clear_interrupt\n"
+    words += "with clear_interrupt():\n thread = threading.Thread(target=time.sleep, args=(60,)); thread.start()\n"
+    words += " print('begun', flush=True); thread.join()"
+    with heard():
+        process = subprocess.Popen([sys.executable, "-c", words], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout.readline() == b"begun\n"
+    time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    assert process.stderr.readline() == b"interrupted\n"
+    time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(10) == 130
 
 
 def test_a_signal_that_is_ignored_stays_so():
