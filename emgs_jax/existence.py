@@ -95,7 +95,9 @@ def judge(
     With d the depths that the frame shows round the Gaussian's pixel, z its own and
     σ² = (depth_noise · z)² + n'Σn, it is seen where |z - min d| <= kσ or |z - max d| <= kσ, and seen through where
     z < min d - kσ. What is behind is occluded, and what is between, at an edge, may be either: that says nothing.
-    One that is seen is confirmed by what it explains. One that is seen while others explain all points there only
+    What is not seen through is confirmed by points that it explains, however flat the look and however near an edge:
+    there the depth round its pixel shows nothing, and a floor behind a table would never be confirmed. One that is seen
+    while others explain all points there only
     repeats what the map knows, as the second layer of a wall does: that speaks against it, or a map would grow for as
     long as one looks. What is confirmed must be as wide as a pixel for that: a view from afar has no point for each.
 
@@ -126,7 +128,7 @@ def judge(
     spread = 0.5 * (jnp.trace(gaussians.covs, axis1=-2, axis2=-1) - variance)  # variance along the surface
     has_points = spread >= (depth / camera.focal[0]) ** 2
     is_superfluous = is_seen & (use < 0) & (has_points | (map.existence <= 0))
-    change = config.hit * (is_seen & (use > 0)) - config.miss * (is_seen_through | is_superfluous)
+    change = config.hit * ((use > 0) & ~is_seen_through) - config.miss * (is_seen_through | is_superfluous)
     existence = jnp.clip(map.existence + change, -config.max_log_odds, config.max_log_odds)
     existence = jnp.where(change == 0, map.existence, existence)
     judged = eqx.tree_at(lambda m: m.existence, map, existence)

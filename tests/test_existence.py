@@ -48,7 +48,7 @@ def map_of(*parts: Gaussians, existence=0.5, weight=1.0) -> GaussianMap:
 
 
 def used(map: GaussianMap):
-    """As if the frame had been fused into every Gaussian."""
+    """As if the frame had been fused into every Gaussian; negated, into none of them."""
     return jnp.ones(map.existence.shape, jnp.int32)
 
 
@@ -115,11 +115,25 @@ def test_what_is_on_the_surface_and_explains_nothing_goes_but_what_a_view_from_a
     np.testing.assert_array_equal(after.gaussians.valid, [False, False, True, True, False, True])
 
 
-@pytest.mark.parametrize("use", [-1, 1])
-def test_use_elsewhere_says_nothing_of_what_is_hidden(settings, use):
-    map = map_of(discs((0, 0, 4.0)), existence=-1.9)
-    after, _ = judged(map, jnp.array([use]), look(3.0), HERE, CAMERA, NOISE, settings)
-    assert_same(after, map)
+@pytest.mark.parametrize("use", [-1, 0, 1])
+@pytest.mark.parametrize("place", ["hidden", "flat", "edge"])
+def test_what_shows_nothing_is_confirmed_by_what_it_explains_and_by_nothing_else(settings, place, use):
+    """Behind the wall; a floor in a flat look; and between the two depths of an edge."""
+    depth, mean, normal = 3.0, (0, 0, 4.0), (0, 0, -1.0)
+    if place == "flat":
+        mean, normal = (0, 0, 3.0), (0, np.sqrt(1 - 0.1**2), -0.1)
+    if place == "edge":
+        depth, mean = np.where(np.arange(CAMERA.width) < CAMERA.width // 2, 2.0, 4.0), (0, 0, 3.0)
+    map = map_of(discs(mean, normal), existence=-1.0)
+    after, is_seen = judged(map, jnp.array([use]), look(depth), HERE, CAMERA, NOISE, settings)
+    assert not is_seen.any()
+    np.testing.assert_allclose(after.existence, [-1.0 + (settings.hit if use > 0 else 0.0)], atol=1e-6)
+
+
+def test_what_is_seen_through_is_not_confirmed_by_what_it_explains(settings):
+    map = map_of(discs((0, 0, 2.0)))
+    after, _ = judged(map, used(map), look(3.0), HERE, CAMERA, NOISE, settings)
+    np.testing.assert_allclose(after.existence, map.existence - settings.miss, atol=1e-6)
 
 
 def test_usefulness_is_what_a_frame_fused_into_each_row_of_its_submap():
@@ -145,18 +159,20 @@ SILENT = {
 def test_a_look_that_says_nothing_changes_nothing(settings, reason):
     mean, normal, depth, valid = SILENT[reason]
     map = map_of(discs(mean, normal, std=0.02), existence=-1.9)
-    after, is_seen = judged(map, used(map), look(depth, valid), HERE, CAMERA, NOISE, settings)
+    after, is_seen = judged(map, -used(map), look(depth, valid), HERE, CAMERA, NOISE, settings)
     assert_same(after, map)
     assert not is_seen.any()
 
 
-@pytest.mark.parametrize(("offset", "change"), [(-0.25, -1), (-0.15, 1), (0.15, 1), (0.25, 0)])
-def test_three_standard_deviations_decide(settings, offset, change):
+@pytest.mark.parametrize(
+    ("offset", "of_use", "of_none"), [(-0.25, -1, -1), (-0.15, 1, -1), (0.15, 1, -1), (0.25, 1, 0)]
+)
+def test_three_standard_deviations_decide(settings, offset, of_use, of_none):
     """Two percent of 3 m and 3 mm of the Gaussian: 3σ = 18 cm; a pixel and its neighbours differ by nothing."""
     map = map_of(discs((0, 0, 3.0 + offset)), existence=0.0)
-    map, _ = judged(map, used(map), look(3.0), HERE, CAMERA, NOISE, settings)
-    expected = {-1: -settings.miss, 0: 0.0, 1: settings.hit}[change]
-    np.testing.assert_allclose(map.existence, expected)
+    for use, change in ((1, of_use), (-1, of_none)):
+        after, _ = judged(map, use * used(map), look(3.0), HERE, CAMERA, NOISE, settings)
+        np.testing.assert_allclose(after.existence, {-1: -settings.miss, 0: 0.0, 1: settings.hit}[change])
 
 
 def test_depth_range_is_of_the_pixel_and_its_neighbours():
@@ -272,6 +288,6 @@ def test_as_printed_nothing_changes_by_a_bit(config):
 
 def test_a_frame_that_is_not_tracked_says_nothing(settings):
     map = map_of(discs(WALL), discs(SLAB), existence=-1.9)
-    after, is_seen = judged(map, used(map), look(3.0, valid=False), HERE, CAMERA, jnp.asarray(0.0), settings)
+    after, is_seen = judged(map, -used(map), look(3.0, valid=False), HERE, CAMERA, jnp.asarray(0.0), settings)
     assert_same(after, map)
     assert not is_seen.any()

@@ -187,7 +187,7 @@ VERBS = {
         lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),
     ),
     "densify": (
-        lambda g, T: densify.densify(g, T, CAMERA, densify.DensifyConfig(0.05, 0.3, CONFIG.refinement.render)),
+        lambda g, T: densify.densify(g, T, CAMERA, densify.DensifyConfig(0.05, 0.3, 0.0, CONFIG.refinement.render)),
         lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),
     ),
     "continued": (

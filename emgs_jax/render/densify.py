@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, unproject
-from emgs_jax.ops.linalg import safe_normalize
+from emgs_jax.ops.linalg import outer, safe_normalize, tangent_basis
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import traced
 from emgs_jax.render.composite import (
@@ -30,11 +30,13 @@ class DensifyConfig(eqx.Module):
     Args:
         surface_depth: fraction of the depth; splats within it of the front belong to one surface.
         min_alpha: a pixel with less coverage has no depth.
+        min_std: m; the floor of the covariances, which is not drawn along the surface, see `without_floor`.
         render: how the front is found.
     """
 
     surface_depth: Float[Array, "*b"] = traced(low=0)
     min_alpha: Float[Array, "*b"] = traced(low=0, high=1)
+    min_std: Float[Array, "*b"] = traced(low=0, high=1000)
     render: RenderConfig
 
 
@@ -71,7 +73,7 @@ def densify(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, co
         surface = jnp.where(in_front_surface(weights, depth, config.surface_depth), nearness, 0.0)
         return weighted_sums(weights, depth, values), weighted_sums(surface, depth, values)
 
-    splats = splats_of(gaussians, T_world_camera, camera, drawn)
+    splats = splats_of(without_floor(gaussians, config.min_std), T_world_camera, camera, drawn)
     (whole, surface), overflow = draw_tiles(splats, values, camera, drawn, blend)
     rendering = rendering_of(*whole, overflow, drawn)
     values_sum, weight, depth_sum, _ = surface
@@ -87,6 +89,22 @@ def densify(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, co
         covered=covered,
         rendering=rendering,
     )
+
+
+def without_floor(gaussians: Gaussians, min_std: Float[Array, ""]) -> Gaussians:
+    """The Gaussians as wide along their surfaces as their points lie: Σ - min(σ², λ) (I - nn').
+
+    A fit adds the floor σ² = `min_std`² in all directions, so that each covariance can be inverted. Drawn, it makes the
+    borders of near things a pixel or two too wide. λ is the smaller variance along the surface: what has no floor, or
+    another one, is not turned inside out.
+    """
+    basis = tangent_basis(gaussians.normals)
+    along = jnp.einsum("nda,ndc,ncb->nab", basis, gaussians.covs, basis)
+    half_difference = 0.5 * (along[:, 0, 0] - along[:, 1, 1])
+    smaller = 0.5 * jnp.trace(along, axis1=-2, axis2=-1) - jnp.hypot(half_difference, along[:, 0, 1])
+    floor = jnp.minimum(min_std**2, jnp.maximum(smaller, 0.0))
+    plane = jnp.eye(3) - outer(gaussians.normals)
+    return eqx.tree_at(lambda g: g.covs, gaussians, gaussians.covs - floor[:, None, None] * plane)
 
 
 def in_front_surface(

@@ -8,8 +8,9 @@ import pytest
 from scene import at, move_gaussians, pose
 
 from emgs_jax.gaussians import Gaussians
+from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import render
-from emgs_jax.render.densify import DensifyConfig, densify, in_front_surface
+from emgs_jax.render.densify import DensifyConfig, densify, in_front_surface, without_floor
 
 dense = eqx.filter_jit(densify)
 
@@ -28,7 +29,7 @@ def wall(depth: float, normal=(0.0, 0.0, -1.0), step: float = 0.15) -> Gaussians
 
 @pytest.fixture(scope="module")
 def densify_config(config):
-    return DensifyConfig(0.05, 0.3, config("render.tile_capacity=600").refinement.render)
+    return DensifyConfig(0.05, 0.3, 0.0, config("render.tile_capacity=600").refinement.render)
 
 
 def test_the_points_of_a_slanted_wall_lie_on_it_with_its_normal_and_colour(camera, densify_config):
@@ -58,6 +59,43 @@ def test_the_map_is_drawn_with_the_coverage_of_densification(camera, densify_con
     assert (covered | ~np.asarray(view.valid)).all() and covered.sum() > view.valid.sum()
     np.testing.assert_allclose(np.asarray(view.points)[covered][:, 2], 2.0, atol=2e-3)  # about where the map begins
     np.testing.assert_array_equal(np.asarray(view.depth) > 0, covered)
+
+
+def test_the_floor_of_a_fit_is_not_drawn_along_the_surface():
+    """Four points fitted with a floor, one of no extent, and a covariance that has no floor."""
+    normal, floor = np.array([0.6, 0.0, -0.8]), 0.01
+    along = np.stack([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0]])
+    spread = [(along.T * variances) @ along for variances in ((0.03**2, 0.02**2), (0.0, 0.0))]
+    covs = np.stack(
+        [*(one + floor**2 * np.eye(3) for one in spread), spread[0] / 100 + 1e-4 * np.outer(normal, normal)]
+    )
+    rows = np.tile([0.0, 0, 2], (3, 1)), covs, np.zeros((3, 3)), np.tile(normal, (3, 1))
+    found = without_floor(
+        Gaussians(*(jnp.asarray(a, jnp.float32) for a in rows), jnp.zeros((3, 0)), jnp.ones(3, bool)),
+        jnp.asarray(floor),
+    )
+    across = floor**2 * np.outer(normal, normal)
+    np.testing.assert_allclose(found.covs[:2], [one + across for one in spread], atol=1e-9)
+    np.testing.assert_allclose(np.linalg.eigvalsh(found.covs[2]), [0.0, 0.003**2 - 0.002**2, 1e-4], atol=1e-9)
+    same = without_floor(found, jnp.zeros(()))
+    np.testing.assert_array_equal(same.covs, found.covs)
+
+
+def test_a_near_thing_is_drawn_no_wider_than_its_points(densify_config):
+    """A board of 20 cm at 1 m before a wall, a pixel being 4 mm; with the floor of 1 cm it is five too wide a side."""
+    near = Camera(jnp.array([250.0, 250.0]), jnp.array([59.5, 15.5]), 120, 32)
+    rows = [
+        jnp.asarray(a, jnp.float32) for a in np.meshgrid(np.arange(-0.095, 0.1, 0.01), np.arange(-0.095, 0.1, 0.01))
+    ]
+    means = jnp.stack([row.reshape(-1) for row in (*rows, jnp.ones_like(rows[0]))], -1)
+    spread = 0.005**2 * jnp.diag(jnp.array([1.0, 1, 0])) + 0.01**2 * jnp.eye(3)
+    count = len(means)
+    normals, colors = jnp.tile(jnp.array([0.0, 0, -1]), (count, 1)), jnp.ones((count, 3))
+    covs, valid = jnp.tile(spread, (count, 1, 1)), jnp.ones(count, bool)
+    board = Gaussians(means, covs, colors, normals, jnp.zeros((count, 0)), valid)
+    map = joined(wall(2.0), board)
+    wide, narrow = (dense(map, pose(), near, at(densify_config, "min_std", std)).depth[16] for std in (0.0, 0.01))
+    assert (int((narrow < 1.5).sum()), int((wide < 1.5).sum())) == (52, 63)
 
 
 def joined(*parts: Gaussians) -> Gaussians:
