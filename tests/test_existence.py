@@ -276,6 +276,16 @@ def test_of_three_layers_the_two_that_chose_each_other_become_one(settings):
     np.testing.assert_allclose(after.gaussians.means[::2, 2], [2.005, 2.035], atol=1e-6)
 
 
+def test_nothing_stands_behind_what_is_itself_as_thick(settings):
+    """Layers of 20, 3 and 20 mm at 3, 3.038 and 2.94 m: of the first and the second neither is a sheet behind."""
+    map = map_of(discs([(0, 0, 3.0), (0, 0, 3.038), (0, 0, 2.94)]))
+    thickness = jnp.array([0.02, 0.003, 0.02])
+    map = eqx.tree_at(lambda m: m.gaussians.covs, map, map.gaussians.covs.at[:, 2, 2].set(thickness**2))
+    after = joined(map, map.gaussians.valid, HERE, jnp.asarray(0.01), settings)
+    np.testing.assert_array_equal(after.gaussians.valid, [True, True, False])
+    np.testing.assert_allclose(after.gaussians.means[:2, 2], [2.97, 3.038], atol=1e-6)
+
+
 def test_as_printed_nothing_changes_by_a_bit(config):
     printed = config("slam/existence=paper").existence
     map = map_of(discs(WALL), discs(SLAB), existence=float(printed.birth))
