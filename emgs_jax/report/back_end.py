@@ -12,7 +12,7 @@ from emgs_jax.graph.measurements import Graph
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.running.back_end import BackEnd, Refusal
 from emgs_jax.running.measuring import stacked
-from emgs_jax.running.revisiting import MEASURED, SILENT
+from emgs_jax.running.revisiting import MEASURED, SILENT, UNUSABLE
 
 
 def metric_graph(end: BackEnd) -> Graph:
@@ -68,6 +68,7 @@ def counts(end: BackEnd) -> dict[str, Any]:
         "loops/contradicted": sum(loop.b >= end.first for loop in end.contradicted),
         "loops/accepted": sum(loop.b >= end.first for loop in end.accepted),
         "loops/measured_again": sum(told == MEASURED for told in end.asked.values()),
+        "loops/unusable_answers": sum(told == UNUSABLE for told in end.asked.values()),
         "loops/closures": sum(not closure.info.reason for closure in solved),
         "loops/closures_refused": sum(bool(closure.info.reason) for closure in solved),
     } | refused

@@ -338,13 +338,23 @@ def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
     assert "the prior, asked for both together, says otherwise" in loop_why(line)
 
 
+def test_an_answer_without_a_pose_is_none_and_is_counted(graph):
+    truth = ring()
+    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
+    end.verified = [loop(truth, row) for row in range(1, 5)]
+    loops, (ask, _) = list(end.verified), told_again(truth)
+    ask_again(end, loops[:1], lambda a, b: replace(ask(a, b), T_a_b=np.full((4, 4), np.nan)))
+    assert end.verified == loops and counts(end)["loops/unusable_answers"] == 1
+    assert counts(end)["loops/measured_again"] == 0 and revisit_note(end, is_sequential=False) == []
+
+
 def test_a_loop_for_which_the_prior_has_no_word_and_one_of_another_run_stay(graph):
     truth = ring()
     end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
     end.verified = [loop(truth, row) for row in range(1, 5)]
     loops = list(end.verified)
     ask_again(end, loops[:2], lambda a, b: None)
-    assert counts(end)["loops/measured_again"] == 0
+    assert counts(end)["loops/measured_again"] == counts(end)["loops/unusable_answers"] == 0
     (note,) = revisit_note(end, is_sequential=False)
     assert note.startswith("loops: 2 were measured by keypoints alone") and "graph=default" in note
     assert revisit_note(end, is_sequential=True) == revisit_note(None, is_sequential=False) == []
