@@ -9,7 +9,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import GaussianMap, without
-from emgs_jax.gaussians import blend, has_feature
+from emgs_jax.gaussians import Gaussians, blend, has_feature
 from emgs_jax.observation import Observation, depth_in
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.linalg import inverse_3x3, mahalanobis_sq, outer
@@ -137,11 +137,7 @@ def judge(
 
 @full_precision
 def join_layers(
-    map: GaussianMap,
-    is_seen: Bool[Array, "n"],
-    T_world_camera: jaxlie.SE3,
-    depth_noise: Float[Array, ""],
-    config: ExistenceConfig,
+    map: GaussianMap, is_seen: Bool[Array, "n"], noise: Float[Array, "n"], config: ExistenceConfig
 ) -> GaussianMap:
     """Make one of every two Gaussians of a surface that a look cannot tell apart and that are each other's nearest.
 
@@ -151,11 +147,10 @@ def join_layers(
     Args:
         map: of which the submap is enough.
         is_seen: Gaussians that may be joined.
-        T_world_camera: of the look.
-        depth_noise: as a fraction of the depth.
+        noise: m; of the look along each one's normal, see `noise_along`.
         config: gates.
     """
-    partner, is_pair = nearest_layers(map, is_seen, T_world_camera, depth_noise, config)
+    partner, is_pair = nearest_layers(map, is_seen, noise, config)
     old, other, rows = map.gaussians, take_rows(map, partner), jnp.arange(partner.shape[0])
     is_heavier = (map.weight > other.weight) | ((map.weight == other.weight) & (rows < partner))
     share = other.weight / jnp.maximum(map.weight + other.weight, jnp.finfo(jnp.float32).tiny)
@@ -175,12 +170,42 @@ def join_layers(
     return without(map, is_pair & ~is_heavier)
 
 
+def noise_along(
+    gaussians: Gaussians, origins: Float[Array, "*#n 3"], depth_noise: Float[Array, ""]
+) -> Float[Array, "n"]:
+    """Standard deviation (m) along each normal of what is seen from `origins` with a noise along the ray."""
+    return depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - origins))
+
+
+@full_precision
+def merge_layers(
+    map: GaussianMap, origins: Float[Array, "n 3"], depth_noise: Float[Array, ""], config: ExistenceConfig
+) -> GaussianMap:
+    """Join the layers of a whole map that has moved, until none are left that are each other's nearest.
+
+    Where two visits come to lie on each other nobody looks again: each Gaussian is seen from where it was made.
+
+    Args:
+        map: all Gaussians, world frame.
+        origins: of the camera by which each was made, world frame.
+        depth_noise: as a fraction of the depth.
+        config: gates; with `max_mahalanobis_sq` and `max_layer_sq` 0 the map stays as it is.
+    """
+
+    def is_left(state: tuple[GaussianMap, Bool[Array, ""]]) -> Bool[Array, ""]:
+        return state[1]
+
+    def once(state: tuple[GaussianMap, Bool[Array, ""]]) -> tuple[GaussianMap, Bool[Array, ""]]:
+        map, _ = state
+        noise = noise_along(map.gaussians, origins, depth_noise)
+        joined = join_layers(map, map.gaussians.valid, noise, config)
+        return joined, jnp.any(joined.gaussians.valid != map.gaussians.valid)
+
+    return jax.lax.while_loop(is_left, once, (map, jnp.asarray(True)))[0]
+
+
 def nearest_layers(
-    map: GaussianMap,
-    is_seen: Bool[Array, "n"],
-    T_world_camera: jaxlie.SE3,
-    depth_noise: Float[Array, ""],
-    config: ExistenceConfig,
+    map: GaussianMap, is_seen: Bool[Array, "n"], noise: Float[Array, "n"], config: ExistenceConfig
 ) -> tuple[Int[Array, "n"], Bool[Array, "n"]]:
     """The nearest other layer of every Gaussian, and whether it is that one's nearest, too.
 
@@ -194,7 +219,7 @@ def nearest_layers(
     near = jax.tree.map(lambda leaf: leaf[rows], gaussians)
     offsets, normals = near.means - gaussians.means[:, None], gaussians.normals[:, None]
     both = gaussians.covs[:, None] + near.covs
-    noise = depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - T_world_camera.translation()))[:, None]
+    noise = noise[:, None]
 
     def distance_under(variance: Float[Array, "n #k"]) -> Float[Array, "n k"]:
         return mahalanobis_sq(offsets, inverse_3x3(both + variance[..., None, None] * outer(normals)))

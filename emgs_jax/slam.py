@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from emgs_jax.continuation import ContinuationConfig, continued
 from emgs_jax.em import EmConfig, EmInfo, em_update, owners
-from emgs_jax.existence import ExistenceConfig, join_layers, judge, usefulness
+from emgs_jax.existence import ExistenceConfig, join_layers, judge, noise_along, usefulness
 from emgs_jax.gaussian_map import (
     AverageConfig,
     GaussianMap,
@@ -293,7 +293,9 @@ def _store(
     use = usefulness(map, submap, rows)
     map, is_seen = judge(write_back(map, submap, rows), use, trusted, T, thinned, noise, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
-    submap = join_layers(take_rows(map, rows), is_seen, T, noise, config.existence)
+    submap = take_rows(map, rows)
+    along = noise_along(submap.gaussians, T.translation(), noise)
+    submap = join_layers(submap, is_seen, along, config.existence)
     born = new_map(fresh, _first_weight(weight, config.em.average), config.existence.birth, time)
     born = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), born, halves)
     map, _, overflow = insert(write_back(map, submap, rows), born)

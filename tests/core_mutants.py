@@ -332,6 +332,8 @@ STAGES = [
             "no limit",
         ),
         ("existence < config.refuted", "existence < 0.0", "one look refutes"),
+        ("jnp.any(joined.gaussians.valid != map.gaussians.valid)", "jnp.asarray(False)", "a third layer stays"),
+        ("gaussians.means - origins", "gaussians.means", "all is seen from the world's origin"),
         ("(use > 0) & ~is_seen_through", "is_seen", "what explains nothing is confirmed"),
         ("(use > 0) & ~is_seen_through", "(use > 0) & is_seen", "a flat look does not confirm"),
         ("(use > 0) & ~is_seen_through", "use > 0", "what is seen through is confirmed"),

@@ -345,6 +345,20 @@ MUTANTS = (
         BACK_END,
         "frames keep the scales of before",
     ),
+    Mutant(
+        "emgs_jax/running/correction.py",
+        "if noise and (end.accepted or not end.has_one_unit):",
+        "if noise:",
+        BACK_END,
+        "layers are merged though no loop moved anything",
+    ),
+    Mutant(
+        "emgs_jax/running/following.py",
+        "nodes.T_world.translation(), state.map.birth)",
+        "nodes.T_world.translation(), 0 * state.map.birth)",
+        BACK_END,
+        "all is seen from the first node",
+    ),
     # coming back
     Mutant(
         "emgs_jax/loops/location.py",

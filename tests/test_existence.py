@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scene import assert_same, at, pose
 
-from emgs_jax.existence import depth_range, join_layers, judge, usefulness
+from emgs_jax.existence import depth_range, join_layers, judge, merge_layers, noise_along, usefulness
 from emgs_jax.gaussian_map import GaussianMap, confirmed, new_map
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
 from emgs_jax.ops.camera import Camera, pixel_grid, rays
 from emgs_jax.ops.pytree import take_rows
 
-judged, joined = eqx.filter_jit(judge), eqx.filter_jit(join_layers)
+judged = eqx.filter_jit(judge)
 CAMERA = Camera([40.0, 44.0], [31.5, 23.5], 64, 48)
 NOISE = jnp.asarray(0.02)
 HERE = pose()
@@ -45,6 +45,13 @@ def map_of(*parts: Gaussians, existence=0.5, weight=1.0) -> GaussianMap:
     gaussians = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     one = jnp.ones(gaussians.valid.shape[0])
     return new_map(gaussians, weight * one, jnp.asarray(existence), jnp.asarray(0))
+
+
+@eqx.filter_jit
+def joined(map: GaussianMap, is_seen, T_world_camera, depth_noise, settings) -> GaussianMap:
+    """After one look."""
+    noise = noise_along(map.gaussians, T_world_camera.translation(), depth_noise)
+    return join_layers(map, is_seen, noise, settings)
 
 
 def used(map: GaussianMap):
@@ -286,6 +293,22 @@ def test_nothing_stands_behind_what_is_itself_as_thick(settings):
     np.testing.assert_allclose(after.gaussians.means[:2, 2], [2.97, 3.038], atol=1e-6)
 
 
+def test_layers_of_visits_that_moved_become_one_though_nobody_looks(settings):
+    """Two sheets of a wall 4 cm apart and a third one 4 cm behind, seen from 3 m; one seen from beside stays."""
+    wall = WALL[::4]
+    sheets = [[(x, y, 3.0 + 0.04 * k) for x, y, _ in wall] for k in range(3)]
+    map = map_of(*(discs(sheet) for sheet in sheets), discs([(5.0, 0, 3.0), (5.0, 0, 3.04)]))
+    count, origins = len(wall), jnp.zeros((3 * len(wall) + 2, 3)).at[-2:].set(jnp.array([8.0, 0, 3.0]))
+    after = eqx.filter_jit(merge_layers)(map, origins, NOISE, settings)
+    assert after.gaussians.valid[: 3 * count].sum() == count and after.gaussians.valid[-2:].all()
+    kept = np.asarray(after.gaussians.valid).copy()
+    kept[-2:] = False
+    np.testing.assert_allclose(after.gaussians.means[kept, 2], 3.04, atol=0.021)
+    np.testing.assert_allclose(after.gaussians.covs[kept, 2, 2], 0.003**2, rtol=1e-3)  # no thicker
+    np.testing.assert_allclose(after.weight[kept], 3.0)
+    assert_same(eqx.filter_jit(merge_layers)(after, origins, NOISE, settings), after)
+
+
 def test_as_printed_nothing_changes_by_a_bit(config):
     printed = config("slam/existence=paper").existence
     map = map_of(discs(WALL), discs(SLAB), existence=float(printed.birth))
@@ -293,6 +316,7 @@ def test_as_printed_nothing_changes_by_a_bit(config):
     assert_same(after, map)
     assert is_seen[: len(WALL)].any()  # it looks, but draws no conclusion
     assert_same(joined(map, is_seen, HERE, NOISE, printed), map)
+    assert_same(eqx.filter_jit(merge_layers)(map, jnp.zeros((len(is_seen), 3)), NOISE, printed), map)
     assert confirmed(map).valid.all()
 
 

@@ -78,6 +78,7 @@ def deform(
     turn = _mean_turn(motions.turn, share).as_matrix()
     floor = min_std**2 * jnp.eye(3)
     shapes = jnp.einsum("nij,njk,nlk->nil", turn, gaussians.covs - floor, turn)
+    shapes = 0.5 * (shapes + shapes.mT)  # as equal as roundings were not
     normals = jnp.einsum("nij,nj->ni", turn, gaussians.normals)
     changed = means, scale[:, None, None] ** 2 * shapes + floor, normals
     moved = eqx.tree_at(lambda g: (g.means, g.covs, g.normals), gaussians, changed)

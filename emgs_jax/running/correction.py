@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from emgs_jax.running.following import settle
 from emgs_jax.running.inputs import Input
 from emgs_jax.running.locating import looks_of
 from emgs_jax.running.record import FOUND, PLACED, SEGMENT, MappingRun, row_of_first_node
@@ -39,7 +40,8 @@ def correct(run: MappingRun, given: Input) -> None:
 def finish(run: MappingRun) -> None:
     """The best poses for all that was measured by the back end of a run, and the map that conforms to them.
 
-    Nothing where no loop says what is not so: among themselves frames and map fit better as they were placed.
+    Nothing where no loop says what is not so: among themselves frames and map fit better as they were placed. Else the
+    layers are merged that came to lie on each other and that nobody saw again.
     """
     end = run.back_end
     ask_again(end, end.news(end.new(end.agreed())), run.ask)
@@ -49,6 +51,9 @@ def finish(run: MappingRun) -> None:
     if has_retracted or end.accepted or loops:
         run.state = end.close(run.state, loops)
         _take_poses(run)
+    noise = [record.depth_noise for record in run.records if record.depth_noise is not None]
+    if noise and (end.accepted or not end.has_one_unit):  # at the end only: what was made one Gaussian stays one
+        run.state = settle(run.state, end.nodes(end.segment), float(np.median(noise)), run.config.existence)
 
 
 def _take_poses(run: MappingRun) -> None:

@@ -14,6 +14,7 @@ from scene import assert_same, random_gaussians, random_observation
 from emgs_jax import load_config
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.graph.deform import DeformConfig
+from emgs_jax.graph.measurements import Nodes
 from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
 from emgs_jax.loops.appearance import Database, Keyframe
 from emgs_jax.loops.revisit import Revisit
@@ -25,6 +26,7 @@ from emgs_jax.report.page_strip import loop_why
 from emgs_jax.running import correction
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.correction import correct, finish
+from emgs_jax.running.following import settle
 from emgs_jax.running.measuring import Look, chain_edge, map_edge
 from emgs_jax.running.record import FrameRecord, MappingRun
 from emgs_jax.running.revisiting import ask_again
@@ -391,3 +393,43 @@ def test_what_moves_the_poses_was_asked_for_before(graph, monkeypatch):
     finish(run)
     assert end.accepted == [] and len(end.refusals) == 3 and end.agreed() == []
     assert error(end.poses, drifted) == 0
+
+
+@pytest.mark.parametrize("has_loop", [True, False])
+def test_a_map_whose_visits_were_joined_is_settled_at_the_end_with_the_noise_of_its_frames(
+    graph, monkeypatch, has_loop
+):
+    truth, drifted = ring(), ring(1.95 * np.pi)
+    end = walked(graph, drifted)
+    end.verified = [loop(truth, row) for row in range(1, 9)] if has_loop else []
+    records = [FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0) for i, pose in enumerate(drifted)]
+    records = [replace(record, depth_noise=0.01 * (i % 3)) for i, record in enumerate(records[:-1])] + [records[-1]]
+    run, asked = MappingRun(None, SimpleNamespace(existence="gates"), state=state_of(drifted), records=records), []
+    run.back_end = end
+
+    def settled(state, nodes, noise, gates):
+        np.testing.assert_allclose(nodes.T_world.as_matrix()[: len(end.poses)], end.poses, atol=1e-5)
+        asked.append((noise, gates))
+        return replace(state, time=jnp.asarray(-1))
+
+    monkeypatch.setattr(correction, "settle", settled)
+    finish(run)
+    assert asked == ([(0.01, "gates")] if has_loop else []) and (run.state.time == -1) == has_loop
+
+
+def test_a_gaussian_is_seen_from_the_node_of_its_birth(graph):
+    """Two sheets of a wall before the first node, and two that the second one sees from beside."""
+    apart = [[0.0, 0, 3.0], [0, 0, 3.04], [5, 0, 3.0], [5, 0, 3.04]]
+    cov, normal = jnp.diag(jnp.array([0.05, 0.05, 0.003])) ** 2, jnp.array([0.0, 0, -1])
+    gaussians = random_gaussians(4)
+    rows = jnp.asarray(apart, jnp.float32), jnp.tile(cov, (4, 1, 1)), jnp.tile(normal, (4, 1))
+    gaussians = eqx.tree_at(lambda g: (g.means, g.covs, g.normals), gaussians, rows)
+    gaussians = eqx.tree_at(lambda g: g.features, gaussians, jnp.zeros((4, 0)))
+    map = new_map(gaussians, jnp.ones(4), jnp.ones(()), jnp.asarray(0))
+    map = eqx.tree_at(lambda m: m.birth, map, jnp.array([0, 0, 1, 1], jnp.int32))
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, 3] = 8.0, 0.0, 3.0
+    nodes = Nodes(jaxlie.SE3.from_matrix(jnp.asarray(poses, jnp.float32)), jnp.zeros(2), jnp.ones(2, bool))
+    state = replace(state_of(ring()), map=map)
+    after = settle(state, nodes, 0.02, load_config().slam.existence)
+    np.testing.assert_array_equal(after.map.gaussians.valid, [True, False, True, True])
