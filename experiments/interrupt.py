@@ -43,6 +43,27 @@ def _is_lost(frame: FrameType | None) -> bool:
     return False
 
 
+def _end(number: int, _: FrameType | None) -> None:
+    print(_word(number), file=sys.stderr)
+    raise SystemExit(128 + number)  # as shells have it
+
+
+def _word(number: int) -> str:
+    return "terminated" if number == signal.SIGTERM else "interrupted"
+
+
+def _heard() -> list[signal.Signals]:
+    """Signals that this thread may listen to; who started the program may have them ignored."""
+    is_main = threading.current_thread() is threading.main_thread()
+    return [number for number in RAISED if is_main and signal.getsignal(number) not in (signal.SIG_IGN, None)]
+
+
+def end_clearly() -> None:
+    """End with one word from here on, outside of `clear_interrupt` too: the imports of a command take seconds."""
+    for number in _heard():
+        signal.signal(number, _end)
+
+
 def _wait_for_threads(numbers: Iterable[int]) -> None:
     """Wait for threads that Python has given up; it waits for all others itself. The same signal again ends at once.
 
@@ -58,18 +79,17 @@ def _wait_for_threads(numbers: Iterable[int]) -> None:
 @contextlib.contextmanager
 def clear_interrupt() -> Iterator[None]:
     """End the program with one word on Ctrl-C or SIGTERM; HYDRA_FULL_ERROR=1 shows where it was."""
-    is_main = threading.current_thread() is threading.main_thread()
-    heard = [number for number in RAISED if is_main and signal.getsignal(number) not in (signal.SIG_IGN, None)]
-    before = {number: signal.signal(number, _interrupt) for number in heard}  # who started it may have it ignored
+    heard = _heard()
+    before = {number: signal.signal(number, _interrupt) for number in heard}
     try:
         yield
     except KeyboardInterrupt as interrupt:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
-        is_terminated = isinstance(interrupt, Terminated)
-        print("terminated" if is_terminated else "interrupted", file=sys.stderr)
+        number = signal.SIGTERM if isinstance(interrupt, Terminated) else signal.SIGINT
+        print(_word(number), file=sys.stderr)
         _wait_for_threads(heard)
-        raise SystemExit(128 + (signal.SIGTERM if is_terminated else signal.SIGINT)) from None  # as shells have it
+        raise SystemExit(128 + number) from None
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

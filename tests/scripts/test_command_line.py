@@ -211,6 +211,21 @@ def test_the_same_signal_again_ends_at_once():
     assert process.wait(10) == 130
 
 
+@pytest.mark.parametrize(("number", "word"), [(signal.SIGTERM, "terminated"), (signal.SIGINT, "interrupted")])
+def test_a_signal_while_a_command_imports_ends_it_with_a_word(number, word):
+    """Found by the kills: `python -m experiments.tune` showed where in a library's import it was."""
+    command = [sys.executable, "-X", "importtime", "-m", "experiments.tune"]
+    with heard():
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    for line in process.stderr:
+        if line.rstrip().endswith("experiments.interrupt"):
+            break
+    time.sleep(0.1)  # seconds before the end of the imports
+    process.send_signal(number)
+    said = [line for line in process.stderr.read().splitlines() if not line.startswith("import time:")]
+    assert (process.wait(), said) == (128 + number, [word])
+
+
 def test_a_signal_that_is_ignored_stays_so():
     """As of a job in the background of a script."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
