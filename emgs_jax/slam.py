@@ -289,8 +289,7 @@ def _store(
     """
     (aligned, T, localization), (fresh, weight, halves) = place, new
     thinned, noise = downscale(camera, config.observation.thin), localization.depth_noise
-    trusted = _trusted(aligned, localization)
-    use = usefulness(map, submap, rows)
+    trusted, use = _trusted(aligned, localization), usefulness(map, submap, rows)
     map, is_seen = judge(write_back(map, submap, rows), use, trusted, T, thinned, noise, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
     along = noise_along((submap := take_rows(map, rows)).gaussians, T.translation(), noise)
