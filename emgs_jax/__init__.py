@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.data.base import BadFrameError, Dataset, Frame
     from emgs_jax.em import EmConfig, EmInfo, em_update
     from emgs_jax.evaluation.reconstruction import EvaluationConfig
-    from emgs_jax.existence import ExistenceConfig, join_layers, judge, merge_layers, noise_along, usefulness
+    from emgs_jax.existence import ExistenceConfig, join_layers, judge, merge_layers, usefulness
     from emgs_jax.gaussian_map import (
         AverageConfig,
         GaussianMap,
@@ -69,7 +69,7 @@ _HOMES = {
         *("AverageConfig", "GaussianMap", "SubmapConfig"),
         *("confirmed", "empty_map", "grow", "insert", "new_map", "select_submap", "write_back"),
     ),
-    "existence": ("ExistenceConfig", "join_layers", "judge", "merge_layers", "noise_along", "usefulness"),
+    "existence": ("ExistenceConfig", "join_layers", "judge", "merge_layers", "usefulness"),
     "gaussians": ("FitConfig", "Gaussians", "cluster", "fit_to_points"),
     "initialization": ("initialize",),
     "io.map_file": ("load_map", "save_map"),

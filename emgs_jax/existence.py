@@ -9,7 +9,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import GaussianMap, without
-from emgs_jax.gaussians import Gaussians, blend, has_feature
+from emgs_jax.gaussians import blend, has_feature
 from emgs_jax.observation import Observation, depth_in
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.linalg import inverse_3x3, mahalanobis_sq, outer
@@ -97,9 +97,9 @@ def judge(
     z < min d - kσ. What is behind is occluded, and what is between, at an edge, may be either: that says nothing.
     What is not seen through is confirmed by points that it explains, however flat the look and however near an edge:
     there the depth round its pixel shows nothing, and a floor behind a table would never be confirmed. One that is seen
-    while others explain all points there only
-    repeats what the map knows, as the second layer of a wall does: that speaks against it, or a map would grow for as
-    long as one looks. What is confirmed must be as wide as a pixel for that: a view from afar has no point for each.
+    while others explain all points there only repeats what the map knows, as the second layer of a wall does: that
+    speaks against it, or a map would grow for as long as one looks. What is confirmed must be as wide as a pixel for
+    that: a view from afar has no point for each.
 
     Args:
         map: all Gaussians, world frame.
@@ -137,7 +137,11 @@ def judge(
 
 @full_precision
 def join_layers(
-    map: GaussianMap, is_seen: Bool[Array, "n"], noise: Float[Array, "n"], config: ExistenceConfig
+    map: GaussianMap,
+    is_seen: Bool[Array, "n"],
+    origins: Float[Array, "*#n 3"],
+    depth_noise: Float[Array, ""],
+    config: ExistenceConfig,
 ) -> GaussianMap:
     """Make one of every two Gaussians of a surface that a look cannot tell apart and that are each other's nearest.
 
@@ -147,10 +151,11 @@ def join_layers(
     Args:
         map: of which the submap is enough.
         is_seen: Gaussians that may be joined.
-        noise: m; of the look along each one's normal, see `noise_along`.
+        origins: of the camera of the look, world frame; one for all, or one for each.
+        depth_noise: as a fraction of the depth.
         config: gates.
     """
-    partner, is_pair = nearest_layers(map, is_seen, noise, config)
+    partner, is_pair = nearest_layers(map, is_seen, origins, depth_noise, config)
     old, other, rows = map.gaussians, take_rows(map, partner), jnp.arange(partner.shape[0])
     is_heavier = (map.weight > other.weight) | ((map.weight == other.weight) & (rows < partner))
     share = other.weight / jnp.maximum(map.weight + other.weight, jnp.finfo(jnp.float32).tiny)
@@ -168,13 +173,6 @@ def join_layers(
     )
     map = where_rows(is_pair & is_heavier, joined, map)
     return without(map, is_pair & ~is_heavier)
-
-
-def noise_along(
-    gaussians: Gaussians, origins: Float[Array, "*#n 3"], depth_noise: Float[Array, ""]
-) -> Float[Array, "n"]:
-    """Standard deviation (m) along each normal of what is seen from `origins` with a noise along the ray."""
-    return depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - origins))
 
 
 @full_precision
@@ -197,15 +195,18 @@ def merge_layers(
 
     def once(state: tuple[GaussianMap, Bool[Array, ""]]) -> tuple[GaussianMap, Bool[Array, ""]]:
         map, _ = state
-        noise = noise_along(map.gaussians, origins, depth_noise)
-        joined = join_layers(map, map.gaussians.valid, noise, config)
+        joined = join_layers(map, map.gaussians.valid, origins, depth_noise, config)
         return joined, jnp.any(joined.gaussians.valid != map.gaussians.valid)
 
     return jax.lax.while_loop(is_left, once, (map, jnp.asarray(True)))[0]
 
 
 def nearest_layers(
-    map: GaussianMap, is_seen: Bool[Array, "n"], noise: Float[Array, "n"], config: ExistenceConfig
+    map: GaussianMap,
+    is_seen: Bool[Array, "n"],
+    origins: Float[Array, "*#n 3"],
+    depth_noise: Float[Array, ""],
+    config: ExistenceConfig,
 ) -> tuple[Int[Array, "n"], Bool[Array, "n"]]:
     """The nearest other layer of every Gaussian, and whether it is that one's nearest, too.
 
@@ -219,7 +220,7 @@ def nearest_layers(
     near = jax.tree.map(lambda leaf: leaf[rows], gaussians)
     offsets, normals = near.means - gaussians.means[:, None], gaussians.normals[:, None]
     both = gaussians.covs[:, None] + near.covs
-    noise = noise[:, None]
+    noise = depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - origins))[:, None]
 
     def distance_under(variance: Float[Array, "n #k"]) -> Float[Array, "n k"]:
         return mahalanobis_sq(offsets, inverse_3x3(both + variance[..., None, None] * outer(normals)))

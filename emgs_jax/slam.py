@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from emgs_jax.continuation import ContinuationConfig, continued
 from emgs_jax.em import EmConfig, EmInfo, em_update, owners
-from emgs_jax.existence import ExistenceConfig, join_layers, judge, noise_along, usefulness
+from emgs_jax.existence import ExistenceConfig, join_layers, judge, usefulness
 from emgs_jax.gaussian_map import (
     AverageConfig,
     GaussianMap,
@@ -289,11 +289,11 @@ def _store(
     """
     (aligned, T, localization), (fresh, weight, halves) = place, new
     thinned, noise = downscale(camera, config.observation.thin), localization.depth_noise
-    trusted, use = _trusted(aligned, localization), usefulness(map, submap, rows)
+    trusted = _trusted(aligned, localization)
+    use = usefulness(map, submap, rows)
     map, is_seen = judge(write_back(map, submap, rows), use, trusted, T, thinned, noise, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
-    along = noise_along((submap := take_rows(map, rows)).gaussians, T.translation(), noise)
-    submap = join_layers(submap, is_seen, along, config.existence)
+    submap = join_layers(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
     born = new_map(fresh, _first_weight(weight, config.em.average), config.existence.birth, time)
     born = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), born, halves)
     map, _, overflow = insert(write_back(map, submap, rows), born)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scene import assert_same, at, pose
 
-from emgs_jax.existence import depth_range, join_layers, judge, merge_layers, noise_along, usefulness
+from emgs_jax.existence import depth_range, join_layers, judge, merge_layers, usefulness
 from emgs_jax.gaussian_map import GaussianMap, confirmed, new_map
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
@@ -50,8 +50,7 @@ def map_of(*parts: Gaussians, existence=0.5, weight=1.0) -> GaussianMap:
 @eqx.filter_jit
 def joined(map: GaussianMap, is_seen, T_world_camera, depth_noise, settings) -> GaussianMap:
     """After one look."""
-    noise = noise_along(map.gaussians, T_world_camera.translation(), depth_noise)
-    return join_layers(map, is_seen, noise, settings)
+    return join_layers(map, is_seen, T_world_camera.translation(), depth_noise, settings)
 
 
 def used(map: GaussianMap):

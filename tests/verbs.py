@@ -201,12 +201,7 @@ VERBS = {
         lambda s: (map_of(s), random_observation(192, s, 2), pose(translation=(0.1 * s, 0, 0))),
     ),
     "join_layers": (
-        lambda m, T: existence.join_layers(
-            m,
-            jnp.arange(32) % 3 > 0,
-            existence.noise_along(m.gaussians, T.translation(), ONE * 0.1),
-            CONFIG.existence,
-        ),
+        lambda m, T: existence.join_layers(m, jnp.arange(32) % 3 > 0, T.translation(), ONE * 0.1, CONFIG.existence),
         lambda s: (map_of(s), pose(translation=(0.1 * s, 0, 0))),
     ),
     "num_independent": (
