@@ -137,7 +137,7 @@ def _moved(run: MappingRun) -> tuple[np.ndarray | None, np.ndarray | None, tuple
     is_known = any(pose is not None for pose in run.true_poses)
     truth = np.stack([unknown if pose is None else pose for pose in run.true_poses]) if is_known else None
     end = run.back_end
-    if end is None or not end.accepted:
+    if end is None or not end.closures:  # frames that are only located in a saved map are no nodes beside its loops
         return truth, None, ()
     shift = row_of_first_node(run) - end.first  # from a node to the row of its record
     loops = tuple((shift + loop.a, shift + loop.b) for loop in end.accepted if min(loop.a, loop.b) >= end.first)

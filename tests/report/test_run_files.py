@@ -127,9 +127,10 @@ def test_the_overview_shows_loops_between_the_frames_of_the_back_end_and_the_pat
     run, later = finished(), poses_along(np.full(NUM_FRAMES - 2, 5.0))
     loops = [SimpleNamespace(a=3, b=5), SimpleNamespace(a=1, b=5)]  # the first three nodes are a saved map's
     poses = [np.eye(4)] * 3 + [*later]
-    run.back_end = SimpleNamespace(accepted=loops, poses=poses, online=[pose + 1.0 for pose in poses], first=3)
+    online = [pose + 1.0 for pose in poses]
+    run.back_end = SimpleNamespace(accepted=loops, closures=[None], poses=poses, online=online, first=3)
     save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
-    run.back_end.accepted = []
+    run.back_end.closures = []  # as where frames are only located in a saved map: its loops are there, and no node
     save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
     (paths, without) = drawn
     assert paths.loops == ((2, 4),) and without.loops == () and without.online is None
