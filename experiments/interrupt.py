@@ -6,10 +6,9 @@ import os
 import signal
 import sys
 import threading
-import time
 import weakref
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from types import FrameType
 
 
@@ -43,13 +42,17 @@ def _is_lost(frame: FrameType | None) -> bool:
     return False
 
 
-def _end(number: int, _: FrameType | None) -> None:
-    print(_word(number), file=sys.stderr)
-    raise SystemExit(128 + number)  # as shells have it
+def _end(number: int, _: FrameType | None = None) -> None:
+    """Leave the process with one word, at once: whatever has to be written is written and closed by now.
 
-
-def _word(number: int) -> str:
-    return "terminated" if number == signal.SIGTERM else "interrupted"
+    Python's own end would take what other threads compute with from under them, and the program would end with SIGSEGV:
+    it waits for no daemon, as those of SciPy's trees are, and for none whose `join` was interrupted. What is raised
+    in that end would be printed, and forgotten.
+    """
+    os.write(2, f"{'terminated' if number == signal.SIGTERM else 'interrupted'}\n".encode())
+    with contextlib.suppress(OSError, ValueError, RuntimeError):  # closed, or a print is being interrupted
+        sys.stdout.flush()
+    os._exit(128 + number)  # as shells have it
 
 
 def _heard() -> list[signal.Signals]:
@@ -64,18 +67,6 @@ def end_clearly() -> None:
         signal.signal(number, _end)
 
 
-def _wait_for_threads(numbers: Iterable[int]) -> None:
-    """Wait for threads that Python has given up; it waits for all others itself. The same signal again ends at once.
-
-    Python before 3.13 takes a thread for ended where the `join` of it was interrupted. What such a thread computes is
-    taken from under it as the program ends, and the program ends with SIGSEGV.
-    """
-    for number in numbers:
-        signal.signal(number, lambda number, _: os._exit(128 + number))
-    while not all(thread.is_alive() for thread in threading.enumerate()):
-        time.sleep(AGAIN)
-
-
 @contextlib.contextmanager
 def clear_interrupt() -> Iterator[None]:
     """End the program with one word on Ctrl-C or SIGTERM; HYDRA_FULL_ERROR=1 shows where it was."""
@@ -86,10 +77,7 @@ def clear_interrupt() -> Iterator[None]:
     except KeyboardInterrupt as interrupt:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
-        number = signal.SIGTERM if isinstance(interrupt, Terminated) else signal.SIGINT
-        print(_word(number), file=sys.stderr)
-        _wait_for_threads(heard)
-        raise SystemExit(128 + number) from None
+        _end(signal.SIGTERM if isinstance(interrupt, Terminated) else signal.SIGINT)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

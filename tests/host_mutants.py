@@ -319,6 +319,27 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/running/measuring.py",
+        "[angle * look.depth] * 3",
+        "[angle] * 3",
+        BACK_END,
+        "a translation as sure in a hall as in a cupboard",
+    ),
+    Mutant(
+        "emgs_jax/running/measuring.py",
+        "noise.depth if look.depth_noise is None else max(look.depth_noise, LEAST_NOISE)",
+        "noise.depth",
+        BACK_END,
+        "every frame measures as well as the first",
+    ),
+    Mutant(
+        "emgs_jax/running/correction.py",
+        "        look = replace(look, depth_noise=record.depth_noise)\n",
+        "",
+        COMING_BACK,
+        "likewise: the back end is not told",
+    ),
+    Mutant(
+        "emgs_jax/running/measuring.py",
         "offset = min(before)",
         "offset = max(before)",
         BACK_END,

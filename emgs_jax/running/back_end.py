@@ -149,7 +149,7 @@ class BackEnd:
         if chain is not None:
             self.edges.append(chain)
         if origin is not None and origin < time:
-            self.edges.append(map_edge(self.poses, self.log_scales, origin, self.config.noise))
+            self.edges.append(map_edge(look, self.poses, self.log_scales, origin, self.config.noise))
 
     def look_for_loops(self, look: Look) -> list[LoopMeasurement]:
         """Describe the last node, and verify what it looks like; returns the new loops that are agreed upon."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from emgs_jax.graph.measurements import LOOP, ODOMETRY, Edges
 from emgs_jax.graph.problem import bucket
+from emgs_jax.localization import LEAST_NOISE
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.ops.ranges import number
@@ -17,19 +18,22 @@ from emgs_jax.running.convert import to_se3
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Standard deviations of what is measured, m, degrees and log-scale.
+    """Standard deviations of what is measured, as multiples of ν, by how much of their depth a frame's points err.
+
+    Those of a pose that such points hold are so many ν as an angle, and so many ν z as a length, with z the median
+    depth: no unit is in them, and a prior that errs twice as much is believed half as much.
 
     Args:
-        pair, pair_deg: of the relative pose of two neighbours; those k apart: √k times.
-        map, map_deg: of a frame placed in the map, relative to the frame of whose Gaussians it was placed by.
-        log_scale: of the ratio of two neighbours' scales, likewise.
+        pair: of the relative pose of two neighbours; those k apart: √k times.
+        map: of a frame placed in the map, relative to the frame of whose Gaussians it was placed by.
+        log_scale: of the ratio of two neighbours' scales, as `pair`.
+        depth: ν of a frame that was not compared with the map, as the first is.
     """
 
     pair: float = number(low=1e-9, high=1000)
-    pair_deg: float = number(low=1e-9, high=1000)
     map: float = number(low=1e-9, high=1000)
-    map_deg: float = number(low=1e-9, high=1000)
     log_scale: float = number(low=1e-9, high=1000)
+    depth: float = number(low=1e-9, high=1000)
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,7 @@ class Look:
         points: camera frame, m of its inference, (h, w, 3).
         mask: of these, (h, w).
         T_anchor_views: by frame index, the poses (4, 4) that its inference says; some may not be finite.
+        depth_noise: ν of the points, as they differ from the map; None where they were not compared with it.
     """
 
     frame: int
@@ -49,6 +54,12 @@ class Look:
     points: np.ndarray
     mask: np.ndarray
     T_anchor_views: Mapping[int, np.ndarray]
+    depth_noise: float | None = None
+
+    @property
+    def depth(self) -> float:
+        """The points' median z, m of its inference; 1 where there are none."""
+        return float(np.median(self.points[self.mask][:, 2])) if self.mask.any() else 1.0
 
 
 class Edge(NamedTuple):
@@ -62,9 +73,10 @@ class Edge(NamedTuple):
     kind: int
 
 
-def _weights(distance: float, turn_deg: float, log_scale: float = np.inf) -> np.ndarray:
-    """(7, 7) square root of the information of independent errors; an infinite one is not measured."""
-    return np.diag(1.0 / np.array([distance] * 3 + [np.radians(turn_deg)] * 3 + [log_scale]))
+def _weights(look: Look, noise: NoiseConfig, angle: float, log_scale: float = np.inf) -> np.ndarray:
+    """(7, 7) square root of the information of independent errors, given in ν; an infinite one is not measured."""
+    depth_noise = noise.depth if look.depth_noise is None else max(look.depth_noise, LEAST_NOISE)
+    return np.diag(1.0 / (depth_noise * np.array([angle * look.depth] * 3 + [angle] * 3 + [log_scale])))
 
 
 def chain_edge(
@@ -89,14 +101,16 @@ def chain_edge(
         return None
     offset = min(before)
     row, spread = time - offset, np.sqrt(offset)
-    weights = _weights(spread * noise.pair, spread * noise.pair_deg, spread * noise.log_scale)
+    weights = _weights(look, noise, spread * noise.pair, spread * noise.log_scale)
     return Edge(time, row, _as_placed(poses, log_scales, row), log_scales[row] - log_scales[time], weights, ODOMETRY)
 
 
-def map_edge(poses: Sequence[np.ndarray], log_scales: Sequence[float], origin: int, noise: NoiseConfig) -> Edge:
+def map_edge(
+    look: Look, poses: Sequence[np.ndarray], log_scales: Sequence[float], origin: int, noise: NoiseConfig
+) -> Edge:
     """Where the last frame was placed, relative to the frame `origin` of whose Gaussians it was placed by."""
     measured = _as_placed(poses, log_scales, origin)
-    return Edge(len(poses) - 1, origin, measured, 0.0, _weights(noise.map, noise.map_deg), ODOMETRY)
+    return Edge(len(poses) - 1, origin, measured, 0.0, _weights(look, noise, noise.map), ODOMETRY)
 
 
 def _as_placed(poses: Sequence[np.ndarray], log_scales: Sequence[float], row: int) -> np.ndarray:

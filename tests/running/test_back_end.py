@@ -205,7 +205,7 @@ def test_a_frame_is_held_where_it_was_placed_and_not_where_it_was_predicted(grap
     """Both edges, in the unit of the frame's inference, whatever the window says of the two frames."""
     placed, scales = list(ring(1.95 * np.pi)[:31]), [0.0] * 30 + [np.log(1.1)]
     chain = chain_edge(look(ring(), 30), placed, scales, 0, graph.noise)
-    held = map_edge(placed, scales, 12, graph.noise)
+    held = map_edge(look(ring(), 30), placed, scales, 12, graph.noise)
     assert (chain.a, chain.b, held.a, held.b) == (30, 29, 30, 12)
     for edge in (chain, held):
         expected = np.linalg.inv(placed[30]) @ placed[edge.b]
@@ -226,6 +226,25 @@ def test_the_frame_before_is_the_nearest_that_the_window_knows(graph):
     assert chain_edge(measured, poses, scales, 28, graph.noise) is None, "before that the camera was lost"
     measured.T_anchor_views[30][:] = np.nan
     assert chain_edge(measured, poses, scales, 0, graph.noise) is None, "it is not known itself"
+
+
+def test_what_is_measured_is_as_sure_as_the_depths_that_it_was_measured_by(graph):
+    """Rotation by ν, translation by ν times the median depth in the unit of the inference, whatever that unit is."""
+    poses, scales = list(ring()[:31]), [0.0] * 31
+    blind = look(ring(), 30)
+    seeing = replace(blind, points=np.full((4, 4, 3), 7.0), mask=np.arange(16).reshape(4, 4) < 3, depth_noise=0.02)
+    seeing.points[0, :3, 2] = 2.0, 2.5, 40.0
+    for edge, share in (
+        (chain_edge(seeing, poses, scales, 0, graph.noise), graph.noise.pair),
+        (map_edge(seeing, poses, scales, 12, graph.noise), graph.noise.map),
+    ):
+        stds = 0.02 * share * np.array([2.5, 2.5, 2.5, 1, 1, 1])
+        np.testing.assert_allclose(1 / np.diag(edge.sqrt_info)[:6], stds)
+    assert chain_edge(seeing, poses, scales, 0, graph.noise).sqrt_info[6, 6] == 1 / (0.02 * graph.noise.log_scale)
+    exact = map_edge(replace(seeing, depth_noise=0.0), poses, scales, 12, graph.noise)
+    assert 1e3 < exact.sqrt_info[0, 0] < 1e5, "more certain than any loop, and finite"
+    first = map_edge(blind, poses, scales, 12, graph.noise)
+    np.testing.assert_allclose(1 / np.diag(first.sqrt_info)[:6], graph.noise.depth * graph.noise.map)
 
 
 def test_without_a_loop_nothing_moves_however_the_predictions_differ(graph):

@@ -13,6 +13,7 @@ from scene import assert_same
 
 from emgs_jax import load_config, load_map
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.localization import LEAST_NOISE
 from emgs_jax.loops.two_views import gap_between
 from emgs_jax.prior.base import Prior, PriorPrediction
 from emgs_jax.report.metrics import score_back_end
@@ -210,8 +211,12 @@ def test_a_run_goes_on_in_a_saved_map_and_can_be_saved_itself(folder, tmp_path):
     assert int(run.map.birth.max()) >= len(THERE) and int(run.state.time) == len(end.poses)
     new = [edge for edge in end.edges if edge.a >= end.first]
     assert any(edge.b < end.first for edge in new), "the new frames hang on those that the map was made from"
-    of_map = 1 / config().graph.noise.map
-    assert all(edge.sqrt_info[0, 0] == of_map for edge in new if edge.b < end.first), "but no window has both"
+    assert all(edge.sqrt_info[6, 6] == 0 for edge in new if edge.b < end.first), "by the map: no window has both"
+    noise = config().graph.noise
+    for edge in new:
+        told = max(run.records[edge.a - end.first].depth_noise, LEAST_NOISE)
+        angle = noise.pair if edge.sqrt_info[6, 6] else noise.map
+        assert edge.sqrt_info[5, 5] == pytest.approx(1 / (told * angle)), "as sure as its frame's depths"
     save_progress(tmp_path, run)
     (tmp_path / "metrics.json").write_text("{}")
     again = load_saved(str(tmp_path), "extend", config().graph, end.intrinsics, 0.01)

@@ -8,9 +8,7 @@ import shlex
 import signal
 import subprocess
 import sys
-import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -152,9 +150,13 @@ def heard():
         signal.signal(signal.SIGINT, before)
 
 
+def raises(code: int) -> None:
+    raise SystemExit(code)
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 @pytest.mark.parametrize("place", ["collector", "object", "program"])
-def test_a_signal_is_not_lost_wherever_the_program_is(number, code, place):
+def test_a_signal_is_not_lost_wherever_the_program_is(number, code, place, monkeypatch):
     """Python prints what is raised in a callback of the collector, as JAX has one, and the run went on to its end."""
 
     sent = []
@@ -166,6 +168,7 @@ def test_a_signal_is_not_lost_wherever_the_program_is(number, code, place):
             sum(range(10))
 
     before = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)]
+    monkeypatch.setattr(os, "_exit", raises)
     with heard(), pytest.raises(SystemExit) as ended, clear_interrupt():
         match place:
             case "collector":
@@ -181,34 +184,39 @@ def test_a_signal_is_not_lost_wherever_the_program_is(number, code, place):
     assert [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)] == before
 
 
-def test_no_thread_computes_after_an_interrupt():
-    """Python 3.11 takes a thread for ended whose `join` was interrupted, and the program ended with SIGSEGV."""
-    done = threading.Event()
-
-    def compute():
-        time.sleep(0.5)
-        done.set()
-
-    with heard(), pytest.raises(SystemExit), clear_interrupt(), ThreadPoolExecutor(1) as threads:
-        threads.submit(compute)
-        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
-    assert done.is_set()
+THREADS = {  # which Python does not wait for as it ends, or does
+    "of SciPy, which are daemons": "tree = cKDTree(np.random.default_rng(0).random((400000, 3)))\n"
+    " while True: tree.query(tree.data + .01, workers=2)",
+    "that are waited for": "thread = threading.Thread(target=time.sleep, args=(60,)); thread.start(); thread.join()",
+}
 
 
-def test_the_same_signal_again_ends_at_once():
-    """Who presses Ctrl-C twice does not wait for a thread."""
-    words = "import threading, time; from experiments.interrupt import clear_interrupt\n"
-    words += "with clear_interrupt():\n thread = threading.Thread(target=time.sleep, args=(60,)); thread.start()\n"
-    words += " print('begun', flush=True); thread.join()"
+@pytest.mark.parametrize("kind", THREADS)
+def test_an_interrupt_ends_the_program_whatever_its_threads_compute(kind):
+    """The kills found SIGSEGV: Python ends, and what a thread computes with is gone before it."""
+    words = "import threading, time, numpy as np\nfrom scipy.spatial import cKDTree\n"
+    words += "from experiments.interrupt import clear_interrupt\n"
+    words += f"with clear_interrupt():\n print('begun', flush=True); print('kept', end='')\n {THREADS[kind]}"
+    for wait in (0.5, 0.6, 0.7):  # the tree is built in .1 s
+        with heard():
+            process = subprocess.Popen([sys.executable, "-c", words], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        assert process.stdout.readline() == b"begun\n"
+        time.sleep(wait)
+        process.send_signal(signal.SIGINT)
+        code = process.wait(10)
+        assert (code, process.stdout.read(), process.stderr.read()) == (130, b"kept", b"interrupted\n")
+
+
+def test_a_signal_after_the_work_is_done_is_no_traceback():
+    """Found by the kills: SIGTERM while JAX cleaned up, in a callback that Python calls as it ends."""
+    words = "import atexit, time\nfrom experiments.interrupt import clear_interrupt, end_clearly\nend_clearly()\n"
+    words += "with clear_interrupt(): pass\n"
+    words += "atexit.register(lambda: (print('ending', flush=True), time.sleep(10)))"
     with heard():
         process = subprocess.Popen([sys.executable, "-c", words], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert process.stdout.readline() == b"begun\n"
-    time.sleep(0.2)
-    process.send_signal(signal.SIGINT)
-    assert process.stderr.readline() == b"interrupted\n"
-    time.sleep(0.2)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(10) == 130
+    assert process.stdout.readline() == b"ending\n"
+    process.send_signal(signal.SIGTERM)
+    assert (process.wait(5), process.stderr.read()) == (143, b"terminated\n")
 
 
 @pytest.mark.parametrize(("number", "word"), [(signal.SIGTERM, "terminated"), (signal.SIGINT, "interrupted")])

@@ -5,10 +5,10 @@ from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
 
-import experiments.run
 import numpy as np
 import pytest
 
+import experiments.run
 from emgs_jax.running import configure
 from emgs_jax.running.record import FOUND
 from experiments.export import export_run
