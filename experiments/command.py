@@ -1,6 +1,7 @@
 """What the commands share: Hydra, the compilation cache, and an error that is one clear line."""
 
 import contextlib
+import logging
 import os
 import re
 import sys
@@ -24,6 +25,7 @@ from .interrupt import clear_interrupt
 from .keys import check_keys
 
 RUN = "config"  # conf/config.yaml, whose help lists every choice, by Hydra
+TALKATIVE = ("jax", "numexpr", "websockets")  # libraries that log at INFO which accelerators and threads are not there
 
 
 def command(
@@ -34,6 +36,9 @@ def command(
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
         @wraps(task)
         def job(config: DictConfig) -> Any:
+            if not HydraConfig.get().verbose:
+                for library in TALKATIVE:
+                    logging.getLogger(library).setLevel(logging.WARNING)
             with clear_errors():
                 check_keys(name, config)
                 leave_memory_to_torch(config)

@@ -1,1 +1,1 @@
-"""Whether the covariances of poses are those of their errors: `python -m tests.nees --rooms 6`."""
+"""Whether the covariances of poses are those of their errors: `python -m tests.nees --runs 6`."""

@@ -98,6 +98,12 @@ def test_the_programs_end_with_one_line(command, message, tmp_path):
     assert "Traceback" not in done.stderr
 
 
+def test_a_command_says_what_it_did_and_nothing_of_its_libraries():
+    words = [sys.executable, "-m", "experiments.cli", "report", str(exact_run())]
+    done = subprocess.run(words, cwd=CONF.parent, capture_output=True, text=True, check=True)
+    assert done.stderr == "" and done.stdout.startswith(f"{exact_run()}/report.html") and done.stdout.count("\n") == 1
+
+
 def test_a_new_run_in_the_folder_moves_the_answer_away(tmp_path):
     from emgs_jax.report.run_files import claim_folder
 
