@@ -23,7 +23,7 @@ def correct(run: MappingRun, given: Input) -> None:
     for look, record in zip(looks, added, strict=True):
         if record.location in (FOUND, SEGMENT):
             end.since = len(end.poses)
-        look = replace(look, depth_noise=record.depth_noise)
+        look = replace(look, depth_noise=record.depth_noise if record.status in PLACED else None)
         end.add(look, record.pose, record.scale or 1.0, record.origin, record.status in PLACED)
     if added[-1].similarity is not None:
         join(run, given)

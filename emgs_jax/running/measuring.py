@@ -27,7 +27,7 @@ class NoiseConfig:
         pair: of the relative pose of two neighbours; those k apart: √k times.
         map: of a frame placed in the map, relative to the frame of whose Gaussians it was placed by.
         log_scale: of the ratio of two neighbours' scales, as `pair`.
-        depth: ν of a frame that was not compared with the map, as the first is.
+        depth: ν of a frame that was not placed in the map, as the first is.
     """
 
     pair: float = number(low=1e-9, high=1000)
@@ -46,7 +46,8 @@ class Look:
         points: camera frame, m of its inference, (h, w, 3).
         mask: of these, (h, w).
         T_anchor_views: by frame index, the poses (4, 4) that its inference says; some may not be finite.
-        depth_noise: ν of the points, as they differ from the map; None where they were not compared with it.
+        depth_noise: ν of the points, as they differ from the map; None where the frame was not placed in it: the few
+            that are near the map by chance say nothing.
     """
 
     frame: int

@@ -123,6 +123,11 @@ def test_a_camera_that_was_carried_off_comes_back():
     end = run.back_end
     assert end.since == first + patience - 1 and not end.is_placed[first]
     assert not any(edge.a >= end.since > edge.b and edge.b >= first for edge in end.edges), "lost frames hold nothing"
+    unplaced = [edge for edge in end.edges if not end.is_placed[edge.a] and edge.a == edge.b + 1]
+    unsure = 1 / (config().graph.noise.depth * config().graph.noise.pair)
+    assert unplaced and all(edge.sqrt_info[5, 5] == pytest.approx(unsure) for edge in unplaced), (
+        "few points fit exactly"
+    )
 
 
 NOWHERE = ("graph.location.min_inliers=100000", "graph.max_known=1e9", "graph.location.max_patience=4")
