@@ -49,7 +49,9 @@ def _end(number: int, _: FrameType | None = None) -> None:
     it waits for no daemon, as those of SciPy's trees are, and for none whose `join` was interrupted. What is raised
     in that end would be printed, and forgotten.
     """
-    os.write(2, f"{'terminated' if number == signal.SIGTERM else 'interrupted'}\n".encode())
+    word = "terminated" if number == signal.SIGTERM else "interrupted"
+    with contextlib.suppress(OSError):
+        os.write(2, f"{word}\n".encode())
     with contextlib.suppress(OSError, ValueError, RuntimeError):  # closed, or a print is being interrupted
         sys.stdout.flush()
     os._exit(128 + number)  # as shells have it

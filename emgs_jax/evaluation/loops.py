@@ -18,6 +18,7 @@ def loop_metrics(
 
     A loop is right where its measured motion is the true one up to 30 cm and 10°. A frame comes back where it is within
     1 m and 30° of one at least `min_gap` frames older; it is found where a right loop begins within 10 frames of it.
+    Where only loops begin there that nobody can judge, as those into a saved map, it counts neither way.
 
     Args:
         loops: frames a and b and the measured pose of camera b in camera a, metres, (4, 4).
@@ -27,12 +28,17 @@ def loop_metrics(
     judged = [(b, _is_right(measured, truth[a], truth[b])) for a, b, measured in loops if _known(truth, a, b)]
     right = [b for b, is_right in judged if is_right]
     returning = _returning(truth, min_gap)
-    found = [any(abs(row - b) <= REACH for b in right) for row in returning]
+    unjudged = [b for a, b, _ in loops if not _known(truth, a, b)]
+    found = [_is_near(row, right) for row in returning if _is_near(row, right) or not _is_near(row, unjudged)]
     return {
         "loops/precision": len(right) / len(judged) if judged else None,
         "loops/recall": float(np.mean(found)) if found else None,
         "loops/returning_frames": len(returning),
     }
+
+
+def _is_near(row: int, frames: Sequence[int]) -> bool:
+    return any(abs(row - frame) <= REACH for frame in frames)
 
 
 def _known(truth: Sequence[np.ndarray | None], *rows: int) -> bool:

@@ -48,6 +48,17 @@ def test_without_loops_or_returns_or_truth_nothing_is_said():
     assert loop_metrics([between(5, 75, THERE_AND_BACK)], unknown, 60)["loops/precision"] is None
 
 
+def test_what_only_loops_into_a_saved_map_may_have_found_is_not_judged():
+    """Its frames have no truth here."""
+    truth = [None, *THERE_AND_BACK, *THERE_AND_BACK[1:11]]  # frames 71 to 91 return
+    into_saved = (0, 81, np.eye(4))
+    found = loop_metrics([into_saved], truth, 60)
+    assert found["loops/recall"] is None and found["loops/precision"] is None and found["loops/returning_frames"] == 21
+    into_saved = (0, 71, np.eye(4))
+    assert loop_metrics([into_saved], truth, 60)["loops/recall"] == 0.0, "frames 82 to 91 are found by nothing"
+    assert loop_metrics([into_saved, between(11, 91, truth)], truth, 60)["loops/recall"] == 1.0
+
+
 def test_a_frame_that_looks_elsewhere_does_not_return():
     turned = [pose.copy() for pose in THERE_AND_BACK]
     for pose in turned[40:]:
