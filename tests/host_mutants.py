@@ -333,10 +333,17 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/running/correction.py",
-        "        look = replace(look, depth_noise=record.depth_noise)\n",
-        "",
+        "record.depth_noise if record.status in PLACED else None",
+        "None",
         COMING_BACK,
         "likewise: the back end is not told",
+    ),
+    Mutant(
+        "emgs_jax/running/correction.py",
+        "record.depth_noise if record.status in PLACED else None",
+        "record.depth_noise",
+        COMING_BACK,
+        "what is lost is as certain as the few points that fit by chance",
     ),
     Mutant(
         "emgs_jax/running/measuring.py",
