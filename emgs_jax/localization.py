@@ -16,6 +16,7 @@ from emgs_jax.ops.pytree import choice, stack, traced
 from emgs_jax.registration.belief import Belief, certain, measured, moved, next_belief, root_information
 from emgs_jax.registration.icp import IcpInfo, icp
 from emgs_jax.registration.noise import confidence_levels
+from emgs_jax.registration.pose_noise import pose_std, repeat_poses
 from emgs_jax.registration.problem import IcpConfig
 from emgs_jax.registration.repeat import repeat_error, repeat_scale, through_previous
 from emgs_jax.registration.rigid import MIN_PAIRS, pose_row, scale_translation
@@ -46,8 +47,8 @@ class LocalizationConfig(eqx.Module):
         scale_std: of the logarithm of a scale about the mean of those before it, if it erred anew with every frame: the
             longer errors last, the larger. inf: map and repeats alone hold the scale (printed).
         max_pair_distance: fraction of the depth; farther points are no pair.
-        anchor_noise: of `fused`: variance of the prior's own pose near the anchor, over that of its motion.
-        anchor_range: m; of `fused`: distance from the anchor at which its standard deviation has doubled.
+        pose_shared: part of the variance of the prior's poses that two of its answers about one have in common, see
+            `pose_std`; 1: what they differ by says nothing, what depths differ by does (printed).
         num_alike, num_shared: frames that see one part of the map, and whose windows share images: they err alike, see
             `next_belief` and `measured`.
         icp: the fine step.
@@ -62,8 +63,7 @@ class LocalizationConfig(eqx.Module):
     coarse_scale: Float[Array, "*b"] = choice("none", "ratio", "estimated")
     scale_std: Float[Array, "*b"] = traced(low=1e-4, high=math.inf)
     max_pair_distance: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    anchor_noise: Float[Array, "*b"] = traced(low=1e-6, high=math.inf)
-    anchor_range: Float[Array, "*b"] = traced(low=1e-6, high=math.inf)
+    pose_shared: Float[Array, "*b"] = traced(low=0, high=1)
     num_alike: Float[Array, "*b"] = traced(low=1, high=math.inf)
     num_shared: Float[Array, "*b"] = traced(low=1, high=math.inf)
     icp: IcpConfig
@@ -128,14 +128,12 @@ class LocalizationInfo(eqx.Module):
     icp: IcpInfo
 
 
-def _motion_noise(
-    depth_noise: Float[Array, ""], mean_depth: Float[Array, ""], ratio_std: Float[Array, ""], config: LocalizationConfig
-) -> Float[Array, "7"]:
-    """Standard deviations of the prior's motion between two frames, and of the ratio of their scales."""
-    angle = depth_noise / jnp.sqrt(jnp.maximum(config.icp.prior_information, NO_INFORMATION))
+def _ratio_noise(
+    depth_noise: Float[Array, ""], ratio_std: Float[Array, ""], config: LocalizationConfig
+) -> Float[Array, ""]:
+    """Standard deviation of the logarithm of the ratio of two frames' scales."""
     ratio = jnp.where(config.coarse_scale > 0, ratio_std, depth_noise * config.icp.scale_noise)
-    ratio = jnp.maximum(jnp.where(config.icp.scale_noise > 0, ratio, 0.0), NO_INFORMATION)
-    return jnp.append(jnp.repeat(jnp.stack([angle * mean_depth, angle]), 3), ratio)
+    return jnp.maximum(jnp.where(config.icp.scale_noise > 0, ratio, 0.0), NO_INFORMATION)
 
 
 def _no_motion(mean_depth: Float[Array, ""], config: LocalizationConfig) -> Float[Array, "7"]:
@@ -224,13 +222,15 @@ def localize_coarse(
     repeat_rms, mean_depth = repeat_error(now, previous, T_world_previous, scale, config.max_pair_distance)
     depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, belief.depth_noise), LEAST_NOISE)
     motion, anchored, forms, is_linked = _readings(prediction, previous, T_world_previous, scale, camera, config)
-    noise, unknown = _motion_noise(depth_noise, mean_depth, ratio_std, config), _no_motion(mean_depth, config)
-    belief = moved(belief, motion, jnp.where(is_linked, noise, unknown))
-    distance = jnp.linalg.norm(anchored.translation() - prediction.T_world_anchor.translation())
-    reach = 1.0 + distance / config.anchor_range
-    own = anchored, noise[:-1] * jnp.sqrt(config.anchor_noise) * reach
+    repeats, latest = repeat_poses(prediction, belief.repeats, scale, mean_depth, config.num_shared)
+    root = jnp.sqrt(jnp.maximum(config.icp.prior_information, NO_INFORMATION))
+    std = jnp.maximum(pose_std(repeats, latest, depth_noise / root, config.pose_shared), LEAST_NOISE / root)
+    of_motion, of_pose = jnp.repeat(std * jnp.stack([mean_depth, jnp.ones(())]), 3, axis=-1)
+    noise = jnp.append(of_motion, _ratio_noise(depth_noise, ratio_std, config))
+    belief = moved(belief, motion, jnp.where(is_linked, noise, _no_motion(mean_depth, config)))
+    belief = eqx.tree_at(lambda b: b.repeats, belief, repeats)
     known = pose_row(forms, config.coarse.astype(jnp.int32)), scale
-    coarse, scale, belief = _measured(*known, own, belief, config)
+    coarse, scale, belief = _measured(*known, (anchored, of_pose), belief, config)
     is_finite = jnp.all(jnp.isfinite(coarse.wxyz_xyz))
     coarse = jaxlie.SE3(jnp.where(is_finite, coarse.wxyz_xyz, T_world_previous.wxyz_xyz))
     raw_current, raw_newest = pose_row(prediction.T_world_views, 1), pose_row(prediction.T_world_views, 2)

@@ -36,6 +36,7 @@ class Prediction(eqx.Module):
         T_world_views: the prior's own poses, composed with the anchor; rows: previous, current, newest.
         T_world_anchor: pose of the anchor, about which the scale of this call acts.
         has_newest: False at the end of a sequence, where there is no newer image.
+        is_repeat: False where the frame before is of the same call, so that nothing of it is said twice.
     """
 
     current: Observation
@@ -43,6 +44,7 @@ class Prediction(eqx.Module):
     T_world_views: jaxlie.SE3
     T_world_anchor: jaxlie.SE3
     has_newest: Bool[Array, "*b"]
+    is_repeat: Bool[Array, "*b"]
 
 
 class ObservationConfig(eqx.Module):

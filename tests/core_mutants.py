@@ -160,7 +160,6 @@ GRAPH = [
 
 STAGES = [
     *own("localization", "test_localization")(
-        ("1.0 + distance / config.anchor_range", "1.0", "a pose far from the anchor counts like one near it"),
         ("(1.0 + chi_sq / apart.shape[0])", "1.0", "a lost anchor counts in full"),
         ("config.scale_std**-2", "0.0", "the prior's own unit holds no scale"),
         ("coarse.scale * jnp.where(is_tracked, scale, 1.0)", "coarse.scale", "the accepted scale is dropped"),
@@ -194,7 +193,19 @@ STAGES = [
         ("(scale > 0.1)", "(scale > 0.0)", "any scale is believed"),
         ("jnp.where(is_found, scale, otherwise)", "scale", "the ratio of no pair"),
     ),
+    *own("registration/pose_noise", "registration/test_pose_noise")(
+        ("[mean_depth, jnp.ones(())]", "[jnp.ones(()), jnp.ones(())]", "metres for a fraction of the depth"),
+        (" & prediction.is_repeat\n", "\n", "one answer repeats itself"),
+        ("before.counts + is_again, max_count", "before.counts + is_again, jnp.inf", "nothing is forgotten"),
+        ("prediction.has_newest, (current", "True, (current", "a motion that was never said"),
+        (" - LOG_OF_SQUARE", "", "a mean of logarithms for the logarithm of the mean"),
+        (" - jnp.log(differing)", "", "all of the variance differs"),
+        ("latest / differing", "0.0 * latest", "its own repeat says nothing of a pose"),
+        ("jnp.where(shared < 1.0, found, otherwise)", "found", "the printed form looks at repeats"),
+        ("anchor @ previous]), scale)", "anchor @ previous]), 1.0)", "each answer in its own unit"),
+    ),
     *own("registration/belief", "registration/test_belief")(
+        ("eqx.tree_at(lambda b: b.repeats, after, repeats)", "after", "a frame that fits badly says nothing again"),
         ("A @ covariance @ A.T + ", "covariance + ", "the errors stay in the axes of the camera before"),
         ("jnp.diag(noise**2)", "jnp.diag(noise)", "deviations for variances"),
         ("found.misfit / depth_noise, 1.0) ** 2", "found.misfit / depth_noise, 1.0)", "a deviation for its variance"),

@@ -113,6 +113,7 @@ def predict_room(
         T_world_views=stack_poses(poses),
         T_world_anchor=anchor,
         has_newest=jnp.asarray(has_newest),
+        is_repeat=jnp.asarray(True),
     )
 
 

@@ -14,6 +14,7 @@ from emgs_jax.observation import transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.belief import certain, root_information
 from emgs_jax.registration.icp import icp
+from emgs_jax.registration.pose_noise import Repeats, none_yet
 from emgs_jax.registration.repeat import repeat_scale
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
@@ -139,35 +140,37 @@ def test_the_fused_pose_lies_between_chain_and_anchor_and_far_from_the_anchor_at
     shifted = eqx.tree_at(
         lambda p: p.T_world_views, prediction, jaxlie.SE3((shift @ prediction.T_world_views).wxyz_xyz)
     )
-    fused = at(printed, "coarse", COARSE["fused"])
-    uncertain = eqx.tree_at(lambda b: b.depth_noise, certain(), jnp.asarray(1.0))
+    config = at(at(printed, "coarse", COARSE["fused"]), "pose_shared", 0.75)
 
-    def distance(noise, reach):
-        config = at(at(fused, "anchor_noise", noise), "anchor_range", reach)
-        arguments = shifted, world(FRAME - 1, wide), path_pose(FRAME - 1), wide, config, uncertain
+    def distance(motion, own):
+        belief = eqx.tree_at(lambda b: b.repeats, certain(), repeats_of(motion, own))
+        arguments = shifted, world(FRAME - 1, wide), path_pose(FRAME - 1), wide, config, belief
         return pose_error(coarse_step(*arguments).T_world_camera, path_pose(FRAME))[0]
 
-    assert distance(1e-6, 1.0) == pytest.approx(0.1, abs=1e-3)
-    assert distance(1e9, 1.0) == pytest.approx(0.0, abs=1e-3)
-    assert distance(1.0, 1e-3) == pytest.approx(0.0, abs=1e-3)
+    assert distance(10.0, 1e-3) == pytest.approx(0.1, abs=1e-3)
+    assert distance(1e-3, 10.0) == pytest.approx(0.0, abs=1e-3)
 
 
-@pytest.mark.parametrize(("noise", "reach"), [(1.0, 0.5), (0.25, 0.2), (3.0, 1.0)])
+def repeats_of(motion: float, own: float):
+    """A great many that say these deviations, where three quarters of the variance are shared."""
+    log_squares = jnp.asarray([[2 * np.log(std) + np.log(0.5) - 0.36898] * 2 for std in (motion, own)])
+    return Repeats(none_yet().said, log_squares, jnp.full(2, 1e6))
+
+
+@pytest.mark.parametrize("ratio", [0.5, 1.0, 3.0])
 @pytest.mark.parametrize("shifted_by", [0.005, 0.1])
-def test_the_fused_pose_weighs_chain_and_anchor_by_their_variances(wide, printed, noise, reach, shifted_by):
-    """Q of the motion, Q · noise · (1 + distance / range)² of the prior's own pose, and its Cauchy weight."""
+def test_the_fused_pose_weighs_chain_and_anchor_by_their_variances(wide, printed, ratio, shifted_by):
+    """By the variances of the prior's motion and of its own pose, and that one's Cauchy weight."""
     prediction, shift = predict_room(FRAME, wide), pose(translation=(shifted_by, 0, 0))
     shifted = eqx.tree_at(
         lambda p: p.T_world_views, prediction, jaxlie.SE3((shift @ prediction.T_world_views).wxyz_xyz)
     )
-    config = at(at(at(printed, "coarse", COARSE["fused"]), "anchor_noise", noise), "anchor_range", reach)
-    config = at(config, "icp.prior_information", 30.0)
-    belief = eqx.tree_at(lambda b: b.depth_noise, certain(), jnp.asarray(0.03))
+    config = at(at(printed, "coarse", COARSE["fused"]), "pose_shared", 0.75)
+    config = at(at(config, "icp.prior_information", 30.0), "num_shared", 1e7)
+    belief = eqx.tree_at(lambda b: b.repeats, certain(), repeats_of(0.005, 0.005 * ratio))
     result = coarse_step(shifted, world(FRAME - 1, wide), path_pose(FRAME - 1), wide, config, belief)
-    anchored, anchor = shift @ path_pose(FRAME), prediction.T_world_anchor
-    distance = np.linalg.norm(anchored.translation() - anchor.translation())
-    motion = (0.03 * float(result.mean_depth)) ** 2 / 30
-    own = motion * noise * (1 + distance / reach) ** 2
+    motion = (0.005 * float(result.mean_depth)) ** 2
+    own = motion * ratio**2
     weighted = own * (1 + shifted_by**2 / (motion + own) / 6)
     share = motion / (motion + weighted)
     moved = pose_error(result.T_world_camera, path_pose(FRAME))[0]
@@ -273,9 +276,7 @@ def test_without_enough_pairs_the_priors_own_pose_stands_in_for_the_chain(wide, 
     known, apart = (coarse_of(p, wide, fused) for p in (predict_room(FRAME, wide), blind))
     assert max(pose_error(apart.T_world_camera, expected)) < (2e-3 if count < 16 else 0.5)
     if count < 16:
-        noise = float(apart.depth_noise * apart.mean_depth) / 30**0.5
-        distance = np.linalg.norm(expected.translation() - prediction.T_world_anchor.translation())
-        own = noise * float(fused.anchor_noise) ** 0.5 * (1 + distance / float(fused.anchor_range))
+        noise = own = float(apart.depth_noise * apart.mean_depth) / 30**0.5  # nothing is said twice yet
         far = min(float(fused.max_step), 1.0) * float(apart.mean_depth)
         together = 1 / np.sqrt(1 / own**2 + 1 / (far**2 + noise**2))
         np.testing.assert_allclose(np.sqrt(np.diag(apart.belief.covariance)[:3]), together, rtol=0.1)

@@ -234,6 +234,7 @@ def test_a_step_moves_with_a_rigid_motion_of_the_world(state, camera, settings):
         jaxlie.SE3((motion @ prediction.T_world_views).wxyz_xyz),
         motion @ prediction.T_world_anchor,
         prediction.has_newest,
+        prediction.is_repeat,
     )
     map = eqx.tree_at(lambda m: m.gaussians, state.map, move_gaussians(motion, state.map.gaussians))
     moved_state = SlamState(

@@ -33,7 +33,7 @@ from emgs_jax.ops import camera as cam
 from emgs_jax.ops import clustering, linalg, neighbours
 from emgs_jax.ops.pytree import stack, take_rows
 from emgs_jax.refinement import refine
-from emgs_jax.registration import belief, icp, noise, rigid
+from emgs_jax.registration import belief, icp, noise, pose_noise, rigid
 from emgs_jax.render import composite, densify, project
 
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
@@ -68,7 +68,7 @@ def image_of(seed: int):
 
 def belief_of(seed: int) -> belief.Belief:
     covariance = jnp.diag(jnp.array([4e-4] * 3 + [1e-4] * 4)) * (1.0 + seed)
-    return belief.Belief(covariance, covariance, ONE * 0.01, ONE * 0.02, ONE * 3.0)
+    return belief.Belief(covariance, covariance, ONE * 0.01, ONE * 0.02, ONE * 3.0, pose_noise.none_yet())
 
 
 def coarse_of(seed: int) -> localization.CoarsePose:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.icp import IcpInfo
+from emgs_jax.registration.pose_noise import Repeats, in_unit, none_yet
 
 DEGREES = 7
 
@@ -26,6 +27,7 @@ class Belief(eqx.Module):
         depth_noise: how much its points differ from the map, as a fraction of their depth.
         log_scale: mean logarithm of the scales of the tracked frames: the prior's own unit, in that of the map.
         num_scales: how many these are.
+        repeats: what two answers of the prior differed by about one pose.
     """
 
     covariance: Float[Array, "*b 7 7"]
@@ -33,12 +35,13 @@ class Belief(eqx.Module):
     depth_noise: Float[Array, "*b"]
     log_scale: Float[Array, "*b"]
     num_scales: Float[Array, "*b"]
+    repeats: Repeats
 
 
 def certain() -> Belief:
     """Of the frame that the map is made of: its pose is exact, and its scale is the unit."""
     exact = jnp.zeros((DEGREES, DEGREES))
-    return Belief(exact, exact, jnp.zeros(()), jnp.zeros(()), jnp.ones(()))
+    return Belief(exact, exact, jnp.zeros(()), jnp.zeros(()), jnp.ones(()), none_yet())
 
 
 @full_precision
@@ -70,6 +73,21 @@ def update(
     posterior = jnp.linalg.solve(jnp.eye(DEGREES) + covariance @ information, covariance)
     posterior = 0.5 * (posterior + posterior.T)
     return posterior @ information @ difference, posterior
+
+
+def rescaled_belief(belief: Belief, factor: Float[Array, ""]) -> Belief:
+    """The belief where all lengths of the map are multiplied by `factor`."""
+    units = jnp.ones(DEGREES).at[:3].set(factor)
+    return eqx.tree_at(
+        lambda b: (b.covariance, b.world_covariance, b.log_scale, b.repeats),
+        belief,
+        (
+            units[:, None] * belief.covariance * units,
+            units[:, None] * belief.world_covariance * units,
+            belief.log_scale + jnp.log(factor),
+            in_unit(belief.repeats, factor),
+        ),
+    )
 
 
 def moved(belief: Belief, T_previous_current: jaxlie.SE3, noise: Float[Array, "7"]) -> Belief:
@@ -125,5 +143,7 @@ def next_belief(
     _, world = update(worth * belief.world_covariance, nothing, found.information / num_alike)
     num_scales = belief.num_scales + 1.0
     log_scale = belief.log_scale + (jnp.log(scale) - belief.log_scale) / num_scales
-    after = Belief(covariance, world, found.misfit, log_scale, num_scales)
-    return jax.tree.map(lambda new, old: jnp.where(is_tracked, new, old), after, belief)
+    repeats = in_unit(belief.repeats, scale)
+    after = Belief(covariance, world, found.misfit, log_scale, num_scales, repeats)
+    after = jax.tree.map(lambda new, old: jnp.where(is_tracked, new, old), after, belief)
+    return eqx.tree_at(lambda b: b.repeats, after, repeats)

@@ -23,6 +23,7 @@ from emgs_jax.loops.revisit import RevisitConfig
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement, VerificationConfig, VerifyInfo, neighbours_of, verify
 from emgs_jax.ops.ranges import number
+from emgs_jax.registration.belief import rescaled_belief
 from emgs_jax.running.convert import to_se3
 from emgs_jax.running.following import follow
 from emgs_jax.running.measuring import Edge, Look, NoiseConfig, chain_edge, loop_edge, map_edge, stacked
@@ -276,8 +277,8 @@ class BackEnd:
         self.poses = list(np.asarray(after.T_world.as_matrix(), np.float64)[:count])
         self.log_scales = list(np.asarray(after.log_scale, np.float64)[:count])
         change = jnp.mean(after.log_scale - before.log_scale, where=before.valid)
-        belief = replace(state.belief, log_scale=state.belief.log_scale + change)
-        return follow(replace(state, belief=belief), before, after, self.min_std, self.config.deform)
+        state = replace(state, belief=rescaled_belief(state.belief, jnp.exp(change)))
+        return follow(state, before, after, self.min_std, self.config.deform)
 
     def nodes(self, segment: int | None = None) -> Nodes:
         """All nodes, or those of a segment, with free rows up to a power of two: the map's part compiles rarely."""

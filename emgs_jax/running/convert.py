@@ -129,6 +129,7 @@ def to_prediction(
         T_world_views=to_se3(np.asarray(T_world_anchor) @ prediction.T_anchor_view[rows]),
         T_world_anchor=to_se3(T_world_anchor),
         has_newest=jnp.asarray(has_newest),
+        is_repeat=jnp.asarray(True),
     )
 
 
@@ -159,6 +160,7 @@ def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[
             T_world_views=jaxlie.SE3(poses[jnp.array([i - 1, i, min(i + 1, num_views - 1)])]),
             T_world_anchor=jaxlie.SE3(poses[0]),
             has_newest=jnp.asarray(i + 1 < num_views),
+            is_repeat=jnp.asarray(False),
         )
         for i in range(1, num_views)
     ]

@@ -90,8 +90,9 @@ def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
 
     view = _zeros(jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), first.views))
     pose, poses = (jaxlie.SE3(jnp.asarray(np.eye(1, 7).repeat(n, 0).squeeze(), jnp.float32)) for n in (1, 3))
+    unknown = jnp.asarray(False)
     prediction = Prediction(
-        current=view, previous=view, T_world_views=poses, T_world_anchor=pose, has_newest=jnp.asarray(False)
+        current=view, previous=view, T_world_views=poses, T_world_anchor=pose, has_newest=unknown, is_repeat=unknown
     )
     map = empty_map(config.submap.map_capacity, view.features.shape[-1])
     key = jax.tree.structure((map, view, config)), tuple(leaf.shape for leaf in jax.tree.leaves((map, view)))

@@ -91,6 +91,7 @@ def as_prediction(taken: FirstWindow | Prediction) -> Prediction:
         T_world_views=_repeated(T, 3),
         T_world_anchor=T,
         has_newest=jnp.asarray(False),
+        is_repeat=jnp.asarray(False),
     )
 
 
@@ -109,7 +110,7 @@ def found_at(run: MappingRun, prediction: Prediction, location: Location) -> tup
     T, scale = to_se3(location.T_world_camera), jnp.exp(jnp.asarray(location.log_scale, jnp.float32))
     placed = moved(prediction, anchor_motion(prediction, T, scale))
     views = placed.T_world_views.wxyz_xyz[jnp.array([1, 1, 2])]
-    again = replace(placed, previous=placed.current, T_world_views=jaxlie.SE3(views))
+    again = replace(placed, previous=placed.current, T_world_views=jaxlie.SE3(views), is_repeat=jnp.asarray(False))
     covariance = jnp.asarray(location.covariance, jnp.float32)
     if run.state is None:
         map, time, saved = run.saved.map, len(run.saved.back_end.poses), run.saved

@@ -16,7 +16,7 @@ from emgs_jax.graph.measurements import ODOMETRY
 from emgs_jax.loops.location import Location
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.observation import Prediction
-from emgs_jax.registration.belief import Belief
+from emgs_jax.registration.belief import rescaled_belief
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.convert import FirstWindow, to_se3
 from emgs_jax.running.following import follow, move_map
@@ -141,7 +141,8 @@ def join(run: MappingRun, given: Input) -> None:
     map, run.config = with_part(state.map, moved, run.config)
     run.state = replace(state, map=map)
     if here == newer:
-        run.state = replace(run.state, belief=_moved_belief(similarity, state.belief))
+        factor = jnp.asarray(scale_of(similarity), jnp.float32)
+        run.state = replace(run.state, belief=rescaled_belief(state.belief, factor))
         run.prior_motion = anchored_by(run.records[-1], predicted(run, given))
 
 
@@ -165,17 +166,6 @@ def _moved_record(similarity: np.ndarray, record: FrameRecord) -> FrameRecord:
         **{name: None if pose is None else moved_pose(similarity, pose) for name, pose in poses.items()},
         covariance=None if record.covariance is None else units[:, None] * record.covariance * units,
         scale=None if record.scale is None else scale * record.scale,
-    )
-
-
-def _moved_belief(similarity: np.ndarray, belief: Belief) -> Belief:
-    scale = scale_of(similarity)
-    units = jnp.asarray([scale] * 3 + [1.0] * 4, jnp.float32)
-    return replace(
-        belief,
-        covariance=units[:, None] * belief.covariance * units,
-        world_covariance=units[:, None] * belief.world_covariance * units,
-        log_scale=belief.log_scale + jnp.log(jnp.asarray(scale, jnp.float32)),
     )
 
 

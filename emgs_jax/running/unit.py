@@ -8,6 +8,7 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.registration.belief import rescaled_belief
 from emgs_jax.running.record import MappingRun
 from emgs_jax.slam import SlamState
 
@@ -75,17 +76,11 @@ def rescaled(state: SlamState, factor: float, origin: np.ndarray) -> SlamState:
         lengths = placed(gaussians.means), factor**2 * gaussians.covs
         return eqx.tree_at(lambda m: (m.gaussians.means, m.gaussians.covs), map, lengths)
 
-    T, belief = state.T_world_previous, state.belief
-    units = jnp.asarray([factor] * 3 + [1.0] * 4, jnp.float32)
+    T = state.T_world_previous
     return replace(
         state,
         map=grown(state.map),
         previous=eqx.tree_at(lambda o: o.points, state.previous, placed(state.previous.points)),
         T_world_previous=jaxlie.SE3.from_rotation_and_translation(T.rotation(), placed(T.translation())),
-        belief=replace(
-            belief,
-            covariance=units[:, None] * belief.covariance * units,
-            world_covariance=units[:, None] * belief.world_covariance * units,
-            log_scale=belief.log_scale + jnp.log(jnp.asarray(factor, jnp.float32)),
-        ),
+        belief=rescaled_belief(state.belief, jnp.asarray(factor, jnp.float32)),
     )

@@ -76,6 +76,7 @@ def test_the_root_measures_the_mahalanobis_distance():
 
 def test_a_frame_that_is_tracked_is_known_as_its_points_say_and_another_as_before():
     before = eqx.tree_at(lambda b: (b.covariance, b.world_covariance), certain(), (covariance(), covariance(2)))
+    before = eqx.tree_at(lambda b: b.repeats.said, before, jaxlie.SE3(jnp.tile(MOTION.wxyz_xyz, (2, 1))))
     zero, one = jnp.zeros(()), jnp.ones((), jnp.int32)
     found = IcpInfo(one, zero, zero, jnp.asarray(0.04), jnp.zeros(8), 1e4 * jnp.eye(7), zero, zero, one, one > 0)
     arguments = before, found, jnp.asarray(0.02), jnp.asarray(1.1)
@@ -89,5 +90,9 @@ def test_a_frame_that_is_tracked_is_known_as_its_points_say_and_another_as_befor
     np.testing.assert_allclose(after.log_scale, np.log(1.1) / 2, rtol=1e-5)
     assert after.num_scales == 2 and after.depth_noise == pytest.approx(0.04)
     same = next_belief(*arguments, jnp.asarray(False), jnp.asarray(5.0))
+    # What the prior said of the poses is said, whether its points fit or not: in the unit of its final scale.
+    for belief in (after, same):
+        np.testing.assert_allclose(belief.repeats.said.translation(), 1.1 * before.repeats.said.translation())
+    same = eqx.tree_at(lambda b: b.repeats, same, before.repeats)
     for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(before), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -11,7 +11,7 @@ from scene import slam_config
 from emgs_jax.data.base import Frame
 from emgs_jax.ops.camera import unproject
 from emgs_jax.prior.base import PriorPrediction, Window
-from emgs_jax.running.convert import to_camera, to_first_window, to_prediction, to_se3
+from emgs_jax.running.convert import opening, to_camera, to_first_window, to_prediction, to_se3
 
 HEIGHT, WIDTH = 12, 16
 DATASET = SimpleNamespace(intrinsics=(18.0, 17.0, 7.25, 5.5), size=(WIDTH, HEIGHT))
@@ -73,7 +73,7 @@ def test_a_step_has_the_current_and_the_previous_view_and_their_poses_in_the_wor
     prediction, frames = predicted(Window(3, views, (4, 5), 5))
     step = to_prediction(prediction, frames, ANCHOR, CONFIG)
     assert is_view(step.current, 5) and is_view(step.previous, 4)
-    assert bool(step.has_newest) == has_newest
+    assert bool(step.has_newest) == has_newest and bool(step.is_repeat)
     assert_poses(step.T_world_views, world([4, 5, 6 if has_newest else 5]))
     assert_poses(step.T_world_anchor, ANCHOR)
     np.testing.assert_allclose(step.current.features, np.broadcast_to([1.0, 0.0], step.current.features.shape))
@@ -98,6 +98,13 @@ def test_the_first_window_is_all_its_views_in_order():
     for row, index in enumerate(usable):
         view = SimpleNamespace(**{name: getattr(window.views, name)[row] for name in vars(window.views)})
         assert is_view(view, index)
+
+
+def test_the_steps_of_the_first_window_say_nothing_twice():
+    """They are of one answer: that the poses of one follow from those before says nothing of how right they are."""
+    window, _ = to_first_window(*predicted(FIRST), ANCHOR, CONFIG)
+    _, steps = opening(window, SimpleNamespace(initialization="incremental"))
+    assert len(steps) == len(FIRST.dense) - 1 and not any(step.is_repeat for step in steps)
 
 
 @pytest.mark.parametrize("since", [0, 2])

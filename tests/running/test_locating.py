@@ -47,6 +47,7 @@ def prediction() -> Prediction:
         T_world_views=to_se3(np.stack(poses)),
         T_world_anchor=to_se3(matrix((0, 0, 30), (1, 1, 1))),
         has_newest=jnp.asarray(True),
+        is_repeat=jnp.asarray(True),
     )
 
 
@@ -82,8 +83,9 @@ def test_the_coarse_pose_of_the_step_is_where_the_camera_was_found(coarse):
 
 def test_map_unit_and_time_of_a_lost_run_go_on():
     before = lost_state()
-    state, _ = found_at(run(before), prediction(), FOUND_THERE)
+    state, again = found_at(run(before), prediction(), FOUND_THERE)
     assert_same(state.map, before.map)
+    assert not again.is_repeat  # it is its own previous frame
     assert int(state.time) == 12 and float(state.belief.num_scales) == 9
     np.testing.assert_array_equal(state.belief.log_scale, before.belief.log_scale)
     np.testing.assert_allclose(state.belief.covariance, FOUND_THERE.covariance)

@@ -14,6 +14,7 @@ from emgs_jax.running.unit import in_own_unit, rescaled
 from emgs_jax.slam import SlamState
 
 LOG_SCALE = -0.1  # the map is as much too small
+SAID = (0.5, -1.0, 2.0)
 
 
 def a_run(log_scale: float) -> MappingRun:
@@ -23,8 +24,13 @@ def a_run(log_scale: float) -> MappingRun:
     records = [FrameRecord(0, None, None, "initialization", pose=poses[0])]
     known = {"scale": 0.9, "covariance": np.eye(6)}
     records += [FrameRecord(i, None, None, "tracked", pose=poses[i], newest_pose=poses[i], **known) for i in (1, 2)]
-    known = jnp.asarray(log_scale), jnp.eye(7), jnp.eye(7)
-    belief = eqx.tree_at(lambda b: (b.log_scale, b.covariance, b.world_covariance), certain(), known)
+    known = (
+        jnp.asarray(log_scale),
+        jnp.eye(7),
+        jnp.eye(7),
+        jaxlie.SE3(jnp.tile(pose((0.3, 0, 0), SAID).wxyz_xyz, (2, 1))),
+    )
+    belief = eqx.tree_at(lambda b: (b.log_scale, b.covariance, b.world_covariance, b.repeats.said), certain(), known)
     map = new_map(random_gaussians(9), jnp.ones(9), jnp.ones(()), jnp.asarray(0))
     last = jaxlie.SE3.from_matrix(jnp.asarray(poses[-1], jnp.float32))
     return MappingRun(
@@ -52,6 +58,7 @@ def test_all_lengths_grow_about_the_first_camera_and_directions_stay():
         np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [factor] * 3 + [1.0] * 4, rtol=1e-5)
     np.testing.assert_allclose(np.sqrt(np.diag(run.records[1].covariance)), [factor] * 3 + [1.0] * 3, rtol=1e-7)
     assert float(after.belief.log_scale) == pytest.approx(0.0, abs=1e-6)
+    np.testing.assert_allclose(after.belief.repeats.said.translation(), factor * np.tile(SAID, (2, 1)), rtol=1e-5)
 
 
 def test_a_point_keeps_its_pixel_in_every_view():

@@ -1,0 +1,99 @@
+"""How wrong the prior's poses are: by how much two of its answers differ about the same one.
+
+The answer before the current one has the current frame as its newest, and the previous one as its current: it has said
+how the camera moved from there to here, and where it was then relative to the anchor. The current one says both again.
+Depths tell less: a prior may keep those of an image, and one that solves for poses knows them better than any depth.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from emgs_jax.observation import Prediction
+from emgs_jax.ops.precision import full_precision
+from emgs_jax.ops.pytree import stack
+from emgs_jax.registration.rigid import pose_row, scale_translation
+
+LOG_OF_SQUARE = -0.36898  # mean logarithm of χ²/3 with three degrees of freedom: ψ(3/2) - log(3/2)
+SMALLEST_SQUARE = 1e-14  # of what two answers differ by: rounding
+
+
+class Repeats(eqx.Module):
+    """What two answers of the prior differed by so far; rows: motion to the next frame, pose relative to the anchor.
+
+    Args:
+        said: both as the last answer has them, m of the map; NaN where it has none.
+        log_squares: mean logarithm of the mean square, per axis, of the differences: of lengths in mean depths, angles.
+        counts: differences in that mean.
+    """
+
+    said: jaxlie.SE3
+    log_squares: Float[Array, "*b 2 2"]
+    counts: Float[Array, "*b 2"]
+
+
+def none_yet() -> Repeats:
+    """Of the frame that the map is made of."""
+    return Repeats(jaxlie.SE3(jnp.full((2, 7), jnp.nan)), jnp.zeros((2, 2)), jnp.zeros(2))
+
+
+def in_unit(repeats: Repeats, factor: Float[Array, ""]) -> Repeats:
+    """The repeats where all lengths of the map are multiplied by `factor`."""
+    return eqx.tree_at(lambda r: r.said, repeats, scale_translation(repeats.said, factor))
+
+
+@full_precision
+def repeat_poses(
+    prediction: Prediction,
+    before: Repeats,
+    scale: Float[Array, ""],
+    mean_depth: Float[Array, ""],
+    max_count: Float[Array, ""],
+) -> tuple[Repeats, Float[Array, "2 2"]]:
+    """The repeats with those of this answer, and the mean squares of these alone: 0 where it says nothing again.
+
+    Args:
+        prediction: the answer.
+        before: of the last frame.
+        scale: of this answer. The poses returned are in its own unit: `in_unit` when the scale is final.
+        mean_depth: of the previous frame, m of the map.
+        max_count: from this number of differences on older ones are forgotten.
+    """
+    previous, current, newest = (pose_row(prediction.T_world_views, row) for row in range(3))
+    anchor = prediction.T_world_anchor.inverse()
+    again = scale_translation(stack([previous.inverse() @ current, anchor @ previous]), scale).wxyz_xyz
+    is_again = jnp.all(jnp.isfinite(before.said.wxyz_xyz) & jnp.isfinite(again), axis=-1) & prediction.is_repeat
+    none = jaxlie.SE3.identity().wxyz_xyz
+    then, now = (jaxlie.SE3(jnp.where(is_again[:, None], T, none)) for T in (before.said.wxyz_xyz, again))
+    differences = (then.inverse() @ now).log().reshape(2, 2, 3) / jnp.stack([mean_depth, jnp.ones(())])[:, None]
+    squares = jnp.mean(differences**2, axis=-1)
+    counts = jnp.minimum(before.counts + is_again, max_count)
+    changes = (jnp.log(squares + SMALLEST_SQUARE) - before.log_squares) / jnp.maximum(counts, 1.0)[:, None]
+    log_squares = before.log_squares + jnp.where(is_again[:, None], changes, 0.0)
+    coming = jnp.where(prediction.has_newest, (current.inverse() @ newest).wxyz_xyz, jnp.nan)
+    said = stack([jaxlie.SE3(coming), anchor @ current])
+    return Repeats(said, log_squares, counts), squares
+
+
+@full_precision
+def pose_std(
+    repeats: Repeats, latest: Float[Array, "2 2"], otherwise: Float[Array, ""], shared: Float[Array, ""]
+) -> Float[Array, "2 2"]:
+    """Standard deviations per axis, of lengths and angles (columns), of the prior's motion and of its own pose (rows).
+
+    Two answers of variance v that have the part c of it in common differ by the variance 2 (1 - c) v. The mean is one
+    of logarithms, and what was to be expected without any repeat counts like one of them: neither a turn on the spot
+    nor a first guess that is far off holds it. A pose whose own repeat differs by more is as uncertain as that.
+
+    Args:
+        repeats: so far.
+        latest: of this answer alone, see `repeat_poses`.
+        otherwise: of both and each, without any repeat and for `shared` = 1.
+        shared: c.
+    """
+    differing, counts = 2.0 * jnp.maximum(1.0 - shared, 1e-6), repeats.counts[:, None]
+    of_repeats = repeats.log_squares - LOG_OF_SQUARE - jnp.log(differing)
+    mean = (counts * of_repeats + 2.0 * jnp.log(otherwise)) / (counts + 1.0)
+    found = jnp.sqrt(jnp.maximum(jnp.exp(mean), latest / differing))
+    return jnp.where(shared < 1.0, found, otherwise)
