@@ -250,6 +250,28 @@ def test_a_step_moves_with_a_rigid_motion_of_the_world(state, camera, settings):
     assert np.median(error) < 2e-3 and np.quantile(error, 0.95) < 0.02
 
 
+@pytest.mark.parametrize(
+    "law",
+    [
+        {"depth_noise": 0.03, "scale_noise": 0.0, "pose_noise": (1e-4, 1e-4)},  # structure from motion
+        {"depth_noise": 0.002, "scale_noise": 0.0, "pose_noise": (0.03, 0.015)},  # a depth camera in the hand
+    ],
+)
+def test_poses_are_trusted_as_far_as_they_repeat_whatever_depths_do(window, camera, config, law):
+    """By the law of the depths, as printed, the path of either prior is worse: nothing ties the two."""
+    rng, count = np.random.default_rng(0), 15
+    given = [window, *(noisy_prediction(FRAME + i, camera, rng, **law) for i in range(count))]
+    chosen = at(config(*WHOLE, "slam.initialization=merged"), "localization.max_residual", 1.0)
+
+    def error(shared):
+        _, infos = run(given, FULL, at(chosen, "localization.pose_shared", shared))
+        ends = [pose_error(info.T_world_camera, path_pose(FRAME + i))[0] for i, info in enumerate(infos)]
+        return np.sqrt(np.mean(np.square(ends)))
+
+    said, by_depths = error(0.75), error(1.0)
+    assert said < 0.7 * by_depths
+
+
 @pytest.mark.parametrize("poison", [1e6])
 def test_free_rows_of_the_map_and_invalid_points_change_nothing(state, camera, settings, poison):
     def put(tree, valid):
