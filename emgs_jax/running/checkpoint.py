@@ -22,7 +22,7 @@ from emgs_jax.running.record import FrameRecord, MappingRun
 from emgs_jax.slam import SlamConfig, SlamState
 
 CHECKPOINT_FILE = "checkpoint.npz"
-FORMAT, VERSION = "emgs_jax.checkpoint", 4
+FORMAT, VERSION = "emgs_jax.checkpoint", 5
 POSES = tuple(field.name for field in fields(FrameRecord) if field.name.endswith("pose"))
 MATRICES = dict.fromkeys(POSES, 4) | {"covariance": 6, "similarity": 4}  # of a record, and how many rows they have
 
