@@ -197,7 +197,7 @@ STAGES = [
         ("[mean_depth, jnp.ones(())]", "[jnp.ones(()), jnp.ones(())]", "metres for a fraction of the depth"),
         (" & prediction.is_repeat\n", "\n", "one answer repeats itself"),
         ("before.counts + is_again, max_count", "before.counts + is_again, jnp.inf", "nothing is forgotten"),
-        ("prediction.has_newest, (current", "True, (current", "a motion that was never said"),
+        ("[prediction.has_newest, jnp", "[jnp.asarray(True), jnp", "a motion that was never said"),
         (" - LOG_OF_SQUARE", "", "a mean of logarithms for the logarithm of the mean"),
         (" - jnp.log(differing)", "", "all of the variance differs"),
         ("latest / differing", "0.0 * latest", "its own repeat says nothing of a pose"),

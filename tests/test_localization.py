@@ -1,5 +1,7 @@
 """Coarse readings recover an exact chain, scales are found, every guard keeps the coarse pose and says why."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,7 +16,7 @@ from emgs_jax.observation import transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.belief import certain, root_information
 from emgs_jax.registration.icp import icp
-from emgs_jax.registration.pose_noise import Repeats, none_yet
+from emgs_jax.registration.pose_noise import none_yet
 from emgs_jax.registration.repeat import repeat_scale
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
@@ -154,7 +156,7 @@ def test_the_fused_pose_lies_between_chain_and_anchor_and_far_from_the_anchor_at
 def repeats_of(motion: float, own: float):
     """A great many that say these deviations, where three quarters of the variance are shared."""
     log_squares = jnp.asarray([[2 * np.log(std) + np.log(0.5) - 0.36898] * 2 for std in (motion, own)])
-    return Repeats(none_yet().said, log_squares, jnp.full(2, 1e6))
+    return replace(none_yet(), log_squares=log_squares, counts=jnp.full(2, 1e6))
 
 
 @pytest.mark.parametrize("ratio", [0.5, 1.0, 3.0])

@@ -8,7 +8,7 @@ Depths tell less: a prior may keep those of an image, and one that solves for po
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.precision import full_precision
@@ -23,19 +23,21 @@ class Repeats(eqx.Module):
     """What two answers of the prior differed by so far; rows: motion to the next frame, pose relative to the anchor.
 
     Args:
-        said: both as the last answer has them, m of the map; NaN where it has none.
+        said: both as the last answer has them, m of the map.
+        is_said: False where it has none; `said` is the identity then.
         log_squares: mean logarithm of the mean square, per axis, of the differences: of lengths in mean depths, angles.
         counts: differences in that mean.
     """
 
     said: jaxlie.SE3
+    is_said: Bool[Array, "*b 2"]
     log_squares: Float[Array, "*b 2 2"]
     counts: Float[Array, "*b 2"]
 
 
 def none_yet() -> Repeats:
     """Of the frame that the map is made of."""
-    return Repeats(jaxlie.SE3(jnp.full((2, 7), jnp.nan)), jnp.zeros((2, 2)), jnp.zeros(2))
+    return Repeats(jaxlie.SE3.identity((2,)), jnp.zeros(2, bool), jnp.zeros((2, 2)), jnp.zeros(2))
 
 
 def in_unit(repeats: Repeats, factor: Float[Array, ""]) -> Repeats:
@@ -63,17 +65,19 @@ def repeat_poses(
     previous, current, newest = (pose_row(prediction.T_world_views, row) for row in range(3))
     anchor = prediction.T_world_anchor.inverse()
     again = scale_translation(stack([previous.inverse() @ current, anchor @ previous]), scale).wxyz_xyz
-    is_again = jnp.all(jnp.isfinite(before.said.wxyz_xyz) & jnp.isfinite(again), axis=-1) & prediction.is_repeat
-    none = jaxlie.SE3.identity().wxyz_xyz
-    then, now = (jaxlie.SE3(jnp.where(is_again[:, None], T, none)) for T in (before.said.wxyz_xyz, again))
-    differences = (then.inverse() @ now).log().reshape(2, 2, 3) / jnp.stack([mean_depth, jnp.ones(())])[:, None]
-    squares = jnp.mean(differences**2, axis=-1)
+    is_again = before.is_said & jnp.all(jnp.isfinite(again), axis=-1) & prediction.is_repeat
+    again = jnp.where(is_again[:, None], again, before.said.wxyz_xyz)
+    differences = (before.said.inverse() @ jaxlie.SE3(again)).log().reshape(2, 2, 3) / jnp.stack(
+        [mean_depth, jnp.ones(())]
+    )[:, None]
+    squares = jnp.where(is_again[:, None], jnp.mean(differences**2, axis=-1), 0.0)
     counts = jnp.minimum(before.counts + is_again, max_count)
     changes = (jnp.log(squares + SMALLEST_SQUARE) - before.log_squares) / jnp.maximum(counts, 1.0)[:, None]
     log_squares = before.log_squares + jnp.where(is_again[:, None], changes, 0.0)
-    coming = jnp.where(prediction.has_newest, (current.inverse() @ newest).wxyz_xyz, jnp.nan)
-    said = stack([jaxlie.SE3(coming), anchor @ current])
-    return Repeats(said, log_squares, counts), squares
+    said = stack([current.inverse() @ newest, anchor @ current]).wxyz_xyz
+    is_said = jnp.all(jnp.isfinite(said), axis=-1) & jnp.stack([prediction.has_newest, jnp.asarray(True)])
+    said = jaxlie.SE3(jnp.where(is_said[:, None], said, jaxlie.SE3.identity().wxyz_xyz))
+    return Repeats(said, is_said, log_squares, counts), squares
 
 
 @full_precision

@@ -1,5 +1,7 @@
 """What two answers about one pose differ by: against answers whose errors are drawn, with a part of them in common."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -132,7 +134,7 @@ def test_older_repeats_are_forgotten():
     small, large, repeats = 0.01, 0.1, none_yet()
     said, _ = said_again(none_yet(), exact(1))
     for size in [small] * 10 + [large] * 30:
-        before = Repeats(said.said, repeats.log_squares, repeats.counts)
+        before = Repeats(said.said, said.is_said, repeats.log_squares, repeats.counts)
         repeats, _ = said_again(before, answer(2, jaxlie.SE3.identity(), (STEP @ pose((0, 0, 0), (size, 0, 0)), STEP)))
     assert float(repeats.counts[0]) == MEMORY
     logs = np.log([size**2 / 3 / DEPTH**2 for size in (small, large)])
@@ -143,7 +145,7 @@ def test_older_repeats_are_forgotten():
 def test_without_repeats_the_depths_say_it_and_one_guess_counts_like_one_repeat():
     nothing, guess, shared = jnp.zeros((2, 2)), jnp.asarray(0.02), jnp.asarray(0.5)
     np.testing.assert_allclose(pose_std(none_yet(), nothing, guess, shared), 0.02 * np.ones((2, 2)), rtol=1e-5)
-    known = Repeats(none_yet().said, jnp.full((2, 2), np.log(0.001**2) - 0.36898), jnp.array([3.0, 0.0]))
+    known = replace(none_yet(), log_squares=jnp.full((2, 2), np.log(0.001**2) - 0.36898), counts=jnp.array([3.0, 0.0]))
     std = pose_std(known, nothing, guess, shared)
     np.testing.assert_allclose(std[0], 0.001 ** (3 / 4) * 0.02 ** (1 / 4), rtol=1e-4)
     np.testing.assert_allclose(std[1], 0.02, rtol=1e-5)
