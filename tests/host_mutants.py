@@ -361,8 +361,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/running/back_end.py",
-        "state.belief.log_scale + change",
-        "state.belief.log_scale",
+        "belief=rescaled_belief(state.belief, jnp.exp(change))",
+        "belief=state.belief",
         BACK_END,
         "the unit of a run is corrected twice",
     ),
