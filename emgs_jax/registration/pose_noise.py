@@ -67,9 +67,8 @@ def repeat_poses(
     again = scale_translation(stack([previous.inverse() @ current, anchor @ previous]), scale).wxyz_xyz
     is_again = before.is_said & jnp.all(jnp.isfinite(again), axis=-1) & prediction.is_repeat
     again = jnp.where(is_again[:, None], again, before.said.wxyz_xyz)
-    differences = (before.said.inverse() @ jaxlie.SE3(again)).log().reshape(2, 2, 3) / jnp.stack(
-        [mean_depth, jnp.ones(())]
-    )[:, None]
+    units = jnp.stack([mean_depth, jnp.ones(())])[:, None]
+    differences = (before.said.inverse() @ jaxlie.SE3(again)).log().reshape(2, 2, 3) / units
     squares = jnp.where(is_again[:, None], jnp.mean(differences**2, axis=-1), 0.0)
     counts = jnp.minimum(before.counts + is_again, max_count)
     changes = (jnp.log(squares + SMALLEST_SQUARE) - before.log_squares) / jnp.maximum(counts, 1.0)[:, None]
