@@ -205,7 +205,11 @@ STAGES = [
         ("anchor @ previous]), scale)", "anchor @ previous]), 1.0)", "each answer in its own unit"),
     ),
     *own("registration/belief", "registration/test_belief")(
-        ("eqx.tree_at(lambda b: b.repeats, after, repeats)", "after", "a frame that fits badly says nothing again"),
+        (
+            "belief.repeats, scale))\n    after = Belief(",
+            "belief.repeats, 1.0))\n    after = Belief(",
+            "what was said stays in the unit of its answer",
+        ),
         ("A @ covariance @ A.T + ", "covariance + ", "the errors stay in the axes of the camera before"),
         ("jnp.diag(noise**2)", "jnp.diag(noise)", "deviations for variances"),
         ("found.misfit / depth_noise, 1.0) ** 2", "found.misfit / depth_noise, 1.0)", "a deviation for its variance"),

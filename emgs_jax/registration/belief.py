@@ -143,7 +143,7 @@ def next_belief(
     _, world = update(worth * belief.world_covariance, nothing, found.information / num_alike)
     num_scales = belief.num_scales + 1.0
     log_scale = belief.log_scale + (jnp.log(scale) - belief.log_scale) / num_scales
-    repeats = in_unit(belief.repeats, scale)
-    after = Belief(covariance, world, found.misfit, log_scale, num_scales, repeats)
-    after = jax.tree.map(lambda new, old: jnp.where(is_tracked, new, old), after, belief)
-    return eqx.tree_at(lambda b: b.repeats, after, repeats)
+    # What the prior said of its poses is said whether its points fit or not.
+    belief = eqx.tree_at(lambda b: b.repeats, belief, in_unit(belief.repeats, scale))
+    after = Belief(covariance, world, found.misfit, log_scale, num_scales, belief.repeats)
+    return jax.tree.map(lambda new, old: jnp.where(is_tracked, new, old), after, belief)
