@@ -31,6 +31,7 @@ WINDOWS = ("tests/prior/test_windows.py",)
 RECORDED = ("tests/prior/test_recorded.py",)
 FEATURED = ("tests/prior/test_featured.py",)
 BUNDLE = ("tests/prior/multiview/test_bundle_adjustment.py",)
+KEYS = ("tests/prior/multiview/test_keys.py",)
 DEPTH = ("tests/prior/multiview/test_depth.py",)
 INCREMENTAL = ("tests/prior/multiview/test_incremental.py",)
 LENS = ("tests/prior/multiview/test_lens.py",)
@@ -1594,38 +1595,59 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/prior/multiview/bundle_adjustment.py",
-        "1.0 + jnp.sum(fixed**2, axis=-1) / config.pixel_std**2",
-        "1.0 + 0.0 * jnp.sum(fixed**2, axis=-1) / config.pixel_std**2",
+        "(config.pixel_std**2 + jnp.sum(errors**2, axis=-1))",
+        "(config.pixel_std**2 + 0.0 * jnp.sum(errors**2, axis=-1))",
         BUNDLE,
-        "points are solved without the robust weight",
+        "steps without the robust weight",
     ),
     Mutant(
         "emgs_jax/prior/multiview/bundle_adjustment.py",
-        "return jnp.where(seen, jnp.sqrt(jnp.log1p(safe) / safe), 0.0)[..., None] * errors",
-        "return jnp.where(seen, 1.0, 0.0)[..., None] * errors",
-        BUNDLE,
-        "poses by least squares without the robust loss",
-    ),
-    Mutant(
-        "emgs_jax/prior/multiview/bundle_adjustment.py",
-        "return T_ref_view @ jaxlie.SE3.exp(jnp.where(is_fixed[:, None], 0.0, xi))",
-        "return T_ref_view @ jaxlie.SE3.exp(jnp.where(is_fixed[:, None], xi, 0.0))",
+        "of_view = (unknowns.free == jnp.arange(num_views)[:, None])",
+        "of_view = (unknowns.free != jnp.arange(num_views)[:, None])",
         BUNDLE,
         "the wrong views are held",
     ),
     Mutant(
         "emgs_jax/prior/multiview/bundle_adjustment.py",
-        "xi, lens = (jnp.where(is_finite, found, 0.0) for found in solution)",
-        "xi, lens = (0.0 * found for found in solution)",
+        "lambda a, b: jnp.where(is_better, a, b), found, estimate",
+        "lambda a, b: jnp.where(is_better, a, b), estimate, found",
         BUNDLE,
-        "poses stay where they start",
+        "what is worse is taken",
     ),
     Mutant(
         "emgs_jax/prior/multiview/bundle_adjustment.py",
-        "for _ in range(config.num_point_steps - 1):",
-        "for _ in range(0):",
+        'schur = (A - jnp.einsum("lcj,ldj->cd", onto, B))',
+        "schur = A",
         BUNDLE,
-        "points take a single step",
+        "points are taken to stay when the poses move",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/bundle_adjustment.py",
+        "jnp.log1p(squares / problem.config.pixel_std**2)",
+        "squares / problem.config.pixel_std**2",
+        BUNDLE,
+        "steps are judged without the robust loss",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/keys.py",
+        ">= config.min_shift * width",
+        ">= 0.0",
+        KEYS,
+        "every view that leaves is a key",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/keys.py",
+        "if frame not in views)",
+        "if frame in views)",
+        KEYS,
+        "views of the window are keys",
+    ),
+    Mutant(
+        "emgs_jax/prior/multiview/keys.py",
+        "(-shared[frame], -frame)",
+        "(shared[frame], -frame)",
+        KEYS,
+        "keys that share most go first",
     ),
     Mutant(
         "emgs_jax/prior/multiview/lens.py",
@@ -1762,7 +1784,7 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/prior/multiview/incremental.py",
-        "num_fixed = min(config.num_fixed, len(frames) - 2)",
+        "num_fixed = max(min(config.num_fixed, len(frames) - 2), len(frames) - num_views)",
         "num_fixed = len(frames)",
         INCREMENTAL,
         "later windows are not refined",

@@ -1,20 +1,21 @@
-"""Bundle adjustment of a window: Levenberg–Marquardt over the poses, every point eliminated.
+"""Bundle adjustment of a window: Levenberg–Marquardt over poses, points and lens, every point eliminated.
 
-For given poses each point has its own small least-squares problem. Its Gauss–Newton solution, as a function of the
-poses, leaves a problem in the poses alone (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 1973), whose
-Jacobian is that of the Schur complement.
+Landmarks meet in the poses only, so each has its own three normal equations. What they leave is the Schur complement, a
+small dense problem in the poses (Triggs et al., "Bundle adjustment: a modern synthesis", 2000). An error e counts by
+the Cauchy loss log(1 + e²/σ²)/2, which gives it the weight 1 / (σ² + e²).
 
 The lens may be an unknown too. Baselines are short, so a radial error of the pixels does not show as a large residual:
 it turns the views and moves them the other way, and structure and path get two scales (7-Scenes: k = -.03, 6 %).
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-import lineax as lx
-import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jax.scipy.linalg import cho_factor, cho_solve
+from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, project
 from emgs_jax.ops.linalg import inverse_3x3
@@ -22,21 +23,21 @@ from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, traced
 from emgs_jax.prior.multiview.lens import undistort
 
+FIRST_DAMPING, LEAST_DAMPING, DAMPING_FACTOR = 1e-4, 1e-8, 10.0  # Marquardt's, as a fraction of the diagonal
+
 
 class BundleConfig(eqx.Module):
     """The robust loss and the solve.
 
     Args:
-        pixel_std: standard deviation of a detected point; larger errors count ever less (Cauchy).
+        pixel_std: σ, standard deviation of a detected point.
         damping: of a point's solve, as a fraction of its Hessian's trace: holds the depth of a point without parallax.
-        num_point_steps: Gauss–Newton steps of every point for given poses.
         max_steps: of the solver.
-        tolerance: relative and absolute, of the solver.
+        tolerance: it ends with a step that lowers the loss by less than this fraction.
     """
 
     pixel_std: Float[Array, "*b"] = traced(low=1e-6, high=1000)
     damping: Float[Array, "*b"] = traced(low=0, high=1)
-    num_point_steps: int = static(low=0, high=100)
     max_steps: int = static(low=0, high=1000)
     tolerance: float = static(low=0, high=1)
 
@@ -57,73 +58,91 @@ class Unknowns(eqx.Module):
     """What is solved for, beside the points.
 
     Args:
-        is_fixed: views whose pose is held.
+        free: rows of the views whose pose is not held; v where there are fewer.
         distortion_std: what the lens's distortion is expected to be, see `undistort`; 0 = it has none.
     """
 
-    is_fixed: Bool[Array, "v"]
+    free: Int[Array, "f"]
     distortion_std: Float[Array, ""]
 
 
-def _errors(
-    T_ref_view: jaxlie.SE3, points: Float[Array, "l 3"], tracks: Tracks, camera: Camera
-) -> tuple[Float[Array, "v l 2"], Float[Array, "v l 2 3"], Bool[Array, "v l"]]:
-    """Reprojection errors (px), their Jacobians by the point, and which of them count."""
-    rotation = T_ref_view.rotation().as_matrix()
-    local = jnp.einsum("vij,vli->vlj", rotation, points - T_ref_view.translation()[:, None])
-    pixels, depth = project(camera, local)
-    seen = tracks.is_seen & (depth > NEAREST_DEPTH)
-    safe_depth = jnp.where(seen, depth, 1.0)
-    along = jnp.eye(2, 3) - local[..., :2, None] * jnp.array([0.0, 0.0, 1.0]) / safe_depth[..., None, None]
-    by_local = camera.focal[:, None] * along / safe_depth[..., None, None]
-    jacobian = jnp.einsum("vlij,vkj->vlik", by_local, rotation)
-    return jnp.where(seen[..., None], pixels - tracks.pixels, 0.0), jacobian, seen
+class Estimate(NamedTuple):
+    """Poses, camera -> reference; points of the reference frame; the distortion in its standard deviations."""
+
+    T_ref_view: jaxlie.SE3
+    points: Float[Array, "l 3"]
+    lens: Float[Array, ""]
+
+
+class Problem(NamedTuple):
+    """What was seen and what is solved for."""
+
+    tracks: Tracks
+    unknowns: Unknowns
+    camera: Camera
+    config: BundleConfig
 
 
 def _moved(
-    T_ref_view: jaxlie.SE3, points: Float[Array, "l 3"], tracks: Tracks, camera: Camera, config: BundleConfig
-) -> Float[Array, "l 3"]:
-    """One Gauss–Newton step of every point; differentiable in the poses as the Schur complement is."""
-    errors, jacobian, seen = _errors(T_ref_view, points, tracks, camera)
-    fixed, jacobian = jax.lax.stop_gradient((errors, jacobian))
-    weight = seen / (1.0 + jnp.sum(fixed**2, axis=-1) / config.pixel_std**2)
-    weighted = weight[..., None, None] * jacobian
-    hessian = jnp.einsum("vlij,vlik->ljk", weighted, jacobian)
-    trace = jnp.trace(hessian, axis1=-2, axis2=-1)
-    inverse = inverse_3x3(hessian + (config.damping * trace)[:, None, None] * jnp.eye(3))
-    step = jnp.einsum("ljk,vlik,vli->lj", inverse, weighted, errors)
-    return points - jnp.where(trace[:, None] > 0, step, 0.0)
+    estimate: Estimate, xi: Float[Array, "*v 6"], points_step: Float[Array, "*l 3"], lens_step: Float[Array, ""]
+) -> Estimate:
+    """Poses T Exp(ξ), points and lens after a step; a single row is one of all."""
+    moved = estimate.T_ref_view @ jaxlie.SE3.exp(xi)
+    return Estimate(moved, estimate.points + points_step, estimate.lens + lens_step)
 
 
-def settle(
-    T_ref_view: jaxlie.SE3, points: Float[Array, "l 3"], tracks: Tracks, camera: Camera, config: BundleConfig
-) -> Float[Array, "l 3"]:
-    """The points that fit these poses, by `num_point_steps` Gauss–Newton steps."""
-    still = jax.lax.stop_gradient(T_ref_view.wxyz_xyz)
-    for _ in range(config.num_point_steps - 1):
-        points = jax.lax.stop_gradient(_moved(jaxlie.SE3(still), points, tracks, camera, config))
-    return _moved(T_ref_view, points, tracks, camera, config)
+def _errors(estimate: Estimate, problem: Problem) -> tuple[Float[Array, "v l 2"], Bool[Array, "v l"]]:
+    """Reprojection errors (px), and which of them count: what is seen and in front of the view. The others are 0."""
+    T, tracks, camera = estimate.T_ref_view, problem.tracks, problem.camera
+    away = estimate.points - T.translation()[:, None]
+    pixels, depth = project(camera, jnp.einsum("vij,vli->vlj", T.rotation().as_matrix(), away))
+    shown = jnp.where(tracks.is_seen[..., None], tracks.pixels, 0.0)
+    distortion = problem.unknowns.distortion_std * estimate.lens
+    counts = tracks.is_seen & (depth > NEAREST_DEPTH)
+    errors = pixels - undistort(shown, distortion, camera.focal, camera.center)
+    return jnp.where(counts[..., None], errors, 0.0), counts
 
 
-def _posed(xi: Float[Array, "v 6"], T_ref_view: jaxlie.SE3, is_fixed: Bool[Array, "v"]) -> jaxlie.SE3:
-    return T_ref_view @ jaxlie.SE3.exp(jnp.where(is_fixed[:, None], 0.0, xi))
+def _loss(estimate: Estimate, problem: Problem) -> Float[Array, ""]:
+    """The sum of the losses; what is behind its view counts as an error of a focal length."""
+    errors, counts = _errors(estimate, problem)
+    behind = problem.tracks.is_seen & ~counts
+    squares = jnp.where(behind, jnp.sum(problem.camera.focal**2), jnp.sum(errors**2, axis=-1))
+    return 0.5 * (jnp.sum(jnp.log1p(squares / problem.config.pixel_std**2)) + estimate.lens**2)
 
 
-def _seen_by(lens: Float[Array, ""], tracks: Tracks, unknowns: Unknowns, camera: Camera) -> Tracks:
-    distortion, pixels = unknowns.distortion_std * lens, jnp.where(tracks.is_seen[..., None], tracks.pixels, 0.0)
-    return Tracks(undistort(pixels, distortion, camera.focal, camera.center), tracks.is_seen)
+def _columns(unknowns: Unknowns, num_views: int) -> Float[Array, "v 7 u"]:
+    """Where a view's ξ and the lens, which is the last, stand among the unknowns; nowhere where the pose is held."""
+    of_view = (unknowns.free == jnp.arange(num_views)[:, None]).astype(jnp.float32)
+    of_poses = jnp.einsum("vf,ab->vafb", of_view, jnp.eye(6)).reshape(num_views, 6, -1)
+    return jnp.pad(of_poses, ((0, 0), (0, 1), (0, 1))).at[:, -1, -1].set(1.0)
 
 
-def _residuals(unknown: tuple, args: tuple) -> tuple[Float[Array, "v l 2"], Float[Array, ""]]:
-    """Reprojection errors in standard deviations, whose squares sum to the Cauchy loss, and the distortion in its."""
-    (xi, lens), (T_start, points, tracks, unknowns, camera, config) = unknown, args
-    T, tracks = _posed(xi, T_start, unknowns.is_fixed), _seen_by(lens, tracks, unknowns, camera)
-    points = settle(T, points, tracks, camera, config)
-    errors, _, seen = _errors(T, points, tracks, camera)
-    errors = errors / config.pixel_std
-    squared = jnp.where(seen, jnp.sum(errors**2, axis=-1), 1.0)
-    safe = jnp.maximum(squared, 1e-6)
-    return jnp.where(seen, jnp.sqrt(jnp.log1p(safe) / safe), 0.0)[..., None] * errors, lens
+def _step(
+    estimate: Estimate, problem: Problem, damping: Float[Array, ""]
+) -> tuple[Float[Array, "v 6"], Float[Array, "l 3"], Float[Array, ""]]:
+    """Of poses, points and lens, by the damped normal equations of the weighted errors."""
+    (errors, counts), config = _errors(estimate, problem), problem.config
+    # A step that all views, or all points, share moves each error as one of its own does.
+    shared = jax.jacfwd(lambda x: _errors(_moved(estimate, x[:6], x[7:], x[6]), problem)[0])(jnp.zeros(10))
+    root = jnp.sqrt(counts / (config.pixel_std**2 + jnp.sum(errors**2, axis=-1)))[..., None]
+    J, errors = root[..., None] * shared, root * errors
+    J, of_points = J[..., :7], J[..., 7:]
+    columns = _columns(problem.unknowns, len(J))
+    A = jnp.einsum("vac,vlia,vlib,vbd->cd", columns, J, J, columns).at[-1, -1].add(1.0)
+    B = jnp.einsum("vac,vlaj->lcj", columns, jnp.einsum("vlia,vlij->vlaj", J, of_points))
+    C = jnp.einsum("vlij,vlik->ljk", of_points, of_points)
+    a = -jnp.einsum("vac,vlia,vli->c", columns, J, errors).at[-1].add(estimate.lens)
+    c = -jnp.einsum("vlij,vli->lj", of_points, errors)
+    A = A + jnp.diag(jnp.where(jnp.diagonal(A) > 0, damping * jnp.diagonal(A), 1.0))
+    trace = jnp.trace(C, axis1=-2, axis2=-1)[:, None, None]
+    inverse = inverse_3x3(C + ((config.damping + damping) * trace + (trace == 0)) * jnp.eye(3))
+    onto = jnp.einsum("lcj,ljk->lck", B, inverse)
+    std = jnp.sqrt(jnp.diagonal(A))  # scaled so, the equations of metres and radians are alike
+    schur = (A - jnp.einsum("lcj,ldj->cd", onto, B)) / std / std[:, None]
+    step = cho_solve(cho_factor(schur, lower=True), (a - jnp.einsum("lcj,lj->c", onto, c)) / std) / std
+    points = jnp.einsum("ljk,lk->lj", inverse, c - jnp.einsum("lcj,c->lj", B, step))
+    return jnp.einsum("vac,c->va", columns[:, :6], step), points, step[-1]
 
 
 @full_precision
@@ -149,16 +168,25 @@ def adjust(
         Poses, points, the distortion, and the reprojection error (px) of every observation, inf where it is none or
         behind the view.
     """
-    args = (T_ref_view, points, tracks, unknowns, camera, config)
-    solver = optx.LevenbergMarquardt(
-        rtol=config.tolerance, atol=config.tolerance, linear_solver=lx.Normal(lx.Cholesky())
-    )
-    start = jnp.zeros((unknowns.is_fixed.shape[0], 6)), jnp.zeros(())
-    solution = optx.least_squares(_residuals, solver, start, args, max_steps=config.max_steps, throw=False).value
-    is_finite = jnp.all(jnp.isfinite(solution[0])) & jnp.isfinite(solution[1])
-    xi, lens = (jnp.where(is_finite, found, 0.0) for found in solution)
-    T, tracks = _posed(xi, T_ref_view, unknowns.is_fixed), _seen_by(lens, tracks, unknowns, camera)
-    points = settle(T, points, tracks, camera, config)
-    errors, _, seen = _errors(T, points, tracks, camera)
-    error = jnp.where(seen, jnp.linalg.norm(errors, axis=-1), jnp.inf)
-    return T, points, unknowns.distortion_std * lens, error
+    problem = Problem(tracks, unknowns, camera, config)
+
+    def is_going_on(state: tuple) -> Bool[Array, ""]:
+        *_, count, is_done = state
+        return (count < config.max_steps) & ~is_done
+
+    def body(state: tuple) -> tuple:
+        estimate, loss, damping, count, _ = state
+        found = _moved(estimate, *_step(estimate, problem, damping))
+        new = _loss(found, problem)
+        is_better = new < loss  # never where a step is not finite
+        estimate = jax.tree.map(lambda a, b: jnp.where(is_better, a, b), found, estimate)
+        damping = jnp.where(is_better, jnp.maximum(damping / DAMPING_FACTOR, LEAST_DAMPING), damping * DAMPING_FACTOR)
+        is_done = is_better & (loss - new <= config.tolerance * loss)
+        return estimate, jnp.where(is_better, new, loss), damping, count + 1, is_done
+
+    start = Estimate(T_ref_view, points, jnp.zeros(()))
+    state = start, _loss(start, problem), jnp.asarray(FIRST_DAMPING), 0, jnp.asarray(False)
+    estimate, *_ = jax.lax.while_loop(is_going_on, body, state)
+    errors, counts = _errors(estimate, problem)
+    error = jnp.where(counts, jnp.linalg.norm(errors, axis=-1), jnp.inf)
+    return estimate.T_ref_view, estimate.points, unknowns.distortion_std * estimate.lens, error

@@ -16,6 +16,7 @@ import numpy as np
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.bundle_adjustment import BundleConfig, Tracks, Unknowns, adjust
+from emgs_jax.prior.multiview.keys import KeyConfig
 from emgs_jax.prior.multiview.landmarks import (
     NONE,
     MatchingConfig,
@@ -37,6 +38,7 @@ class StructureConfig:
 
     Args:
         matching: detection, matching and acceptance.
+        keys: views that stay when they leave the window.
         bundle: the refinement.
         max_landmarks: that take part in the refinement; those that most views see.
         num_fixed: at most, the oldest views of a window, which hold the frame and scale of the ones before.
@@ -49,6 +51,7 @@ class StructureConfig:
     """
 
     matching: MatchingConfig
+    keys: KeyConfig
     bundle: BundleConfig
     max_landmarks: int = number(low=1)
     num_fixed: int = number(low=1, high=1000)
@@ -89,7 +92,7 @@ def extend(structure: Structure, camera: Camera, num_views: int, config: Structu
                 triangulate(structure, config.matching)
     frames = sorted(structure.placed())
     # A short window refines its two newest views too; it takes two others to hold the scale.
-    num_fixed = min(config.num_fixed, len(frames) - 2)
+    num_fixed = max(min(config.num_fixed, len(frames) - 2), len(frames) - num_views)
     if num_fixed >= 2:
         refine(structure, camera, num_views, frames[:num_fixed], config)
 
@@ -131,20 +134,21 @@ def refine(
 
     With a `distortion_std` the lens is measured in the first round, and keypoints move to where a pinhole sees them.
     """
+    num_rows = num_views + config.keys.max_keys
     for count in range(config.num_rounds):
         is_measured = distortion_std > 0 and count == 0
         frames = sorted(structure.placed())
-        ids, tracks = _tracks(structure, frames, num_views, config)
-        poses = np.tile(np.eye(4), (num_views, 1, 1))
+        ids, tracks = _tracks(structure, frames, num_rows, config)
+        poses = np.tile(np.eye(4), (num_rows, 1, 1))
         poses[: len(frames)] = [structure.views[frame].T_ref_view for frame in frames]
         points = np.zeros((config.max_landmarks, 3))
         points[: len(ids)] = structure.points[ids]
-        is_fixed = np.array([frame in fixed for frame in frames] + [True] * (num_views - len(frames)))
+        free = [row for row, frame in enumerate(frames) if frame not in fixed]
         T, points, distortion, error = jitted_adjust(
             jaxlie.SE3.from_matrix(jnp.asarray(poses, jnp.float32)),
             jnp.asarray(points, jnp.float32),
             tracks,
-            Unknowns(jnp.asarray(is_fixed), jnp.asarray(distortion_std * is_measured, jnp.float32)),
+            Unknowns(_padded(free, num_views, num_rows), jnp.asarray(distortion_std * is_measured, jnp.float32)),
             camera,
             config.bundle,
         )
@@ -155,8 +159,12 @@ def refine(
                 structure.views[frame].T_ref_view = poses[row]
         if is_measured:
             straighten(structure, float(distortion))
-        _drop(structure, frames, ids, error, config)
+        _drop(structure, frames, fixed, ids, error, config)
         triangulate(structure, config.matching)
+
+
+def _padded(rows: list[int], count: int, other: int) -> jnp.ndarray:
+    return jnp.asarray(rows + [other] * (count - len(rows)), jnp.int32)
 
 
 def _ranked_pairs(structure: Structure, config: StructureConfig) -> list[tuple[int, int, np.ndarray]]:
@@ -207,7 +215,7 @@ def _columns(structure: Structure, ids: np.ndarray) -> np.ndarray:
 
 
 def _tracks(
-    structure: Structure, frames: list[int], num_views: int, config: StructureConfig
+    structure: Structure, frames: list[int], num_rows: int, config: StructureConfig
 ) -> tuple[np.ndarray, Tracks]:
     """The landmarks that most views see, and where."""
     views = [structure.views[frame] for frame in frames]
@@ -215,8 +223,8 @@ def _tracks(
     ids, count = np.unique(seen, return_counts=True)
     ids = ids[count >= 2][np.argsort(-count[count >= 2], kind="stable")][: config.max_landmarks]
     column = _columns(structure, ids)
-    pixels = np.zeros((num_views, config.max_landmarks, 2), np.float32)
-    is_seen = np.zeros((num_views, config.max_landmarks), bool)
+    pixels = np.zeros((num_rows, config.max_landmarks, 2), np.float32)
+    is_seen = np.zeros((num_rows, config.max_landmarks), bool)
     for row, view in enumerate(views):
         places = column[view.landmark]
         pixels[row, places[places >= 0]] = view.pixels[places >= 0]
@@ -224,14 +232,25 @@ def _tracks(
     return ids, Tracks(jnp.asarray(pixels), jnp.asarray(is_seen))
 
 
-def _drop(structure: Structure, frames: list[int], ids: np.ndarray, error: np.ndarray, config: StructureConfig) -> None:
-    """Take landmarks from the keypoints that do not fit them, and positions from those that too few views see."""
+def _drop(
+    structure: Structure,
+    frames: list[int],
+    fixed: list[int],
+    ids: np.ndarray,
+    error: np.ndarray,
+    config: StructureConfig,
+) -> None:
+    """Take landmarks from the keypoints that do not fit them, and positions from those that too few views see.
+
+    Views that are held keep theirs: where a newer pose is wrong for a while, they would lose what holds it.
+    """
     column = _columns(structure, ids)
     count = np.zeros(len(ids), int)
     for row, frame in enumerate(frames):
         view = structure.views[frame]
         places = column[view.landmark]
         fits = (places < 0) | (error[row, places] < config.matching.max_reprojection_error)
-        view.landmark[~fits] = NONE
+        if frame not in fixed:
+            view.landmark[~fits] = NONE
         count[places[fits & (places >= 0)]] += 1
     structure.points[ids[count < 2]] = np.nan

@@ -37,6 +37,7 @@ from emgs_jax.ops.ranges import number
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate_depth
 from emgs_jax.prior.multiview.incremental import StructureConfig, begin_again, extend, initialize
+from emgs_jax.prior.multiview.keys import kept
 from emgs_jax.prior.multiview.landmarks import Structure, detect, forget, link
 from emgs_jax.prior.multiview.lens import as_shown, points_shown, rectify, straight
 from emgs_jax.prior.multiview.planar import PlanarConfig, fill_planes
@@ -90,7 +91,7 @@ class MultiviewStereo(Prior):
     def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:
         self._structure_config, self._dense_config = structure, dense
         settings = {"structure": _values(structure), "dense": _values(dense)}
-        self.provenance = Provenance("multiview_stereo", {"version": 4} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 5} | settings)
         self._next = 0
         self._structure = Structure(np.eye(3))
 
@@ -146,10 +147,11 @@ class MultiviewStereo(Prior):
             self._grays = {frame: rectify(gray, lens) for frame, gray in self._grays.items()}
 
     def _forget(self, window: Window) -> None:
-        gone = [frame for frame in self._structure.views if frame not in window.views]
+        stays = {*window.views, *kept(self._structure, window.views, self._camera.width, self._structure_config.keys)}
+        gone = [frame for frame in self._structure.views if frame not in stays]
         forget(self._structure, gone, self._structure_config.matching)
         for known in (self._grays, self._depths, self._spreads):
-            for frame in [frame for frame in known if frame not in window.views]:
+            for frame in [frame for frame in known if frame not in stays]:
                 del known[frame]
 
     def _add(self, frame: Frame) -> None:

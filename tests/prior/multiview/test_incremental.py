@@ -167,7 +167,7 @@ def test_observations_that_do_not_fit_are_dropped_and_landmarks_that_fewer_than_
     error[0, 0] = 2 * limit  # three views remain
     error[1, 1] = np.inf  # one view remains
     error[:2, 2] = 1.1 * limit  # one view remains
-    _drop(structure, [0, 1, 2, 3], np.arange(3), error, CONFIG)
+    _drop(structure, [0, 1, 2, 3], [], np.arange(3), error, CONFIG)
     np.testing.assert_array_equal(np.isnan(structure.points[:, 0]), [False, True, True])
     shown = np.stack([view.landmark for view in structure.views.values()])
     np.testing.assert_array_equal(shown[:, 0], [NONE, 0, 0, 0])

@@ -91,6 +91,12 @@ def test_poses_and_depths_are_the_true_ones_up_to_one_scale(room, answered):
 
 
 @pytest.mark.slow
+def test_views_that_leave_the_window_stay_as_keys(answered, answered_by):
+    views, window = answered_by._structure.views, answered[-1].window.views
+    assert set(window) < set(views) == set(answered_by._grays), "every view of this walk is far from the one before"
+
+
+@pytest.mark.slow
 def test_an_answer_obeys_the_protocol(room, answered, answered_by):
     assert isinstance(make_prior(), Prior)
     fx, fy, cx, cy = room.intrinsics
@@ -214,7 +220,8 @@ def test_after_a_loss_a_known_place_is_found_again(room):
     for index, same in enumerate(back, start=NUM_FRAMES + gap):
         np.testing.assert_allclose(after[index], before[same], atol=0.02)
     assert found[-1].mask[-1].any()
-    without = answers(make_prior("prior.structure.matching.max_remembered=0"), images)
+    nothing_kept = "prior.structure.matching.max_remembered=0", "prior.structure.keys.max_keys=0"
+    without = answers(make_prior(*nothing_kept), images)
     assert np.isnan(without[-1].T_anchor_view[-1]).all()
 
 
@@ -311,5 +318,5 @@ def test_the_provenance_holds_every_value_of_the_config_as_json_writes_it():
     def without_targets(node):
         return {k: without_targets(v) for k, v in node.items() if k != "_target_"} if hasattr(node, "items") else node
 
-    assert settings == {"version": 4} | jsonable(without_targets(config.prior))
+    assert settings == {"version": 5} | jsonable(without_targets(config.prior))
     assert settings != make_prior("prior.dense.depth.max_cost=0.11").provenance.settings

@@ -1,0 +1,58 @@
+"""Key views: which views stay in the structure when they leave the window.
+
+A window spans as much of the walk as its images do: of a video that is centimetres, in which no landmark has parallax,
+and the scale walks. Views that lie farther apart hold it (Klein and Murray, "Parallel tracking and mapping", 2007).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from emgs_jax.ops.ranges import number
+from emgs_jax.prior.multiview.landmarks import Structure, View
+
+
+@dataclass(frozen=True)
+class KeyConfig:
+    """Which views stay.
+
+    Args:
+        max_keys: beside those of the window; those go first that share least with its newest view. 0: none stays.
+        min_shift: median distance between the images of a landmark in a view and in the key before it, from which on
+            the view is a key, too; as a fraction of the image's width.
+    """
+
+    max_keys: int = number(low=0, high=1000)
+    min_shift: float = number(low=0)
+
+
+def kept(structure: Structure, views: Sequence[int], width: int, config: KeyConfig) -> list[int]:
+    """The placed views, none of `views`, that stay: keys until now, and what leaves the window and is far from them.
+
+    Args:
+        structure: of the window before.
+        views: of the window.
+        width: of the images, pixels.
+        config: how many, and how far apart.
+    """
+    placed = structure.placed()
+    keys: list[int] = []
+    for frame in sorted(frame for frame in placed if frame not in views):
+        if not keys or _shift(structure, placed[keys[-1]], placed[frame]) >= config.min_shift * width:
+            keys.append(frame)
+    shared = {frame: len(_common(structure, placed[frame], placed[max(placed)])[0]) for frame in keys}
+    return sorted(sorted(keys, key=lambda frame: (-shared[frame], -frame))[: config.max_keys])
+
+
+def _common(structure: Structure, a: View, b: View) -> tuple[np.ndarray, np.ndarray]:
+    """Keypoints of two views that show the same landmarks."""
+    known_a, known_b = (np.flatnonzero(structure.known(view)) for view in (a, b))
+    _, rows_a, rows_b = np.intersect1d(a.landmark[known_a], b.landmark[known_b], return_indices=True)
+    return known_a[rows_a], known_b[rows_b]
+
+
+def _shift(structure: Structure, a: View, b: View) -> float:
+    """Median distance in pixels between the images of what both show; inf where that is nothing."""
+    rows_a, rows_b = _common(structure, a, b)
+    return float(np.median(np.linalg.norm(a.pixels[rows_a] - b.pixels[rows_b], axis=1))) if len(rows_a) else np.inf
