@@ -31,6 +31,7 @@ WINDOWS = ("tests/prior/test_windows.py",)
 RECORDED = ("tests/prior/test_recorded.py",)
 FEATURED = ("tests/prior/test_featured.py",)
 BUNDLE = ("tests/prior/multiview/test_bundle_adjustment.py",)
+FIRST_FRAME = ("tests/running/test_first_frame.py",)
 KEYS = ("tests/prior/multiview/test_keys.py",)
 DEPTH = ("tests/prior/multiview/test_depth.py",)
 INCREMENTAL = ("tests/prior/multiview/test_incremental.py",)
@@ -1648,6 +1649,27 @@ MUTANTS = (
         "(shared[frame], -frame)",
         KEYS,
         "keys that share most go first",
+    ),
+    Mutant(
+        "emgs_jax/running/first_frame.py",
+        "record.covariance + adjoint @ own @ adjoint.T",
+        "record.covariance + own",
+        FIRST_FRAME,
+        "the first frame's error in the axes of the others",
+    ),
+    Mutant(
+        "emgs_jax/running/first_frame.py",
+        "float(belief.repeats.counts[0]) == 0 or",
+        "",
+        FIRST_FRAME,
+        "a guess is taken for what was learned",
+    ),
+    Mutant(
+        "emgs_jax/running/first_frame.py",
+        "or run.saved is not None:",
+        "or False:",
+        FIRST_FRAME,
+        "poses in a saved map have a first frame",
     ),
     Mutant(
         "emgs_jax/prior/multiview/lens.py",

@@ -17,6 +17,7 @@ from emgs_jax.running.compilation import use_compilation_cache
 from emgs_jax.running.configure import RunConfig, build_dataset, build_prior
 from emgs_jax.running.convert import FirstWindow
 from emgs_jax.running.correction import correct, finish
+from emgs_jax.running.first_frame import with_first_frame
 from emgs_jax.running.growth import advance, begin_anew, prepare, start
 from emgs_jax.running.inputs import Input, RawView, inputs
 from emgs_jax.running.locating import (
@@ -128,6 +129,7 @@ def map_frames(run: MappingRun, dataset: Dataset, prior: Prior, keeper: Keeper |
         leave_out(run)
         raise
     finally:  # what an interrupted run leaves has the same unit
+        with_first_frame(run)
         in_own_unit(run)
 
 

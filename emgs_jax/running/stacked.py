@@ -22,6 +22,7 @@ from emgs_jax.prior.base import Prior
 from emgs_jax.running.clock import Timer
 from emgs_jax.running.convert import FirstWindow
 from emgs_jax.running.drive import spent, take
+from emgs_jax.running.first_frame import with_first_frame
 from emgs_jax.running.growth import advance, start
 from emgs_jax.running.inputs import Input, RawView, inputs
 from emgs_jax.running.record import MappingRun, record_lost, record_start, record_step
@@ -76,6 +77,7 @@ def map_together(
     for group in stacks:
         group.hand_out()
     for run in runs:
+        with_first_frame(run)
         in_own_unit(run)
 
 

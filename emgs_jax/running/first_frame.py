@@ -1,0 +1,48 @@
+"""What the first frame itself is off by: the covariances of a run's poses are relative to it."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emgs_jax.localization import LEAST_NOISE, LocalizationConfig
+from emgs_jax.registration.pose_noise import pose_std
+from emgs_jax.running.convert import to_se3
+from emgs_jax.running.record import MappingRun
+from emgs_jax.slam import SlamState
+
+
+def own_covariance(state: SlamState, config: LocalizationConfig) -> np.ndarray:
+    """(6, 6) of the first frame's pose, in its own axes: as far as the prior's motions turned out to be off.
+
+    One answer repeats nothing. When the map begins nobody knows how far its poses are off, and what the first one is
+    off by is off in every later one: that is known at the end only. 0 where no answer has repeated another.
+
+    Args:
+        state: after the last step; m of its map.
+        config: of the steps.
+    """
+    belief, last = state.belief, state.previous
+    if not last.valid.any() or float(belief.repeats.counts[0]) == 0 or float(config.pose_shared) >= 1:
+        return np.zeros((6, 6))
+    mean_depth = jnp.mean((state.T_world_previous.inverse() @ last.points)[..., 2], where=last.valid)
+    otherwise = jnp.maximum(belief.depth_noise, LEAST_NOISE) / jnp.sqrt(config.icp.prior_information)
+    std = pose_std(belief.repeats, jnp.zeros((2, 2)), otherwise, config.pose_shared)[0]
+    return np.diag(np.repeat(np.asarray(std * jnp.stack([mean_depth, jnp.ones(())]), np.float64) ** 2, 3))
+
+
+def with_first_frame(run: MappingRun) -> None:
+    """Add `own_covariance`, seen from each frame, to those of a run that ends; those in a saved map have none."""
+    if run.state is None or run.saved is not None:
+        return
+    own = own_covariance(run.state, run.config.localization)
+    rows = [row for row, record in enumerate(run.records) if record.covariance is not None]
+    if not rows or not own.any():
+        return
+    first = next(record.pose for record in run.records if record.pose is not None)
+    T = np.stack([np.linalg.inv(run.records[row].pose) @ first for row in rows])
+    adjoints = np.asarray(jax.vmap(lambda T: T.adjoint())(to_se3(T)), np.float64)
+    for row, adjoint in zip(rows, adjoints, strict=True):
+        record = run.records[row]
+        run.records[row] = replace(record, covariance=record.covariance + adjoint @ own @ adjoint.T)
