@@ -427,10 +427,17 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/running/locating.py",
-        "linked.issuperset(range(len(end.poses) + 1 - count, len(end.poses)))",
-        "True",
+        "        if node not in leads:\n            return False\n        node = leads[node]\n",
+        "        node = leads.get(node, 0)\n",
         LOCATING,
         "a map begins anew beside one that nothing leads from",
+    ),
+    Mutant(
+        "emgs_jax/running/locating.py",
+        "        node = leads[node]\n    return True\n",
+        "        return leads[node] == node - 1\n    return True\n",
+        LOCATING,
+        "what the prior has lost on the way ends it",
     ),
     Mutant(
         "emgs_jax/running/locating.py",

@@ -34,8 +34,8 @@ def is_missing(run: MappingRun, info: StepInfo | None) -> bool:
 def is_to_begin_anew(run: MappingRun, given: Input, state: SlamState, info: StepInfo) -> bool:
     """Whether the map is to go on from a frame that is found nowhere, where the prior puts it.
 
-    Not before there is little hope, and only where the prior leads from the last frame that was placed to this one and
-    knows what it sees: there are points, and its two predictions of the image before are one thing.
+    Not before there is little hope, and only where the prior leads from a frame that was placed to this one and knows
+    what it sees: there are points, and its two predictions of the image before are one thing.
 
     Args:
         run: before this frame.
@@ -45,20 +45,28 @@ def is_to_begin_anew(run: MappingRun, given: Input, state: SlamState, info: Step
     """
     count = _num_untracked(run, info)
     is_due = not run.is_fixed and count >= run.back_end.config.location.max_patience
-    if not is_due or info.localization.is_lost or not _leads_here(run.back_end, given, count):
+    if not is_due or info.localization.is_lost or not _leads_here(run.back_end, given):
         return False
     depths = np.asarray(depth_in(state.T_world_previous, state.previous))
     depth = np.median(depths[np.asarray(state.previous.valid)])
     return bool(info.localization.repeat_rms <= run.config.localization.max_residual * depth)
 
 
-def _leads_here(end: BackEnd, given: Input, count: int) -> bool:
-    """Whether each of the last `count` frames, the given one included, is predicted together with the one before."""
+def _leads_here(end: BackEnd, given: Input) -> bool:
+    """Whether the given frame is predicted together with the one before, and so on back to one that was placed.
+
+    What the prior itself has lost on the way is passed over, where a later answer shows frames of both sides.
+    """
     here, before = (given.T_anchor_views.get(given.frames[0].index - offset) for offset in (0, 1))
     if here is None or before is None or not np.isfinite([here, before]).all():
         return False
-    linked = {edge.a for edge in end.edges if edge.kind == ODOMETRY and edge.b == edge.a - 1}
-    return linked.issuperset(range(len(end.poses) + 1 - count, len(end.poses)))
+    leads = {edge.a: edge.b for edge in end.edges if edge.kind == ODOMETRY}
+    node = len(end.poses) - 1
+    while not end.is_placed[node]:
+        if node not in leads:
+            return False
+        node = leads[node]
+    return True
 
 
 def _num_untracked(run: MappingRun, info: StepInfo) -> int:

@@ -147,12 +147,15 @@ def test_a_camera_is_looked_for_after_some_frames_that_are_not_tracked(statuses,
     assert not is_missing(without, info)
 
 
-def begins_anew(chain=(3, 4, 5, 6), here=(6, 7), repeat_rms=0.01, is_lost=False, is_fixed=False, patience=5) -> bool:
+def begins_anew(
+    chain=((3, 2), (4, 3), (5, 4), (6, 5)), here=(6, 7), repeat_rms=0.01, is_lost=False, is_fixed=False, patience=5
+) -> bool:
     """The last five of eight frames, the given one included, are not tracked; without changes all speaks for it."""
     config = load_config("graph=default", f"graph.location.max_patience={patience}")
     poses = np.stack([matrix((0, 0, 0), (0.1 * k, 0, 0)) for k in range(8)])
     end = SimpleNamespace(poses=list(poses[:7]), config=config.graph)
-    end.edges = [SimpleNamespace(a=node, b=node - 1, kind=ODOMETRY) for node in chain]
+    end.edges = [SimpleNamespace(a=a, b=b, kind=ODOMETRY) for a, b in chain]
+    end.is_placed = [True] * 3 + [False] * 4
     statuses = ["initialization", "tracked", "tracked", *["degraded"] * 4]
     records = [FrameRecord(row, None, None, status) for row, status in enumerate(statuses)]
     found = SimpleNamespace(is_tracked=False, is_lost=is_lost, repeat_rms=repeat_rms)
@@ -170,8 +173,10 @@ def begins_anew(chain=(3, 4, 5, 6), here=(6, 7), repeat_rms=0.01, is_lost=False,
     [
         ({}, True),
         ({"patience": 6}, False),  # not yet
-        ({"chain": (4, 5, 6)}, False),  # nothing leads from the last frame that was placed
-        ({"chain": (3, 4, 5)}, False),
+        ({"chain": ((4, 3), (5, 4), (6, 5))}, False),  # nothing leads from a frame that was placed
+        ({"chain": ((3, 2), (4, 3), (5, 4))}, False),
+        ({"chain": ((6, 2),)}, True),  # the prior had lost what is between
+        ({"chain": ((3, 2), (6, 4), (5, 4))}, False),
         ({"here": (7,)}, False),
         ({"here": (6,)}, False),
         ({"repeat_rms": 1.0}, False),  # the prior says something else each time
