@@ -1679,6 +1679,13 @@ MUTANTS = (
         "poses in a saved map have a first frame",
     ),
     Mutant(
+        "emgs_jax/prior/multiview/incremental.py",
+        "if frame not in fixed:\n            view.landmark",
+        "if True:\n            view.landmark",
+        INCREMENTAL,
+        "views that are held lose what does not fit for now",
+    ),
+    Mutant(
         "emgs_jax/prior/multiview/lens.py",
         "return pixels + distortion *",
         "return pixels - distortion *",

@@ -173,3 +173,12 @@ def test_observations_that_do_not_fit_are_dropped_and_landmarks_that_fewer_than_
     np.testing.assert_array_equal(shown[:, 0], [NONE, 0, 0, 0])
     np.testing.assert_array_equal(shown[:, 1], [1, NONE, NONE, NONE])
     np.testing.assert_array_equal(shown[:, 2], [NONE, NONE, 2, NONE])
+
+
+def test_views_that_are_held_keep_what_does_not_fit_for_now():
+    structure, error = seen_by(4, 2, 3), np.zeros((4, 3))
+    error[:3, 0] = 2 * CONFIG.matching.max_reprojection_error  # one view remains
+    _drop(structure, [0, 1, 2, 3], [0, 1], np.arange(3), error, CONFIG)
+    shown = np.stack([view.landmark for view in structure.views.values()])
+    np.testing.assert_array_equal(shown[:, 0], [0, 0, NONE, 0])
+    assert np.isnan(structure.points[0, 0])
