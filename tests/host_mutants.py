@@ -441,6 +441,13 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/running/locating.py",
+        "(e.b > end.first or e.a == e.b + 1)",
+        "True",
+        LOCATING,
+        "the anchor leads to a frame",
+    ),
+    Mutant(
+        "emgs_jax/running/locating.py",
         "info.localization.repeat_rms <= run.config.localization.max_residual * depth",
         "True",
         LOCATING,
@@ -1684,6 +1691,13 @@ MUTANTS = (
         "if True:\n            view.landmark",
         INCREMENTAL,
         "views that are held lose what does not fit for now",
+    ),
+    Mutant(
+        "emgs_jax/running/back_end.py",
+        "return row >= self.since and is_led",
+        "return row >= self.since",
+        BACK_END,
+        "frames are measured to lost ones",
     ),
     Mutant(
         "emgs_jax/prior/multiview/lens.py",

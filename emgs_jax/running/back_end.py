@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.graph.deform import DeformConfig
-from emgs_jax.graph.measurements import LOOP, Graph, Nodes
+from emgs_jax.graph.measurements import LOOP, ODOMETRY, Graph, Nodes
 from emgs_jax.graph.optimize import GraphConfig, GraphInfo, optimize
 from emgs_jax.graph.problem import bucket
 from emgs_jax.loops.agreement import AgreementConfig, agreeing
@@ -146,11 +146,16 @@ class BackEnd:
         self.frames.append(look.frame)
         self.is_placed.append(is_placed)
         self.segments.append(self.segment)
-        chain = chain_edge(look, self.poses, self.log_scales, self.since, self.config.noise)
+        chain = chain_edge(look, self.poses, self.log_scales, self._has_place, self.config.noise)
         if chain is not None:
             self.edges.append(chain)
         if origin is not None and origin < time:
             self.edges.append(map_edge(look, self.poses, self.log_scales, origin, self.config.noise))
+
+    def _has_place(self, row: int) -> bool:
+        """Whether a node is related to those before, or the map holds it; none from before the camera was found."""
+        is_led = self.is_placed[row] or any(edge.a == row and edge.kind == ODOMETRY for edge in self.edges)
+        return row >= self.since and is_led
 
     def look_for_loops(self, look: Look) -> list[LoopMeasurement]:
         """Describe the last node, and verify what it looks like; returns the new loops that are agreed upon."""

@@ -55,12 +55,13 @@ def is_to_begin_anew(run: MappingRun, given: Input, state: SlamState, info: Step
 def _leads_here(end: BackEnd, given: Input) -> bool:
     """Whether the given frame is predicted together with the one before, and so on back to one that was placed.
 
-    What the prior itself has lost on the way is passed over, where a later answer shows frames of both sides.
+    What the prior itself has lost on the way is passed over, where a later answer shows frames of both sides. The
+    anchor is none of them: a prior that is somewhere else says a pose of it, too.
     """
     here, before = (given.T_anchor_views.get(given.frames[0].index - offset) for offset in (0, 1))
     if here is None or before is None or not np.isfinite([here, before]).all():
         return False
-    leads = {edge.a: edge.b for edge in end.edges if edge.kind == ODOMETRY}
+    leads = {e.a: e.b for e in end.edges if e.kind == ODOMETRY and (e.b > end.first or e.a == e.b + 1)}
     node = len(end.poses) - 1
     while not end.is_placed[node]:
         if node not in leads:

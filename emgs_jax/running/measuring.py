@@ -1,6 +1,6 @@
 """What a frame measures, as edges of the graph: where it was placed, relative to the frame before and to the map."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -81,7 +81,11 @@ def _weights(look: Look, noise: NoiseConfig, angle: float, log_scale: float = np
 
 
 def chain_edge(
-    look: Look, poses: Sequence[np.ndarray], log_scales: Sequence[float], since: int, noise: NoiseConfig
+    look: Look,
+    poses: Sequence[np.ndarray],
+    log_scales: Sequence[float],
+    has_place: Callable[[int], bool],
+    noise: NoiseConfig,
 ) -> Edge | None:
     """Where the last frame was placed, relative to the nearest one before it that its window shows; None without one.
 
@@ -92,12 +96,13 @@ def chain_edge(
         look: of the frame.
         poses: T_world_camera (4, 4) of all nodes, the last one its own; that of a frame k before it is k before.
         log_scales: σ of all nodes, likewise.
-        since: the first node that it may be measured to: before it the camera was lost.
+        has_place: whether it may be measured to a node: not to one whose pose only stands in.
         noise: of the measurements.
     """
     time = len(poses) - 1
     known = {frame for frame, pose in look.T_anchor_views.items() if np.isfinite(pose).all()}
-    before = [look.frame - frame for frame in known if 0 < look.frame - frame <= time - since]
+    offsets = (look.frame - frame for frame in known)
+    before = [offset for offset in offsets if 0 < offset <= time and has_place(time - offset)]
     if look.frame not in known or not before:
         return None
     offset = min(before)

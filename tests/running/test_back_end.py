@@ -204,7 +204,7 @@ def test_the_loops_of_a_map_that_was_loaded_do_not_count(graph):
 def test_a_frame_is_held_where_it_was_placed_and_not_where_it_was_predicted(graph):
     """Both edges, in the unit of the frame's inference, whatever the window says of the two frames."""
     placed, scales = list(ring(1.95 * np.pi)[:31]), [0.0] * 30 + [np.log(1.1)]
-    chain = chain_edge(look(ring(), 30), placed, scales, 0, graph.noise)
+    chain = chain_edge(look(ring(), 30), placed, scales, anywhere, graph.noise)
     held = map_edge(look(ring(), 30), placed, scales, 12, graph.noise)
     assert (chain.a, chain.b, held.a, held.b) == (30, 29, 30, 12)
     for edge in (chain, held):
@@ -214,18 +214,37 @@ def test_a_frame_is_held_where_it_was_placed_and_not_where_it_was_predicted(grap
     assert chain.log_ratio == pytest.approx(-np.log(1.1)) and held.sqrt_info[6, 6] == 0
 
 
+def anywhere(row: int) -> bool:
+    return True
+
+
+def test_a_frame_is_not_measured_to_one_whose_pose_only_stands_in(graph):
+    """The prior has lost two frames; its later answer, which knows them again, leads from before to after them."""
+    end, poses = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01), ring()
+    for frame in range(4):
+        seen = look(poses, frame)
+        if frame in (1, 2):
+            seen.T_anchor_views[frame][:] = np.nan
+        end.add(seen, poses[frame], 1.0, None, is_placed=frame == 0)
+    assert [(edge.a, edge.b) for edge in end.edges] == [(3, 0)]
+    end.add(look(poses, 4), poses[4], 1.0, None, is_placed=False)
+    assert (end.edges[-1].a, end.edges[-1].b) == (4, 3), "a frame that is led to is as good as a placed one"
+
+
 def test_the_frame_before_is_the_nearest_that_the_window_knows(graph):
     poses, scales = list(ring()[:31]), [0.0] * 31
     measured = look(ring(), 30)
-    next_to = chain_edge(measured, poses, scales, 0, graph.noise)
+    next_to = chain_edge(measured, poses, scales, anywhere, graph.noise)
     for frame in (29, 28):
         measured.T_anchor_views[frame][:] = np.nan
-    edge = chain_edge(measured, poses, scales, 0, graph.noise)
+    edge = chain_edge(measured, poses, scales, anywhere, graph.noise)
     assert edge.b == 27
     np.testing.assert_allclose(edge.sqrt_info * np.sqrt(3), next_to.sqrt_info)
-    assert chain_edge(measured, poses, scales, 28, graph.noise) is None, "before that the camera was lost"
+    assert chain_edge(measured, poses, scales, lambda row: row >= 28, graph.noise) is None, (
+        "before that the camera was lost"
+    )
     measured.T_anchor_views[30][:] = np.nan
-    assert chain_edge(measured, poses, scales, 0, graph.noise) is None, "it is not known itself"
+    assert chain_edge(measured, poses, scales, anywhere, graph.noise) is None, "it is not known itself"
 
 
 def test_what_is_measured_is_as_sure_as_the_depths_that_it_was_measured_by(graph):
@@ -235,12 +254,14 @@ def test_what_is_measured_is_as_sure_as_the_depths_that_it_was_measured_by(graph
     seeing = replace(blind, points=np.full((4, 4, 3), 7.0), mask=np.arange(16).reshape(4, 4) < 3, depth_noise=0.02)
     seeing.points[0, :3, 2] = 2.0, 2.5, 40.0
     for edge, share in (
-        (chain_edge(seeing, poses, scales, 0, graph.noise), graph.noise.pair),
+        (chain_edge(seeing, poses, scales, anywhere, graph.noise), graph.noise.pair),
         (map_edge(seeing, poses, scales, 12, graph.noise), graph.noise.map),
     ):
         stds = 0.02 * share * np.array([2.5, 2.5, 2.5, 1, 1, 1])
         np.testing.assert_allclose(1 / np.diag(edge.sqrt_info)[:6], stds)
-    assert chain_edge(seeing, poses, scales, 0, graph.noise).sqrt_info[6, 6] == 1 / (0.02 * graph.noise.log_scale)
+    assert chain_edge(seeing, poses, scales, anywhere, graph.noise).sqrt_info[6, 6] == 1 / (
+        0.02 * graph.noise.log_scale
+    )
     exact = map_edge(replace(seeing, depth_noise=0.0), poses, scales, 12, graph.noise)
     assert 1e3 < exact.sqrt_info[0, 0] < 1e5, "more certain than any loop, and finite"
     first = map_edge(blind, poses, scales, 12, graph.noise)

@@ -155,7 +155,7 @@ def begins_anew(
     poses = np.stack([matrix((0, 0, 0), (0.1 * k, 0, 0)) for k in range(8)])
     end = SimpleNamespace(poses=list(poses[:7]), config=config.graph)
     end.edges = [SimpleNamespace(a=a, b=b, kind=ODOMETRY) for a, b in chain]
-    end.is_placed = [True] * 3 + [False] * 4
+    end.is_placed, end.first = [True] * 3 + [False] * 4, 0
     statuses = ["initialization", "tracked", "tracked", *["degraded"] * 4]
     records = [FrameRecord(row, None, None, status) for row, status in enumerate(statuses)]
     found = SimpleNamespace(is_tracked=False, is_lost=is_lost, repeat_rms=repeat_rms)
@@ -176,6 +176,7 @@ def begins_anew(
         ({"chain": ((4, 3), (5, 4), (6, 5))}, False),  # nothing leads from a frame that was placed
         ({"chain": ((3, 2), (4, 3), (5, 4))}, False),
         ({"chain": ((6, 2),)}, True),  # the prior had lost what is between
+        ({"chain": ((6, 0),)}, False),  # the anchor
         ({"chain": ((3, 2), (6, 4), (5, 4))}, False),
         ({"here": (7,)}, False),
         ({"here": (6,)}, False),
