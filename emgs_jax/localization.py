@@ -16,7 +16,7 @@ from emgs_jax.ops.pytree import choice, stack, traced
 from emgs_jax.registration.belief import Belief, certain, measured, moved, next_belief, root_information
 from emgs_jax.registration.icp import IcpInfo, icp
 from emgs_jax.registration.noise import confidence_levels
-from emgs_jax.registration.pose_noise import pose_std, repeat_poses
+from emgs_jax.registration.pose_noise import LEAST_NOISE, NO_INFORMATION, axis_std, repeat_poses
 from emgs_jax.registration.problem import IcpConfig
 from emgs_jax.registration.repeat import repeat_error, repeat_scale, through_previous
 from emgs_jax.registration.rigid import MIN_PAIRS, pose_row, scale_translation
@@ -30,8 +30,6 @@ REASONS = (
     "the geometry does not determine the pose",
 )
 
-LEAST_NOISE = 2e-4  # of the depth; keeps the covariance of an exact prior regular
-NO_INFORMATION = 1e-6  # in place of 0
 FUSED = 3
 
 
@@ -223,9 +221,8 @@ def localize_coarse(
     depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, belief.depth_noise), LEAST_NOISE)
     motion, anchored, forms, is_linked = _readings(prediction, previous, T_world_previous, scale, camera, config)
     repeats, latest = repeat_poses(prediction, belief.repeats, scale, mean_depth, config.num_shared)
-    root = jnp.sqrt(jnp.maximum(config.icp.prior_information, NO_INFORMATION))
-    std = jnp.maximum(pose_std(repeats, latest, depth_noise / root, config.pose_shared), LEAST_NOISE / root)
-    of_motion, of_pose = jnp.repeat(std * jnp.stack([mean_depth, jnp.ones(())]), 3, axis=-1)
+    guess = depth_noise, mean_depth, config.icp.prior_information
+    of_motion, of_pose = axis_std(repeats, latest, *guess, config.pose_shared)
     noise = jnp.append(of_motion, _ratio_noise(depth_noise, ratio_std, config))
     belief = moved(belief, motion, jnp.where(is_linked, noise, _no_motion(mean_depth, config)))
     belief = eqx.tree_at(lambda b: b.repeats, belief, repeats)

@@ -349,8 +349,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/running/measuring.py",
-        "offset = min(before)",
-        "offset = max(before)",
+        "nearest = sorted(look.frame - frame for frame in known)",
+        "nearest = sorted((look.frame - frame for frame in known), reverse=True)",
         BACK_END,
         "the oldest frame of the window for the one before",
     ),

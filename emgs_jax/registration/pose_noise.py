@@ -16,6 +16,8 @@ from emgs_jax.ops.pytree import stack
 from emgs_jax.registration.rigid import pose_row, scale_translation
 
 LOG_OF_SQUARE = -0.36898  # mean logarithm of χ²/3 with three degrees of freedom: ψ(3/2) - log(3/2)
+LEAST_NOISE = 2e-4  # of the depth; keeps the covariance of an exact prior regular
+NO_INFORMATION = 1e-6  # in place of 0
 SMALLEST_SQUARE = 1e-14  # of what two answers differ by: rounding
 
 
@@ -100,3 +102,27 @@ def pose_std(
     mean = (counts * of_repeats + 2.0 * jnp.log(otherwise)) / (counts + 1.0)
     found = jnp.sqrt(jnp.maximum(jnp.exp(mean), latest / differing))
     return jnp.where(shared < 1.0, found, otherwise)
+
+
+@full_precision
+def axis_std(
+    repeats: Repeats,
+    latest: Float[Array, "2 2"],
+    depth_noise: Float[Array, ""],
+    mean_depth: Float[Array, ""],
+    information: Float[Array, ""],
+    shared: Float[Array, ""],
+) -> Float[Array, "2 6"]:
+    """`pose_std` of each axis, m and rad, in the order of ξ.
+
+    Args:
+        repeats: so far.
+        latest: of this answer alone.
+        depth_noise: as a fraction of the depth.
+        mean_depth: m of the map.
+        information: of a pose without any repeat, in that of depths with this noise (`prior_information`).
+        shared: see `pose_std`.
+    """
+    root = jnp.sqrt(jnp.maximum(information, NO_INFORMATION))
+    std = jnp.maximum(pose_std(repeats, latest, depth_noise / root, shared), LEAST_NOISE / root)
+    return jnp.repeat(std * jnp.append(mean_depth, 1.0), 3, axis=-1)

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.localization import LEAST_NOISE, LocalizationConfig
-from emgs_jax.registration.pose_noise import pose_std
+from emgs_jax.localization import LocalizationConfig
+from emgs_jax.observation import depth_in
+from emgs_jax.registration.pose_noise import LEAST_NOISE, axis_std
 from emgs_jax.running.convert import to_se3
 from emgs_jax.running.record import MappingRun
 from emgs_jax.slam import SlamState
@@ -26,10 +27,10 @@ def own_covariance(state: SlamState, config: LocalizationConfig) -> np.ndarray:
     belief, last = state.belief, state.previous
     if not last.valid.any() or float(belief.repeats.counts[0]) == 0 or float(config.pose_shared) >= 1:
         return np.zeros((6, 6))
-    mean_depth = jnp.mean((state.T_world_previous.inverse() @ last.points)[..., 2], where=last.valid)
-    otherwise = jnp.maximum(belief.depth_noise, LEAST_NOISE) / jnp.sqrt(config.icp.prior_information)
-    std = pose_std(belief.repeats, jnp.zeros((2, 2)), otherwise, config.pose_shared)[0]
-    return np.diag(np.repeat(np.asarray(std * jnp.stack([mean_depth, jnp.ones(())]), np.float64) ** 2, 3))
+    mean_depth = jnp.mean(depth_in(state.T_world_previous, last), where=last.valid)
+    guess = jnp.maximum(belief.depth_noise, LEAST_NOISE), mean_depth, config.icp.prior_information
+    std = axis_std(belief.repeats, jnp.zeros((2, 2)), *guess, config.pose_shared)[0]
+    return np.diag(np.asarray(std, np.float64) ** 2)
 
 
 def with_first_frame(run: MappingRun) -> None:

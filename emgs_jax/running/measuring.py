@@ -9,10 +9,10 @@ import numpy as np
 
 from emgs_jax.graph.measurements import LOOP, ODOMETRY, Edges
 from emgs_jax.graph.problem import bucket
-from emgs_jax.localization import LEAST_NOISE
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.ops.ranges import number
+from emgs_jax.registration.pose_noise import LEAST_NOISE
 from emgs_jax.running.convert import to_se3
 
 
@@ -101,11 +101,10 @@ def chain_edge(
     """
     time = len(poses) - 1
     known = {frame for frame, pose in look.T_anchor_views.items() if np.isfinite(pose).all()}
-    offsets = (look.frame - frame for frame in known)
-    before = [offset for offset in offsets if 0 < offset <= time and has_place(time - offset)]
-    if look.frame not in known or not before:
+    nearest = sorted(look.frame - frame for frame in known)
+    offset = next((offset for offset in nearest if 0 < offset <= time and has_place(time - offset)), None)
+    if look.frame not in known or offset is None:
         return None
-    offset = min(before)
     row, spread = time - offset, np.sqrt(offset)
     weights = _weights(look, noise, spread * noise.pair, spread * noise.log_scale)
     return Edge(time, row, _as_placed(poses, log_scales, row), log_scales[row] - log_scales[time], weights, ODOMETRY)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emgs_jax.ops.ranges import number
-from emgs_jax.prior.multiview.landmarks import Structure, View
+from emgs_jax.prior.multiview.landmarks import Structure, View, common
 
 
 @dataclass(frozen=True)
@@ -41,18 +41,18 @@ def kept(structure: Structure, views: Sequence[int], width: int, config: KeyConf
     for frame in sorted(frame for frame in placed if frame not in views):
         if not keys or _shift(structure, placed[keys[-1]], placed[frame]) >= config.min_shift * width:
             keys.append(frame)
-    shared = {frame: len(_common(structure, placed[frame], placed[max(placed)])[0]) for frame in keys}
+    shared = {frame: len(_known_common(structure, placed[frame], placed[max(placed)])[0]) for frame in keys}
     return sorted(sorted(keys, key=lambda frame: (-shared[frame], -frame))[: config.max_keys])
 
 
-def _common(structure: Structure, a: View, b: View) -> tuple[np.ndarray, np.ndarray]:
-    """Keypoints of two views that show the same landmarks."""
-    known_a, known_b = (np.flatnonzero(structure.known(view)) for view in (a, b))
-    _, rows_a, rows_b = np.intersect1d(a.landmark[known_a], b.landmark[known_b], return_indices=True)
-    return known_a[rows_a], known_b[rows_b]
+def _known_common(structure: Structure, a: View, b: View) -> tuple[np.ndarray, np.ndarray]:
+    """Keypoints of two views that have the same landmark, whose position is known."""
+    rows_a, rows_b = common(a, b)
+    is_known = structure.known(a)[rows_a]
+    return rows_a[is_known], rows_b[is_known]
 
 
 def _shift(structure: Structure, a: View, b: View) -> float:
     """Median distance in pixels between the images of what both show; inf where that is nothing."""
-    rows_a, rows_b = _common(structure, a, b)
+    rows_a, rows_b = _known_common(structure, a, b)
     return float(np.median(np.linalg.norm(a.pixels[rows_a] - b.pixels[rows_b], axis=1))) if len(rows_a) else np.inf

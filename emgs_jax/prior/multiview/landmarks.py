@@ -159,14 +159,20 @@ def forget(structure: Structure, frames: Sequence[int], config: MatchingConfig) 
     structure.points = structure.points[used]
 
 
+def common(a: View, b: View) -> tuple[np.ndarray, np.ndarray]:
+    """Keypoints of two views, row by row, that have the same landmark."""
+    _, rows_a, rows_b = np.intersect1d(a.landmark, b.landmark, return_indices=True)
+    has = a.landmark[rows_a] != NONE
+    return rows_a[has], rows_b[has]
+
+
 def relative_pose(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, float] | None:
     """T_a_b with a unit baseline from the landmarks that two views share, and a score; None without enough of them.
 
     The score is the number of matches in front of both cameras times the sine of their median parallax.
     """
-    _, rows_a, rows_b = np.intersect1d(a.landmark, b.landmark, return_indices=True)
-    has = a.landmark[rows_a] != NONE
-    pixels_a, pixels_b = a.pixels[rows_a[has]], b.pixels[rows_b[has]]
+    rows_a, rows_b = common(a, b)
+    pixels_a, pixels_b = a.pixels[rows_a], b.pixels[rows_b]
     if len(pixels_a) < config.min_matches:
         return None
     E, mask = essential(pixels_a, pixels_b, K, config.max_epipolar_error)
