@@ -106,6 +106,12 @@ def test_host_packages_stay_out_of_the_core(path):
     assert not inner(path) & HOST_FILES
 
 
+def test_no_two_files_of_tests_share_a_name():
+    # Tests are collected as top-level modules: of two with one name pytest refuses the second, in a whole run only.
+    names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
+    assert sorted(set(names)) == sorted(names)
+
+
 def test_nothing_is_pickled():
     for path in FILES:
         assert not {"pickle", "dill", "cloudpickle", "joblib", "shelve"} & imports_of(path), path
