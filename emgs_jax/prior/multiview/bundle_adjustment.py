@@ -59,10 +59,12 @@ class Unknowns(eqx.Module):
 
     Args:
         free: rows of the views whose pose is not held; v where there are fewer.
-        distortion_std: what the lens's distortion is expected to be, see `undistort`; 0 = it has none.
+        distortion: of the lens, to begin with, see `undistort`.
+        distortion_std: what it is expected to be; 0 = the tracks are of a pinhole camera.
     """
 
     free: Int[Array, "f"]
+    distortion: Float[Array, ""]
     distortion_std: Float[Array, ""]
 
 
@@ -184,7 +186,8 @@ def adjust(
         is_done = is_better & (loss - new <= config.tolerance * loss)
         return estimate, jnp.where(is_better, new, loss), damping, count + 1, is_done
 
-    start = Estimate(T_ref_view, points, jnp.zeros(()))
+    std = unknowns.distortion_std
+    start = Estimate(T_ref_view, points, jnp.where(std > 0, unknowns.distortion / jnp.where(std > 0, std, 1.0), 0.0))
     state = start, _loss(start, problem), jnp.asarray(FIRST_DAMPING), 0, jnp.asarray(False)
     estimate, *_ = jax.lax.while_loop(is_going_on, body, state)
     errors, counts = _errors(estimate, problem)

@@ -1,12 +1,11 @@
 """Structure from motion of a sliding window: where its views are and where their landmarks (host side, NumPy in, out).
 
-The first window in which that succeeds is built from its best pair of views (Schönberger and Frahm,
-"Structure-from-motion revisited", CVPR 2016); each later view is placed by the landmarks that it shows. Bundle
-adjustment refines the views of the window. Views that have lost the structure begin one of their own.
+Each view is placed by the landmarks that it shows, and bundle adjustment refines the views of the window. While the
+structure still has every view that tells something, it also measures the lens.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,13 +20,14 @@ from emgs_jax.prior.multiview.landmarks import (
     NONE,
     MatchingConfig,
     Structure,
-    View,
+    known_common,
     place,
     refind,
-    relative_pose,
     straighten,
     triangulate,
 )
+from emgs_jax.prior.multiview.lens import distort
+from emgs_jax.prior.multiview.sources import parallax
 
 jitted_adjust = eqx.filter_jit(adjust)
 
@@ -43,8 +43,11 @@ class StructureConfig:
         max_landmarks: that take part in the refinement; those that most views see.
         num_fixed: at most, the oldest views of a window, which hold the frame and scale of the ones before.
         num_rounds: of refinement; observations that do not fit are dropped after each.
+        min_first_parallax_rad: between the rays of the median landmark of the pair of views that a structure begins
+            with; with less its depths are noise.
         distortion_std: what the radial distortion of the lens is expected to be, as k of x (1 + k |x|²) with x on the
-            plane z = 1; it is measured in the first window. 0 = the images have none.
+            plane z = 1; it is measured until the first key view goes. 0 = the images have none.
+        min_lens_parallax_rad: likewise, between the newest view and the farthest, for the lens to be measured.
         median_depth: m; what the median landmark of the first view is taken for: images alone do not tell the scale.
         max_lost: newest views of a window, one after the other, that cannot be placed, from which on they begin a
             structure of their own; what is forgotten then is not found again. inf: never.
@@ -56,29 +59,11 @@ class StructureConfig:
     max_landmarks: int = number(low=1)
     num_fixed: int = number(low=1, high=1000)
     num_rounds: int = number(low=1, high=100)
+    min_first_parallax_rad: float = number(low=0, high=3)
     distortion_std: float = number(low=0, high=1000)
+    min_lens_parallax_rad: float = number(low=0, high=3)
     median_depth: float = number(low=1e-6)
     max_lost: float = number(low=3, high=math.inf)  # fewer are no structure
-
-
-def initialize(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> bool:
-    """Place the views of a window, the oldest of which is the reference; False without enough parallax or matches."""
-    pairs = _ranked_pairs(structure, config)
-    for a, b, T_a_b in pairs[:3]:
-        _reset(structure)
-        structure.views[a].T_ref_view, structure.views[b].T_ref_view = np.eye(4), T_a_b
-        triangulate(structure, config.matching)
-        _grow(structure, camera, num_views, a, config)
-        placed = structure.placed()
-        reference = placed[min(placed)]
-        # Two views alone are confirmed by nothing.
-        if len(placed) > 2 and structure.known(reference).sum() >= config.matching.min_matches:
-            if config.distortion_std > 0:
-                refine(structure, camera, num_views, [a], config, config.distortion_std)
-            _normalize(structure, reference, config)
-            return True
-    _reset(structure)
-    return False
 
 
 def extend(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> None:
@@ -91,120 +76,88 @@ def extend(structure: Structure, camera: Camera, num_views: int, config: Structu
             if view.T_ref_view is None and find(structure, view, config.matching):
                 triangulate(structure, config.matching)
     frames = sorted(structure.placed())
+    measure_lens(structure, camera, num_views, config)
     # A short window refines its two newest views too; it takes two others to hold the scale.
     num_fixed = max(min(config.num_fixed, len(frames) - 2), len(frames) - num_views)
     if num_fixed >= 2:
         refine(structure, camera, num_views, frames[:num_fixed], config)
 
 
-def begin_again(
-    structure: Structure, current: int, camera: Camera, num_views: int, config: StructureConfig
-) -> Structure | None:
-    """A structure of the newest views alone, where these have lost the one that there is; None where they have not.
+def measure_lens(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> None:
+    """Measure the distortion of the lens by all views that there are, and move the keypoints.
 
-    Nothing relates it to the other, of which it has neither views nor landmarks: its frame is that of its first view,
-    its scale that of its own `median_depth`. The lens is the same.
-
-    Args:
-        structure: after `extend`; it stays as it is.
-        current: a view that must be placed by then.
-        camera: of the images.
-        num_views: at most, in a window.
-        config: of both.
+    Views that lie near to each other blame the lens for the noise of their depths, so what they say is left out below
+    `min_lens_parallax_rad`, and counts by the parallax squared above. Of the adjustment only the lens is taken: in
+    `refine` the views that are held hold the scale.
     """
-    last = max(structure.placed(), default=-1)
-    lost = {frame: view for frame, view in structure.views.items() if frame > last}
-    if current not in lost or len(lost) < config.max_lost:
-        return None
-    views = {frame: replace(view, landmark=view.landmark.copy()) for frame, view in lost.items()}
-    new = Structure(structure.K, views, np.full_like(structure.points, np.nan), structure.distortion)
-    has_begun = initialize(new, camera, num_views, replace(config, distortion_std=0.0))
-    return new if has_begun and current in new.placed() else None
+    largest = _largest_parallax(structure, config)
+    if structure.is_lens_known or config.distortion_std == 0 or largest < max(config.min_lens_parallax_rad, 1e-9):
+        return
+    *_, distortion, _ = _solve(structure, camera, num_views, sorted(structure.placed())[:1], config, measures=True)
+    structure.distortion_weight += largest**2
+    share = largest**2 / structure.distortion_weight
+    straighten(structure, structure.distortion + share * (distortion - structure.distortion))
 
 
-def refine(
+def refine(structure: Structure, camera: Camera, num_views: int, fixed: list[int], config: StructureConfig) -> None:
+    """Bundle adjustment of all placed views; drops what does not fit and triangulates what now does."""
+    for _ in range(config.num_rounds):
+        frames = sorted(structure.placed())
+        ids, poses, points, _, error = _solve(structure, camera, num_views, fixed, config)
+        structure.points[ids] = points
+        for row, frame in enumerate(frames):
+            if frame not in fixed:
+                structure.views[frame].T_ref_view = poses[row]
+        _drop(structure, frames, fixed, ids, error, config)
+        triangulate(structure, config.matching)
+
+
+def _largest_parallax(structure: Structure, config: StructureConfig) -> float:
+    """Of the median landmark between the newest view and another (sine); 0 where it shares too little with each."""
+    placed, largest = structure.placed(), 0.0
+    newest = placed.get(max(placed, default=-1))
+    for other in placed.values():
+        rows, _ = known_common(structure, newest, other)
+        if len(rows) >= config.matching.min_matches:
+            points = structure.points[newest.landmark[rows]]
+            angles = parallax(points, newest.T_ref_view[:3, 3], other.T_ref_view[:3, 3])
+            largest = max(largest, float(np.median(angles)))
+    return largest
+
+
+def _solve(
     structure: Structure,
     camera: Camera,
     num_views: int,
     fixed: list[int],
     config: StructureConfig,
-    distortion_std: float = 0.0,
-) -> None:
-    """Bundle adjustment of all placed views; drops what does not fit and triangulates what now does.
-
-    With a `distortion_std` the lens is measured in the first round, and keypoints move to where a pinhole sees them.
-    """
-    num_rows = num_views + config.keys.max_keys
-    for count in range(config.num_rounds):
-        is_measured = distortion_std > 0 and count == 0
-        frames = sorted(structure.placed())
-        ids, tracks = _tracks(structure, frames, num_rows, config)
-        poses = np.tile(np.eye(4), (num_rows, 1, 1))
-        poses[: len(frames)] = [structure.views[frame].T_ref_view for frame in frames]
-        points = np.zeros((config.max_landmarks, 3))
-        points[: len(ids)] = structure.points[ids]
-        free = [row for row, frame in enumerate(frames) if frame not in fixed]
-        T, points, distortion, error = jitted_adjust(
-            jaxlie.SE3.from_matrix(jnp.asarray(poses, jnp.float32)),
-            jnp.asarray(points, jnp.float32),
-            tracks,
-            Unknowns(_padded(free, num_views, num_rows), jnp.asarray(distortion_std * is_measured, jnp.float32)),
-            camera,
-            config.bundle,
-        )
-        poses, error = np.asarray(T.as_matrix(), np.float64), np.asarray(error)
-        structure.points[ids] = np.asarray(points, np.float64)[: len(ids)]
-        for row, frame in enumerate(frames):
-            if frame not in fixed:
-                structure.views[frame].T_ref_view = poses[row]
-        if is_measured:
-            straighten(structure, float(distortion))
-        _drop(structure, frames, fixed, ids, error, config)
-        triangulate(structure, config.matching)
-
-
-def _padded(rows: list[int], count: int, other: int) -> jnp.ndarray:
-    return jnp.asarray(rows + [other] * (count - len(rows)), jnp.int32)
-
-
-def _ranked_pairs(structure: Structure, config: StructureConfig) -> list[tuple[int, int, np.ndarray]]:
-    """Pairs of views with their relative pose, the one with most matches and parallax first."""
-    frames, found = sorted(structure.views), []
-    for i, a in enumerate(frames):
-        for b in frames[i + 1 :]:
-            result = relative_pose(structure.views[a], structure.views[b], structure.K, config.matching)
-            if result is not None:
-                found.append((result[1], a, b, result[0]))
-    return [item[1:] for item in sorted(found, key=lambda item: -item[0])]
-
-
-def _grow(structure: Structure, camera: Camera, num_views: int, origin: int, config: StructureConfig) -> None:
-    """Place one view after the other, the one with most known landmarks first."""
-    while True:
-        refine(structure, camera, num_views, [origin], config)
-        waiting = [view for view in structure.views.values() if view.T_ref_view is None]
-        waiting.sort(key=lambda view: -structure.known(view).sum())
-        if not any(place(structure, view, config.matching) for view in waiting):
-            return
-        triangulate(structure, config.matching)
-
-
-def _reset(structure: Structure) -> None:
-    structure.points[:] = np.nan
-    for view in structure.views.values():
-        view.T_ref_view = None
-
-
-def _normalize(structure: Structure, reference: View, config: StructureConfig) -> None:
-    """Make a placed view the reference and its median landmark `median_depth` deep."""
-    T_first_ref = np.linalg.inv(reference.T_ref_view)
-    structure.points = structure.points @ T_first_ref[:3, :3].T + T_first_ref[:3, 3]
-    depth = structure.points[reference.landmark[structure.known(reference)], 2]
-    scale = config.median_depth / np.median(depth)
-    structure.points *= scale
-    for view in structure.placed().values():
-        view.T_ref_view = T_first_ref @ view.T_ref_view
-        view.T_ref_view[:3, 3] *= scale
+    measures: bool = False,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray]:
+    """Landmarks that take part (l,), poses of all placed views, their points (l, 3), lens and errors as in `adjust`."""
+    frames, num_rows = sorted(structure.placed()), num_views + config.keys.max_keys
+    ids, tracks = _tracks(structure, frames, num_rows, config)
+    if measures:
+        shown = distort(np.asarray(tracks.pixels), structure.lens())
+        tracks = Tracks(jnp.asarray(shown, jnp.float32), tracks.is_seen)
+    poses = np.tile(np.eye(4), (num_rows, 1, 1))
+    poses[: len(frames)] = [structure.views[frame].T_ref_view for frame in frames]
+    points = np.zeros((config.max_landmarks, 3))
+    points[: len(ids)] = structure.points[ids]
+    free = [row if row < len(frames) and frames[row] not in fixed else num_rows for row in range(num_rows)]
+    T, points, distortion, error = jitted_adjust(
+        jaxlie.SE3.from_matrix(jnp.asarray(poses, jnp.float32)),
+        jnp.asarray(points, jnp.float32),
+        tracks,
+        Unknowns(
+            jnp.asarray(free, jnp.int32),
+            jnp.asarray(structure.distortion, jnp.float32),
+            jnp.asarray(config.distortion_std * measures, jnp.float32),
+        ),
+        camera,
+        config.bundle,
+    )
+    poses, points = np.asarray(T.as_matrix(), np.float64), np.asarray(points, np.float64)
+    return ids, poses, points[: len(ids)], float(distortion), np.asarray(error)
 
 
 def _columns(structure: Structure, ids: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from emgs_jax.ops.ranges import number
-from emgs_jax.prior.multiview.landmarks import Structure, View, common
+from emgs_jax.prior.multiview.landmarks import Structure, View, known_common
 
 
 @dataclass(frozen=True)
@@ -27,32 +27,31 @@ class KeyConfig:
     min_shift: float = number(low=0)
 
 
-def kept(structure: Structure, views: Sequence[int], width: int, config: KeyConfig) -> list[int]:
-    """The placed views, none of `views`, that stay: keys until now, and what leaves the window and is far from them.
+def key_views(structure: Structure, views: Sequence[int], width: int, config: KeyConfig) -> list[int]:
+    """The placed views, none of `views`, that are far from each other: keys until now, and what leaves the window.
 
     Args:
         structure: of the window before.
         views: of the window.
         width: of the images, pixels.
-        config: how many, and how far apart.
+        config: how far apart.
     """
     placed = structure.placed()
     keys: list[int] = []
     for frame in sorted(frame for frame in placed if frame not in views):
         if not keys or _shift(structure, placed[keys[-1]], placed[frame]) >= config.min_shift * width:
             keys.append(frame)
-    shared = {frame: len(_known_common(structure, placed[frame], placed[max(placed)])[0]) for frame in keys}
+    return keys
+
+
+def kept(structure: Structure, keys: Sequence[int], config: KeyConfig) -> list[int]:
+    """Those of the key views that stay: they share most with the newest view."""
+    placed = structure.placed()
+    shared = {frame: len(known_common(structure, placed[frame], placed[max(placed)])[0]) for frame in keys}
     return sorted(sorted(keys, key=lambda frame: (-shared[frame], -frame))[: config.max_keys])
-
-
-def _known_common(structure: Structure, a: View, b: View) -> tuple[np.ndarray, np.ndarray]:
-    """Keypoints of two views that have the same landmark, whose position is known."""
-    rows_a, rows_b = common(a, b)
-    is_known = structure.known(a)[rows_a]
-    return rows_a[is_known], rows_b[is_known]
 
 
 def _shift(structure: Structure, a: View, b: View) -> float:
     """Median distance in pixels between the images of what both show; inf where that is nothing."""
-    rows_a, rows_b = _known_common(structure, a, b)
+    rows_a, rows_b = known_common(structure, a, b)
     return float(np.median(np.linalg.norm(a.pixels[rows_a] - b.pixels[rows_b], axis=1))) if len(rows_a) else np.inf

@@ -9,7 +9,7 @@ import numpy as np
 from emgs_jax.keypoints import sift
 from emgs_jax.keypoints.poses import essential, pose_of, unit_rays
 from emgs_jax.ops.ranges import number
-from emgs_jax.prior.multiview.lens import Lens, straight
+from emgs_jax.prior.multiview.lens import Lens, distort, straight
 from emgs_jax.prior.multiview.memory import Memory, remember, without
 
 NONE = -1  # a keypoint without a landmark
@@ -68,7 +68,7 @@ class View:
 class Structure:
     """Views by frame index, and landmarks: `points` (l, 3) in the reference frame, NaN where not triangulated.
 
-    `distortion` is that of the lens, as far as it has been measured.
+    `distortion` of the lens is the mean of what was measured, of that total weight, until it `is_lens_known`.
     """
 
     K: np.ndarray
@@ -76,6 +76,8 @@ class Structure:
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     distortion: float = 0.0
     memory: Memory = field(default_factory=Memory)
+    distortion_weight: float = 0.0
+    is_lens_known: bool = False
 
     def lens(self) -> Lens:
         """What the images were taken with."""
@@ -99,10 +101,10 @@ def detect(gray: np.ndarray, config: MatchingConfig) -> View:
 
 
 def straighten(structure: Structure, distortion: float) -> None:
-    """Move the keypoints of a structure whose images were taken to have no distortion to where a pinhole sees them."""
-    structure.distortion = distortion
+    """Move the keypoints to where a pinhole camera sees what a lens of this distortion shows."""
+    before, structure.distortion = structure.lens(), distortion
     for view in structure.views.values():
-        view.pixels = straight(view.pixels, structure.lens())
+        view.pixels = straight(distort(view.pixels, before), structure.lens())
 
 
 def match(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -166,10 +168,18 @@ def common(a: View, b: View) -> tuple[np.ndarray, np.ndarray]:
     return rows_a[has], rows_b[has]
 
 
-def relative_pose(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, float] | None:
-    """T_a_b with a unit baseline from the landmarks that two views share, and a score; None without enough of them.
+def known_common(structure: Structure, a: View, b: View) -> tuple[np.ndarray, np.ndarray]:
+    """Keypoints of two views that have the same landmark, whose position is known."""
+    rows_a, rows_b = common(a, b)
+    is_known = structure.known(a)[rows_a]
+    return rows_a[is_known], rows_b[is_known]
 
-    The score is the number of matches in front of both cameras times the sine of their median parallax.
+
+def relative_pose(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, int, float] | None:
+    """T_a_b with a unit baseline from the landmarks that two views share; None without enough of them.
+
+    Returns:
+        The pose, the number of matches in front of both cameras, and the sine of their median parallax.
     """
     rows_a, rows_b = common(a, b)
     pixels_a, pixels_b = a.pixels[rows_a], b.pixels[rows_b]
@@ -178,15 +188,15 @@ def relative_pose(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tu
     E, mask = essential(pixels_a, pixels_b, K, config.max_epipolar_error)
     if E is None or E.shape != (3, 3):
         return None
-    count, R, t, mask = cv2.recoverPose(E, pixels_a, pixels_b, K, mask=mask)
+    inliers = mask.ravel() > 0  # before those that are so far away that they tell nothing of the baseline are left out
+    count, R, t, _ = cv2.recoverPose(E, pixels_a, pixels_b, K, mask=mask)
     if count < config.min_matches:
         return None
-    inliers = mask.ravel() > 0
     rays_a, rays_b = unit_rays(pixels_a[inliers], K), unit_rays(pixels_b[inliers], K)
     parallax = np.linalg.norm(np.cross(rays_a @ R.T, rays_b), axis=1)
     T_b_a = np.eye(4)
     T_b_a[:3, :3], T_b_a[:3, 3] = R, t.ravel()
-    return np.linalg.inv(T_b_a), float(count * np.median(parallax))
+    return np.linalg.inv(T_b_a), count, float(np.median(parallax))
 
 
 def place(structure: Structure, view: View, config: MatchingConfig) -> bool:

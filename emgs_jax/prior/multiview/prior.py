@@ -36,8 +36,9 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate_depth
-from emgs_jax.prior.multiview.incremental import StructureConfig, begin_again, extend, initialize
-from emgs_jax.prior.multiview.keys import kept
+from emgs_jax.prior.multiview.incremental import StructureConfig, extend
+from emgs_jax.prior.multiview.initialization import begin_again, initialize
+from emgs_jax.prior.multiview.keys import kept, key_views
 from emgs_jax.prior.multiview.landmarks import Structure, detect, forget, link
 from emgs_jax.prior.multiview.lens import as_shown, points_shown, rectify, straight
 from emgs_jax.prior.multiview.planar import PlanarConfig, fill_planes
@@ -91,7 +92,7 @@ class MultiviewStereo(Prior):
     def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:
         self._structure_config, self._dense_config = structure, dense
         settings = {"structure": _values(structure), "dense": _values(dense)}
-        self.provenance = Provenance("multiview_stereo", {"version": 5} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 6} | settings)
         self._next = 0
         self._structure = Structure(np.eye(3))
 
@@ -129,6 +130,7 @@ class MultiviewStereo(Prior):
         self._structure = Structure(calibration(intrinsics))
         self._has_begun = False
         self._oldest = 0  # view of this structure
+        self._shown: dict[int, np.ndarray] = {}
         self._grays: dict[int, np.ndarray] = {}
         self._depths: dict[int, np.ndarray] = {}
         self._spreads: dict[int, np.ndarray] = {}
@@ -136,21 +138,26 @@ class MultiviewStereo(Prior):
         self._num_views = len(frames) + 3
 
     def _place_views(self, current: int) -> None:
-        given = self._camera, self._num_views, self._structure_config
+        given, distortion = (self._camera, self._num_views, self._structure_config), self._structure.distortion
         if self._has_begun:
             extend(self._structure, *given)
             other = begin_again(self._structure, current, *given)
             if other is not None:
                 self._structure, self._oldest = other, min(other.views)
         elif initialize(self._structure, *given):
-            self._has_begun, lens = True, self._structure.lens()
-            self._grays = {frame: rectify(gray, lens) for frame, gray in self._grays.items()}
+            self._has_begun = True
+        if self._structure.distortion != distortion:
+            lens = self._structure.lens()
+            self._grays = {frame: rectify(shown, lens) for frame, shown in self._shown.items()}
 
     def _forget(self, window: Window) -> None:
-        stays = {*window.views, *kept(self._structure, window.views, self._camera.width, self._structure_config.keys)}
+        config = self._structure_config.keys
+        keys = key_views(self._structure, window.views, self._camera.width, config)
+        stays = {*window.views, *kept(self._structure, keys, config)}
+        self._structure.is_lens_known |= len(keys) > config.max_keys
         gone = [frame for frame in self._structure.views if frame not in stays]
         forget(self._structure, gone, self._structure_config.matching)
-        for known in (self._grays, self._depths, self._spreads):
+        for known in (self._shown, self._grays, self._depths, self._spreads):
             for frame in [frame for frame in known if frame not in stays]:
                 del known[frame]
 
@@ -163,7 +170,8 @@ class MultiviewStereo(Prior):
             )
         view, lens = detect(gray, self._structure_config.matching), self._structure.lens()
         view.pixels = straight(view.pixels, lens)
-        self._grays[frame.index] = rectify(np.float32(gray) / 255.0, lens)
+        self._shown[frame.index] = np.float32(gray) / 255.0
+        self._grays[frame.index] = rectify(self._shown[frame.index], lens)
         self._structure.views[frame.index] = view
         link(self._structure, frame.index, self._structure_config.matching)
 

@@ -30,7 +30,7 @@ def solve(poses, points, pixels, is_seen=None, is_fixed=(True, True, False, Fals
         jaxlie.SE3.from_matrix(jnp.asarray(poses, jnp.float32)),
         jnp.asarray(points, jnp.float32),
         Tracks(jnp.asarray(pixels, jnp.float32), jnp.asarray(is_seen)),
-        Unknowns(jnp.asarray(np.flatnonzero(~np.asarray(is_fixed))), jnp.zeros(())),
+        Unknowns(jnp.asarray(np.flatnonzero(~np.asarray(is_fixed))), *jnp.zeros(2)),
         small_camera(),
         config,
     )

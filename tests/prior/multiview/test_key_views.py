@@ -1,9 +1,11 @@
 """Which views stay when they leave the window, and what they are good for."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from stereo_scene import SIZE, calibration, matrix, projected, structure_config
 
-from emgs_jax.prior.multiview.keys import KeyConfig, kept
+from emgs_jax.prior.multiview.keys import KeyConfig, kept, key_views
 from emgs_jax.prior.multiview.landmarks import NONE, Structure, View, forget, link, triangulate
 
 WIDTH, NUM_POINTS = 100, 40
@@ -23,21 +25,26 @@ def shifted(*shifts: float) -> Structure:
     return Structure(np.eye(3), views, np.ones((NUM_POINTS, 3)))
 
 
+def stay(structure: Structure, views: Sequence[int], config: KeyConfig, width: int = WIDTH) -> list[int]:
+    """The views that stay beside those of the window."""
+    return kept(structure, key_views(structure, views, width, config), config)
+
+
 def test_a_view_that_leaves_stays_where_it_is_far_from_the_key_before_it():
     structure = shifted(0, 4, 8, 11, 15, 22, 30, 31)
-    assert kept(structure, (6, 7), WIDTH, KeyConfig(8, 0.1)) == [0, 3, 5]
-    assert kept(structure, (0, 6, 7), WIDTH, KeyConfig(8, 0.1)) == [1, 4], "view 0 is in the window anyway"
-    assert kept(structure, (6, 7), WIDTH, KeyConfig(0, 0.1)) == []
+    assert stay(structure, (6, 7), KeyConfig(8, 0.1)) == [0, 3, 5]
+    assert stay(structure, (0, 6, 7), KeyConfig(8, 0.1)) == [1, 4], "view 0 is in the window anyway"
+    assert stay(structure, (6, 7), KeyConfig(0, 0.1)) == []
 
 
 def test_those_go_that_share_least_with_the_newest_view():
     structure = shifted(0, 10, 20, 30, 40)
     structure.views[1].landmark[5:] = -1
-    assert kept(structure, (4,), WIDTH, KeyConfig(3, 0.1)) == [0, 2, 3]
+    assert stay(structure, (4,), KeyConfig(3, 0.1)) == [0, 2, 3]
     structure.views[1].landmark[:] = -1
-    assert kept(structure, (4,), WIDTH, KeyConfig(4, 0.1)) == [0, 1, 2, 3], "nothing in common is far"
+    assert stay(structure, (4,), KeyConfig(4, 0.1)) == [0, 1, 2, 3], "nothing in common is far"
     structure.views[2].T_ref_view = None
-    assert kept(structure, (4,), WIDTH, KeyConfig(4, 0.1)) == [0, 1, 3], "what is not placed is no key"
+    assert stay(structure, (4,), KeyConfig(4, 0.1)) == [0, 1, 3], "what is not placed is no key"
 
 
 def seen_from(T: np.ndarray, points: np.ndarray, descriptors: np.ndarray) -> View:
@@ -57,7 +64,7 @@ def test_a_camera_that_turns_back_shows_the_landmarks_of_a_key_again():
         structure = Structure(calibration())
         for frame, T in enumerate(poses):
             window = range(max(frame - 2, 0), frame + 1)
-            stays = {*window, *kept(structure, window, SIZE[0], KeyConfig(max_keys, 0.1))}
+            stays = {*window, *stay(structure, window, KeyConfig(max_keys, 0.1), SIZE[0])}
             forget(structure, [one for one in structure.views if one not in stays], config)
             structure.views[frame] = seen_from(T, points, descriptors)
             link(structure, frame, config)

@@ -306,7 +306,8 @@ def test_the_relative_pose_is_the_true_one_up_to_the_length_of_the_baseline(conf
     expected = np.linalg.inv(poses[0]) @ poses[2]
     expected[:3, 3] /= np.linalg.norm(expected[:3, 3])
     np.testing.assert_allclose(far[0], expected, atol=1e-4)
-    assert far[1] > near[1]  # twice the parallax
+    assert far[1] == near[1] == NUM_POINTS
+    assert far[2] > 1.5 * near[2]  # twice the parallax
 
 
 def test_fewer_matches_than_a_pose_needs_are_refused_in_the_config():

@@ -12,7 +12,7 @@ from tiny_run import SMALL_STEREO
 from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.io.files import jsonable
 from emgs_jax.prior.base import Prior, windows
-from emgs_jax.prior.multiview.lens import Lens, grid, straight
+from emgs_jax.prior.multiview.lens import Lens, grid, rectify, straight
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.convert import to_first_window, to_se3
@@ -61,8 +61,15 @@ def answered_by():
 
 
 @pytest.fixture(scope="module")
-def answered(room, answered_by):
-    return answers(answered_by, room)
+def answered_with(room, answered_by):
+    """Every answer, and the distortion of the lens as it was known then."""
+    found = predictions(room, answered_by, WINDOW_SIZE, Clock())
+    return [(prediction, answered_by.report()["prior/distortion"]) for prediction, _ in found]
+
+
+@pytest.fixture(scope="module")
+def answered(answered_with):
+    return [prediction for prediction, _ in answered_with]
 
 
 def blank(room):
@@ -97,13 +104,29 @@ def test_views_that_leave_the_window_stay_as_keys(answered, answered_by):
 
 
 @pytest.mark.slow
-def test_an_answer_obeys_the_protocol(room, answered, answered_by):
+def test_all_images_are_straightened_by_the_newest_lens(answered, answered_by):
+    for frame, gray in answered_by._grays.items():
+        expected = rectify(answered_by._shown[frame], answered_by._structure.lens())
+        np.testing.assert_array_equal(gray, expected, err_msg=f"view {frame}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("max_keys, is_known", [(0, True), (8, False)])
+def test_the_lens_is_known_once_a_key_view_has_gone(room, max_keys, is_known):
+    prior, measured = make_prior(f"prior.structure.keys.max_keys={max_keys}"), []
+    for _ in predictions(room, prior, WINDOW_SIZE, Clock()):
+        measured.append(prior.report()["prior/distortion"])
+    assert (measured[-1] == measured[-2]) == is_known and measured[0] != 0
+
+
+@pytest.mark.slow
+def test_an_answer_obeys_the_protocol(room, answered_with):
     assert isinstance(make_prior(), Prior)
     fx, fy, cx, cy = room.intrinsics
-    lens = Lens(np.array([fx, fy]), np.array([cx, cy]), answered_by.report()["prior/distortion"])
-    u, v = np.moveaxis(straight(grid(96, 128), lens), -1, 0)
-    assert abs(lens.distortion) < 0.03  # the room is drawn without any
-    for answer, window in zip(answered, windows(NUM_FRAMES, WINDOW_SIZE), strict=True):
+    for (answer, distortion), window in zip(answered_with, windows(NUM_FRAMES, WINDOW_SIZE), strict=True):
+        assert abs(distortion) < 0.03  # the room is drawn without any
+        lens = Lens(np.array([fx, fy]), np.array([cx, cy]), distortion)
+        u, v = np.moveaxis(straight(grid(96, 128), lens), -1, 0)
         num_views, num_dense = len(window.views), len(window.dense)
         assert answer.window == window
         np.testing.assert_array_equal(answer.T_anchor_view[0], np.eye(4))
@@ -266,11 +289,14 @@ def test_a_camera_in_another_room_begins_a_structure_of_its_own(room, two_rooms,
 
 
 @pytest.mark.slow
-def test_the_lens_is_measured_once(two_rooms):
+def test_a_second_structure_takes_the_lens_of_the_first(two_rooms):
     prior = make_prior("prior.structure.max_lost=4")
-    found = predictions(two_rooms, prior, WINDOW_SIZE, Clock())
-    measured = [prior.report()["prior/distortion"] for _ in found]
-    assert measured[0] != 0 and len(measured) > NUM_FRAMES and len(set(measured)) == 1
+    first, second = set(), set()
+    for prediction, _ in predictions(two_rooms, prior, WINDOW_SIZE, Clock()):
+        is_second = not np.isfinite(prediction.T_anchor_view[0]).all()
+        (second if is_second else first).add(prior.report()["prior/distortion"])
+    assert len(second) == 1 and 0 not in first | second
+    assert len(first) > 2, "while no key view has gone, each window measures it"
 
 
 @pytest.mark.slow
@@ -318,5 +344,5 @@ def test_the_provenance_holds_every_value_of_the_config_as_json_writes_it():
     def without_targets(node):
         return {k: without_targets(v) for k, v in node.items() if k != "_target_"} if hasattr(node, "items") else node
 
-    assert settings == {"version": 5} | jsonable(without_targets(config.prior))
+    assert settings == {"version": 6} | jsonable(without_targets(config.prior))
     assert settings != make_prior("prior.dense.depth.max_cost=0.11").provenance.settings
