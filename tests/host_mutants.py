@@ -1903,6 +1903,13 @@ MUTANTS = (
         "a second structure has a lens of its own",
     ),
     Mutant(
+        "emgs_jax/report/back_end.py",
+        'if outcomes[loop.a, loop.b] == "known"',
+        "if False",
+        ("tests/running/test_back_end.py",),
+        "loops that the poses say already are not found",
+    ),
+    Mutant(
         "emgs_jax/keypoints/sift.py",
         "is_distinct = 1 - best < max_ratio**2 * (1 - second)",
         "is_distinct = 1 - best < max_ratio * (1 - second)",

@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from emgs_jax.graph.measurements import Graph
 from emgs_jax.loops.two_views import rescaled
+from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.running.back_end import BackEnd, Refusal
 from emgs_jax.running.measuring import stacked
 from emgs_jax.running.revisiting import MEASURED, SILENT, UNUSABLE
@@ -31,20 +33,40 @@ def loop_list(end: BackEnd) -> list[dict[str, Any]]:
     said so already), unconfirmed (others do not agree), unsolved (no better poses were found with it, and `reason` says
     why) or refused, and then `gate` and `measured` say by what.
     """
-    unsolved = {(loop.a, loop.b): one.info.reason for one in end.closures if one.info.reason for loop in one.loops}
-    accepted = {(loop.a, loop.b) for loop in end.accepted}
+    unsolved, outcomes, lines = _unsolved(end), _outcomes(end), []
     found = [Refusal(loop.a, loop.b, "", math.nan) for loop in end.verified]
-    agreed = {(loop.a, loop.b) for loop in end.agreed()}
-    lines = []
     known = (item for item in [*found, *end.refusals] if item.a >= end.first)  # what is older is of another run
     for a, b, gate, measured in sorted(known, key=lambda item: (item.b, item.a)):
-        verified = "accepted" if (a, b) in accepted else "known" if (a, b) in agreed else "unconfirmed"
-        if verified == "known" and (a, b) in unsolved:
-            verified = "unsolved"
-        line = {"frame": end.frames[b], "other": end.frames[a], "outcome": "refused" if gate else verified}
+        outcome = "refused" if gate else outcomes[a, b]
+        line = {"frame": end.frames[b], "other": end.frames[a], "outcome": outcome}
         line |= {"reason": unsolved[a, b]} if line["outcome"] == "unsolved" else {}
         lines.append(line | ({"gate": gate, "measured": measured} if gate else {}))
     return lines
+
+
+def found_loops(end: BackEnd) -> list[LoopMeasurement]:
+    """The loops that are believed: what is accepted, and what is known, since the poses say so without it."""
+    outcomes = _outcomes(end)
+    return [*end.accepted, *(loop for loop in end.verified if outcomes[loop.a, loop.b] == "known")]
+
+
+def _outcomes(end: BackEnd) -> dict[tuple[int, int], str]:
+    """Of every verified loop, see `loop_list`."""
+    unsolved, accepted, agreed = _unsolved(end), _ends(end.accepted), _ends(end.agreed())
+    outcomes = {}
+    for ends in _ends(end.verified):
+        known = "unsolved" if ends in unsolved else "known"
+        outcomes[ends] = "accepted" if ends in accepted else known if ends in agreed else "unconfirmed"
+    return outcomes
+
+
+def _ends(loops: Sequence[LoopMeasurement]) -> set[tuple[int, int]]:
+    return {(loop.a, loop.b) for loop in loops}
+
+
+def _unsolved(end: BackEnd) -> dict[tuple[int, int], str]:
+    """Why no better poses were found with a loop."""
+    return {(loop.a, loop.b): one.info.reason for one in end.closures if one.info.reason for loop in one.loops}
 
 
 def revisit_note(end: BackEnd | None, is_sequential: bool) -> list[str]:

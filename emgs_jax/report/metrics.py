@@ -31,7 +31,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
-from emgs_jax.report.back_end import counts
+from emgs_jax.report.back_end import counts, found_loops
 from emgs_jax.report.provenance import RAW_PRIOR, prefixed
 from emgs_jax.running.clock import Clock, peak_memory_mb
 from emgs_jax.running.dense import center_cloud, dense_map
@@ -257,11 +257,11 @@ def score_back_end(run: MappingRun) -> Metrics:
 
 
 def _loops(run: MappingRun) -> tuple[list[tuple[int, int, np.ndarray]], list[np.ndarray | None]]:
-    """The accepted loops in metres of the truth, and the true poses of the nodes that they are between."""
+    """The loops that are believed in metres of the truth, and the true poses of the nodes that they are between."""
     end = run.back_end
     compared = with_truth(run, run.poses)
     unit = (None if compared is None else trajectory_metrics(*compared)["trajectory/scale"]) or 1.0
-    loops = [(loop.a, loop.b, rescaled(loop.Z_a_b, unit * np.exp(end.log_scales[loop.a]))) for loop in end.accepted]
+    loops = [(loop.a, loop.b, rescaled(loop.Z_a_b, unit * np.exp(end.log_scales[loop.a]))) for loop in found_loops(end)]
     of_saved: list[np.ndarray | None] = [None] * end.first
     return loops, of_saved + run.true_poses[row_of_first_node(run) :]
 

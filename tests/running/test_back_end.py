@@ -21,7 +21,7 @@ from emgs_jax.loops.revisit import Revisit
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.registration.belief import certain
-from emgs_jax.report.back_end import counts, loop_list, metric_graph, revisit_note
+from emgs_jax.report.back_end import counts, found_loops, loop_list, metric_graph, revisit_note
 from emgs_jax.report.page_strip import loop_why
 from emgs_jax.running import correction
 from emgs_jax.running.back_end import BackEnd
@@ -184,10 +184,14 @@ def test_a_loop_that_others_agree_with_and_that_cannot_be_solved_says_why(graph,
     end.verified = [known, broken]
     monkeypatch.setattr(end, "agreed", lambda since=0: end.verified)
     assert [line["outcome"] for line in loop_list(end)] == ["known", "known"]
+    assert found_loops(end) == [known, broken], "what the poses say already is found as well"
     bad = replace(broken, Z_a_b=np.full((4, 4), np.nan))
     end.close(state, [bad])
     unsolved, other = loop_list(end)
     assert (unsolved["outcome"], other["outcome"]) == ("unsolved", "known")
+    assert found_loops(end) == [known]
+    end.accepted = [known]
+    assert found_loops(end) == [known], "once"
     assert unsolved["reason"] == end.closures[-1].info.reason and "reason" not in other
     assert loop_why(unsolved) == f"verified, but no better poses were found with it: {unsolved['reason']}"
 
