@@ -90,8 +90,10 @@ def measure_lens(structure: Structure, camera: Camera, num_views: int, config: S
     `min_lens_parallax_rad`, and counts by the parallax squared above. Of the adjustment only the lens is taken: in
     `refine` the views that are held hold the scale.
     """
+    if structure.is_lens_known or config.distortion_std == 0:
+        return
     largest = _largest_parallax(structure, config)
-    if structure.is_lens_known or config.distortion_std == 0 or largest < max(config.min_lens_parallax_rad, 1e-9):
+    if largest == 0 or largest < config.min_lens_parallax_rad:
         return
     *_, distortion, _ = _solve(structure, camera, num_views, sorted(structure.placed())[:1], config, measures=True)
     structure.distortion_weight += largest**2

@@ -68,7 +68,8 @@ class View:
 class Structure:
     """Views by frame index, and landmarks: `points` (l, 3) in the reference frame, NaN where not triangulated.
 
-    `distortion` of the lens is the mean of what was measured, of that total weight, until it `is_lens_known`.
+    `distortion` of the lens is the mean of what windows measured, with weights that add up to `distortion_weight`; it
+    changes until it `is_lens_known`.
     """
 
     K: np.ndarray
