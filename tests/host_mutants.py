@@ -1897,8 +1897,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/prior/multiview/initialization.py",
-        "new.is_lens_known = structure.distortion_weight > 0",
-        "pass",
+        "is_lens_known=structure.distortion_weight > 0",
+        "is_lens_known=False",
         MULTIVIEW,
         "a second structure has a lens of its own",
     ),

@@ -5,7 +5,7 @@ small dense problem in the poses (Triggs et al., "Bundle adjustment: a modern sy
 the Cauchy loss log(1 + e²/σ²)/2, which gives it the weight 1 / (σ² + e²).
 
 The lens may be an unknown too. Baselines are short, so a radial error of the pixels does not show as a large residual:
-it turns the views and moves them the other way, and structure and path get two scales (7-Scenes: k = -.03, 6 %).
+it turns the views and moves them the other way, and structure and path get two scales (7-Scenes: k = .03, 6 %).
 """
 
 from typing import NamedTuple

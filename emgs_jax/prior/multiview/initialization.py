@@ -11,6 +11,7 @@ import numpy as np
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.multiview.incremental import StructureConfig, measure_lens, refine
 from emgs_jax.prior.multiview.landmarks import Structure, View, place, relative_pose, triangulate
+from emgs_jax.prior.multiview.memory import Memory
 
 
 def initialize(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> bool:
@@ -53,8 +54,13 @@ def begin_again(
     if current not in lost or len(lost) < config.max_lost:
         return None
     views = {frame: replace(view, landmark=view.landmark.copy()) for frame, view in lost.items()}
-    new = Structure(structure.K, views, np.full_like(structure.points, np.nan), structure.distortion)
-    new.is_lens_known = structure.distortion_weight > 0
+    new = replace(
+        structure,
+        views=views,
+        points=np.full_like(structure.points, np.nan),
+        memory=Memory(),
+        is_lens_known=structure.distortion_weight > 0,
+    )
     has_begun = initialize(new, camera, num_views, config)
     return new if has_begun and current in new.placed() else None
 

@@ -12,7 +12,7 @@ known, more the smaller the expected error is.
 
 The frame is that of the first image that could be placed (image 0, unless the camera rests at first), and the scale
 that of its window, which is fixed by `median_depth`; images alone do not tell it. The radial distortion of the lens is
-measured in that window too: points lie on the rays of the lens then, not on those of the pinhole.
+measured until the first key view goes: points lie on the rays of the lens as it is known, not on those of the pinhole.
 
 Where the camera has lost all that the structure knows, the newest views begin another one, with a frame and a scale of
 its own. What is known of the views before is of no use then: they have no pose any more, the anchor included.

@@ -297,6 +297,7 @@ def test_a_second_structure_takes_the_lens_of_the_first(two_rooms):
         (second if is_second else first).add(prior.report()["prior/distortion"])
     assert len(second) == 1 and 0 not in first | second
     assert len(first) > 2, "while no key view has gone, each window measures it"
+    assert prior._structure.distortion_weight > 0, "a third would take it as well"
 
 
 @pytest.mark.slow
