@@ -74,7 +74,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             dense = dense_map(session, dataset, densify, evaluation, labelled)
         with clock.phase("export"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
-            notes = save_outputs(folder, session, dense, densify, title)
+            notes = save_outputs(folder, session, dense, densify, title, evaluation.alignment == "sim3")
             save_classes(folder, prior)
         with clock.phase("evaluate"):
             scorer = new_scorer(dataset, evaluation, prior)

@@ -33,6 +33,11 @@ class Alignment:
         moved[:, :3, 3] = self.apply(moved[:, :3, 3])
         return moved
 
+    def inverse(self) -> "Alignment":
+        """From the reference's frame to the estimate's."""
+        rotation = self.rotation.T
+        return Alignment(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
 
 def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
     """Pair timestamps (n,) and (m,), in seconds, that are each other's nearest within `max_difference`.

@@ -28,7 +28,7 @@ class Paths:
     Args:
         estimate: of every frame.
         is_placed: (n,), False where the camera was lost and a pose stands in for its own.
-        truth: NaN where unknown.
+        truth: where the estimate fits it best; NaN where unknown.
         online: as the frames were placed, before poses moved.
         loops: rows of the frames that loops join.
     """
@@ -188,7 +188,7 @@ def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
         image, extent = seen_from_above(points, colors, path[:, 2])
         axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=1)
     if paths.truth is not None:
-        _draw_path(axes, paths.truth[:, :3, 3] @ rotation.T, _TRUTH, "true path", 5.0)
+        _draw_path(axes, paths.truth[:, :3, 3] @ rotation.T, _TRUTH, "true path, where it fits best", 5.0)
     if paths.online is not None:
         _draw_path(axes, paths.online[:, :3, 3] @ rotation.T, _ONLINE, "as it was placed", 1.6)
     # Thinner with its outline than the true path, so that one on top of the other shows both.

@@ -46,7 +46,7 @@ def placed_paths(run: RecordedRun, with_scale: bool) -> PlacedPaths:
     if not known.any():
         return PlacedPaths(run.truth, run.raw, {})
     ours, _ = align_poses(run.poses[known], run.truth[known], with_scale)
-    back = _inverse(ours)
+    back = ours.inverse()
     errors = {"ours": _errors(run.poses, run.truth, ours)}
     truth = np.where(known[:, None, None], back.apply_to_poses(run.truth), np.nan)
     raw = run.raw
@@ -94,11 +94,6 @@ def key_of(run: RecordedRun, errors: dict[str, np.ndarray]) -> str:
     if errors:
         parts += [(OURS, "ours"), (RAW, "raw prior")] + [(ONLINE, "as placed")] * ("online" in errors)
     return "".join(f'<i style="background:{color}"></i>{name}' for color, name in parts)
-
-
-def _inverse(a: Alignment) -> Alignment:
-    rotation = a.rotation.T
-    return Alignment(1.0 / a.scale, rotation, -(rotation @ a.translation) / a.scale)
 
 
 def _errors(poses: np.ndarray, truth: np.ndarray, alignment: Alignment) -> np.ndarray:

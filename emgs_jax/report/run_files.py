@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
@@ -101,8 +102,15 @@ def save_classes(folder: Path, prior: Prior) -> None:
         save_text(folder / TEXT_FILE, text)
 
 
-def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: DensifyConfig, title: str) -> list[str]:
-    """Write the files that show the map; returns what could not be made, and why."""
+def save_outputs(
+    folder: Path, run: MappingRun, dense: DenseMap, config: DensifyConfig, title: str, with_scale: bool
+) -> list[str]:
+    """Write the files that show the map; returns what could not be made, and why.
+
+    Args:
+        title: of the picture.
+        with_scale: the true path is drawn where it fits best by a similarity, not by a rigid motion, as it is scored.
+    """
     gaussians = jax.device_get(confirmed(run.state.map))
     valid = gaussians.valid
     # As drawn: the covariances are those that close the surface.
@@ -116,7 +124,8 @@ def save_outputs(folder: Path, run: MappingRun, dense: DenseMap, config: Densify
 
     centers = center_cloud(run)
     no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, centers.colors)
-    paths = Paths(np.stack(run.poses), np.array([record.status != "lost" for record in run.records]), *_moved(run))
+    is_placed = np.array([record.status != "lost" for record in run.records])
+    paths = Paths(np.stack(run.poses), is_placed, _placed_truth(run, with_scale), *_moved(run))
     classes = () if dense.labels is None else dense.labels.classes
     draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes, feature_cloud(gaussians))
     return [] if no_mesh is None else [f"no mesh.ply: {no_mesh}"]
@@ -131,14 +140,25 @@ def feature_cloud(gaussians: Gaussians) -> PointCloud | None:
     return PointCloud(*(np.asarray(values)[valid] for values in (gaussians.means, gaussians.normals, colors)))
 
 
-def _moved(run: MappingRun) -> tuple[np.ndarray | None, np.ndarray | None, tuple[tuple[int, int], ...]]:
-    """The true path, that before the back end moved it, and its loops, as `Paths` has them."""
-    unknown = np.full((4, 4), np.nan)
-    is_known = any(pose is not None for pose in run.true_poses)
-    truth = np.stack([unknown if pose is None else pose for pose in run.true_poses]) if is_known else None
+def _placed_truth(run: MappingRun, with_scale: bool) -> np.ndarray | None:
+    """The true path (n, 4, 4) where the estimate fits it best, NaN where unknown; None where it is nowhere known.
+
+    A prior has a frame and often a unit of its own: drawn as it is, a path without error would look like one that
+    drifts.
+    """
+    truth = np.stack([np.full((4, 4), np.nan) if pose is None else pose for pose in run.true_poses])
+    known = np.isfinite(truth).all((1, 2))
+    if not known.any():
+        return None
+    alignment, _ = align_poses(np.stack(run.poses)[known], truth[known], with_scale)
+    return alignment.inverse().apply_to_poses(truth)
+
+
+def _moved(run: MappingRun) -> tuple[np.ndarray | None, tuple[tuple[int, int], ...]]:
+    """The path before the back end moved it, and its loops, as `Paths` has them."""
     end = run.back_end
     if end is None or not end.closures:  # frames that are only located in a saved map are no nodes beside its loops
-        return truth, None, ()
+        return None, ()
     shift = row_of_first_node(run) - end.first  # from a node to the row of its record
     loops = tuple((shift + loop.a, shift + loop.b) for loop in end.accepted if min(loop.a, loop.b) >= end.first)
-    return truth, np.stack(end.online[end.first :]), loops
+    return np.stack(end.online[end.first :]), loops

@@ -58,7 +58,7 @@ def test_map_ply_holds_the_gaussians_in_use_as_they_are_drawn(tmp_path):
     """The covariances are those that close the surface, the opacity is the drawing's."""
     run = finished()
     config = densify_config("render.covariance_scale=2.25", "render.opacity=0.75")
-    assert save_outputs(tmp_path, run, dense_of(run), config, "a wall") == []
+    assert save_outputs(tmp_path, run, dense_of(run), config, "a wall", True) == []
     gaussians = run.state.map.gaussians
     valid = np.asarray(gaussians.valid)
     rows = vertices(tmp_path / "map.ply")
@@ -76,20 +76,20 @@ def test_map_ply_holds_the_gaussians_in_use_as_they_are_drawn(tmp_path):
 
 def test_points_ply_is_the_dense_cloud_with_its_classes(tmp_path):
     run = finished()
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
     rows, dense = vertices(tmp_path / "points.ply"), dense_of(run)
     np.testing.assert_allclose(np.stack([np.ravel(rows[axis]) for axis in "xyz"], 1), dense.cloud.points, rtol=1e-6)
     np.testing.assert_array_equal(np.ravel(rows["nz"]), -1.0)
     np.testing.assert_array_equal(np.ravel(rows["red"]), [255, 0])
     np.testing.assert_array_equal(np.ravel(rows["label"]), [1, -1])
     assert b"comment label 0 floor\ncomment label 1 wall\n" in (tmp_path / "points.ply").read_bytes()
-    save_outputs(tmp_path, run, DenseMap(dense.cloud), densify_config(), "a wall")
+    save_outputs(tmp_path, run, DenseMap(dense.cloud), densify_config(), "a wall", True)
     assert "label" not in vertices(tmp_path / "points.ply").dtype.names
 
 
 def test_the_mesh_is_the_wall_seen_from_the_cameras_side(tmp_path):
     run = finished()
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
     mesh = trimesh.load(tmp_path / "mesh.ply")
     np.testing.assert_allclose(mesh.vertices[:, 2], 2.0, atol=0.02)
     towards = np.average(mesh.face_normals[:, 2], weights=mesh.area_faces)
@@ -99,7 +99,7 @@ def test_the_mesh_is_the_wall_seen_from_the_cameras_side(tmp_path):
 
 def test_what_could_not_be_made_is_named(tmp_path):
     run = finished(gaussians=wall(0.0, 0.2))  # 40 Gaussians
-    (note,) = save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    (note,) = save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
     assert note.startswith("no mesh.ply: 40 points") and not (tmp_path / "mesh.ply").exists()
     assert {path.name for path in tmp_path.iterdir()} == {"map.ply", "points.ply", "overview.png"}
 
@@ -110,13 +110,38 @@ def test_the_overview_shows_the_true_path_where_it_is_known(num_unknown, tmp_pat
 
     truth = [None] * num_unknown + [*poses_along(np.linspace(0.0, 1.0, NUM_FRAMES) + 0.3)][num_unknown:]
     run = finished(truth)
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
     image = cv2.imread(str(tmp_path / "overview.png"))[..., ::-1].astype(int)
     share = {
         name: np.all(np.abs(image - color) <= 8, axis=-1).mean()
         for name, color in (("estimate", (228, 87, 46)), ("truth", (27, 153, 139)))
     }
     assert share["estimate"] > 1e-4 and (share["truth"] > 1e-4) == (num_unknown < NUM_FRAMES)
+
+
+@pytest.mark.parametrize("with_scale", [True, False])
+def test_the_overview_shows_the_true_path_where_the_estimate_fits_it_best(with_scale, tmp_path, monkeypatch):
+    """A map in another frame and unit is not drawn as one that drifts."""
+    from emgs_jax.report import overview
+
+    drawn = []
+    monkeypatch.setattr(overview, "draw_overview", lambda path, cloud, paths, *rest: drawn.append(paths))
+    unknown, turned = 2, np.eye(4)
+    turned[:3, :3] = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    bent = poses_along(np.linspace(0.0, 1.0, NUM_FRAMES))
+    bent[:, 1, 3] = bent[:, 0, 3] ** 2  # a straight path leaves its roll open
+    truth = turned @ bent
+    truth[:, :3, 3] = 2.0 * truth[:, :3, 3] + [5.0, -3.0, 1.0]
+    run = finished([None if row == unknown else pose for row, pose in enumerate(truth)])
+    run.poses[:] = bent
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", with_scale)
+    (paths,) = drawn
+    known = np.arange(NUM_FRAMES) != unknown
+    middle = bent[known, :3, 3].mean(0)
+    expected = bent[known].copy()
+    expected[:, :3, 3] = middle + (1.0 if with_scale else 2.0) * (bent[known, :3, 3] - middle)
+    np.testing.assert_allclose(paths.truth[known], expected, atol=1e-9)
+    assert np.isnan(paths.truth[unknown]).all()
 
 
 def test_the_overview_shows_loops_between_the_frames_of_the_back_end_and_the_path_before(tmp_path, monkeypatch):
@@ -129,9 +154,9 @@ def test_the_overview_shows_loops_between_the_frames_of_the_back_end_and_the_pat
     poses = [np.eye(4)] * 3 + [*later]
     online = [pose + 1.0 for pose in poses]
     run.back_end = SimpleNamespace(accepted=loops, closures=[None], poses=poses, online=online, first=3)
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
     run.back_end.closures = []  # as where frames are only located in a saved map: its loops are there, and no node
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
     (paths, without) = drawn
     assert paths.loops == ((2, 4),) and without.loops == () and without.online is None
     np.testing.assert_array_equal(paths.online, later + 1.0)
@@ -154,5 +179,5 @@ def test_a_new_run_never_lies_beside_the_outputs_of_another(tmp_path):
 def test_every_file_that_a_run_writes_is_known_as_an_output(tmp_path):
     run = finished()
     save_progress(tmp_path, run)
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall")
+    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
     assert {path.name for path in tmp_path.iterdir()} <= set(OUTPUTS)

@@ -195,7 +195,7 @@ def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
     protocol = hydra.utils.instantiate(compose().evaluation)
     dense = dense_map(blind, dataset(), config, protocol)
     assert len(dense.cloud) > 1000 and len(dense.pictures) == 4
-    assert save_outputs(tmp_path, blind, dense, config, "blind") == []
+    assert save_outputs(tmp_path, blind, dense, config, "blind", True) == []
     names = {"map.ply", "points.ply", "mesh.ply", "overview.png"}
     assert {path.name for path in tmp_path.iterdir()} == names
     scorer = new_scorer(dataset(), protocol, EditedPrior())
