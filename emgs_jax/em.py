@@ -210,7 +210,7 @@ def m_step(
     nothing = jnp.zeros((gaussians.valid.shape[0], 17))
     sums, _ = jax.lax.scan(add, nothing, split_rows((points, weights, step), MAX_POINTS))
     total = sums[:, 0]
-    has_points = total > config.min_responsibility
+    has_points = (total > config.min_responsibility) & (sums[:, 1] > 0)  # a vanishing share times a precision is 0
     mean = sums[:, 2:] / jnp.where(has_points, sums[:, 1], 1.0)[:, None]
     rows, columns = jnp.triu_indices(3)
     second = jnp.zeros((total.shape[0], 3, 3)).at[:, rows, columns].set(mean[:, 3:9])

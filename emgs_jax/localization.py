@@ -158,11 +158,10 @@ def _readings(
     anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, scale)
     last = previous, T_world_previous, motion
     via_previous, same_image = through_previous(prediction, *last, scale, camera, config.max_pair_distance)
-    linked = stack([same_image, T_world_previous @ motion]).wxyz_xyz
+    linked = stack([via_previous, same_image, T_world_previous @ motion]).wxyz_xyz
     is_linked = (jnp.sum(paired) >= MIN_PAIRS) & jnp.all(jnp.isfinite(linked), axis=-1)
-    same_image, chain = jnp.where(is_linked[:, None], linked, anchored.wxyz_xyz)
-    forms = stack([via_previous, jaxlie.SE3(same_image), anchored, jaxlie.SE3(chain)])
-    return motion, anchored, forms, is_linked[1]
+    via_previous, same_image, chain = map(jaxlie.SE3, jnp.where(is_linked[:, None], linked, anchored.wxyz_xyz))
+    return motion, anchored, stack([via_previous, same_image, anchored, chain]), is_linked[2]
 
 
 def _measured(

@@ -146,6 +146,20 @@ def sample_features(grid: Float[Array, "y x f"], size: tuple[int, int], thin: in
 
 
 @full_precision
+def known_surface(
+    points: Float[Array, "h w 3"], mask: Bool[Array, "h w"], config: ObservationConfig
+) -> Bool[Array, "h w"]:
+    """Which points of an image `observe` takes: of those in the mask the ones with a normal."""
+    valid = mask & (points[..., 2] > 0)
+    return valid & _is_surface(normals_from_pointmap(jnp.where(valid[..., None], points, 0.0), valid, config))
+
+
+def _is_surface(normals: Float[Array, "h w 3"]) -> Bool[Array, "h w"]:
+    """A point without a normal lies on a sliver or in a hole's rim, where a prior guesses."""
+    return jnp.any(normals != 0, axis=-1)
+
+
+@full_precision
 def observe(
     points: Float[Array, "h w 3"],
     colors: Float[Array, "h w 3"],
@@ -162,8 +176,7 @@ def observe(
     valid = mask & is_finite & (confidence >= config.min_confidence)
     points = jnp.where(valid[..., None], points, 0.0)
     normals = normals_from_pointmap(points, valid, config)
-    # A point without a normal lies on a sliver or in a hole's rim, where a prior guesses.
-    valid &= jnp.any(normals != 0, axis=-1)
+    valid &= _is_surface(normals)
     confidence = jnp.where(valid, confidence, 1.0)
     thin = config.thin
     points, colors, normals, confidence, valid = (

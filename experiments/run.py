@@ -49,6 +49,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         raise ValueError(
             "baseline= fuses every frame where it was placed, and graph= moves poses afterwards: use graph=none with it"
         )
+    if config.map is not None and Path(config.map).resolve() == folder.resolve():
+        raise ValueError(f"map={config.map} is the folder of this run, too: give hydra.run.dir=ANOTHER")
     with contextlib.ExitStack() as stack:
         stack.enter_context(owned(folder))
         clock = stack.enter_context(Clock().watching())
@@ -64,6 +66,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         baselines = Baselines(fused, session, dataset)
         settings = OmegaConf.to_container(config, resolve=True)
         origin = provenance(settings, dataset, prior.provenance)
+        if saved is not None:
+            origin["map"] = saved.checksum
         keeper = Keeper(folder / CHECKPOINT_FILE, build(config, "checkpoint"), signature(origin))
         for note in [*filter(None, [keeper.note]), *claim_folder(folder, keeper.found is not None)]:
             tqdm.write(note)
@@ -118,8 +122,9 @@ def _map(
         for index, reason in dataset.skipped.items():
             log.append(to_line(FrameRecord(index, None, None, "skipped", reason)))
         try:
-            views = map_frames(session, dataset, prior, keeper)
-            with session.clock.phase("raw_prior"):
+            # Closed, so that what stops the gathering ends the mapping before what it has is written.
+            mapping = contextlib.closing(map_frames(session, dataset, prior, keeper))
+            with mapping as views, session.clock.phase("raw_prior"):
                 return gather(
                     views if live is None else live.watch(views, session),
                     evaluation,

@@ -220,7 +220,7 @@ STAGES = [
         ("jnp.where(is_tracked, new, old)", "new", "a frame that is not tracked counts"),
     ),
     *own("observation", "test_observation")(
-        ("    valid &= jnp.any(normals != 0, axis=-1)\n", "", "points without a normal stay valid"),
+        ("    valid &= _is_surface(normals)\n", "", "points without a normal stay valid"),
         ("config.max_depth_step * inverse_depth)", "config.max_depth_step)", "a depth step in absolute units"),
         ("count > len(taps) / 5", "count > len(taps) / 9", "a normal from a nearly empty window"),
         ("moments[..., 0] - count * mean[..., 0] ** 2", "moments[..., 0]", "second moments about the pixel"),

@@ -240,6 +240,16 @@ def test_a_gaussian_with_too_little_responsibility_stays_as_it_is(paper):
     assert info.num_updated <= (~little).sum()
 
 
+def test_a_share_that_vanishes_moves_nothing(paper):
+    """A responsibility of 3e-38 times a precision of .01 is 0 in float32, and 0 / 0 was the new mean."""
+    one = jax.tree.map(lambda x: x[:1], GAUSSIANS)
+    points = jax.tree.map(lambda x: x[:4], POINTS)
+    step = EStep(jnp.zeros((4, 1), int), jnp.full((4, 1), 3e-38), jnp.ones(4, bool))
+    new, total = m_step(one, points, jnp.full(4, 0.01), step, changed(paper, min_responsibility=0.0))
+    assert_same(new, one)
+    assert total == 0
+
+
 FLAT = jnp.diag(jnp.array([0.04, 0.01, 0.0001]))  # principal axes x, y; normal z
 
 

@@ -68,10 +68,14 @@ class VoxelConfig:
         voxel_m: its side, in the lengths of the poses.
         max_footprint_px: a point is drawn as the square that its voxel covers, but at most so far to each side: what
             lies just before the camera would fill the image.
+        surface_depth: see `draw_voxels`.
+        min_points: likewise.
     """
 
     voxel_m: float = number(low=1e-6)
     max_footprint_px: int = number(low=1, high=4096)
+    surface_depth: float = number(low=0)
+    min_points: int = number(low=1)
 
     def __post_init__(self) -> None:
         _require_positive("voxel", voxel_m=self.voxel_m, max_footprint_px=self.max_footprint_px)
@@ -126,8 +130,8 @@ class _Voxels:
         return self._grid.cloud()
 
     def renderer(self) -> Draw:
-        cloud = self.cloud()
-        return lambda T: draw_points(cloud, T, self._pinhole, self._config.voxel_m, self._config.max_footprint_px)
+        cloud, counts = self.cloud(), self._grid.counts()
+        return lambda T: draw_voxels(cloud, counts, T, self._pinhole, self._config)
 
 
 class _Tsdf:
@@ -206,32 +210,64 @@ class _Tsdf:
         return self._o3d.core.Tensor(np.asarray(values, np.float64))
 
 
-def draw_points(cloud: PointCloud, T_world_camera: np.ndarray, pinhole: Pinhole, side: float, max_px: int) -> Image:
-    """Draw points as squares parallel to the image, as large as a voxel of this side; the nearest one wins.
+def draw_voxels(
+    cloud: PointCloud, counts: np.ndarray, T_world_camera: np.ndarray, pinhole: Pinhole, config: VoxelConfig
+) -> Image:
+    """Draw averaged points as squares parallel to the image, as large as their voxel; a pixel shows its front surface.
 
-    Reaches ceil(half the side in pixels) pixels to each side of the point's own: a point may lie anywhere in its voxel.
+    The voxels that cover a pixel are one surface as far as none is farther behind the one before than a fraction
+    `surface_depth` of its depth. The first one with `min_points` points is seen, at their median depth, as ours is at
+    the median of its layers: the nearest voxel of all would be the nearest error of all frames. Where no surface has so
+    many the one with most is seen. A square reaches ceil(half the side in pixels) pixels to each side of the point's
+    own: a point may lie anywhere in its voxel.
+
+    Args:
+        counts: (n,) points of each voxel.
     """
     fx, fy, cx, cy = pinhole.intrinsics
     points = (cloud.points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     z = np.where(points[:, 2] > 0, points[:, 2], 1.0)
     u, v = fx * points[:, 0] / z + cx, fy * points[:, 1] / z + cy
-    reach = np.ceil(np.clip(0.5 * side * max(fx, fy) / z, 0.0, max_px))
+    reach = np.ceil(np.clip(0.5 * config.voxel_m * max(fx, fy) / z, 0.0, config.max_footprint_px))
     inside = (u > -reach - 0.5) & (u < pinhole.width + reach) & (v > -reach - 0.5) & (v < pinhole.height + reach)
     rows = np.flatnonzero((points[:, 2] > 0) & inside)
-    rows = rows[np.argsort(-z[rows], kind="stable")]  # the nearest is written last
+    rows = rows[np.argsort(z[rows], kind="stable")]
     u, v, reach = (np.rint(values[rows]).astype(np.int64) for values in (u, v, reach))
-    nearest = np.full((pinhole.height, pinhole.width), -1)
+    covered = []  # pixel times the number of rows, plus row: sorted, they are by pixel and from near to far
     for ring in range(int(reach.max(initial=0)) + 1):  # squares round the own pixels, from there outwards
         order = np.flatnonzero(reach >= ring)
         steps = range(-ring, ring + 1)
         for dy, dx in ((dy, dx) for dy in steps for dx in steps if max(abs(dy), abs(dx)) == ring):
             y, x = v[order] + dy, u[order] + dx
             drawn = (y >= 0) & (y < pinhole.height) & (x >= 0) & (x < pinhole.width)
-            np.maximum.at(nearest, (y[drawn], x[drawn]), order[drawn])
-    is_drawn, found = nearest >= 0, rows[nearest] if len(rows) else np.zeros_like(nearest)
-    if not is_drawn.any():
-        return _nothing(pinhole)
-    return np.where(is_drawn, z[found], 0.0), np.where(is_drawn[..., None], cloud.colors[found], 0.0)
+            covered.append((y[drawn] * pinhole.width + x[drawn]) * len(rows) + order[drawn])
+    depth, colors = _nothing(pinhole)
+    if not any(map(len, covered)):
+        return depth, colors
+    pixel, which = np.divmod(np.sort(np.concatenate(covered)), len(rows))
+    which = rows[which]
+    seen, middle = _front(pixel, z[which], counts[which], config)
+    depth.reshape(-1)[seen], colors.reshape(-1, 3)[seen] = z[which[middle]], cloud.colors[which[middle]]
+    return depth, colors
+
+
+def _front(
+    pixel: np.ndarray, depth: np.ndarray, counts: np.ndarray, config: VoxelConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Every pixel that is covered, once, and the row with the median of the points of its front surface.
+
+    Rows are ordered by pixel, and from near to far.
+    """
+    is_next = pixel[1:] == pixel[:-1]
+    begins = np.concatenate([[True], ~is_next | (np.diff(depth) > config.surface_depth * depth[:-1])])
+    first = np.flatnonzero(begins)  # rows of surfaces
+    sizes = np.add.reduceat(counts, first)
+    owner = pixel[first]
+    order = np.lexsort((-np.minimum(sizes, config.min_points), owner))  # stable: of equals the nearest comes first
+    shown = order[np.unique(owner[order], return_index=True)[1]]
+    upto = np.cumsum(counts)
+    middle = np.searchsorted(upto, upto[first[shown]] - counts[first[shown]] + 0.5 * sizes[shown])
+    return owner[shown], middle
 
 
 def _nothing(pinhole: Pinhole) -> Image:

@@ -93,13 +93,20 @@ class VoxelGrid:
 
     def cloud(self) -> PointCloud:
         """The mean of each occupied voxel so far."""
-        empty = (np.empty(0, np.int64), np.empty((0, 10)))
-        _, sums = self._tables[0] if len(self._tables) == 1 else _merge([empty, *self._tables])
+        sums = self._sums()
         means = sums[:, :9] / sums[:, 9:]
         length = np.linalg.norm(means[:, 3:6], axis=1, keepdims=True)
         # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
         normals = np.where(length > 0.1, means[:, 3:6] / np.maximum(length, 0.1), 0.0)
         return PointCloud(means[:, :3], normals, means[:, 6:9])
+
+    def counts(self) -> np.ndarray:
+        """How many points were averaged for each row of `cloud`."""
+        return self._sums()[:, 9]
+
+    def _sums(self) -> np.ndarray:
+        empty = (np.empty(0, np.int64), np.empty((0, 10)))
+        return (self._tables[0] if len(self._tables) == 1 else _merge([empty, *self._tables]))[1]
 
 
 def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:

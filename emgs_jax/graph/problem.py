@@ -88,6 +88,8 @@ def problem_of(graph: Graph, scale_std: float) -> Problem | str:
         return "no edge is in use"
     joined = _parts(graph, used)
     used = used & joined[np.asarray(edges.a) * used] & joined[np.asarray(edges.b) * used]
+    if not used.any():
+        return "no measurement leads to the first node"
 
     n, e = bucket(len(valid)), bucket(int(used.sum()))
     still = np.tile([1.0, 0, 0, 0, 0, 0, 0], (n, 1))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import chi2, norm
 
@@ -89,21 +90,35 @@ def agreeing(
     now = np.stack([poses[loop.b] for loop in every])
     corrections = implied @ np.linalg.inv(now)
     queries, candidates = (np.array([getattr(loop, name) for loop in every]) for name in ("b", "a"))
-    agree = _are_near(queries, config.max_query_gap) & _are_near(candidates, config.max_candidate_gap)
-    one, other = np.nonzero(agree)
+    one, other = pairs_within(queries, config.max_query_gap)
+    is_near = np.abs(candidates[one] - candidates[other]) <= config.max_candidate_gap
+    one, other = one[is_near], other[is_near]
     distance, turn = gap_between(corrections[other] @ now[one], implied[one])
-    agree[one, other] = (distance <= config.max_distance) & (turn <= config.max_turn_deg)
-    agree &= agree.T
-    _, group = connected_components(agree, directed=False)
+    fits = (distance <= config.max_distance) & (turn <= config.max_turn_deg)
+    agree = coo_array((fits, (one, other)), shape=(len(every), len(every))).tocsr()
+    one, other = (agree * agree.T).nonzero()
+    _, group = connected_components(coo_array((np.ones(len(one)), (one, other)), agree.shape), directed=False)
     is_evidence = np.arange(len(every)) < len(loops)
-
-    def is_accepted(row: int) -> bool:
-        others = set(queries[agree[row] & is_evidence]) - {queries[row]}
-        against = set(queries[(group == group[row]) & ~is_evidence])
-        return len(others) >= config.min_others and len(against) <= config.max_contradicted
-
-    return np.array([is_accepted(row) for row in range(len(loops))], bool)
+    backs = is_evidence[other] & (queries[one] != queries[other])
+    num_others = _num_different(one[backs], queries[other[backs]], len(every))
+    num_against = _num_different(group[~is_evidence], queries[~is_evidence], len(every))[group]
+    is_accepted = (num_others >= config.min_others) & (num_against <= config.max_contradicted)
+    return is_accepted[: len(loops)]
 
 
-def _are_near(frames: Int[np.ndarray, " n"], max_gap: int) -> Bool[np.ndarray, "n n"]:
-    return np.abs(frames[:, None] - frames) <= max_gap
+def pairs_within(frames: Int[np.ndarray, " n"], max_gap: int) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """Positions in `frames` of all pairs that lie within a gap of each other, in both orders, each with itself, too."""
+    order = np.argsort(frames, kind="stable")
+    ordered = frames[order]
+    begin, end = (
+        np.searchsorted(ordered, ordered + gap, side) for gap, side in ((-max_gap, "left"), (max_gap, "right"))
+    )
+    count = end - begin
+    one = np.repeat(np.arange(len(frames)), count)
+    other = np.arange(len(one)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(begin, count)
+    return order[one], order[other]
+
+
+def _num_different(rows: Int[np.ndarray, " n"], values: Int[np.ndarray, " n"], num_rows: int) -> Int[np.ndarray, " r"]:
+    """How many different values stand in each row."""
+    return np.bincount(np.unique(np.stack([rows, values]), axis=1)[0], minlength=num_rows)

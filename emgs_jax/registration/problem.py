@@ -40,7 +40,7 @@ class IcpConfig(eqx.Module):
             0 = no prior, the printed form.
         scale_noise: standard deviation of the logarithm of the scale about the coarse step's, in units of the points'
             depth noise, where nothing else is known of it; 0 = no scale (printed).
-        num_points: how many points take part.
+        num_points: how many points take part at least: every n-th of them, with the largest n that leaves so many.
         num_searches: how often the Gaussians near every point are looked up, each time with a solve after it.
         num_neighbours: Gaussians near a point, which every step of a solve compares.
         num_color_neighbours: Gaussians from which a Gaussian's intensity gradient is fitted.

@@ -13,17 +13,20 @@ from emgs_jax.graph.measurements import Graph
 from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.running.back_end import BackEnd, Refusal
-from emgs_jax.running.measuring import stacked
+from emgs_jax.running.measuring import Edge, stacked
 from emgs_jax.running.revisiting import MEASURED, SILENT, UNUSABLE
 
 
 def metric_graph(end: BackEnd) -> Graph:
     """Poses and measurements in the map's scale, without scales of their own: what other solvers read."""
-    scaled = [
-        edge._replace(Z_a_b=rescaled(edge.Z_a_b, np.exp(end.log_scales[edge.a])), log_ratio=0.0) for edge in end.edges
-    ]
-    nodes = end.nodes()
-    return Graph(replace(nodes, log_scale=jnp.zeros_like(nodes.log_scale)), stacked(scaled))
+
+    def scaled(edge: Edge) -> Edge:
+        scale = np.exp(end.log_scales[edge.a])
+        sqrt_info = edge.sqrt_info / np.array([scale] * 3 + [1.0] * 4)
+        return edge._replace(Z_a_b=rescaled(edge.Z_a_b, scale), log_ratio=0.0, sqrt_info=sqrt_info)
+
+    nodes = end.nodes(end.segment)
+    return Graph(replace(nodes, log_scale=jnp.zeros_like(nodes.log_scale)), stacked([*map(scaled, end.edges)]))
 
 
 def loop_list(end: BackEnd) -> list[dict[str, Any]]:

@@ -25,7 +25,7 @@ from emgs_jax.evaluation.reconstruction import (
 )
 from emgs_jax.evaluation.rendering import Rendered
 from emgs_jax.evaluation.segmentation import LabelledPoints, compare_labels, label_cells, translate, true_labels
-from emgs_jax.evaluation.trajectory import trajectory_metrics
+from emgs_jax.evaluation.trajectory import align_poses, trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.loops.two_views import rescaled
@@ -221,7 +221,7 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     """Size of the map, how many frames came to what, time and memory."""
     statuses = Counter(record.status for record in run.records)
     metrics: Metrics = {"map/num_gaussians": int(np.asarray(confirmed(run.state.map).valid).sum())}
-    metrics["map/double_wall_percent"] = double_walls(confirmed(run.state.map))
+    metrics["map/double_wall_percent"] = double_walls(confirmed(run.state.map), metres(run))
     metrics["map/num_tentative"] = int(np.asarray(run.state.map.gaussians.valid).sum()) - metrics["map/num_gaussians"]
     metrics["map/capacity"] = run.config.submap.map_capacity
     metrics |= {f"frames/{status}": statuses[status] for status in STATUSES}
@@ -235,10 +235,17 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     return metrics
 
 
-def double_walls(gaussians: Gaussians) -> float | None:
-    """Share of valid Gaussians that another stands behind, in per cent, see `double_wall_share`."""
+def metres(run: MappingRun) -> float:
+    """A length of the map in metres, as the true path says; without one the map's unit is taken for a metre."""
+    poses = with_truth(run, run.poses)
+    return 1.0 if poses is None else align_poses(*poses, with_scale=True)[0].scale
+
+
+def double_walls(gaussians: Gaussians, scale: float) -> float | None:
+    """Per cent of valid Gaussians that another stands behind, see `double_wall_share`; `scale`: see `metres`."""
     rows = jax.device_get(gaussians)
-    share = double_wall_share(rows.means[rows.valid], rows.normals[rows.valid], rows.covs[rows.valid])
+    means, normals, covs = (values[rows.valid] for values in (rows.means, rows.normals, rows.covs))
+    share = double_wall_share(scale * means, normals, scale**2 * covs)
     return None if share is None else 100.0 * share
 
 

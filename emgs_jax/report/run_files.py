@@ -18,13 +18,14 @@ from emgs_jax.io.g2o import save_graph_g2o
 from emgs_jax.io.map_file import save_map_npz
 from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
-from emgs_jax.io.trajectory import save_trajectory_tum
+from emgs_jax.io.trajectory import from_tum, save_trajectory_tum
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import loop_list, metric_graph
 from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, REPORT_FILE, TEXT_FILE
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
+from emgs_jax.running.first_frame import seen_from
 from emgs_jax.running.places import save_places
 from emgs_jax.running.record import UNJOINED, MappingRun, row_of_first_node
 from emgs_jax.semantics import principal_colors
@@ -61,7 +62,7 @@ def save_progress(folder: Path, run: MappingRun) -> None:
     were when the frames were placed (in the unit of the finished map), graph.g2o and loops.json. Frames that are left
     out are marked in frames.jsonl.
     """
-    _mark_unjoined(folder / FRAMES_FILE, run)
+    _complete_lines(folder / FRAMES_FILE, run)
     if run.state is not None:
         save_trajectory_tum(
             folder / "trajectory.txt", [record.timestamp for record in run.records], np.stack(run.poses)
@@ -79,11 +80,18 @@ def save_progress(folder: Path, run: MappingRun) -> None:
             save_graph_g2o(folder / "graph.g2o", metric_graph(end))
 
 
-def _mark_unjoined(path: Path, run: MappingRun) -> None:
-    """Say in frames.jsonl, which was written as the frames were placed, which of them are left out after all."""
-    if not path.exists() or all(record.reason != UNJOINED for record in run.records):
+def _complete_lines(path: Path, run: MappingRun) -> None:
+    """What was not known yet as frames.jsonl was written, frame by frame: the first one's error, what is left out."""
+    if not path.exists() or (run.first_covariance is None and all(r.reason != UNJOINED for r in run.records)):
         return
     lines, records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()], iter(run.records)
+    uncertain = [line for line in lines if line["covariance"] is not None]
+    if run.first_covariance is not None and uncertain:
+        first = next(line["pose"] for line in lines if line["pose"] is not None)
+        placed = from_tum(np.array([first, *(line["pose"] for line in uncertain)]))
+        added = seen_from(run.first_covariance, placed[0], placed[1:])
+        for line, covariance in zip(uncertain, added, strict=True):
+            line["covariance"] = (np.array(line["covariance"]) + covariance).tolist()
     for line in lines:
         record = None if line["status"] == "skipped" else next(records)
         if record is not None and record.reason == UNJOINED:

@@ -41,7 +41,8 @@ class BackEndConfig:
         agreement: of verified loops with each other.
         revisit: how they are measured once more.
         every: frames between keyframes.
-        max_known: χ² of a loop at the poses as they are, up to which it says what is so already and is left out.
+        max_known: χ² of a loop at the poses as they are, up to which it says what is so already: it closes nothing by
+            itself, and the prior is not asked for it.
         min_frames: between two closures.
         solver: of the graph.
         deform: how the map follows what was solved.

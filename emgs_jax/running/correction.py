@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from emgs_jax.running.convert import to_se3
 from emgs_jax.running.following import settle
 from emgs_jax.running.inputs import Input
 from emgs_jax.running.locating import looks_of
@@ -23,7 +24,7 @@ def correct(run: MappingRun, given: Input) -> None:
     for look, record in zip(looks, added, strict=True):
         if record.location in (FOUND, SEGMENT):
             end.since = len(end.poses)
-        look = replace(look, depth_noise=record.depth_noise if record.status in PLACED else None)
+        look = replace(look, depth_noise=record.depth_noise if record.status == "tracked" else None)
         end.add(look, record.pose, record.scale or 1.0, record.origin, record.status in PLACED)
     if added[-1].similarity is not None:
         join(run, given)
@@ -52,14 +53,21 @@ def finish(run: MappingRun) -> None:
     if has_retracted or end.accepted or loops:
         run.state = end.close(run.state, loops)
         _take_poses(run)
-    noise = [record.depth_noise for record in run.records if record.depth_noise is not None]
+    tracked = [record for record in run.records if record.status == "tracked"]
+    noise = [record.depth_noise for record in tracked if record.depth_noise is not None]
     if noise and (end.accepted or not end.has_one_unit):  # at the end only: what was made one Gaussian stays one
         run.state = settle(run.state, end.nodes(end.segment), float(np.median(noise)), run.config.existence)
 
 
 def _take_poses(run: MappingRun) -> None:
-    """The back end's poses and scales into the records of its frames, which are the last ones."""
+    """The back end's poses and scales into the records of its frames, which are the last ones.
+
+    The prior's world goes with the last frame, where it is known by a frame that was found.
+    """
     end, first = run.back_end, row_of_first_node(run)
+    if run.prior_motion is not None:
+        change = to_se3(end.poses[-1] @ np.linalg.inv(run.records[-1].pose))
+        run.prior_motion = change @ run.prior_motion
     found = zip(end.poses[end.first :], np.exp(end.log_scales[end.first :]).tolist(), strict=True)
     run.records[first:] = [
         replace(record, pose=pose, scale=None if record.scale is None else scale)

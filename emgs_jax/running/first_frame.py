@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from emgs_jax.localization import LocalizationConfig
 from emgs_jax.observation import depth_in
@@ -41,9 +42,18 @@ def with_first_frame(run: MappingRun) -> None:
     rows = [row for row, record in enumerate(run.records) if record.covariance is not None]
     if not rows or not own.any():
         return
+    run.first_covariance = own
     first = next(record.pose for record in run.records if record.pose is not None)
-    T = np.stack([np.linalg.inv(run.records[row].pose) @ first for row in rows])
-    adjoints = np.asarray(jax.vmap(lambda T: T.adjoint())(to_se3(T)), np.float64)
-    for row, adjoint in zip(rows, adjoints, strict=True):
+    added = seen_from(own, first, np.stack([run.records[row].pose for row in rows]))
+    for row, covariance in zip(rows, added, strict=True):
         record = run.records[row]
-        run.records[row] = replace(record, covariance=record.covariance + adjoint @ own @ adjoint.T)
+        run.records[row] = replace(record, covariance=record.covariance + covariance)
+
+
+def seen_from(
+    own: Float[np.ndarray, "6 6"], T_world_first: Float[np.ndarray, "4 4"], T_world_cameras: Float[np.ndarray, "n 4 4"]
+) -> Float[np.ndarray, "n 6 6"]:
+    """What the first frame's covariance makes other poses uncertain by: Ad own Adᵀ, each in its own axes."""
+    adjoints = jax.vmap(lambda T: T.adjoint())(to_se3(np.linalg.inv(T_world_cameras) @ T_world_first))
+    adjoints = np.asarray(adjoints, np.float64)
+    return adjoints @ own @ adjoints.transpose(0, 2, 1)

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
+import equinox as eqx
 import numpy as np
 
 from emgs_jax.data.base import Dataset
@@ -12,8 +13,11 @@ from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, posed
 from emgs_jax.evaluation.segmentation import LabelGrid, LabelledPoints, nearest_classes
 from emgs_jax.io.spool import Spool
+from emgs_jax.observation import known_surface
 from emgs_jax.running.inputs import RawView
-from emgs_jax.running.record import MappingRun
+from emgs_jax.running.record import PLACED, MappingRun
+
+has_normal = eqx.filter_jit(known_surface)
 
 Text = tuple[tuple[str, ...], np.ndarray]  # names of classes and their embeddings (c, f)
 
@@ -38,8 +42,8 @@ class RawPrior:
 class Baselines:
     """Every baseline twice: from the prior's views at the prior's own poses, and at ours.
 
-    At ours it takes what the map took: frames that are tracked or that the map was made from, each prediction in the
-    size that it was given there. So what is different is the fusion alone.
+    At ours it takes what the map took: frames that are tracked or that the map was made from, of each the points with a
+    normal, in the size that the prediction was given there. So what is different is the fusion alone.
 
     Args:
         configs: by name.
@@ -54,13 +58,16 @@ class Baselines:
         self.poses: list[np.ndarray] = []  # ours, as they were: the finished run has another unit
         self._run = run
 
-    def add(self, row: int, view: View, T_world_camera: np.ndarray) -> None:
-        """Add the frame of a record, with its pose as the prior says it."""
+    def add(self, row: int, view: View, points: np.ndarray, mask: np.ndarray, T_world_camera: np.ndarray) -> None:
+        """Add the frame of a record, with its points (h, w, 3), which are known, and its pose as the prior says it."""
         record = self._run.records[row]
         self.poses.append(record.pose)
         for fusion in self.raw.values():
             fusion.add(view, T_world_camera, 1.0)
-        if record.status in ("tracked", "initialization"):
+        if record.status in PLACED and self.ours:
+            taken = np.asarray(has_normal(points, mask, self._run.config.observation))
+            cloud = PointCloud(*(values[taken[mask]] for values in vars(view.cloud).values()))
+            view = View(np.where(taken, view.depth, 0.0).astype(np.float32), view.image, cloud)
             for fusion in self.ours.values():
                 fusion.add(view, record.pose, 1.0 if record.scale is None else record.scale)
 
@@ -95,7 +102,8 @@ def gather(
                 seen = mask & (labels >= 0)
                 grid.add(points[seen] @ pose[:3, :3].T + pose[:3, 3], labels[seen])
             if baselines is not None:
-                baselines.add(row, View(depth, image, cloud), pose)
+                known = mask & np.isfinite(points).all(-1)
+                baselines.add(row, View(depth, image, cloud), points, known, pose)
             yield posed(cloud, pose)
 
     cloud = fuse_clouds(clouds(), evaluation.voxel_m)

@@ -3,6 +3,7 @@
 Keyframes, poses and measurements. The other run's frames are further nodes of the same graph.
 """
 
+import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from emgs_jax.running.measuring import Edge
 PLACES_FILE, MAP_FILE, METRICS_FILE = "places.npz", "map.npz", "metrics.json"
 FORMAT, VERSION, DESCRIPTORS = "emgs_jax.places", 1, "rootsift"
 MODES = ("extend", "locate")
+LEFT_OUT = -1  # segment of nodes whose part was never joined with the map
 NODES = ("poses", "log_scales", "frames", "is_placed")
 LOOPS = ("verified", "contradicted", "accepted")
 OF_POINTS, OF_KEYFRAMES = ("pixels", "descriptors", "points"), ("frame", "intrinsics", "size", "depths")
@@ -38,12 +40,14 @@ class SavedMap:
         back_end: what was measured then; its `first` node is the next.
         depth_noise: how much a frame differed from the map, as a fraction of its depth.
         is_fixed: frames are only located in it; it stays as it is.
+        checksum: of its files, SHA-256.
     """
 
     map: GaussianMap
     back_end: BackEnd
     depth_noise: float
     is_fixed: bool
+    checksum: str
 
     @property
     def count(self) -> int:
@@ -56,6 +60,7 @@ def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
     keyframes, header = end.database.keyframes, {"format": FORMAT, "version": VERSION, "descriptors": DESCRIPTORS}
     header |= {"depth_noise": depth_noise, "num_trained": end.database.num_trained, "has_one_unit": end.has_one_unit}
     arrays = {name: np.asarray(getattr(end, name)) for name in NODES} | {"words": end.database.words}
+    arrays["is_kept"] = np.array(end.segments) == end.segment
     arrays |= {f"keyframes.{name}": np.stack([getattr(one, name) for one in keyframes]) for name in OF_KEYFRAMES}
     arrays |= {f"keyframes.{name}": np.concatenate([getattr(one, name) for one in keyframes]) for name in OF_POINTS}
     arrays["keyframes.num_points"] = np.array([len(one.pixels) for one in keyframes])
@@ -124,11 +129,21 @@ def load_saved(
         raise ValueError(f"map={folder} has no {PLACES_FILE}: map it again with graph=default")
     end = BackEnd(config, tuple(intrinsics), min_std)
     depth_noise = load_places(folder / PLACES_FILE, end)
+    size = end.database.keyframes[0].depths.shape[::-1]
+    if size != tuple(config.appearance.grid):
+        raise ValueError(f"map={folder} was made with graph.appearance.grid=[{size[0]},{size[1]}]: give that here, too")
     map = load_map(folder / MAP_FILE)
     births = np.asarray(map.birth)[np.asarray(map.gaussians.valid)]
     if len(births) == 0 or births.min() < 0 or births.max() >= len(end.poses):
         raise ValueError(f"{folder}: {MAP_FILE} and {PLACES_FILE} are not of one run: map again")
-    return SavedMap(map, end, depth_noise, mode == "locate")
+    return SavedMap(map, end, depth_noise, mode == "locate", _checksum(folder / MAP_FILE, folder / PLACES_FILE))
+
+
+def _checksum(*files: Path) -> str:
+    found = hashlib.sha256()
+    for file in files:
+        found.update(file.read_bytes())
+    return found.hexdigest()
 
 
 def _fill(end: BackEnd, arrays: Mapping[str, np.ndarray], num_trained: int) -> None:
@@ -152,7 +167,8 @@ def _fill(end: BackEnd, arrays: Mapping[str, np.ndarray], num_trained: int) -> N
         rows = _rows(name, arrays, LoopMeasurement.__annotations__, count)
         setattr(end, name, [LoopMeasurement(**row) for row in rows])
     end.first = end.since = count
-    end.segments = [0] * count
+    is_kept = arrays.get("is_kept", np.ones(count, bool))  # files of before do not say
+    end.segments = np.where(is_kept, 0, LEFT_OUT).tolist()
 
 
 def _keyframes(arrays: Mapping[str, np.ndarray]) -> tuple[Keyframe, ...]:

@@ -54,11 +54,11 @@ class FrameRecord:
         inliers: points that agree with the map.
         residual: of these to the map's planes, as a fraction of their depth.
         scale: by which the prediction was multiplied.
-        depth_noise: how much the points differ from the map, as a fraction of their depth.
+        depth_noise: how much the points differ from the map, as a fraction of their depth; None where none agrees.
         step_m: between the coarse and the fine pose.
         step_rad: likewise.
         similarity: where it is `joined`, what takes its part to the other: (4, 4) with e^σ R in the place of R.
-        origin: place in the run of the frame by whose Gaussians it was placed (median of their births).
+        origin: the frame by whose Gaussians it was placed (median of their births), counted from the map's first one.
         repeat_rms: how far the two predictions of the previous image are apart, m.
         fused: points that moved Gaussians.
         updated: Gaussians that they moved.
@@ -121,6 +121,7 @@ class MappingRun:
         structure: where the prior's frame is, if it is not related to the first frame any more.
         aside: states of the other parts, by their segment; see `running/segments.py`.
         ask: the prior, for both visits of a loop; see `running/revisiting.py`.
+        first_covariance: (6, 6) of the first frame, as frames were placed, when the run has ended (`first_frame.py`).
     """
 
     camera: Camera
@@ -135,6 +136,7 @@ class MappingRun:
     structure: PlacedStructure | None = None
     aside: dict[int, SlamState] = field(default_factory=dict)
     ask: Ask = lambda a, b: None
+    first_covariance: np.ndarray | None = None
 
     @property
     def is_fixed(self) -> bool:
@@ -250,7 +252,7 @@ def _described(info: StepInfo) -> dict[str, Any]:
         "inliers": int(localization.icp.num_inliers),
         "residual": float(localization.icp.residual),
         "scale": float(localization.scale),
-        "depth_noise": float(localization.depth_noise),
+        "depth_noise": float(localization.depth_noise) if int(localization.icp.num_inliers) else None,
         "step_m": float(localization.step_m),
         "step_rad": float(localization.step_rad),
         "origin": int(info.origin) if localization.is_tracked else None,

@@ -124,16 +124,18 @@ def join(run: MappingRun, given: Input) -> None:
     if here < there:
         similarity = np.linalg.inv(similarity)
     newer, older, before = max(here, there), min(here, there), end.nodes()
+    unit = np.exp(end.log_scales[place.by])  # of the place's covariance: its map may be the one that moves
     rows = [row for row, one in enumerate(end.segments) if one == newer]
     for row in rows:
         end.poses[row] = moved_pose(similarity, end.poses[row])
+        end.online[row] = moved_pose(similarity, end.online[row])
         end.log_scales[row] += float(np.log(scale_of(similarity)))
     after, first = end.nodes(), row_of_first_node(run) - end.first
     for row in rows:
         run.records[first + row] = _moved_record(similarity, run.records[first + row])
     end.segments = [older if one == newer else one for one in end.segments]
     end.segment, end.has_one_unit = older, False
-    end.edges.append(_edge(end, place))
+    end.edges.append(_edge(end, place, unit))
     other = run.aside[there]
     run.aside = {one: state for one, state in run.aside.items() if one != there}
     state = follow(run.state, before, after, end.min_std, end.config.deform)
@@ -146,11 +148,14 @@ def join(run: MappingRun, given: Input) -> None:
         run.prior_motion = anchored_by(run.records[-1], predicted(run, given))
 
 
-def _edge(end: BackEnd, place: Location) -> Edge:
-    """What holds two segments together: the last node relative to the keyframe by which it was found, as it is now."""
+def _edge(end: BackEnd, place: Location, unit: float) -> Edge:
+    """What holds two segments together: the last node relative to the keyframe by which it was found, as it is now.
+
+    `unit` is a length of that keyframe's inference in the map in which the place was found.
+    """
     a, b = place.by, len(end.poses) - 1
     scale = np.exp(end.log_scales[a])
-    units = np.array([scale] * 3 + [1.0] * 4)
+    units = np.array([unit] * 3 + [1.0] * 4)
     information = np.linalg.inv(place.covariance / units[:, None] / units)
     measured = rescaled(np.linalg.inv(end.poses[a]) @ end.poses[b], 1.0 / scale)
     ratio = end.log_scales[b] - end.log_scales[a]

@@ -369,6 +369,8 @@ def test_what_is_not_finite_is_refused_by_row():
     refused(eqx.tree_at(lambda g: g.nodes.log_scale, graph, graph.nodes.log_scale.at[5].set(jnp.nan)), "nodes [5]")
     refused(eqx.tree_at(lambda g: g.nodes.log_scale, graph, graph.nodes.log_scale.at[5].set(-1e3)), "cost")
     refused(eqx.tree_at(lambda g: g.edges.valid, graph, 0 * graph.edges.valid == 1), "no edge")
+    alone = graph.edges.valid & (graph.edges.a != 0) & (graph.edges.b != 0)
+    refused(eqx.tree_at(lambda g: g.edges.valid, graph, alone), "no measurement leads to the first node")
 
 
 def test_loops_that_contradict_the_window_are_refused_or_given_no_weight():

@@ -1,6 +1,8 @@
 """Loops between keyframes whose poses are known: what is measured, what every gate refuses, and what no gate can."""
 
 import dataclasses
+import tracemalloc
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -22,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.data.apartment import Apartment
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.plan import APART
-from emgs_jax.loops.agreement import agreeing, is_consistent
+from emgs_jax.loops.agreement import agreeing, is_consistent, pairs_within
 from emgs_jax.loops.alignment import Gate
 from emgs_jax.loops.appearance import Keyframe, describe
 from emgs_jax.loops.contradiction import contradicted_share
@@ -278,6 +280,31 @@ def test_loops_of_one_query_are_one_witness_and_distant_ones_none():
     far = [loop(0, 500), loop(1, 501), loop(2, 511)]
     assert not agreeing(far, [], poses, scales, config).any()
     assert agreeing([*far[:2], loop(2, 502)], [], poses, scales, config).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_pairs_of_nearby_queries_are_all_that_is_compared(seed):
+    """Oracle: every pair."""
+    frames = np.random.default_rng(seed).integers(0, 40, 60)
+    one, other = pairs_within(frames, 3)
+    expected = np.nonzero(np.abs(frames[:, None] - frames) <= 3)
+    assert sorted(zip(one, other, strict=True)) == sorted(zip(*expected, strict=True))
+
+
+def test_many_loops_are_compared_in_memory_that_grows_as_they_do():
+    """Symptom: matrices of all loops with all, 1.3 GB for 7,500."""
+    poses, scales, loop = drifted_path()
+    poses |= {600 + frame: poses[500] for frame in range(20_000)}
+    scales |= dict.fromkeys(poses, 0.0)
+    first = loop(0, 500)
+    loops = [replace(first, b=600 + frame) for frame in range(20_000)]
+    config = loops_config("agreement.max_query_gap=4")["agreement"]
+    tracemalloc.start()
+    try:
+        assert agreeing(loops, [], poses, scales, config).all()
+        assert tracemalloc.get_traced_memory()[1] < 300e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_statement_that_is_contradicted_falls_with_all_that_agree_one_after_the_other():

@@ -3,10 +3,12 @@
 import dataclasses
 from types import SimpleNamespace
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hand_run import STATUSES, densify_config, hand_run, inverse, poses_along, random_poses, random_similarity, wall
-from scene import evaluation_config
+from scene import evaluation_config, random_gaussians
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import Frame
@@ -231,6 +233,24 @@ def test_a_run_is_described_by_its_counts():
     assert (metrics["frames/longest_untracked"], metrics["frames/longest_untracked_from"]) == (2, 5)
     assert metrics["map/num_gaussians"] == int(run.state.map.gaussians.valid.sum())
     assert metrics["map/capacity"] == len(run.state.map.gaussians.valid) > metrics["map/num_gaussians"]
+
+
+COV = jnp.diag(jnp.array([0.05, 0.05, 0.01])) ** 2
+
+
+@pytest.mark.parametrize("unit", [0.5, 1.0, 2.0])
+def test_walls_stand_twice_in_metres_whatever_the_unit_of_the_map_is(unit):
+    """Two sheets 10 cm apart; the limit is 15 cm."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0, 2, 0.1), np.arange(0, 2, 0.1)))
+    means = np.concatenate([np.stack([x, y, 0 * x + z], 1) for z in (2.0, 2.1)])
+    truth = poses_along(np.linspace(0.0, 1.0, NUM_FRAMES))
+    ours = truth.copy()
+    ours[:, :3, 3] *= unit
+    covs, normals = (jnp.tile(v, (len(means), *[1] * v.ndim)) for v in (COV, jnp.array([0.0, 0.0, -1.0])))
+    rows = jnp.asarray(unit * means, jnp.float32), unit**2 * covs, normals
+    two = eqx.tree_at(lambda g: (g.means, g.covs, g.normals), random_gaussians(len(means), num_features=2), rows)
+    run = hand_run(ours, ours, [*truth], gaussians=two)
+    assert describe(run, Room())["map/double_wall_percent"] == 100.0
 
 
 def test_seconds_a_frame_are_those_of_steps_that_compiled_nothing():

@@ -14,7 +14,7 @@ from scene import assert_same, random_gaussians, random_observation
 from emgs_jax import load_config
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.graph.deform import DeformConfig
-from emgs_jax.graph.measurements import Nodes
+from emgs_jax.graph.measurements import Graph, Nodes, residuals
 from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
 from emgs_jax.loops.appearance import Database, Keyframe
 from emgs_jax.loops.revisit import Revisit
@@ -27,7 +27,7 @@ from emgs_jax.running import correction
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.correction import correct, finish
 from emgs_jax.running.following import settle
-from emgs_jax.running.measuring import Look, chain_edge, map_edge
+from emgs_jax.running.measuring import Look, chain_edge, map_edge, stacked
 from emgs_jax.running.record import FrameRecord, MappingRun
 from emgs_jax.running.revisiting import ask_again
 from emgs_jax.slam import SlamState
@@ -144,14 +144,17 @@ def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatc
     truth, drifted = ring(), ring(1.95 * np.pi)
     end, loops = walked(graph, drifted), [loop(truth, row) for row in range(1, 9)]
     end.verified = list(loops)
-    records = [FrameRecord(row, None, None, "tracked", pose=pose) for row, pose in enumerate(drifted)]
-    run = MappingRun(None, None, state=end.close(state_of(drifted), loops), records=records, back_end=end)
+    state = end.close(state_of(drifted), loops)
+    records = [FrameRecord(row, None, None, "tracked", pose=pose) for row, pose in enumerate(end.poses)]
+    run = MappingRun(None, None, state=state, records=records, back_end=end)
+    run.prior_motion = motion = jaxlie.SE3.from_matrix(jnp.asarray(ring()[7], jnp.float32))
     frame, raw = SimpleNamespace(index=COUNT - 1, image=None), SimpleNamespace(points=None, mask=None)
     given = SimpleNamespace(frames=[frame], raw=[raw], T_anchor_views={})
     monkeypatch.setattr(end, "add", lambda *arguments: None)
     monkeypatch.setattr(end, "look_for_loops", lambda look: [])
     correct(run, given)
-    assert end.accepted == loops and len(end.closures) == 1
+    assert end.accepted == loops and len(end.closures) == 1 and run.prior_motion is motion
+    records = list(run.records)
 
     def contradict(look: Look) -> list:
         end.contradicted = [loop(truth, row) for row in (9, 10)]
@@ -162,6 +165,27 @@ def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatc
     assert not end.accepted and len(end.closures) == 2
     assert error(end.poses, drifted) < 0.01
     assert error([record.pose for record in run.records], end.poses) == 0
+    # What the prior says of the next frame is as far from this one as before.
+    change = end.poses[-1] @ np.linalg.inv(records[-1].pose)
+    assert np.linalg.norm(change[:3, 3]) > 1e-3
+    np.testing.assert_allclose(run.prior_motion.as_matrix(), change @ motion.as_matrix(), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("status", "expected"), [("tracked", 0.001), ("initialization", None), ("degraded", None), ("lost", None)]
+)
+def test_only_what_a_tracked_frame_differs_from_the_map_by_says_how_sure_its_poses_are(
+    graph, monkeypatch, status, expected
+):
+    """Symptom: where a map begins anew its frame fits nothing, and its edge was believed to .04 mm."""
+    end, looks = walked(graph, ring()), []
+    record = FrameRecord(0, None, None, status, pose=np.eye(4), depth_noise=0.001)
+    run = MappingRun(None, None, state=state_of(ring()), records=[record], back_end=end)
+    frame, raw = SimpleNamespace(index=COUNT, image=None), SimpleNamespace(points=None, mask=None)
+    monkeypatch.setattr(end, "add", lambda look, *rest: looks.append(look))
+    monkeypatch.setattr(end, "look_for_loops", lambda look: [])
+    correct(run, SimpleNamespace(frames=[frame], raw=[raw], T_anchor_views={}))
+    assert [look.depth_noise for look in looks] == [expected]
 
 
 def test_a_loop_that_cannot_be_solved_changes_nothing(graph):
@@ -291,6 +315,22 @@ def test_other_solvers_read_the_graph_in_the_scale_of_the_map(graph, tmp_path):
     read = load_graph_g2o(tmp_path / "graph.g2o")
     assert int(read.nodes.valid.sum()) == COUNT and len(read.edges.a) == len(end.edges)
     np.testing.assert_allclose(read.edges.Z_a_b.translation()[0], 1.1 * end.edges[0].Z_a_b[:3, 3], rtol=1e-5, atol=1e-6)
+
+
+def test_a_graph_for_other_solvers_costs_what_ours_does_and_has_the_nodes_of_the_map_only(graph):
+    poses = ring()
+    end = walked(graph, poses, scale=2.0)
+    end.poses = [pose @ change for pose, change in zip(end.poses, random_steps(0.01), strict=True)]
+    ours = np.sum(residuals(Graph(end.nodes(), stacked(end.edges))) ** 2, axis=1)[: len(end.edges)]
+    assert ours.min() > 0
+    np.testing.assert_allclose(np.sum(residuals(metric_graph(end)) ** 2, axis=1)[: len(ours)], ours, rtol=1e-3)
+    end.segments[:5] = [-1] * 5
+    np.testing.assert_array_equal(np.flatnonzero(metric_graph(end).nodes.valid), range(5, COUNT))
+
+
+def random_steps(std: float) -> np.ndarray:
+    steps = np.random.default_rng(0).normal(0, std, (COUNT, 6))
+    return np.asarray(jaxlie.SE3.exp(jnp.asarray(steps, jnp.float32)).as_matrix(), np.float64)
 
 
 def test_without_a_graph_there_is_no_back_end():
@@ -447,7 +487,10 @@ def test_a_map_whose_visits_were_joined_is_settled_at_the_end_with_the_noise_of_
     end = walked(graph, drifted)
     end.verified = [loop(truth, row) for row in range(1, 9)] if has_loop else []
     records = [FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0) for i, pose in enumerate(drifted)]
-    records = [replace(record, depth_noise=0.01 * (i % 3)) for i, record in enumerate(records[:-1])] + [records[-1]]
+    records = [replace(record, depth_noise=0.01 * (i % 3)) for i, record in enumerate(records)]
+    records += [replace(records[0], status="degraded", depth_noise=9.0)] * 90  # fits nothing
+    monkeypatch.setattr(correction, "row_of_first_node", lambda run: 0)
+    monkeypatch.setattr(correction, "_take_poses", lambda run: None)
     run, asked = MappingRun(None, SimpleNamespace(existence="gates"), state=state_of(drifted), records=records), []
     run.back_end = end
 

@@ -127,6 +127,28 @@ def test_a_run_that_is_stopped_while_it_writes_takes_no_step_again(tmp_path, mon
 
 
 @pytest.mark.slow
+def test_a_run_that_is_stopped_where_its_predictions_are_gathered_ends_before_it_is_written(tmp_path, monkeypatch):
+    """Symptom: the mapping was still waiting, so its checkpoint was not written and its path was in another unit."""
+    order = []
+
+    def gather(views, *rest):
+        next(views)
+        raise Stopped
+
+    for module, name in ((drive, "in_own_unit"), (drive, "leave_out"), (experiments.run, "save_progress")):
+        monkeypatch.setattr(module, name, lambda *_, name=name: order.append(name))
+    monkeypatch.setattr(experiments.run, "gather", gather)
+    with pytest.raises(Stopped):
+        experiments.run.run(compose(*OVERRIDES), tmp_path)
+    assert order == ["leave_out", "in_own_unit", "save_progress"] and (tmp_path / CHECKPOINT_FILE).exists()
+
+
+def test_a_run_does_not_go_on_in_the_map_that_it_would_replace(tmp_path):
+    with pytest.raises(ValueError, match="is the folder of this run, too: give hydra.run.dir=ANOTHER"):
+        experiments.run.run(compose(f"map={tmp_path}", "graph=default"), tmp_path)
+
+
+@pytest.mark.slow
 def test_another_command_in_the_folder_begins_anew_and_says_why(tmp_path, monkeypatch, capsys):
     stopped(tmp_path, monkeypatch, OVERRIDES, 2, False)
     metrics = experiments.run.run(compose(*OVERRIDES, "slam.em.noise=0.5"), tmp_path)

@@ -1,5 +1,8 @@
 """The covariances of a run that ends have the first frame's own error in them, as it is seen from each frame."""
 
+import json
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
@@ -10,8 +13,9 @@ from scene import pose, random_gaussians, random_observation, slam_config
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.observation import transform
 from emgs_jax.registration.belief import certain
+from emgs_jax.report.run_files import save_progress
 from emgs_jax.running.first_frame import own_covariance, with_first_frame
-from emgs_jax.running.record import FrameRecord, MappingRun
+from emgs_jax.running.record import FrameRecord, MappingRun, to_line
 from emgs_jax.slam import SlamState
 from tests.nees.consistency import pose_errors
 
@@ -63,6 +67,23 @@ def test_what_is_added_is_the_scatter_of_the_poses_relative_to_a_first_frame_tha
         added = run.records[row].covariance - before[row]
         std = np.sqrt(np.diag(added))
         np.testing.assert_allclose(np.cov(errors.T) / std / std[:, None], added / std / std[:, None], atol=0.07)
+
+
+def test_the_file_of_the_frames_says_it_too(tmp_path):
+    run = a_run()
+    run.records = [replace(record, timestamp=0.1 * record.index) for record in run.records]
+    lost = FrameRecord(3, None, 0.3, "lost", pose=run.records[-1].pose)
+    run.records.append(lost)
+    lines = [json.dumps(to_line(record), default=np.ndarray.tolist) for record in run.records]
+    skipped = json.dumps(to_line(FrameRecord(9, None, None, "skipped")))
+    (tmp_path / "frames.jsonl").write_text("\n".join([skipped, *lines]) + "\n")
+    with_first_frame(run)
+    save_progress(tmp_path, run)
+    found = [json.loads(line) for line in (tmp_path / "frames.jsonl").read_text().splitlines()]
+    assert found[0]["status"] == "skipped" and found[-1]["covariance"] is None
+    for line, record in zip(found[2:4], run.records[1:3], strict=True):
+        np.testing.assert_allclose(line["covariance"], record.covariance, rtol=1e-4, atol=1e-10)
+        assert np.max(line["covariance"]) > 2e-4
 
 
 def test_poses_in_a_saved_map_are_not_relative_to_a_first_frame():

@@ -20,7 +20,7 @@ CAMERA = (300.0, 300.0, 160.0, 120.0)
 
 @pytest.fixture(scope="module")
 def graph():
-    return load_config("graph=default").graph
+    return load_config("graph=default", "graph.appearance.grid=[8,6]").graph  # as the keyframes of the scene have it
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +94,37 @@ def test_a_run_without_loops_and_of_several_units_comes_back_too(graph, end, tmp
     read = BackEnd(graph, CAMERA, 0.01)
     load_places(tmp_path / "places.npz", read)
     assert read.accepted == [] and len(read.edges) == len(plain.edges) and not read.has_one_unit
+
+
+def test_what_was_left_out_of_the_map_is_no_part_of_it_when_it_is_loaded_either(graph, end, tmp_path):
+    """Symptom: the kept part was not the first, all its measurements were held by a node that nothing joined with it,
+    and no loop ever moved anything again."""
+    parted = walked(graph, ring())
+    parted.segments, parted.segment = [0] * 3 + [4] * (len(parted.poses) - 3), 4
+    parted.database = extend(parted.database, end.database.keyframes[1], graph.appearance)
+    save_places(tmp_path / "places.npz", parted, 0.0)
+    read = BackEnd(graph, CAMERA, 0.01)
+    load_places(tmp_path / "places.npz", read)
+    np.testing.assert_array_equal(read.nodes(read.segment).valid, parted.nodes(parted.segment).valid)
+    with np.load(tmp_path / "places.npz") as file:
+        arrays = {name: array for name, array in file.items() if name != "is_kept"}  # as of a version before
+    np.savez(tmp_path / "places.npz", **arrays)
+    before = BackEnd(graph, CAMERA, 0.01)
+    load_places(tmp_path / "places.npz", before)
+    assert before.segments == [0] * len(before.poses)
+
+
+def test_a_map_with_depths_on_another_grid_is_refused_before_a_frame_is_mapped(folder):
+    coarse = load_config("graph=default", "graph.appearance.grid=[40,30]").graph
+    with pytest.raises(ValueError, match=r"was made with graph.appearance.grid=\[8,6\]: give that here, too"):
+        load(folder, coarse)
+
+
+def test_a_map_that_was_made_again_is_another_one(folder, graph):
+    first = load(folder, graph).checksum
+    assert load(folder, graph).checksum == first
+    save_map(folder / "map.npz", map_born(18))
+    assert load(folder, graph).checksum != first
 
 
 def test_a_folder_is_loaded_with_its_next_node_as_the_first(graph, folder, end):

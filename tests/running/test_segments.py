@@ -141,9 +141,10 @@ def test_a_run_that_is_stopped_in_a_part_or_after_it_was_joined_has_the_same_bit
 def test_of_parts_that_never_meet_the_one_with_most_placed_frames_is_the_map(tmp_path, num_before):
     numbers = (*THERE[:num_before], *BACK)
     (tmp_path / "frames.jsonl").write_text(
-        '{"index": 99, "status": "skipped"}\n'
+        '{"index": 99, "status": "skipped", "covariance": null}\n'
         + "".join(
-            f'{{"index": {row}, "status": "tracked", "reason": null, "pose": [1]}}\n' for row in range(len(numbers))
+            f'{{"index": {row}, "status": "tracked", "reason": null, "pose": [1], "covariance": null}}\n'
+            for row in range(len(numbers))
         )
     )
     run = apart(numbers, num_before, NEVER)
@@ -192,6 +193,7 @@ def two_parts(is_first_aside: bool, similarity: np.ndarray):
     order = [0, 0, 0, 3, 3, 3] if is_first_aside else [3, 3, 3, 0, 0, 0]
     end = BackEnd(config().graph, (300.0, 300.0, 160.0, 120.0), 0.0)
     end.poses, end.log_scales = list(random_poses(rng, 6)), list(rng.normal(size=6))
+    end.online = list(random_poses(rng, 6))
     end.frames, end.is_placed, end.segments, end.segment = list(range(6)), [True] * 6, order, order[-1]
     end.locate = lambda look, elsewhere: (Location(np.eye(4), 0.0, 1e-4 * np.eye(7), 1), None)
     states = part(1, [0, 1, 2, 1]), part(2, [3, 4, 5, 5])
@@ -219,6 +221,7 @@ def test_the_newer_part_moves_as_a_whole_and_the_older_stays(is_first_aside, mon
     similarity[:3, :3], similarity[:3, 3] = known.scale * known.rotation, known.translation
     run, states = two_parts(is_first_aside, similarity)
     before = [pose.copy() for pose in run.back_end.poses], list(run.back_end.log_scales)
+    online = [pose.copy() for pose in run.back_end.online]
     monkeypatch.setattr(segments, "looks_of", lambda given: [None])
     monkeypatch.setattr(segments, "predicted", lambda run, given: None)
     monkeypatch.setattr(segments, "anchored_by", lambda record, prediction: record.scale)
@@ -231,6 +234,8 @@ def test_the_newer_part_moves_as_a_whole_and_the_older_stays(is_first_aside, mon
         pose, factor = (moved_pose(S, before[0][row]), scale) if row in moving else (before[0][row], 1.0)
         np.testing.assert_allclose(run.back_end.poses[row], pose)
         np.testing.assert_array_equal(run.records[row].pose, run.back_end.poses[row])
+        expected = moved_pose(S, online[row]) if row in moving else online[row]
+        np.testing.assert_allclose(run.back_end.online[row], expected)
         assert run.back_end.log_scales[row] == pytest.approx(before[1][row] + np.log(factor))
         assert run.records[row].scale == pytest.approx(1.5 * factor)
     assert run.config.submap.map_capacity == 8
@@ -249,3 +254,5 @@ def test_the_newer_part_moves_as_a_whole_and_the_older_stays(is_first_aside, mon
     measured = np.linalg.inv(run.back_end.poses[1]) @ run.back_end.poses[5]
     np.testing.assert_allclose(edge.Z_a_b[:3, 3] * np.exp(run.back_end.log_scales[1]), measured[:3, 3], atol=1e-9)
     assert (edge.a, edge.b) == (1, 5)
+    # The place was found to 1 cm in the map as it was then, whichever of the two has moved since.
+    np.testing.assert_allclose(edge.sqrt_info, np.diag([100 * np.exp(before[1][1])] * 3 + [100.0] * 4))

@@ -96,8 +96,12 @@ def depth_edges(
 
 
 def above_percentile(confidence: Float[Array, "h w"], percentile: Float[Array, ""]) -> Bool[Array, "h w"]:
-    """Whether a pixel's confidence is above a percentile of its view's; all pixels for percentile 0."""
-    return (confidence > jnp.quantile(confidence, percentile / 100.0)) | (percentile <= 0)
+    """Whether a pixel's confidence is above a percentile of its view's, or the highest: a constant one is never low.
+
+    All pixels for percentile 0.
+    """
+    is_above = confidence > jnp.quantile(confidence, percentile / 100.0)
+    return is_above | (confidence >= jnp.max(confidence)) | (percentile <= 0)
 
 
 @full_precision
