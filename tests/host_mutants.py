@@ -369,6 +369,13 @@ MUTANTS = (
         "a run goes on in another map than it was begun in",
     ),
     Mutant(
+        "emgs_jax/running/drive.py",
+        "is_known = is_related(run, given)",
+        "is_known = True",
+        ("tests/running/test_segments.py",),
+        "a prior in a frame of its own is located nowhere",
+    ),
+    Mutant(
         "emgs_jax/running/segments.py",
         "np.array([unit] * 3 + [1.0] * 4)",
         "np.array([scale] * 3 + [1.0] * 4)",

@@ -48,7 +48,16 @@ from emgs_jax.running.record import (
     record_step,
 )
 from emgs_jax.running.revisiting import asking
-from emgs_jax.running.segments import begun_segment, enter, leave_out, meeting, predicted
+from emgs_jax.running.segments import (
+    begun_segment,
+    enter,
+    in_structure,
+    is_related,
+    leave_out,
+    meeting,
+    placed_by,
+    predicted,
+)
 from emgs_jax.running.unit import in_own_unit
 from emgs_jax.running.untracked import alarm
 from emgs_jax.slam import StepInfo
@@ -186,7 +195,9 @@ def integrate(run: MappingRun, given: Input, prediction: Prediction) -> tuple[St
     if is_missing(run, info):
         place, location = look_for(run, given)
         if place is not None:
-            begin, again = found_at(run, prediction, place)
+            is_known = is_related(run, given)
+            seen = prediction if is_known else in_structure(prediction, given, placed_by(given, place.T_world_camera))
+            begin, again = found_at(run, seen, place, has_other_unit=not is_known)
             found = advance(begin, again, run.camera, run.config)
             location = refusal(found[1], again, place, run.back_end.config.location) or FOUND
             if location == FOUND:
@@ -201,8 +212,12 @@ def integrate(run: MappingRun, given: Input, prediction: Prediction) -> tuple[St
 
 def anchor_anew(run: MappingRun, given: Input) -> None:
     """From the last frame on the prior's world is where that was found, if it was."""
-    if run.records[-1].location == FOUND:
+    if run.records[-1].location != FOUND:
+        return
+    if is_related(run, given):
         run.prior_motion = anchored_by(run.records[-1], predicted(run, given))
+    else:  # the prior has gone on in a frame of its own
+        run.structure, run.prior_motion = placed_by(given, run.records[-1].pose), None
 
 
 def repeat(run: MappingRun, given: Input, checkpoint: Checkpoint, is_last: bool) -> None:

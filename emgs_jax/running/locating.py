@@ -110,8 +110,12 @@ def begun(run: MappingRun, prediction: Prediction) -> SlamState:
     return SlamState(run.saved.map, prediction.current, prediction.T_world_anchor, certain(), time)
 
 
-def found_at(run: MappingRun, prediction: Prediction, location: Location) -> tuple[SlamState, Prediction]:
+def found_at(
+    run: MappingRun, prediction: Prediction, location: Location, has_other_unit: bool = False
+) -> tuple[SlamState, Prediction]:
     """State and prediction whose step begins where the camera is found: this frame is its own previous one.
+
+    With `has_other_unit` the prior's lengths are no longer those of the steps before: this frame says what they are.
 
     Raises:
         ValueError: the features of a saved map are not as wide as those of this run.
@@ -134,6 +138,8 @@ def found_at(run: MappingRun, prediction: Prediction, location: Location) -> tup
         belief, time = replace(certain(), depth_noise=depth_noise, log_scale=log_scale), jnp.asarray(time, jnp.int32)
     else:
         map, belief, time = run.state.map, run.state.belief, run.state.time
+        if has_other_unit:
+            belief = replace(belief, log_scale=jnp.asarray(location.log_scale, jnp.float32))
     belief = replace(belief, covariance=covariance, world_covariance=covariance)
     return SlamState(map, transform(T, prediction.current, scale), T, belief, time), again
 

@@ -27,16 +27,34 @@ from emgs_jax.running.measuring import Edge
 from emgs_jax.running.record import UNJOINED, FrameRecord, MappingRun, row_of_first_node, to_matrix
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
 
+UNKNOWN = np.full((4, 4), np.nan)  # pose
+
 
 def predicted(run: MappingRun, given: Input) -> Prediction:
     """What is given as a step's input, in the world of the map; without poses where that is not related to it."""
     prediction, placed = as_prediction(given.taken), run.structure
     if placed is None or placed.number != given.structure:
         return prediction
+    return in_structure(prediction, given, placed)
+
+
+def in_structure(prediction: Prediction, given: Input, placed: PlacedStructure) -> Prediction:
+    """A step's input with the poses that are given in a frame of the prior's own, where that frame is placed."""
     here = given.frames[0].index
     rows = here - 1, here, here + int(prediction.has_newest)
-    T_world_views = placed.T_world_structure @ np.stack([given.T_anchor_views[row] for row in rows])
+    T_world_views = placed.T_world_structure @ np.stack([given.T_anchor_views.get(row, UNKNOWN) for row in rows])
     return replace(prediction, T_world_views=to_se3(T_world_views), T_world_anchor=to_se3(placed.T_world_anchor))
+
+
+def is_related(run: MappingRun, given: Input) -> bool:
+    """Whether the poses that are given are in a frame of which it is known where it is in the map."""
+    return given.structure == (0 if run.structure is None else run.structure.number)
+
+
+def placed_by(given: Input, pose: np.ndarray) -> PlacedStructure:
+    """Where the prior's own frame is, by the pose of the given frame in the world; lengths are scaled about that."""
+    own = given.T_anchor_views.get(given.frames[0].index, UNKNOWN)
+    return PlacedStructure(given.structure, pose @ np.linalg.inv(own), pose)
 
 
 def begun_segment(run: MappingRun, given: Input) -> tuple[SlamState, SlamConfig] | None:
@@ -44,9 +62,8 @@ def begun_segment(run: MappingRun, given: Input) -> tuple[SlamState, SlamConfig]
 
     Its unit is the prior's own: another one says nothing of it.
     """
-    number = 0 if run.structure is None else run.structure.number
     pose = given.T_anchor_views.get(given.frames[0].index)
-    is_new = run.back_end is not None and run.state is not None and not run.is_fixed and given.structure != number
+    is_new = run.back_end is not None and run.state is not None and not run.is_fixed and not is_related(run, given)
     if not is_new or pose is None or not np.isfinite(pose).all():
         return None
     view = jax.tree.map(lambda leaf: leaf[None], as_prediction(given.taken).current)
@@ -60,11 +77,9 @@ def begun_segment(run: MappingRun, given: Input) -> tuple[SlamState, SlamConfig]
 
 def enter(run: MappingRun, given: Input, before: SlamState) -> None:
     """Go on in the segment that the last frame has begun; the state `before` it is set aside."""
-    pose = run.records[-1].pose
-    T_world_structure = pose @ np.linalg.inv(given.T_anchor_views[given.frames[0].index])
     run.aside = run.aside | {run.back_end.segment: before}
     run.back_end.segment = given.structure
-    run.structure, run.prior_motion = PlacedStructure(given.structure, T_world_structure, pose), None
+    run.structure, run.prior_motion = placed_by(given, run.records[-1].pose), None
 
 
 def meeting(run: MappingRun, given: Input, info: StepInfo) -> np.ndarray | None:

@@ -1,5 +1,6 @@
 """Parts of a run without a relation; oracles: true poses and surfaces, similarities by hand, bits of other runs."""
 
+import sys
 from dataclasses import replace
 from functools import cache
 
@@ -164,6 +165,24 @@ def test_of_parts_that_never_meet_the_one_with_most_placed_frames_is_the_map(tmp
     (tmp_path / "metrics.json").write_text("{}")
     saved = load_saved(str(tmp_path), "extend", config().graph, run.back_end.intrinsics, 0.01)
     assert_same(jax.device_get(saved.map), jax.device_get(run.map))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cut", [0, 3])
+def test_a_prior_that_goes_on_in_a_frame_of_its_own_is_located_in_a_saved_map(tmp_path, monkeypatch, cut):
+    """Symptom: every frame of it was refused, because it had no pose in the world from before."""
+    monkeypatch.setattr(sys.modules[__name__], "UNIT", 1.05)
+    frames = walk(THERE)
+    first = mapped(frames, build_prior(settings(), frames))
+    save_progress(tmp_path, first)
+    (tmp_path / "metrics.json").write_text("{}")
+    again = walk(BACK)
+    saved = load_saved(str(tmp_path), "locate", config().graph, again.intrinsics, 0.01)
+    run = mapped(again, Apart(build_prior(settings("prior.seed=7"), again), cut), saved)
+    assert [record.status for record in run.records[cut + 1 :]] == ["tracked"] * (len(BACK) - cut - 1)
+    for record in run.records[cut + 1 :]:
+        distance, turn = gap_between(record.pose, record.true_pose)
+        assert distance < 0.05 and turn < 2.0, record.index
 
 
 @pytest.mark.slow
