@@ -86,7 +86,7 @@ def delegated(arguments: Sequence[str]) -> list[str]:
         )
     # Interpolations are the run's, so they are not resolved here.
     words = [_quoted(text.replace("${", r"\${")) for text in rest]
-    return [*kept, f"overrides=[{','.join(words)}]"] if rest else kept
+    return [f"overrides=[{','.join(words)}]", *kept] if rest else kept  # options such as --cfg come last
 
 
 def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:

@@ -67,7 +67,10 @@ KEYS: dict[str, dict[str, Kind]] = {
         ),
         "shard": TEXT,
     },
-    "export": {"formats": NAMES, "max_points": whole(1)},
+    "export": {
+        "formats": Kind("a list of names", lambda value: value == [] or NAMES.fits(value)),
+        "max_points": whole(1),
+    },
     "effects": {"repetitions": Kind("a list of keys", lambda value: _is_list(value) and all(map(_is_text, value)))},
     "embed": {"classes": NAMES},
     "segment": {"map": Kind("a folder or a list of folders", lambda value: _is_text(value) or NAMES.fits(value))},

@@ -19,14 +19,15 @@ from .command import command
 def report(folder: Path) -> Path:
     """Write report.html into the folder of a finished run; without its images where they are gone."""
     run = read_run(folder)
-    dataset, note = images_of(run.provenance["config"], len(run.poses))
+    dataset, note = images_of(run.provenance, len(run.poses))
     path = write_report(run, dataset, note)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB" + (f"\n{note}" if note else ""))
     return path
 
 
-def images_of(settings: Mapping[str, Any], count: int) -> tuple[ReadableFrames | None, str]:
+def images_of(provenance: Mapping[str, Any], count: int) -> tuple[ReadableFrames | None, str]:
     """The data set of a run, or why there is none; raises ValueError where settings name other code than ours."""
+    settings = provenance["config"]
     check_targets(settings["dataset"])
     try:
         dataset = build_dataset(OmegaConf.create(dict(settings)))
@@ -36,6 +37,8 @@ def images_of(settings: Mapping[str, Any], count: int) -> tuple[ReadableFrames |
         return None, f"The images are not shown: {message_of(error)}"
     if len(dataset) != count:
         return None, f"The images are not shown: there are {len(dataset)} now, and {count} were mapped."
+    if dataset.fingerprint() != provenance["data"]["fingerprint"]:
+        return None, "The images are not shown: they are not those that were mapped."
     return dataset, ""
 
 

@@ -89,14 +89,13 @@ def _about(paths: Sequence[Path]) -> str:
     for found, origin in zip(blocks, origins, strict=True):
         frames[f"{origin['data']['name']} {origin['data']['sequence']}"] = found["trajectory/num_frames"]
     data = ", ".join(f"{name} ({count} frames)" for name, count in frames.items())
-    device = origins[0]["device"]
     label = " (**simulated**)" if any(origin["simulated"] for origin in origins) else ""
     facts = {
         "Prior": _distinct(origin["prior"]["name"] for origin in origins) + label,
         "data": data,
         "`prior.seed`": _distinct(origin["seed"] for origin in origins),
         "protocol": _distinct(origin["protocol"] for origin in origins),
-        "device": f"{device['kind']}, {device['cpu_count']} CPU cores",
+        "device": _distinct(f"{one['kind']}, {one['cpu_count']} CPU cores" for one in (o["device"] for o in origins)),
         "commit": f"`{revision_of(origin['git'] for origin in origins)}`",
     }
     return "; ".join(f"{name} {value}" for name, value in facts.items()) + "."

@@ -38,7 +38,6 @@ from .together import (
     provenance_of,
     refuse_other_maps,
     replayed,
-    shared_settings,
     side_by_side,
 )
 
@@ -161,11 +160,17 @@ def _sequences(words: Sequence[str], config: DictConfig, kind: str, space: Space
 
 
 def _check_apart(tuned: Mapping[str, DictConfig], held_out: Mapping[str, DictConfig]) -> None:
-    settings = [(name, shared_settings(config)) for name, config in tuned.items()]
+    """Raise ValueError where frames and predictions are those of a tuned sequence, in whatever words."""
+    decide = {name: _source(config) for name, config in tuned.items()}
     for name, config in held_out.items():
-        same = [other for other, values in settings if values == shared_settings(config)]
+        same = [other for other, source in decide.items() if source == _source(config)]
         if same:
             raise ValueError(f"held_out.{name} is the tuned sequence {same[0]}: hold out another sequence or seed")
+
+
+def _source(config: DictConfig) -> tuple[Any, Any]:
+    """What a sequence is mapped from."""
+    return build_dataset(config).fingerprint(), OmegaConf.to_container(config.prior, resolve=True)
 
 
 def _search(

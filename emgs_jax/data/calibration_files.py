@@ -41,7 +41,10 @@ OPENCV_KEYS = {
     *("extrinsic_parameters", "image_points", "grid_points", "fisheye_model", "camera_name", "distortion_model"),
     *("rectification_matrix", "projection_matrix"),
 }
-ORB_SECTIONS = ("Camera", "ORBextractor", "Viewer", "File", "System", "IMU", "Stereo", "RGBD", "loopClosing")
+ORB_SECTIONS = (
+    *("Camera", "ORBextractor", "Viewer", "File", "System", "IMU", "Stereo", "RGBD", "loopClosing"),
+    *("DepthMapFactor", "ThDepth"),
+)
 TRANSFORMS_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 
 

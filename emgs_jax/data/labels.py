@@ -19,13 +19,13 @@ class LabelFolder:
     Args:
         folder: of PNG images of ids with one channel, 8 or 16 bits.
         classes: file that names them, see `data.class_file`; names without ids count from 0.
-        unknown: ids that mean that there is no class.
+        unknown: ids that mean that there is no class, also where they have a name; None: 0, unless it has one.
 
     Raises:
         ValueError: the folder or the file is not there, or the file names no classes, or an id twice.
     """
 
-    def __init__(self, folder: Path, classes: Path, unknown: Collection[int] = (0,)) -> None:
+    def __init__(self, folder: Path, classes: Path, unknown: Collection[int] | None = None) -> None:
         if not folder.is_dir():
             raise ValueError(f"{folder} is no folder: give one with a class image (PNG) for every image")
         self.folder, self.classes = folder, classes
@@ -33,7 +33,8 @@ class LabelFolder:
         self.names = known.names
         positions = {row: row for row in range(len(self.names))} if known.positions is None else known.positions
         named = {id_: position for id_, position in positions.items() if position >= 0}
-        self._known = replace(known, positions=dict.fromkeys(unknown, -1) | named)
+        without = dict.fromkeys((0,) if unknown is None else unknown, -1)
+        self._known = replace(known, positions=without | named if unknown is None else named | without)
         self._largest_id = max(self._known.positions or ())
 
     def path(self, image: str | Path) -> Path:
@@ -68,8 +69,10 @@ class LabelFolder:
             raise BadFrameError(f"{error}, or say with `unknown` which ids mean no class") from error
 
 
-def as_unknown(unknown: Sequence[int], key: str) -> tuple[int, ...]:
-    """The ids of a config; raises ValueError, which names `key`, where one is no whole number from 0."""
+def as_unknown(unknown: Sequence[int] | None, key: str) -> tuple[int, ...] | None:
+    """The ids of a config, None where it leaves them open; a ValueError names `key` where one is no whole number."""
+    if unknown is None:
+        return None
     if isinstance(unknown, str) or any(not isinstance(id_, int) or id_ < 0 for id_ in unknown):
         raise ValueError(f"{key} must be a list of ids, whole numbers from 0, got {unknown}")
     return tuple(unknown)

@@ -109,7 +109,7 @@ def depth_path(path: Path) -> Path:
 def read_rows(path: Path, images: list[Path]) -> list[str]:
     """The row of traj.txt for every image, still as text: image frame000012 belongs to row 12, from 0."""
     try:
-        rows = [row for row in reading.read_text(path).splitlines() if row.strip()]
+        rows = reading.read_text(path).rstrip().splitlines()
     except BadFrameError as error:
         raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
     last = max(number_of(p) for p in images)

@@ -184,14 +184,17 @@ def _camera_info(bag: Any, topic: str, info_topic: str | None, path: Path) -> Ca
     chosen = _connections(bag, _topic_of(bag, (INFO,), wanted, path, "info_topic"))
     for connection, _, raw in bag.messages(connections=chosen):
         message = bag.deserialize(raw, connection.msgtype)
-        K, bent = (getattr(message, name, None) for name in ("k", "d"))
-        K, bent = (message.K if K is None else K), [float(v) for v in (message.D if bent is None else bent)]  # ROS 1
+        K, bent, P = (getattr(message, name if hasattr(message, name) else name.upper()) for name in "kdp")  # ROS 1: K
+        size, bent = (int(message.width), int(message.height)), [float(v) for v in bent]
+        if "rect" in topic.rsplit("/image", 1)[-1]:  # K and D are those of the raw image, P is what it was made to
+            if not P[0] > 0 or not P[5] > 0:
+                raise ValueError(f"{path}: camera_info has no P for the rectified {topic}: give dataset.intrinsics")
+            return Calibration((float(P[0]), float(P[5]), float(P[2]), float(P[6])), (), size)
         if message.distortion_model not in STRAIGHT_MODELS or any(bent[5:]) or len(bent) in (1, 2, 3):
             raise ValueError(
                 f"{path}: camera_info has the distortion {message.distortion_model!r} with {len(bent)} numbers, and "
                 "read are k1, k2, p1, p2(, k3): take the rectified topic, or give dataset.intrinsics"
             )
-        size = int(message.width), int(message.height)
         intrinsics = float(K[0]), float(K[4]), float(K[2]), float(K[5])
         return Calibration(intrinsics, tuple(bent[:5]) if any(bent) else (), size)
     raise ValueError(f"{path}: camera_info has no message, so dataset.intrinsics must say the camera: {ALTERNATIVES}")

@@ -49,7 +49,7 @@ class Tum:
         max_time_difference: seconds between a colour image and its depth image or pose.
         labels: folder in the sequence with the true classes of every image, see `LabelFolder`; None = there are none.
         classes: file in the sequence that names them.
-        unknown: their ids that mean no class.
+        unknown: their ids that mean no class, see `LabelFolder`.
     """
 
     name = "tum"
@@ -68,7 +68,7 @@ class Tum:
         max_time_difference: Number = 0.02,
         labels: str | None = None,
         classes: str = "classes.txt",
-        unknown: Sequence[int] = (0,),
+        unknown: Sequence[int] | None = None,
     ) -> None:
         self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
         times, names, _ = read_list(self._folder / "rgb.txt", 2)

@@ -27,15 +27,15 @@ class LabelFeatures:
         folder: STEM.png with class ids (see `LabelFolder`), or STEM.npy with scores (h, w, classes), at least 0, in
             the order of `names`, for every image STEM.* of the data set.
         names: file of the classes.
-        unknown: ids that mean no class.
+        unknown: ids that mean no class, see `LabelFolder`.
         text: file of `experiments.embed` with the names' embeddings; None = the axes.
     """
 
-    def __init__(self, folder: str, names: str, unknown: Sequence[int] = (0,), text: str | None = None) -> None:
+    def __init__(self, folder: str, names: str, unknown: Sequence[int] | None = None, text: str | None = None) -> None:
         ids = as_unknown(unknown, "features.unknown")
         self._labels = LabelFolder(Path(folder).expanduser(), Path(names).expanduser(), ids)
         self._names_file, self._file = names, text
-        self.settings = {"folder": Path(folder).name, "unknown": [*ids]}
+        self.settings = {"folder": Path(folder).name, "unknown": None if ids is None else [*ids]}
 
     @property
     def identity(self) -> dict:

@@ -115,7 +115,7 @@ def _errors(rows: Sequence[Row]) -> str:
     columns = [column for column in COLUMNS if any(row.values.get(column.key) is not None for row in rows)]
     groups: dict[tuple, list[Row]] = {}
     for row in rows:
-        groups.setdefault((row.dataset, row.sequences, row.protocol), []).append(row)
+        groups.setdefault((row.dataset, row.sequences, row.protocol, row.is_simulated), []).append(row)
     best = {
         what: [best_of((row.values.get(column.key) for row in members), column) for column in columns]
         for what, members in groups.items()
@@ -125,7 +125,8 @@ def _errors(rows: Sequence[Row]) -> str:
         sequences = row.sequences[0] if len(row.sequences) == 1 else f"mean of {len(row.sequences)}"
         label = "simulated" if row.is_simulated else "measured"
         line = texts([row.dataset, sequences, row.variant, row.kind, label, row.protocol, str(len(row.seeds))])
-        for column, top in zip(columns, best[row.dataset, row.sequences, row.protocol], strict=True):
+        tops = best[row.dataset, row.sequences, row.protocol, row.is_simulated]
+        for column, top in zip(columns, tops, strict=True):
             line += number(row.values.get(column.key), column, top, row.spreads.get(column.key))
         lines.append(line)
     titles = ("data set", "sequence", "setting", "", "source", "protocol", "seeds")

@@ -67,7 +67,7 @@ def verdict(run: RecordedRun) -> tuple[str, str]:
     key = "rendering/depth_within_5_percent"
     met, met_raw = metrics.get(key), metrics.get(RAW_PRIOR + key)
     if met is not None and met_raw is not None:
-        words += f"; {met:.0f} % of what the map shows is within 5 % of the true depth (prior alone: {met_raw:.0f} %)"
+        words += f"; {met:.0f} % of the true depths are rendered within 5 % (prior alone: {met_raw:.0f} %)"
     is_mixed = is_degraded or (met is not None and met_raw is not None and met < met_raw)
     level = "bad" if is_lost or is_worse else "mixed" if is_mixed else "good"
     return level, f"{words}; {tracked}."

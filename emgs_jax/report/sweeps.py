@@ -35,8 +35,8 @@ class SweepResults:
 
     Args:
         folder: of the results.
-        provenance: what all settings share. Results of other data, predictions or values are not mixed with these:
-            ValueError.
+        provenance: what all settings share. Results of other data, predictions, values or code are not mixed with
+            these: ValueError.
     """
 
     def __init__(self, folder: Path, provenance: Mapping[str, Any]) -> None:
@@ -48,9 +48,10 @@ class SweepResults:
 
     def _read(self) -> list[dict[str, Any]]:
         old = read_sweep(self.path)
-        for key in ("data", "prior", "config"):
-            if old["provenance"][key] != self._header["provenance"][key]:
-                changed = difference(old["provenance"][key], self._header["provenance"][key], key)
+        before, now = old["provenance"], self._header["provenance"]
+        for key in ("data", "prior", "config", "git", "versions"):
+            if before.get(key) != now.get(key):
+                changed = difference(before.get(key), now.get(key), key)
                 raise ValueError(f"{self.path} holds a sweep with {changed}: {_REMEDY}")
         return old["settings"]
 

@@ -60,6 +60,7 @@ def test_an_id_without_a_name_and_one_that_was_cut_to_8_bits_are_told_apart(tmp_
         ("a.txt", "", "a.txt names no class"),
         ("a.txt", "wall\nwall\n", "a.txt names 'wall' twice"),
         ("a.txt", "1 wall\n1 chair\n", "an id stands in it twice"),
+        ("a.txt", "1 wall\n2 floor\nceiling\n", "some lines are `id name` and 'ceiling' is not"),
         ("a.yaml", "[wall]", "a.yaml is no class file .it is no mapping"),
         ("a.yaml", "class_names_reduced: [wall]", "it lacks map_to_reduced"),
         ("a.yaml", "class_names_reduced: [wall]\nmap_to_reduced: {1: 2}", "says 1: 2, and there are 1 classes"),

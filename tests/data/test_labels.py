@@ -67,9 +67,20 @@ def test_a_bad_class_image_is_named_with_the_remedy(folder, problem):
 def test_ids_that_mean_no_class_are_the_users_to_name(folder):
     with pytest.raises(BadFrameError, match=r"no name in .* for id 0"):
         labels_of(folder, unknown=()).read("0.5.jpg")
+    assert as_unknown(None, "dataset.unknown") is None
     for bad in ("0", [-1], [1.5]):
         with pytest.raises(ValueError, match=r"dataset\.unknown must be a list of ids"):
             as_unknown(bad, "dataset.unknown")
+
+
+def test_ids_that_mean_no_class_mean_none_also_where_they_have_a_name(folder):
+    named = labels_of(folder)
+    ids = sorted(row for row, position in named._known.positions.items() if position >= 0)
+    again = labels_of(folder, unknown=(0, ids[0]))
+    shown, before = again.read("0.5.jpg"), named.read("0.5.jpg")
+    first = named._known.positions[ids[0]]
+    assert (before == first).any()
+    np.testing.assert_array_equal(shown, np.where(before == first, -1, before))
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from emgs_jax.data.images import Images
 from emgs_jax.data.rosbag import RosBag, to_rgb
 
 rosbags = pytest.importorskip("rosbags", reason="reads bags: pip install -e .[rosbag]")
-from tests.data.written_bag import SIZE, D, K, write_bag  # noqa: E402
+from tests.data.written_bag import SIZE, D, K, P, write_bag  # noqa: E402
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -58,6 +58,22 @@ def test_a_lens_or_encoding_that_is_not_read_is_refused(tmp_path):
     (tmp_path / "bayer").mkdir()
     with pytest.raises(ValueError, match="encoding 'bayer_rggb8'.*dataset.topic"):
         RosBag(str(write_bag(tmp_path / "bayer", encoding="bayer_rggb8")))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("kind", ["Image", "CompressedImage"])
+def test_a_rectified_topic_has_the_camera_that_it_was_made_for(version, kind, tmp_path):
+    """Symptom: it was straightened once more, with the raw image's K; and 'take the rectified topic' led nowhere."""
+    path = write_bag(tmp_path, version, kind, name="rect_color", model="equidistant", bent=D[:4])
+    dataset = RosBag(str(path), size=SIZE)
+    np.testing.assert_allclose(dataset.intrinsics, [P[0], P[5], P[2], P[6]])
+    np.testing.assert_array_equal(dataset[1].image[..., ::-1], color_image(1, SIZE))
+
+
+def test_a_rectified_topic_without_its_camera_is_refused(tmp_path):
+    path = write_bag(tmp_path, name="rect", P=np.zeros(12))
+    with pytest.raises(ValueError, match="no P for the rectified /cam/image_rect: give dataset.intrinsics"):
+        RosBag(str(path))
 
 
 def test_a_damaged_bag_and_a_missing_library_are_clear(tmp_path, monkeypatch):

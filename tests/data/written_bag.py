@@ -10,17 +10,18 @@ from tests.data.written_scene import color_image
 
 SIZE = (160, 120)
 K = [130.0, 0, 80.5, 0, 128.0, 59.0, 0, 0, 1]
+P = [110.0, 0, 79.0, 0, 0, 112.0, 60.0, 0, 0, 0, 1, 0]  # of rectified images
 D = [0.02, -0.004, 0.001, -0.002, 0.0]
 
 
-def messages(store, version, kind, info=True, encoding="bgr8", model="plumb_bob", bent=D):
+def messages(store, version, kind, info=True, encoding="bgr8", model="plumb_bob", bent=D, P=P, name="raw"):
     """(topic, type, message, nanoseconds) of three images and a camera_info."""
     types = store.types
     time = types["builtin_interfaces/msg/Time"](1, 0)
     extra = {"seq": 0} if version == 1 else {}
     header = types["std_msgs/msg/Header"](stamp=time, frame_id="cam", **extra)
     if info:
-        letters = dict(zip("dkrp" if version == 2 else "DKRP", (bent, K, np.eye(3).ravel(), np.zeros(12)), strict=True))
+        letters = dict(zip("dkrp" if version == 2 else "DKRP", (bent, K, np.eye(3).ravel(), P), strict=True))
         roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
         values = {name: np.array(value, np.float64) for name, value in letters.items()}
         info_type = types["sensor_msgs/msg/CameraInfo"]
@@ -31,11 +32,11 @@ def messages(store, version, kind, info=True, encoding="bgr8", model="plumb_bob"
         if kind == "Image":
             padded = np.pad(image.reshape(SIZE[1], -1), ((0, 0), (0, 4)))  # rows may be longer than the picture
             found = types["sensor_msgs/msg/Image"](header, *SIZE[::-1], encoding, 0, 3 * SIZE[0] + 4, padded.ravel())
-            yield "/cam/image_raw", "sensor_msgs/msg/Image", found, int((1 + i / 10) * 1e9)
+            yield f"/cam/image_{name}", "sensor_msgs/msg/Image", found, int((1 + i / 10) * 1e9)
         else:
             data = cv2.imencode(".png", image)[1].ravel()
             found = types["sensor_msgs/msg/CompressedImage"](header, "png", data)
-            yield "/cam/image_raw/compressed", "sensor_msgs/msg/CompressedImage", found, int((1 + i / 10) * 1e9)
+            yield f"/cam/image_{name}/compressed", "sensor_msgs/msg/CompressedImage", found, int((1 + i / 10) * 1e9)
 
 
 def write_bag(folder, version=2, kind="Image", **options):

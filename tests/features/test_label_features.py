@@ -2,7 +2,6 @@
 
 import io
 import re
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -143,4 +142,5 @@ def test_a_name_that_is_no_class_is_refused(folder):
         model_of(folder).embed(("dog",))
     with pytest.raises(ValueError, match=r"features\.unknown must be a list"):
         model_of(folder, unknown="0")
-    assert SimpleNamespace(**model_of(folder).settings).unknown == [0]
+    assert model_of(folder).settings["unknown"] is None
+    assert model_of(folder, unknown=[0, 7]).settings["unknown"] == [0, 7]

@@ -178,6 +178,17 @@ def compose_export(folder, *overrides):
     return configure.compose(f"folder='{folder}'", *overrides, name="export")
 
 
+def test_images_that_are_not_those_that_were_mapped_are_refused(tmp_path):
+    """Symptom: a folder with one image more and one less was as good, and every pose had its neighbour's image."""
+    folder = written_run(tmp_path / "run")
+    path = folder / "metrics.json"
+    metrics = json.loads(path.read_text())
+    metrics["provenance"]["data"]["fingerprint"] = "of other images"
+    path.write_text(json.dumps(metrics))
+    with pytest.raises(ValueError, match="they are not those that were mapped. formats=.frustums. needs no images"):
+        export_run(compose_export(folder, "formats=[colmap]"))
+
+
 def test_the_command_writes_the_images_that_the_run_was_made_of(tmp_path):
     """The built-in room makes them again; the frame's picture is that of the data set."""
     folder = written_run(tmp_path / "run")

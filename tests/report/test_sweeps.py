@@ -11,6 +11,7 @@ from emgs_jax.report.sweeps import SweepResults, draw, read_sweep, table, write_
 
 ATE, F1 = "trajectory/ate_sim3_m", "reconstruction/f1_5cm_percent"
 PROVENANCE = {"data": {"name": "room"}, "prior": {"name": "simulated", "settings": {"seed": 0}}, "config": {"a": 1}}
+PROVENANCE |= {"git": {"revision": "aaaa"}, "versions": {"jax": "1"}}
 AXES = {"slam.em.noise": [0.5, 1.0], "slam.em.min_std": [0.01, 0.02, 0.03]}
 
 

@@ -15,6 +15,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import FrameLog, write_json
 from emgs_jax.io.trajectory import save_trajectory_tum, to_tum
 from emgs_jax.report.run_files import save_progress
+from emgs_jax.running.configure import build_dataset
 
 SIZE = 48, 40  # of the images, pixels
 INTRINSICS = 40.0, 42.0, 22.0, 20.5  # all four differ, and the centre is not in the middle
@@ -61,7 +62,8 @@ def written_run(folder: Path, *, has_truth: bool = True, sequence: str = "room",
     loops = [{"frame": 5, "other": 0, "outcome": "accepted"}]
     loops.append({"frame": 4, "other": 1, "outcome": "refused", "gate": "hull", "measured": 0.01})
     write_json(folder / "loops.json", loops)
-    config = OmegaConf.to_container(compose("render.tile_capacity=512"), resolve=True)
+    composed = compose("render.tile_capacity=512")
+    config = OmegaConf.to_container(composed, resolve=True)
     block = {
         "format": 1,
         "protocol": "paper/sim3",
@@ -70,6 +72,7 @@ def written_run(folder: Path, *, has_truth: bool = True, sequence: str = "room",
         "data": {
             "name": "synthetic",
             "sequence": sequence,
+            "fingerprint": build_dataset(composed).fingerprint(),
             "camera": {"size": [640, 480], "intrinsics": [500.0, 500.0, 320.0, 240.0]},  # of the images on disk
             "frames": {"size": SIZE, "intrinsics": INTRINSICS},
         },

@@ -225,7 +225,7 @@ def test_words_that_are_no_key_of_an_evaluation_go_to_its_runs_as_they_are():
     own = ["suite=tum", "-m", "suite.root=it", "hydra/launcher=joblib", "+variants.wide={slam.window_size:7}"]
     assert experiments.evaluate.delegated(["--cfg", "job", *own]) == ["--cfg", "job", *own]
     arguments = experiments.evaluate.delegated([*words[:1], *own, *words[1:]])
-    assert arguments[:-1] == own and experiments.evaluate.delegated(own) == own
+    assert arguments[1:] == own and experiments.evaluate.delegated(own) == own
     given = [text for text in arguments if text[0] != "-" and not text.startswith(("hydra", "suite.root"))]
     config = compose(*given, "suite.root='some folder'", name="evaluate")
     jobs = list(experiments.evaluate.plan(OmegaConf.to_container(config, resolve=True)))

@@ -52,6 +52,10 @@ def test_what_conf_says_passes(name):
     check_keys(name, compose(*NEEDED.get(name, []), name=name))
 
 
+def test_an_export_may_be_of_the_scaled_copies_alone():
+    check_keys("export", compose("folder=a", "scale=1.07", "formats=[]", name="export"))
+
+
 def test_segment_takes_one_folder_or_several():
     """A list, as docs/semantics.md has it, was refused."""
     for given in ("map=a", "map=[a,b]"):

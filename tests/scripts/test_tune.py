@@ -229,6 +229,7 @@ def test_whole_numbers_stay_whole(tmp_path):
         (["space={slam.em.support:{low:0,high:1}}"], r"write slam.em.support: \[printed, normalized\]"),
         ([SPACE], r"held_out names no sequence.*'held_out=\{fresh:\{prior\.seed:3\}\}'"),
         ([SPACE, "held_out={same:{prior.seed:0}}"], "held_out.same is the tuned sequence own"),
+        ([SPACE, "held_out={same:{on_bad_frame:skip}}"], "held_out.same is the tuned sequence own"),
         ([SPACE, "held_out={../up:{prior.seed:3}}"], "plain names"),
         ([SPACE, f"held_out={{other:{{{GATE}:3}}}}"], "gives .* a value, but it is searched"),
         ([SPACE, "held_out={other:{prior.sed:3}}"], r"prior\.sed is no key of the config; near names: prior\.seed"),
