@@ -52,6 +52,7 @@ FILES = {
     ),
     "camera_info.yaml": (ROS, LENS),
     "orb.yaml": (ORB, LENS),
+    "orb_rgbd.yaml": (ORB + "ThDepth: 40.0\nDepthMapFactor: 5000.0\n", LENS),  # of ORB-SLAM2
     "intrinsics.yaml": (MAST3R, LENS),
     "straight/intrinsics.yaml": (f"width: 640\nheight: 480\ncalibration: {[*K]}\n", ()),
     "vipe.json": (json.dumps(PLAIN), ()),

@@ -51,6 +51,16 @@ def test_a_row_that_is_no_pose_is_a_bad_frame(replica_root):
             dataset[i]
 
 
+def test_a_blank_row_is_no_pose_and_moves_no_other(replica_root):
+    path = replica_root / "office9" / "traj.txt"
+    rows = path.read_text().splitlines()
+    path.write_text("\n".join([rows[0], "", rows[2], "", ""]))
+    dataset = load(replica_root)
+    np.testing.assert_allclose(dataset[2].T_world_camera, scene_pose(2), atol=1e-8)
+    with pytest.raises(BadFrameError, match="traj.txt, row 1"):
+        dataset[1]
+
+
 def test_missing_or_broken_calibration_names_the_file(replica_root):
     path = replica_root / "cam_params.json"
     path.write_text(path.read_text()[:-9])

@@ -5,6 +5,7 @@ import io
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.parse import unquote
 
 import numpy as np
@@ -15,7 +16,7 @@ from PIL import Image
 from written_run import written_run
 
 from emgs_jax.io.files import write_json
-from emgs_jax.report import table_page
+from emgs_jax.report import evaluation_page, table_page
 from emgs_jax.report.evaluation_page import Found, JobLine, verdict, write_evaluation_page
 from emgs_jax.report.page import MAX_BYTES, write_report
 from emgs_jax.report.recorded_run import read_run
@@ -142,6 +143,18 @@ def test_pictures_are_as_large_as_all_of_them_fit(tmp_path, monkeypatch):
     assert widths[10**7] == [360, 360] and widths[40_000][0] < 360 and len(widths[10_000]) == 2
     monkeypatch.setattr(table_page, "PICTURE_BYTES", int(1.5 * len(found[0])))
     assert [bool(text) for text in thumbnails(paths)] == [True, False, False, False]  # the first that fit
+
+
+def test_what_is_simulated_is_not_better_than_what_is_measured():
+    """They must not be set beside each other: each has its own best."""
+    shared = {"dataset": "room", "sequences": ("one",), "protocol": "p", "variant": "default", "seeds": (0,)}
+    shared |= {"spreads": {}}
+    rows = [
+        SimpleNamespace(**shared, kind=kind, is_simulated=is_simulated, values={ATE: error})
+        for kind, is_simulated, error in zip("abcd", (True, True, False, False), (0.02, 0.05, 0.03, 0.04), strict=True)
+    ]
+    lines = re.findall(r"<tr.*?</tr>", evaluation_page._errors(rows), re.DOTALL)
+    assert ['class="best"' in line for line in lines if "room" in line] == [True, False, True, False]
 
 
 BLOCK = {

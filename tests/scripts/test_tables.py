@@ -51,6 +51,14 @@ def test_rows_are_mean_and_deviation_over_the_seeds_and_the_map_is_counted_again
     assert counts.count(" 1,") + counts.count(" 1.") == len(COLUMNS)
 
 
+def test_every_device_is_named(tmp_path):
+    paths = [written(tmp_path / "default", seed) for seed in (3, 4)]
+    metrics = json.loads(paths[1].read_text())
+    metrics["provenance"]["device"] = {"kind": "gpu", "cpu_count": 16}
+    paths[1].write_text(json.dumps(metrics))
+    assert "device cpu, 2 CPU cores, gpu, 16 CPU cores;" in block(paths, {"synthetic": "room"})
+
+
 def test_the_short_table_has_what_is_named_and_the_best_of_each_column_in_bold(tmp_path):
     """Lengths of ours are the smaller ones, and so are its shares, which is worse."""
     paths = [written(tmp_path / "default", 3, ours=0.02, raw=0.03), written(tmp_path / "level 2", 3, ours=0.01)]
