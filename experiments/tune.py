@@ -160,10 +160,11 @@ def _sequences(words: Sequence[str], config: DictConfig, kind: str, space: Space
 
 
 def _check_apart(tuned: Mapping[str, DictConfig], held_out: Mapping[str, DictConfig]) -> None:
-    """Raise ValueError where frames and predictions are those of a tuned sequence, in whatever words."""
+    """Raise ValueError where the frames, and the keys of the prior, are those of a tuned sequence."""
     decide = {name: _source(config) for name, config in tuned.items()}
     for name, config in held_out.items():
-        same = [other for other, source in decide.items() if source == _source(config)]
+        source = _source(config)
+        same = [other for other, one in decide.items() if one == source]
         if same:
             raise ValueError(f"held_out.{name} is the tuned sequence {same[0]}: hold out another sequence or seed")
 

@@ -99,11 +99,11 @@ def _of_yaml(text: str) -> tuple[list[str], dict[int, int]]:
 def _of_lines(text: str) -> tuple[list[str], dict[int, int] | None]:
     lines = [line for line in (raw.split("#")[0].strip() for raw in text.splitlines()) if line]
     rows = [re.fullmatch(r"(-?[0-9]{1,9})\s+(.+)", line) for line in lines]
-    if not any(rows):
+    if 2 * sum(row is not None for row in rows) <= len(rows):  # a name may begin with a number
         return [_word(line) for line in lines], None
     odd = [line for line, row in zip(lines, rows, strict=True) if row is None]
     if odd:
-        raise ValueError(f"some lines are `id name` and {odd[0][:60]!r} is not: give each an id, or none")
+        raise ValueError(f"most lines are `id name` and {odd[0][:60]!r} is not: give each an id, or none")
     positions = {int(row[1]): number for number, row in enumerate(rows) if row}
     if len(positions) < len(rows):
         raise ValueError("an id stands in it twice")

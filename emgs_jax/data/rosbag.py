@@ -1,5 +1,6 @@
 """Images of a bag of ROS 1 or 2, read without ROS by the library rosbags; no ground truth."""
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ TO_RGB = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "mono8": cv2.COLOR_GRAY2RGB}
 TO_RGB |= {"rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
 CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4}
 STRAIGHT_MODELS = ("plumb_bob", "rational_polynomial", "")
+RECTIFIED = re.compile(r"(^|[/_])rect([/_]|$)")  # a topic, as image_proc and others name it
 
 
 class RosBag:
@@ -186,7 +188,7 @@ def _camera_info(bag: Any, topic: str, info_topic: str | None, path: Path) -> Ca
         message = bag.deserialize(raw, connection.msgtype)
         K, bent, P = (getattr(message, name if hasattr(message, name) else name.upper()) for name in "kdp")  # ROS 1: K
         size, bent = (int(message.width), int(message.height)), [float(v) for v in bent]
-        if "rect" in topic.rsplit("/image", 1)[-1]:  # K and D are those of the raw image, P is what it was made to
+        if RECTIFIED.search(topic):  # K and D are those of the raw image, P is what it was made to
             if not P[0] > 0 or not P[5] > 0:
                 raise ValueError(f"{path}: camera_info has no P for the rectified {topic}: give dataset.intrinsics")
             return Calibration((float(P[0]), float(P[5]), float(P[2]), float(P[6])), (), size)

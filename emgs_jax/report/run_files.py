@@ -27,7 +27,7 @@ from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.first_frame import seen_from
 from emgs_jax.running.places import save_places
-from emgs_jax.running.record import UNJOINED, MappingRun, row_of_first_node
+from emgs_jax.running.record import SEGMENT, UNJOINED, MappingRun, row_of_first_node
 from emgs_jax.semantics import principal_colors
 
 # metrics.json first: it is what makes a folder a finished result.
@@ -86,7 +86,8 @@ def _complete_lines(path: Path, run: MappingRun) -> None:
         return
     lines, records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()], iter(run.records)
     uncertain = [line for line in lines if line["covariance"] is not None]
-    if run.first_covariance is not None and uncertain:
+    has_one_world = all(record.location != SEGMENT for record in run.records)  # poses as placed, that of the first, too
+    if run.first_covariance is not None and uncertain and has_one_world:
         first = next(line["pose"] for line in lines if line["pose"] is not None)
         placed = from_tum(np.array([first, *(line["pose"] for line in uncertain)]))
         added = seen_from(run.first_covariance, placed[0], placed[1:])

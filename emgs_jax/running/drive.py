@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 
 import jax
+import jaxlie
 from omegaconf import OmegaConf
 from tqdm import tqdm
 
@@ -216,8 +217,8 @@ def anchor_anew(run: MappingRun, given: Input) -> None:
         return
     if is_related(run, given):
         run.prior_motion = anchored_by(run.records[-1], predicted(run, given))
-    else:  # the prior has gone on in a frame of its own
-        run.structure, run.prior_motion = placed_by(given, run.records[-1].pose), None
+    else:  # the prior has gone on in a frame of its own, which follows this one where the back end moves it
+        run.structure, run.prior_motion = placed_by(given, run.records[-1].pose), jaxlie.SE3.identity()
 
 
 def repeat(run: MappingRun, given: Input, checkpoint: Checkpoint, is_last: bool) -> None:

@@ -24,6 +24,11 @@ def test_a_name_a_line_has_no_ids(tmp_path):
         found.positions_of(np.array([1]), "x.txt")
 
 
+def test_a_name_may_begin_with_a_number(tmp_path):
+    found = read_classes(written(tmp_path, "table\n2 seater sofa\nchair\n"))
+    assert found.names == ("table", "2 seater sofa", "chair") and found.positions is None
+
+
 def test_an_id_and_a_name_a_line_and_0_is_undefined(tmp_path):
     found = read_classes(written(tmp_path, "7 tv screen\n3 wall\n"))
     assert found.names == ("tv screen", "wall")
@@ -60,7 +65,7 @@ def test_an_id_without_a_name_and_one_that_was_cut_to_8_bits_are_told_apart(tmp_
         ("a.txt", "", "a.txt names no class"),
         ("a.txt", "wall\nwall\n", "a.txt names 'wall' twice"),
         ("a.txt", "1 wall\n1 chair\n", "an id stands in it twice"),
-        ("a.txt", "1 wall\n2 floor\nceiling\n", "some lines are `id name` and 'ceiling' is not"),
+        ("a.txt", "1 wall\n2 floor\nceiling\n", "most lines are `id name` and 'ceiling' is not"),
         ("a.yaml", "[wall]", "a.yaml is no class file .it is no mapping"),
         ("a.yaml", "class_names_reduced: [wall]", "it lacks map_to_reduced"),
         ("a.yaml", "class_names_reduced: [wall]\nmap_to_reduced: {1: 2}", "says 1: 2, and there are 1 classes"),

@@ -9,7 +9,7 @@ from written_scene import color_image
 
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.images import Images
-from emgs_jax.data.rosbag import RosBag, to_rgb
+from emgs_jax.data.rosbag import RECTIFIED, RosBag, to_rgb
 
 rosbags = pytest.importorskip("rosbags", reason="reads bags: pip install -e .[rosbag]")
 from tests.data.written_bag import SIZE, D, K, P, write_bag  # noqa: E402
@@ -68,6 +68,22 @@ def test_a_rectified_topic_has_the_camera_that_it_was_made_for(version, kind, tm
     dataset = RosBag(str(path), size=SIZE)
     np.testing.assert_allclose(dataset.intrinsics, [P[0], P[5], P[2], P[6]])
     np.testing.assert_array_equal(dataset[1].image[..., ::-1], color_image(1, SIZE))
+
+
+@pytest.mark.parametrize(
+    ("topic", "is_rectified"),
+    [
+        ("/cam/image_rect", True),
+        ("/cam/image_rect_color/compressed", True),
+        ("/zed/rgb/color/rect/image", True),
+        ("/cam/image_raw", False),
+        ("/direct/color", False),
+        ("/correct_cam/rgb/compressed", False),
+        ("/cam/image_corrected", False),
+    ],
+)
+def test_what_is_rectified_is_told_by_a_word_of_the_topic(topic, is_rectified):
+    assert bool(RECTIFIED.search(topic)) == is_rectified
 
 
 def test_a_rectified_topic_without_its_camera_is_refused(tmp_path):

@@ -20,6 +20,7 @@ from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.belief import certain
 from emgs_jax.running.convert import FirstWindow, to_se3
+from emgs_jax.running.drive import anchor_anew
 from emgs_jax.running.locating import (
     anchor_motion,
     anchored_by,
@@ -31,7 +32,7 @@ from emgs_jax.running.locating import (
     refusal,
     with_map,
 )
-from emgs_jax.running.record import FrameRecord, new_run
+from emgs_jax.running.record import FOUND, FrameRecord, new_run
 from emgs_jax.slam import SlamState
 
 PLACE = matrix((10, -70, 20), (3.0, -2.0, 1.0))
@@ -117,6 +118,17 @@ def test_from_then_on_the_prior_says_its_poses_from_where_the_camera_was_found()
     assert moved(given, None) is given
     record = FrameRecord(0, None, None, "tracked", pose=PLACE, scale=1.1)
     np.testing.assert_allclose(anchored_by(record, given).wxyz_xyz, motion.wxyz_xyz, atol=1e-6)
+
+
+def test_a_frame_of_its_own_is_where_the_camera_was_found_and_goes_with_it_from_then_on():
+    own = matrix((0, 40, 0), (1, 2, 3))
+    session = SimpleNamespace(structure=None, prior_motion=None)
+    session.records = [FrameRecord(0, None, None, "tracked", pose=PLACE, scale=1.1, location=FOUND)]
+    given = SimpleNamespace(structure=2, frames=[SimpleNamespace(index=5)], T_anchor_views={5: own})
+    anchor_anew(session, given)
+    np.testing.assert_allclose(session.structure.T_world_structure @ own, PLACE, atol=1e-12)
+    assert session.structure.number == 2
+    np.testing.assert_allclose(session.prior_motion.as_matrix(), np.eye(4))  # None would stay behind in a closure
 
 
 def test_the_first_view_of_a_sequence_is_its_own_previous_one():
