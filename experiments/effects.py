@@ -42,13 +42,21 @@ class Effect:
 
 
 def read_effects(folder: str | Path, repetitions: Sequence[str]) -> list[Effect]:
-    """Effects of all sweeps below a folder; raises ValueError where there is none, or a sweep lacks its own config."""
+    """Effects of all sweeps below a folder.
+
+    Raises:
+        ValueError: there is none, one is there twice, or one lacks its own config.
+    """
     paths = sorted(Path(folder).rglob("sweep.json"))
     if not paths:
         raise ValueError(f"there is no sweep.json below {folder}: make some with experiments.sweep -m prior.seed=0,1,2")
     groups: dict[tuple[str, str], list[tuple]] = defaultdict(list)
+    repeated: dict[tuple[str, str], Path] = {}
     for path in paths:
         sweep = read_sweep(path)
+        other = repeated.setdefault((_described(sweep), _identity(sweep, ())), path)
+        if other != path:
+            raise ValueError(f"{path} is the same sweep as {other}, and would count as one more: move one of them away")
         groups[_described(sweep), _identity(sweep, repetitions)] += _differences(sweep, path)
     titles = [title for title, _ in groups]
     effects = []
@@ -65,12 +73,13 @@ def _described(sweep: Mapping[str, Any]) -> str:
 
 
 def _identity(sweep: Mapping[str, Any], repetitions: Sequence[str]) -> str:
-    """The config without what may differ between repetitions."""
+    """The code, and the config without what may differ between repetitions."""
+    code = [sweep["provenance"].get(key) for key in ("git", "versions")]
     config = copy.deepcopy(sweep["provenance"]["config"])
     for key in repetitions:
         *nodes, name = key.split(".")
         reduce(lambda node, name: node.get(name, {}), nodes, config).pop(name, None)
-    return json.dumps(config, sort_keys=True)
+    return json.dumps([code, config], sort_keys=True)
 
 
 def _differences(sweep: Mapping[str, Any], path: Path) -> Iterator[tuple[str | None, Any, Any, dict[str, float]]]:

@@ -108,10 +108,13 @@ def _path_arrays(run: RecordedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
 
 
 def _packed(layers: dict[str, np.ndarray], poses: dict[str, np.ndarray]) -> tuple[list[dict[str, Any]], str, str]:
-    """As `packed`, with fewer Gaussians where all of them are too many; the last value says so."""
+    """As `packed`, with fewer Gaussians where all of them are too many; the last value says so.
+
+    The paths of some 15,000 frames are too many by themselves: then there is no Gaussian.
+    """
     count = whole = len(layers["mean"])
     about, text = packed(layers | poses)
-    while len(text) > _MAP_BYTES:
+    while len(text) > _MAP_BYTES and count:
         count = int(0.95 * count * _MAP_BYTES / len(text))
         about, text = packed(thinned(layers, count) | poses)
     note = f"The page shows the {count:,} of {whole:,} Gaussians that most frames agree on; map.npz has all of them."

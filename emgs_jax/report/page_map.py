@@ -1,6 +1,7 @@
 """The map as the page gets it: layers of a few bytes a Gaussian, packed into one block of text."""
 
 import base64
+import math
 import zlib
 from collections.abc import Mapping
 from typing import Any
@@ -82,7 +83,7 @@ def packed(arrays: Mapping[str, np.ndarray]) -> tuple[list[dict[str, Any]], str]
     about, parts, offset = [], [], 0
     for name, values in arrays.items():
         values = np.ascontiguousarray(values)
-        columns = np.ascontiguousarray(values.reshape(len(values), -1).T)
+        columns = np.ascontiguousarray(values.reshape(len(values), math.prod(values.shape[1:])).T)
         raw = columns.astype(columns.dtype.newbyteorder("<")).view(np.uint8).reshape(-1, columns.dtype.itemsize)
         parts.append(np.ascontiguousarray(raw.T).tobytes())
         about.append({"name": name, "type": values.dtype.name, "rows": len(values), "columns": len(columns)})

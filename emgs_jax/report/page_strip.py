@@ -166,7 +166,7 @@ def _arcs(run: RecordedRun) -> str:
         )
         path = f"M{a:g} 100Q{(a + b) / 2:g} {-80 if is_accepted else -20:g} {b:g} 100"
         style = f'fill="none" stroke="{color}" opacity="{opacity}" vector-effect="non-scaling-stroke"'
-        parts.append(f'<path d="{path}" {style}><title>{escape(loop_words(loop))}</title></path>')
+        parts.append(f'<path d="{path}" {style}><title>{escape(loop_words(run, loop))}</title></path>')
     return f"{len(run.frames)}|" + "".join(parts)
 
 
@@ -200,9 +200,10 @@ def loop_why(loop: dict[str, Any]) -> str:
     return f"{why}: {loop['reason']}" if loop.get("reason") else why
 
 
-def loop_words(loop: dict[str, Any]) -> str:
-    """Frames, outcome and reason."""
-    return f"frames {loop['frame']} and {loop['other']}: {loop_why(loop)}"
+def loop_words(run: RecordedRun, loop: dict[str, Any]) -> str:
+    """Frames, by their index in the data set as everywhere on the page, outcome and reason."""
+    frame, other = (run.frames[loop[name]]["index"] for name in ("frame", "other"))
+    return f"frames {frame} and {other}: {loop_why(loop)}"
 
 
 def _short(value: float) -> str:

@@ -75,7 +75,9 @@ def verdict(run: RecordedRun) -> tuple[str, str]:
 
 def is_metric(run: RecordedRun) -> bool:
     """Whether lengths of the map are meant to be metres."""
-    return not any(key.endswith("median_depth") for key in flat(run.provenance["config"].get("prior", {})))
+    said = flat(run.provenance["prior"].get("settings", {}))  # of what a recording was made with, too
+    has_unit = not any(key.endswith("median_depth") for key in said)
+    return has_unit and all(value != "arbitrary" for key, value in said.items() if key.endswith("scale"))
 
 
 def head(run: RecordedRun, again: Repeated) -> str:
@@ -144,7 +146,7 @@ def loops(run: RecordedRun) -> str:
         return ""
     counts = Counter(map(loop_why, run.loops)).most_common()
     rows = [(f"{count}", words) for words, count in counts]
-    each = "".join(f"<li>{escape(loop_words(loop))}</li>" for loop in run.loops[:500])
+    each = "".join(f"<li>{escape(loop_words(run, loop))}</li>" for loop in run.loops[:500])
     more = f"<li>and {len(run.loops) - 500} more in loops.json</li>" if len(run.loops) > 500 else ""
     closures = f"{run.metrics.get('loops/closures', 0)} closures moved poses and map."
     outcomes = table(("candidates", "outcome"), rows)

@@ -164,6 +164,8 @@ def heat(answer: Answer, word: int) -> np.ndarray:
     leads = answer.relevance.leads[:, word].astype(np.float64)
     known = np.zeros(len(leads), bool)
     known[answer.rows] = np.asarray(answer.gaussians.features)[answer.rows].any(1)
+    if not known.any():
+        return np.full(len(leads), np.nan)
     low, high = np.percentile(leads[known], [1, 99])
     return np.where(known, ((leads - low) / max(high - low, 1e-9)).clip(0.0, 1.0), np.nan)
 

@@ -92,8 +92,9 @@ def is_finished(folder: Path, config: Mapping[str, Any]) -> bool:
 
 
 def read_estimates(out: Path) -> list[Estimate]:
-    """All results below `out`, in the order of their folders."""
-    return [item for path in sorted(out.glob(f"*/*/*/*/{METRICS_FILE}")) for item in estimates_of(path)]
+    """All results below `out`, in the order of their folders; a folder that is no seed's, such as a copy, is none."""
+    paths = (path for path in sorted(out.glob(f"*/*/*/*/{METRICS_FILE}")) if path.parent.name.isdecimal())
+    return [item for path in paths for item in estimates_of(path)]
 
 
 def estimates_of(path: Path) -> list[Estimate]:

@@ -6,6 +6,7 @@ import json
 import re
 import zlib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from hand_run import random_similarity
 from page_elements import HOSTILE, Elements
 from written_run import CLASSES, two_walls, written_run
 
-from emgs_jax.report import page
+from emgs_jax.report import page, page_words
 from emgs_jax.report.page import MAX_BYTES, write_report
 from emgs_jax.report.page_map import COV_UNIT, packed, thinned
 from emgs_jax.report.page_strip import placed_paths
@@ -115,6 +116,41 @@ def test_a_large_map_is_thinned_to_the_size_of_a_page_and_the_page_says_so(tmp_p
     assert len(elements.scripts["arrays"]) <= 5_000 and 0 < shown < whole
     assert f"The page shows the {shown:,} of {whole:,} Gaussians" in text_of(folder)
     assert len(text_of(folder).encode()) < MAX_BYTES
+
+
+def test_where_the_paths_alone_are_too_many_the_page_has_them_and_no_gaussian(tmp_path, monkeypatch):
+    """Symptom: after 20,000 frames the run ended with 'cannot reshape array of size 0', and no page."""
+    folder = written_run(tmp_path)
+    monkeypatch.setattr(page, "_MAP_BYTES", 10)
+    write_report(read_run(folder), None)
+    arrays = unpacked(Elements(text_of(folder)))
+    assert len(arrays["mean"]) == 0 and arrays["cov"].shape == (0, 6) and len(arrays["poses"]) == 6
+    assert f"The page shows the 0 of {len(two_walls().means):,} Gaussians" in text_of(folder)
+
+
+def test_loops_name_frames_as_the_rest_of_the_page_does(tmp_path):
+    """After a skipped image places in use and indices of the data set are not the same."""
+    folder = written_run(tmp_path)
+    lines = [json.loads(line) for line in (folder / "frames.jsonl").read_text().splitlines()]
+    lines = [line | {"index": line["index"] + 1} for line in lines]
+    (folder / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_report(read_run(folder), None)
+    text = text_of(folder)
+    assert "frames 6 and 1: accepted" in text and "frames 5 and 0" not in text
+
+
+@pytest.mark.parametrize(
+    ("settings", "is_metric"),
+    [
+        ({"level": 1.0}, True),
+        ({"structure": {"median_depth": 2.0}}, False),  # multiview_stereo, and a recording of it
+        ({"scale": "arbitrary", "anchor_depth_m": 2.0}, False),
+        ({"scale": "metric"}, True),
+    ],
+)
+def test_whether_lengths_are_metres_is_what_the_prior_says_of_itself(settings, is_metric):
+    run = SimpleNamespace(provenance={"prior": {"name": "recorded", "settings": settings}, "config": {"prior": {}}})
+    assert page_words.is_metric(run) == is_metric
 
 
 def test_thinning_keeps_what_most_frames_agree_on_in_its_order():

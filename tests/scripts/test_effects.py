@@ -1,5 +1,6 @@
 """The table of effects; oracle: sweeps written by hand, whose differences are known."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,24 @@ def test_sweeps_with_another_config_are_not_averaged_with_these(tmp_path):
     effects = read_effects(tmp_path, REPETITIONS)
     assert [len(effect.metrics[ATE]) for effect in effects] == [1] * 4
     assert effects[0].data != effects[2].data
+
+
+def test_a_copy_of_a_sweep_is_no_repetition(tmp_path):
+    """Symptom: the same seed three times was 'all of at least three agree', in bold."""
+    for number in range(2):
+        write_sweep(tmp_path / str(number), 0, {(8.0, "inf"): 0.10, (4.0, "inf"): 0.13})
+    with pytest.raises(ValueError, match="1.sweep.json is the same sweep as .*0.sweep.json, and would count"):
+        read_effects(tmp_path, REPETITIONS)
+
+
+def test_sweeps_of_other_code_are_not_averaged_with_these(tmp_path):
+    for seed in (0, 1):
+        write_sweep(tmp_path / str(seed), seed, {(8.0, "inf"): 0.10, (4.0, "inf"): 0.13})
+    path = tmp_path / "1" / "sweep.json"
+    sweep = json.loads(path.read_text())
+    sweep["provenance"]["git"] = {"revision": "bbbb"}
+    path.write_text(json.dumps(sweep))
+    assert [len(effect.metrics[ATE]) for effect in read_effects(tmp_path, REPETITIONS)] == [1] * 4
 
 
 def test_the_se3_table_shows_the_metrics_of_that_alignment(tmp_path):

@@ -39,7 +39,7 @@ class MatchingConfig:
     max_reprojection_error: float = number(low=0, high=1000)
     min_matches: int = number(low=1)
     min_parallax: float = number(low=0, high=1000)
-    min_refound: int = number(low=0)
+    min_refound: int = number(low=6)  # a pose needs as many
     max_remembered: int = number(low=0, high=1e8)
 
     def __post_init__(self) -> None:
