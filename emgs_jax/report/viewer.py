@@ -16,7 +16,7 @@ import numpy as np
 
 from emgs_jax.report.viewer_layers import LAYERS, ask, colors_of, find_words, highlighted, picked
 from emgs_jax.report.viewer_run import Shown
-from emgs_jax.report.viewer_scene import Scene, wxyz
+from emgs_jax.report.viewer_scene import Scene, field_of_view, wxyz
 
 if TYPE_CHECKING:
     import viser
@@ -201,6 +201,7 @@ class Viewer:
             pose = self._run.poses[self._row()]
             with client.atomic():
                 client.camera.wxyz, client.camera.position = wxyz(pose), pose[:3, 3]
+                client.camera.fov = field_of_view(self._run.camera)
 
 
 def check_port(port: int) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.ops.camera import Camera
 from emgs_jax.report.overview import view_from_above
 from emgs_jax.report.page_strip import OURS, STATUS_COLORS
 from emgs_jax.report.viewer_layers import covariances
@@ -99,10 +100,9 @@ class Scene:
 
     def _frustum(self, run: Shown, name: str, row: int, color: str, scale: float) -> Any:
         camera, pose = run.camera, run.poses[row]
-        fov = 2 * float(np.arctan2(camera.height / 2, float(camera.focal[1])))
         return self._scene.add_camera_frustum(
             name,
-            fov,
+            field_of_view(camera),
             camera.width / camera.height,
             scale=scale,
             thickness=1.5,
@@ -120,6 +120,11 @@ class Scene:
         for client in self._server.get_clients().values():  # who waits for the first frame
             client.camera.up_direction = first.up
             client.camera.position, client.camera.look_at = first.position, first.look_at
+
+
+def field_of_view(camera: Camera) -> float:
+    """Vertical, in radians."""
+    return 2 * float(np.arctan2(camera.height / 2, float(camera.focal[1])))
 
 
 def wxyz(pose: np.ndarray) -> np.ndarray:
