@@ -355,13 +355,6 @@ MUTANTS = (
         "loops name other frames than the page",
     ),
     Mutant(
-        "emgs_jax/report/page.py",
-        "while len(text) > _MAP_BYTES and count:",
-        "while len(text) > _MAP_BYTES and count > 1:",
-        PAGE,
-        "a page of a long run keeps a Gaussian too many",
-    ),
-    Mutant(
         "emgs_jax/data/rosbag.py",
         "if RECTIFIED.search(topic):",
         "if False:",
