@@ -24,7 +24,7 @@ def export_run(config: DictConfig) -> list[Path]:
     factor = find_factor(run, wanted)
     dataset = None
     if IMAGE_FORMATS & {*wanted.formats}:
-        dataset, note = images_of(run.provenance, len(run.poses))
+        dataset, note = images_of(run)
         if dataset is None:
             raise ValueError(f"{note} formats=[frustums] needs no images")
     if factor is None:

@@ -22,9 +22,15 @@ def whole(low: int, or_null: bool = False) -> Kind:
     return Kind(words, lambda value: (or_null and value is None) or _is_whole(value, low))
 
 
+def some(words: str, fits: Callable[[Any], bool]) -> Kind:
+    """A list, which may be empty."""
+    return Kind(f"a list of {words}", lambda value: _is_list(value) and all(map(fits, value)))
+
+
 def many(words: str, fits: Callable[[Any], bool]) -> Kind:
     """A list of one or more."""
-    return Kind(f"a list of {words}", lambda value: _is_list(value) and len(value) > 0 and all(map(fits, value)))
+    kind = some(words, fits)
+    return Kind(kind.words, lambda value: kind.fits(value) and len(value) > 0)
 
 
 def _is_whole(value: Any, low: int) -> bool:
@@ -61,17 +67,14 @@ KEYS: dict[str, dict[str, Kind]] = {
     "tune": AT_ONCE,  # the others it checks itself
     "evaluate": {
         "seeds": many("whole numbers", lambda value: _is_whole(value, 0)),
-        "overrides": Kind("a list of KEY=VALUE", lambda value: _is_list(value) and all(map(_is_change, value))),
+        "overrides": some("KEY=VALUE", _is_change),
         "variants": Kind(
             "NAME: {KEY: VALUE}, one or more", lambda value: isinstance(value, Mapping) and len(value) > 0
         ),
         "shard": TEXT,
     },
-    "export": {
-        "formats": Kind("a list of names", lambda value: value == [] or NAMES.fits(value)),
-        "max_points": whole(1),
-    },
-    "effects": {"repetitions": Kind("a list of keys", lambda value: _is_list(value) and all(map(_is_text, value)))},
+    "export": {"formats": some("names", _is_text), "max_points": whole(1)},
+    "effects": {"repetitions": some("keys", _is_text)},
     "embed": {"classes": NAMES},
     "segment": {"map": Kind("a folder or a list of folders", lambda value: _is_text(value) or NAMES.fits(value))},
     "benchmark": {

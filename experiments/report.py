@@ -1,15 +1,13 @@
 """Write the page of a run anew: `python -m experiments.report FOLDER`; a run writes it at its end by itself."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.report.page import write_report
-from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.repeat import check_targets
 from emgs_jax.running.configure import build_dataset, message_of
 
@@ -19,15 +17,15 @@ from .command import command
 def report(folder: Path) -> Path:
     """Write report.html into the folder of a finished run; without its images where they are gone."""
     run = read_run(folder)
-    dataset, note = images_of(run.provenance, len(run.poses))
+    dataset, note = images_of(run)
     path = write_report(run, dataset, note)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB" + (f"\n{note}" if note else ""))
     return path
 
 
-def images_of(provenance: Mapping[str, Any], count: int) -> tuple[ReadableFrames | None, str]:
+def images_of(run: RecordedRun) -> tuple[ReadableFrames | None, str]:
     """The data set of a run, or why there is none; raises ValueError where settings name other code than ours."""
-    settings = provenance["config"]
+    settings, count = run.provenance["config"], len(run.poses)
     check_targets(settings["dataset"])
     try:
         dataset = build_dataset(OmegaConf.create(dict(settings)))
@@ -37,7 +35,7 @@ def images_of(provenance: Mapping[str, Any], count: int) -> tuple[ReadableFrames
         return None, f"The images are not shown: {message_of(error)}"
     if len(dataset) != count:
         return None, f"The images are not shown: there are {len(dataset)} now, and {count} were mapped."
-    if dataset.fingerprint() != provenance["data"]["fingerprint"]:
+    if dataset.fingerprint() != run.provenance["data"]["fingerprint"]:
         return None, "The images are not shown: they are not those that were mapped."
     return dataset, ""
 

@@ -81,7 +81,7 @@ def true_points(config: DictConfig, run: RecordedRun, scene: str) -> LabelledPoi
         return read_labelled_mesh(Path(str(config.truth)), scene, read_classes(config.classes))
     if config.classes is not None:
         raise ValueError("classes is the file of a mesh's ids, and truth=frames has the data set's names: leave it out")
-    dataset, note = images_of(run.provenance, len(run.poses))
+    dataset, note = images_of(run)
     if dataset is None:
         raise ValueError(f"truth=frames: the frames of {run.folder} cannot be read again. {note}")
     cells = [

@@ -342,10 +342,10 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/report/evaluation_page.py",
-        "groups.setdefault((row.dataset, row.sequences, row.protocol, row.is_simulated), [])",
-        "groups.setdefault((row.dataset, row.sequences, row.protocol, True), [])",
+        "return row.dataset, row.sequences, row.protocol, row.is_simulated",
+        "return row.dataset, row.sequences, row.protocol",
         ("tests/report/test_table_page.py",),
-        "the best of simulated rows alone is marked",
+        "simulated rows are set beside measured ones",
     ),
     Mutant(
         "emgs_jax/report/page_strip.py",
@@ -391,8 +391,8 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/running/places.py",
-        "_checksum(folder / MAP_FILE, folder / PLACES_FILE)",
-        "_checksum(folder / PLACES_FILE)",
+        "fingerprint(folder, files, {})",
+        "fingerprint(folder, files[1:], {})",
         ("tests/running/test_places.py",),
         "a run goes on in another map than it was begun in",
     ),
@@ -1209,10 +1209,10 @@ MUTANTS = (
     ),
     Mutant(
         "emgs_jax/report/run_files.py",
-        "if not known.any():",
-        "if not known.all():",
+        "return alignment.inverse().apply_to_poses(truth)",
+        "return truth",
         RUN_FILES,
-        "a true path that is unknown in one frame is not drawn",
+        "the true path is drawn in a frame of its own",
     ),
     Mutant(
         "emgs_jax/report/run_files.py",

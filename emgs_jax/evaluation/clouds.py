@@ -105,8 +105,9 @@ class VoxelGrid:
         return self._sums()[:, 9]
 
     def _sums(self) -> np.ndarray:
-        empty = (np.empty(0, np.int64), np.empty((0, 10)))
-        return (self._tables[0] if len(self._tables) == 1 else _merge([empty, *self._tables]))[1]
+        if len(self._tables) != 1:
+            self._tables = [_merge([(np.empty(0, np.int64), np.empty((0, 10))), *self._tables])]
+        return self._tables[0][1]
 
 
 def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:

@@ -96,8 +96,9 @@ def agreeing(
     distance, turn = gap_between(corrections[other] @ now[one], implied[one])
     fits = (distance <= config.max_distance) & (turn <= config.max_turn_deg)
     agree = coo_array((fits, (one, other)), shape=(len(every), len(every))).tocsr()
-    one, other = (agree * agree.T).nonzero()
-    _, group = connected_components(coo_array((np.ones(len(one)), (one, other)), agree.shape), directed=False)
+    agree = agree * agree.T
+    one, other = agree.nonzero()
+    _, group = connected_components(agree, directed=False)
     is_evidence = np.arange(len(every)) < len(loops)
     backs = is_evidence[other] & (queries[one] != queries[other])
     num_others = _num_different(one[backs], queries[other[backs]], len(every))

@@ -110,12 +110,17 @@ def _jobs(out: Path, jobs: Sequence[JobLine]) -> str:
     return rows_of(("", "run", "what it came to"), (), lines) + quiet(more)
 
 
+def _comparable(row: Row) -> tuple:
+    """What two rows must share to be set beside each other."""
+    return row.dataset, row.sequences, row.protocol, row.is_simulated
+
+
 def _errors(rows: Sequence[Row]) -> str:
     """Ours, the raw prior and baselines one below the other; the best on the same data is marked."""
     columns = [column for column in COLUMNS if any(row.values.get(column.key) is not None for row in rows)]
     groups: dict[tuple, list[Row]] = {}
     for row in rows:
-        groups.setdefault((row.dataset, row.sequences, row.protocol, row.is_simulated), []).append(row)
+        groups.setdefault(_comparable(row), []).append(row)
     best = {
         what: [best_of((row.values.get(column.key) for row in members), column) for column in columns]
         for what, members in groups.items()
@@ -125,8 +130,7 @@ def _errors(rows: Sequence[Row]) -> str:
         sequences = row.sequences[0] if len(row.sequences) == 1 else f"mean of {len(row.sequences)}"
         label = "simulated" if row.is_simulated else "measured"
         line = texts([row.dataset, sequences, row.variant, row.kind, label, row.protocol, str(len(row.seeds))])
-        tops = best[row.dataset, row.sequences, row.protocol, row.is_simulated]
-        for column, top in zip(columns, tops, strict=True):
+        for column, top in zip(columns, best[_comparable(row)], strict=True):
             line += number(row.values.get(column.key), column, top, row.spreads.get(column.key))
         lines.append(line)
     titles = ("data set", "sequence", "setting", "", "source", "protocol", "seeds")

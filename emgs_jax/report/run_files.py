@@ -27,7 +27,7 @@ from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.first_frame import seen_from
 from emgs_jax.running.places import save_places
-from emgs_jax.running.record import SEGMENT, UNJOINED, MappingRun, row_of_first_node
+from emgs_jax.running.record import SEGMENT, UNJOINED, MappingRun, row_of_first_node, with_truth
 from emgs_jax.semantics import principal_colors
 
 # metrics.json first: it is what makes a folder a finished result.
@@ -155,11 +155,11 @@ def _placed_truth(run: MappingRun, with_scale: bool) -> np.ndarray | None:
     A prior has a frame and often a unit of its own: drawn as it is, a path without error would look like one that
     drifts.
     """
-    truth = np.stack([np.full((4, 4), np.nan) if pose is None else pose for pose in run.true_poses])
-    known = np.isfinite(truth).all((1, 2))
-    if not known.any():
+    known = with_truth(run, run.poses)
+    if known is None:
         return None
-    alignment, _ = align_poses(np.stack(run.poses)[known], truth[known], with_scale)
+    alignment, _ = align_poses(*known, with_scale)
+    truth = np.stack([np.full((4, 4), np.nan) if pose is None else pose for pose in run.true_poses])
     return alignment.inverse().apply_to_poses(truth)
 
 

@@ -67,7 +67,7 @@ class Baselines:
         if record.status in PLACED and self.ours:
             taken = np.asarray(has_normal(points, mask, self._run.config.observation))
             cloud = PointCloud(*(values[taken[mask]] for values in vars(view.cloud).values()))
-            view = View(np.where(taken, view.depth, 0.0).astype(np.float32), view.image, cloud)
+            view = View(np.where(taken, view.depth, np.float32(0.0)), view.image, cloud)
             for fusion in self.ours.values():
                 fusion.add(view, record.pose, 1.0 if record.scale is None else record.scale)
 

@@ -3,7 +3,6 @@
 Keyframes, poses and measurements. The other run's frames are further nodes of the same graph.
 """
 
-import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from emgs_jax.data.reading import fingerprint
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.files import atomic_write
 from emgs_jax.io.map_file import load_map
@@ -40,7 +40,7 @@ class SavedMap:
         back_end: what was measured then; its `first` node is the next.
         depth_noise: how much a frame differed from the map, as a fraction of its depth.
         is_fixed: frames are only located in it; it stays as it is.
-        checksum: of its files, SHA-256.
+        checksum: of its files.
     """
 
     map: GaussianMap
@@ -136,14 +136,8 @@ def load_saved(
     births = np.asarray(map.birth)[np.asarray(map.gaussians.valid)]
     if len(births) == 0 or births.min() < 0 or births.max() >= len(end.poses):
         raise ValueError(f"{folder}: {MAP_FILE} and {PLACES_FILE} are not of one run: map again")
-    return SavedMap(map, end, depth_noise, mode == "locate", _checksum(folder / MAP_FILE, folder / PLACES_FILE))
-
-
-def _checksum(*files: Path) -> str:
-    found = hashlib.sha256()
-    for file in files:
-        found.update(file.read_bytes())
-    return found.hexdigest()
+    files = folder / MAP_FILE, folder / PLACES_FILE
+    return SavedMap(map, end, depth_noise, mode == "locate", fingerprint(folder, files, {}))
 
 
 def _fill(end: BackEnd, arrays: Mapping[str, np.ndarray], num_trained: int) -> None:

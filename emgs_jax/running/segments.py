@@ -32,10 +32,10 @@ UNKNOWN = np.full((4, 4), np.nan)  # pose
 
 def predicted(run: MappingRun, given: Input) -> Prediction:
     """What is given as a step's input, in the world of the map; without poses where that is not related to it."""
-    prediction, placed = as_prediction(given.taken), run.structure
-    if placed is None or placed.number != given.structure:
+    prediction = as_prediction(given.taken)
+    if run.structure is None or not is_related(run, given):
         return prediction
-    return in_structure(prediction, given, placed)
+    return in_structure(prediction, given, run.structure)
 
 
 def in_structure(prediction: Prediction, given: Input, placed: PlacedStructure) -> Prediction:
