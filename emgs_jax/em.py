@@ -13,9 +13,10 @@ from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import (
     Entries,
     Whitening,
+    across,
+    between,
     dot,
-    gather_entries,
-    gather_offsets,
+    down,
     outer,
     principal_axes_2x2,
     safe_normalize,
@@ -23,11 +24,12 @@ from emgs_jax.ops.linalg import (
     whiten,
     whitening,
 )
-from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.neighbours import Groups, Nearby, among_nearest, group_points, nearby, of_queries
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import choice, join_rows, split_rows, static, traced, where_rows
+from emgs_jax.ops.pytree import choice, join_rows, split_rows, static, take_rows, traced, where_rows
 
-MAX_POINTS = 16384  # whose K explanations are held at once
+BLOCK = 16  # points that share a list of Gaussians
+MAX_BLOCKS = 8192  # whose explanations are held at once
 
 
 class EmConfig(eqx.Module):
@@ -35,6 +37,7 @@ class EmConfig(eqx.Module):
 
     Args:
         num_neighbours: K, nearest Gaussians per point.
+        num_candidates: Gaussians near a block of points, among which the K of each point are looked for.
         min_normal_cos: τ_n, on the mean over the neighbours of n_k · n_i.
         max_mahalanobis_sq: τ_Σ, on the smallest squared Mahalanobis distance (R1).
         max_log_gap: τ_π, on the gap between the best explanation and the best possible one; `inf` as printed (R3).
@@ -51,6 +54,7 @@ class EmConfig(eqx.Module):
     """
 
     num_neighbours: int = static(low=1, high=256)
+    num_candidates: int = static(low=1, high=384)
     min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
     max_mahalanobis_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
     max_log_gap: Float[Array, "*b"] = traced(low=0, high=math.inf)
@@ -66,24 +70,26 @@ class EmConfig(eqx.Module):
 
 
 class EStep(eqx.Module):
-    """Which Gaussians explain which points.
+    """Which Gaussians explain which points, by blocks of points that are near each other.
 
     Args:
-        rows: the K nearest Gaussians of each point.
-        responsibilities: r^ik; a row sums to 1, or is 0 where the point takes no part.
-        is_fused: the points that pass every gate.
+        near: the Gaussians near each block of points.
+        responsibilities: r^ik of the points of each block; over its Gaussians they sum to 1, or are 0 where the point
+            takes no part. Only the K nearest of a point have any.
+        is_fused: the points that pass every gate, in their order.
     """
 
-    rows: Int[Array, "m k"]
-    responsibilities: Float[Array, "m k"]
+    near: Nearby
+    responsibilities: Float[Array, "b q c"]
     is_fused: Bool[Array, "m"]
 
 
 def owners(step: EStep, num_gaussians: int) -> Int[Array, "m"]:
     """The Gaussian that explains each point best; `num_gaussians` where none does."""
-    best = jnp.argmax(step.responsibilities, axis=-1)[:, None]
-    rows = jnp.take_along_axis(step.rows, best, axis=-1)[:, 0]
-    return jnp.where(jnp.any(step.responsibilities > 0, axis=-1), rows, num_gaussians)
+    best = jnp.argmax(step.responsibilities, axis=-1)
+    rows = jnp.take_along_axis(step.near.rows, best, axis=-1)
+    rows = jnp.where(jnp.any(step.responsibilities > 0, axis=-1), rows, num_gaussians)
+    return of_queries(step.near, rows, step.is_fused.shape[0])
 
 
 class EmInfo(eqx.Module):
@@ -95,9 +101,7 @@ class EmInfo(eqx.Module):
     mean_log_joint: Float[Array, ""]
 
 
-def widened_distance_sq(
-    triangle: Entries, offsets: Entries, noise: Entries
-) -> tuple[Float[Array, "m k"], Float[Array, "m k"]]:
+def widened_distance_sq(triangle: Entries, offsets: Entries, noise: Entries) -> tuple[Array, Array]:
     """Squared Mahalanobis distance under Σ_k + ν ν' and log|Σ_k + ν ν'| - log|Σ_k| (Sherman–Morrison).
 
     ν is a point's noise: a standard deviation along its viewing ray. `triangle` is that of `whitening`.
@@ -115,6 +119,7 @@ def e_step(
     noise: Float[Array, "m 3"],
     config: EmConfig,
     white: Whitening | None = None,
+    groups: Groups | None = None,
 ) -> tuple[EStep, Float[Array, "m"]]:
     """Responsibilities of the K nearest Gaussians for every point (eq. 2 and 3), and each point's best log-joint.
 
@@ -124,50 +129,51 @@ def e_step(
         noise: m; standard deviation of every point along its viewing ray, as a vector.
         config: gates and weights.
         white: `whitening` of the Gaussians' covariances; None makes it here.
+        groups: `group_points` of the valid Gaussians' means; likewise.
     """
-    rows, found = knn(points.points, gaussians.means, gaussians.valid, config.num_neighbours)
-    white = whitening(gaussians.covs) if white is None else white
-    parts = split_rows((points, noise, rows, found), MAX_POINTS)
-    explained = jax.lax.map(lambda part: _explain(gaussians, white, *part, config), parts)
-    return join_rows(explained, points.valid.shape[0])
+    groups = group_points(gaussians.means, gaussians.valid) if groups is None else groups
+    near = nearby(points.points, points.valid, groups, config.num_candidates, BLOCK)
+    table = gaussians, whitening(gaussians.covs) if white is None else white
+    parts = split_rows((near, *take_rows((points, noise), near.queries)), MAX_BLOCKS)
+    explained = jax.lax.map(lambda part: _explain(table, *part, config), parts)
+    responsibilities, is_fused, best = join_rows(explained, near.rows.shape[0])
+    is_fused, best = (of_queries(near, values, points.valid.shape[0]) for values in (is_fused, best))
+    return EStep(near, responsibilities, is_fused & points.valid), best
 
 
 def _explain(
-    gaussians: Gaussians,
-    white: Whitening,
+    table: tuple[Gaussians, Whitening],
+    near: Nearby,
     points: Observation,
-    noise: Float[Array, "m 3"],
-    rows: Int[Array, "m k"],
-    found: Bool[Array, "m k"],
+    noise: Float[Array, "b q 3"],
     config: EmConfig,
-) -> tuple[EStep, Float[Array, "m"]]:
-    """The E-step for given neighbours."""
-    triangles, logdets = white
-    offsets = gather_offsets(points.points, gaussians.means, rows)
-    ray, normals = (jnp.unstack(vectors[:, None], axis=-1) for vectors in (config.noise * noise, points.normals))
-    distance_sq, log_growth = widened_distance_sq(gather_entries(triangles, rows), offsets, ray)
-    normal_cos = dot(gather_entries(gaussians.normals, rows), normals)
+) -> tuple[Float[Array, "b q c"], Bool[Array, "b q"], Float[Array, "b q"]]:
+    """The E-step for blocks of points and the Gaussians near them: every point of a block with each of these."""
+    gaussians, (triangles, logdets) = take_rows(table, near.rows)
+    offsets = between(points.points, gaussians.means)
+    ray, normals = (down(vectors) for vectors in (config.noise * noise, points.normals))
+    found = among_nearest(dot(offsets, offsets), near.exists[:, None], config.num_neighbours)
+    distance_sq, log_growth = widened_distance_sq(across(triangles), offsets, ray)
+    normal_cos = dot(across(gaussians.normals), normals)
     # Without one of the features the term must vanish.
     feature_gap = 0.0
     if gaussians.features.shape[-1]:
-        feature = jnp.unstack(points.features[:, None], axis=-1)
-        meaning = safe_normalize(gaussians.features)
-        both = has_feature(points.features)[:, None] & has_feature(meaning)[rows]
-        feature_gap = jnp.where(both, dot(gather_entries(meaning, rows), feature) - 1.0, 0.0)
-    log_det_term = -config.determinant_weight * (logdets[rows] + log_growth)
+        both = has_feature(points.features)[:, :, None] & has_feature(gaussians.features)[:, None]
+        cosine = jnp.einsum("bqf,bcf->bqc", points.features, safe_normalize(gaussians.features))
+        feature_gap = jnp.where(both, cosine - 1.0, 0.0)
+    log_det_term = -config.determinant_weight * (logdets[:, None] + log_growth)
     log_joint = -0.5 * distance_sq + log_det_term
     log_joint += config.normal_weight * (normal_cos - 1.0) + config.feature_weight * feature_gap
 
     has_neighbour = jnp.any(found, axis=-1)
-    some = found | ~has_neighbour[:, None]  # a reduction over nothing has no value; such points are left out below
+    some = found | ~has_neighbour[..., None]  # a reduction over nothing has no value; such points are left out below
     best = jnp.max(jnp.where(some, log_joint, -jnp.inf), axis=-1)
     log_gap = jnp.max(jnp.where(some, log_det_term, -jnp.inf), axis=-1) - best
     mean_cos = jnp.sum(jnp.where(found, normal_cos, 0.0), axis=-1) / jnp.maximum(jnp.sum(found, axis=-1), 1)
     nearest_sq = jnp.min(jnp.where(some, distance_sq, jnp.inf), axis=-1)
     is_fused = points.valid & has_neighbour & (mean_cos >= config.min_normal_cos)
     is_fused &= (nearest_sq <= config.max_mahalanobis_sq) & (log_gap <= config.max_log_gap)
-    responsibilities = jax.nn.softmax(log_joint, axis=-1, where=some) * is_fused[:, None]
-    return EStep(rows, responsibilities, is_fused), best
+    return jax.nn.softmax(log_joint, axis=-1, where=some) * is_fused[..., None], is_fused, best
 
 
 def support(gaussians: Gaussians, points: Observation, step: EStep, config: EmConfig) -> Float[Array, "n"]:
@@ -178,14 +184,15 @@ def support(gaussians: Gaussians, points: Observation, step: EStep, config: EmCo
     basis = tangent_basis(gaussians.normals)
     plane_covs = jnp.einsum("nda,ndc,ncb->nab", basis, gaussians.covs, basis)
     axes = jnp.einsum("nda,nab->ndb", basis, principal_axes_2x2(plane_covs))
-    offsets = gather_offsets(points.points, gaussians.means, step.rows)
-    along = [dot(offsets, gather_entries(axis, step.rows)) for axis in jnp.unstack(axes, axis=-1)]
-    is_positive = jnp.stack(along, axis=-1) > 0
-    r = step.responsibilities[..., None]
-    sides = jnp.concatenate([jnp.where(is_positive, r, 0.0), jnp.where(is_positive, 0.0, r)], axis=-1)
-    sums = jnp.zeros((gaussians.valid.shape[0], 4)).at[step.rows].add(sides)
-    smaller = 2.0 * jnp.minimum(sums[:, :2], sums[:, 2:])
-    total = sums[:, :2] + sums[:, 2:]
+    near_means, near_axes = take_rows((gaussians.means, axes), step.near.rows)
+    offsets = between(take_rows(points.points, step.near.queries), near_means)
+    r, sides = step.responsibilities, []
+    for axis in jnp.unstack(near_axes, axis=-1):
+        is_positive = dot(offsets, across(axis)) > 0
+        sides += [jnp.sum(jnp.where(is_positive, r, 0.0), axis=1), jnp.sum(jnp.where(is_positive, 0.0, r), axis=1)]
+    sums = jnp.zeros((gaussians.valid.shape[0], 4)).at[step.near.rows].add(jnp.stack(sides, axis=-1))
+    first, second = sums[:, 0::2], sums[:, 1::2]
+    smaller, total = 2.0 * jnp.minimum(first, second), first + second
     normalized = smaller / jnp.where(total > 0, total, 1.0)
     both = jnp.where(config.support > 0, normalized, jnp.minimum(smaller, 1.0))
     return jnp.min(both, axis=-1)
@@ -206,9 +213,9 @@ def m_step(
     Returns:
         The new parameters (the old ones where no point is), and the total responsibility Σ_i r_ik.
     """
-    add = lambda sums, part: (_add_statistics(sums, gaussians.means, *part), None)  # noqa: E731
-    nothing = jnp.zeros((gaussians.valid.shape[0], 17))
-    sums, _ = jax.lax.scan(add, nothing, split_rows((points, weights, step), MAX_POINTS))
+    blocks = take_rows((points, weights), step.near.queries)
+    sums = _statistics(gaussians.means[step.near.rows], *blocks, step.responsibilities)
+    sums = jnp.zeros((gaussians.valid.shape[0], 17)).at[step.near.rows].add(sums)
     total = sums[:, 0]
     has_points = (total > config.min_responsibility) & (sums[:, 1] > 0)  # a vanishing share times a precision is 0
     mean = sums[:, 2:] / jnp.where(has_points, sums[:, 1], 1.0)[:, None]
@@ -228,23 +235,21 @@ def m_step(
     return where_rows(has_points, new, gaussians), jnp.where(has_points, total, 0.0)
 
 
-def _add_statistics(
-    sums: Float[Array, "n 17"],
-    means: Float[Array, "n 3"],
+def _statistics(
+    means: Float[Array, "b c 3"],
     points: Observation,
-    weights: Float[Array, "m"],
-    step: EStep,
-) -> Float[Array, "n 17"]:
-    """Add Σ r and Σ r w (1, offset, upper triangle of offset offset', normal, colour) over every Gaussian's points."""
-    r = step.responsibilities
-    weighted = r * weights[:, None]
+    weights: Float[Array, "b q"],
+    responsibilities: Float[Array, "b q c"],
+) -> Float[Array, "b c 17"]:
+    """Σ r and Σ r w (1, offset, upper triangle of offset offset', normal, colour) over the points of every block."""
+    weighted = responsibilities * weights[..., None]
     # Offsets from the old means: second moments of world coordinates would cancel in float32.
-    offsets = points.points[:, None] - means[step.rows]
-    rows, columns = jnp.triu_indices(3)
-    products = offsets[..., rows] * offsets[..., columns]
-    others = jnp.broadcast_to(jnp.concatenate([points.normals, points.colors], axis=-1)[:, None], (*r.shape, 6))
-    statistics = jnp.concatenate([jnp.ones_like(r)[..., None], offsets, products, others], axis=-1)
-    return sums.at[step.rows].add(jnp.concatenate([r[..., None], weighted[..., None] * statistics], axis=-1))
+    offsets = between(points.points, means)
+    products = [offsets[row] * offsets[column] for row in range(3) for column in range(row, 3)]
+    moments = [jnp.sum(weighted * value, axis=1) for value in (*offsets, *products)]
+    totals = [jnp.sum(responsibilities, axis=1), jnp.sum(weighted, axis=1)]
+    others = jnp.einsum("bqc,bqv->bcv", weighted, jnp.concatenate([points.normals, points.colors], axis=-1))
+    return jnp.concatenate([jnp.stack([*totals, *moments], axis=-1), others], axis=-1)
 
 
 def _with_features(submap: GaussianMap, points: Observation, step: EStep, config: EmConfig) -> GaussianMap:
@@ -262,16 +267,18 @@ def em_update(
     noise: Float[Array, "m 3"],
     config: EmConfig,
     white: Whitening | None = None,
+    groups: Groups | None = None,
 ) -> tuple[GaussianMap, EStep, EmInfo]:
     """One incremental EM step: fuse the points of `aligned` (world frame) that the submap explains.
 
-    `noise` is the standard deviation of each point along its viewing ray, a vector in metres; `white` as in `e_step`.
+    `noise` is the standard deviation of each point along its viewing ray, a vector in metres; `white` and
+    `groups` as in `e_step`.
 
     Returns:
         The updated submap, what explains which point, and counts. Without any fused point the submap is unchanged.
     """
     gaussians = submap.gaussians
-    step, best = e_step(gaussians, aligned, noise, config, white)
+    step, best = e_step(gaussians, aligned, noise, config, white, groups)
     new, total = m_step(gaussians, aligned, precision(noise, config), step, config)
     evidence = jnp.where(total > 0, support(gaussians, aligned, step, config), 0.0)
     updated, gain = update_average(submap, new, evidence, config.average)

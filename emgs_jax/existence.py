@@ -13,7 +13,7 @@ from emgs_jax.gaussians import blend, has_feature
 from emgs_jax.observation import Observation, depth_in
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.linalg import inverse_3x3, mahalanobis_sq, outer
-from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.neighbours import group_points, nearest, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, put_rows, static, take_rows, traced, where_rows
 
@@ -216,7 +216,9 @@ def nearest_layers(
     with its own error. Then it is taken under ν² (1 / W_a + 1 / W_b), what the means of so many frames differ by.
     """
     gaussians, count = map.gaussians, is_seen.shape[0]
-    rows, found = knn(gaussians.means, gaussians.means, is_seen, config.num_neighbours, is_seen)
+    groups = group_points(gaussians.means, is_seen)
+    order = order_of(groups, count)
+    rows, found = nearest(gaussians.means, is_seen, gaussians.means, groups, config.num_neighbours, order=order)
     near = jax.tree.map(lambda leaf: leaf[rows], gaussians)
     offsets, normals = near.means - gaussians.means[:, None], gaussians.normals[:, None]
     both = gaussians.covs[:, None] + near.covs
@@ -236,8 +238,8 @@ def nearest_layers(
     has_both = has_feature(near.features) & has_feature(gaussians.features)[:, None]
     found &= ~has_both | (_inner(near.features, gaussians.features[:, None]) > 0)
     distance_sq = jnp.where(found, distance_sq, jnp.inf)
-    nearest = jnp.argmin(distance_sq, axis=-1)[:, None]
-    partner = jnp.take_along_axis(rows, nearest, axis=-1)[:, 0]
+    best = jnp.argmin(distance_sq, axis=-1)[:, None]
+    partner = jnp.take_along_axis(rows, best, axis=-1)[:, 0]
     has_layer = jnp.any(found, axis=-1)
     return partner, has_layer & has_layer[partner] & (partner[partner] == jnp.arange(count))
 

@@ -9,7 +9,7 @@ from emgs_jax.observation import Observation
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import kmeans, strided_seeds
 from emgs_jax.ops.linalg import dot, inverse_2x2, outer, safe_normalize, tangent_basis, whiten, whitening
-from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.neighbours import Groups, group_points, nearest, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, static, take_rows, traced, where_rows
 
@@ -75,7 +75,10 @@ def fit_to_points(
     The covariance has min_std² added on the diagonal, which keeps every eigenvalue at or above the floor. A centre
     with fewer than four points becomes invalid.
     """
-    rows, found = knn(centers, observation.points, observation.valid, config.num_fit_neighbours)
+    points, num = observation.points, config.num_fit_neighbours
+    groups = group_points(points, observation.valid)
+    # A centre stands for several points: few centres share a list, and that is long.
+    rows, found = nearest(centers, exists, points, groups, num, size=4, count=6 * num)
     valid = exists & (jnp.sum(found, axis=-1) >= 4)
     found |= ~valid[:, None]  # a softmax over nothing would be NaN; these rows are replaced below
     near = jax.tree.map(lambda leaf: leaf[rows], observation)
@@ -171,9 +174,10 @@ def intensity(colors: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
     return colors @ jnp.array(LUMINANCE, colors.dtype)
 
 
-def color_gradients(gaussians: Gaussians, num_neighbours: int) -> Float[Array, "n 3"]:
+def color_gradients(gaussians: Gaussians, groups: Groups, num_neighbours: int) -> Float[Array, "n 3"]:
     """Intensity gradient (1/m) of every Gaussian in its tangent plane, fitted to its neighbours; orthogonal to n."""
-    rows, found = knn(gaussians.means, gaussians.means, gaussians.valid, num_neighbours, gaussians.valid)
+    means, valid = gaussians.means, gaussians.valid
+    rows, found = nearest(means, valid, means, groups, num_neighbours, order=order_of(groups, valid.shape[0]))
     basis = tangent_basis(gaussians.normals)
     offsets = jnp.einsum("nkd,nda->nka", gaussians.means[rows] - gaussians.means[:, None], basis)
     offsets = jnp.where(found[..., None], offsets, 0.0)

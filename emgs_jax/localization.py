@@ -11,6 +11,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation, Prediction, transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.linalg import Whitening, safe_normalize
+from emgs_jax.ops.neighbours import Groups
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
 from emgs_jax.registration.belief import Belief, certain, measured, moved, next_belief, root_information
@@ -244,6 +245,7 @@ def localize_fine(
     coarse: CoarsePose,
     config: LocalizationConfig,
     white: Whitening | None = None,
+    groups: Groups | None = None,
 ) -> tuple[jaxlie.SE3, Observation, LocalizationInfo]:
     """Fine registration against the submap; the coarse pose and scale stay where a check fails.
 
@@ -253,6 +255,7 @@ def localize_fine(
         coarse: result of `localize_coarse`.
         config: terms, gates and checks.
         white: `whitening` of the submap's covariances; None makes it here.
+        groups: `group_points` of the valid Gaussians' means; likewise.
 
     Returns:
         T_world_camera, the observation in the world frame, and the outcome.
@@ -260,7 +263,7 @@ def localize_fine(
     scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
     noise = coarse.depth_noise * coarse.mean_depth, coarse.depth_noise
     known = root_information(coarse.belief.covariance)
-    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, noise, config.icp, white, known)
+    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, noise, config.icp, white, known, groups)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     # The length has no gradient where a step is zero, which it is to the bit with an exact prior; this has.
     step_m, step_rad = (part @ safe_normalize(part) for part in (step[:3], step[3:]))

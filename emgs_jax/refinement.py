@@ -12,7 +12,7 @@ from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
 from emgs_jax.gaussians import Gaussians, gathered_features, has_feature
 from emgs_jax.ops.camera import Camera, nearest_pixel
 from emgs_jax.ops.linalg import inverse_2x2, mahalanobis_sq, outer, safe_normalize
-from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.neighbours import group_points, nearest
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, static, take_rows, traced, where_rows
 from emgs_jax.render.composite import RenderConfig, Rendering, render_splats, splat_depth, splats_of
@@ -71,7 +71,9 @@ def match_on_image(
     map_splats: Splats, candidate_splats: Splats, visible: Bool[Array, "n"], config: RefinementConfig
 ) -> tuple[Int[Array, "g k"], Float[Array, "g k"], Bool[Array, "g k"]]:
     """The K_2D nearest visible map splats of every candidate, and the squared distance under Σ_map + Σ_candidate."""
-    rows, found = knn(candidate_splats.means, map_splats.means, visible, config.num_candidates)
+    groups = group_points(map_splats.means, visible)
+    asked = candidate_splats.means, candidate_splats.valid
+    rows, found = nearest(*asked, map_splats.means, groups, config.num_candidates)
     covs = map_splats.covs[rows] + candidate_splats.covs[:, None]
     offsets = map_splats.means[rows] - candidate_splats.means[:, None]
     return rows, mahalanobis_sq(offsets, inverse_2x2(covs)), found

@@ -1,6 +1,7 @@
 """The pipeline: `init_state` makes the map of the first window, `step` integrates one frame. Both are pure."""
 
 from collections.abc import Callable
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -29,12 +30,15 @@ from emgs_jax.observation import Observation, ObservationConfig, Prediction, tra
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.linalg import Whitening, whitening
+from emgs_jax.ops.neighbours import Groups, group_points, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, static_choice, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
 from emgs_jax.registration.belief import Belief, certain
 from emgs_jax.registration.rigid import median, pose_row
 from emgs_jax.splitting import SplittingConfig, split
+
+Index: TypeAlias = tuple[Whitening, Groups]  # of the submap's Gaussians
 
 
 class SlamConfig(eqx.Module):
@@ -167,11 +171,11 @@ def step(
     """
     thin, last = config.observation.thin, (state.previous, state.T_world_previous, state.belief)
     coarse, guess = call(_approach, prediction, last, camera, thin, config.localization)
-    submap, white, rows, submap_overflow = call(_select, state.map, (state.previous, guess), config.submap)
-    T, aligned, localization = call(_place, prediction.current, submap, coarse, config.localization, white)
+    submap, index, rows, submap_overflow = call(_select, state.map, (state.previous, guess), config.submap)
+    T, aligned, localization = call(_place, prediction.current, submap, coarse, config.localization, index)
     rows_each, place = spacing(camera, thin, config.fit), (aligned, T, localization)
     fine = rows_each, downscale(camera, thin), config.em, config.continuation, config.splitting
-    submap, rest, em, halves, origin = call(_fuse, submap, white, *place, state.time, *fine)
+    submap, rest, em, halves, origin = call(_fuse, submap, index, *place, state.time, *fine)
     candidates, weight = call(cluster, rest, call(_order, camera, thin), rows_each, config.fit)
     submap, fresh, refinement = call(_refine, submap, candidates, T, camera, thin, config.refinement)
     look = (fresh, weight, halves), place, state.time
@@ -206,24 +210,29 @@ def _approach(
 @eqx.filter_jit
 def _select(
     map: GaussianMap, clouds: tuple[Observation, ...], config: SubmapConfig
-) -> tuple[GaussianMap, Whitening, Int[Array, "s"], Int[Array, ""]]:
-    """`select_submap` with the whitening of its covariances, which stay as they are until EM."""
+) -> tuple[GaussianMap, Index, Int[Array, "s"], Int[Array, ""]]:
+    """`select_submap` with what is found once for all stages until EM, while its Gaussians stay as they are."""
     submap, rows, overflow = select_submap(map, clouds, config)
-    return submap, whitening(submap.gaussians.covs), rows, overflow
+    gaussians = submap.gaussians
+    index = whitening(gaussians.covs), group_points(gaussians.means, gaussians.valid)
+    return submap, index, rows, overflow
 
 
 @eqx.filter_jit
 def _place(
-    current: Observation, submap: GaussianMap, coarse: CoarsePose, config: LocalizationConfig, white: Whitening
+    current: Observation, submap: GaussianMap, coarse: CoarsePose, config: LocalizationConfig, index: Index
 ) -> tuple[jaxlie.SE3, Observation, LocalizationInfo]:
     """The fine pose, against what is confirmed."""
-    return localize_fine(current, confirmed(submap), coarse, config, white)
+    white, groups = index
+    target = confirmed(submap)
+    of_confirmed = group_points(target.means, target.valid, order_of(groups, target.valid.shape[0]))
+    return localize_fine(current, target, coarse, config, white, of_confirmed)
 
 
 @eqx.filter_jit
 def _fuse(
     submap: GaussianMap,
-    white: Whitening,
+    index: Index,
     aligned: Observation,
     T: jaxlie.SE3,
     localization: LocalizationInfo,
@@ -242,7 +251,7 @@ def _fuse(
     trusted = _trusted(aligned, localization)
     noise = localization.noise[:, None] * (trusted.points - T.translation())
     before = submap
-    submap, explained, em = em_update(submap, trusted, noise, config, white)
+    submap, explained, em = em_update(submap, trusted, noise, config, *index)
     owned = owners(explained, submap.birth.shape[0])
     births = take_rows(submap.birth, owned).astype(jnp.float32)
     origin = jnp.where(em.num_fused > 0, median(births, explained.is_fused), time).astype(jnp.int32)

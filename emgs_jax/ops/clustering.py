@@ -4,7 +4,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.linalg import between, dot
+from emgs_jax.ops.neighbours import group_points, nearby
+from emgs_jax.ops.pytree import take_rows
+
+BLOCK = 16  # points that share a list of seeds
+NUM_CANDIDATES = 24  # seeds near a block, among which every point keeps looking for its own while they move
 
 
 def morton_order(height: int, width: int) -> Int[Array, "{height}*{width}"]:
@@ -43,15 +48,22 @@ def kmeans(
         Centroids, which of them have points, and how many; an empty cluster stays where it was and becomes invalid.
     """
 
+    near = nearby(points, valid, group_points(seeds, seed_exists), NUM_CANDIDATES, BLOCK)
+    blocks, counts = take_rows((points, valid), near.queries)
+    counts &= near.queries < points.shape[0]
+
     def iterate(_: Int[Array, ""], state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         centroids, exists, _ = state
-        nearest, _ = knn(points, centroids, exists, 1)
-        rows = jnp.where(valid, nearest[:, 0], seeds.shape[0])
-        count = jnp.zeros(seeds.shape[0]).at[rows].add(1.0, mode="drop")
         # Offsets instead of positions: sums of many coordinates lose digits in float32.
-        offsets = points - centroids[nearest[:, 0]]
-        total = jnp.zeros_like(seeds).at[rows].add(offsets, mode="drop")
-        return centroids + total / jnp.maximum(count, 1.0)[:, None], exists & (count > 0), count
+        offsets = between(blocks, centroids[near.rows])
+        distance_sq = jnp.where((near.exists & exists[near.rows])[:, None], dot(offsets, offsets), jnp.inf)
+        nearest = jnp.argmin(distance_sq, axis=-1)[..., None]
+        is_own = counts[..., None] & (nearest == jnp.arange(near.rows.shape[1]))
+        sums = [jnp.sum(jnp.where(is_own, values, 0.0), axis=1) for values in (*offsets, jnp.ones(()))]
+        sums = jnp.stack(sums, axis=-1)
+        total = jnp.zeros((seeds.shape[0], 4)).at[near.rows].add(sums)
+        count = total[:, 3]
+        return centroids + total[:, :3] / jnp.maximum(count, 1.0)[:, None], exists & (count > 0), count
 
     start = seeds, seed_exists, seed_exists.astype(seeds.dtype)
     return jax.lax.fori_loop(0, num_iterations, iterate, start)

@@ -106,6 +106,21 @@ def gather_offsets(points: Float[Array, "m d"], table: Float[Array, "n d"], rows
     return tuple(a - b for a, b in zip(entries, gather_entries(table, rows), strict=True))
 
 
+def down(vectors: Float[Array, "b q d"]) -> Entries:
+    """Vectors of a block's q queries entry by entry, to meet the c vectors of `across`."""
+    return tuple(entry[:, :, None] for entry in jnp.unstack(vectors, axis=-1))
+
+
+def across(vectors: Float[Array, "b c d"]) -> Entries:
+    """Vectors of the c things near a block, likewise."""
+    return tuple(entry[:, None] for entry in jnp.unstack(vectors, axis=-1))
+
+
+def between(first: Float[Array, "b q d"], second: Float[Array, "b c d"]) -> Entries:
+    """first - second for every pair within each block, entry by entry."""
+    return tuple(a - b for a, b in zip(down(first), across(second), strict=True))
+
+
 def dot(first: Entries, second: Entries) -> Float[Array, "..."]:
     """Inner product."""
     return sum((a * b for a, b in zip(first, second, strict=True)), start=jnp.zeros(()))

@@ -1,19 +1,188 @@
-"""Nearest neighbours and compaction with static shapes."""
+"""Nearest neighbours and compaction with static shapes.
 
-import math
+Neighbours are looked for by blocks: queries that are near each other share a list of the points that are nearest to any
+of them, and choose among these. Everything is a few large operations on dense arrays, with one small sort for each set
+of positions, which suits a GPU and the vector units of a CPU alike.
+"""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from emgs_jax.ops.k_smallest import smallest
-from emgs_jax.ops.pytree import fill_rows, join_rows
+from emgs_jax.ops.linalg import between, dot
+from emgs_jax.ops.pytree import fill_rows, join_rows, split_rows
 
-GROUP = 32  # points per group: near each other
+GROUP = 16  # points per group: near each other
+NUM_GROUPS = 24  # groups that a block of queries looks into
+BLOCK = 8  # queries of a block of `knn`
+RANKED = 12  # values that are compared with all others at once
 CURVE_BITS = 8  # per axis, of the cells of the Hilbert curve
-# Queries at once. On a CPU they are near each other, and their distances stay in the cache.
-BLOCK, LARGE_BLOCK = 64, 256
-NUM_NEAR = 32  # groups that such a block looks at first, beside twice its share of all groups
+FAR = 1e18  # m; where what does not count stands: its squared distance is finite, and larger than any other
+MAX_BLOCKS = 4096  # which are compared with their groups at once; more are done one part after the other
+
+
+class Groups(eqx.Module):
+    """Points along a space-filling curve, so that every GROUP consecutive ones are near each other.
+
+    Args:
+        positions: of the members, coordinate by coordinate; FAR where there is none.
+        rows: of the members in the array that they come from.
+        low, high: corners of the box round each group.
+    """
+
+    positions: Float[Array, "g d p"]
+    rows: Int[Array, "g p"]
+    low: Float[Array, "g d"]
+    high: Float[Array, "g d"]
+
+
+class Nearby(eqx.Module):
+    """What is near each block of queries.
+
+    Args:
+        queries: rows of the queries of a block; one past the last where a block has room left.
+        rows: of the points that are nearest to any query of the block, nearest first.
+        exists: which of them there are.
+        beyond_sq: no other point is nearer to a query of the block than that, m².
+    """
+
+    queries: Int[Array, "b q"]
+    rows: Int[Array, "b c"]
+    exists: Bool[Array, "b c"]
+    beyond_sq: Float[Array, "b"]
+
+
+def curve_order(positions: Float[Array, "m d"], counts: Bool[Array, "m"]) -> Int[Array, "m"]:
+    """Rows along the Hilbert curve through the box of those that count; the others come last."""
+    low = jnp.min(jnp.where(counts[:, None], positions, jnp.inf), axis=0)
+    high = jnp.max(jnp.where(counts[:, None], positions, -jnp.inf), axis=0)
+    return jnp.argsort(jnp.where(counts, _curve(positions, low, high), jnp.iinfo(jnp.int32).max))
+
+
+def group_points(points: Float[Array, "n d"], valid: Bool[Array, "n"], order: Int[Array, "n"] | None = None) -> Groups:
+    """Groups of the valid points along `order`; None: along the curve."""
+    points = jax.lax.stop_gradient(points)  # a row number has no gradient
+    order = curve_order(points, valid) if order is None else order
+    counts = fill_rows(valid[order], GROUP, False).reshape(-1, GROUP)
+    members = fill_rows(points[order], GROUP, FAR).reshape(-1, GROUP, points.shape[1])
+    near, far = jnp.where(counts[..., None], members, FAR), jnp.where(counts[..., None], members, -FAR)
+    rows = fill_rows(order, GROUP, 0).reshape(-1, GROUP)
+    return Groups(near.swapaxes(1, 2), rows, jnp.min(near, axis=1), jnp.max(far, axis=1))
+
+
+def order_of(groups: Groups, num_points: int) -> Int[Array, "n"]:
+    """The order of the points that were grouped: for a search of the same points among themselves."""
+    return groups.rows.reshape(-1)[:num_points]
+
+
+def nearby(
+    queries: Float[Array, "m d"],
+    asked: Bool[Array, "m"],
+    groups: Groups,
+    count: int,
+    size: int,
+    order: Int[Array, "m"] | None = None,
+) -> Nearby:
+    """The `count` points nearest to any query of each block, of those in the groups whose boxes are nearest to it.
+
+    Args:
+        queries: m positions.
+        asked: those that count; one that is not finite never does.
+        groups: of the points.
+        count: length of the list, static; not more than NUM_GROUPS groups hold.
+        size: queries of a block, static.
+        order: of the queries, `size` consecutive ones are a block; None: along the curve.
+    """
+    queries, groups = jax.lax.stop_gradient((queries, groups))
+    asked &= jnp.all(jnp.isfinite(queries), axis=-1)
+    order = curve_order(queries, asked) if order is None else order
+    rows = fill_rows(order, size, queries.shape[0]).reshape(-1, size)
+    counts = fill_rows(asked[order], size, False).reshape(-1, size)
+    blocks = jnp.where(counts[..., None], queries.at[rows].get(mode="clip"), -FAR)
+    count = min(count, groups.rows.size)
+    parts = split_rows((blocks, counts), MAX_BLOCKS)
+    found = jax.lax.map(lambda part: _nearest_to_any(*part, groups, count), parts)
+    return Nearby(rows, *join_rows(found, rows.shape[0]))
+
+
+def _nearest_to_any(
+    blocks: Float[Array, "b q d"], counts: Bool[Array, "b q"], groups: Groups, count: int
+) -> tuple[Int[Array, "b c"], Bool[Array, "b c"], Float[Array, "b"]]:
+    """`nearby` for blocks as they are; a query that does not count is at -FAR."""
+    low = jnp.min(jnp.where(counts[..., None], blocks, FAR), axis=1)
+    high = jnp.max(blocks, axis=1)
+    gap_sq = _distance_to_boxes_sq(low, high, groups)
+    num_groups = min(max(NUM_GROUPS, -(-count // GROUP)), groups.rows.shape[0])
+    negative, near = jax.lax.top_k(-gap_sq, num_groups)
+    # The least of what `top_k` gives, not its last column: XLA makes a whole sort of one that is sliced.
+    beyond_sq = -jnp.min(negative, axis=1) if num_groups < groups.rows.shape[0] else jnp.inf
+    members = [values[near].reshape(near.shape[0], -1) for values in jnp.unstack(groups.positions, axis=1)]
+    # One query and one coordinate after the other: sums over short axes would not fill the vectors of a CPU.
+    nearest_sq = jnp.full(members[0].shape, jnp.inf)
+    for query in jnp.unstack(blocks, axis=1):
+        offsets = tuple(x[:, None] - y for x, y in zip(jnp.unstack(query, axis=-1), members, strict=True))
+        nearest_sq = jnp.minimum(nearest_sq, dot(offsets, offsets))
+    negative, best = jax.lax.top_k(-nearest_sq, count)
+    rows = groups.rows[jnp.take_along_axis(near, best // GROUP, axis=1), best % GROUP]
+    is_cut = count < nearest_sq.shape[1]
+    return (
+        rows,
+        negative > -FAR,
+        jnp.minimum(beyond_sq, -jnp.min(negative, axis=1) if is_cut else jnp.full(rows.shape[:1], jnp.inf)),
+    )
+
+
+def _distance_to_boxes_sq(low: Float[Array, "b d"], high: Float[Array, "b d"], groups: Groups) -> Float[Array, "b g"]:
+    """Squared distance of each block's box to those of the groups."""
+    corners = (jnp.unstack(x, axis=-1) for x in (low, high, groups.low, groups.high))
+    gaps = tuple(
+        jnp.maximum(jnp.maximum(group_low - b[:, None], a[:, None] - group_high), 0.0)
+        for a, b, group_low, group_high in zip(*corners, strict=True)
+    )
+    return dot(gaps, gaps)
+
+
+def of_queries(near: Nearby, values: Shaped[Array, "b q *v"], num_queries: int) -> Shaped[Array, "m *v"]:
+    """Values of the queries of all blocks in the order of the queries."""
+    return jnp.zeros((num_queries, *values.shape[2:]), values.dtype).at[near.queries].set(values, mode="drop")
+
+
+def among_nearest(distance_sq: Float[Array, "*b c"], exists: Bool[Array, "*#b c"], k: int) -> Bool[Array, "*b c"]:
+    """Which of c points are the k nearest of those that exist."""
+    return exists & (ranks(jnp.where(exists, distance_sq, jnp.inf)) < k)
+
+
+def nearest(
+    queries: Float[Array, "m d"],
+    asked: Bool[Array, "m"],
+    points: Float[Array, "n d"],
+    groups: Groups,
+    k: int,
+    size: int = BLOCK,
+    count: int = 0,
+    order: Int[Array, "m"] | None = None,
+) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
+    """The k nearest points of every query among those `nearby` its block, nearest first.
+
+    For positions on surfaces that is nearly always those of `knn`: the farthest of the k may be missed.
+
+    Args:
+        queries: m positions.
+        asked: those that count; the others may have any answer or none.
+        points: n positions.
+        groups: of those that count.
+        k: number of neighbours, static.
+        size: queries of a block, static.
+        count: length of a block's list; by default 4 k, at least 32.
+        order: of the queries; None: along the curve.
+
+    Returns:
+        Row numbers into `points`, and which of them exist.
+    """
+    near, rows, distance_sq = _search(queries, asked, points, groups, k, size, count, order)
+    rows, exists = (of_queries(near, values, queries.shape[0]) for values in (rows, distance_sq < FAR))
+    return rows, exists
 
 
 def knn(
@@ -23,66 +192,83 @@ def knn(
     k: int,
     asked: Bool[Array, "m"] | None = None,
 ) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
-    """The k nearest valid points of every query, nearest first; exact up to `smallest`'s precision.
+    """The k nearest valid points of every query, nearest first, exactly.
 
-    Points and queries are sorted along the Hilbert curve, so that groups of points and blocks of queries are compact.
-    On a CPU a block looks at the groups whose boxes are nearest to its own, then at the next ones as long as they might
-    hold one of the k nearest; on an accelerator, which such a condition would hold up, it looks at all points.
+    As `nearest`, but a block whose list may lack one of them is compared with all points, one block after the other.
 
     Args:
         queries: m positions.
         points: n positions.
         valid: which points count.
         k: number of neighbours, static; at most n.
-        asked: queries that need an answer, None for all; on a CPU the others cost next to nothing.
+        asked: queries that need an answer, None for all.
 
     Returns:
         Row numbers into `points`, and which of them exist: False where fewer than k points are valid. A query that is
         not asked may have any or none.
     """
     queries, points = jax.lax.stop_gradient((queries, points))  # a row number has no gradient
-    low = jnp.min(jnp.where(valid[:, None], points, jnp.inf), axis=0)
-    high = jnp.max(jnp.where(valid[:, None], points, -jnp.inf), axis=0)
-    cells = _curve(jnp.concatenate([points, queries]), low, high)
-    order = jnp.argsort(jnp.where(valid, cells[: points.shape[0]], jnp.iinfo(jnp.int32).max))
     asked = jnp.ones(queries.shape[0], bool) if asked is None else asked
-    query_order = jnp.argsort(jnp.where(asked, cells[points.shape[0] :], jnp.iinfo(jnp.int32).max))
-    sorted_points = jnp.where(valid[:, None], points, jnp.inf)[order]
-    groups = fill_rows(sorted_points, GROUP, jnp.inf).reshape(-1, GROUP, points.shape[1])
-    # Those that are not asked come last; wherever they are, they must not widen the box of a block.
-    sorted_queries = jnp.where(asked[:, None], queries, queries[query_order[0]])[query_order]
-    rows, exists = jax.lax.platform_dependent(
-        sorted_queries,
-        asked[query_order],
-        groups,
-        cpu=lambda queries, asked, groups: _by_blocks(queries, asked, groups, BLOCK, NUM_NEAR, k),
-        default=lambda queries, asked, groups: _by_blocks(queries, asked, groups, LARGE_BLOCK, groups.shape[0], k),
-    )
-    found = jnp.where(exists, order[rows], 0), exists
-    return jax.tree.map(lambda sorted_rows: jnp.zeros_like(sorted_rows).at[query_order].set(sorted_rows), found)
+    near, *found = _search(queries, asked, points, group_points(points, valid), k, BLOCK, 0, None)
+    blocks = queries.at[near.queries].get(mode="clip")
+    is_asked = asked.at[near.queries].get(mode="fill", fill_value=False)
+    is_open = jnp.any(is_asked & (found[1][..., -1] > near.beyond_sq[:, None]), axis=1)
+    open_blocks, _, _ = compact_rows(is_open, is_open.shape[0])
+
+    def look_at_all(number: Int[Array, ""], found: list[Array]) -> list[Array]:
+        block = open_blocks[number]
+        distance_sq = jnp.sum((blocks[block][:, None] - points) ** 2, axis=-1)
+        negative, rows = jax.lax.top_k(-jnp.where(valid, distance_sq, 3.0 * FAR**2), k)
+        return [found[0].at[block].set(rows), found[1].at[block].set(-negative)]
+
+    rows, distance_sq = jax.lax.fori_loop(0, jnp.sum(is_open), look_at_all, found)
+    rows, exists = (of_queries(near, values, queries.shape[0]) for values in (rows, distance_sq < FAR))
+    return jnp.where(exists, rows, 0), exists
 
 
-def _by_blocks(
+def _search(
     queries: Float[Array, "m d"],
     asked: Bool[Array, "m"],
-    groups: Float[Array, "g p d"],
-    size: int,
-    num_near: int,
+    points: Float[Array, "n d"],
+    groups: Groups,
     k: int,
-) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
-    """Neighbours of all queries, block after block, as rows of the flattened groups; free places are at infinity."""
-    num_queries, num_axes = queries.shape
-    blocks = jnp.pad(queries, ((0, -num_queries % size), (0, 0)), mode="edge").reshape(-1, size, num_axes)
-    is_asked = jnp.any(fill_rows(asked, size, False).reshape(-1, size), axis=1)
-    num_near = max(num_near + 2 * groups.shape[0] // blocks.shape[0], -(-k // GROUP))
-    if num_near < groups.shape[0]:
-        boxes = jnp.min(groups, axis=1), jnp.max(jnp.where(jnp.isfinite(groups), groups, -jnp.inf), axis=1)
-        search = lambda block: _search_near(*block, groups, boxes, num_near, k)  # noqa: E731
-    else:
-        search = lambda block: _search(block[0], groups.reshape(-1, num_axes), k)  # noqa: E731
-    rows, distance_sq = jax.lax.map(search, (blocks, is_asked))
-    found = rows.swapaxes(1, 2), jnp.isfinite(distance_sq).swapaxes(1, 2)
-    return join_rows(found, num_queries)
+    size: int,
+    count: int,
+    order: Int[Array, "m"] | None,
+) -> tuple[Nearby, Int[Array, "b q k"], Float[Array, "b q k"]]:
+    """What is near each block, and of every query the k nearest of these with their squared distances."""
+    queries, points = jax.lax.stop_gradient((queries, points))
+    near = nearby(queries, asked, groups, count or max(4 * k, 32), size, order)
+    blocks = queries.at[near.queries].get(mode="clip")
+    offsets = between(blocks, jnp.where(near.exists[..., None], points[near.rows], FAR))
+    distance_sq = dot(offsets, offsets)
+    rank = ranks(distance_sq)
+    # To every rank its row; what comes after the k nearest falls off the end.
+    places = *jnp.indices(rank.shape, sparse=True)[:2], rank
+    beyond = jnp.zeros((*rank.shape[:2], k), jnp.int32), jnp.full((*rank.shape[:2], k), 3.0 * FAR**2)
+    found = jnp.broadcast_to(near.rows[:, None], rank.shape), distance_sq
+    rows, found_sq = (start.at[places].set(values, mode="drop") for start, values in zip(beyond, found, strict=True))
+    return near, rows, found_sq
+
+
+def ranks(values: Float[Array, "*b c"]) -> Int[Array, "*b c"]:
+    """How many of the c values, which are not negative, are smaller than each of them; each has another rank.
+
+    Some values after the others are compared with all: operations on whole vectors instead of a sort of each row, in a
+    loop, or XLA would do them anew for everything that looks at the ranks. Values that differ by less than c · 2⁻²³ of
+    themselves count as equal; of these the first comes first.
+    """
+    num = values.shape[-1]
+    # Not negative floats are ordered as their bits are, the last of which carry the place.
+    place_bits = (1 << (num - 1).bit_length()) - 1
+    keys = (jax.lax.bitcast_convert_type(values, jnp.int32) & ~place_bits) | jnp.arange(num)
+    others = jnp.pad(keys, [(0, 0)] * (keys.ndim - 1) + [(0, -num % RANKED)], constant_values=jnp.iinfo(jnp.int32).max)
+
+    def compare(turn: Int[Array, ""], rank: Int[Array, "*b c"]) -> Int[Array, "*b c"]:
+        some = jax.lax.dynamic_slice_in_dim(others, turn * RANKED, RANKED, axis=-1)
+        return rank + sum(some[..., number : number + 1] < keys for number in range(RANKED))
+
+    return jax.lax.fori_loop(0, -(-num // RANKED), compare, jnp.zeros(keys.shape, jnp.int32))
 
 
 def _curve(positions: Float[Array, "m d"], low: Float[Array, "d"], high: Float[Array, "d"]) -> Int[Array, "m"]:
@@ -112,83 +298,6 @@ def _curve(positions: Float[Array, "m d"], low: Float[Array, "d"], high: Float[A
         for axis in axes:
             code = (code << 1) | (((axis ^ flips) >> bit) & 1)
     return code
-
-
-def _search_near(
-    queries: Float[Array, "q d"],
-    is_asked: Bool[Array, ""],
-    groups: Float[Array, "g p d"],
-    boxes: tuple[Float[Array, "g d"], Float[Array, "g d"]],
-    num_near: int,
-    k: int,
-) -> tuple[Int[Array, "k q"], Float[Array, "k q"]]:
-    """`_search` in the `num_near` groups nearest to the queries' box, then in the next, until none is nearer."""
-    low, high = boxes
-    gaps = jnp.maximum(jnp.maximum(low - jnp.max(queries, axis=0), jnp.min(queries, axis=0) - high), 0.0)
-
-    def is_open(state: tuple) -> Bool[Array, ""]:
-        ahead_sq, (_, distance_sq) = state
-        nearest_sq = jnp.min(ahead_sq)
-        return is_asked & jnp.isfinite(nearest_sq) & ~jnp.all(distance_sq[-1] <= nearest_sq)
-
-    def look(state: tuple) -> tuple:
-        ahead_sq, found = state
-        near_sq, near = jax.lax.top_k(-ahead_sq, num_near)
-        # The last turn may have room left, which must not be filled with groups that were looked at before.
-        members = jnp.where(jnp.isfinite(near_sq)[:, None, None], groups[near], jnp.inf)
-        index, distance_sq = _search(queries, members.reshape(-1, groups.shape[2]), k)
-        rows = near[index // GROUP] * GROUP + index % GROUP
-        both = jax.tree.map(lambda old, new: jnp.concatenate([old, new]), found, (rows, distance_sq))
-        best = smallest(both[1], k)
-        found = jax.tree.map(lambda values: jnp.take_along_axis(values, best, axis=0), both)
-        return ahead_sq.at[near].set(jnp.inf), found
-
-    nothing = jnp.zeros((k, queries.shape[0]), jnp.int32), jnp.full((k, queries.shape[0]), jnp.inf)
-    return jax.lax.while_loop(is_open, look, (jnp.sum(gaps**2, axis=-1), nothing))[1]
-
-
-def _search(
-    queries: Float[Array, "q d"], points: Float[Array, "n d"], k: int
-) -> tuple[Int[Array, "k q"], Float[Array, "k q"]]:
-    """Rows of the k nearest of all points, nearest first, and their squared distances.
-
-    Every one of the k nearest is in one of k sets of points whose nearest member is nearest, so only those sets are
-    sorted: a minimum over sets is much cheaper than a partial sort of all distances.
-    """
-    num_sets = GROUP * max(-(-k // GROUP), math.isqrt(k * points.shape[0]) // GROUP, 1)
-    points = fill_rows(points, num_sets, jnp.inf)
-    members, columns = points.reshape(-1, num_sets, points.shape[1]), queries.T
-    nearest_sq = jax.lax.platform_dependent(
-        members,
-        columns,
-        cpu=_nearest_member_by_parts,
-        default=lambda members, columns: jnp.min(_distance_sq(members[:, :, None], columns), axis=0),
-    )
-    sets = smallest(nearest_sq, k)
-    candidates = _distance_sq(members[:, sets], columns).reshape(-1, queries.shape[0])
-    best = smallest(candidates, k)
-    rows = (best // k) * num_sets + jnp.take_along_axis(sets, best % k, axis=0)
-    return rows, jnp.take_along_axis(candidates, best, axis=0)
-
-
-def _nearest_member_by_parts(members: Float[Array, "m s d"], columns: Float[Array, "d q"]) -> Float[Array, "s q"]:
-    """Squared distance from every query to the nearest member of each set.
-
-    Part of the sets after part, member after member: XLA would share larger pieces among the processor's threads, which
-    takes longer than the work, and would not fill the vectors in a reduction over the first axis.
-    """
-
-    def closer(least_sq: Float[Array, "p q"], points: Float[Array, "p d"]) -> tuple[Float[Array, "p q"], None]:
-        return jnp.minimum(least_sq, _distance_sq(points[:, None], columns)), None
-
-    start = jnp.full((GROUP, columns.shape[1]), jnp.inf)
-    parts = members.reshape(members.shape[0], -1, GROUP, members.shape[2]).swapaxes(0, 1)
-    return jax.lax.map(lambda part: jax.lax.scan(closer, start, part)[0], parts).reshape(-1, columns.shape[1])
-
-
-def _distance_sq(points: Float[Array, "*#b d"], columns: Float[Array, "d q"]) -> Float[Array, "*b"]:
-    # One axis after the other, and the queries last: so the sums fill the processor's vectors.
-    return sum(((points[..., axis] - columns[axis]) ** 2 for axis in range(columns.shape[0])), start=jnp.zeros(()))
 
 
 def compact_rows(mask: Bool[Array, "n"], capacity: int) -> tuple[Int[Array, "c"], Bool[Array, "c"], Int[Array, ""]]:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import Whitening
+from emgs_jax.ops.neighbours import Groups
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.matching import Matches, surface_of
 from emgs_jax.registration.noise import confidence_levels, noise_of_levels, num_independent, robust_std
@@ -125,6 +126,7 @@ def icp(
     config: IcpConfig,
     white: Whitening | None = None,
     known: Float[Array, "7 7"] | None = None,
+    groups: Groups | None = None,
 ) -> tuple[jaxlie.SE3, Float[Array, ""], IcpInfo]:
     """Place camera-frame `source` on `target`: argmin over xi and s of data + prior, T = T_world_coarse exp(xi).
 
@@ -146,12 +148,13 @@ def icp(
         white: `whitening` of the target's covariances; None makes it here.
         known: root of the information of the coarse pose and scale, (xi, log s), where there is a prior; None: that of
             `noise`.
+        groups: `group_points` of the valid Gaussians' means; None makes it here.
 
     Returns:
         T_world_camera, the scale, and what the solve found.
     """
     source = jax.tree.map(lambda leaf: leaf[:: max(leaf.shape[0] // config.num_points, 1)], source)
-    surface = surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, white)
+    surface = surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, white, groups)
 
     def problem_of(uncertainty: Uncertainty) -> Problem:
         return pose_problem(source, surface, T_world_coarse, noise[1], uncertainty, config, known)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.gaussians import Gaussians, color_gradients, intensity
 from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import Whitening, dot, gather_entries, gather_offsets, mahalanobis_sq, whiten, whitening, widen
+from emgs_jax.ops.neighbours import Groups, group_points
 
 Candidates: TypeAlias = tuple[Int[Array, "p k"], Bool[Array, "p k"]]  # of `knn`: rows of the Gaussians, which exist
 
@@ -19,6 +20,7 @@ class Surface(eqx.Module):
 
     Args:
         gaussians: n of them, world frame.
+        groups: of the means of the valid ones, see `group_points`.
         triangles: of `whitening`.
         plane_vars: m²; variance along the normal.
         light: luminance.
@@ -26,6 +28,7 @@ class Surface(eqx.Module):
     """
 
     gaussians: Gaussians
+    groups: Groups
     triangles: Float[Array, "n 6"]
     plane_vars: Float[Array, "n"]
     light: Float[Array, "n"]
@@ -50,17 +53,23 @@ class Matches(eqx.Module):
 
 
 def surface_of(
-    gaussians: Gaussians, has_color: Bool[Array, ""], num_color_neighbours: int, white: Whitening | None = None
+    gaussians: Gaussians,
+    has_color: Bool[Array, ""],
+    num_color_neighbours: int,
+    white: Whitening | None = None,
+    groups: Groups | None = None,
 ) -> Surface:
-    """Whitening (made here where it is None), thickness and colour gradients; zero gradients unless `has_color`."""
+    """Whitening, groups (made here where they are None), thickness and colour gradients, zero unless `has_color`."""
+    groups = group_points(gaussians.means, gaussians.valid) if groups is None else groups
     # Only where colour counts: the gradients cost a neighbour search over the submap.
     gradients = jax.lax.cond(
         has_color,
-        lambda: color_gradients(gaussians, num_color_neighbours),
+        lambda: color_gradients(gaussians, groups, num_color_neighbours),
         lambda: jnp.zeros_like(gaussians.means),
     )
     return Surface(
         gaussians=gaussians,
+        groups=groups,
         triangles=(whitening(gaussians.covs) if white is None else white)[0],
         plane_vars=mahalanobis_sq(gaussians.normals, gaussians.covs),  # n' Σ n
         light=intensity(gaussians.colors),

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from emgs_jax.ops.ranks import kth_smallest
 from emgs_jax.registration.rigid import MIN_PAIRS, median
 
 NUM_LEVELS = 8  # of confidence
@@ -17,9 +18,9 @@ def confidence_levels(confidence: Float[Array, "p"], valid: Bool[Array, "p"]) ->
     Only the order counts, since networks mean different things by their numbers. Equal confidences have equal levels:
     a constant one says nothing, and all points have level 0.
     """
-    ordered = jnp.sort(jnp.where(valid, confidence, jnp.inf))
-    below = jnp.searchsorted(ordered, confidence, side="left")
-    return jnp.clip(NUM_LEVELS * below // jnp.maximum(jnp.sum(valid), 1), 0, NUM_LEVELS - 1)
+    share = jnp.arange(1, NUM_LEVELS) * jnp.sum(valid)
+    edges = kth_smallest(confidence, valid, -(-share // NUM_LEVELS) - 1)  # the last of each level's lower ones
+    return jnp.sum(confidence[:, None] > edges, axis=-1)
 
 
 def robust_std(errors: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from emgs_jax.gaussians import intensity
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.linalg import whiten, widen
-from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.neighbours import nearest
 from emgs_jax.ops.pytree import choice, static, traced
 from emgs_jax.registration.matching import Candidates, Matches, Surface, match
 
@@ -125,8 +125,8 @@ def pose_of(y: Float[Array, "7"], problem: Problem) -> tuple[jaxlie.SE3, Float[A
 def candidates_at(y: Float[Array, "7"], problem: Problem, config: IcpConfig) -> Candidates:
     """The Gaussians near every point, placed by the unknowns y."""
     T, scale = pose_of(y, problem)
-    target = problem.surface.gaussians
-    return knn(transform(T, problem.source, scale).points, target.means, target.valid, config.num_neighbours)
+    surface, points = problem.surface, transform(T, problem.source, scale).points
+    return nearest(points, problem.source.valid, surface.gaussians.means, surface.groups, config.num_neighbours)
 
 
 def matches_at(y: Float[Array, "7"], candidates: Candidates, problem: Problem, config: IcpConfig) -> Matches:

@@ -7,6 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.ops.linalg import SMALLEST_LENGTH
 from emgs_jax.ops.precision import full_precision
+from emgs_jax.ops.ranks import kth_smallest
 
 MIN_PAIRS = 16  # fewer pairs of noisy points do not make a pose
 
@@ -29,8 +30,8 @@ def interpolate(start: jaxlie.SE3, end: jaxlie.SE3, share: Float[Array, ""]) -> 
 def median(values: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
     """Lower median of the valid values; 1 without any."""
     count = jnp.sum(valid)
-    ordered = jnp.sort(jnp.where(valid, values, jnp.inf))
-    return jnp.where(count > 0, ordered[jnp.maximum(count - 1, 0) // 2], 1.0)
+    middle = kth_smallest(values, valid, jnp.maximum(count - 1, 0)[None] // 2)[0]
+    return jnp.where(count > 0, middle, 1.0)
 
 
 @full_precision

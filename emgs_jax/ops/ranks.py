@@ -1,0 +1,31 @@
+"""Values by their rank, without a sort."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+DIGIT_BITS = 2  # of a rank's value that one look at all values finds
+
+
+def kth_smallest(values: Float[Array, "p"], valid: Bool[Array, "p"], ranks: Int[Array, "r"]) -> Float[Array, "r"]:
+    """The valid values with these ranks, 0 the smallest, exactly; NaN where there are fewer.
+
+    Floats are ordered as their bits are, once those of negative ones are turned round. The bits of an answer are found
+    from the highest on, by how many values are smaller than each of the numbers that begin with what is known.
+    """
+    bits = jax.lax.bitcast_convert_type(values, jnp.int32)
+    turned = bits ^ ((bits >> 31) & jnp.int32(0x7FFFFFFF))
+    top = jnp.uint32(1 << 31)
+    keys = jnp.where(valid, jax.lax.bitcast_convert_type(turned, jnp.uint32) ^ top, jnp.uint32(0xFFFFFFFF))
+    digits = jnp.arange(1, 1 << DIGIT_BITS, dtype=jnp.uint32)
+
+    def find_digit(turn: Int[Array, ""], known: Array) -> Array:
+        shift = (32 - DIGIT_BITS * (turn + 1)).astype(jnp.uint32)
+        begins = known[:, None] | (digits << shift)
+        num_smaller = jnp.sum(keys < begins[..., None], axis=-1)
+        return known | (jnp.sum(num_smaller <= ranks[:, None], axis=-1).astype(jnp.uint32) << shift)
+
+    found = jax.lax.fori_loop(0, 32 // DIGIT_BITS, find_digit, jnp.zeros(ranks.shape, jnp.uint32)) ^ top
+    bits = jax.lax.bitcast_convert_type(found, jnp.int32)
+    found = jax.lax.bitcast_convert_type(bits ^ ((bits >> 31) & jnp.int32(0x7FFFFFFF)), jnp.float32)
+    return jnp.where(ranks < jnp.sum(valid), found, jnp.nan)
