@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.ops.linalg import safe_normalize
 from emgs_jax.ops.precision import full_precision
@@ -65,13 +65,6 @@ class ObservationConfig(eqx.Module):
     min_confidence: Float[Array, "*b"] = traced(low=0)
 
 
-def _shifted(image: Array, dy: int, dx: int, radius: int) -> Array:
-    """`image` moved by (dy, dx) with zeros beyond the border."""
-    height, width = image.shape[:2]
-    padded = jnp.pad(image, [(radius, radius), (radius, radius)] + [(0, 0)] * (image.ndim - 2))
-    return padded[radius + dy : radius + dy + height, radius + dx : radius + dx + width]
-
-
 def normals_from_pointmap(
     points: Float[Array, "h w 3"], valid: Bool[Array, "h w"], config: ObservationConfig
 ) -> Float[Array, "h w 3"]:
@@ -88,36 +81,31 @@ def normals_from_pointmap(
     inverse_depth = jnp.where(valid, 1.0 / jnp.where(valid, depth, 1.0), 0.0)
     ray_xy = points[..., :2] * inverse_depth[..., None]
     radius, spacing = config.normal_radius, config.normal_spacing
-    taps = [(dy, dx) for dy in range(-radius, radius + 1, spacing) for dx in range(-radius, radius + 1, spacing)]
+    steps = jnp.arange(0, 2 * radius + 1, spacing)
+    taps = jnp.stack(jnp.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    border = [(radius, radius), (radius, radius)]
+    around = jnp.pad(inverse_depth, border), jnp.pad(ray_xy, [*border, (0, 0)])
 
-    count = jnp.zeros_like(depth)
-    moments = jnp.zeros((*depth.shape, 3))  # of the ray offsets: xx, xy, yy
-    cross = jnp.zeros((*depth.shape, 2))
-    sums = jnp.zeros((*depth.shape, 3))  # x, y, 1/z, all relative to the pixel itself
-    for dy, dx in taps:
-        other = _shifted(inverse_depth, dy, dx, radius)
-        weight = ((other > 0) & (jnp.abs(other - inverse_depth) <= config.max_depth_step * inverse_depth)).astype(
-            depth.dtype
-        )
-        x, y = jnp.moveaxis(_shifted(ray_xy, dy, dx, radius) - ray_xy, -1, 0)
-        u = other - inverse_depth
-        count += weight
-        sums += weight[..., None] * jnp.stack([x, y, u], axis=-1)
-        moments += weight[..., None] * jnp.stack([x * x, x * y, y * y], axis=-1)
-        cross += weight[..., None] * jnp.stack([x * u, y * u], axis=-1)
+    def add(moments: tuple[Array, ...], tap: Int[Array, "2"]) -> tuple[tuple[Array, ...], None]:
+        """One neighbour of every pixel: its count, offsets x, y, u = 1/z relative to the pixel, and their products."""
+        other, ray = (jax.lax.dynamic_slice(x, (*tap, 0)[: x.ndim], (*depth.shape, 2)[: x.ndim]) for x in around)
+        is_same = (other > 0) & (jnp.abs(other - inverse_depth) <= config.max_depth_step * inverse_depth)
+        (x, y), u = jnp.unstack(ray - ray_xy, axis=-1), other - inverse_depth
+        terms = jnp.ones_like(u), x, y, u, x * x, x * y, y * y, x * u, y * u
+        return tuple(sum + jnp.where(is_same, term, 0.0) for sum, term in zip(moments, terms, strict=True)), None
 
-    mean = sums / jnp.maximum(count, 1.0)[..., None]
-    xx = moments[..., 0] - count * mean[..., 0] ** 2
-    xy = moments[..., 1] - count * mean[..., 0] * mean[..., 1]
-    yy = moments[..., 2] - count * mean[..., 1] ** 2
-    xu = cross[..., 0] - count * mean[..., 0] * mean[..., 2]
-    yu = cross[..., 1] - count * mean[..., 1] * mean[..., 2]
+    # A loop: unrolled, these few lines were a tenth of all that is compiled.
+    sums, _ = jax.lax.scan(add, (jnp.zeros_like(depth),) * 9, taps)
+    count, xx, xy, yy, xu, yu = sums[0], *sums[4:]
+    x, y, u = (total / jnp.maximum(count, 1.0) for total in sums[1:4])
+    xx, xy, yy = xx - count * x**2, xy - count * x * y, yy - count * y**2
+    xu, yu = xu - count * x * u, yu - count * y * u
     det = xx * yy - xy * xy
     # Valid pixels in one line determine no plane; rounding must not decide.
-    is_fitted = valid & (count > len(taps) / 5) & (det > 1e-4 * (xx + yy) ** 2)
+    is_fitted = valid & (count > taps.shape[0] / 5) & (det > 1e-4 * (xx + yy) ** 2)
     safe_det = jnp.where(is_fitted, det, 1.0)
     slope = jnp.stack([yy * xu - xy * yu, xx * yu - xy * xu], axis=-1) / safe_det[..., None]
-    level = inverse_depth + mean[..., 2] - jnp.sum(slope * (mean[..., :2] + ray_xy), axis=-1)
+    level = inverse_depth + u - jnp.sum(slope * (jnp.stack([x, y], axis=-1) + ray_xy), axis=-1)
     normals = -safe_normalize(jnp.concatenate([slope, level[..., None]], axis=-1))
     return jnp.where(is_fitted[..., None], normals, 0.0)
 

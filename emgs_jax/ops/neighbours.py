@@ -116,7 +116,9 @@ def _nearest_to_any(
     num_groups = min(max(NUM_GROUPS, -(-count // GROUP)), groups.rows.shape[0])
     negative, near = jax.lax.top_k(-gap_sq, num_groups)
     # The least of what `top_k` gives, not its last column: XLA makes a whole sort of one that is sliced.
-    beyond_sq = -jnp.min(negative, axis=1) if num_groups < groups.rows.shape[0] else jnp.inf
+    beyond_sq = -jnp.min(negative, axis=1)
+    if num_groups == groups.rows.shape[0]:  # it looks into all of them
+        beyond_sq = jnp.full_like(beyond_sq, jnp.inf)
     members = [values[near].reshape(near.shape[0], -1) for values in jnp.unstack(groups.positions, axis=1)]
     # One query and one coordinate after the other: sums over short axes would not fill the vectors of a CPU.
     nearest_sq = jnp.full(members[0].shape, jnp.inf)
@@ -125,12 +127,9 @@ def _nearest_to_any(
         nearest_sq = jnp.minimum(nearest_sq, dot(offsets, offsets))
     negative, best = jax.lax.top_k(-nearest_sq, count)
     rows = groups.rows[jnp.take_along_axis(near, best // GROUP, axis=1), best % GROUP]
-    is_cut = count < nearest_sq.shape[1]
-    return (
-        rows,
-        negative > -FAR,
-        jnp.minimum(beyond_sq, -jnp.min(negative, axis=1) if is_cut else jnp.full(rows.shape[:1], jnp.inf)),
-    )
+    if count < nearest_sq.shape[1]:  # what is nearby beside the list
+        beyond_sq = jnp.minimum(beyond_sq, -jnp.min(negative, axis=1))
+    return rows, negative > -FAR, beyond_sq
 
 
 def _distance_to_boxes_sq(low: Float[Array, "b d"], high: Float[Array, "b d"], groups: Groups) -> Float[Array, "b g"]:
