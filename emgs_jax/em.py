@@ -134,7 +134,10 @@ def e_step(
     groups = group_points(gaussians.means, gaussians.valid) if groups is None else groups
     near = nearby(points.points, points.valid, groups, config.num_candidates, BLOCK)
     table = gaussians, whitening(gaussians.covs) if white is None else white
-    parts = split_rows((near, *take_rows((points, noise), near.queries)), MAX_BLOCKS)
+    blocks, noise = take_rows((points, noise), near.queries)
+    # Where a block has room left there is no point.
+    blocks = eqx.tree_at(lambda o: o.valid, blocks, blocks.valid & (near.queries < points.valid.shape[0]))
+    parts = split_rows((near, blocks, noise), MAX_BLOCKS)
     explained = jax.lax.map(lambda part: _explain(table, *part, config), parts)
     responsibilities, is_fused, best = join_rows(explained, near.rows.shape[0])
     is_fused, best = (of_queries(near, values, points.valid.shape[0]) for values in (is_fused, best))

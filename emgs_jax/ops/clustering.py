@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.ops.linalg import between, dot
-from emgs_jax.ops.neighbours import group_points, nearby
+from emgs_jax.ops.neighbours import compact_rows, group_points, nearby
 from emgs_jax.ops.pytree import take_rows
 
 BLOCK = 16  # points that share a list of seeds
@@ -25,13 +25,14 @@ def strided_seeds(
     valid: Bool[Array, "m"], order: Int[Array, "m"], spacing: int, num_seeds: int
 ) -> tuple[Int[Array, "k"], Bool[Array, "k"]]:
     """Rows of every `spacing`-th valid point along `order`, and which seeds exist."""
-    ranks = jnp.cumsum(valid[order])
-    wanted = spacing // 2 + spacing * jnp.arange(num_seeds) + 1
-    exists = wanted <= ranks[-1]
+    along, _, _ = compact_rows(valid[order], order.shape[0])  # positions of the valid points along the order
+    count = jnp.sum(valid)
+    wanted = spacing // 2 + spacing * jnp.arange(num_seeds)
+    exists = wanted < count
     # Fewer points than half a spacing still make one seed.
-    first = jnp.minimum(wanted[0], ranks[-1])
-    wanted, exists = wanted.at[0].set(first), exists.at[0].set(ranks[-1] > 0)
-    positions = jnp.searchsorted(ranks, jnp.where(exists, wanted, 1))
+    first = jnp.clip(count - 1, 0, wanted[0])
+    wanted, exists = wanted.at[0].set(first), exists.at[0].set(count > 0)
+    positions = along[jnp.where(exists, wanted, 0)]
     return order[jnp.minimum(positions, order.shape[0] - 1)], exists
 
 

@@ -306,7 +306,6 @@ def compact_rows(mask: Bool[Array, "n"], capacity: int) -> tuple[Int[Array, "c"]
         The rows (n where there is none, which `put_rows` drops), which of them exist, and how many did not fit.
     """
     count = jnp.sum(mask)
-    rows = jnp.searchsorted(jnp.cumsum(mask), jnp.arange(1, capacity + 1))
-    exists = jnp.arange(capacity) < count
-    overflow = jnp.maximum(count - capacity, 0)
-    return jnp.where(exists, rows, mask.shape[0]), exists, overflow
+    places = jnp.where(mask, jnp.cumsum(mask) - 1, capacity)
+    rows = jnp.full(capacity, mask.shape[0]).at[places].set(jnp.arange(mask.shape[0]), mode="drop")
+    return rows, jnp.arange(capacity) < count, jnp.maximum(count - capacity, 0)

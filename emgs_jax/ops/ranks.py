@@ -4,8 +4,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-DIGIT_BITS = 2  # of a rank's value that one look at all values finds
-
 
 def kth_smallest(values: Float[Array, "p"], valid: Bool[Array, "p"], ranks: Int[Array, "r"]) -> Float[Array, "r"]:
     """The valid values with these ranks, 0 the smallest, exactly; NaN where there are fewer.
@@ -17,15 +15,15 @@ def kth_smallest(values: Float[Array, "p"], valid: Bool[Array, "p"], ranks: Int[
     turned = bits ^ ((bits >> 31) & jnp.int32(0x7FFFFFFF))
     top = jnp.uint32(1 << 31)
     keys = jnp.where(valid, jax.lax.bitcast_convert_type(turned, jnp.uint32) ^ top, jnp.uint32(0xFFFFFFFF))
-    digits = jnp.arange(1, 1 << DIGIT_BITS, dtype=jnp.uint32)
-
-    def find_digit(turn: Int[Array, ""], known: Array) -> Array:
-        shift = (32 - DIGIT_BITS * (turn + 1)).astype(jnp.uint32)
+    # Of one rank more bits at once, which is fewer looks; of several the looks would become wider than they save.
+    digit_bits = 4 if ranks.shape[0] == 1 else 2
+    digits = jnp.arange(1, 1 << digit_bits, dtype=jnp.uint32)
+    known = jnp.zeros(ranks.shape, jnp.uint32)
+    for shift in range(32 - digit_bits, -1, -digit_bits):
         begins = known[:, None] | (digits << shift)
         num_smaller = jnp.sum(keys < begins[..., None], axis=-1)
-        return known | (jnp.sum(num_smaller <= ranks[:, None], axis=-1).astype(jnp.uint32) << shift)
-
-    found = jax.lax.fori_loop(0, 32 // DIGIT_BITS, find_digit, jnp.zeros(ranks.shape, jnp.uint32)) ^ top
+        known |= jnp.sum(num_smaller <= ranks[:, None], axis=-1).astype(jnp.uint32) << shift
+    found = known ^ top
     bits = jax.lax.bitcast_convert_type(found, jnp.int32)
     found = jax.lax.bitcast_convert_type(bits ^ ((bits >> 31) & jnp.int32(0x7FFFFFFF)), jnp.float32)
     return jnp.where(ranks < jnp.sum(valid), found, jnp.nan)
