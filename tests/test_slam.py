@@ -378,7 +378,7 @@ def predictions(window, count):
 
 @pytest.mark.parametrize(
     "capacities",
-    [(128, 256), pytest.param((64, 64), marks=pytest.mark.long)],  # each new size of the submap compiles the whole step
+    [(100, 256), pytest.param((64, 64), marks=pytest.mark.long)],  # each new size of the submap compiles the whole step
 )
 def test_growing_on_the_way_gives_the_same_map_as_starting_large(window, capacities):
     def mapped(capacity, submap):
@@ -388,8 +388,8 @@ def test_growing_on_the_way_gives_the_same_map_as_starting_large(window, capacit
     small, infos = mapped(*capacities)
     large, large_infos = mapped(256, 256)
     count = int(np.sum(large.map.gaussians.valid))
-    assert count > 128 and len(infos) == len(large_infos) == 3
-    assert small.map.weight.shape == (256,)
+    assert count > 100 and len(infos) == len(large_infos) == 3
+    assert small.map.weight.shape == (2 * capacities[0],)
     assert all(int(i.overflow.map) == int(i.overflow.submap) == 0 for i in infos)
     for a, b in zip(jax.tree.leaves(small.map), jax.tree.leaves(large.map), strict=True):
         # Other shapes sum in another order.
@@ -555,8 +555,9 @@ def test_a_window_opens_whole_or_view_by_view(window):
         assert max(pose_error(p.T_world_anchor, path_pose(0))) < 1e-6
     poses = np.array(window.T_world_views.wxyz_xyz)
     poses[1] = np.nan
+    replaced = eqx.tree_at(lambda w: w.T_world_views, window, jaxlie.SE3(device(poses)))
     with pytest.raises(ValueError, match="no pose"):
-        opening(eqx.tree_at(lambda w: w.T_world_views, window, jaxlie.SE3(device(poses))), slam_config())
+        opening(replaced, slam_config("slam.initialization=merged"))
 
 
 def test_an_unknown_initialisation_is_refused():
