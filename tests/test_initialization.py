@@ -1,20 +1,27 @@
 """The first map: its number of Gaussians, its weights, its place in the world, and independence of the world frame."""
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from scene import move_gaussians, observe_room, path_pose, pose, stack_poses
+from scene import (
+    move_gaussians,
+    moved_points,
+    observe_room,
+    on_host,
+    path_pose,
+    pose,
+    product,
+    replace,
+    rows_of,
+    stack,
+    stack_poses,
+)
 
 from emgs_jax.initialization import initialize
-from emgs_jax.observation import transform
-from emgs_jax.ops.pytree import stack
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 
-first_map = eqx.filter_jit(initialize)
+first_map = on_host(initialize)
 POSES = [path_pose(i) for i in range(3)]
 
 
@@ -40,7 +47,7 @@ def test_the_weights_count_every_point_in_units_of_lambda(result):
 
 def test_the_views_are_moved_to_the_world_by_the_priors_poses(result, views):
     for i, T in enumerate(POSES):
-        expected = transform(T, jax.tree.map(lambda x, i=i: x[i], views), jnp.ones(()))
+        expected = moved_points(T, rows_of(views, i))
         np.testing.assert_allclose(result[2].points[i], expected.points, atol=1e-6)  # roundings
 
 
@@ -58,17 +65,17 @@ def test_the_gaussians_lie_on_the_rooms_walls_with_their_normals_and_colours(res
 
 
 def test_invalid_points_are_not_clustered(views, camera, config):
-    blind = eqx.tree_at(lambda o: o.valid, views, views.valid.at[1:].set(False))
+    blind = replace(views, valid=views.valid & (np.arange(3) < 1)[:, None])
     gaussians, weight, _ = first_map(blind, stack_poses(POSES), camera, 1, config().fit)
     np.testing.assert_allclose(weight.sum(), 768 / 8, rtol=1e-5)
-    nothing = eqx.tree_at(lambda o: o.valid, views, jnp.zeros((3, 768), bool))
+    nothing = replace(views, valid=np.zeros((3, 768), bool))
     gaussians, weight, _ = first_map(nothing, stack_poses(POSES), camera, 1, config().fit)
     assert not gaussians.valid.any() and weight.sum() == 0
 
 
 def test_the_map_moves_with_the_anchor(result, views, camera, config):
     motion = pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
-    moved, weight, _ = first_map(views, stack_poses([motion @ T for T in POSES]), camera, 1, config().fit)
+    moved, weight, _ = first_map(views, stack_poses([product(motion, T) for T in POSES]), camera, 1, config().fit)
     expected = move_gaussians(motion, result[0])
     # A point half-way between two centroids may go to either, which moves both: most are equal to roundings.
     error = np.abs(moved.means - expected.means).max(1)
