@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scene import assert_same, device, fresh_map, on_host, random_gaussians, replace, rows_of
+from scene import assert_same, at, device, fresh_map, on_host, random_gaussians, replace, rows_of
 
 from emgs_jax.em import EStep, em_update, owners
 from emgs_jax.gaussian_map import GaussianMap, insert
@@ -10,7 +10,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
 from emgs_jax.splitting import halves, is_too_coarse, split
 
-splitted, too_coarse, fused, halved, owned = (on_host(f) for f in (split, is_too_coarse, em_update, halves, owners))
+splitted, too_coarse, halved, owned = (on_host(f) for f in (split, is_too_coarse, halves, owners))
 UP = (0.0, 0.0, 1.0)
 SPACING, NUM_POINTS = 8, 64
 
@@ -138,7 +138,7 @@ def test_printed_splits_nothing(config):
 
 def test_no_more_than_max_splits_and_the_rest_in_the_next_frames(config):
     """Two discs that are to be cut alike, the first by the even points and the second by the odd ones."""
-    settings = config("slam.splitting.max_splits=1", "slam.splitting.min_points=1").splitting
+    settings = config("slam.splitting.max_splits=1").splitting
     both = rows_of(one_disc(), np.array([0, 0]))
     points = colored(points_of(both))
     cut, second = parted(both, points, settings, np.arange(NUM_POINTS, dtype=np.int32) % 2)
@@ -149,11 +149,11 @@ def test_no_more_than_max_splits_and_the_rest_in_the_next_frames(config):
 
 @on_host
 def seen_again(map, points, noise, em_config, splitting):
-    """One frame: fused, split, and the halves in free rows."""
-    map, step, _ = em_update(map, points, noise, em_config)
-    map, second = split(map, points, noise, owners(step, 96), SPACING, splitting)
+    """One frame: what it is fused into and by which shares, and the map with halves in free rows."""
+    fused, step, _ = em_update(map, points, noise, em_config)
+    map, second = split(fused, points, noise, owners(step, 96), SPACING, splitting)
     map, _, overflow = insert(map, second)
-    return map, overflow
+    return fused, step, map, overflow
 
 
 def frames_of_a_checkerboard(config, splitting, num_frames=12):
@@ -163,18 +163,17 @@ def frames_of_a_checkerboard(config, splitting, num_frames=12):
     squares = np.floor((np.asarray(points.points) - map.gaussians.means[0])[:, :2] / 0.15).astype(int).sum(-1) % 2
     points = replace(points, colors=np.broadcast_to(0.2 + 0.6 * squares[:, None], (1200, 3)))
     noise, counts = np.zeros((1200, 3), np.float32), []
-    for _ in range(num_frames):
-        map, overflow = seen_again(map, points, noise, config.em, splitting)
+    for _ in range(num_frames + 1):
+        fused, step, map, overflow = seen_again(map, points, noise, config.em, splitting)
         assert overflow == 0
         counts.append(int(map.gaussians.valid.sum()))
-    _, step, _ = fused(map, points, noise, config.em)
-    shown = np.einsum("mk,mkc->mc", step.responsibilities, map.gaussians.colors[step.rows])
+    shown = np.einsum("mk,mkc->mc", step.responsibilities, fused.gaussians.colors[step.rows])
     return counts, float(np.mean(np.abs(shown - points.colors)[step.is_fused]))
 
 
 def test_a_checkerboard_seen_near_becomes_its_squares_and_then_no_more(config):
     whole, settings = config("slam.em.num_neighbours=8"), config().splitting
-    _, blurred = frames_of_a_checkerboard(whole, config("slam/splitting=paper").splitting)
+    _, blurred = frames_of_a_checkerboard(whole, at(settings, "min_points", 1e6))  # never near enough
     counts, sharp = frames_of_a_checkerboard(whole, settings)
     assert sharp < 0.6 * blurred
     assert counts[-1] == counts[-4] and 6 <= counts[-1] <= 2 * 1200 / (settings.min_points * SPACING)
