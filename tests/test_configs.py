@@ -159,13 +159,15 @@ def last_name(node) -> str:
 
 
 class Reads(ast.NodeVisitor):
-    """Which fields of which config classes a file reads: of what is annotated as such, or held under their key."""
+    """Which fields of which config classes a file reads: of what is annotated as such, is held under the key that it
+    has in conf/, or is called as its class is."""
 
     def __init__(self, classes: dict[type, set[str]]) -> None:
         self.names, self.found, self.owner = {module.__name__ for module in classes}, set(), ""
         self.of_key: dict[str, set[str]] = {}
         for module, keys in classes.items():
-            for key in keys:
+            own = re.sub(r"(?<!^)(?=[A-Z])", "_", module.__name__.removesuffix("Config")).lower()
+            for key in keys | {own}:
                 self.of_key.setdefault(key, set()).add(module.__name__)
 
     def read(self, tree: ast.AST) -> set[tuple[str, str]]:
@@ -225,9 +227,11 @@ def test_every_field_of_a_config_class_is_read():
 
 
 def test_a_field_that_only_something_else_has_counts_as_unread():
-    source = (
-        "def f(config: IcpConfig, other):\n    icp = config\n    return icp.noise + other.color_std + config.a.residual"
-    )
+    source = """
+def f(config: IcpConfig, other):
+    icp = config
+    return icp.noise + other.color_std + config.a.residual
+"""
     found = Reads(config_classes()).read(ast.parse(source))
     assert ("IcpConfig", "noise") in found
     assert not {("IcpConfig", "color_std"), ("IcpConfig", "residual")} & found

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from compiled_rows import largest_difference, random_problem
 from scene import (
     as_numpy,
     at,
@@ -50,6 +51,11 @@ def optimised(function, *arguments):
     return jax.device_get(jax.jit(function).lower(*arguments).compile(AS_USERS_HAVE_IT)(*arguments))
 
 
+def test_the_derivative_of_icps_rows_is_that_by_every_unknown_by_itself():
+    """Versions that pyproject.toml excludes fail here: with 0.10.2 the scale's column of the colour rows was x's."""
+    assert largest_difference(*random_problem(np.random.default_rng(0)), AS_USERS_HAVE_IT) < 1e-4
+
+
 def test_neighbours_are_the_nearest():
     rng = np.random.default_rng(0)
     points, queries = (np.float32(rng.uniform(-1, 1, (count, 3))) for count in (3000, 4800))
@@ -62,7 +68,7 @@ def test_neighbours_are_the_nearest():
 
 
 def test_an_update_is_that_of_equations_2_to_4():
-    num_points, num_gaussians = 1600, 300
+    num_points, num_gaussians = 600, 300
     config = changed(slam_config().em, max_mahalanobis_sq=60.0, min_normal_cos=0.85, min_responsibility=0.1)
     gaussians, points = random_gaussians(num_gaussians, 1, 3), random_observation(num_points, 1, 3)
     noise = np.float32(0.05 * np.random.default_rng(2).normal(size=(num_points, 3)))
@@ -71,7 +77,7 @@ def test_an_update_is_that_of_equations_2_to_4():
     names, every = ("points", "normals", "features", "colors"), np.ones(num_points, bool)
     arrays = *(np.asarray(getattr(points, name), float) for name in names), noise.astype(float), every
     rows, fused, _ = reference.em_update(*arrays, as_numpy(gaussians), weight, config)
-    assert np.mean(step.is_fused != fused) < 0.002 and 0.2 < fused.mean() < 1  # at a gate a rounding decides
+    assert np.mean(step.is_fused != fused) < 0.005 and 0.2 < fused.mean() < 1  # at a gate a rounding decides
     g, apart = map.gaussians, []
     for k, expected in rows.items():
         actual = g.means[k], g.covs[k], g.normals[k], g.colors[k], map.weight[k]
@@ -82,7 +88,7 @@ def test_an_update_is_that_of_equations_2_to_4():
 
 def test_an_image_is_that_of_every_gaussian_at_every_pixel(camera):
     config = slam_config().refinement.render
-    g = random_gaussians(150, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
+    g = random_gaussians(60, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
     T = pose((0.05, -0.1, 0.05), (0.05, -0.05, 0.1))
     image = optimised(lambda g, T, config: render(g, g.colors, T, camera, config), g, T, config)
     colors = np.asarray(g.colors, float)
@@ -97,7 +103,7 @@ def test_an_image_is_that_of_every_gaussian_at_every_pixel(camera):
 
 def test_normals_are_those_of_least_squares_over_the_window():
     """A slanted plane with errors of 1 %, and holes."""
-    config = slam_config("slam.observation.normal_radius=4", "slam.observation.normal_spacing=2").observation
+    config = slam_config("slam.observation.normal_radius=2", "slam.observation.normal_spacing=2").observation
     rng, (height, width) = np.random.default_rng(0), (96, 128)
     x, y = (np.arange(width) - 62.5) / 100, (np.arange(height) - 47.25) / 110
     rays = np.stack(np.broadcast_arrays(x, y[:, None], 1.0), axis=-1)
@@ -109,12 +115,13 @@ def test_normals_are_those_of_least_squares_over_the_window():
     normals, is_known = seen.normals.reshape(height, width, 3), seen.valid.reshape(height, width)
     assert is_known[valid].mean() > 0.95 and not is_known[~valid].any()
     for row, column in np.argwhere(is_known)[::97]:
-        taps = range(-4, 5, 2)
+        taps = range(-2, 3, 2)
         expected = reference.normal_of_window(points.astype(float), valid, row, column, taps, 0.03)
         # Sums of a window relative to its pixel in float32; .1 rad wide, so 1e-6 of them is 1e-5 rad.
         assert normals[row, column] @ expected > np.cos(np.radians(0.05))
 
 
+@pytest.mark.long  # compiles for half a minute
 def test_the_fine_step_finds_the_pose_in_a_closed_room():
     """From 5 cm and 2 degrees, among discs on the walls where another view has its pixels."""
     view, T = Camera([60.0, 66.0], [39.5, 30.25], 80, 64), path_pose(3)
@@ -136,4 +143,4 @@ def test_the_fine_step_finds_the_pose_in_a_closed_room():
     coarse = CoarsePose(start, start, *map(device, (1.0, 0.02, 2.0, 0.01)), belief, jnp.asarray(True))
     found, aligned, info = optimised(localize_fine, current, walls, coarse, config)
     assert info.is_tracked and info.icp.num_inliers > 2500 and aligned.valid.all()
-    assert max(pose_error(found, T)) < 0.01 < 0.03 < min(pose_error(start, T))
+    assert max(pose_error(found, T)) < 0.01 < 0.02 < min(pose_error(start, T))
