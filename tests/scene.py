@@ -1,6 +1,6 @@
 """One small config and one small scene for the tests of the core, and what tests do with arrays, in NumPy."""
 
-from functools import cache
+from functools import cache, reduce
 from pathlib import Path
 
 import equinox as eqx
@@ -133,8 +133,8 @@ def pose_of(matrix: np.ndarray) -> jaxlie.SE3:
 
 
 def product(*poses: jaxlie.SE3) -> jaxlie.SE3:
-    """Of one or more poses, the last one applied first."""
-    return pose_of(np.linalg.multi_dot([np.eye(4), *map(matrix_of, poses)]))
+    """Of poses, the last one applied first."""
+    return pose_of(reduce(np.matmul, map(matrix_of, poses), np.eye(4)))
 
 
 def pose(rotation=(0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0)) -> jaxlie.SE3:
