@@ -29,7 +29,7 @@ def motions(rotations: Rotation, translations) -> np.ndarray:
 
 
 def _left_jacobian(omega: np.ndarray) -> np.ndarray:
-    angle, skew = np.linalg.norm(omega, axis=-1)[:, None, None], np.cross(np.eye(3), -omega[:, None])
+    angle, skew = np.linalg.norm(omega, axis=-1)[:, None, None], np.cross(np.eye(3), omega[:, None])
     safe = np.where(angle > 1e-6, angle, 1.0)
     first = np.where(angle > 1e-6, (1 - np.cos(safe)) / safe**2, 0.5)
     second = np.where(angle > 1e-6, (safe - np.sin(safe)) / safe**3, 1 / 6)

@@ -106,7 +106,7 @@ def test_what_is_not_in_use_is_zero_with_finite_derivatives(double):
     graph = small_graph()
     padded = with_padding(graph)
     for plain, filled in zip(linearize(graph), linearize(padded), strict=True):
-        np.testing.assert_array_equal(np.asarray(filled)[:-2], plain)
+        np.testing.assert_allclose(np.asarray(filled)[:-2], plain, rtol=0, atol=1e-10)  # roundings of another program
         np.testing.assert_array_equal(np.asarray(filled)[-2:], 0.0)
 
 

@@ -152,7 +152,7 @@ def test_older_repeats_are_forgotten():
     small, large, repeats = 0.01, 0.1, none_yet()
     said, _ = said_again(none_yet(), exact(1))
     for size in [small] * 10 + [large] * 30:
-        before = Repeats(said.said, said.is_said, repeats.log_squares, repeats.counts)
+        before = Repeats(said.said, *map(device, (said.is_said, repeats.log_squares, repeats.counts)))
         repeats, _ = said_again(before, answer(2, STILL, (product(STEP, pose((0, 0, 0), (size, 0, 0))), STEP)))
     assert float(repeats.counts[0]) == MEMORY
     logs = np.log([size**2 / 3 / DEPTH**2 for size in (small, large)])
