@@ -5,29 +5,18 @@ import jax
 import numpy as np
 import pytest
 import reference
-from scene import (
-    assert_same,
-    at,
-    device,
-    fresh_map,
-    on_host,
-    poisoned,
-    random_gaussians,
-    random_observation,
-    replace,
-    rows_of,
-)
+import scene as sc
 
 from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert, select_submap, update_average, write_back
 from emgs_jax.gaussians import empty_gaussians
 
-update, select, inserted_into, written = (on_host(f) for f in (update_average, select_submap, insert, write_back))
+update, select, inserted_into, written = (sc.on_host(f) for f in (update_average, select_submap, insert, write_back))
 
 
 def map_of(count: int, capacity: int, seed: int = 0) -> GaussianMap:
     """So many Gaussians, and free rows."""
-    map, free = fresh_map(random_gaussians(count, seed)), jax.device_get(empty_map(capacity - count, 0))
-    return jax.tree.map(lambda *rows: device(np.concatenate(rows)), map, free)
+    map, free = sc.fresh_map(sc.random_gaussians(count, seed)), jax.device_get(empty_map(capacity - count, 0))
+    return jax.tree.map(lambda *rows: sc.device(np.concatenate(rows)), map, free)
 
 
 MAP = map_of(200, 256)
@@ -43,7 +32,7 @@ def averaged(values, evidence, config):
     map, means, gains = map_of(1, 1), [], []
     map = eqx.tree_at(lambda m: m.gaussians.means, map, np.zeros((1, 3), np.float32))
     for value, delta in zip(values, evidence, strict=True):
-        new = replace(map.gaussians, means=np.full((1, 3), value))
+        new = sc.replace(map.gaussians, means=np.full((1, 3), value))
         map, gain = update(map, new, np.float32([delta]), config)
         means.append(float(map.gaussians.means[0, 0]))
         gains.append(float(gain[0]))
@@ -74,14 +63,14 @@ def test_uneven_evidence_gives_the_reference_average(average, kind):
 
 
 def test_forgetting_shrinks_the_kept_weight_before_each_update(average):
-    _, gains, map = averaged([1.0] * 2, [1.0] * 2, at(average["count"], "forgetting", 0.5))
+    _, gains, map = averaged([1.0] * 2, [1.0] * 2, sc.at(average["count"], "forgetting", 0.5))
     np.testing.assert_allclose(gains, [1 / 1.5, 1 / 1.75], rtol=1e-6)  # W: 1, .5 + 1, .75 + 1
     np.testing.assert_allclose(map.weight, 1.75, rtol=1e-6)
 
 
 def test_certainty_ends_at_the_largest_weight(average):
     """A camera that stands still for long must not make a map that no later view can move."""
-    _, gains, map = averaged([1.0] * 5, [1.0] * 5, at(average["count"], "max_weight", 3.0))
+    _, gains, map = averaged([1.0] * 5, [1.0] * 5, sc.at(average["count"], "max_weight", 3.0))
     np.testing.assert_allclose(gains, [1 / 2, 1 / 3, 1 / 4, 1 / 4, 1 / 4], rtol=1e-6)
     np.testing.assert_allclose(map.weight, 4.0)
 
@@ -90,10 +79,10 @@ def test_certainty_ends_at_the_largest_weight(average):
 def test_a_gaussian_without_evidence_or_that_is_invalid_stays_bit_for_bit(average, kind):
     map = map_of(6, 8)
     evidence = np.float32([0.0, 0.5, 0.0, 1.0, 0.0, 0.2, 0.7, 0.7])  # the last two rows are free
-    wild = poisoned(random_gaussians(8, 5), evidence > 0, np.nan)
+    wild = sc.poisoned(sc.random_gaussians(8, 5), evidence > 0, np.nan)
     updated, gain = update(map, wild, evidence, average[kind])
     still = np.array([0, 2, 4, 6, 7])
-    assert_same(rows_of(updated, still), rows_of(map, still))
+    sc.assert_same(sc.rows_of(updated, still), sc.rows_of(map, still))
     np.testing.assert_array_equal(np.asarray(gain)[still], 0)
     np.testing.assert_array_equal(updated.num_updates, [1, 2, 1, 2, 1, 2, 0, 0])
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(updated))
@@ -109,7 +98,7 @@ def in_box(map, clouds, config):
 
 
 def box_cloud(low, high):
-    return replace(random_observation(40), points=np.linspace(low, high, 40))
+    return sc.replace(sc.random_observation(40), points=np.linspace(low, high, 40))
 
 
 CLOUDS = box_cloud([-0.5, -0.4, 1.2], [0.0, 0.3, 1.9]), box_cloud([-0.2, 0.0, 1.5], [0.33, 0.41, 2.5])
@@ -124,18 +113,18 @@ def test_a_submap_holds_the_gaussians_in_the_box_of_the_clouds(config):
     exists = submap.gaussians.valid
     np.testing.assert_array_equal(rows[exists], expected)
     np.testing.assert_array_equal(rows[~exists], 256)
-    assert_same(rows_of(submap, exists), rows_of(map, expected))
+    sc.assert_same(sc.rows_of(submap, exists), sc.rows_of(map, expected))
 
 
 def test_invalid_points_do_not_widen_the_box(config):
-    wild = replace(CLOUDS[1], points=np.full((40, 3), 1e6), valid=np.zeros(40, bool))
+    wild = sc.replace(CLOUDS[1], points=np.full((40, 3), 1e6), valid=np.zeros(40, bool))
     # Rows past the end are no rows of the map, so only the valid part is compared.
     one, other = (select(MAP, clouds, config().submap) for clouds in ((CLOUDS[0], wild), (CLOUDS[0], CLOUDS[0])))
     np.testing.assert_array_equal(one[1], other[1])
 
 
 def test_clouds_without_a_valid_point_select_nothing(config):
-    empty = replace(CLOUDS[0], valid=np.zeros(40, bool))
+    empty = sc.replace(CLOUDS[0], valid=np.zeros(40, bool))
     submap, rows, overflow = select(MAP, (empty, empty), config().submap)
     assert not submap.gaussians.valid.any() and overflow == 0
     np.testing.assert_array_equal(rows, 256)
@@ -153,7 +142,7 @@ def test_a_submap_that_is_too_small_by_one_counts_one(config):
 def test_writing_an_unchanged_submap_back_changes_no_bit(config, capacity):
     map = MAP
     submap, rows, _ = select(map, CLOUDS, config(f"slam.submap.submap_capacity={capacity}").submap)
-    assert_same(written(map, submap, rows), map)
+    sc.assert_same(written(map, submap, rows), map)
 
 
 def test_a_changed_submap_changes_its_rows_only(config):
@@ -161,24 +150,24 @@ def test_a_changed_submap_changes_its_rows_only(config):
     submap, rows, _ = select(map, CLOUDS, config().submap)
     expected = np.array(map.weight)
     expected[in_box(map, CLOUDS, config().submap)] += 5
-    changed = replace(submap, weight=submap.weight + np.float32(5))
+    changed = sc.replace(submap, weight=submap.weight + np.float32(5))
     np.testing.assert_array_equal(written(map, changed, rows).weight, expected)
 
 
 def with_holes(holes):
     """Ten Gaussians but for those rows."""
-    map = fresh_map(random_gaussians(10))
-    return eqx.tree_at(lambda m: m.gaussians.valid, map, device(~np.isin(np.arange(10), holes)))
+    map = sc.fresh_map(sc.random_gaussians(10))
+    return eqx.tree_at(lambda m: m.gaussians.valid, map, sc.device(~np.isin(np.arange(10), holes)))
 
 
 def inserted_rows(map, fresh, **more):
     """The map with new Gaussians, how many it has now, and how many found no row."""
-    return inserted_into(map, fresh_map(fresh, **more))
+    return inserted_into(map, sc.fresh_map(fresh, **more))
 
 
 def test_fresh_gaussians_fill_the_free_rows_in_order():
-    map, fresh = with_holes([2, 3, 7, 9]), random_gaussians(5, 9)
-    fresh = replace(fresh, valid=np.array([False, True, True, False, True]))
+    map, fresh = with_holes([2, 3, 7, 9]), sc.random_gaussians(5, 9)
+    fresh = sc.replace(fresh, valid=np.array([False, True, True, False, True]))
     inserted, count, overflow = inserted_rows(map, fresh, weight=np.arange(5.0), existence=0.25, birth=6)
     assert (count, overflow) == (3, 0)
     for row, source in ((2, 1), (3, 2), (7, 4)):
@@ -187,7 +176,7 @@ def test_fresh_gaussians_fill_the_free_rows_in_order():
         assert inserted.existence[row] == 0.25 and inserted.birth[row] == 6
     np.testing.assert_array_equal(inserted.gaussians.valid, [True] * 9 + [False])
     others = np.array([0, 1, 4, 5, 6, 8])
-    assert_same(rows_of(inserted, others), rows_of(map, others))
+    sc.assert_same(sc.rows_of(inserted, others), sc.rows_of(map, others))
 
 
 @pytest.mark.parametrize(
@@ -195,22 +184,22 @@ def test_fresh_gaussians_fill_the_free_rows_in_order():
 )
 def test_what_finds_no_free_row_is_counted_and_the_rest_is_kept(holes, overflow):
     map = with_holes([*holes])
-    inserted, count, lost = inserted_rows(map, random_gaussians(5, 9))
+    inserted, count, lost = inserted_rows(map, sc.random_gaussians(5, 9))
     assert (count, lost) == (5 - overflow, overflow)
     assert inserted.gaussians.valid.sum() == 10 - len(holes) + min(5, len(holes))
     kept = np.setdiff1d(np.arange(10), holes)
-    assert_same(rows_of(inserted, kept), rows_of(map, kept))
+    sc.assert_same(sc.rows_of(inserted, kept), sc.rows_of(map, kept))
 
 
 def test_inserting_nothing_changes_no_bit():
     map = with_holes([1, 3])
     inserted, count, overflow = inserted_rows(map, jax.device_get(empty_gaussians(5, 0)), weight=7.0)
-    assert_same(inserted, map)
+    sc.assert_same(inserted, map)
     assert (count, overflow) == (0, 0)
 
 
 def test_growing_keeps_every_row_and_adds_free_neutral_ones():
     map = map_of(5, 8)
     grown = grow(map, 16)
-    assert_same(rows_of(grown, slice(8)), map)
-    assert_same(rows_of(grown, slice(8, None)), empty_map(8, 0))
+    sc.assert_same(sc.rows_of(grown, slice(8)), map)
+    sc.assert_same(sc.rows_of(grown, slice(8, None)), empty_map(8, 0))

@@ -11,25 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+import scene as sc
 from compiled_rows import largest_difference, random_problem
-from scene import (
-    as_numpy,
-    at,
-    changed,
-    device,
-    flat_gaussians,
-    fresh_map,
-    matrix_of,
-    observe_room,
-    path_pose,
-    pose,
-    pose_error,
-    product,
-    random_gaussians,
-    random_observation,
-    replace,
-    slam_config,
-)
 from scipy.spatial import cKDTree
 
 from emgs_jax.em import em_update
@@ -69,14 +52,14 @@ def test_neighbours_are_the_nearest():
 
 def test_an_update_is_that_of_equations_2_to_4():
     num_points, num_gaussians = 600, 300
-    config = changed(slam_config().em, max_mahalanobis_sq=60.0, min_normal_cos=0.85, min_responsibility=0.1)
-    gaussians, points = random_gaussians(num_gaussians, 1, 3), random_observation(num_points, 1, 3)
+    config = sc.changed(sc.slam_config().em, max_mahalanobis_sq=60.0, min_normal_cos=0.85, min_responsibility=0.1)
+    gaussians, points = sc.random_gaussians(num_gaussians, 1, 3), sc.random_observation(num_points, 1, 3)
     noise = np.float32(0.05 * np.random.default_rng(2).normal(size=(num_points, 3)))
     weight = np.linspace(0.5, 3.0, num_gaussians)
-    map, step, _ = optimised(em_update, fresh_map(gaussians, weight), points, noise, config)
+    map, step, _ = optimised(em_update, sc.fresh_map(gaussians, weight), points, noise, config)
     names, every = ("points", "normals", "features", "colors"), np.ones(num_points, bool)
     arrays = *(np.asarray(getattr(points, name), float) for name in names), noise.astype(float), every
-    rows, fused, _ = reference.em_update(*arrays, as_numpy(gaussians), weight, config)
+    rows, fused, _ = reference.em_update(*arrays, sc.as_numpy(gaussians), weight, config)
     assert np.mean(step.is_fused != fused) < 0.005 and 0.2 < fused.mean() < 1  # at a gate a rounding decides
     g, apart = map.gaussians, []
     for k, expected in rows.items():
@@ -87,12 +70,12 @@ def test_an_update_is_that_of_equations_2_to_4():
 
 
 def test_an_image_is_that_of_every_gaussian_at_every_pixel(camera):
-    config = slam_config().refinement.render
-    g = random_gaussians(60, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
-    T = pose((0.05, -0.1, 0.05), (0.05, -0.05, 0.1))
+    config = sc.slam_config().refinement.render
+    g = sc.random_gaussians(60, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
+    T = sc.pose((0.05, -0.1, 0.05), (0.05, -0.05, 0.1))
     image = optimised(lambda g, T, config: render(g, g.colors, T, camera, config), g, T, config)
     colors = np.asarray(g.colors, float)
-    values, alpha, depth, _ = reference.render(as_numpy(g), colors, matrix_of(T), camera, config)
+    values, alpha, depth, _ = reference.render(sc.as_numpy(g), colors, sc.matrix_of(T), camera, config)
     assert image.overflow == 0 and (alpha > 0.3).mean() > 0.2
     wrong = np.abs(image.alpha - alpha) > 1e-4  # at a splat's edge, whose weight is .01
     assert wrong.mean() < 0.02 and np.abs(image.alpha - alpha).max() < 0.02
@@ -103,7 +86,7 @@ def test_an_image_is_that_of_every_gaussian_at_every_pixel(camera):
 
 def test_normals_are_those_of_least_squares_over_the_window():
     """A slanted plane with errors of 1 %, and holes."""
-    config = slam_config("slam.observation.normal_radius=2", "slam.observation.normal_spacing=2").observation
+    config = sc.slam_config("slam.observation.normal_radius=2", "slam.observation.normal_spacing=2").observation
     rng, (height, width) = np.random.default_rng(0), (96, 128)
     x, y = (np.arange(width) - 62.5) / 100, (np.arange(height) - 47.25) / 110
     rays = np.stack(np.broadcast_arrays(x, y[:, None], 1.0), axis=-1)
@@ -111,7 +94,7 @@ def test_normals_are_those_of_least_squares_over_the_window():
     points *= 1 + 0.01 * rng.normal(size=(height, width, 1)).astype(np.float32)
     valid, ones = rng.uniform(size=(height, width)) < 0.8, np.ones((height, width), np.float32)
     images = np.abs(rays).astype(np.float32), np.zeros((height, width, 0), np.float32), ones
-    seen = optimised(observe, points, *images, valid, at(config, "max_depth_step", 0.03))
+    seen = optimised(observe, points, *images, valid, sc.at(config, "max_depth_step", 0.03))
     normals, is_known = seen.normals.reshape(height, width, 3), seen.valid.reshape(height, width)
     assert is_known[valid].mean() > 0.95 and not is_known[~valid].any()
     for row, column in np.argwhere(is_known)[::97]:
@@ -124,23 +107,23 @@ def test_normals_are_those_of_least_squares_over_the_window():
 @pytest.mark.long  # compiles for half a minute
 def test_the_fine_step_finds_the_pose_in_a_closed_room():
     """From 5 cm and 2 degrees, among discs on the walls where another view has its pixels."""
-    view, T = Camera([60.0, 66.0], [39.5, 30.25], 80, 64), path_pose(3)
-    config = slam_config("slam.localization.icp.num_points=4800").localization
+    view, T = Camera([60.0, 66.0], [39.5, 30.25], 80, 64), sc.path_pose(3)
+    config = sc.slam_config("slam.localization.icp.num_points=4800").localization
     gates = {"min_inlier_fraction": 0.0, "max_residual": np.inf, "max_step": np.inf, "max_step_rad": np.inf}
-    config = changed(config, **gates, **{"icp.prior_information": 0.0, "icp.max_mahalanobis_sq": 25.0})
-    other, current = path_pose(2), observe_room(T, view)
-    seen, matrix = observe_room(other, view), matrix_of(other)
+    config = sc.changed(config, **gates, **{"icp.prior_information": 0.0, "icp.max_mahalanobis_sq": 25.0})
+    other, current = sc.path_pose(2), sc.observe_room(T, view)
+    seen, matrix = sc.observe_room(other, view), sc.matrix_of(other)
     rows = np.random.default_rng(0).permutation(80 * 64)[:1500]
     means, normals = (np.asarray(x, float)[rows] for x in (seen.points, seen.normals))
-    walls = flat_gaussians(means @ matrix[:3, :3].T + matrix[:3, 3], 0.03)
+    walls = sc.flat_gaussians(means @ matrix[:3, :3].T + matrix[:3, 3], 0.03)
     normals = normals @ matrix[:3, :3].T
     across = normals[:, :, None] * normals[:, None]
     covs = 0.03**2 * (np.eye(3) - across) + 0.003**2 * across
-    walls = replace(walls, normals=normals, covs=covs, colors=np.asarray(seen.colors)[rows])
-    start = product(T, pose((0.01, -0.02, 0.02), (0.03, 0.02, -0.03)))
-    covariance = device(np.diag([1e-3] * 6 + [1e-4]))
-    belief = Belief(covariance, covariance, *map(device, (0.01, 0.0, 1.0)), none_yet())
-    coarse = CoarsePose(start, start, *map(device, (1.0, 0.02, 2.0, 0.01)), belief, jnp.asarray(True))
+    walls = sc.replace(walls, normals=normals, covs=covs, colors=np.asarray(seen.colors)[rows])
+    start = sc.product(T, sc.pose((0.01, -0.02, 0.02), (0.03, 0.02, -0.03)))
+    covariance = sc.device(np.diag([1e-3] * 6 + [1e-4]))
+    belief = Belief(covariance, covariance, *map(sc.device, (0.01, 0.0, 1.0)), none_yet())
+    coarse = CoarsePose(start, start, *map(sc.device, (1.0, 0.02, 2.0, 0.01)), belief, jnp.asarray(True))
     found, aligned, info = optimised(localize_fine, current, walls, coarse, config)
     assert info.is_tracked and info.icp.num_inliers > 2500 and aligned.valid.all()
-    assert max(pose_error(found, T)) < 0.01 < 0.02 < min(pose_error(start, T))
+    assert max(sc.pose_error(found, T)) < 0.01 < 0.02 < min(sc.pose_error(start, T))

@@ -7,26 +7,7 @@ import jaxlie
 import numpy as np
 import pytest
 import reference
-from scene import (
-    assert_same,
-    at,
-    changed,
-    device,
-    move_gaussians,
-    moved_points,
-    observe_room,
-    path_pose,
-    poisoned,
-    pose,
-    pose_error,
-    predict_room,
-    product,
-    replace,
-    rows_of,
-    slam_config,
-    stack,
-    stack_poses,
-)
+import scene as sc
 
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
@@ -47,18 +28,18 @@ LENIENT = {"localization.max_residual": 1.0, "localization.min_eigenvalue": 0.0}
 
 
 def lenient(*overrides: str, **values):
-    chosen = slam_config(*WHOLE, "slam.localization.coarse=same_image", "slam.em.average.gain=count", *overrides)
-    return changed(chosen, **LENIENT, **values)
+    chosen = sc.slam_config(*WHOLE, "slam.localization.coarse=same_image", "slam.em.average.gain=count", *overrides)
+    return sc.changed(chosen, **LENIENT, **values)
 
 
 def exact(i, **more) -> Prediction:
-    return predict_room(i, Camera([20.0, 23.0], [14.5, 12.25], 32, 24), num_features=2, **more)
+    return sc.predict_room(i, Camera([20.0, 23.0], [14.5, 12.25], 32, 24), num_features=2, **more)
 
 
 @pytest.fixture(scope="module")
 def window(camera):
-    poses = [path_pose(i) for i in range(FRAME)]
-    return FirstWindow(stack([observe_room(T, camera, num_features=2) for T in poses]), stack_poses(poses))
+    poses = [sc.path_pose(i) for i in range(FRAME)]
+    return FirstWindow(sc.stack([sc.observe_room(T, camera, num_features=2) for T in poses]), sc.stack_poses(poses))
 
 
 @pytest.fixture(scope="module")
@@ -77,9 +58,9 @@ def stepped(state, settings):
 
 
 def test_the_first_state_holds_the_last_view_as_it_is_in_the_world(state, window, camera):
-    expected = moved_points(path_pose(FRAME - 1), observe_room(path_pose(FRAME - 1), camera))
+    expected = sc.moved_points(sc.path_pose(FRAME - 1), sc.observe_room(sc.path_pose(FRAME - 1), camera))
     np.testing.assert_allclose(state.previous.points, expected.points, atol=1e-6)  # roundings
-    assert max(pose_error(state.T_world_previous, path_pose(FRAME - 1))) < 1e-6
+    assert max(sc.pose_error(state.T_world_previous, sc.path_pose(FRAME - 1))) < 1e-6
     valid = np.asarray(state.map.gaussians.valid)
     assert valid.sum() == 3 * 768 // (8 * 3)
     np.testing.assert_allclose(np.asarray(state.map.weight)[valid].sum(), 3 * 768 / 8, rtol=1e-5)  # of λ points
@@ -89,19 +70,19 @@ def test_an_exact_prediction_is_tracked_and_its_points_are_fused_or_become_gauss
     new, info = jax.device_get(stepped)
     assert info.localization.is_tracked
     # Pixels are 10 cm apart here: a coarse map pulls by a small part of that (R9); the prior holds against it.
-    distance, angle = pose_error(info.T_world_camera, path_pose(FRAME))
+    distance, angle = sc.pose_error(info.T_world_camera, sc.path_pose(FRAME))
     assert distance < 0.02 and angle < 0.01
     assert info.em.num_points == 768 and info.em.num_fused > 0.5 * 768
     assert info.num_gaussians == new.map.gaussians.valid.sum()
     assert info.num_gaussians == state.map.gaussians.valid.sum() + info.refinement.num_fresh
-    assert_same(new.T_world_previous, info.T_world_camera)
+    sc.assert_same(new.T_world_previous, info.T_world_camera)
     assert int(info.overflow.map) == int(info.overflow.submap) == 0
-    assert max(pose_error(info.T_world_newest, path_pose(FRAME + 1))) < 5e-3  # the chain alone, which is exact
+    assert max(sc.pose_error(info.T_world_newest, sc.path_pose(FRAME + 1))) < 5e-3  # the chain alone, which is exact
 
 
 def test_the_frame_is_kept_as_it_was_aligned_for_the_next_step(stepped):
     new, info = stepped
-    expected = moved_points(info.T_world_camera, exact(FRAME).current, info.localization.scale)
+    expected = sc.moved_points(info.T_world_camera, exact(FRAME).current, info.localization.scale)
     np.testing.assert_allclose(new.previous.points, expected.points, atol=1e-5)  # roundings, here and below
     np.testing.assert_allclose(new.previous.normals, expected.normals, atol=1e-5)
 
@@ -112,10 +93,10 @@ def test_two_layers_that_a_look_cannot_tell_apart_become_one(state, settings):
     beside = np.arange(len(held)) + len(held)  # the same again a millimetre in front, in free rows
     rows = np.arange(256)
     rows[beside] = held
-    doubled = jax.tree.map(device, rows_of(map, rows))
+    doubled = jax.tree.map(sc.device, sc.rows_of(map, rows))
     means = np.array(doubled.gaussians.means)
     means[beside] += 1e-3 * np.asarray(map.gaussians.normals)[held]
-    doubled = eqx.tree_at(lambda m: m.gaussians.means, doubled, device(means))
+    doubled = eqx.tree_at(lambda m: m.gaussians.means, doubled, sc.device(means))
     new, info = step(eqx.tree_at(lambda s: s.map, state, doubled), exact(FRAME), FULL, settings)
     assert info.localization.is_tracked
     found = int(info.num_gaussians)
@@ -129,12 +110,12 @@ def small_steps(camera, num_frames, slab_frames=()):
     before = FRAME - 1.0
     for k in range(num_frames):
         i = FRAME + 0.2 * k
-        views = stack_poses([path_pose(j) for j in (before, i, i + 0.2)])
-        seen = observe_room(path_pose(before), camera, num_features=2)
+        views = sc.stack_poses([sc.path_pose(j) for j in (before, i, i + 0.2)])
+        seen = sc.observe_room(sc.path_pose(before), camera, num_features=2)
         prediction = eqx.tree_at(lambda p: (p.previous, p.T_world_views), exact(i), (seen, views))
         if k in slab_frames:
             points = np.where(is_slab[:, None], 0.5, 1.0) * prediction.current.points
-            prediction = eqx.tree_at(lambda p: p.current.points, prediction, device(points))
+            prediction = eqx.tree_at(lambda p: p.current.points, prediction, sc.device(points))
         before = i
         yield prediction
 
@@ -167,20 +148,20 @@ def test_a_new_gaussian_weighs_as_many_images_as_its_points_amount_to_or_one_as_
     """Clusters hold some number of points, of which λ are one image's; in all no more than there are."""
     held = np.asarray(state.map.gaussians.valid)
     # So that EM and the image plane fuse nothing.
-    apart = changed(settings, **{"em.max_mahalanobis_sq": 0.0, "refinement.max_mahalanobis_sq_2d": 0.0})
+    apart = sc.changed(settings, **{"em.max_mahalanobis_sq": 0.0, "refinement.max_mahalanobis_sq_2d": 0.0})
     new, info = step(state, exact(FRAME), FULL, apart)
     fresh = np.asarray(new.map.gaussians.valid) & ~held
     assert info.em.num_fused == 0 and fresh.sum() == info.refinement.num_fresh > 50
     weight = np.asarray(new.map.weight)[fresh]
     np.testing.assert_allclose(8 * weight, np.round(8 * weight), atol=1e-4)
     assert weight.std() > 0.05 and 0.8 * 768 < 8 * weight.sum() <= 768.01
-    printed, _ = step(state, exact(FRAME), FULL, at(apart, "em.average.gain", 0))
+    printed, _ = step(state, exact(FRAME), FULL, sc.at(apart, "em.average.gain", 0))
     np.testing.assert_array_equal(np.asarray(printed.map.weight)[fresh], 1)
 
 
 def test_a_frame_knows_whose_gaussians_it_was_placed_by_and_the_new_ones_know_theirs(state, settings):
     known = np.where(np.arange(256) % 5 == 0, 9, 4).astype(np.int32)
-    aged = eqx.tree_at(lambda s: (s.map.birth, s.time), state, (device(known), device(np.int32(20))))
+    aged = eqx.tree_at(lambda s: (s.map.birth, s.time), state, (sc.device(known), sc.device(np.int32(20))))
     new, info = step(aged, exact(FRAME), FULL, settings)
     assert info.origin == 4 and new.time == 21
     was, now = np.asarray(state.map.gaussians.valid), np.asarray(new.map.gaussians.valid)
@@ -194,7 +175,7 @@ def test_num_updates_counts_em_and_refinement_once_each(state, stepped):
 
 
 def without_points(prediction: Prediction) -> Prediction:
-    return eqx.tree_at(lambda p: p.current.valid, prediction, device(np.zeros(768, bool)))
+    return eqx.tree_at(lambda p: p.current.valid, prediction, sc.device(np.zeros(768, bool)))
 
 
 @pytest.mark.parametrize("loss", ["no point", "nan pose", "rejected"])
@@ -203,14 +184,14 @@ def test_a_frame_that_is_not_tracked_leaves_the_map_bit_for_bit(state, settings,
     if loss == "no point":
         prediction = without_points(prediction)
     elif loss == "nan pose":
-        nowhere = jaxlie.SE3(device(np.full((3, 7), np.nan)))
+        nowhere = jaxlie.SE3(sc.device(np.full((3, 7), np.nan)))
         prediction = eqx.tree_at(lambda p: p.T_world_views, prediction, nowhere)
     else:
-        config = at(settings, "localization.max_residual", 0.0)
+        config = sc.at(settings, "localization.max_residual", 0.0)
     new, info = step(state, prediction, FULL, config)
     assert not info.localization.is_tracked and info.localization.reason > 0
     assert info.em.num_fused == 0 and info.em.num_points == 0 and info.refinement.num_fresh == 0
-    assert_same(new.map, state.map)
+    sc.assert_same(new.map, state.map)
     # What is not to be mapped may still be what the next frame's coarse pose needs.
     seen = np.asarray(new.previous.valid)
     assert seen.all() if loss == "rejected" else not seen.any()
@@ -222,7 +203,7 @@ def test_a_step_after_a_lost_frame_is_tracked_again(state, settings):
     _, info = step(between, exact(FRAME + 1), FULL, settings)
     assert info.localization.is_tracked
     # Over two frames, and the scale is not known either.
-    assert pose_error(info.T_world_camera, path_pose(FRAME + 1))[0] < 0.07
+    assert sc.pose_error(info.T_world_camera, sc.path_pose(FRAME + 1))[0] < 0.07
 
 
 def errors_of(shape, rng):
@@ -237,54 +218,54 @@ def errors_of(shape, rng):
 def noisy(observation, camera, rng, depth_noise):
     """Depths that are wrong by a fraction, smoothly over the image."""
     factor = 1 + depth_noise * errors_of((camera.height, camera.width), rng)
-    return replace(observation, points=observation.points * factor)
+    return sc.replace(observation, points=observation.points * factor)
 
 
 def noisy_prediction(i, camera, rng, depth_noise=0.02, scale_noise=0.02, pose_noise=(0.01, 0.005)):
     """One call's errors: a scale, depths of each image, and poses by centimetres and milliradians."""
     given = exact(i, scale=1 + scale_noise * rng.normal())
-    off = [pose(pose_noise[1] * rng.normal(size=3), pose_noise[0] * rng.normal(size=3)) for _ in range(3)]
+    off = [sc.pose(pose_noise[1] * rng.normal(size=3), pose_noise[0] * rng.normal(size=3)) for _ in range(3)]
     views = map(jaxlie.SE3, np.asarray(given.T_world_views.wxyz_xyz))
-    poses = stack_poses([product(T, error) for T, error in zip(views, off, strict=True)])
+    poses = sc.stack_poses([sc.product(T, error) for T, error in zip(views, off, strict=True)])
     images = (noisy(o, camera, rng, depth_noise) for o in (given.current, given.previous))
     return eqx.tree_at(lambda p: (p.current, p.previous, p.T_world_views), given, (*images, poses))
 
 
 def every_pose(change, poses: jaxlie.SE3) -> jaxlie.SE3:
-    return stack_poses([change(jaxlie.SE3(values)) for values in np.asarray(poses.wxyz_xyz)])
+    return sc.stack_poses([change(jaxlie.SE3(values)) for values in np.asarray(poses.wxyz_xyz)])
 
 
 def test_a_step_moves_with_a_rigid_motion_of_the_world(state, camera, settings):
     """With noisy depths, so that the noise along the rays from the camera, wherever that is, decides what is fused."""
-    motion = pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
+    motion = sc.pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
     prediction = noisy_prediction(FRAME, camera, np.random.default_rng(0))
     stepped = step(state, prediction, FULL, settings)
-    quiet = step(state, prediction, FULL, at(settings, "em.noise", 0.0))[1]
+    quiet = step(state, prediction, FULL, sc.at(settings, "em.noise", 0.0))[1]
     assert stepped[1].localization.is_tracked and quiet.em.num_fused < stepped[1].em.num_fused
-    views = every_pose(lambda T: product(motion, T), prediction.T_world_views)
-    poses = views, product(motion, prediction.T_world_anchor)
+    views = every_pose(lambda T: sc.product(motion, T), prediction.T_world_views)
+    poses = views, sc.product(motion, prediction.T_world_anchor)
     moved_prediction = eqx.tree_at(lambda p: (p.T_world_views, p.T_world_anchor), prediction, poses)
     moved_state = eqx.tree_at(
         lambda s: (s.map.gaussians, s.previous, s.T_world_previous),
         state,
         (
-            move_gaussians(motion, state.map.gaussians),
-            moved_points(motion, state.previous),
-            product(motion, state.T_world_previous),
+            sc.move_gaussians(motion, state.map.gaussians),
+            sc.moved_points(motion, state.previous),
+            sc.product(motion, state.T_world_previous),
         ),
     )
     new, info = step(moved_state, moved_prediction, FULL, settings)
     # The solver ends within its tolerance of the same pose; points near a gate may pass it or not.
-    assert max(pose_error(info.T_world_camera, product(motion, stepped[1].T_world_camera))) < 2e-3
+    assert max(sc.pose_error(info.T_world_camera, sc.product(motion, stepped[1].T_world_camera))) < 2e-3
     assert abs(int(info.em.num_fused) - int(stepped[1].em.num_fused)) <= 0.02 * 768
     old = np.asarray(state.map.gaussians.valid)
-    expected = move_gaussians(motion, stepped[0].map.gaussians)
+    expected = sc.move_gaussians(motion, stepped[0].map.gaussians)
     error = np.linalg.norm(np.asarray(new.map.gaussians.means) - expected.means, axis=1)[old]
     assert np.median(error) < 2e-3 and np.quantile(error, 0.95) < 0.02
 
 
 def larger_pose(T: jaxlie.SE3) -> jaxlie.SE3:
-    return jaxlie.SE3(device(np.asarray(T.wxyz_xyz) * ([1.0] * 4 + [LARGER] * 3)))
+    return jaxlie.SE3(sc.device(np.asarray(T.wxyz_xyz) * ([1.0] * 4 + [LARGER] * 3)))
 
 
 LARGER = 4.0  # a power of two, so that floats are scaled without rounding
@@ -296,23 +277,23 @@ def test_in_a_world_four_times_as_large_a_step_makes_a_map_four_times_as_large(s
     config = settings
     for path in lengths:
         group, name = path.split(".")
-        config = at(config, path, LARGER * float(getattr(getattr(settings, group), name)))
+        config = sc.at(config, path, LARGER * float(getattr(getattr(settings, group), name)))
     points = lambda p: (p.current.points, p.previous.points, p.T_world_views, p.T_world_anchor)  # noqa: E731
     prediction = noisy_prediction(FRAME, camera, np.random.default_rng(0))
     current, previous, views, anchor = points(prediction)
-    grown = device(LARGER * np.asarray(current)), device(LARGER * np.asarray(previous))
+    grown = sc.device(LARGER * np.asarray(current)), sc.device(LARGER * np.asarray(previous))
     large = eqx.tree_at(points, prediction, (*grown, every_pose(larger_pose, views), larger_pose(anchor)))
 
     def larger(state: SlamState) -> SlamState:
         parts = lambda s: (s.map.gaussians.means, s.map.gaussians.covs, s.previous.points, s.T_world_previous)  # noqa: E731
         means, covs, seen, T = parts(state)
         arrays = LARGER * np.asarray(means), LARGER**2 * np.asarray(covs), LARGER * np.asarray(seen)
-        return eqx.tree_at(parts, state, (*map(device, arrays), larger_pose(T)))
+        return eqx.tree_at(parts, state, (*map(sc.device, arrays), larger_pose(T)))
 
     expected, said = step(state, prediction, FULL, settings)
     new, info = step(larger(state), large, FULL, config)
     assert info.localization.is_tracked
-    distance, angle = pose_error(info.T_world_camera, larger_pose(said.T_world_camera))
+    distance, angle = sc.pose_error(info.T_world_camera, larger_pose(said.T_world_camera))
     assert distance < LARGER * 1e-3 and angle < 1e-3  # the solver's tolerance
     np.testing.assert_allclose(info.localization.scale, said.localization.scale, rtol=1e-3)
     np.testing.assert_allclose(info.localization.depth_noise, said.localization.depth_noise, rtol=1e-2)
@@ -336,11 +317,11 @@ def test_poses_are_trusted_as_far_as_they_repeat_whatever_depths_do(window, came
     """By the law of the depths, as printed, the path of either prior is worse: nothing ties the two."""
     rng, count = np.random.default_rng(0), 15
     given = [window, *(noisy_prediction(FRAME + i, camera, rng, **law) for i in range(count))]
-    chosen = at(slam_config(*WHOLE), "localization.max_residual", 1.0)
+    chosen = sc.at(sc.slam_config(*WHOLE), "localization.max_residual", 1.0)
 
     def error(shared):
-        _, infos = run(given, at(chosen, "localization.pose_shared", shared))
-        ends = [pose_error(info.T_world_camera, path_pose(FRAME + i))[0] for i, info in enumerate(infos)]
+        _, infos = run(given, sc.at(chosen, "localization.pose_shared", shared))
+        ends = [sc.pose_error(info.T_world_camera, sc.path_pose(FRAME + i))[0] for i, info in enumerate(infos)]
         return np.sqrt(np.mean(np.square(ends)))
 
     said, by_depths = error(0.75), error(1.0)
@@ -350,15 +331,15 @@ def test_poses_are_trusted_as_far_as_they_repeat_whatever_depths_do(window, came
 def test_free_rows_of_the_map_and_invalid_points_change_nothing(state, settings):
     seen = np.arange(768) % 6 > 0
     views = lambda p: (p.current.valid, p.previous.valid)  # noqa: E731
-    prediction = eqx.tree_at(views, exact(FRAME), (device(seen), device(seen)))
+    prediction = eqx.tree_at(views, exact(FRAME), (sc.device(seen), sc.device(seen)))
     clean, clean_info = step(state, prediction, FULL, settings)
     images = lambda p: (p.current, p.previous)  # noqa: E731
-    bad_prediction = eqx.tree_at(images, prediction, tuple(poisoned(o, seen, 1e6) for o in images(prediction)))
-    bad_state = eqx.tree_at(lambda s: s.map, state, poisoned(state.map, state.map.gaussians.valid, 1e6))
+    bad_prediction = eqx.tree_at(images, prediction, tuple(sc.poisoned(o, seen, 1e6) for o in images(prediction)))
+    bad_state = eqx.tree_at(lambda s: s.map, state, sc.poisoned(state.map, state.map.gaussians.valid, 1e6))
     bad, bad_info = step(bad_state, bad_prediction, FULL, settings)
-    assert_same(bad_info, clean_info)
+    sc.assert_same(bad_info, clean_info)
     valid = np.asarray(clean.map.gaussians.valid)
-    assert_same(rows_of(bad.map, valid), rows_of(clean.map, valid))
+    sc.assert_same(sc.rows_of(bad.map, valid), sc.rows_of(clean.map, valid))
 
 
 def run(given, config):
@@ -398,19 +379,19 @@ def test_growing_on_the_way_gives_the_same_map_as_starting_large(window, capacit
 
 @pytest.mark.parametrize("initialization", ["merged", "incremental"])
 def test_a_run_follows_the_exact_path_reports_every_step_and_repeats_bit_for_bit(window, initialization):
-    chosen = slam_config(*WHOLE, f"slam.initialization={initialization}")
+    chosen = sc.slam_config(*WHOLE, f"slam.initialization={initialization}")
     results = []
     for _ in range(2):
-        state, infos = run(predictions(window, 3), at(chosen, "localization.max_residual", 1.0))
+        state, infos = run(predictions(window, 3), sc.at(chosen, "localization.max_residual", 1.0))
         results.append((state, [info.T_world_camera for info in infos]))
-    assert_same(*results)
-    truth = [path_pose(i) for i in range(1 if initialization == "incremental" else FRAME, FRAME + 3)]
+    sc.assert_same(*results)
+    truth = [sc.path_pose(i) for i in range(1 if initialization == "incremental" else FRAME, FRAME + 3)]
     found = results[0][1]
     assert len(found) == len(truth)
     # Frames are 5 cm and 2 degrees apart: a pose that is late by one is nearer to its neighbour than to its own.
-    assert max(pose_error(T, t)[0] for T, t in zip(found, truth, strict=True)) < 0.02
-    assert min(pose_error(T, t)[0] for T, t in zip(found[1:], truth[:-1], strict=True)) > 0.03
-    assert max(pose_error(results[0][0].T_world_previous, found[-1])) < 1e-6
+    assert max(sc.pose_error(T, t)[0] for T, t in zip(found, truth, strict=True)) < 0.02
+    assert min(sc.pose_error(T, t)[0] for T, t in zip(found[1:], truth[:-1], strict=True)) > 0.03
+    assert max(sc.pose_error(results[0][0].T_world_previous, found[-1])) < 1e-6
 
 
 def off_walls(points):
@@ -421,18 +402,18 @@ def off_walls(points):
 
 def test_a_map_of_noisy_predictions_is_more_accurate_than_their_points(camera):
     """Oracle: the room's walls, and the camera's path. The prior's points lie where its own poses put them."""
-    chosen = changed(slam_config(*WHOLE, "slam.em.average.gain=count"), **LENIENT)
-    poses = [path_pose(i) for i in range(FRAME)]
+    chosen = sc.changed(sc.slam_config(*WHOLE, "slam.em.average.gain=count"), **LENIENT)
+    poses = [sc.path_pose(i) for i in range(FRAME)]
     ratios = []
     for seed in range(6):  # few frames of a small world: one by itself says little
         rng, count = np.random.default_rng(seed), 8
-        views = [noisy(observe_room(T, camera, num_features=2), camera, rng, 0.02) for T in poses]
+        views = [noisy(sc.observe_room(T, camera, num_features=2), camera, rng, 0.02) for T in poses]
         sequence = [noisy_prediction(FRAME + i, camera, rng) for i in range(count)]
-        final, infos = run([FirstWindow(stack(views), stack_poses(poses)), *sequence], chosen)
+        final, infos = run([FirstWindow(sc.stack(views), sc.stack_poses(poses)), *sequence], chosen)
         assert all(i.localization.is_tracked for i in infos)
         raw_poses = [jaxlie.SE3(np.asarray(p.T_world_views.wxyz_xyz)[1]) for p in sequence]
         pairs = [*zip(poses, views, strict=True), *zip(raw_poses, (p.current for p in sequence), strict=True)]
-        raw = np.concatenate([off_walls(moved_points(T, o).points) for T, o in pairs])
+        raw = np.concatenate([off_walls(sc.moved_points(T, o).points) for T, o in pairs])
         ours = off_walls(final.map.gaussians.means)[np.asarray(final.map.gaussians.valid)]
         ratios.append([np.median(ours) / np.median(raw), np.quantile(ours, 0.9) / np.quantile(raw, 0.9)])
     # Twelve frames see a wall, with errors that are independent but for the path's: a third is the most to hope for.
@@ -459,14 +440,14 @@ def choices(module, prefix=""):
 
 def other_configs(settings):
     """Every number of the config another one, every reading in turn, numbers as YAML may have them, and a preset."""
-    yield jax.tree.map(lambda x: device(np.where(np.isfinite(x), np.asarray(x) * 1.1, 1.0)), settings)
+    yield jax.tree.map(lambda x: sc.device(np.where(np.isfinite(x), np.asarray(x) * 1.1, 1.0)), settings)
     readings = choices(settings)
     assert {"localization.coarse", "em.support", "localization.icp.residual", "em.average.gain"} <= set(readings)
     for i in range(max(readings.values())):
-        yield changed(settings, **{path: min(i, count - 1) for path, count in readings.items()})
+        yield sc.changed(settings, **{path: min(i, count - 1) for path, count in readings.items()})
     for value in ("1", "2.5", "inf"):
-        yield slam_config(*WHOLE, f"slam.em.max_mahalanobis_sq={value}")
-    yield slam_config(*WHOLE, "slam/em=paper", "slam/localization=paper", "slam/refinement=paper")
+        yield sc.slam_config(*WHOLE, f"slam.em.max_mahalanobis_sq={value}")
+    yield sc.slam_config(*WHOLE, "slam/em=paper", "slam/localization=paper", "slam/refinement=paper")
 
 
 def test_no_number_and_no_reading_of_the_config_traces_or_compiles_anything(state, stepped, settings):
@@ -501,7 +482,7 @@ def test_every_matrix_product_of_a_step_is_in_full_float32(state, stepped, setti
 
 
 def test_room_is_doubled_where_rows_did_not_fit(settings):
-    zero, some = (device(np.int32(number)) for number in (0, 1))
+    zero, some = (sc.device(np.int32(number)) for number in (0, 1))
     room = settings.submap.map_capacity, settings.submap.submap_capacity
     for map, submap in ((zero, zero), (some, zero), (zero, some), (some, some)):
         grown = with_room(settings, Overflow(map, submap, some)).submap
@@ -515,7 +496,7 @@ def test_a_frame_is_repeated_from_the_same_state_until_it_fits(state, stepped, s
     def crowded(given, _, __, chosen):
         calls.append((given, chosen.submap.map_capacity))
         lost = np.int32(chosen.submap.map_capacity < 4 * settings.submap.map_capacity)
-        overflow = Overflow(*(device(np.int32(number)) for number in (lost, 0, 1 + lost)))
+        overflow = Overflow(*(sc.device(np.int32(number)) for number in (lost, 0, 1 + lost)))
         return given, eqx.tree_at(lambda i: i.overflow, stepped[1], overflow)
 
     _, info, chosen = advance(state, prediction, FULL, settings, crowded)
@@ -523,8 +504,8 @@ def test_a_frame_is_repeated_from_the_same_state_until_it_fits(state, stepped, s
     assert chosen.submap.map_capacity == 1024 and chosen.submap.submap_capacity == settings.submap.submap_capacity
     for given, size in calls:
         assert given.map.weight.shape == (size,)
-        assert_same(rows_of(given.map, slice(256)), jax.device_get(state.map))
-        assert_same(given.previous, state.previous)
+        sc.assert_same(sc.rows_of(given.map, slice(256)), jax.device_get(state.map))
+        sc.assert_same(given.previous, state.previous)
 
 
 def test_the_first_map_is_made_again_until_it_fits(state, window, settings):
@@ -532,7 +513,7 @@ def test_the_first_map_is_made_again_until_it_fits(state, window, settings):
 
     def crowded(_, __, ___, chosen):
         sizes.append(chosen.submap.map_capacity)
-        return state, device(np.int32(chosen.submap.map_capacity < 1000))
+        return state, sc.device(np.int32(chosen.submap.map_capacity < 1000))
 
     started, chosen = start(window, FULL, settings, crowded)
     assert sizes == [256, 512, 1024] and chosen.submap.map_capacity == 1024
@@ -541,25 +522,25 @@ def test_the_first_map_is_made_again_until_it_fits(state, window, settings):
 
 def test_a_window_opens_whole_or_view_by_view(window):
     """Each further view of an incremental start is a step's current frame, with the one before it and the next one."""
-    first, following = opening(window, slam_config("slam.initialization=merged"))
+    first, following = opening(window, sc.slam_config("slam.initialization=merged"))
     assert first is window and following == []
-    first, following = opening(window, slam_config("slam.initialization=incremental"))
-    view = lambda i: rows_of(window.views, i)  # noqa: E731
-    assert_same(first, rows_of(window, slice(1)))
+    first, following = opening(window, sc.slam_config("slam.initialization=incremental"))
+    view = lambda i: sc.rows_of(window.views, i)  # noqa: E731
+    sc.assert_same(first, sc.rows_of(window, slice(1)))
     assert len(following) == FRAME - 1
     for i, p in enumerate(following, start=1):
-        assert_same((p.current, p.previous), (view(i), view(i - 1)))
+        sc.assert_same((p.current, p.previous), (view(i), view(i - 1)))
         assert p.has_newest == (i < FRAME - 1)
         for row, j in enumerate((i - 1, i, min(i + 1, FRAME - 1))):
-            assert max(pose_error(jaxlie.SE3(np.asarray(p.T_world_views.wxyz_xyz)[row]), path_pose(j))) < 1e-6
-        assert max(pose_error(p.T_world_anchor, path_pose(0))) < 1e-6
+            assert max(sc.pose_error(jaxlie.SE3(np.asarray(p.T_world_views.wxyz_xyz)[row]), sc.path_pose(j))) < 1e-6
+        assert max(sc.pose_error(p.T_world_anchor, sc.path_pose(0))) < 1e-6
     poses = np.array(window.T_world_views.wxyz_xyz)
     poses[1] = np.nan
-    replaced = eqx.tree_at(lambda w: w.T_world_views, window, jaxlie.SE3(device(poses)))
+    replaced = eqx.tree_at(lambda w: w.T_world_views, window, jaxlie.SE3(sc.device(poses)))
     with pytest.raises(ValueError, match="no pose"):
-        opening(replaced, slam_config("slam.initialization=merged"))
+        opening(replaced, sc.slam_config("slam.initialization=merged"))
 
 
 def test_an_unknown_initialisation_is_refused():
     with pytest.raises(Exception, match="one of merged, incremental.*'random'"):
-        slam_config("slam.initialization=random")
+        sc.slam_config("slam.initialization=random")

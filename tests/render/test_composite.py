@@ -6,21 +6,7 @@ import jaxlie
 import numpy as np
 import pytest
 import reference
-from scene import (
-    as_numpy,
-    at,
-    flat_gaussians,
-    join,
-    matrix_of,
-    move_gaussians,
-    on_host,
-    poisoned,
-    pose,
-    product,
-    random_gaussians,
-    replace,
-    rows_of,
-)
+import scene as sc
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import pixel_grid, rays
@@ -28,19 +14,19 @@ from emgs_jax.render.composite import render
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 
-draw = on_host(render)
+draw = sc.on_host(render)
 COUNT = 24  # rows of every map, which makes one program for a size of tiles
-T = pose((0.05, -0.1, 0.05), (0.05, -0.05, 0.1))
+T = sc.pose((0.05, -0.1, 0.05), (0.05, -0.05, 0.1))
 
 
 def scene():
     """Random Gaussians, one of them near and thick, so that it reaches behind the camera, and one seen edge on."""
-    g = random_gaussians(COUNT, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
+    g = sc.random_gaussians(COUNT, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
     means, covs, normals = (np.array(x) for x in (g.means, g.covs, g.normals))
     means[:2] = (0.25, 0.2, 0.6), (-0.4, 0.3, 1.6)
     covs[0] = np.diag([0.001, 0.001, 0.03])
     normals[:2] = (0.8, 0.0, -0.6), (0.95, 0.2, 0.23)
-    return replace(g, means=means, covs=covs, normals=normals)
+    return sc.replace(g, means=means, covs=covs, normals=normals)
 
 
 GAUSSIANS, WHITE = scene(), np.ones((COUNT, 3), np.float32)
@@ -53,9 +39,9 @@ def render_config(config):
 
 def discs(*given) -> Gaussians:
     """Discs of a mean, a normal and a standard deviation, a millimetre thick, and free rows."""
-    made = join(*(flat_gaussians(mean, std, normal, 1e-3) for mean, normal, std in given))
+    made = sc.join(*(sc.flat_gaussians(mean, std, normal, 1e-3) for mean, normal, std in given))
     rows = np.arange(COUNT)
-    return replace(rows_of(made, np.minimum(rows, len(given) - 1)), valid=rows < len(given))
+    return sc.replace(sc.rows_of(made, np.minimum(rows, len(given) - 1)), valid=rows < len(given))
 
 
 def assert_images_equal(actual, expected, atol):
@@ -70,7 +56,9 @@ def image(camera, render_config):
 
 def test_the_image_equals_the_tile_free_reference(camera, render_config, image):
     colors = np.asarray(GAUSSIANS.colors, float)
-    values, alpha, depth, depth_std = reference.render(as_numpy(GAUSSIANS), colors, matrix_of(T), camera, render_config)
+    values, alpha, depth, depth_std = reference.render(
+        sc.as_numpy(GAUSSIANS), colors, sc.matrix_of(T), camera, render_config
+    )
     assert image.overflow == 0 and (alpha > 0.3).mean() > 0.2
     # A splat's edge (3 σ) has weight .9 exp(-4.5) = .01, and float32 may put a pixel on either side of it.
     wrong = np.abs(image.alpha - alpha) > 1e-4
@@ -96,7 +84,7 @@ def test_depth_exists_exactly_where_alpha_suffices(image, render_config):
 
 
 def test_a_fronto_parallel_gaussian_has_its_own_depth_where_it_covers(camera, render_config):
-    rendering = draw(discs(((0.1, 0.05, 2.0), (0, 0, -1), 0.15)), WHITE, pose(), camera, render_config)
+    rendering = draw(discs(((0.1, 0.05, 2.0), (0, 0, -1), 0.15)), WHITE, sc.pose(), camera, render_config)
     covered = np.asarray(rendering.depth) > 0
     assert covered.sum() >= 8
     np.testing.assert_allclose(np.asarray(rendering.depth)[covered], 2.0, atol=1e-5)  # roundings
@@ -106,7 +94,7 @@ def test_a_fronto_parallel_gaussian_has_its_own_depth_where_it_covers(camera, re
 
 def test_the_depth_of_a_slanted_gaussian_is_that_of_its_plane(camera, render_config):
     normal, mean = np.array([0.5, 0.3, -1.0]), np.array([0.1, 0.05, 2.0])
-    rendering = draw(discs((mean, normal, 0.15)), WHITE, pose(), camera, render_config)
+    rendering = draw(discs((mean, normal, 0.15)), WHITE, sc.pose(), camera, render_config)
     directions = np.asarray(rays(camera, pixel_grid(camera)), float)
     plane = (normal @ mean) / (directions @ normal)
     covered = np.asarray(rendering.depth) > 0
@@ -121,13 +109,13 @@ def test_the_image_does_not_depend_on_the_tile_size(camera, config, image, size)
 
 
 def test_the_image_does_not_depend_on_the_order_of_rows(camera, render_config, image):
-    shuffled = rows_of(GAUSSIANS, np.random.default_rng(0).permutation(COUNT))
+    shuffled = sc.rows_of(GAUSSIANS, np.random.default_rng(0).permutation(COUNT))
     assert_images_equal(draw(shuffled, shuffled.colors, T, camera, render_config), image, 2e-5)  # order of sums
 
 
 def test_moving_map_and_camera_together_does_not_change_the_image(camera, render_config, image):
-    motion = pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
-    moved = draw(move_gaussians(motion, GAUSSIANS), GAUSSIANS.colors, product(motion, T), camera, render_config)
+    motion = sc.pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
+    moved = draw(sc.move_gaussians(motion, GAUSSIANS), GAUSSIANS.colors, sc.product(motion, T), camera, render_config)
     # Coordinates of 3 m in float32; a pixel at a splat's edge may lose its weight of .01.
     assert np.quantile(np.abs(moved.alpha - image.alpha), 0.99) < 1e-3
     assert np.abs(moved.alpha - image.alpha).max() < 0.011
@@ -136,8 +124,8 @@ def test_moving_map_and_camera_together_does_not_change_the_image(camera, render
 @pytest.mark.parametrize("poison", [np.nan, np.inf, 1e6])
 def test_invalid_rows_change_no_pixel(camera, render_config, poison):
     seen = np.arange(COUNT) % 3 > 0
-    clean = replace(GAUSSIANS, valid=seen)
-    wild = poisoned(clean, seen, poison)
+    clean = sc.replace(GAUSSIANS, valid=seen)
+    wild = sc.poisoned(clean, seen, poison)
     images = (draw(g, np.asarray(g.colors), T, camera, render_config) for g in (wild, clean))
     assert_images_equal(*images, atol=0)
 
@@ -145,23 +133,23 @@ def test_invalid_rows_change_no_pixel(camera, render_config, poison):
 def test_a_free_row_where_the_camera_is_leaves_the_gradient_of_the_pose_finite(camera, render_config):
     """Free rows are at the origin; a camera there is at depth 0 of them."""
     is_free = np.arange(COUNT) < 4
-    free = replace(GAUSSIANS, valid=~is_free, means=np.where(is_free[:, None], 0.0, GAUSSIANS.means))
-    ahead = pose()
+    free = sc.replace(GAUSSIANS, valid=~is_free, means=np.where(is_free[:, None], 0.0, GAUSSIANS.means))
+    ahead = sc.pose()
 
     def total(shift):
         there = jaxlie.SE3.from_rotation_and_translation(ahead.rotation(), shift)
         drawn = render(free, free.colors, there, camera, render_config)
         return jnp.sum(drawn.values) + jnp.sum(drawn.depth) + jnp.sum(drawn.depth_std)
 
-    assert np.isfinite(on_host(jax.grad(total))(np.zeros(3, np.float32))).all()
+    assert np.isfinite(sc.on_host(jax.grad(total))(np.zeros(3, np.float32))).all()
 
 
 def test_a_nearer_gaussian_hides_what_is_behind_it(camera, render_config):
-    config = at(render_config, "opacity", 1.0)
+    config = sc.at(render_config, "opacity", 1.0)
     both = discs(((0.0, 0.0, 2.0), (0, 0, -1), 0.6), ((0.0, 0.0, 1.0), (0, 0, -1), 0.3))
     colors = np.zeros((COUNT, 3), np.float32)
     colors[:2] = (0, 1, 0), (1, 0, 0)
-    rendering = draw(both, colors, pose(), camera, config)
+    rendering = draw(both, colors, sc.pose(), camera, config)
     row, column = 12, 14  # the pixel of the mean, to within half a pixel of splats with 6 and more
     np.testing.assert_allclose(rendering.values[row, column], [1, 0, 0], atol=0.02)  # exp of a quarter pixel
     np.testing.assert_allclose(rendering.depth[row, column], 1.0, atol=0.02)
@@ -180,13 +168,15 @@ MANY = discs(*(((0.0, 0.0, 1.0 + 0.05 * i), (0, 0, -1), 30.0) for i in range(COU
     ],
 )
 def test_what_a_full_tile_leaves_out_is_counted_unless_it_is_hidden(camera, config, capacity, opacity, overflow):
-    small = at(config(f"render.tile_capacity={capacity}", "render.tile_size=32").refinement.render, "opacity", opacity)
-    drawn = draw(MANY, MANY.colors, pose(), camera, small)
+    small = sc.at(
+        config(f"render.tile_capacity={capacity}", "render.tile_size=32").refinement.render, "opacity", opacity
+    )
+    drawn = draw(MANY, MANY.colors, sc.pose(), camera, small)
     assert drawn.overflow == overflow
     assert (drawn.alpha > 0.99).all() == (opacity > 0.5)
 
 
 def test_an_empty_map_is_a_black_image_without_depth(camera, render_config):
-    nothing = replace(GAUSSIANS, valid=np.zeros(COUNT, bool))
+    nothing = sc.replace(GAUSSIANS, valid=np.zeros(COUNT, bool))
     rendering = draw(nothing, GAUSSIANS.colors, T, camera, render_config)
     assert all((np.asarray(x) == 0).all() for x in jax.tree.leaves(rendering))

@@ -3,20 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from scene import (
-    at,
-    changed,
-    device,
-    flat_gaussians,
-    join,
-    matrix_of,
-    move_gaussians,
-    on_host,
-    pose,
-    product,
-    replace,
-    rows_of,
-)
+import scene as sc
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
@@ -24,7 +11,7 @@ from emgs_jax.render.composite import render
 from emgs_jax.render.densify import DensifyConfig, densify, in_front_surface, without_floor
 
 NUM_ROWS = 1080  # of every map, many of them free: one program for all
-drawn_dense, in_front = on_host(densify), on_host(in_front_surface)
+drawn_dense, in_front = sc.on_host(densify), sc.on_host(in_front_surface)
 
 
 def dense(gaussians: Gaussians, *arguments):
@@ -34,15 +21,15 @@ def dense(gaussians: Gaussians, *arguments):
 def filled(gaussians: Gaussians) -> Gaussians:
     """With free rows after them."""
     rows, count = np.arange(NUM_ROWS), gaussians.valid.shape[0]
-    more = rows_of(gaussians, np.minimum(rows, count - 1))
-    return replace(more, valid=more.valid & (rows < count))
+    more = sc.rows_of(gaussians, np.minimum(rows, count - 1))
+    return sc.replace(more, valid=more.valid & (rows < count))
 
 
 def wall(depth: float, normal=(0.0, 0.0, -1.0), step: float = 0.15) -> Gaussians:
     """Discs on a grid on the plane through (0, 0, depth) with a normal."""
     x, y = (a.reshape(-1) for a in np.meshgrid(np.arange(-2, 2, step), np.arange(-1.5, 1.5, step)))
     z = depth - (normal[0] * x + normal[1] * y) / normal[2]
-    return flat_gaussians(np.stack([x, y, z], -1), step / 2, normal, color=(0.2, 0.5, 0.8))
+    return sc.flat_gaussians(np.stack([x, y, z], -1), step / 2, normal, color=(0.2, 0.5, 0.8))
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +40,7 @@ def densify_config(config):
 def test_the_points_of_a_slanted_wall_lie_on_it_with_its_normal_and_colour(camera, densify_config):
     normal = np.array([0.3, 0.2, -1.0]) / np.linalg.norm([0.3, 0.2, -1.0])
     # Without the blur: a splat's depth is kept within its own extent, which blur widens on the image only.
-    view = dense(wall(2.0, normal), pose(), camera, at(densify_config, "render.blur", 0.0))
+    view = dense(wall(2.0, normal), sc.pose(), camera, sc.at(densify_config, "render.blur", 0.0))
     valid = view.valid
     assert view.rendering.overflow == 0 and valid.mean() > 0.95
     distance = (view.points[valid] - [0, 0, 2]) @ normal
@@ -63,11 +50,11 @@ def test_the_points_of_a_slanted_wall_lie_on_it_with_its_normal_and_colour(camer
 
 
 def test_the_map_is_drawn_with_the_coverage_of_densification(camera, densify_config):
-    image, far, thin = on_host(render), filled(wall(2.0)), at(densify_config, "render.opacity", 0.1)
-    whole = image(far, far.colors, pose(), camera, thin.render)
+    image, far, thin = sc.on_host(render), filled(wall(2.0)), sc.at(densify_config, "render.opacity", 0.1)
+    whole = image(far, far.colors, sc.pose(), camera, thin.render)
     half = float(np.median(whole.alpha))  # so that half of the pixels have a depth
-    view = dense(far, pose(), camera, at(thin, "min_alpha", half))
-    expected = image(far, far.colors, pose(), camera, at(thin.render, "min_alpha", half))
+    view = dense(far, sc.pose(), camera, sc.at(thin, "min_alpha", half))
+    expected = image(far, far.colors, sc.pose(), camera, sc.at(thin.render, "min_alpha", half))
     for name in ("alpha", "depth", "depth_std"):  # roundings; a standard deviation is the root of a difference
         np.testing.assert_allclose(getattr(view.rendering, name), getattr(expected, name), atol=1e-3, err_msg=name)
     np.testing.assert_array_equal(view.valid, view.rendering.depth > 0)
@@ -87,7 +74,7 @@ def test_the_floor_of_a_fit_is_not_drawn_along_the_surface():
         [*(one + floor**2 * np.eye(3) for one in spread), spread[0] / 100 + 1e-4 * np.outer(normal, normal)]
     )
     rows = np.tile([0.0, 0, 2], (3, 1)), covs, np.zeros((3, 3)), np.tile(normal, (3, 1))
-    flat, cut = Gaussians(*map(device, (*rows, np.zeros((3, 0)), np.ones(3, bool)))), on_host(without_floor)
+    flat, cut = Gaussians(*map(sc.device, (*rows, np.zeros((3, 0)), np.ones(3, bool)))), sc.on_host(without_floor)
     found = cut(flat, np.float32(floor))
     across = floor**2 * np.outer(normal, normal)
     np.testing.assert_allclose(found.covs[:2], [one + across for one in spread], atol=1e-9)
@@ -100,9 +87,9 @@ def test_a_near_thing_is_drawn_no_wider_than_its_points(densify_config):
     """A board of 20 cm at 1 m before a wall, a pixel being 4 mm; with the floor of 1 cm it is five too wide a side."""
     near = Camera([250.0, 250.0], [59.5, 15.5], 120, 32)
     x, y = (a.reshape(-1) for a in np.meshgrid(np.arange(-0.095, 0.1, 0.01), np.arange(-0.095, 0.1, 0.01)))
-    board = flat_gaussians(np.stack([x, y, np.ones_like(x)], -1), (0.005**2 + 0.01**2) ** 0.5, color=1.0)
-    map = join(wall(2.0), board)
-    wide, narrow = (dense(map, pose(), near, at(densify_config, "min_std", std)).depth[16] for std in (0.0, 0.01))
+    board = sc.flat_gaussians(np.stack([x, y, np.ones_like(x)], -1), (0.005**2 + 0.01**2) ** 0.5, color=1.0)
+    map = sc.join(wall(2.0), board)
+    wide, narrow = (dense(map, sc.pose(), near, sc.at(densify_config, "min_std", std)).depth[16] for std in (0.0, 0.01))
     assert (int((narrow < 1.5).sum()), int((wide < 1.5).sum())) == (52, 63)
 
 
@@ -111,13 +98,13 @@ def beside(distance: float, std=0.12) -> Gaussians:
     z, y = (a.reshape(-1) for a in np.meshgrid(np.arange(-1, 2, std), np.arange(-1.5, 1.5, std)))
     rows = np.stack([np.full(len(z), distance), y, z], -1), np.tile(np.diag([0.02, std, std]) ** 2, (len(z), 1, 1))
     rows += np.tile([0.9, 0.1, 0.1], (len(z), 1)), np.tile([-1.0, 0, 0], (len(z), 1))
-    return Gaussians(*map(device, (*rows, np.zeros((len(z), 0)), np.ones(len(z), bool))))
+    return Gaussians(*map(sc.device, (*rows, np.zeros((len(z), 0)), np.ones(len(z), bool))))
 
 
 def test_a_door_frame_in_passing_hides_nothing_that_it_does_not_cover(camera, densify_config):
     """The picture that showed it: a frame of a walk in a doorway, filled by a door frame 8 cm before the camera."""
-    config = at(densify_config, "render.blur", 0.0)
-    alone, passing = (dense(map, pose(), camera, config) for map in (wall(2.0), join(wall(2.0), beside(0.5))))
+    config = sc.at(densify_config, "render.blur", 0.0)
+    alone, passing = (dense(map, sc.pose(), camera, config) for map in (wall(2.0), sc.join(wall(2.0), beside(0.5))))
     column = float(camera.center[0] + camera.focal[0] * 0.5 / 2.0)  # where the wall beside meets the far one
     is_far = alone.valid & (np.arange(camera.width) < column - 4)
     assert is_far.sum() > 100
@@ -126,9 +113,9 @@ def test_a_door_frame_in_passing_hides_nothing_that_it_does_not_cover(camera, de
 
 def test_the_other_side_of_a_thin_wall_does_not_show_through(camera, densify_config):
     """Seen from the other side it was mapped 3 cm too near to this one."""
-    other = replace(wall(1.97, (0.0, 0.0, 1.0)), colors=np.ones(wall(1.97).colors.shape))
-    view = dense(join(wall(2.0), other), pose(), camera, densify_config)
-    alone = dense(wall(2.0), pose(), camera, densify_config)
+    other = sc.replace(wall(1.97, (0.0, 0.0, 1.0)), colors=np.ones(wall(1.97).colors.shape))
+    view = dense(sc.join(wall(2.0), other), sc.pose(), camera, densify_config)
+    alone = dense(wall(2.0), sc.pose(), camera, densify_config)
     np.testing.assert_allclose(view.colors[alone.valid], alone.colors[alone.valid], atol=1e-5)
     np.testing.assert_allclose(view.depth[alone.valid], alone.depth[alone.valid], atol=1e-5)
 
@@ -136,7 +123,7 @@ def test_the_other_side_of_a_thin_wall_does_not_show_through(camera, densify_con
 def discs(depths, colors, std=0.3) -> Gaussians:
     """Discs that face the camera, behind each other on the ray of pixel (15, 12)."""
     ray = np.array([0.5 / 20.0, -0.25 / 23.0, 1.0])
-    return replace(flat_gaussians(np.outer(depths, ray), std, thickness=1e-3), colors=np.array(colors))
+    return sc.replace(sc.flat_gaussians(np.outer(depths, ray), std, thickness=1e-3), colors=np.array(colors))
 
 
 RED, BLUE = (0.9, 0.1, 0.1), (0.2, 0.5, 0.8)
@@ -144,7 +131,7 @@ RED, BLUE = (0.9, 0.1, 0.1), (0.2, 0.5, 0.8)
 
 @pytest.mark.parametrize("opacity", [0.9, 0.6])
 def test_what_is_behind_shines_through_nothing(camera, densify_config, opacity):
-    view = dense(discs([2.0, 1.0], [RED, BLUE]), pose(), camera, at(densify_config, "render.opacity", opacity))
+    view = dense(discs([2.0, 1.0], [RED, BLUE]), sc.pose(), camera, sc.at(densify_config, "render.opacity", opacity))
     assert view.valid[12, 15]
     np.testing.assert_allclose(view.depth[12, 15], 1.0, atol=1e-5)  # roundings, here and below
     np.testing.assert_allclose(view.points[12, 15], [0.025, -0.25 / 23, 1.0], atol=1e-5)
@@ -156,7 +143,7 @@ def test_what_is_behind_shines_through_nothing(camera, densify_config, opacity):
 def test_the_layers_of_a_surface_are_averaged_whichever_comes_first(camera, densify_config, opacity, order):
     """All are centred on the pixel, so each counts the same; what is 7 % behind is another surface."""
     depths, colors = [2.0, 2.02, 2.07, 2.2][::order], [RED, BLUE, BLUE, RED][::order]
-    view = dense(discs(depths, colors), pose(), camera, at(densify_config, "render.opacity", opacity))
+    view = dense(discs(depths, colors), sc.pose(), camera, sc.at(densify_config, "render.opacity", opacity))
     np.testing.assert_allclose(view.depth[12, 15], 2.03, atol=1e-4)
     np.testing.assert_allclose(view.colors[12, 15], (np.array(RED) + 2 * np.array(BLUE)) / 3, atol=1e-4)
 
@@ -164,9 +151,9 @@ def test_the_layers_of_a_surface_are_averaged_whichever_comes_first(camera, dens
 def test_layers_count_by_how_near_the_pixel_is_to_their_centres(camera, densify_config):
     """A disc whose centre is one deviation away counts exp(-1/2)."""
     two = discs([2.0, 2.04], [RED, BLUE])
-    two = replace(two, means=np.asarray(two.means) + [[0, 0, 0], [0.3, 0, 0]])
-    config = changed(densify_config, **{"render.blur": 0.0, "render.covariance_scale": 1.0})
-    view = dense(two, pose(), camera, config)
+    two = sc.replace(two, means=np.asarray(two.means) + [[0, 0, 0], [0.3, 0, 0]])
+    config = sc.changed(densify_config, **{"render.blur": 0.0, "render.covariance_scale": 1.0})
+    view = dense(two, sc.pose(), camera, config)
     share = np.exp(-0.5) / (1 + np.exp(-0.5))
     np.testing.assert_allclose(view.depth[12, 15], 2.0 + 0.04 * share, atol=2e-4)  # 2.04 m looks a little smaller
 
@@ -174,8 +161,8 @@ def test_layers_count_by_how_near_the_pixel_is_to_their_centres(camera, densify_
 def test_a_near_surface_has_no_holes_before_a_wall(camera, densify_config):
     """Oracle: the two depths. A pixel shows one of the two walls, and all that the near one covers shows it."""
     near = wall(1.5)
-    near = replace(near, valid=np.abs(near.means)[:, 0] < 0.4)
-    view = dense(join(near, wall(2.4, step=0.2)), pose(), camera, densify_config)
+    near = sc.replace(near, valid=np.abs(near.means)[:, 0] < 0.4)
+    view = dense(sc.join(near, wall(2.4, step=0.2)), sc.pose(), camera, densify_config)
     depth = view.depth
     assert view.valid.all()
     is_near, is_far = np.abs(depth - 1.5) < 1e-2, np.abs(depth - 2.4) < 2e-2
@@ -185,12 +172,12 @@ def test_a_near_surface_has_no_holes_before_a_wall(camera, densify_config):
 
 
 def test_points_move_with_map_and_camera(camera, densify_config):
-    T, motion = pose((0.05, 0.1, 0)), pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
+    T, motion = sc.pose((0.05, 0.1, 0)), sc.pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
     view = dense(wall(2.0), T, camera, densify_config)
-    moved = dense(move_gaussians(motion, wall(2.0)), product(motion, T), camera, densify_config)
+    moved = dense(sc.move_gaussians(motion, wall(2.0)), sc.product(motion, T), camera, densify_config)
     both = view.valid & moved.valid
     assert both.mean() > 0.9
-    expected = view.points @ matrix_of(motion)[:3, :3].T + matrix_of(motion)[:3, 3]
+    expected = view.points @ sc.matrix_of(motion)[:3, :3].T + sc.matrix_of(motion)[:3, 3]
     np.testing.assert_allclose(moved.points[both], expected[both], atol=2e-3)  # a splat more or less at its edge
 
 
@@ -210,7 +197,7 @@ def test_the_front_surface_is_a_part_of_the_depth_about_the_weighted_median(weig
 
 
 def test_pixels_without_depth_are_invalid_and_finite(camera, densify_config):
-    nothing = replace(wall(2.0), valid=np.zeros(wall(2.0).valid.shape, bool))
-    view = dense(nothing, pose(), camera, densify_config)
+    nothing = sc.replace(wall(2.0), valid=np.zeros(wall(2.0).valid.shape, bool))
+    view = dense(nothing, sc.pose(), camera, densify_config)
     assert not view.valid.any() and not view.covered.any()
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(view))
