@@ -69,6 +69,7 @@ def test_an_update_is_that_of_equations_2_to_4():
     assert len(apart) > 100 and np.quantile(apart, 0.98) < 1e-3
 
 
+@pytest.mark.long
 def test_an_image_is_that_of_every_gaussian_at_every_pixel(camera):
     config = sc.slam_config().refinement.render
     g = sc.random_gaussians(60, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))

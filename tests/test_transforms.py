@@ -15,7 +15,7 @@ from scene import stack
 from verbs import FORWARD, INSIDE_ANOTHER, LOOSE, ROWS_TOGETHER, VERBS
 
 pytestmark = pytest.mark.slow  # every verb is compiled twice: minutes
-NAMES = [pytest.param(name, marks=pytest.mark.long if name in INSIDE_ANOTHER else ()) for name in VERBS]
+NAMES = [pytest.param(name, marks=pytest.mark.long if name in INSIDE_ANOTHER | FORWARD else ()) for name in VERBS]
 STEPS = (1e-3, 3e-4)  # parts of each array's largest entry; float32 rounds a quotient by the second to 2e-4
 
 
@@ -120,10 +120,7 @@ def test_a_batch_is_its_items_one_by_one(name):
                 np.testing.assert_array_equal(a, b, err_msg=name)
 
 
-SMOOTH = [pytest.param(name, marks=pytest.mark.long if name in INSIDE_ANOTHER | FORWARD else ()) for name in VERBS]
-
-
-@pytest.mark.parametrize("name", SMOOTH)
+@pytest.mark.parametrize("name", NAMES)
 def test_the_derivative_is_that_of_a_finite_difference(name):
     """Along a random direction of all inputs, of a sum of all results with random weights; and it is finite."""
     verb = compiled(name)

@@ -263,7 +263,7 @@ VERBS = {
 }
 # These end where a solver or a gate decides, or sum many terms.
 LOOSE = {"render", "icp", "localize_coarse", "localize_fine", "refine", "densify", "initialize"}
-# The solver has a while loop, which has no reverse mode.
+# The solver has a while loop, which has no reverse mode; to compile it with a derivative takes half a minute.
 FORWARD = {"icp", "localize_fine"}
 # Medians: where rows move apart, another one takes the median's place at once.
 ROWS_TOGETHER = {"localize_coarse", "localize_fine"}
