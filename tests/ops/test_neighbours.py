@@ -69,6 +69,14 @@ def test_points_that_are_crowded_or_far_apart_equal_brute_force(spread):
     check(queries.astype(np.float32), points.astype(np.float32), np.ones(MANY_POINTS, bool), 16, EVERY)
 
 
+def test_the_search_does_not_end_with_the_nearest():
+    """One point among the queries, and a shell about them: the others are anywhere on it."""
+    shell = uniform(13, MANY_POINTS, 3)
+    shell *= uniform(14, MANY_POINTS, 1, low=0.95, high=1.05) / np.linalg.norm(shell, axis=1, keepdims=True)
+    shell[0] = 0.0
+    check(np.float32(0.01) * uniform(15, MANY_QUERIES, 3), shell, np.ones(MANY_POINTS, bool), 16, EVERY)
+
+
 def test_queries_that_are_not_asked_change_nothing_for_the_others():
     """Among them are ones at infinity, as free rows of a map may be."""
     rng, queries = np.random.default_rng(9), uniform(10, MANY_QUERIES, 3)
