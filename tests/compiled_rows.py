@@ -1,6 +1,6 @@
 """Compares the compiled derivative of ICP's rows with that by each unknown alone; exits with 1 where they differ.
 
-A process of its own, since the tests switch off the optimisations of the compiler that this is about.
+For a version of JAX by itself; `test_optimized.py` does the same.
 """
 
 import sys
@@ -26,8 +26,8 @@ def random_problem(rng: np.random.Generator) -> tuple[Matches, Problem]:
         return jnp.asarray(rng.normal(size=shape), jnp.float32)
 
     def unit(*shape: int) -> jax.Array:
-        values = normal(*shape)
-        return values / jnp.linalg.norm(values, axis=-1, keepdims=True)
+        values = rng.normal(size=shape)
+        return jnp.asarray(values / np.linalg.norm(values, axis=-1, keepdims=True), jnp.float32)
 
     points = normal(NUM_POINTS, 3) + jnp.array([0.0, 0.0, 3.0])
     T = jaxlie.SE3.exp(jnp.array([0.2, -0.1, 0.3, 0.1, 0.5, -0.2]))
@@ -52,17 +52,21 @@ def random_problem(rng: np.random.Generator) -> tuple[Matches, Problem]:
     return matches, Problem(source, surface, T, jnp.full(NUM_POINTS, 0.01), 0.005 * one, jnp.eye(7), 0.01 * one)
 
 
-def largest_difference(matches: Matches, problem: Problem) -> float:
-    """Of any entry, as a fraction of its column's largest."""
+def largest_difference(matches: Matches, problem: Problem, options: dict | None = None) -> float:
+    """Of any entry, as a fraction of its column's largest; `options` of the compiler are those of the derivative."""
     settings = load_config().slam.localization.icp
-    y = jnp.asarray(np.random.default_rng(1).normal(size=7), jnp.float32) * 0.01
+    y = jnp.asarray(np.random.default_rng(1).normal(size=7) * 0.01, jnp.float32)
 
     def rows(y: jax.Array) -> jax.Array:
         return rows_of(y, matches, problem, settings)
 
-    compiled = jax.jit(jax.jacfwd(rows))(y)
-    alone = jnp.stack([jax.jvp(rows, (y,), (direction,))[1] for direction in jnp.eye(7)], axis=-1)
-    return float(jnp.max(jnp.abs(compiled - alone) / jnp.max(jnp.abs(alone), axis=(0, 1))))
+    def along(y: jax.Array, direction: jax.Array) -> jax.Array:
+        return jax.jvp(rows, (y,), (direction,))[1]
+
+    together = jax.jit(jax.jacfwd(rows)).lower(y).compile(options)(y)
+    plain = jax.jit(along).lower(y, y).compile({"xla_backend_optimization_level": 0})
+    alone = np.stack([plain(y, direction) for direction in np.eye(7, dtype=np.float32)], axis=-1)
+    return float(np.max(np.abs(together - alone) / np.max(np.abs(alone), axis=(0, 1))))
 
 
 if __name__ == "__main__":

@@ -4,15 +4,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 
-def knn(queries, points, valid, k):
-    """Distances (m, k) of the k nearest valid points, ascending; inf where there are fewer."""
-    result = np.full((len(queries), k), np.inf)
-    for i, query in enumerate(np.asarray(queries, float)):
-        distances = np.sort(np.linalg.norm(np.asarray(points, float)[np.asarray(valid)] - query, axis=-1))[:k]
-        result[i, : len(distances)] = distances
-    return result
-
-
 def nearest_rows(query, points, valid, k):
     distance = np.where(valid, np.linalg.norm(np.asarray(points, float) - query, axis=-1), np.inf)
     rows = np.argsort(distance, kind="stable")[:k]

@@ -1,15 +1,18 @@
-"""One small config and one small scene for the tests of the core, and conversions to the NumPy truth."""
+"""One small config and one small scene for the tests of the core, and what tests do with arrays, in NumPy."""
 
-from functools import cache
+from functools import cache, reduce
 from pathlib import Path
 
 import equinox as eqx
 import hydra
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from reference import room_view
+from scipy.spatial.transform import Rotation
 
+from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation, Prediction
 from emgs_jax.ops.camera import Camera
@@ -57,61 +60,138 @@ def at(tree, path: str, value):
             node = getattr(node, name)
         return node
 
-    return eqx.tree_at(find, tree, jnp.asarray(value, jnp.float32))
+    return eqx.tree_at(find, tree, jnp.asarray(np.float32(value)))
+
+
+def changed(tree, **values):
+    """The config with several fields replaced: changed(config, **{"average.gain": 0.0})."""
+    for path, value in values.items():
+        tree = at(tree, path, value)
+    return tree
+
+
+# An operation on a JAX array that stands alone is a program of its own, some 25 ms to compile for every shape: what
+# tests prepare and look at is done in NumPy.
+
+
+def on_host(function):
+    """The function, compiled once for each shape, with NumPy arrays for results."""
+    compiled = eqx.filter_jit(function)
+    return lambda *arguments: jax.device_get(compiled(*arguments))
+
+
+def device(values) -> jax.Array:
+    """Float32, where it is no array of integers or booleans."""
+    values = np.asarray(values)
+    return jnp.asarray(values.astype(np.float32) if values.dtype == np.float64 else values)
+
+
+def replace(tree, **leaves):
+    """The tree with these attributes replaced by arrays."""
+    names = tuple(leaves)
+    return eqx.tree_at(lambda x: tuple(getattr(x, name) for name in names), tree, tuple(map(device, leaves.values())))
+
+
+def rows_of(tree, rows):
+    """These rows of every leaf, as NumPy arrays."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[rows], tree)
+
+
+def join(*trees):
+    """All rows of every leaf, one tree after the other."""
+    return jax.tree.map(lambda *leaves: device(np.concatenate(leaves)), *trees)
+
+
+def stack(trees):
+    """Every tree a row."""
+    return jax.tree.map(lambda *leaves: device(np.stack(leaves)), *trees)
+
+
+def poisoned(tree, valid, value):
+    """All numbers of rows that are not valid replaced by a wild one; integers and booleans stay."""
+
+    def put(leaf):
+        leaf = np.asarray(leaf)
+        mask = np.asarray(valid).reshape(-1, *[1] * (leaf.ndim - 1))
+        return device(np.where(mask, leaf, np.float32(value)) if leaf.dtype == np.float32 else leaf)
+
+    return jax.tree.map(put, tree)
+
+
+def matrix_of(T: jaxlie.SE3) -> np.ndarray:
+    """(4, 4), float64."""
+    matrix, values = np.eye(4), np.asarray(T.wxyz_xyz, float)
+    matrix[:3, :3] = Rotation.from_quat(np.roll(values[:4], -1)).as_matrix()
+    matrix[:3, 3] = values[4:]
+    return matrix
+
+
+def pose_of(matrix: np.ndarray) -> jaxlie.SE3:
+    """SE3 of a matrix (4, 4)."""
+    quaternion = np.roll(Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True), 1)
+    return jaxlie.SE3(device(np.concatenate([quaternion, matrix[:3, 3]])))
+
+
+def product(*poses: jaxlie.SE3) -> jaxlie.SE3:
+    """Of poses, the last one applied first."""
+    return pose_of(reduce(np.matmul, map(matrix_of, poses), np.eye(4)))
 
 
 def pose(rotation=(0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0)) -> jaxlie.SE3:
     """SE3 from a rotation vector (rad) and a translation (m)."""
-    rotation = jaxlie.SO3.exp(jnp.asarray(rotation, jnp.float32))
-    return jaxlie.SE3.from_rotation_and_translation(rotation, jnp.asarray(translation, jnp.float32))
+    quaternion = np.roll(Rotation.from_rotvec(np.asarray(rotation, float)).as_quat(), 1)
+    return jaxlie.SE3(device(np.concatenate([quaternion, np.asarray(translation, float)])))
 
 
 def pose_error(actual: jaxlie.SE3, expected: jaxlie.SE3) -> tuple[float, float]:
     """Distance (m) and angle (rad) between two poses."""
-    difference = np.asarray((expected.inverse() @ actual).log(), float)
-    return float(np.linalg.norm(difference[:3])), float(np.linalg.norm(difference[3:]))
+    one, other = np.asarray(actual.wxyz_xyz, float), np.asarray(expected.wxyz_xyz, float)
+    turns = [Rotation.from_quat(np.roll(values[:4], -1)) for values in (one, other)]
+    return float(np.linalg.norm(one[4:] - other[4:])), float((turns[1].inv() * turns[0]).magnitude())
 
 
 def observe_room(T_world_camera: jaxlie.SE3, camera: Camera, num_features: int = 0, scale: float = 1.0) -> Observation:
     """The exact observation of the box room, camera frame; features are all the same unit vector."""
-    matrix = np.asarray(T_world_camera.as_matrix(), float)
     focal, center = np.asarray(camera.focal, float), np.asarray(camera.center, float)
-    points, normals, colors = room_view(matrix, focal, center, camera.width, camera.height)
+    points, normals, colors = room_view(matrix_of(T_world_camera), focal, center, camera.width, camera.height)
     count = len(points)
-    return Observation(
-        points=jnp.asarray(points * scale, jnp.float32),
-        colors=jnp.asarray(colors, jnp.float32),
-        normals=jnp.asarray(normals, jnp.float32),
-        features=jnp.full((count, num_features), 1.0 / np.sqrt(max(num_features, 1)), jnp.float32),
-        confidence=jnp.ones(count),
-        valid=jnp.ones(count, bool),
-    )
+    features = np.full((count, num_features), 1.0 / max(num_features, 1) ** 0.5)
+    arrays = scale * points, colors, normals, features, np.ones(count), np.ones(count, bool)
+    return Observation(*map(device, arrays))
 
 
-def path_pose(i: int) -> jaxlie.SE3:
+def moved_points(T: jaxlie.SE3, observation: Observation, scale: float = 1.0) -> Observation:
+    """What `transform` says, in float64: points scaled about the camera and placed, normals turned."""
+    matrix = matrix_of(T)
+    points, normals = (np.asarray(x, float) for x in (observation.points, observation.normals))
+    placed = float(scale) * points @ matrix[:3, :3].T + matrix[:3, 3]
+    return replace(observation, points=placed, normals=normals @ matrix[:3, :3].T)
+
+
+def path_pose(i: float) -> jaxlie.SE3:
     """The small scene's camera path: 4 cm and under 2 degrees a frame."""
     return pose((0.02 * np.sin(i), 0.03 * i - 0.05, 0.01 * i), (0.04 * i - 0.1, 0.02 * np.cos(i), 0.02 * i))
 
 
 def stack_poses(poses: list[jaxlie.SE3]) -> jaxlie.SE3:
-    return jaxlie.SE3(jnp.stack([T.wxyz_xyz for T in poses]))
+    return jaxlie.SE3(device(np.stack([T.wxyz_xyz for T in poses])))
 
 
 def predict_room(
-    i: int, camera: Camera, scale: float = 1.0, has_newest: bool = True, num_features: int = 0
+    i: float, camera: Camera, scale: float = 1.0, has_newest: bool = True, num_features: int = 0
 ) -> Prediction:
     """An exact prediction of frame i of the path, but for a scale about each camera and about the anchor."""
-    anchor = path_pose(0)
+    anchor = matrix_of(path_pose(0))
     poses = []
     for T in (path_pose(i - 1), path_pose(i), path_pose(i + 1)):
-        local = anchor.inverse() @ T
-        local = jaxlie.SE3.from_rotation_and_translation(local.rotation(), scale * local.translation())
-        poses.append(anchor @ local)
+        local = np.linalg.inv(anchor) @ matrix_of(T)
+        local[:3, 3] *= scale
+        poses.append(pose_of(anchor @ local))
     return Prediction(
         current=observe_room(path_pose(i), camera, num_features, scale),
         previous=observe_room(path_pose(i - 1), camera, num_features, scale),
         T_world_views=stack_poses(poses),
-        T_world_anchor=anchor,
+        T_world_anchor=path_pose(0),
         has_newest=jnp.asarray(has_newest),
         is_repeat=jnp.asarray(True),
     )
@@ -129,8 +209,28 @@ def random_gaussians(count: int, seed: int = 0, num_features: int = 0, low=(-1, 
         rng.uniform(0, 1, (count, 3)),
         unit(rng.normal(size=(count, 3)) * 0.3 + [0, 0, -1]),
         unit(rng.normal(size=(count, num_features))),
+        np.ones(count, bool),
     )
-    return Gaussians(*(jnp.asarray(a, jnp.float32) for a in arrays), jnp.ones(count, bool))
+    return Gaussians(*map(device, arrays))
+
+
+def flat_gaussians(means, std=0.05, normal=(0.0, 0.0, -1.0), thickness=0.01, color=0.5, features=()) -> Gaussians:
+    """Round discs, all with one normal, as wide as `std` and less thick."""
+    means = np.atleast_2d(np.asarray(means, float))
+    count, normal = len(means), np.asarray(normal, float) / np.linalg.norm(normal)
+    across = np.outer(normal, normal)
+    cov = std**2 * (np.eye(3) - across) + thickness**2 * across
+    every = lambda row: np.broadcast_to(np.asarray(row, float), (count, *np.shape(row)[-1:]))  # noqa: E731
+    arrays = means, np.tile(cov, (count, 1, 1)), every(np.broadcast_to(color, 3)), every(normal), every(features)
+    return Gaussians(*map(device, arrays), device(np.ones(count, bool)))
+
+
+def fresh_map(gaussians: Gaussians, weight=1.0, existence=1.0, birth=0) -> GaussianMap:
+    """A map of Gaussians that were fused once; weight, existence and birth are one for all or one for each."""
+    count = gaussians.valid.shape[0]
+    weight, existence = (np.broadcast_to(np.asarray(x, float), count) for x in (weight, existence))
+    births = np.broadcast_to(np.asarray(birth, np.int32), count)
+    return GaussianMap(gaussians, *map(device, (weight, np.ones(count, np.int32), existence, births)))
 
 
 def as_numpy(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -143,17 +243,28 @@ def as_numpy(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 def move_gaussians(T: jaxlie.SE3, g: Gaussians) -> Gaussians:
     """A rigid motion of Gaussians."""
-    R = T.rotation().as_matrix()
-    moved = g.means @ R.T + T.translation(), R @ g.covs @ R.T, g.normals @ R.T
-    return eqx.tree_at(lambda x: (x.means, x.covs, x.normals), g, moved)
+    R, t = (lambda matrix: (matrix[:3, :3], matrix[:3, 3]))(matrix_of(T))
+    means, covs, normals = (np.asarray(x, float) for x in (g.means, g.covs, g.normals))
+    return replace(g, means=means @ R.T + t, covs=R @ covs @ R.T, normals=normals @ R.T)
 
 
 def random_observation(count: int, seed: int = 0, num_features: int = 0) -> Observation:
     """World-frame points in the box of `random_gaussians`."""
     g = random_gaussians(count, seed + 1000, num_features)
-    return Observation(g.means, g.colors, g.normals, g.features, jnp.ones(count), jnp.ones(count, bool))
+    ones = map(device, (np.ones(count), np.ones(count, bool)))
+    return Observation(g.means, g.colors, g.normals, g.features, *ones)
 
 
 def assert_same(actual, expected):
     """Equal trees, bit for bit."""
-    assert eqx.tree_equal(actual, expected), (actual, expected)
+    leaves, structure = jax.tree.flatten(actual)
+    others, other_structure = jax.tree.flatten(expected)
+    assert structure == other_structure, (structure, other_structure)
+    for one, other in zip(map(np.asarray, leaves), map(np.asarray, others), strict=True):
+        assert one.dtype == other.dtype and np.array_equal(one, other), (one, other)
+
+
+def assert_rows_near(actual, expected, atol, names=("means", "covs", "normals", "colors")):
+    """These fields of two trees, within one tolerance."""
+    for name in names:
+        np.testing.assert_allclose(getattr(actual, name), getattr(expected, name), atol=atol, err_msg=name)

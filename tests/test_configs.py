@@ -5,6 +5,7 @@ import dataclasses
 import inspect
 import re
 import typing
+from functools import cache
 from pathlib import Path
 
 import hydra
@@ -27,10 +28,24 @@ def group_and_option(path: Path) -> tuple[str, str]:
     return str(path.parent.relative_to(CONF)), path.stem
 
 
+OPTIONS = {
+    group: [option for other, option in map(group_and_option, GROUPED) if other == group]
+    for group in dict.fromkeys(group for group, _ in map(group_and_option, GROUPED))
+}
+
+
+@cache
+def together(number: int) -> dict:
+    """The config of a run with each group's option of that number, counted round."""
+    chosen = {group: options[number % len(options)] for group, options in OPTIONS.items() if group not in OF_COMMANDS}
+    return OmegaConf.to_container(compose(*(f"{group}={option}" for group, option in chosen.items())), resolve=False)
+
+
+@cache
 def composed(group: str, option: str) -> dict:
-    """The config of the command that has the group."""
+    """The config of the command that has the group; options of several groups are composed together."""
     if group not in OF_COMMANDS:
-        return OmegaConf.to_container(compose(f"{group}={option}"), resolve=False)
+        return together(OPTIONS[group].index(option))
     config = configure.compose(f"{group}={option}", name=OF_COMMANDS[group])
     return {group: OmegaConf.to_container(config[group], resolve=False)}
 
@@ -59,12 +74,12 @@ def test_every_option_composes_and_its_keys_are_parameters(path):
         assert required <= keys, f"{node['_target_']}: {required - keys} have no value"
 
 
-@pytest.mark.parametrize(
-    "path", [p for p in GROUPED if "slam" in p.parts], ids=lambda path: "/".join(group_and_option(path))
-)
-def test_every_option_of_slam_instantiates(path):
-    group, option = group_and_option(path)
-    assert isinstance(slam_config(f"{group}={option}"), SlamConfig)
+@pytest.mark.parametrize("number", range(2))
+def test_every_option_of_slam_instantiates(number):
+    chosen = {group: options for group, options in OPTIONS.items() if group.startswith("slam/")}
+    assert chosen and max(map(len, chosen.values())) == 2
+    config = slam_config(*(f"{group}={options[number % len(options)]}" for group, options in chosen.items()))
+    assert isinstance(config, SlamConfig)
 
 
 def test_an_unknown_key_is_refused():
@@ -107,36 +122,119 @@ def test_the_paper_preset_takes_every_printed_reading():
     assert {key: OmegaConf.select(paper.slam, key) for key in printed} == printed
 
 
+@cache
 def config_classes():
-    """Every class of conf/ that holds settings only, and the config classes that they hold."""
-    seen = set()
+    """Every class of conf/ that holds settings only, the config classes that they hold, and the keys that hold each."""
+    found: dict[type, set[str]] = {}
 
-    def visit(module):
-        if module in seen or not dataclasses.is_dataclass(module):
+    def visit(module, key):
+        if not dataclasses.is_dataclass(module):
             return
-        seen.add(module)
-        for hint in typing.get_type_hints(module).values():
-            if inspect.isclass(hint):
-                visit(hint)
+        is_new = module not in found
+        found.setdefault(module, set()).add(key)
+        if is_new:
+            for name, hint in typing.get_type_hints(module).items():
+                for part in (hint, *typing.get_args(hint)):
+                    if inspect.isclass(part):
+                        visit(part, name)
+
+    def visit_nodes(node, key):
+        if isinstance(node, dict):
+            if "_target_" in node:
+                visit(hydra.utils.get_class(node["_target_"]), key)
+            for name, value in node.items():
+                visit_nodes(value, name)
 
     for group, option in map(group_and_option, GROUPED):
-        for node in targets(composed(group, option)):
-            visit(hydra.utils.get_class(node["_target_"]))
-    return seen
+        visit_nodes(composed(group, option), "")
+    return found
+
+
+def last_name(node) -> str:
+    """`c` of a.b.c and of c, and of a.b.c.config."""
+    if isinstance(node, ast.Attribute):
+        inner = last_name(node.value)
+        return inner if node.attr == "config" and inner not in ("self", "") else node.attr
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+class Reads(ast.NodeVisitor):
+    """Which fields of which config classes a file reads: of what is annotated as such, is held under the key that it
+    has in conf/, or is called as its class is."""
+
+    def __init__(self, classes: dict[type, set[str]]) -> None:
+        self.names, self.found, self.owner = {module.__name__ for module in classes}, set(), ""
+        self.of_key: dict[str, set[str]] = {}
+        for module, keys in classes.items():
+            own = re.sub(r"(?<!^)(?=[A-Z])", "_", module.__name__.removesuffix("Config")).lower()
+            for key in keys | {own}:
+                self.of_key.setdefault(key, set()).add(module.__name__)
+
+    def read(self, tree: ast.AST) -> set[tuple[str, str]]:
+        self.of_name = {key: set(names) for key, names in self.of_key.items()}
+        for node in ast.walk(tree):
+            is_typed = isinstance(node, ast.arg | ast.AnnAssign) and node.annotation is not None
+            if is_typed:
+                words = set(re.findall(r"\w+", ast.unparse(node.annotation)))
+                name = node.arg if isinstance(node, ast.arg) else last_name(node.target)
+                self.of_name.setdefault(name, set()).update(words & self.names)
+        for _ in range(2):  # names for such a name
+            for node in ast.walk(tree):
+                if isinstance(node, ast.Assign) and len(node.targets) == 1:
+                    self.rename(node.targets[0], node.value)
+        self.visit(tree)
+        return self.found
+
+    def rename(self, target, value) -> None:
+        if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+            for one, other in zip(target.elts, value.elts, strict=False):
+                self.rename(one, other)
+        elif last_name(target) and last_name(value) in self.of_name:
+            self.of_name.setdefault(last_name(target), set()).update(self.of_name[last_name(value)])
+
+    def visit_ClassDef(self, node) -> None:
+        before, self.owner = self.owner, node.name
+        self.generic_visit(node)
+        self.owner = before
+
+    def visit_Attribute(self, node) -> None:
+        if isinstance(node.ctx, ast.Load):
+            base = last_name(node.value)
+            owners = {self.owner} if base == "self" else self.of_name.get(base, set())
+            self.found |= {(owner, node.attr) for owner in owners}
+        self.generic_visit(node)
+
+
+# Written into results as a whole, by `dataclasses.asdict`.
+ONLY_WRITTEN = {"EvaluationConfig.protocol"}
 
 
 def test_every_field_of_a_config_class_is_read():
-    read = set()
-    for folder in ("emgs_jax", "experiments"):
-        for path in (ROOT / folder).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text())):
-                if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
-                    read.add(node.attr)
+    """By `config.name` where config is of that class, by its annotation or the key that holds it: an attribute of that
+    name of anything else does not count."""
     classes = config_classes()
-    names = {module.__name__ for module in classes}
-    assert {"SlamConfig", "IcpConfig", "DensifyConfig", "EvaluationConfig", "MaskConfig", "SweepConfig"} <= names
-    unread = [f"{module.__name__}.{field.name}" for module in classes for field in dataclasses.fields(module)]
-    assert not [name for name in unread if name.rpartition(".")[2] not in read]
+    paths = [path for folder in ("emgs_jax", "experiments") for path in (ROOT / folder).rglob("*.py")]
+    reads = Reads(classes)
+    read = set().union(*(reads.read(ast.parse(path.read_text())) for path in paths))
+    assert {"SlamConfig", "IcpConfig", "DensifyConfig", "EvaluationConfig", "MaskConfig", "SweepConfig"} <= reads.names
+    unread = set()
+    for module in classes:
+        family = [other.__name__ for other in classes if issubclass(other, module) or issubclass(module, other)]
+        for field in dataclasses.fields(module):
+            if not any((name, field.name) in read for name in family):
+                unread.add(f"{module.__name__}.{field.name}")
+    assert unread == ONLY_WRITTEN
+
+
+def test_a_field_that_only_something_else_has_counts_as_unread():
+    source = """
+def f(config: IcpConfig, other):
+    icp = config
+    return icp.noise + other.color_std + config.a.residual
+"""
+    found = Reads(config_classes()).read(ast.parse(source))
+    assert ("IcpConfig", "noise") in found
+    assert not {("IcpConfig", "color_std"), ("IcpConfig", "residual")} & found
 
 
 def test_every_number_of_a_config_class_declares_its_range():

@@ -1,24 +1,24 @@
 """What is new goes on where the map ends: a wall that a frame shows too far away."""
 
-import equinox as eqx
-import jax.numpy as jnp
-import jaxlie
 import numpy as np
 import pytest
+from scene import device, flat_gaussians, fresh_map, matrix_of, on_host, pose
 
 from emgs_jax.continuation import ContinuationConfig, continued, depth_error, window
-from emgs_jax.gaussian_map import GaussianMap, empty_map
+from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.observation import Observation
 from emgs_jax.ops.camera import Camera
 
 HEIGHT, WIDTH = 12, 16
-CAMERA = Camera(focal=jnp.array([16.0, 16.0]), center=jnp.array([7.5, 5.5]), width=WIDTH, height=HEIGHT)
-HALF = jnp.tile(jnp.arange(WIDTH) < WIDTH // 2, HEIGHT)  # the map has the left half of the wall
-T = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.exp(jnp.array([0.1, -0.2, 0.3])), jnp.array([1.0, 2.0, 3.0]))
+CAMERA = Camera([16.0, 16.0], [7.5, 5.5], WIDTH, HEIGHT)
+HALF = np.tile(np.arange(WIDTH) < WIDTH // 2, HEIGHT)  # the map has the left half of the wall
+T = pose((0.1, -0.2, 0.3), (1.0, 2.0, 3.0))
+TURN, PLACE = matrix_of(T)[:3, :3], matrix_of(T)[:3, 3]
+goes_on, error_of = on_host(continued), on_host(depth_error)
 
 
 def config(width: float = 0.2, max_error: float = 0.3, min_cos: float = 0.3) -> ContinuationConfig:
-    return ContinuationConfig(*map(jnp.asarray, (width, max_error, min_cos)))
+    return ContinuationConfig(*map(device, (width, max_error, min_cos)))
 
 
 def rays() -> np.ndarray:
@@ -28,26 +28,27 @@ def rays() -> np.ndarray:
 
 def seen(depth: np.ndarray | float) -> Observation:
     """A frame of the wall z = 2 m, with the given depth (m) of every pixel."""
-    points = T.apply(jnp.asarray(rays() * np.broadcast_to(depth, HEIGHT * WIDTH)[:, None], jnp.float32))
     count = HEIGHT * WIDTH
-    normals = jnp.broadcast_to(T.rotation().apply(jnp.array([0.0, 0.0, -1.0])), (count, 3))
-    nothing = jnp.zeros((count, 3))
-    return Observation(points, nothing, normals, jnp.zeros((count, 0)), jnp.ones(count), jnp.ones(count, bool))
+    points = rays() * np.broadcast_to(depth, count)[:, None] @ TURN.T + PLACE
+    normals = np.tile(TURN @ [0.0, 0.0, -1.0], (count, 1))
+    arrays = points, np.zeros((count, 3)), normals, np.zeros((count, 0)), np.ones(count), np.ones(count, bool)
+    return Observation(*map(device, arrays))
 
 
 def wall(weight: float, normal: tuple[float, float, float] = (0.0, 0.0, -1.0)) -> GaussianMap:
     """The Gaussian of every pixel, at 2 m."""
-    count = HEIGHT * WIDTH
-    means = T.apply(jnp.asarray(rays() * 2.0, jnp.float32))
-    normals = jnp.broadcast_to(T.rotation().apply(jnp.asarray(normal)), (count, 3))
-    changed = (means, normals, jnp.full(count, weight))
-    return eqx.tree_at(lambda m: (m.gaussians.means, m.gaussians.normals, m.weight), empty_map(count, 0), changed)
+    return fresh_map(flat_gaussians(rays() * 2.0 @ TURN.T + PLACE, normal=TURN @ normal), weight)
 
 
-def depth_after(frame: Observation, map: GaussianMap, noise=0.02, **changes) -> np.ndarray:
-    noise = jnp.broadcast_to(jnp.asarray(noise), HALF.shape)
-    found = continued(frame, map, HALF, noise, T, CAMERA, config(**changes))
-    return np.asarray(T.inverse().apply(found.points))[:, 2]
+def moved(frame: Observation, map: GaussianMap, noise=0.02, is_fused=HALF, **changes) -> np.ndarray:
+    """The points, camera frame."""
+    noise = np.float32(np.broadcast_to(noise, HALF.shape))
+    points = goes_on(frame, map, is_fused, noise, T, CAMERA, config(**changes)).points
+    return (points - PLACE) @ TURN
+
+
+def depth_after(*arguments, **changes) -> np.ndarray:
+    return moved(*arguments, **changes)[:, 2]
 
 
 def test_a_wall_that_is_seen_too_far_goes_on_where_the_map_ends() -> None:
@@ -58,14 +59,13 @@ def test_a_wall_that_is_seen_too_far_goes_on_where_the_map_ends() -> None:
 
 
 def test_points_move_along_their_rays_only() -> None:
-    found = continued(seen(2.2), wall(1e6), HALF, jnp.full(HALF.shape, 0.02), T, CAMERA, config())
-    local = np.asarray(T.inverse().apply(found.points))
+    local = moved(seen(2.2), wall(1e6))
     np.testing.assert_allclose(local / local[:, 2:], rays(), atol=1e-5)
 
 
 @pytest.mark.parametrize("weight", [1.0, 3.0])
 def test_the_share_of_a_young_map_in_the_difference_is_its_own(weight: float) -> None:
-    old, young = (np.log(depth_after(seen(2.2), wall(w)) / 2.2)[~np.asarray(HALF)] for w in (1e9, weight))
+    old, young = (np.log(depth_after(seen(2.2), wall(w)) / 2.2)[~HALF] for w in (1e9, weight))
     np.testing.assert_allclose(young, old * weight / (weight + 1), rtol=2e-2, atol=1e-4)
 
 
@@ -76,9 +76,9 @@ def test_errors_that_are_not_alike_move_nothing() -> None:
 
 
 def test_as_printed_and_with_nothing_fused_no_bit_changes() -> None:
-    frame, noise = seen(2.2), jnp.full(HALF.shape, 0.02)
-    for is_fused, settings in ((HALF, config(width=0.0)), (jnp.zeros_like(HALF), config())):
-        found = continued(frame, wall(1e6), is_fused, noise, T, CAMERA, settings)
+    frame, noise = seen(2.2), np.full(HALF.shape, 0.02, np.float32)
+    for is_fused, settings in ((HALF, config(width=0.0)), (np.zeros_like(HALF), config())):
+        found = goes_on(frame, wall(1e6), is_fused, noise, T, CAMERA, settings)
         np.testing.assert_array_equal(found.points, frame.points)
 
 
@@ -87,7 +87,7 @@ def test_uncertain_points_tell_less() -> None:
     depth = 2.0 * np.where(rows % 2, 1.1, 1.0)  # every other row errs
     even = depth_after(seen(depth), wall(1e6))
     known = depth_after(seen(depth), wall(1e6), noise=np.where(rows % 2, 0.2, 0.02))
-    new = ~np.asarray(HALF) & (rows % 2 == 0)
+    new = ~HALF & (rows % 2 == 0)
     assert np.mean(np.abs(known[new] - 2.0)) < 0.3 * np.mean(np.abs(even[new] - 2.0))
 
 
@@ -96,18 +96,18 @@ def test_an_exact_frame_without_noise_stays_finite_and_where_it_is() -> None:
 
 
 def test_what_is_another_surface_or_is_seen_flat_has_no_error() -> None:
-    frame, everywhere = seen(2.2), jnp.ones(HEIGHT * WIDTH, bool)
-    center = T.translation()
-    error, is_known = depth_error(frame.points, wall(1.0), everywhere, center, config())
-    assert bool(is_known.all())
+    frame, everywhere, center = seen(2.2), np.ones(HEIGHT * WIDTH, bool), np.float32(PLACE)
+    error, is_known = error_of(frame.points, wall(1.0), everywhere, center, config())
+    assert is_known.all()
     np.testing.assert_allclose(error, np.log(1.1), rtol=1e-4)
-    error, is_known = depth_error(frame.points, wall(1.0), everywhere, center, config(max_error=0.05))
-    assert not bool(is_known.any()) and not np.any(error)
+    error, is_known = error_of(frame.points, wall(1.0), everywhere, center, config(max_error=0.05))
+    assert not is_known.any() and not np.any(error)
     flat = wall(1.0, normal=(1.0, 0.0, 0.0))
-    _, is_known = depth_error(frame.points, flat, everywhere, center, config(min_cos=0.5))
-    assert not bool(is_known.any())
+    _, is_known = error_of(frame.points, flat, everywhere, center, config(min_cos=0.5))
+    assert not is_known.any()
 
 
 def test_window_is_gaussian_and_the_identity_without_width() -> None:
-    np.testing.assert_array_equal(window(4, jnp.zeros(())), np.eye(4))
-    np.testing.assert_allclose(window(4, jnp.asarray(2.0))[0], np.exp(-(np.arange(4) ** 2) / 8.0), rtol=1e-6)
+    weights = on_host(window)
+    np.testing.assert_array_equal(weights(4, np.float32(0.0)), np.eye(4))
+    np.testing.assert_allclose(weights(4, np.float32(2.0))[0], np.exp(-(np.arange(4) ** 2) / 8.0), rtol=1e-6)

@@ -2,34 +2,24 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from scene import assert_same, at, random_gaussians, random_observation
+import scene as sc
 
-from emgs_jax.gaussian_map import (
-    GaussianMap,
-    empty_map,
-    grow,
-    insert,
-    new_map,
-    select_submap,
-    update_average,
-    write_back,
-)
+from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert, select_submap, update_average, write_back
 from emgs_jax.gaussians import empty_gaussians
 
-update = eqx.filter_jit(update_average)
-select = eqx.filter_jit(select_submap)
-insert = eqx.filter_jit(insert)
+update, select, inserted_into, written = (sc.on_host(f) for f in (update_average, select_submap, insert, write_back))
 
 
 def map_of(count: int, capacity: int, seed: int = 0) -> GaussianMap:
-    return grow(
-        new_map(random_gaussians(count, seed), jnp.ones(count), jnp.ones(()), jnp.asarray(0)),
-        capacity,
-    )
+    """So many Gaussians, and free rows."""
+    map, free = sc.fresh_map(sc.random_gaussians(count, seed)), jax.device_get(empty_map(capacity - count, 0))
+    return jax.tree.map(lambda *rows: sc.device(np.concatenate(rows)), map, free)
+
+
+MAP = map_of(200, 256)
 
 
 @pytest.fixture(scope="module")
@@ -40,10 +30,10 @@ def average(config):
 def averaged(values, evidence, config):
     """Mean's x of one Gaussian after each value, its gains, and its map."""
     map, means, gains = map_of(1, 1), [], []
-    map = eqx.tree_at(lambda m: m.gaussians.means, map, jnp.zeros((1, 3)))
+    map = eqx.tree_at(lambda m: m.gaussians.means, map, np.zeros((1, 3), np.float32))
     for value, delta in zip(values, evidence, strict=True):
-        new = eqx.tree_at(lambda g: g.means, map.gaussians, jnp.full((1, 3), value))
-        map, gain = update(map, new, jnp.array([delta]), config)
+        new = sc.replace(map.gaussians, means=np.full((1, 3), value))
+        map, gain = update(map, new, np.float32([delta]), config)
         means.append(float(map.gaussians.means[0, 0]))
         gains.append(float(gain[0]))
     return means, gains, map
@@ -73,14 +63,14 @@ def test_uneven_evidence_gives_the_reference_average(average, kind):
 
 
 def test_forgetting_shrinks_the_kept_weight_before_each_update(average):
-    _, gains, map = averaged([1.0] * 2, [1.0] * 2, at(average["count"], "forgetting", 0.5))
+    _, gains, map = averaged([1.0] * 2, [1.0] * 2, sc.at(average["count"], "forgetting", 0.5))
     np.testing.assert_allclose(gains, [1 / 1.5, 1 / 1.75], rtol=1e-6)  # W: 1, .5 + 1, .75 + 1
     np.testing.assert_allclose(map.weight, 1.75, rtol=1e-6)
 
 
 def test_certainty_ends_at_the_largest_weight(average):
     """A camera that stands still for long must not make a map that no later view can move."""
-    _, gains, map = averaged([1.0] * 5, [1.0] * 5, at(average["count"], "max_weight", 3.0))
+    _, gains, map = averaged([1.0] * 5, [1.0] * 5, sc.at(average["count"], "max_weight", 3.0))
     np.testing.assert_allclose(gains, [1 / 2, 1 / 3, 1 / 4, 1 / 4, 1 / 4], rtol=1e-6)
     np.testing.assert_allclose(map.weight, 4.0)
 
@@ -88,14 +78,11 @@ def test_certainty_ends_at_the_largest_weight(average):
 @pytest.mark.parametrize("kind", ["ema_printed", "count"])
 def test_a_gaussian_without_evidence_or_that_is_invalid_stays_bit_for_bit(average, kind):
     map = map_of(6, 8)
-    evidence = jnp.array([0.0, 0.5, 0.0, 1.0, 0.0, 0.2, 0.7, 0.7])  # the last two rows are free
-    poison = jax.tree.map(
-        lambda x: jnp.where(evidence.reshape(-1, *[1] * (x.ndim - 1)) > 0, x, jnp.nan), random_gaussians(8, 5)
-    )
-    poison = eqx.tree_at(lambda g: g.valid, poison, jnp.ones(8, bool))
-    updated, gain = update(map, poison, evidence, average[kind])
+    evidence = np.float32([0.0, 0.5, 0.0, 1.0, 0.0, 0.2, 0.7, 0.7])  # the last two rows are free
+    wild = sc.poisoned(sc.random_gaussians(8, 5), evidence > 0, np.nan)
+    updated, gain = update(map, wild, evidence, average[kind])
     still = np.array([0, 2, 4, 6, 7])
-    assert_same(jax.tree.map(lambda x: x[still], updated), jax.tree.map(lambda x: x[still], map))
+    sc.assert_same(sc.rows_of(updated, still), sc.rows_of(map, still))
     np.testing.assert_array_equal(np.asarray(gain)[still], 0)
     np.testing.assert_array_equal(updated.num_updates, [1, 2, 1, 2, 1, 2, 0, 0])
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(updated))
@@ -111,9 +98,7 @@ def in_box(map, clouds, config):
 
 
 def box_cloud(low, high):
-    cloud = random_observation(40)
-    points = jnp.linspace(jnp.array(low), jnp.array(high), 40)
-    return eqx.tree_at(lambda o: o.points, cloud, points)
+    return sc.replace(sc.random_observation(40), points=np.linspace(low, high, 40))
 
 
 CLOUDS = box_cloud([-0.5, -0.4, 1.2], [0.0, 0.3, 1.9]), box_cloud([-0.2, 0.0, 1.5], [0.33, 0.41, 2.5])
@@ -121,33 +106,32 @@ CLOUDS = box_cloud([-0.5, -0.4, 1.2], [0.0, 0.3, 1.9]), box_cloud([-0.2, 0.0, 1.
 
 def test_a_submap_holds_the_gaussians_in_the_box_of_the_clouds(config):
     config = config("slam.submap.voxel_size=0.13", "slam.submap.margin=0.07").submap
-    map = map_of(200, 256)
+    map = MAP
     submap, rows, overflow = select(map, CLOUDS, config)
     expected = in_box(map, CLOUDS, config)
     assert 20 < len(expected) < 100 and overflow == 0
-    exists = np.asarray(submap.gaussians.valid)
-    np.testing.assert_array_equal(np.asarray(rows)[exists], expected)
-    np.testing.assert_array_equal(np.asarray(rows)[~exists], 256)
-    assert_same(jax.tree.map(lambda x: x[exists], submap), jax.tree.map(lambda x: x[expected], map))
+    exists = submap.gaussians.valid
+    np.testing.assert_array_equal(rows[exists], expected)
+    np.testing.assert_array_equal(rows[~exists], 256)
+    sc.assert_same(sc.rows_of(submap, exists), sc.rows_of(map, expected))
 
 
 def test_invalid_points_do_not_widen_the_box(config):
-    poisoned = eqx.tree_at(lambda o: (o.points, o.valid), CLOUDS[1], (jnp.full((40, 3), 1e6), jnp.zeros(40, bool)))
-    map = map_of(200, 256)
+    wild = sc.replace(CLOUDS[1], points=np.full((40, 3), 1e6), valid=np.zeros(40, bool))
     # Rows past the end are no rows of the map, so only the valid part is compared.
-    one, other = (select(map, clouds, config().submap) for clouds in ((CLOUDS[0], poisoned), (CLOUDS[0], CLOUDS[0])))
+    one, other = (select(MAP, clouds, config().submap) for clouds in ((CLOUDS[0], wild), (CLOUDS[0], CLOUDS[0])))
     np.testing.assert_array_equal(one[1], other[1])
 
 
 def test_clouds_without_a_valid_point_select_nothing(config):
-    empty = eqx.tree_at(lambda o: o.valid, CLOUDS[0], jnp.zeros(40, bool))
-    submap, rows, overflow = select(map_of(20, 32), (empty, empty), config().submap)
+    empty = sc.replace(CLOUDS[0], valid=np.zeros(40, bool))
+    submap, rows, overflow = select(MAP, (empty, empty), config().submap)
     assert not submap.gaussians.valid.any() and overflow == 0
-    np.testing.assert_array_equal(rows, 32)
+    np.testing.assert_array_equal(rows, 256)
 
 
 def test_a_submap_that_is_too_small_by_one_counts_one(config):
-    map = map_of(200, 256)
+    map = MAP
     count = len(in_box(map, CLOUDS, config().submap))
     for capacity, expected in ((count, 0), (count - 1, 1)):
         submap, _, overflow = select(map, CLOUDS, config(f"slam.submap.submap_capacity={capacity}").submap)
@@ -156,68 +140,66 @@ def test_a_submap_that_is_too_small_by_one_counts_one(config):
 
 @pytest.mark.parametrize("capacity", [192, 10])
 def test_writing_an_unchanged_submap_back_changes_no_bit(config, capacity):
-    map = map_of(200, 256)
+    map = MAP
     submap, rows, _ = select(map, CLOUDS, config(f"slam.submap.submap_capacity={capacity}").submap)
-    assert_same(write_back(map, submap, rows), map)
+    sc.assert_same(written(map, submap, rows), map)
 
 
 def test_a_changed_submap_changes_its_rows_only(config):
-    map = map_of(200, 256)
+    map = MAP
     submap, rows, _ = select(map, CLOUDS, config().submap)
-    changed = eqx.tree_at(lambda m: m.weight, submap, submap.weight + 5)
     expected = np.array(map.weight)
     expected[in_box(map, CLOUDS, config().submap)] += 5
-    np.testing.assert_array_equal(write_back(map, changed, rows).weight, expected)
+    changed = sc.replace(submap, weight=submap.weight + np.float32(5))
+    np.testing.assert_array_equal(written(map, changed, rows).weight, expected)
 
 
-def with_holes(count, holes):
-    map = map_of(count, count)
-    free = jnp.isin(jnp.arange(count), jnp.array(holes))
-    return eqx.tree_at(lambda m: m.gaussians.valid, map, ~free)
+def with_holes(holes):
+    """Ten Gaussians but for those rows."""
+    map = sc.fresh_map(sc.random_gaussians(10))
+    return eqx.tree_at(lambda m: m.gaussians.valid, map, sc.device(~np.isin(np.arange(10), holes)))
+
+
+def inserted_rows(map, fresh, **more):
+    """The map with new Gaussians, how many it has now, and how many found no row."""
+    return inserted_into(map, sc.fresh_map(fresh, **more))
 
 
 def test_fresh_gaussians_fill_the_free_rows_in_order():
-    map, fresh = with_holes(10, [2, 3, 7, 9]), random_gaussians(5, 9)
-    fresh = eqx.tree_at(lambda g: g.valid, fresh, jnp.array([False, True, True, False, True]))
-    inserted, count, overflow = insert(map, new_map(fresh, jnp.arange(5.0), jnp.asarray(0.25), jnp.asarray(6)))
+    map, fresh = with_holes([2, 3, 7, 9]), sc.random_gaussians(5, 9)
+    fresh = sc.replace(fresh, valid=np.array([False, True, True, False, True]))
+    inserted, count, overflow = inserted_rows(map, fresh, weight=np.arange(5.0), existence=0.25, birth=6)
     assert (count, overflow) == (3, 0)
     for row, source in ((2, 1), (3, 2), (7, 4)):
-        np.testing.assert_array_equal(inserted.gaussians.means[row], fresh.means[source])
+        np.testing.assert_array_equal(inserted.gaussians.means[row], np.asarray(fresh.means)[source])
         assert inserted.weight[row] == source and inserted.num_updates[row] == 1
         assert inserted.existence[row] == 0.25 and inserted.birth[row] == 6
     np.testing.assert_array_equal(inserted.gaussians.valid, [True] * 9 + [False])
     others = np.array([0, 1, 4, 5, 6, 8])
-    assert_same(jax.tree.map(lambda x: x[others], inserted), jax.tree.map(lambda x: x[others], map))
+    sc.assert_same(sc.rows_of(inserted, others), sc.rows_of(map, others))
 
 
-@pytest.mark.parametrize(("holes", "expected"), [([2], 2), ([], 3), ([1, 4], 1), ([0, 1, 4], 0)])
-def test_what_finds_no_free_row_is_counted_and_the_rest_is_kept(holes, expected):
-    map, fresh = with_holes(6, holes or [99]), random_gaussians(3, 9)
-    inserted, count, overflow = insert(map, new_map(fresh, jnp.ones(3), jnp.ones(()), jnp.asarray(0)))
-    assert (count, overflow) == (3 - expected, expected)
-    assert inserted.gaussians.valid.sum() == min(6, 6 - len(holes) + 3)
-    kept = np.setdiff1d(np.arange(6), holes)
-    assert_same(jax.tree.map(lambda x: x[kept], inserted), jax.tree.map(lambda x: x[kept], map))
-
-
-def test_more_fresh_gaussians_than_rows_are_counted():
-    _, count, overflow = insert(
-        empty_map(4, 0), new_map(random_gaussians(7), jnp.ones(7), jnp.ones(()), jnp.asarray(0))
-    )
-    assert (count, overflow) == (4, 3)
+@pytest.mark.parametrize(
+    ("holes", "overflow"), [([2], 4), ([], 5), ([1, 4], 3), ([0, 1, 4, 6, 9], 0), (range(10), 0)], ids=str
+)
+def test_what_finds_no_free_row_is_counted_and_the_rest_is_kept(holes, overflow):
+    map = with_holes([*holes])
+    inserted, count, lost = inserted_rows(map, sc.random_gaussians(5, 9))
+    assert (count, lost) == (5 - overflow, overflow)
+    assert inserted.gaussians.valid.sum() == 10 - len(holes) + min(5, len(holes))
+    kept = np.setdiff1d(np.arange(10), holes)
+    sc.assert_same(sc.rows_of(inserted, kept), sc.rows_of(map, kept))
 
 
 def test_inserting_nothing_changes_no_bit():
-    map = with_holes(6, [1, 3])
-    inserted, count, overflow = insert(
-        map, new_map(empty_gaussians(4, 0), jnp.full(4, 7.0), jnp.ones(()), jnp.asarray(0))
-    )
-    assert_same(inserted, map)
+    map = with_holes([1, 3])
+    inserted, count, overflow = inserted_rows(map, jax.device_get(empty_gaussians(5, 0)), weight=7.0)
+    sc.assert_same(inserted, map)
     assert (count, overflow) == (0, 0)
 
 
 def test_growing_keeps_every_row_and_adds_free_neutral_ones():
     map = map_of(5, 8)
     grown = grow(map, 16)
-    assert_same(jax.tree.map(lambda x: x[:8], grown), map)
-    assert_same(jax.tree.map(lambda x: x[8:], grown), empty_map(8, 0))
+    sc.assert_same(sc.rows_of(grown, slice(8)), map)
+    sc.assert_same(sc.rows_of(grown, slice(8, None)), empty_map(8, 0))

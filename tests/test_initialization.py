@@ -1,31 +1,26 @@
 """The first map: its number of Gaussians, its weights, its place in the world, and independence of the world frame."""
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from scene import move_gaussians, observe_room, path_pose, pose, stack_poses
+import scene as sc
 
 from emgs_jax.initialization import initialize
-from emgs_jax.observation import transform
-from emgs_jax.ops.pytree import stack
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 
-first_map = eqx.filter_jit(initialize)
-POSES = [path_pose(i) for i in range(3)]
+first_map = sc.on_host(initialize)
+POSES = [sc.path_pose(i) for i in range(3)]
 
 
 @pytest.fixture(scope="module")
 def views(camera):
-    return stack([observe_room(T, camera, num_features=2) for T in POSES])
+    return sc.stack([sc.observe_room(T, camera, num_features=2) for T in POSES])
 
 
 @pytest.fixture(scope="module")
 def result(views, camera, config):
-    return first_map(views, stack_poses(POSES), camera, 1, config().fit)
+    return first_map(views, sc.stack_poses(POSES), camera, 1, config().fit)
 
 
 def test_there_are_num_points_over_lambda_and_views_gaussians(result):
@@ -40,7 +35,7 @@ def test_the_weights_count_every_point_in_units_of_lambda(result):
 
 def test_the_views_are_moved_to_the_world_by_the_priors_poses(result, views):
     for i, T in enumerate(POSES):
-        expected = transform(T, jax.tree.map(lambda x, i=i: x[i], views), jnp.ones(()))
+        expected = sc.moved_points(T, sc.rows_of(views, i))
         np.testing.assert_allclose(result[2].points[i], expected.points, atol=1e-6)  # roundings
 
 
@@ -58,18 +53,18 @@ def test_the_gaussians_lie_on_the_rooms_walls_with_their_normals_and_colours(res
 
 
 def test_invalid_points_are_not_clustered(views, camera, config):
-    blind = eqx.tree_at(lambda o: o.valid, views, views.valid.at[1:].set(False))
-    gaussians, weight, _ = first_map(blind, stack_poses(POSES), camera, 1, config().fit)
+    blind = sc.replace(views, valid=views.valid & (np.arange(3) < 1)[:, None])
+    gaussians, weight, _ = first_map(blind, sc.stack_poses(POSES), camera, 1, config().fit)
     np.testing.assert_allclose(weight.sum(), 768 / 8, rtol=1e-5)
-    nothing = eqx.tree_at(lambda o: o.valid, views, jnp.zeros((3, 768), bool))
-    gaussians, weight, _ = first_map(nothing, stack_poses(POSES), camera, 1, config().fit)
+    nothing = sc.replace(views, valid=np.zeros((3, 768), bool))
+    gaussians, weight, _ = first_map(nothing, sc.stack_poses(POSES), camera, 1, config().fit)
     assert not gaussians.valid.any() and weight.sum() == 0
 
 
 def test_the_map_moves_with_the_anchor(result, views, camera, config):
-    motion = pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
-    moved, weight, _ = first_map(views, stack_poses([motion @ T for T in POSES]), camera, 1, config().fit)
-    expected = move_gaussians(motion, result[0])
+    motion = sc.pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
+    moved, weight, _ = first_map(views, sc.stack_poses([sc.product(motion, T) for T in POSES]), camera, 1, config().fit)
+    expected = sc.move_gaussians(motion, result[0])
     # A point half-way between two centroids may go to either, which moves both: most are equal to roundings.
     error = np.abs(moved.means - expected.means).max(1)
     assert np.median(error) < 1e-5 and error.max() < 0.05
@@ -77,8 +72,8 @@ def test_the_map_moves_with_the_anchor(result, views, camera, config):
 
 
 def test_features_of_width_zero_are_possible(camera, config, result):
-    views = stack([observe_room(T, camera) for T in POSES])
-    gaussians, _, _ = first_map(views, stack_poses(POSES), camera, 1, config().fit)
+    views = sc.stack([sc.observe_room(T, camera) for T in POSES])
+    gaussians, _, _ = first_map(views, sc.stack_poses(POSES), camera, 1, config().fit)
     # Another program, whose sums may round otherwise; as above.
     error = np.abs(gaussians.means - result[0].means).max(1)
     assert np.median(error) < 1e-5 and error.max() < 0.05

@@ -2,47 +2,52 @@
 
 import time
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scene import on_host, replace
 
+from emgs_jax import semantics
 from emgs_jax.gaussians import empty_gaussians
-from emgs_jax.semantics import classify, principal_colors, relevance, similarities
+from emgs_jax.semantics import principal_colors, relevance
+
+classify, similarities = on_host(semantics.classify), on_host(semantics.similarities)
+_relevance, _colors = on_host(relevance), on_host(principal_colors)
+AXES = np.float32([[2.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
+
+
+def gaussians_of(features, valid):
+    return replace(empty_gaussians(*np.shape(features)), features=features, valid=np.asarray(valid, bool))
 
 
 @pytest.fixture
 def three():
     """Three valid Gaussians with known features, and one row of padding."""
-    features = jnp.array([[1.0, 0.0, 0.0], [1.2, 1.6, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    valid = jnp.array([True, True, True, False])
-    return eqx.tree_at(lambda g: (g.features, g.valid), empty_gaussians(4, 3), (features, valid))
+    features = np.array([[1.0, 0.0, 0.0], [1.2, 1.6, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    return gaussians_of(features, [True, True, True, False])
 
 
 def test_the_closest_text_embedding_wins_and_rows_without_meaning_get_none(three):
-    classes = classify(three, jnp.array([[2.0, 0.0, 0.0], [0.0, 3.0, 0.0]]))
+    classes = classify(three, AXES)
     # Row 2 has no feature and row 3 is not valid; lengths of the embeddings do not matter.
     np.testing.assert_array_equal(classes, [0, 1, -1, -1])
 
 
 def test_similarities_are_cosines(three):
-    cosines = similarities(three, jnp.array([[2.0, 0.0, 0.0], [0.0, 3.0, 0.0]]))
+    cosines = similarities(three, AXES)
     np.testing.assert_allclose(cosines[:3], [[1.0, 0.0], [0.6, 0.8], [0.0, 0.0]], atol=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(0, 3), (2, 4)])
 def test_embeddings_of_another_model_are_refused(three, shape):
     with pytest.raises(ValueError, match="embed the classes"):
-        classify(three, jnp.zeros(shape))
-
-
-_relevance, _colors = eqx.filter_jit(relevance), eqx.filter_jit(principal_colors)
+        classify(three, np.zeros(shape, np.float32))
 
 
 def asked(gaussians, words, rivals=(), margin=0.0, min_cosine=-1.0):
-    rivals = jnp.asarray(rivals, jnp.float32).reshape(-1, gaussians.features.shape[-1])
-    return _relevance(gaussians, jnp.asarray(words, jnp.float32), rivals, jnp.asarray(margin), jnp.asarray(min_cosine))
+    rivals = np.float32(rivals).reshape(-1, gaussians.features.shape[-1])
+    return _relevance(gaussians, np.float32(words), rivals, np.float32(margin), np.float32(min_cosine))
 
 
 def test_relevance_is_what_a_loop_over_gaussians_and_words_finds():
@@ -50,11 +55,7 @@ def test_relevance_is_what_a_loop_over_gaussians_and_words_finds():
     features, words, rivals = (rng.normal(size=(count, 5)) for count in (40, 3, 2))
     features[7] = 0.0
     valid = np.arange(40) != 11
-    gaussians = eqx.tree_at(
-        lambda g: (g.features, g.valid),
-        empty_gaussians(40, 5),
-        (jnp.asarray(features, jnp.float32), jnp.asarray(valid)),
-    )
+    gaussians = gaussians_of(features, valid)
     margin, least = 0.15, 0.3
     found = asked(gaussians, words, rivals, margin, least)
     for row in range(40):
@@ -82,7 +83,7 @@ def test_margin_rivals_and_a_least_cosine_make_none_of_these(three):
 
 
 def test_the_length_of_a_feature_says_nothing(three):
-    longer = eqx.tree_at(lambda g: g.features, three, three.features * jnp.array([[0.1], [7.0], [1.0], [1.0]]))
+    longer = replace(three, features=np.asarray(three.features) * [[0.1], [7.0], [1.0], [1.0]])
     np.testing.assert_allclose(asked(longer, np.eye(3)).cosines, asked(three, np.eye(3)).cosines, atol=1e-6)
     np.testing.assert_allclose(_colors(longer), _colors(three), atol=1e-4)
 
@@ -93,11 +94,7 @@ def test_colours_are_the_features_along_their_main_directions():
     features = rng.normal(size=(60, 6)) * [5.0, 3.0, 2.0, 0.3, 0.2, 0.1] + 1.0
     features[3] = 0.0
     valid = np.arange(60) != 5
-    gaussians = eqx.tree_at(
-        lambda g: (g.features, g.valid),
-        empty_gaussians(60, 6),
-        (jnp.asarray(features, jnp.float32), jnp.asarray(valid)),
-    )
+    gaussians = gaussians_of(features, valid)
     known = valid & features.any(1)
     units = features[known] / np.linalg.norm(features[known], axis=1, keepdims=True)
     centered = units - units.mean(0)
@@ -105,16 +102,16 @@ def test_colours_are_the_features_along_their_main_directions():
     directions *= np.sign(np.take_along_axis(directions, np.abs(directions).argmax(1)[:, None], 1))
     along = centered @ directions.T
     low, high = np.percentile(along, [1, 99], axis=0)
-    colors = np.asarray(_colors(gaussians))
+    colors = _colors(gaussians)
     np.testing.assert_allclose(colors[known], ((along - low) / (high - low)).clip(0, 1), atol=2e-3)
     np.testing.assert_array_equal(colors[~known], 0.5)
 
 
 def test_features_that_do_not_differ_are_grey(three):
-    same = eqx.tree_at(lambda g: g.features, three, jnp.ones((4, 3)))
+    same = replace(three, features=np.ones((4, 3)))
     np.testing.assert_array_equal(_colors(same), 0.5)
     np.testing.assert_array_equal(_colors(empty_gaussians(4, 2)), 0.5)
-    two = eqx.tree_at(lambda g: g.features, three, jnp.array([[1.0, 0, 0], [0, 1.0, 0], [1.0, 0, 0], [0, 1.0, 0]]))
+    two = replace(three, features=np.array([[1.0, 0, 0], [0, 1.0, 0], [1.0, 0, 0], [0, 1.0, 0]]))
     np.testing.assert_allclose(_colors(two)[:, 1:], 0.5)  # one direction only
 
 
@@ -123,9 +120,7 @@ def test_twenty_words_to_twenty_thousand_gaussians_of_width_1024_cost_a_few_prod
     """The bar is .2 s on two quiet cores, which the bare product needs a tenth of; how busy they are cancels."""
     rng = np.random.default_rng(0)
     features = jnp.asarray(rng.normal(size=(20000, 1024)), jnp.float32)
-    gaussians = eqx.tree_at(
-        lambda g: (g.features, g.valid), empty_gaussians(20000, 1024), (features, jnp.ones(20000, bool))
-    )
+    gaussians = gaussians_of(features, np.ones(20000))
     words, nothing = jnp.asarray(rng.normal(size=(20, 1024)), jnp.float32), jnp.zeros(())
     question, fast = (gaussians, words, words[:4], nothing, nothing), {"xla_backend_optimization_level": 3}
     ask = jax.jit(relevance).lower(*question).compile(fast)

@@ -1,20 +1,9 @@
 """Public functions of the core with arguments of small fixed shapes, for tests of what JAX makes of them."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
-from scene import (
-    observe_room,
-    path_pose,
-    pose,
-    predict_room,
-    random_gaussians,
-    random_observation,
-    slam_config,
-    stack_poses,
-)
+import scene as sc
 
 from emgs_jax import (
     continuation,
@@ -31,107 +20,137 @@ from emgs_jax import observation as obs
 from emgs_jax.graph import deform, measurements
 from emgs_jax.ops import camera as cam
 from emgs_jax.ops import clustering, linalg, neighbours
-from emgs_jax.ops.pytree import stack, take_rows
+from emgs_jax.ops.pytree import take_rows
 from emgs_jax.refinement import refine
 from emgs_jax.registration import belief, icp, noise, pose_noise, rigid
 from emgs_jax.render import composite, densify, project
 
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
-CONFIG = slam_config("slam.submap.map_capacity=48", "slam.submap.submap_capacity=32", "render.tile_capacity=32")
-ONE = jnp.ones(())
-ROWS = jnp.arange(192)
+CONFIG = sc.slam_config("slam.submap.map_capacity=48", "slam.submap.submap_capacity=32", "render.tile_capacity=32")
+ONE, TENTH, FEW = sc.device(1.0), sc.device(0.1), sc.device(0.01)
+ROWS = np.arange(192)
 
 
 def map_of(seed: int) -> gaussian_map.GaussianMap:
-    return gaussian_map.new_map(random_gaussians(32, seed, 2), jnp.ones(32), ONE, jnp.asarray(0))
+    return sc.fresh_map(sc.random_gaussians(32, seed, 2))
 
 
 def prediction_of(seed: int) -> obs.Prediction:
-    return predict_room(2 + seed, CAMERA, num_features=2)
+    """Poses some millimetres off, likewise."""
+    given, rng = sc.predict_room(2 + seed, CAMERA, num_features=2), np.random.default_rng(seed)
+    views = sc.device(np.asarray(given.T_world_views.wxyz_xyz) + 0.005 * rng.normal(size=(3, 7)))
+    return eqx.tree_at(lambda p: p.T_world_views.wxyz_xyz, given, views)
 
 
 def previous_of(seed: int) -> obs.Observation:
     """Some millimetres off, as predictions are: at a pair that fits exactly the distance has no gradient."""
-    T = path_pose(1 + seed)
-    world = obs.transform(T, observe_room(T, CAMERA, 2), ONE)
-    noise = 0.005 * jnp.asarray(np.random.default_rng(seed).normal(size=world.points.shape), jnp.float32)
-    return eqx.tree_at(lambda o: o.points, world, world.points + noise)
+    T = sc.path_pose(1 + seed)
+    world = sc.moved_points(T, sc.observe_room(T, CAMERA, 2))
+    return sc.replace(world, points=world.points + 0.005 * np.random.default_rng(seed).normal(size=world.points.shape))
 
 
 def image_of(seed: int):
     """A slanted plane, so that every window determines its normal."""
-    rays = cam.rays(CAMERA, cam.pixel_grid(CAMERA))
+    x, y = (np.arange(16) - 7.5) / 10.0, (np.arange(12) - 5.25) / 11.5
+    rays = np.stack(np.broadcast_arrays(x, y[:, None], 1.0), axis=-1)
     plane = rays / (1.0 - (0.02 + 0.01 * seed) * rays[..., :1])
-    features = jnp.full((12, 16, 2), 0.5**0.5)
-    return plane, 0.3 + 0.1 * jnp.abs(plane), features, jnp.ones((12, 16)), jnp.ones((12, 16), bool)
+    arrays = (
+        plane,
+        0.3 + 0.1 * np.abs(plane),
+        np.full((12, 16, 2), 0.5**0.5),
+        np.full((12, 16), 1.5),
+        np.ones((12, 16), bool),
+    )
+    return tuple(map(sc.device, arrays))
 
 
 def belief_of(seed: int) -> belief.Belief:
-    covariance = jnp.diag(jnp.array([4e-4] * 3 + [1e-4] * 4)) * (1.0 + seed)
-    return belief.Belief(covariance, covariance, ONE * 0.01, ONE * 0.02, ONE * 3.0, pose_noise.none_yet())
+    covariance = sc.device(np.diag([4e-4] * 3 + [1e-4] * 4) * (1.0 + seed))
+    return belief.Belief(covariance, covariance, *map(sc.device, (0.01, 0.02, 3.0)), pose_noise.none_yet())
 
 
 def coarse_of(seed: int) -> localization.CoarsePose:
-    T = path_pose(2 + seed)
-    return localization.CoarsePose(T, T, ONE, ONE * 0.02, ONE * 2.0, ONE * 0.01, belief_of(seed), jnp.asarray(True))
+    T, numbers = sc.path_pose(2 + seed), map(sc.device, (1.0, 0.02, 2.0, 0.01))
+    return localization.CoarsePose(T, T, *numbers, belief_of(seed), jnp.asarray(True))
 
 
 def estep_of(seed: int) -> em.EStep:
-    rows = jnp.asarray(np.random.default_rng(seed).integers(0, 32, (40, 3)))
-    return em.EStep(rows, jnp.full((40, 3), 1 / 3, jnp.float32), jnp.ones(40, bool))
+    rng = np.random.default_rng(seed)
+    rows, shares = rng.integers(0, 32, (40, 3)).astype(np.int32), rng.dirichlet(np.ones(3), 40)
+    return em.EStep(*map(sc.device, (rows, shares, np.ones(40, bool))))
 
 
 def points(seed: int):
-    return random_observation(40, seed, 2)
+    return sc.random_observation(40, seed, 2)
 
 
 def close(seed: int):
     """Points on the map, so that EM fuses them."""
-    g = random_gaussians(32, seed, 2)
-    return obs.Observation(g.means + 0.01, g.colors, g.normals, g.features, jnp.ones(32), g.valid)
+    g = sc.random_gaussians(32, seed, 2)
+    return obs.Observation(
+        sc.device(np.asarray(g.means) + 0.01), g.colors, g.normals, g.features, sc.device(np.ones(32)), g.valid
+    )
+
+
+def looking(seed: int):
+    return sc.pose(translation=(0.1 * seed, 0, 0))
 
 
 def graph_of(seed: int) -> measurements.Graph:
     """Poses that are some centimetres off what the edges say; one edge is not in use."""
     rng = np.random.default_rng(seed)
-    numbers = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)  # noqa: E731
-    a, b = jnp.arange(6) % 5, (jnp.arange(6) + 2) % 5
-    T = jaxlie.SE3.exp(numbers(5, 6))
-    Z = jaxlie.SE3(T.wxyz_xyz[a]).inverse() @ jaxlie.SE3(T.wxyz_xyz[b]) @ jaxlie.SE3.exp(0.05 * numbers(6, 6))
-    nodes = measurements.Nodes(T, 0.1 * numbers(5), jnp.ones(5, bool))
-    kind, used = jnp.arange(6) % 2, jnp.arange(6) < 5
-    return measurements.Graph(nodes, measurements.Edges(a, b, Z, numbers(6), numbers(6, 7, 7), kind, used))
+    a, b = np.arange(6, dtype=np.int32) % 5, (np.arange(6, dtype=np.int32) + 2) % 5
+    T = [sc.pose(rng.normal(size=3), rng.normal(size=3)) for _ in range(5)]
+    off = [sc.pose(0.05 * rng.normal(size=3), 0.05 * rng.normal(size=3)) for _ in range(6)]
+    between = [
+        np.linalg.inv(sc.matrix_of(T[i])) @ sc.matrix_of(T[j]) @ sc.matrix_of(d)
+        for i, j, d in zip(a, b, off, strict=True)
+    ]
+    nodes = measurements.Nodes(sc.stack_poses(T), sc.device(0.1 * rng.normal(size=5)), sc.device(np.ones(5, bool)))
+    said = (
+        sc.stack_poses([sc.pose_of(one) for one in between]),
+        *map(sc.device, (rng.normal(size=6), rng.normal(size=(6, 7, 7)))),
+    )
+    return measurements.Graph(
+        nodes, measurements.Edges(*map(sc.device, (a, b)), *said, sc.device(a % 2), sc.device(np.arange(6) < 5))
+    )
 
 
-NOISE = jnp.full((40, 3), 0.02)
-MASK, ORDER = jnp.arange(40) % 3 > 0, jnp.arange(40)
+NOISE = np.full((40, 3), 0.02, np.float32)
+MASK, ORDER = np.arange(40) % 3 > 0, np.arange(40)
 # name: (verb of one item, its arguments by seed)
 VERBS = {
     "safe_normalize": (linalg.safe_normalize, lambda s: (points(s).points,)),
-    "inverse_3x3": (linalg.inverse_3x3, lambda s: (random_gaussians(9, s).covs,)),
-    "whitening": (linalg.whitening, lambda s: (random_gaussians(9, s).covs,)),
+    "inverse_3x3": (linalg.inverse_3x3, lambda s: (sc.random_gaussians(9, s).covs,)),
+    "whitening": (linalg.whitening, lambda s: (sc.random_gaussians(9, s).covs,)),
     "tangent_basis": (linalg.tangent_basis, lambda s: (points(s).normals,)),
-    "principal_axes": (linalg.principal_axes_2x2, lambda s: (random_gaussians(9, s).covs[:, :2, :2],)),
+    "principal_axes": (linalg.principal_axes_2x2, lambda s: (np.asarray(sc.random_gaussians(9, s).covs)[:, :2, :2],)),
     "project": (lambda p: cam.project(CAMERA, p), lambda s: (points(s).points,)),
-    "unproject": (lambda d: cam.unproject(CAMERA, d), lambda s: (jnp.full((12, 16), 1.0 + s),)),
+    "unproject": (lambda d: cam.unproject(CAMERA, d), lambda s: (sc.device(np.full((12, 16), 1.0 + s)),)),
     "observe": (lambda *x: obs.observe(*x, CONFIG.observation), image_of),
-    "transform": (obs.transform, lambda s: (path_pose(s), points(s), ONE * 1.1)),
-    "knn": (lambda q, p: neighbours.knn(q, p, MASK, 3), lambda s: (points(s + 5).points, points(s).points)),
-    "compact_rows": (lambda m: neighbours.compact_rows(m, 20), lambda s: (jnp.roll(MASK, s),)),
-    "strided_seeds": (lambda m: clustering.strided_seeds(m, ORDER, 4, 10), lambda s: (jnp.roll(MASK, s),)),
+    "transform": (obs.transform, lambda s: (sc.path_pose(s), points(s), sc.device(1.1))),
+    "knn": (
+        lambda q, p: neighbours.knn(q, p, jnp.asarray(MASK), 3),
+        lambda s: (points(s + 5).points, points(s).points),
+    ),
+    "compact_rows": (lambda m: neighbours.compact_rows(m, 20), lambda s: (np.roll(MASK, s),)),
+    "strided_seeds": (lambda m: clustering.strided_seeds(m, jnp.asarray(ORDER), 4, 10), lambda s: (np.roll(MASK, s),)),
     "kmeans": (
-        lambda p, c: clustering.kmeans(p, MASK, c, MASK[:8], 2),
-        lambda s: (points(s).points, points(s).points[:8]),
+        lambda p, c: clustering.kmeans(p, jnp.asarray(MASK), c, jnp.asarray(MASK[:8]), 2),
+        lambda s: (points(s).points, np.asarray(points(s).points)[:8]),
     ),
     "fit_to_points": (
         lambda c, o: gaussians.fit_to_points(c, jnp.ones(6, bool), o, CONFIG.fit),
-        lambda s: (points(s).points[:6] + 0.01, points(s)),
+        lambda s: (sc.device(np.asarray(points(s).points)[:6] + 0.01), points(s)),
     ),
-    "cluster": (lambda o: gaussians.cluster(o, ORDER, 8, CONFIG.fit), lambda s: (points(s),)),
-    "blend": (gaussians.blend, lambda s: (random_gaussians(9, s), random_gaussians(9, s + 5), jnp.full(9, 0.3), ONE)),
+    "cluster": (lambda o: gaussians.cluster(o, jnp.asarray(ORDER), 8, CONFIG.fit), lambda s: (points(s),)),
+    "blend": (
+        gaussians.blend,
+        lambda s: (sc.random_gaussians(9, s), sc.random_gaussians(9, s + 5), sc.device(np.full(9, 0.3)), ONE),
+    ),
     "update_average": (
         lambda m, g, e: gaussian_map.update_average(m, g, e, CONFIG.em.average),
-        lambda s: (map_of(s), random_gaussians(32, s + 5, 2), jnp.linspace(0.0, 1.0, 32)),
+        lambda s: (map_of(s), sc.random_gaussians(32, s + 5, 2), sc.device(np.linspace(0.1, 1.0, 32))),
     ),
     "select_submap": (
         lambda m, o: gaussian_map.select_submap(m, (o,), CONFIG.submap),
@@ -139,12 +158,12 @@ VERBS = {
     ),
     "insert": (
         lambda m, g: gaussian_map.insert(m, gaussian_map.new_map(g, jnp.ones(9), ONE, jnp.asarray(0))),
-        lambda s: (map_of(s), random_gaussians(9, s, 2)),
+        lambda s: (map_of(s), sc.random_gaussians(9, s, 2)),
     ),
-    "fit_rigid": (rigid.fit_rigid, lambda s: (points(s).points, points(s + 5).points, jnp.ones(40))),
+    "fit_rigid": (rigid.fit_rigid, lambda s: (points(s).points, points(s + 5).points, sc.device(np.ones(40)))),
     "predict": (
         lambda b, T: belief.predict(b.covariance, T, jnp.full(7, 0.01)),
-        lambda s: (belief_of(s), path_pose(s)),
+        lambda s: (belief_of(s), sc.path_pose(s)),
     ),
     "update": (
         lambda b: belief.update(b.covariance, jnp.linspace(0.0, 0.1, 7), 1e3 * jnp.eye(7)),
@@ -152,63 +171,76 @@ VERBS = {
     ),
     "icp": (
         lambda o, g, T: icp.icp(o, g, T, (ONE * 0.02, ONE * 0.01), CONFIG.localization.icp),
-        lambda s: (obs.transform(path_pose(s).inverse(), close(s), ONE), random_gaussians(32, s, 2), path_pose(s)),
+        lambda s: (
+            sc.moved_points(sc.pose_of(np.linalg.inv(sc.matrix_of(sc.path_pose(s)))), close(s)),
+            sc.random_gaussians(32, s, 2),
+            sc.path_pose(s),
+        ),
     ),
     "initialize": (
         lambda v, T: initialization.initialize(v, T, CAMERA, 1, CONFIG.fit),
         lambda s: (
-            stack([observe_room(path_pose(i + s), CAMERA, 2) for i in (0, 1)]),
-            stack_poses([path_pose(s), path_pose(1 + s)]),
+            sc.stack([sc.observe_room(sc.path_pose(i + s), CAMERA, 2) for i in (0, 1)]),
+            sc.stack_poses([sc.path_pose(s), sc.path_pose(1 + s)]),
         ),
     ),
     "localize_coarse": (
         lambda p, o, T: localization.localize_coarse(p, o, T, CAMERA, CONFIG.localization),
-        lambda s: (prediction_of(s), previous_of(s), path_pose(1 + s)),
+        lambda s: (prediction_of(s), previous_of(s), sc.path_pose(1 + s)),
     ),
     "localize_fine": (
         lambda o, g, c: localization.localize_fine(o, g, c, CONFIG.localization),
-        lambda s: (observe_room(path_pose(2 + s), CAMERA, 2), random_gaussians(32, s, 2), coarse_of(s)),
+        lambda s: (sc.observe_room(sc.path_pose(2 + s), CAMERA, 2), sc.random_gaussians(32, s, 2), coarse_of(s)),
     ),
     "m_step": (
         lambda g, o, e: em.m_step(g, o, jnp.ones(40), e, CONFIG.em),
-        lambda s: (random_gaussians(32, s, 2), points(s), estep_of(s)),
+        lambda s: (sc.random_gaussians(32, s, 2), points(s), estep_of(s)),
     ),
-    "em_update": (lambda m, o: em.em_update(m, o, NOISE[:32], CONFIG.em), lambda s: (map_of(s), close(s))),
+    "em_update": (
+        lambda m, o: em.em_update(m, o, jnp.asarray(NOISE[:32]), sc.at(CONFIG.em, "min_responsibility", 0.5)),
+        lambda s: (map_of(s), close(s)),
+    ),
     "split": (
-        lambda m, o, e: splitting.split(m, o, NOISE, em.owners(e, 32), 1, CONFIG.splitting),
+        lambda m, o, e: splitting.split(m, o, jnp.asarray(NOISE), em.owners(e, 32), 1, CONFIG.splitting),
         lambda s: (map_of(s), points(s), estep_of(s)),
     ),
     "project_gaussians": (
         lambda g, T: project.project_gaussians(g, T, CAMERA, ONE, ONE),
-        lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),
+        lambda s: (sc.random_gaussians(32, s, 2), looking(s)),
     ),
     "render": (
         lambda g, T: composite.render(g, g.colors, T, CAMERA, CONFIG.refinement.render),
-        lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),
+        lambda s: (sc.random_gaussians(32, s, 2), looking(s)),
     ),
     "densify": (
         lambda g, T: densify.densify(g, T, CAMERA, densify.DensifyConfig(0.05, 0.3, 0.0, CONFIG.refinement.render)),
-        lambda s: (random_gaussians(32, s, 2), pose(translation=(0.1 * s, 0, 0))),
+        lambda s: (sc.random_gaussians(32, s, 2), looking(s)),
     ),
     "continued": (
         lambda m, o, T: continuation.continued(
-            o, take_rows(m, ROWS % 32), ROWS % 3 > 0, o.confidence, T, CAMERA, CONFIG.continuation
+            o,
+            take_rows(m, jnp.asarray(ROWS % 32)),
+            jnp.asarray(ROWS % 3 > 0),
+            o.confidence,
+            T,
+            CAMERA,
+            CONFIG.continuation,
         ),
-        lambda s: (map_of(s), random_observation(192, s, 2), pose(translation=(0.1 * s, 0, 0))),
+        lambda s: (map_of(s), sc.random_observation(192, s, 2), looking(s)),
     ),
     "judge": (
         lambda m, o, T: existence.judge(m, jnp.arange(32) % 3 - 1, o, T, CAMERA, ONE * 0.02, CONFIG.existence),
-        lambda s: (map_of(s), random_observation(192, s, 2), pose(translation=(0.1 * s, 0, 0))),
+        lambda s: (map_of(s), sc.random_observation(192, s, 2), looking(s)),
     ),
     "join_layers": (
         lambda m, T: existence.join_layers(m, jnp.arange(32) % 3 > 0, T.translation(), ONE * 0.1, CONFIG.existence),
-        lambda s: (map_of(s), pose(translation=(0.1 * s, 0, 0))),
+        lambda s: (map_of(s), looking(s)),
     ),
     "num_independent": (
         lambda e, p: noise.num_independent(e, p, jnp.arange(40) % 3 > 0),
         lambda s: (points(s).colors[:, 0], points(s).points),
     ),
-    "move": (measurements.move, lambda s: (graph_of(s).nodes, 0.1 * jnp.ones((5, 7)))),
+    "move": (measurements.move, lambda s: (graph_of(s).nodes, sc.device(np.full((5, 7), 0.1)))),
     "deform": (
         lambda m, before, after: deform.deform(m, before, after, ONE * 0.01, deform.DeformConfig(4, 40.0)),
         lambda s: (map_of(s), graph_of(s).nodes, graph_of(s + 5).nodes),
@@ -217,22 +249,23 @@ VERBS = {
     "linearize": (measurements.linearize, lambda s: (graph_of(s),)),
     "robust": (
         lambda chi2, kernel: measurements.robust(chi2, jnp.arange(6) % 2, kernel),
-        lambda s: (jnp.linspace(0.0, 60.0 + s, 6), ONE * 16.8),
+        lambda s: (sc.device(np.linspace(0.0, 60.0 + s, 6)), sc.device(16.8)),
     ),
+    "classify": (semantics.classify, lambda s: (sc.random_gaussians(9, s, 2), sc.device(np.eye(2)))),
     "relevance": (
         lambda g, words: semantics.relevance(g, words, words[:1] + 0.1, ONE * 0.01, -ONE),
-        lambda s: (random_gaussians(32, s, 2), jnp.array([[1.0, 0.2], [0.1, -1.0 - s]])),
+        lambda s: (sc.random_gaussians(32, s, 2), sc.device([[1.0, 0.2], [0.1, -1.0 - s]])),
     ),
     "refine": (
         lambda m, g, T: refine(m, g, T, CAMERA, CONFIG.refinement),
-        lambda s: (map_of(s), random_gaussians(9, s + 5, 2), pose(translation=(0.1 * s, 0, 0))),
+        lambda s: (map_of(s), sc.random_gaussians(9, s + 5, 2), looking(s)),
     ),
 }
 # These end where a solver or a gate decides, or sum many terms.
 LOOSE = {"render", "icp", "localize_coarse", "localize_fine", "refine", "densify", "initialize"}
-# The solver has a while loop, which has no reverse mode; forward mode must be finite.
+# The solver has a while loop, which has no reverse mode; to compile it with a derivative takes half a minute.
 FORWARD = {"icp", "localize_fine"}
-
-
-def numbers(tree):
-    return [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+# Medians: where rows move apart, another one takes the median's place at once.
+ROWS_TOGETHER = {"localize_coarse", "localize_fine"}
+# Each is the larger part of another verb, which is compiled in its place.
+INSIDE_ANOTHER = {"icp", "m_step", "fit_to_points", "cluster", "render", "project_gaussians", "residuals", "knn"}

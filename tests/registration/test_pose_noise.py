@@ -8,29 +8,40 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from scene import pose, random_observation
+from scene import device, matrix_of, on_host, pose, pose_of, product, random_observation, stack_poses
+from scipy.spatial.transform import Rotation
 
 from emgs_jax.observation import Prediction
-from emgs_jax.registration.pose_noise import Repeats, in_unit, none_yet, pose_std, repeat_poses
-from emgs_jax.registration.rigid import pose_row
+from emgs_jax.registration import pose_noise
+from emgs_jax.registration.pose_noise import Repeats, in_unit, none_yet, repeat_poses
 
 STEP, DEPTH, MEMORY = pose((0.03, -0.02, 0.05), (0.2, 0.05, -0.1)), 2.5, 10.0
 MOTION, OWN = (0.01, 0.004), (0.03, 0.02)  # standard deviations: lengths in mean depths, rad
-repeat = eqx.filter_jit(repeat_poses)
+STILL = pose()
+
+
+@on_host
+def repeat(prediction, before, scale):
+    """What is said again, in the unit of its answer and of the world."""
+    repeats, latest = repeat_poses(prediction, before, scale, jnp.asarray(DEPTH), jnp.asarray(MEMORY))
+    return in_unit(repeats, scale), repeats, latest
+
+
+pose_std = on_host(pose_noise.pose_std)
 
 
 def power(count: int) -> jaxlie.SE3:
     """Where the camera is after so many steps."""
-    T = jaxlie.SE3.identity()
-    for _ in range(count):
-        T = T @ STEP
-    return T
+    return product(*[STEP] * count)
 
 
 def drawn(rng: np.random.Generator, std: tuple[float, float], common: np.ndarray, shared: float) -> jaxlie.SE3:
     """A disturbance whose variance has the part `shared` of it in `common`, (6,) normal."""
     xi = np.sqrt(shared) * common + np.sqrt(1 - shared) * rng.normal(size=6)
-    return jaxlie.SE3.exp(jnp.asarray(xi * np.repeat([DEPTH * std[0], std[1]], 3), jnp.float32))
+    xi *= np.repeat([DEPTH * std[0], std[1]], 3)
+    # Of a small turn by ω the logarithm's translation is that of the motion, but for half of ω × t.
+    turn = Rotation.from_rotvec(xi[3:])
+    return pose(turn.as_rotvec(), xi[:3] + 0.5 * np.cross(xi[3:], xi[:3]))
 
 
 def answer(
@@ -38,27 +49,34 @@ def answer(
 ) -> Prediction:
     """What is said of frames number - 1, number and number + 1, in a unit of which `scale` are one metre."""
     anchor = pose((0, 0.7, 0), (3, 1, 2))
-    previous = power(number - 1) @ own
-    views = [previous, previous @ motions[0], previous @ motions[0] @ motions[1]]
-    views = [jaxlie.SE3.from_rotation_and_translation(T.rotation(), scale * T.translation()) for T in views]
-    nothing = random_observation(4)
+    previous = product(power(number - 1), own)
+    views = [previous, product(previous, motions[0]), product(previous, *motions)]
     flags = {"has_newest": True, "is_repeat": True} | more
     return Prediction(
-        nothing,
-        nothing,
-        jaxlie.SE3(jnp.stack([(anchor @ T).wxyz_xyz for T in views])),
+        NOTHING,
+        NOTHING,
+        stack_poses([product(anchor, scaled(T, scale)) for T in views]),
         anchor,
-        *(jnp.asarray(flags[name]) for name in ("has_newest", "is_repeat")),
+        *(device(flags[name]) for name in ("has_newest", "is_repeat")),
     )
 
 
+def scaled(T: jaxlie.SE3, scale: float) -> jaxlie.SE3:
+    matrix = matrix_of(T)
+    matrix[:3, 3] *= scale
+    return pose_of(matrix)
+
+
+NOTHING = random_observation(4)
+
+
 def exact(number: int, **more) -> Prediction:
-    return answer(number, jaxlie.SE3.identity(), (STEP, STEP), **more)
+    return answer(number, STILL, (STEP, STEP), **more)
 
 
 def said_again(before: Repeats, prediction: Prediction, scale: float = 1.0) -> tuple[Repeats, jax.Array]:
-    repeats, latest = repeat(prediction, before, jnp.asarray(1 / scale), jnp.asarray(DEPTH), jnp.asarray(MEMORY))
-    return in_unit(repeats, jnp.asarray(1 / scale)), latest
+    repeats, _, latest = repeat(prediction, before, np.float32(1 / scale))
+    return repeats, latest
 
 
 def test_the_deviations_are_those_of_the_answers():
@@ -68,9 +86,9 @@ def test_the_deviations_are_those_of_the_answers():
     found, latests = [], []
     for number in range(1, 401):
         own = drawn(rng, OWN, common["own"][0], shared)  # of all frames alike: the difference is that of one pose
-        motions = tuple(STEP @ drawn(rng, MOTION, common["motion"][number + k], shared) for k in (0, 1))
+        motions = tuple(product(STEP, drawn(rng, MOTION, common["motion"][number + k], shared)) for k in (0, 1))
         repeats, latest = said_again(repeats, answer(number, own, motions))
-        found.append(pose_std(repeats, jnp.zeros((2, 2)), jnp.asarray(0.01), jnp.asarray(shared)))
+        found.append(pose_std(repeats, np.zeros((2, 2), np.float32), np.float32(0.01), np.float32(shared)))
         latests.append(latest)
     # The pose of a frame is that of the one before and the motion here, and its own there: the motion's error is in it.
     guess, weight = 0.01, 1 / (MEMORY + 1)
@@ -86,15 +104,15 @@ def test_answers_that_agree_differ_by_rounding_whatever_their_unit():
         repeats, latest = said_again(repeats, exact(number, scale=scale), scale)
         assert np.all(np.sqrt(latest) < 1e-5)
     np.testing.assert_array_equal(repeats.counts, [3, 3])
-    np.testing.assert_allclose(pose_row(repeats.said, 0).as_matrix(), STEP.as_matrix(), atol=1e-5)
-    np.testing.assert_allclose(pose_row(repeats.said, 1).as_matrix(), power(4).as_matrix(), atol=1e-5)
+    for values, expected in zip(repeats.said.wxyz_xyz, (STEP, power(4)), strict=True):
+        np.testing.assert_allclose(matrix_of(jaxlie.SE3(values)), matrix_of(expected), atol=1e-5)
 
 
 def test_a_difference_is_in_mean_depths_and_radians():
     shift, turn = pose((0, 0, 0), (0.3, 0, 0)), pose((0.1, 0, 0), (0, 0, 0))
     repeats, _ = said_again(none_yet(), exact(1))
     for change, expected in ((shift, [0.3 / DEPTH, 0]), (turn, [0, 0.1])):
-        _, latest = said_again(repeats, answer(2, jaxlie.SE3.identity(), (STEP @ change, STEP)))
+        _, latest = said_again(repeats, answer(2, STILL, (product(STEP, change), STEP)))
         np.testing.assert_allclose(np.sqrt(3 * latest[0]), expected, atol=1e-4)
         assert np.all(latest[1] < 1e-9)
         _, latest = said_again(repeats, answer(2, change, (STEP, STEP)))
@@ -113,14 +131,14 @@ def test_a_difference_is_in_mean_depths_and_radians():
 def test_what_is_not_said_twice_does_not_count(first, second, counts):
     before, _ = said_again(none_yet(), exact(1, **first))
     np.testing.assert_array_equal(before.counts, [0, 0])
-    after, latest = said_again(before, answer(2, pose((0, 0.1, 0), (1, 0, 0)), (STEP @ STEP, STEP), **second))
+    after, latest = said_again(before, answer(2, pose((0, 0.1, 0), (1, 0, 0)), (power(2), STEP), **second))
     np.testing.assert_array_equal(after.counts, counts)
     np.testing.assert_array_equal(np.any(latest > 0, axis=1), np.array(counts) > 0)
 
 
 def test_a_pose_that_is_no_number_does_not_count_and_leaves_no_trace():
     before, _ = said_again(none_yet(), exact(1))
-    lost = eqx.tree_at(lambda p: p.T_world_views, exact(2), jaxlie.SE3(jnp.full((3, 7), jnp.nan)))
+    lost = eqx.tree_at(lambda p: p.T_world_views, exact(2), jaxlie.SE3(device(np.full((3, 7), np.nan))))
     after, latest = said_again(before, lost)
     assert not np.any(latest) and np.all(np.isfinite(after.log_squares))
     np.testing.assert_array_equal(after.counts, [0, 0])
@@ -134,8 +152,8 @@ def test_older_repeats_are_forgotten():
     small, large, repeats = 0.01, 0.1, none_yet()
     said, _ = said_again(none_yet(), exact(1))
     for size in [small] * 10 + [large] * 30:
-        before = Repeats(said.said, said.is_said, repeats.log_squares, repeats.counts)
-        repeats, _ = said_again(before, answer(2, jaxlie.SE3.identity(), (STEP @ pose((0, 0, 0), (size, 0, 0)), STEP)))
+        before = Repeats(said.said, *map(device, (said.is_said, repeats.log_squares, repeats.counts)))
+        repeats, _ = said_again(before, answer(2, STILL, (product(STEP, pose((0, 0, 0), (size, 0, 0))), STEP)))
     assert float(repeats.counts[0]) == MEMORY
     logs = np.log([size**2 / 3 / DEPTH**2 for size in (small, large)])
     expected = logs[1] + 0.9**30 * (logs[0] - logs[1])
@@ -143,30 +161,38 @@ def test_older_repeats_are_forgotten():
 
 
 def test_without_repeats_the_depths_say_it_and_one_guess_counts_like_one_repeat():
-    nothing, guess, shared = jnp.zeros((2, 2)), jnp.asarray(0.02), jnp.asarray(0.5)
+    nothing, guess, shared = np.zeros((2, 2), np.float32), np.float32(0.02), np.float32(0.5)
     np.testing.assert_allclose(pose_std(none_yet(), nothing, guess, shared), 0.02 * np.ones((2, 2)), rtol=1e-5)
-    known = replace(none_yet(), log_squares=jnp.full((2, 2), np.log(0.001**2) - 0.36898), counts=jnp.array([3.0, 0.0]))
+    logs, counts = np.full((2, 2), np.log(0.001**2) - 0.36898), np.array([3.0, 0.0])
+    known = replace(none_yet(), log_squares=device(logs), counts=device(counts))
     std = pose_std(known, nothing, guess, shared)
     np.testing.assert_allclose(std[0], 0.001 ** (3 / 4) * 0.02 ** (1 / 4), rtol=1e-4)
     np.testing.assert_allclose(std[1], 0.02, rtol=1e-5)
-    np.testing.assert_array_equal(pose_std(known, jnp.ones((2, 2)), guess, jnp.ones(())), 0.02 * jnp.ones((2, 2)))
+    printed = pose_std(known, np.ones((2, 2), np.float32), guess, np.float32(1.0))
+    np.testing.assert_array_equal(printed, np.float32(0.02) * np.ones((2, 2), np.float32))
     # What is in common does not show: a quarter of the variance differs, and twice that is what two differ by.
-    np.testing.assert_allclose(
-        pose_std(known, nothing, guess, jnp.asarray(0.75))[0], (0.001 * 2**0.5) ** (3 / 4) * 0.02 ** (1 / 4), rtol=1e-4
-    )
+    std = pose_std(known, nothing, guess, np.float32(0.75))
+    np.testing.assert_allclose(std[0], (0.001 * 2**0.5) ** (3 / 4) * 0.02 ** (1 / 4), rtol=1e-4)
 
 
 def test_a_pose_is_at_least_as_uncertain_as_its_own_repeat_differs():
-    latest = jnp.array([[0.1**2, 0.0], [0.0, 0.2**2]])
-    std = pose_std(none_yet(), latest, jnp.asarray(0.01), jnp.asarray(0.75))
+    latest = np.float32([[0.1**2, 0.0], [0.0, 0.2**2]])
+    std = pose_std(none_yet(), latest, np.float32(0.01), np.float32(0.75))
     np.testing.assert_allclose(std, [[0.1 * 2**0.5, 0.01], [0.01, 0.2 * 2**0.5]], rtol=1e-5)
 
 
 def test_the_deviations_have_a_finite_gradient_where_answers_agree_and_where_there_are_none():
-    def total(shift, before):
-        prediction = answer(2, jaxlie.SE3.identity(), (STEP @ jaxlie.SE3.exp(shift), STEP))
-        repeats, latest = repeat_poses(prediction, before, jnp.ones(()), jnp.asarray(DEPTH), jnp.asarray(MEMORY))
-        return jnp.sum(pose_std(repeats, latest, jnp.asarray(0.01), jnp.asarray(0.75)))
+    given = answer(2, STILL, (STEP, STEP))
+
+    @on_host
+    def slope(shift, before):
+        def total(shift):
+            moved = jaxlie.SE3(given.T_world_views.wxyz_xyz.at[1:, 4:].add(shift))
+            prediction = eqx.tree_at(lambda p: p.T_world_views, given, moved)
+            repeats, latest = repeat_poses(prediction, before, jnp.ones(()), jnp.asarray(DEPTH), jnp.asarray(MEMORY))
+            return jnp.sum(pose_noise.pose_std(repeats, latest, jnp.asarray(0.01), jnp.asarray(0.75)))
+
+        return jax.grad(total)(shift)
 
     for before in (none_yet(), said_again(none_yet(), exact(1))[0]):
-        assert np.all(np.isfinite(jax.grad(total)(jnp.zeros(6), before)))
+        assert np.isfinite(slope(np.zeros(3, np.float32), before)).all()

@@ -1,12 +1,12 @@
 """The rasteriser against a tile-free NumPy renderer, and identities that any renderer must satisfy."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 import reference
-from scene import as_numpy, at, move_gaussians, pose, random_gaussians
+import scene as sc
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import pixel_grid, rays
@@ -14,20 +14,22 @@ from emgs_jax.render.composite import render
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 
-draw = eqx.filter_jit(render)
-T = pose((0.05, -0.1, 0.05), (0.05, -0.05, 0.1))
+draw = sc.on_host(render)
+COUNT = 24  # rows of every map, which makes one program for a size of tiles
+T = sc.pose((0.05, -0.1, 0.05), (0.05, -0.05, 0.1))
 
 
 def scene():
     """Random Gaussians, one of them near and thick, so that it reaches behind the camera, and one seen edge on."""
-    g = random_gaussians(24, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
-    means = g.means.at[0].set(jnp.array([0.25, 0.2, 0.6])).at[1].set(jnp.array([-0.4, 0.3, 1.6]))
-    covs = g.covs.at[0].set(jnp.diag(jnp.array([0.001, 0.001, 0.03])))
-    normals = g.normals.at[0].set(jnp.array([0.8, 0.0, -0.6])).at[1].set(jnp.array([0.95, 0.2, 0.23]))
-    return eqx.tree_at(lambda g: (g.means, g.covs, g.normals), g, (means, covs, normals))
+    g = sc.random_gaussians(COUNT, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
+    means, covs, normals = (np.array(x) for x in (g.means, g.covs, g.normals))
+    means[:2] = (0.25, 0.2, 0.6), (-0.4, 0.3, 1.6)
+    covs[0] = np.diag([0.001, 0.001, 0.03])
+    normals[:2] = (0.8, 0.0, -0.6), (0.95, 0.2, 0.23)
+    return sc.replace(g, means=means, covs=covs, normals=normals)
 
 
-GAUSSIANS = scene()
+GAUSSIANS, WHITE = scene(), np.ones((COUNT, 3), np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -35,12 +37,11 @@ def render_config(config):
     return config().refinement.render
 
 
-def single(mean, normal, std=0.15) -> Gaussians:
-    """One disc with a given normal, a millimetre thick."""
-    normal = np.asarray(normal) / np.linalg.norm(normal)
-    cov = std**2 * (np.eye(3) - np.outer(normal, normal)) + 1e-6 * np.outer(normal, normal)
-    rows = [jnp.asarray(x, jnp.float32)[None] for x in (mean, cov, (0.2, 0.5, 0.8), normal)]
-    return Gaussians(*rows, jnp.zeros((1, 0)), jnp.ones(1, bool))
+def discs(*given) -> Gaussians:
+    """Discs of a mean, a normal and a standard deviation, a millimetre thick, and free rows."""
+    made = sc.join(*(sc.flat_gaussians(mean, std, normal, 1e-3) for mean, normal, std in given))
+    rows = np.arange(COUNT)
+    return sc.replace(sc.rows_of(made, np.minimum(rows, len(given) - 1)), valid=rows < len(given))
 
 
 def assert_images_equal(actual, expected, atol):
@@ -54,12 +55,9 @@ def image(camera, render_config):
 
 
 def test_the_image_equals_the_tile_free_reference(camera, render_config, image):
+    colors = np.asarray(GAUSSIANS.colors, float)
     values, alpha, depth, depth_std = reference.render(
-        as_numpy(GAUSSIANS),
-        np.asarray(GAUSSIANS.colors, float),
-        np.asarray(T.as_matrix(), float),
-        camera,
-        render_config,
+        sc.as_numpy(GAUSSIANS), colors, sc.matrix_of(T), camera, render_config
     )
     assert image.overflow == 0 and (alpha > 0.3).mean() > 0.2
     # A splat's edge (3 σ) has weight .9 exp(-4.5) = .01, and float32 may put a pixel on either side of it.
@@ -74,8 +72,9 @@ def test_the_image_equals_the_tile_free_reference(camera, render_config, image):
 
 
 def test_white_gaussians_over_black_are_alpha(camera, render_config):
-    rendering = draw(GAUSSIANS, jnp.ones((24, 1)), T, camera, render_config)
-    np.testing.assert_allclose(rendering.values[..., 0], rendering.alpha, atol=1e-6)
+    rendering = draw(GAUSSIANS, WHITE, T, camera, render_config)
+    for channel in np.moveaxis(rendering.values, -1, 0):
+        np.testing.assert_allclose(channel, rendering.alpha, atol=1e-6)
     assert rendering.alpha.min() >= 0 and rendering.alpha.max() <= 1 + 1e-6
 
 
@@ -85,7 +84,7 @@ def test_depth_exists_exactly_where_alpha_suffices(image, render_config):
 
 
 def test_a_fronto_parallel_gaussian_has_its_own_depth_where_it_covers(camera, render_config):
-    rendering = draw(single((0.1, 0.05, 2.0), (0, 0, -1)), jnp.ones((1, 1)), pose(), camera, render_config)
+    rendering = draw(discs(((0.1, 0.05, 2.0), (0, 0, -1), 0.15)), WHITE, sc.pose(), camera, render_config)
     covered = np.asarray(rendering.depth) > 0
     assert covered.sum() >= 8
     np.testing.assert_allclose(np.asarray(rendering.depth)[covered], 2.0, atol=1e-5)  # roundings
@@ -95,7 +94,7 @@ def test_a_fronto_parallel_gaussian_has_its_own_depth_where_it_covers(camera, re
 
 def test_the_depth_of_a_slanted_gaussian_is_that_of_its_plane(camera, render_config):
     normal, mean = np.array([0.5, 0.3, -1.0]), np.array([0.1, 0.05, 2.0])
-    rendering = draw(single(mean, normal), jnp.ones((1, 1)), pose(), camera, render_config)
+    rendering = draw(discs((mean, normal, 0.15)), WHITE, sc.pose(), camera, render_config)
     directions = np.asarray(rays(camera, pixel_grid(camera)), float)
     plane = (normal @ mean) / (directions @ normal)
     covered = np.asarray(rendering.depth) > 0
@@ -110,70 +109,74 @@ def test_the_image_does_not_depend_on_the_tile_size(camera, config, image, size)
 
 
 def test_the_image_does_not_depend_on_the_order_of_rows(camera, render_config, image):
-    order = np.random.default_rng(0).permutation(24)
-    shuffled = jax.tree.map(lambda x: x[order], GAUSSIANS)
+    shuffled = sc.rows_of(GAUSSIANS, np.random.default_rng(0).permutation(COUNT))
     assert_images_equal(draw(shuffled, shuffled.colors, T, camera, render_config), image, 2e-5)  # order of sums
 
 
 def test_moving_map_and_camera_together_does_not_change_the_image(camera, render_config, image):
-    motion = pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
-    moved = draw(move_gaussians(motion, GAUSSIANS), GAUSSIANS.colors, motion @ T, camera, render_config)
+    motion = sc.pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
+    moved = draw(sc.move_gaussians(motion, GAUSSIANS), GAUSSIANS.colors, sc.product(motion, T), camera, render_config)
     # Coordinates of 3 m in float32; a pixel at a splat's edge may lose its weight of .01.
     assert np.quantile(np.abs(moved.alpha - image.alpha), 0.99) < 1e-3
     assert np.abs(moved.alpha - image.alpha).max() < 0.011
 
 
 @pytest.mark.parametrize("poison", [np.nan, np.inf, 1e6])
-def test_invalid_rows_change_no_pixel(camera, render_config, image, poison):
-    rows = jax.tree.map(
-        lambda x: jnp.full_like(x[:8], poison) if x.dtype == jnp.float32 else jnp.zeros(8, bool), GAUSSIANS
-    )
-    padded = jax.tree.map(lambda a, b: jnp.concatenate([b, a]), GAUSSIANS, rows)
-    assert_images_equal(draw(padded, padded.colors, T, camera, render_config), image, 2e-5)  # order of sums
+def test_invalid_rows_change_no_pixel(camera, render_config, poison):
+    seen = np.arange(COUNT) % 3 > 0
+    clean = sc.replace(GAUSSIANS, valid=seen)
+    wild = sc.poisoned(clean, seen, poison)
+    images = (draw(g, np.asarray(g.colors), T, camera, render_config) for g in (wild, clean))
+    assert_images_equal(*images, atol=0)
 
 
 def test_a_free_row_where_the_camera_is_leaves_the_gradient_of_the_pose_finite(camera, render_config):
     """Free rows are at the origin; a camera there is at depth 0 of them."""
-    free = eqx.tree_at(lambda g: (g.valid, g.means), GAUSSIANS, (jnp.arange(24) > 3, GAUSSIANS.means.at[:4].set(0.0)))
+    is_free = np.arange(COUNT) < 4
+    free = sc.replace(GAUSSIANS, valid=~is_free, means=np.where(is_free[:, None], 0.0, GAUSSIANS.means))
+    ahead = sc.pose()
 
     def total(shift):
-        drawn = render(free, free.colors, pose(translation=shift), camera, render_config)
+        there = jaxlie.SE3.from_rotation_and_translation(ahead.rotation(), shift)
+        drawn = render(free, free.colors, there, camera, render_config)
         return jnp.sum(drawn.values) + jnp.sum(drawn.depth) + jnp.sum(drawn.depth_std)
 
-    assert jnp.all(jnp.isfinite(jax.grad(total)(jnp.zeros(3))))
+    assert np.isfinite(sc.on_host(jax.grad(total))(np.zeros(3, np.float32))).all()
 
 
 def test_a_nearer_gaussian_hides_what_is_behind_it(camera, render_config):
-    config = at(render_config, "opacity", 1.0)
-    near, far = single((0.0, 0.0, 1.0), (0, 0, -1), 0.3), single((0.0, 0.0, 2.0), (0, 0, -1), 0.6)
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), far, near)
-    rendering = draw(both, jnp.array([[0.0, 1.0], [1.0, 0.0]]), pose(), camera, config)
+    config = sc.at(render_config, "opacity", 1.0)
+    both = discs(((0.0, 0.0, 2.0), (0, 0, -1), 0.6), ((0.0, 0.0, 1.0), (0, 0, -1), 0.3))
+    colors = np.zeros((COUNT, 3), np.float32)
+    colors[:2] = (0, 1, 0), (1, 0, 0)
+    rendering = draw(both, colors, sc.pose(), camera, config)
     row, column = 12, 14  # the pixel of the mean, to within half a pixel of splats with 6 and more
-    np.testing.assert_allclose(rendering.values[row, column], [1, 0], atol=0.02)  # exp of a quarter pixel
+    np.testing.assert_allclose(rendering.values[row, column], [1, 0, 0], atol=0.02)  # exp of a quarter pixel
     np.testing.assert_allclose(rendering.depth[row, column], 1.0, atol=0.02)
 
 
-def test_a_full_tile_is_counted(camera, config):
-    def overflow(capacity):
-        small = config(f"render.tile_capacity={capacity}", "render.tile_size=32").refinement.render
-        return int(draw(GAUSSIANS, GAUSSIANS.colors, T, camera, small).overflow)
-
-    seen = next(c for c in range(24, 0, -1) if overflow(c - 1) > 0)
-    assert overflow(seen) == 0 and overflow(seen - 1) == 1
+MANY = discs(*(((0.0, 0.0, 1.0 + 0.05 * i), (0, 0, -1), 30.0) for i in range(COUNT)))  # each fills the image
 
 
-@pytest.mark.parametrize(("opacity", "is_seen"), [(0.9, False), (0.1, True)])
-def test_what_a_full_tile_hides_is_not_counted(camera, config, opacity, is_seen):
-    """24 discs that fill the image, of which a tile draws 8: behind them is 1e-8 of the light, or .43 of it."""
-    small = at(config("render.tile_capacity=8", "render.tile_size=32").refinement.render, "opacity", opacity)
-    discs = [single((0.0, 0.0, 1.0 + 0.05 * i), (0, 0, -1), 30.0) for i in range(24)]
-    many = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *discs)
-    drawn = draw(many, many.colors, pose(), camera, small)
-    assert (np.asarray(drawn.alpha) > 0.99).all() != is_seen
-    assert drawn.overflow == (16 if is_seen else 0)
+@pytest.mark.parametrize(
+    ("capacity", "opacity", "overflow"),
+    [
+        (COUNT, 0.1, 0),
+        (COUNT - 1, 0.1, 1),  # behind the others is .09 of the light
+        (8, 0.1, 16),  # and here .43
+        (8, 0.9, 0),  # 1e-8: nothing that is not drawn would be seen
+    ],
+)
+def test_what_a_full_tile_leaves_out_is_counted_unless_it_is_hidden(camera, config, capacity, opacity, overflow):
+    small = sc.at(
+        config(f"render.tile_capacity={capacity}", "render.tile_size=32").refinement.render, "opacity", opacity
+    )
+    drawn = draw(MANY, MANY.colors, sc.pose(), camera, small)
+    assert drawn.overflow == overflow
+    assert (drawn.alpha > 0.99).all() == (opacity > 0.5)
 
 
 def test_an_empty_map_is_a_black_image_without_depth(camera, render_config):
-    nothing = eqx.tree_at(lambda g: g.valid, GAUSSIANS, jnp.zeros(24, bool))
+    nothing = sc.replace(GAUSSIANS, valid=np.zeros(COUNT, bool))
     rendering = draw(nothing, GAUSSIANS.colors, T, camera, render_config)
     assert all((np.asarray(x) == 0).all() for x in jax.tree.leaves(rendering))

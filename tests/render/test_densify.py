@@ -1,30 +1,35 @@
 """One point per pixel: exact on a plane of Gaussians, moved by rigid motions, opaque where a surface is in front."""
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from scene import at, move_gaussians, pose
+import scene as sc
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import render
 from emgs_jax.render.densify import DensifyConfig, densify, in_front_surface, without_floor
 
-dense = eqx.filter_jit(densify)
+NUM_ROWS = 1080  # of every map, many of them free: one program for all
+drawn_dense, in_front = sc.on_host(densify), sc.on_host(in_front_surface)
+
+
+def dense(gaussians: Gaussians, *arguments):
+    return drawn_dense(filled(gaussians), *arguments)
+
+
+def filled(gaussians: Gaussians) -> Gaussians:
+    """With free rows after them."""
+    rows, count = np.arange(NUM_ROWS), gaussians.valid.shape[0]
+    more = sc.rows_of(gaussians, np.minimum(rows, count - 1))
+    return sc.replace(more, valid=more.valid & (rows < count))
 
 
 def wall(depth: float, normal=(0.0, 0.0, -1.0), step: float = 0.15) -> Gaussians:
     """Discs on a grid on the plane through (0, 0, depth) with a normal."""
-    normal = np.asarray(normal) / np.linalg.norm(normal)
     x, y = (a.reshape(-1) for a in np.meshgrid(np.arange(-2, 2, step), np.arange(-1.5, 1.5, step)))
     z = depth - (normal[0] * x + normal[1] * y) / normal[2]
-    cov = (step / 2) ** 2 * (np.eye(3) - np.outer(normal, normal)) + 1e-4 * np.outer(normal, normal)
-    count = len(x)
-    rows = np.stack([x, y, z], -1), np.tile(cov, (count, 1, 1)), np.tile([0.2, 0.5, 0.8], (count, 1))
-    arrays = [jnp.asarray(a, jnp.float32) for a in (*rows, np.tile(normal, (count, 1)))]
-    return Gaussians(*arrays, jnp.zeros((count, 0)), jnp.ones(count, bool))
+    return sc.flat_gaussians(np.stack([x, y, z], -1), step / 2, normal, color=(0.2, 0.5, 0.8))
 
 
 @pytest.fixture(scope="module")
@@ -35,30 +40,29 @@ def densify_config(config):
 def test_the_points_of_a_slanted_wall_lie_on_it_with_its_normal_and_colour(camera, densify_config):
     normal = np.array([0.3, 0.2, -1.0]) / np.linalg.norm([0.3, 0.2, -1.0])
     # Without the blur: a splat's depth is kept within its own extent, which blur widens on the image only.
-    view = dense(wall(2.0, normal), pose(), camera, at(densify_config, "render.blur", 0.0))
-    valid = np.asarray(view.valid)
+    view = dense(wall(2.0, normal), sc.pose(), camera, sc.at(densify_config, "render.blur", 0.0))
+    valid = view.valid
     assert view.rendering.overflow == 0 and valid.mean() > 0.95
-    distance = (np.asarray(view.points)[valid] - [0, 0, 2]) @ normal
+    distance = (view.points[valid] - [0, 0, 2]) @ normal
     assert np.abs(distance).max() < 1e-3  # m; every splat's depth is exact for its plane
-    np.testing.assert_allclose(np.asarray(view.normals)[valid], np.tile(normal, (valid.sum(), 1)), atol=1e-4)
-    np.testing.assert_allclose(np.asarray(view.colors)[valid], np.tile([0.2, 0.5, 0.8], (valid.sum(), 1)), atol=1e-4)
+    np.testing.assert_allclose(view.normals[valid], np.tile(normal, (valid.sum(), 1)), atol=1e-4)
+    np.testing.assert_allclose(view.colors[valid], np.tile([0.2, 0.5, 0.8], (valid.sum(), 1)), atol=1e-4)
 
 
 def test_the_map_is_drawn_with_the_coverage_of_densification(camera, densify_config):
-    image = eqx.filter_jit(render)
-    whole = image(wall(2.0), wall(2.0).colors, pose(), camera, at(densify_config.render, "opacity", 0.1))
-    half = float(jnp.median(whole.alpha))  # so that half of the pixels have a depth
-    view = dense(wall(2.0), pose(), camera, at(at(densify_config, "render.opacity", 0.1), "min_alpha", half))
-    drawn = at(at(densify_config.render, "opacity", 0.1), "min_alpha", half)
-    expected = image(wall(2.0), wall(2.0).colors, pose(), camera, drawn)
+    image, far, thin = sc.on_host(render), filled(wall(2.0)), sc.at(densify_config, "render.opacity", 0.1)
+    whole = image(far, far.colors, sc.pose(), camera, thin.render)
+    half = float(np.median(whole.alpha))  # so that half of the pixels have a depth
+    view = dense(far, sc.pose(), camera, sc.at(thin, "min_alpha", half))
+    expected = image(far, far.colors, sc.pose(), camera, sc.at(thin.render, "min_alpha", half))
     for name in ("alpha", "depth", "depth_std"):  # roundings; a standard deviation is the root of a difference
         np.testing.assert_allclose(getattr(view.rendering, name), getattr(expected, name), atol=1e-3, err_msg=name)
     np.testing.assert_array_equal(view.valid, view.rendering.depth > 0)
     assert 0 < view.valid.sum() < view.valid.size
-    covered = np.asarray(view.covered)
-    assert (covered | ~np.asarray(view.valid)).all() and covered.sum() > view.valid.sum()
-    np.testing.assert_allclose(np.asarray(view.points)[covered][:, 2], 2.0, atol=2e-3)  # about where the map begins
-    np.testing.assert_array_equal(np.asarray(view.depth) > 0, covered)
+    covered = view.covered
+    assert (covered | ~view.valid).all() and covered.sum() > view.valid.sum()
+    np.testing.assert_allclose(view.points[covered][:, 2], 2.0, atol=2e-3)  # about where the map begins
+    np.testing.assert_array_equal(view.depth > 0, covered)
 
 
 def test_the_floor_of_a_fit_is_not_drawn_along_the_surface():
@@ -70,36 +74,23 @@ def test_the_floor_of_a_fit_is_not_drawn_along_the_surface():
         [*(one + floor**2 * np.eye(3) for one in spread), spread[0] / 100 + 1e-4 * np.outer(normal, normal)]
     )
     rows = np.tile([0.0, 0, 2], (3, 1)), covs, np.zeros((3, 3)), np.tile(normal, (3, 1))
-    found = without_floor(
-        Gaussians(*(jnp.asarray(a, jnp.float32) for a in rows), jnp.zeros((3, 0)), jnp.ones(3, bool)),
-        jnp.asarray(floor),
-    )
+    flat, cut = Gaussians(*map(sc.device, (*rows, np.zeros((3, 0)), np.ones(3, bool)))), sc.on_host(without_floor)
+    found = cut(flat, np.float32(floor))
     across = floor**2 * np.outer(normal, normal)
     np.testing.assert_allclose(found.covs[:2], [one + across for one in spread], atol=1e-9)
     np.testing.assert_allclose(np.linalg.eigvalsh(found.covs[2]), [0.0, 0.003**2 - 0.002**2, 1e-4], atol=1e-9)
-    same = without_floor(found, jnp.zeros(()))
+    same = cut(found, np.float32(0.0))
     np.testing.assert_array_equal(same.covs, found.covs)
 
 
 def test_a_near_thing_is_drawn_no_wider_than_its_points(densify_config):
     """A board of 20 cm at 1 m before a wall, a pixel being 4 mm; with the floor of 1 cm it is five too wide a side."""
-    near = Camera(jnp.array([250.0, 250.0]), jnp.array([59.5, 15.5]), 120, 32)
-    rows = [
-        jnp.asarray(a, jnp.float32) for a in np.meshgrid(np.arange(-0.095, 0.1, 0.01), np.arange(-0.095, 0.1, 0.01))
-    ]
-    means = jnp.stack([row.reshape(-1) for row in (*rows, jnp.ones_like(rows[0]))], -1)
-    spread = 0.005**2 * jnp.diag(jnp.array([1.0, 1, 0])) + 0.01**2 * jnp.eye(3)
-    count = len(means)
-    normals, colors = jnp.tile(jnp.array([0.0, 0, -1]), (count, 1)), jnp.ones((count, 3))
-    covs, valid = jnp.tile(spread, (count, 1, 1)), jnp.ones(count, bool)
-    board = Gaussians(means, covs, colors, normals, jnp.zeros((count, 0)), valid)
-    map = joined(wall(2.0), board)
-    wide, narrow = (dense(map, pose(), near, at(densify_config, "min_std", std)).depth[16] for std in (0.0, 0.01))
+    near = Camera([250.0, 250.0], [59.5, 15.5], 120, 32)
+    x, y = (a.reshape(-1) for a in np.meshgrid(np.arange(-0.095, 0.1, 0.01), np.arange(-0.095, 0.1, 0.01)))
+    board = sc.flat_gaussians(np.stack([x, y, np.ones_like(x)], -1), (0.005**2 + 0.01**2) ** 0.5, color=1.0)
+    map = sc.join(wall(2.0), board)
+    wide, narrow = (dense(map, sc.pose(), near, sc.at(densify_config, "min_std", std)).depth[16] for std in (0.0, 0.01))
     assert (int((narrow < 1.5).sum()), int((wide < 1.5).sum())) == (52, 63)
-
-
-def joined(*parts: Gaussians) -> Gaussians:
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
 def beside(distance: float, std=0.12) -> Gaussians:
@@ -107,45 +98,32 @@ def beside(distance: float, std=0.12) -> Gaussians:
     z, y = (a.reshape(-1) for a in np.meshgrid(np.arange(-1, 2, std), np.arange(-1.5, 1.5, std)))
     rows = np.stack([np.full(len(z), distance), y, z], -1), np.tile(np.diag([0.02, std, std]) ** 2, (len(z), 1, 1))
     rows += np.tile([0.9, 0.1, 0.1], (len(z), 1)), np.tile([-1.0, 0, 0], (len(z), 1))
-    return Gaussians(*(jnp.asarray(a, jnp.float32) for a in rows), jnp.zeros((len(z), 0)), jnp.ones(len(z), bool))
+    return Gaussians(*map(sc.device, (*rows, np.zeros((len(z), 0)), np.ones(len(z), bool))))
 
 
 def test_a_door_frame_in_passing_hides_nothing_that_it_does_not_cover(camera, densify_config):
     """The picture that showed it: a frame of a walk in a doorway, filled by a door frame 8 cm before the camera."""
-    config = at(densify_config, "render.blur", 0.0)
-    alone, passing = (dense(map, pose(), camera, config) for map in (wall(2.0), joined(wall(2.0), beside(0.5))))
+    config = sc.at(densify_config, "render.blur", 0.0)
+    alone, passing = (dense(map, sc.pose(), camera, config) for map in (wall(2.0), sc.join(wall(2.0), beside(0.5))))
     column = float(camera.center[0] + camera.focal[0] * 0.5 / 2.0)  # where the wall beside meets the far one
-    is_far = np.asarray(alone.valid & (jnp.arange(camera.width) < column - 4))
+    is_far = alone.valid & (np.arange(camera.width) < column - 4)
     assert is_far.sum() > 100
-    np.testing.assert_allclose(np.asarray(passing.depth)[is_far], 2.0, atol=0.05)  # its own points are 8 cm wide
+    np.testing.assert_allclose(passing.depth[is_far], 2.0, atol=0.05)  # its own points are 8 cm wide
 
 
 def test_the_other_side_of_a_thin_wall_does_not_show_through(camera, densify_config):
     """Seen from the other side it was mapped 3 cm too near to this one."""
-    other = eqx.tree_at(lambda g: g.colors, wall(1.97, (0.0, 0.0, 1.0)), jnp.ones_like(wall(1.97).colors))
-    view = dense(joined(wall(2.0), other), pose(), camera, densify_config)
-    alone = dense(wall(2.0), pose(), camera, densify_config)
+    other = sc.replace(wall(1.97, (0.0, 0.0, 1.0)), colors=np.ones(wall(1.97).colors.shape))
+    view = dense(sc.join(wall(2.0), other), sc.pose(), camera, densify_config)
+    alone = dense(wall(2.0), sc.pose(), camera, densify_config)
     np.testing.assert_allclose(view.colors[alone.valid], alone.colors[alone.valid], atol=1e-5)
     np.testing.assert_allclose(view.depth[alone.valid], alone.depth[alone.valid], atol=1e-5)
 
 
 def discs(depths, colors, std=0.3) -> Gaussians:
-    """Discs that face the camera, behind each other on the ray of pixel (15, 12); the rest of the rows is free."""
-    base, count = wall(2.0), len(depths)
+    """Discs that face the camera, behind each other on the ray of pixel (15, 12)."""
     ray = np.array([0.5 / 20.0, -0.25 / 23.0, 1.0])
-    put = lambda rows, values: rows.at[:count].set(jnp.asarray(values, jnp.float32))  # noqa: E731
-    covs = np.tile(np.diag([std**2, std**2, 1e-6]), (count, 1, 1))
-    return eqx.tree_at(
-        lambda g: (g.means, g.covs, g.colors, g.normals, g.valid),
-        base,
-        (
-            put(base.means, np.outer(depths, ray)),
-            put(base.covs, covs),
-            put(base.colors, colors),
-            put(base.normals, np.tile([0, 0, -1.0], (count, 1))),
-            jnp.arange(base.valid.shape[0]) < count,
-        ),
-    )
+    return sc.replace(sc.flat_gaussians(np.outer(depths, ray), std, thickness=1e-3), colors=np.array(colors))
 
 
 RED, BLUE = (0.9, 0.1, 0.1), (0.2, 0.5, 0.8)
@@ -153,7 +131,7 @@ RED, BLUE = (0.9, 0.1, 0.1), (0.2, 0.5, 0.8)
 
 @pytest.mark.parametrize("opacity", [0.9, 0.6])
 def test_what_is_behind_shines_through_nothing(camera, densify_config, opacity):
-    view = dense(discs([2.0, 1.0], [RED, BLUE]), pose(), camera, at(densify_config, "render.opacity", opacity))
+    view = dense(discs([2.0, 1.0], [RED, BLUE]), sc.pose(), camera, sc.at(densify_config, "render.opacity", opacity))
     assert view.valid[12, 15]
     np.testing.assert_allclose(view.depth[12, 15], 1.0, atol=1e-5)  # roundings, here and below
     np.testing.assert_allclose(view.points[12, 15], [0.025, -0.25 / 23, 1.0], atol=1e-5)
@@ -165,7 +143,7 @@ def test_what_is_behind_shines_through_nothing(camera, densify_config, opacity):
 def test_the_layers_of_a_surface_are_averaged_whichever_comes_first(camera, densify_config, opacity, order):
     """All are centred on the pixel, so each counts the same; what is 7 % behind is another surface."""
     depths, colors = [2.0, 2.02, 2.07, 2.2][::order], [RED, BLUE, BLUE, RED][::order]
-    view = dense(discs(depths, colors), pose(), camera, at(densify_config, "render.opacity", opacity))
+    view = dense(discs(depths, colors), sc.pose(), camera, sc.at(densify_config, "render.opacity", opacity))
     np.testing.assert_allclose(view.depth[12, 15], 2.03, atol=1e-4)
     np.testing.assert_allclose(view.colors[12, 15], (np.array(RED) + 2 * np.array(BLUE)) / 3, atol=1e-4)
 
@@ -173,9 +151,9 @@ def test_the_layers_of_a_surface_are_averaged_whichever_comes_first(camera, dens
 def test_layers_count_by_how_near_the_pixel_is_to_their_centres(camera, densify_config):
     """A disc whose centre is one deviation away counts exp(-1/2)."""
     two = discs([2.0, 2.04], [RED, BLUE])
-    two = eqx.tree_at(lambda g: g.means, two, two.means.at[1, 0].add(0.3))
-    config = at(at(densify_config, "render.blur", 0.0), "render.covariance_scale", 1.0)
-    view = dense(two, pose(), camera, config)
+    two = sc.replace(two, means=np.asarray(two.means) + [[0, 0, 0], [0.3, 0, 0]])
+    config = sc.changed(densify_config, **{"render.blur": 0.0, "render.covariance_scale": 1.0})
+    view = dense(two, sc.pose(), camera, config)
     share = np.exp(-0.5) / (1 + np.exp(-0.5))
     np.testing.assert_allclose(view.depth[12, 15], 2.0 + 0.04 * share, atol=2e-4)  # 2.04 m looks a little smaller
 
@@ -183,11 +161,10 @@ def test_layers_count_by_how_near_the_pixel_is_to_their_centres(camera, densify_
 def test_a_near_surface_has_no_holes_before_a_wall(camera, densify_config):
     """Oracle: the two depths. A pixel shows one of the two walls, and all that the near one covers shows it."""
     near = wall(1.5)
-    near = eqx.tree_at(lambda g: g.valid, near, jnp.abs(near.means[:, 0]) < 0.4)
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), near, wall(2.4, step=0.2))
-    view = dense(both, pose(), camera, densify_config)
-    depth = np.asarray(view.depth)
-    assert np.asarray(view.valid).all()
+    near = sc.replace(near, valid=np.abs(near.means)[:, 0] < 0.4)
+    view = dense(sc.join(near, wall(2.4, step=0.2)), sc.pose(), camera, densify_config)
+    depth = view.depth
+    assert view.valid.all()
     is_near, is_far = np.abs(depth - 1.5) < 1e-2, np.abs(depth - 2.4) < 2e-2
     assert (is_near | is_far).all()
     x = (np.arange(camera.width) - 14.5) / 20.0 * 1.5
@@ -195,15 +172,13 @@ def test_a_near_surface_has_no_holes_before_a_wall(camera, densify_config):
 
 
 def test_points_move_with_map_and_camera(camera, densify_config):
-    T, motion = pose((0.05, 0.1, 0)), pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
+    T, motion = sc.pose((0.05, 0.1, 0)), sc.pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
     view = dense(wall(2.0), T, camera, densify_config)
-    moved = dense(move_gaussians(motion, wall(2.0)), motion @ T, camera, densify_config)
-    both = np.asarray(view.valid & moved.valid)
+    moved = dense(sc.move_gaussians(motion, wall(2.0)), sc.product(motion, T), camera, densify_config)
+    both = view.valid & moved.valid
     assert both.mean() > 0.9
-    expected = np.asarray(view.points) @ np.asarray(motion.rotation().as_matrix()).T + np.asarray(motion.translation())
-    np.testing.assert_allclose(
-        np.asarray(moved.points)[both], expected[both], atol=2e-3
-    )  # a splat more or less at its edge
+    expected = view.points @ sc.matrix_of(motion)[:3, :3].T + sc.matrix_of(motion)[:3, 3]
+    np.testing.assert_allclose(moved.points[both], expected[both], atol=2e-3)  # a splat more or less at its edge
 
 
 @pytest.mark.parametrize(
@@ -215,14 +190,14 @@ def test_points_move_with_map_and_camera(camera, densify_config):
     ],
 )
 def test_the_front_surface_is_a_part_of_the_depth_about_the_weighted_median(weights, expected):
-    weights, depth = jnp.array(weights)[:, None], jnp.array([[1.0], [2.0], [2.15], [2.25]])
-    np.testing.assert_array_equal(in_front_surface(weights, depth, jnp.asarray(0.1))[:, 0], expected)
-    nothing = in_front_surface(0.0 * weights, depth, jnp.asarray(0.1))  # no weight, no surface that matters
+    weights, depth = np.float32(weights)[:, None], np.float32([[1.0], [2.0], [2.15], [2.25]])
+    np.testing.assert_array_equal(in_front(weights, depth, np.float32(0.1))[:, 0], expected)
+    nothing = in_front(0.0 * weights, depth, np.float32(0.1))  # no weight, no surface that matters
     assert nothing.shape == (4, 1)
 
 
 def test_pixels_without_depth_are_invalid_and_finite(camera, densify_config):
-    nothing = eqx.tree_at(lambda g: g.valid, wall(2.0), jnp.zeros(wall(2.0).valid.shape, bool))
-    view = dense(nothing, pose(), camera, densify_config)
+    nothing = sc.replace(wall(2.0), valid=np.zeros(wall(2.0).valid.shape, bool))
+    view = dense(nothing, sc.pose(), camera, densify_config)
     assert not view.valid.any() and not view.covered.any()
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(view))

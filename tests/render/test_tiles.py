@@ -1,22 +1,21 @@
 """Tile assignment against a box test in NumPy, order by depth, and counted overflow."""
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from scene import pose, random_gaussians
+from scene import on_host, pose, random_gaussians, replace
 
+from emgs_jax.render import tiles
 from emgs_jax.render.project import project_gaussians
-from emgs_jax.render.tiles import assign_tiles, tile_corners
 
-RADIUS = jnp.asarray(3.0)
+assign_tiles, tile_corners = on_host(tiles.assign_tiles), on_host(tiles.tile_corners)
+RADIUS = np.float32(3.0)
 
 
 @pytest.fixture(scope="module")
 def splats(camera):
     g = random_gaussians(60, low=(-1, -0.8, 1), high=(1, 0.8, 3))
-    g = eqx.tree_at(lambda g: (g.covs, g.valid), g, (g.covs * 0.1, jnp.arange(60) % 6 > 0))
-    return project_gaussians(g, pose(), camera, jnp.ones(()), jnp.asarray(0.3))
+    g = replace(g, covs=np.asarray(g.covs) * 0.1, valid=np.arange(60) % 6 > 0)
+    return on_host(project_gaussians)(g, pose(), camera, np.float32(1.0), np.float32(0.3))
 
 
 def touching(splats, corner, size):
