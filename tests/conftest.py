@@ -1,7 +1,6 @@
 """Shared by all tests of the core: shapes and types checked at every call, one small config, one small camera."""
 
 import os
-from collections import Counter
 from importlib.metadata import version
 from pathlib import Path
 
@@ -25,7 +24,9 @@ os.environ["XLA_FLAGS"] = " ".join([*QUICK, os.environ.get("XLA_FLAGS", "")])
 import jax  # noqa: E402
 import pytest  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
+from schedule import in_order, scheduler  # noqa: E402
 
+MAX_MAPS = 30000  # and no file of tests makes as many again
 PACKAGE = Path(__file__).resolve().parents[1] / "emgs_jax"
 # Before anything imports the package: every file that declares shapes of JAX arrays has them checked at every call.
 CHECKED = [path for path in sorted(PACKAGE.rglob("*.py")) if "from jaxtyping import Array" in path.read_text()]
@@ -34,10 +35,18 @@ install_import_hook(
 )
 
 
-def pytest_collection_modifyitems(items):
-    """Files with most slow tests first: a long one at the end would leave the other processes without work."""
-    num_slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
-    items.sort(key=lambda item: -num_slow[item.path])
+def pytest_collection_modifyitems(config, items):
+    """Long tests are left out unless `-m` names them, and what shares executables stands together."""
+    if "long" not in config.option.markexpr:
+        left_out = [item for item in items if item.get_closest_marker("long")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in set(left_out)]
+    items[:] = in_order(items)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    return scheduler(config, log)
 
 
 @pytest.fixture(scope="session")
@@ -56,8 +65,31 @@ def camera():
     return Camera([20.0, 23.0], [14.5, 12.25], 32, 24)
 
 
+@pytest.fixture(scope="session")
+def exact_run(tmp_path_factory):
+    """Folder and metrics of a tiny run with the exact prior, made once for all processes: nobody writes into it."""
+    from tiny_run import make_exact_run  # after the hook
+
+    base = tmp_path_factory.getbasetemp()
+    return make_exact_run(base.parent if "PYTEST_XDIST_WORKER" in os.environ else base)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def drop_executables():
-    """Every executable holds memory maps, of which Linux gives a process 65530: past that, compiling segfaults."""
+    """Every executable holds some 13 memory maps, of which Linux gives 65530: past that, compiling segfaults.
+
+    Until then they are kept, because other files need the same: a tiny run is 290 of them, and making them anew costs
+    10 CPU seconds. No memory is gained by dropping them.
+    """
     yield
-    jax.clear_caches()
+    if num_maps() > MAX_MAPS:
+        jax.clear_caches()
+
+
+def num_maps() -> int:
+    """Memory maps of this process; more than `MAX_MAPS` where the system does not tell."""
+    try:
+        with open("/proc/self/maps", "rb") as file:
+            return sum(1 for _ in file)
+    except OSError:
+        return MAX_MAPS + 1

@@ -1,10 +1,14 @@
 """One small setting for every test that needs a whole run; all have the same shapes, so a process compiles once."""
 
+import copy
 import dataclasses
+import json
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 
 import hydra
+from filelock import FileLock
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior, PriorPrediction
@@ -29,7 +33,12 @@ SMALL_STEREO = (  # for images of 128 by 96; at this size a first window of 4 im
 
 
 def compose(*overrides: str, name: str = "config"):
-    """conf/ as Hydra composes it for a script, with the small setting."""
+    """conf/ as Hydra composes it for a script, with the small setting; a copy of one's own."""
+    return copy.deepcopy(_composed(*overrides, name=name))
+
+
+@cache
+def _composed(*overrides: str, name: str):
     return configure.compose(*TINY, *overrides, name=name)
 
 
@@ -72,3 +81,22 @@ def map_tiny(frames, prior, *overrides: str) -> tuple[MappingRun, list]:
     for _ in map_frames(session, frames, prior):
         pass
     return session, maps
+
+
+@cache
+def exact() -> tuple[MappingRun, list]:
+    """The finished run with the exact prior, and the map after each record; nobody changes it."""
+    return map_tiny(dataset(), EditedPrior())
+
+
+def make_exact_run(shared: Path) -> tuple[Path, dict]:
+    """Folder and metrics of `experiments.run` with the exact prior; who comes first makes it, others wait."""
+    import experiments.run
+
+    folder, done = shared / "exact_run", shared / "exact_run.done"
+    with FileLock(shared / "exact_run.lock"):
+        if not done.exists():
+            folder.mkdir(exist_ok=True)
+            experiments.run.run(compose("prior.level=0"), folder)
+            done.touch()
+    return folder, json.loads((folder / "metrics.json").read_text())

@@ -2,14 +2,13 @@
 
 from collections import Counter
 from dataclasses import replace
-from functools import cache
 
 import hydra
 import jax
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from tiny_run import NUM_FRAMES, WINDOW_SIZE, EditedPrior, at_inference, compose, dataset, map_tiny
+from tiny_run import NUM_FRAMES, WINDOW_SIZE, EditedPrior, at_inference, compose, dataset, exact, map_tiny
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.reconstruction import ground_truth_cloud
@@ -25,11 +24,6 @@ from emgs_jax.running.drive import map_frames
 from emgs_jax.running.gathering import RawPrior
 from emgs_jax.running.inputs import inputs, predictions
 from emgs_jax.running.record import new_run
-
-
-@cache
-def exact():
-    return map_tiny(dataset(), EditedPrior())
 
 
 def same_bits(tree, other) -> bool:

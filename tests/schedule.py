@@ -1,0 +1,62 @@
+"""Which files of tests one process takes, and in which order: those that need the same executables stay together."""
+
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).resolve().parent
+# A whole run costs a process some 25 CPU seconds before its first frame, whatever is on disk: tracing and lowering.
+# The longest first: a long one at the end would leave the other processes without work.
+GROUPS = {
+    "tiny": (
+        "running/test_budgets.py",  # counts what is compiled, so it clears what others compiled
+        "scripts/test_run.py",
+        "running/test_drive.py",
+        "running/test_checkpoint.py",
+        "scripts/test_query_and_segment.py",
+        "scripts/test_tune.py",
+        "scripts/test_sweep_script.py",
+        "kills/test_kills.py",
+        "soak/test_soak.py",
+        "test_front_door.py",
+        "test_notebooks.py",
+        "report/test_live_browser.py",
+    ),
+    "smoke": ("running/test_coming_back.py", "running/test_segments.py", "scripts/test_walk.py"),
+    "small": ("test_slam.py", "test_traces.py", "running/test_growth.py", "running/test_stacked.py"),
+}
+_PLACES = {name: (group, place) for group, names in GROUPS.items() for place, name in enumerate(names)}
+
+
+def group_of(path: Path | str) -> str:
+    """The group of a file of tests, else its own name."""
+    path = Path(path)
+    name = path.relative_to(TESTS).as_posix() if path.is_relative_to(TESTS) else path.as_posix()
+    name = name.removeprefix("tests/")
+    return _PLACES.get(name, (name, 0))[0]
+
+
+def in_order(items: list[pytest.Item]) -> list[pytest.Item]:
+    """Groups as above, one after the other, then the files with most slow tests first."""
+    num_slow: dict[str, int] = {}
+    for item in items:
+        group = group_of(item.path)
+        num_slow[group] = num_slow.get(group, 0) + (item.get_closest_marker("slow") is not None)
+    groups = [*GROUPS, *sorted(set(num_slow) - set(GROUPS), key=lambda group: -num_slow[group])]
+
+    def place(item: pytest.Item) -> tuple[int, int]:
+        name = item.path.relative_to(TESTS).as_posix() if item.path.is_relative_to(TESTS) else ""
+        return groups.index(group_of(item.path)), _PLACES.get(name, ("", 0))[1]
+
+    return sorted(items, key=place)
+
+
+def scheduler(config: pytest.Config, log):
+    """xdist's `loadfile`, with a group in the place of its files; None where another way was asked for."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class LoadGroups(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return group_of(nodeid.split("::")[0])
+
+    return LoadGroups(config, log) if config.getvalue("dist") == "loadfile" else None
