@@ -17,7 +17,6 @@ from emgs_jax.report.page import render_config, write_report
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.running.convert import to_se3
 
-pytestmark = pytest.mark.xdist_group("browser")
 BACKGROUND = np.array([0.086, 0.098, 0.118])  # main.js
 PIXELS = """
 const [row, width, height, focal, center] = arguments, { splats, arrays } = report, { gl, canvas } = splats;

@@ -106,14 +106,11 @@ def test_the_table_of_the_paper_labels_simulated_and_quoted_rows(tmp_path):
     assert all("**simulated**" in line for line in lines if "7-Scenes 1 × 2" in line)
 
 
-def test_the_trajectory_column_of_the_paper_table_follows_the_alignment(tmp_path):
-    write_result(tmp_path, 1.0, protocol="paper/se3")
-    assert "| 2.000 |" in paper_table(average(read_estimates(tmp_path), each_sequence=False), [])
-
-
-def test_quoted_rows_stand_only_beside_results_of_their_data_sets(tmp_path):
-    write_result(tmp_path, 1.0, dataset="synthetic", sequence="room0")
-    rows = average(read_estimates(tmp_path), each_sequence=False)
+def test_the_trajectory_column_follows_the_alignment_and_quoted_rows_stand_beside_their_data_sets_only(tmp_path):
+    write_result(tmp_path / "se3", 1.0, protocol="paper/se3")
+    assert "| 2.000 |" in paper_table(average(read_estimates(tmp_path / "se3"), each_sequence=False), [])
+    write_result(tmp_path / "room", 1.0, dataset="synthetic", sequence="room0")
+    rows = average(read_estimates(tmp_path / "room"), each_sequence=False)
     assert paper_table(rows, PUBLISHED) == ""
     line = "| synthetic | room0 | ours, default | **simulated** | paper/sim3 | 1 | 100.00 | 200.00 |"
     assert line in full_table(rows)
@@ -146,13 +143,9 @@ def test_the_csv_has_a_line_per_estimate_that_names_what_it_is_of(tmp_path):
     assert float(ours["trajectory/ate_sim3_m"]) == 0.5 and float(raw["trajectory/ate_sim3_m"]) == 5.0
     assert raw["trajectory/ate_se3_m"] == ""
     for line in (ours, raw):
-        assert (line["dataset"], line["sequence"], line["variant"], line["seed"]) == (
-            "seven_scenes",
-            "chess/seq-01",
-            "default",
-            "0",
-        )
-        assert (line["protocol"], line["is_simulated"], line["revision"]) == ("paper/sim3", "True", "abc")
+        names = ("dataset", "sequence", "variant", "seed", "protocol", "is_simulated", "revision")
+        of = ["seven_scenes", "chess/seq-01", "default", "0", "paper/sim3", "True", "abc"]
+        assert [line[name] for name in names] == of
 
 
 def test_a_result_is_finished_if_it_was_made_with_the_same_settings_wherever_the_data_lies(tmp_path):
