@@ -16,6 +16,8 @@ GROUPS = {
         "scripts/test_query_and_segment.py",
         "scripts/test_tune.py",
         "scripts/test_sweep_script.py",
+        "scripts/test_predict.py",
+        "scripts/test_quality.py",
         "kills/test_kills.py",
         "soak/test_soak.py",
         "test_front_door.py",

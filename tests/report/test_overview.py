@@ -17,7 +17,6 @@ from emgs_jax.report.overview import (
     view_from_above,
 )
 
-
 OURS, TRUTH, MOVED = (228, 87, 46), (27, 153, 139), ((141, 106, 159), (46, 134, 228))  # and loops, as placed
 
 

@@ -2,13 +2,11 @@
 
 import json
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import own_process
 import pytest
-from tiny_run import CONF, dataset
+from tiny_run import dataset
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.report.run_files import claim_folder
@@ -75,8 +73,7 @@ def test_the_programs_end_with_one_line(words, message, exact_run, tmp_path):
 
 def test_a_command_says_what_it_did_and_nothing_of_its_libraries(exact_run, tmp_path):
     shutil.copytree(exact_run[0], tmp_path / "run")
-    words = [sys.executable, "-m", "experiments.cli", "report", str(tmp_path / "run")]
-    done = subprocess.run(words, cwd=CONF.parent, capture_output=True, text=True, check=True)
+    done = own_process.run("experiments.cli", "report", str(tmp_path / "run"))
     assert done.stderr == "" and done.stdout.startswith(f"{tmp_path}/run/report.html") and done.stdout.count("\n") == 1
 
 

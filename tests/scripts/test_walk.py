@@ -43,6 +43,7 @@ def test_a_walk_whose_loop_is_closed_can_be_asked_scored_and_exported(tmp_path):
     assert {path.name for path in export_run(configure.compose(f"folder={folder}", f"out={tmp_path}", name="export"))}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mode", ["extend", "locate"])
 def test_another_run_in_its_map_ends_with_all_its_files(mode, tmp_path):
     folder, before = walked()
