@@ -18,8 +18,7 @@ GROUPS = {
         "scripts/test_sweep_script.py",
         "scripts/test_predict.py",
         "scripts/test_quality.py",
-        "kills/test_kills.py",
-        "soak/test_soak.py",
+        "test_soak.py",
         "test_front_door.py",
         "test_notebooks.py",
         "report/test_live_browser.py",
@@ -45,7 +44,10 @@ def in_order(items: list[pytest.Item]) -> list[pytest.Item]:
     for item in items:
         group = group_of(item.path)
         num_slow[group] = num_slow.get(group, 0) + (item.get_closest_marker("slow") is not None)
-    groups = [*GROUPS, *sorted(set(num_slow) - set(GROUPS), key=lambda group: -num_slow[group])]
+    groups = [
+        *GROUPS,
+        *sorted((group for group in num_slow if group not in GROUPS), key=lambda group: -num_slow[group]),
+    ]
 
     def place(item: pytest.Item) -> tuple[int, int]:
         name = item.path.relative_to(TESTS).as_posix() if item.path.is_relative_to(TESTS) else ""

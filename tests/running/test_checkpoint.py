@@ -26,7 +26,7 @@ from emgs_jax.running.checkpoint import (
     save_checkpoint,
 )
 from emgs_jax.running.record import FrameRecord
-from tests.kills.folders import log_lines
+from tools.kills.folders import log_lines
 
 OVERRIDES = ("prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=256")
 

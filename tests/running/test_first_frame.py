@@ -17,7 +17,7 @@ from emgs_jax.report.run_files import save_progress
 from emgs_jax.running.first_frame import own_covariance, with_first_frame
 from emgs_jax.running.record import FrameRecord, MappingRun, to_line
 from emgs_jax.slam import SlamState
-from tests.nees.consistency import pose_errors
+from tools.nees.consistency import pose_errors
 
 COUNT = 1e6  # repeats beside which the guess does not count
 DIFFERENCE = np.array([0.01, 0.004])  # between two answers about a motion: mean depths and rad, per axis

@@ -1,4 +1,4 @@
-"""`python -m tests.fuzz --cases 10000 --seed 0`: damage inputs at random, read them, and count what came of it.
+"""`python -m tools.fuzz --cases 10000 --seed 0`: damage inputs at random, read them, and count what came of it.
 
 Every verdict is `read`, `clear error` or `fault`; with a fault the exit status is 1. `--first N --cases 1` repeats one.
 """
@@ -29,7 +29,7 @@ def inside(first: int, count: int, seed: int) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tools.fuzz", description=__doc__)
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)

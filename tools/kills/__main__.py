@@ -1,4 +1,4 @@
-"""`python -m tests.kills --kills 50 --seed 0`: stop programs with SIGKILL, SIGTERM and SIGINT at random times.
+"""`python -m tools.kills --kills 50 --seed 0`: stop programs with SIGKILL, SIGTERM and SIGINT at random times.
 
 Runs without and with a back end, a run of `multiview_stereo`, a sweep and a search, in turn.
 
@@ -21,7 +21,7 @@ from .stops import PROGRAMS, run_case, run_whole
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.kills", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tools.kills", description=__doc__)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)

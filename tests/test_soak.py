@@ -8,14 +8,17 @@ import pytest
 
 from emgs_jax.running.record import FrameRecord
 from tests.hand_run import hand_run, poses_along
-from tests.soak.scenes import NUM_FRAMES, SCENES, ToAndFro, to_and_fro
-from tests.soak.soak import faults, grown, ratio, soak
+from tools.soak.scenes import NUM_FRAMES, SCENES, ToAndFro, to_and_fro
+from tools.soak.soak import faults, grown, ratio, soak
 
 SHORT = 14
+USUAL = "black frames"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name", [USUAL, *(pytest.param(name, marks=pytest.mark.long) for name in SCENES if name != USUAL)]
+)
 def test_no_scene_poisons_the_map_and_every_frame_has_a_status(name):
     run, curves = soak(ToAndFro(SHORT, *SCENES[name]))
     assert faults(run, SHORT) == []

@@ -1,4 +1,4 @@
-"""The harness itself: it has to see a fault where there is one; the kills are made by `python -m tests.kills`."""
+"""The harness itself: it has to see a fault where there is one; the kills are made by `python -m tools.kills`."""
 
 import json
 
@@ -10,8 +10,8 @@ from emgs_jax.gaussian_map import empty_map
 from emgs_jax.io.map_file import save_map
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
-from tests.kills.folders import digest, faults, lost
-from tests.kills.stops import Whole, _moment
+from tools.kills.folders import digest, faults, lost
+from tools.kills.stops import Whole, _moment
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""`python -m tests.nees --runs 6`: map rooms with the simulated prior, and compare errors of poses with what is said.
+"""`python -m tools.nees --runs 6`: map rooms with the simulated prior, and compare errors of poses with what is said.
 
 With words of a run, such as `dataset=apartment dataset.stride=2 prior.version=2 graph=default`, that sequence is mapped
 instead, with other seeds of the prior each time. The errors of the frames of one run depend on each other, so that a
@@ -16,7 +16,7 @@ from .consistency import band, nees_of_run
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.nees", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tools.nees", description=__doc__)
     parser.add_argument("--runs", type=int, default=6)
     parser.add_argument("words", nargs="*", help="instead of a room by seed")
     given = parser.parse_args()

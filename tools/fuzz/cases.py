@@ -100,7 +100,7 @@ def run_cases(first: int, count: int, seed: int) -> Iterator[Case]:
     """Cases first … first + count - 1 in processes of their own: what ends one is a fault, and the next goes on."""
     position, end = first, first + count
     while position < end:
-        command = [sys.executable, "-m", "tests.fuzz", "--inside", "--seed", str(seed)]
+        command = [sys.executable, "-m", "tools.fuzz", "--inside", "--seed", str(seed)]
         command += ["--first", str(position), "--cases", str(end - position)]
         child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         for line in child.stdout:

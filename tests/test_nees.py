@@ -1,11 +1,11 @@
-"""The measure itself, on errors of a known law; rooms are mapped by `python -m tests.nees`."""
+"""The measure itself, on errors of a known law; rooms are mapped by `python -m tools.nees`."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.running.record import FrameRecord, MappingRun
-from tests.nees.consistency import band, nees, nees_of_run, pose_errors
+from tools.nees.consistency import band, nees, nees_of_run, pose_errors
 
 COUNT = 4000
 

@@ -1,4 +1,4 @@
-"""`python -m tests.soak --steps 10000`: a camera that walks to and fro in a room, then scenes that are hard.
+"""`python -m tools.soak --steps 10000`: a camera that walks to and fro in a room, then scenes that are hard.
 
 Writes curves of memory, step time, Gaussians and frames that do not fit to OUT/soak.json and OUT/soak.png, and prints
 memory and step time of the last tenth over the second. The exit status is 1 where a map is poisoned, a frame has no
@@ -48,7 +48,7 @@ def draw(path: Path, curves: Curves) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tools.soak", description=__doc__)
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--seconds", type=float, default=np.inf)
     parser.add_argument("--max-ratio", type=float, default=1.05)

@@ -1,1 +1,0 @@
-"""Whether the covariances of poses are those of their errors: `python -m tests.nees --runs 6`."""

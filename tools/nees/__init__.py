@@ -1,0 +1,1 @@
+"""Whether the covariances of poses are those of their errors: `python -m tools.nees --runs 6`."""
