@@ -76,14 +76,7 @@ def test_the_short_table_has_what_is_named_and_the_best_of_each_column_in_bold(t
 
 def test_the_line_above_a_table_says_where_it_comes_from(tmp_path):
     about = block([written(tmp_path, 3), written(tmp_path, 4)], {"synthetic": "room"}).strip().splitlines()[0]
-    for fact in (
-        "simulated",
-        "synthetic room0 (40 frames)",
-        "3, 4",
-        "paper/sim3",
-        "cpu, 2 CPU cores",
-        "`0123456789ab`",
-    ):
+    for fact in ("simulated", "synthetic room0 (40 frames)", "3, 4", "paper/sim3", "`0123456789ab`"):
         assert fact in about, fact
 
 
@@ -123,8 +116,8 @@ def settings(tmp_path):
         config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
         settings = {"default": {}, "level 2": {"prior.level": 2}}
         config["tables"] = {"some": [{"data": ["synthetic"], "seeds": [3, 4], "settings": settings}]}
-        (tmp_path / "page.md").write_text(PAGE)
-        (tmp_path / "full.md").write_text(PAGE)
+        for name in ("page.md", "full.md"):
+            (tmp_path / name).write_text(PAGE)
         yield config
 
 
