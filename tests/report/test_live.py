@@ -1,7 +1,5 @@
 """view=live: what is served follows a run (made by hand, so it is known), and the run neither waits nor ends for it."""
 
-import socket
-import sys
 import threading
 from dataclasses import replace
 from types import SimpleNamespace
@@ -117,17 +115,8 @@ def test_a_view_that_fails_is_said_and_ends_no_run(capsys):
     assert capsys.readouterr().out.count("the run goes on: RuntimeError('no more memory')") == 1
 
 
-def test_a_taken_port_a_missing_extra_and_a_sweep_are_refused_before_the_first_frame(monkeypatch, tmp_path):
-    with socket.socket() as taken:
-        taken.bind((HOST, 0))
-        port = taken.getsockname()[1]
-        with pytest.raises(ValueError, match=f"port={port} is taken"), served(GrowingRun(), LiveConfig(port, 1.0)):
-            pass
-    with pytest.raises(ValueError, match="view= is for run and evaluate"):
-        sweep(compose("view=live", "axes={slam.em.noise:[0.0]}", name="sweep"), tmp_path)
+def test_without_a_config_nothing_is_served_and_a_sweep_is_not_watched(tmp_path):
     with live_view(None, GrowingRun(), None, PRIOR, []) as view:
         assert view is None
-    monkeypatch.setitem(sys.modules, "viser", None)
-    config = build(compose("view=live"), "view")
-    with pytest.raises(ValueError, match=r'pip install "emgs_jax\[viewer\]"'):
-        live_view(config, GrowingRun(), build(compose(), "densify").render, PRIOR, []).__enter__()
+    with pytest.raises(ValueError, match="view= is for run and evaluate"):
+        sweep(compose("view=live", "axes={slam.em.noise:[0.0]}", name="sweep"), tmp_path)
