@@ -27,20 +27,15 @@ from experiments.report import positional
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (
-            ["em.num_neighbours=4"],
-            r"^em\.num_neighbours is no key of the config; near names: slam\.em\.num_neighbours,",
-        ),
+        (["em.num_neighbours=4"], r"^em\.num_neighbours is no key of .*; near names: slam\.em\.num_neighbours,"),
         (["slam.em.max_mahalanobis=3"], r"is no key of the config; near names: slam\.em\.max_mahalanobis_sq"),
         (["slam.refinement.render.opacity=0.3"], r"near names: .*\brender\.opacity"),
         (["dataset=tum", "dataset.num_frames=3"], r"dataset\.num_frames is no key of the config"),
         (["prior.nothing=2"], r"near names: prior\.version, prior\.classes, prior\.confusion, prior\.feature_size"),
-        (["slam.em=paper"], r"one of its options \(default, paper\) with slam/em=paper$"),
         (["slam.em=papre"], r"one of its options \(default, paper\) with slam/em=default$"),
         (["render=bright"], "render=bright is no option of render: there are default"),
         (["slam=paper"], r"slam is chosen by its parts: slam/continuation=…, slam/em=…, slam/existence=…"),
         (["dataset=kitti"], "dataset=kitti is no option of dataset: there are apartment, colmap, images"),
-        (["slam/em=paper,nothing"], "slam/em=paper,nothing is no option"),
         (["dataset=1.5"], "^dataset=1.5 is no option of dataset: there are apartment"),
         (["dataset=null"], "^dataset=null: Config group override must be a string"),
         (["graph=3"], "^graph=3 is no option of graph: there are default, none"),
@@ -64,7 +59,8 @@ def test_a_word_in_the_place_of_a_group_is_an_error_for_every_group():
 
 
 def test_the_arguments_of_a_multirun_are_checked_and_those_of_hydra_are_left_to_it():
-    check_arguments("config", ["-m", "slam.em.noise=0,1", "prior=simulated,multiview_stereo", "hydra.run.dir=x"])
+    words = ["-m", "slam.em.noise=0,1", "prior=simulated,multiview_stereo", "hydra.run.dir=x"]
+    assert check_arguments("config", words) is None
     for option in (["-m"], ["--cfg", "job"]):
         with pytest.raises(ValueError, match=r"slam\.em\.nose is no key"):
             check_arguments("config", [*option, "slam.em.nose=0,1"])
@@ -108,11 +104,6 @@ def test_the_help_of_a_command_names_its_keys_and_its_examples_are_ones(name, mo
     rewritten = delegated if name == "evaluate" else positional
     for _, _, *words in examples:
         check_arguments(name, rewritten(words))
-
-
-def test_a_key_in_an_example_that_is_none_would_be_found():
-    with pytest.raises(ValueError, match=r"^prot is no key of the config; near names: port"):
-        check_arguments("view", positional(["outputs/monday", "prot=8081"]))
 
 
 HELPS = """
