@@ -10,16 +10,8 @@ import numpy as np
 import pytest
 
 from emgs_jax.prior.base import Provenance
-from emgs_jax.report.provenance import (
-    RAW_PRIOR,
-    ROWS,
-    git_revision,
-    prefix_of,
-    prefixed,
-    print_metrics_table,
-    provenance,
-    write_metrics,
-)
+from emgs_jax.report.provenance import RAW_PRIOR, ROWS, git_revision, prefix_of, prefixed, provenance, write_metrics
+from emgs_jax.report.provenance import print_metrics_table as metrics_table
 
 METRICS = {
     "trajectory/ate_sim3_m": 0.0412,
@@ -83,7 +75,7 @@ def test_the_revision_is_that_of_git_and_none_outside_of_its_checkout(tmp_path):
 def test_baselines_have_rows_of_their_own_and_a_second_table_what_is_placed_by_its_points_and_rendered():
     metrics = METRICS | {"reconstruction_icp/accuracy_m": 0.04, "rendering/coverage_percent": 97.25}
     metrics |= prefixed({"reconstruction_icp/accuracy_m": 0.05, "rendering/psnr_db": 20.0}, "baseline_tsdf_ours/")
-    first, second = print_metrics_table(metrics | {"provenance": a_provenance(True)}).split("\n\n")
+    first, second = metrics_table(metrics | {"provenance": a_provenance(True)}).split("\n\n")
     assert first.splitlines()[2].startswith("ours") and "TSDF" not in first
     _, _, ours, tsdf = second.splitlines()
     assert ours.split() == ["ours", "4.00", *["–"] * 4, "97.2", *["–"] * 4]
@@ -107,12 +99,12 @@ def test_metrics_are_strict_json_ours_first_then_the_raw_prior_then_provenance(t
 
 def test_the_table_shows_both_rows_and_says_what_is_simulated():
     metrics = METRICS | prefixed(METRICS, RAW_PRIOR) | {"raw_prior/trajectory/ate_sim3_m": 1.5}
-    table = print_metrics_table(metrics | {"provenance": a_provenance(True)}).splitlines()
+    table = metrics_table(metrics | {"provenance": a_provenance(True)}).splitlines()
     assert table[0].split()[:3] == ["simulated", "ATE", "[cm]"]
     assert table[2].split() == ["ours", "4.12", "5.00", "–", "98.8", "–", "88.0"]
     assert table[3].split() == ["raw", "prior", "150.00", "5.00", "–", "98.8", "–", "88.0"]
     assert len({len(line) for line in table}) == 1
     assert len(table) == 4, "nothing is placed by its points or rendered"
-    alone = print_metrics_table(METRICS | {"provenance": a_provenance(False)})
+    alone = metrics_table(METRICS | {"provenance": a_provenance(False)})
     assert "simulated" not in alone
     assert "raw prior" not in alone

@@ -10,15 +10,8 @@ from emgs_jax.report.provenance import RESULT_FORMAT
 from emgs_jax.report.results import is_finished, read_estimates, result_folder
 from emgs_jax.report.tables import average, full_table, paper_table, to_csv
 
-PUBLISHED = [
-    {
-        "method": "MASt3R-SLAM",
-        "source": "Table II",
-        "protocol": "its own",
-        "seven_scenes": [0.11, 0.16, 0.05, 85.0, 41.7, 88.4],
-        "tum": [0.08, None, 0.03, 83.8, 44.2, 86.1],
-    }
-]
+QUOTED = {"method": "MASt3R-SLAM", "source": "Table II", "protocol": "its own"}
+QUOTED |= {"seven_scenes": [0.11, 0.16, 0.05, 85.0, 41.7, 88.4], "tum": [0.08, None, 0.03, 83.8, 44.2, 86.1]}
 
 
 def write_result(
@@ -26,21 +19,12 @@ def write_result(
 ):
     folder = result_folder(out, dataset, sequence, variant, seed)
     folder.mkdir(parents=True)
-    block = {
-        "format": RESULT_FORMAT,
-        "protocol": "paper/sim3",
-        "simulated": simulated,
-        "prior": {"name": "simulated" if simulated else "mapanything"},
-        "data": {"name": dataset, "sequence": sequence},
-        "git": {"revision": "abc"},
-        "config": {"dataset": {"root": "here", "stride": 10}, "em": {"noise": 1.0}, "compilation_cache": None},
-    } | block
-    metrics = {
-        "trajectory/ate_sim3_m": ate,
-        "trajectory/ate_se3_m": 2.0,
-        "reconstruction/alignment_note": None,
-        "provenance": block,
-    }
+    config = {"dataset": {"root": "here", "stride": 10}, "em": {"noise": 1.0}, "compilation_cache": None}
+    about = {"format": RESULT_FORMAT, "protocol": "paper/sim3", "simulated": simulated, "config": config}
+    about |= {"prior": {"name": "simulated" if simulated else "mapanything"}, "git": {"revision": "abc"}}
+    block = about | {"data": {"name": dataset, "sequence": sequence}} | block
+    metrics = {"trajectory/ate_sim3_m": ate, "trajectory/ate_se3_m": 2.0, "provenance": block}
+    metrics["reconstruction/alignment_note"] = None
     if block["prior"]:
         metrics["raw_prior/trajectory/ate_sim3_m"] = 10 * ate
     (folder / "metrics.json").write_text(json.dumps(metrics))
@@ -91,7 +75,7 @@ def test_the_table_of_the_paper_labels_simulated_and_quoted_rows(tmp_path):
     write_result(tmp_path, 0.0321, seed=0)
     write_result(tmp_path, 0.0341, seed=1)
     write_result(tmp_path, 0.5, dataset="tum", sequence="freiburg1_xyz", simulated=False)
-    table = paper_table(average(read_estimates(tmp_path), each_sequence=False), PUBLISHED)
+    table = paper_table(average(read_estimates(tmp_path), each_sequence=False), [QUOTED])
     lines = [line for line in table.splitlines() if line.startswith("|")]
     assert "must not be compared with quoted rows" in table
     assert lines[0].count("7-Scenes: ") == lines[0].count("TUM: ") == 6
@@ -111,7 +95,7 @@ def test_the_trajectory_column_follows_the_alignment_and_quoted_rows_stand_besid
     assert "| 2.000 |" in paper_table(average(read_estimates(tmp_path / "se3"), each_sequence=False), [])
     write_result(tmp_path / "room", 1.0, dataset="synthetic", sequence="room0")
     rows = average(read_estimates(tmp_path / "room"), each_sequence=False)
-    assert paper_table(rows, PUBLISHED) == ""
+    assert paper_table(rows, [QUOTED]) == ""
     line = "| synthetic | room0 | ours, default | **simulated** | paper/sim3 | 1 | 100.00 | 200.00 |"
     assert line in full_table(rows)
 

@@ -83,23 +83,12 @@ def written_run(folder: Path, *, has_truth: bool = True, sequence: str = "room",
     for name, content in _files(has_truth).items():
         (folder / name).write_bytes(content)
     config, fingerprint = _settings()
-    block = {
-        "format": 1,
-        "protocol": "paper/sim3",
-        "simulated": True,
-        "prior": {"name": "simulated", "settings": {}},
-        "data": {
-            "name": "synthetic",
-            "sequence": sequence,
-            "fingerprint": fingerprint,
-            "camera": {"size": [640, 480], "intrinsics": [500.0, 500.0, 320.0, 240.0]},  # of the images on disk
-            "frames": {"size": SIZE, "intrinsics": INTRINSICS},
-        },
-        "git": None,
-        "versions": {"emgs_jax": "0"},
-        "device": {"kind": "cpu"},
-        "config": config,
-    }
+    data = {"name": "synthetic", "sequence": sequence, "fingerprint": fingerprint}
+    data["camera"] = {"size": [640, 480], "intrinsics": [500.0, 500.0, 320.0, 240.0]}  # of the images on disk
+    data["frames"] = {"size": SIZE, "intrinsics": INTRINSICS}
+    block = {"format": 1, "protocol": "paper/sim3", "simulated": True, "git": None, "device": {"kind": "cpu"}}
+    block |= {"prior": {"name": "simulated", "settings": {}}, "versions": {"emgs_jax": "0"}}
+    block |= {"data": data, "config": config}
     errors = {"trajectory/ate_sim3_m": 0.012, "raw_prior/trajectory/ate_sim3_m": 0.03} if has_truth else {}
     (folder / "metrics.json").write_text(json.dumps(errors | metrics | {"provenance": block}))
     return folder

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import hydra
 import numpy as np
-import own_process
 import pytest
 from omegaconf import OmegaConf
 from tiny_run import NUM_FRAMES, TINY, WINDOW_SIZE, EditedPrior, compose, dataset
@@ -146,14 +145,6 @@ def test_the_command_writes_the_same_bytes_again_prints_both_rows_and_reads_each
     for name in ("map.npz", "trajectory.txt"):
         assert (tmp_path / name).read_bytes() == (exact_run[0] / name).read_bytes()
     assert len(reads) == NUM_FRAMES and sum(reads.values()) <= MAX_PASSES * NUM_FRAMES + PICTURED
-
-
-@pytest.mark.long
-def test_a_second_process_writes_the_same_bytes(tmp_path, exact_run):
-    done = own_process.run("experiments.run", *TINY, "prior.level=0", f"hydra.run.dir={tmp_path}")
-    assert done.returncode == 0, done.stderr
-    for name in ("map.npz", "trajectory.txt"):
-        assert (tmp_path / name).read_bytes() == (exact_run[0] / name).read_bytes()
 
 
 @pytest.mark.slow

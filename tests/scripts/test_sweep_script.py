@@ -99,27 +99,6 @@ def test_a_sweep_that_is_stopped_keeps_its_chunks_and_goes_on_with_those_of_the_
     assert chunks[2] == chunks[1] and [len(chunk) for chunk in chunks] == [2] * 4
 
 
-@pytest.mark.long
-def test_a_sweep_that_is_stopped_and_goes_on_has_the_same_bits(swept, monkeypatch, tmp_path):
-    folder, chunks, map_and_score = swept[0], [], experiments.sweep.map_and_score
-
-    def stopped(work, chunk, bar):
-        chunks.append(chunk)
-        if len(chunks) == 2:
-            raise KeyboardInterrupt
-        return map_and_score(work, chunk, bar)
-
-    monkeypatch.setattr(experiments.sweep, "map_and_score", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        experiments.sweep.sweep(compose(AXES, "chunk=2", name="sweep"), tmp_path)
-    experiments.sweep.sweep(compose(AXES, "chunk=2", name="sweep"), tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in folder.iterdir()}
-    for name in ("sweep.csv", "report.html"):
-        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()
-    kept, whole = (json.loads((place / "sweep.json").read_text())["settings"] for place in (tmp_path, folder))
-    assert kept == whole
-
-
 def test_the_grid_is_every_combination_and_shared_nodes_change_wherever_they_are_used():
     config = compose("axes={slam.em.normal_weight:[0,5],render.opacity:[0.5,0.7]}", name="sweep")
     grid = variants(config, read_axes(config))

@@ -121,19 +121,10 @@ def stopped(monkeypatch, measured, folder: Path, place: int | str) -> None:
     measured.stop_after = None
 
 
-@pytest.mark.parametrize(
-    "places",
-    [
-        (1, "trial 4"),  # in the second batch, which must not change by what was told of it, nor must the next one
-        *(pytest.param(places, marks=pytest.mark.long) for places in ((0, 1, 3), ("trial 1",), ("trial 4",))),
-    ],
-    ids=str,
-)
-def test_a_search_that_is_stopped_goes_on_with_the_trials_of_one_that_is_not(
-    measured, tmp_path, monkeypatch, whole, places
-):
+def test_a_search_that_is_stopped_goes_on_with_the_trials_of_one_that_is_not(measured, tmp_path, monkeypatch, whole):
+    """In the second batch, and as it is told: what was told of it must not change the rest of it, or the next one."""
     folder, rows, _ = whole(measured)
-    for place in places:
+    for place in (1, "trial 4"):
         stopped(monkeypatch, measured, tmp_path, place)
     assert experiments.tune.tune(WORDS, tmp_path) == rows
     for name in ("trials.csv", "tune.md"):
