@@ -26,6 +26,11 @@ TINY = (
     *("render.tile_size=16", "render.tile_capacity=192", "slam.localization.icp.num_points=512"),
     f"slam.window_size={WINDOW_SIZE}",
 )
+SMOKE = (  # for what needs images in which places are recognised; as few points and rows as that takes
+    *("experiment=smoke", "slam.observation.thin=4", "slam.localization.icp.num_points=512"),
+    *("slam.submap.map_capacity=2048", "slam.submap.submap_capacity=1024"),
+    *("slam.em.num_neighbours=6", "slam.fit.num_fit_neighbours=8"),
+)
 SMALL_STEREO = (  # for images of 128 by 96; at this size a first window of 4 images leaves depths 15 % wrong
     *("prior=multiview_stereo", "prior.structure.max_landmarks=192", "prior.structure.num_fixed=3"),
     *("prior.dense.depth.sweep.num_planes=40", "prior.structure.matching.num_features=600"),

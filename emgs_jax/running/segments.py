@@ -150,7 +150,7 @@ def join(run: MappingRun, given: Input) -> None:
         run.records[first + row] = _moved_record(similarity, run.records[first + row])
     end.segments = [older if one == newer else one for one in end.segments]
     end.segment, end.has_one_unit = older, False
-    end.edges.append(_edge(end, place, unit))
+    end.edges.append(edge_to_place(end, place, unit))
     other = run.aside[there]
     run.aside = {one: state for one, state in run.aside.items() if one != there}
     state = follow(run.state, before, after, end.min_std, end.config.deform)
@@ -163,7 +163,7 @@ def join(run: MappingRun, given: Input) -> None:
         run.prior_motion = anchored_by(run.records[-1], predicted(run, given))
 
 
-def _edge(end: BackEnd, place: Location, unit: float) -> Edge:
+def edge_to_place(end: BackEnd, place: Location, unit: float) -> Edge:
     """What holds two segments together: the last node relative to the keyframe by which it was found, as it is now.
 
     `unit` is a length of that keyframe's inference in the map in which the place was found.
