@@ -14,7 +14,6 @@ GROUPS = {
         "running/test_drive.py",
         "running/test_checkpoint.py",
         "scripts/test_query_and_segment.py",
-        "scripts/test_tune.py",
         "scripts/test_sweep_script.py",
         "scripts/test_predict.py",
         "scripts/test_quality.py",
