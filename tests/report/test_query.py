@@ -218,12 +218,17 @@ def test_a_text_encoder_embeds_any_word_and_what_anything_is_stands_against_it(t
     near = np.asarray(map.gaussians.means)[:, 2:] == 1.0
     vectors = model.embed(("red chair", "things")).vectors
     features = jnp.asarray(np.where(near, vectors[0], vectors[1]))
-    save_map(folder / "map.npz", eqx.tree_at(lambda m: m.gaussians.features, map, features))
+    valid = map.gaussians.valid.at[5].set(False)
+    save_map(
+        folder / "map.npz", eqx.tree_at(lambda m: (m.gaussians.features, m.gaussians.valid), map, (features, valid))
+    )
     found = said(folder, "features=random", text="red chair", features__templates=["a {}."])
     assert found["against"] == ("object", "things", "stuff", "texture")
     (chair,) = found["words"][0]["instances"]
     np.testing.assert_allclose(chair["center_m"][2], 1.0, atol=1e-6)
     np.testing.assert_allclose(chair["score"], 1.0, atol=1e-6)
+    _, arrays = load_semantic(folder / "semantic.npz")  # of the rows in use
+    np.testing.assert_allclose(arrays["features"], np.delete(features, 5, axis=0), atol=1e-3)  # float16
     (folder / "text.npz").unlink()
     with pytest.raises(ValueError, match=r"has no text.npz with words, and its features are of .*random"):
         said(folder, text="red chair")
