@@ -400,7 +400,7 @@ MUTANTS = (
         "emgs_jax/running/drive.py",
         "is_known = is_related(run, given)",
         "is_known = True",
-        ("tests/running/test_segments.py",),
+        ("tests/running/test_coming_back.py",),
         "a prior in a frame of its own is located nowhere",
     ),
     Mutant(
@@ -597,7 +597,7 @@ MUTANTS = (
         "emgs_jax/running/growth.py",
         "jnp.full_like(alone.map.birth, state.time - 1)",
         "alone.map.birth",
-        ("tests/running/test_coming_back.py",),
+        ("tests/running/test_segments.py",),
         "what begins anew moves with the first frame",
     ),
     Mutant(

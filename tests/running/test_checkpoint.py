@@ -1,20 +1,21 @@
 """A run that is stopped and goes on; oracle: the bits of the same run that nobody stopped."""
 
+import contextlib
 import itertools
+import os
 import signal
-import subprocess
-import sys
-import time
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import mkdtemp
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_run import CONF, NUM_FRAMES, TINY, compose
+from own_process import begin, ended, wait_for
+from tiny_run import NUM_FRAMES, TINY, compose
 
 import experiments.run
+from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.running import drive
 from emgs_jax.running.checkpoint import (
     CHECKPOINT_FILE,
@@ -29,28 +30,51 @@ from emgs_jax.running.record import FrameRecord
 from tools.kills.folders import log_lines
 
 OVERRIDES = ("prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=256")
+GRAPH = ("graph=default", "graph.every=1")
+SHOWS_TIMES = {"metrics.json", "frames.jsonl", "overview.png", "report.html"}
 
 
 class Stopped(BaseException):
     """As a signal is: nobody catches it as an error."""
 
 
-def stopped(folder, monkeypatch, overrides, after, is_killed):
-    """A run that ends after so many steps; one that is killed writes nothing any more."""
+@contextlib.contextmanager
+def in_step(number: int, is_killed: bool, monkeypatch):
+    """At this step; who is killed writes nothing any more."""
     steps, advance = itertools.count(), drive.advance
 
     def counted(*arguments):
-        if next(steps) == after:
+        if next(steps) == number:
+            if is_killed:
+                patch.setattr(Keeper, "save", lambda self: None)
             raise Stopped
         return advance(*arguments)
 
-    with monkeypatch.context() as patch:
+    with monkeypatch.context() as patch, pytest.raises(Stopped):
         patch.setattr(drive, "advance", counted)
-        if is_killed:
-            save, has_stopped = Keeper.save, lambda: next(steps) > after
-            patch.setattr(Keeper, "save", lambda self: None if has_stopped() else save(self))
-        with pytest.raises(Stopped):
-            experiments.run.run(compose(*overrides), folder)
+        yield
+
+
+@contextlib.contextmanager
+def in_gathering(number: int, monkeypatch):
+    """Where the predictions of this view are gathered: the mapping waits."""
+
+    def gather(views, *rest):
+        for _ in itertools.islice(views, number):
+            pass
+        raise Stopped
+
+    with monkeypatch.context() as patch, pytest.raises(Stopped):
+        patch.setattr(experiments.run, "gather", gather)
+        yield
+
+
+@contextlib.contextmanager
+def in_export(monkeypatch):
+    """After all steps."""
+    with monkeypatch.context() as patch, pytest.raises(Stopped):
+        patch.setattr(experiments.run, "save_outputs", lambda *_: (_ for _ in ()).throw(Stopped))
+        yield
 
 
 @cache
@@ -60,87 +84,78 @@ def whole(*more):
     return folder, experiments.run.run(compose(*OVERRIDES, *more), folder)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("more", "after", "is_killed"),
-    [
-        ((), 1, False),
-        ((), 3, True),
-        (("graph=default", "graph.every=1"), NUM_FRAMES - 2, False),
-        (("baseline=voxel",), 3, True),
-    ],
-)
-def test_a_run_that_is_stopped_and_goes_on_has_the_same_bits(tmp_path, monkeypatch, capsys, more, after, is_killed):
-    overrides = (*OVERRIDES, *more)
-    folder, metrics = whole(*more)
+def goes_on(folder: Path, more: tuple[str, ...], num_steps: range, monkeypatch) -> None:
+    """The same command takes so many steps, and comes to what the run that nobody stopped has."""
+    steps, advance = [], drive.advance
+    with monkeypatch.context() as patch:
+        patch.setattr(drive, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
+        found = experiments.run.run(compose(*OVERRIDES, *more), folder)
+    assert len(steps) in num_steps, "the steps before are not repeated"
+    expected, metrics = whole(*more)
     assert metrics["map/capacity"] > 256, "the map had to grow"
-    stopped(tmp_path, monkeypatch, overrides, after, is_killed)
-    assert (tmp_path / CHECKPOINT_FILE).exists()
-    calls, advance = [], drive.advance
-    monkeypatch.setattr(drive, "advance", lambda *arguments: calls.append(1) or advance(*arguments))
-    found = experiments.run.run(compose(*overrides), tmp_path)
-    assert 0 < len(calls) < NUM_FRAMES - 1, "the steps before are not repeated"
-    assert "going on after frame" in "".join(capsys.readouterr())
-    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in folder.iterdir()}
-    for name in {path.name for path in folder.iterdir()} - {
-        "metrics.json",
-        "frames.jsonl",
-        "overview.png",
-        "report.html",
-    }:
-        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
-    assert log_lines(tmp_path) == log_lines(folder)
+    names = {path.name for path in expected.iterdir()}
+    assert {path.name for path in folder.iterdir()} == names
+    for name in names - SHOWS_TIMES:
+        assert (folder / name).read_bytes() == (expected / name).read_bytes(), name
+    assert log_lines(folder) == log_lines(expected)
     same = [key for key in metrics if not key.startswith(("time/", "memory/"))]
     assert {key: found[key] for key in same} == {key: metrics[key] for key in same}
 
 
 @pytest.mark.slow
-def test_a_scheduler_ends_a_run_with_one_word_and_the_same_command_goes_on(tmp_path):
-    command = [sys.executable, "-m", "experiments.run", *TINY, *OVERRIDES, f"hydra.run.dir={tmp_path}"]
-    log, errors = tmp_path / "frames.jsonl", tmp_path.with_suffix(".log")
-    with open(errors, "w") as file:  # a pipe that nobody reads is full at some time
-        program = subprocess.Popen(command, cwd=CONF.parent, stdout=file, stderr=subprocess.STDOUT)
-        end = time.monotonic() + 300
-        while program.poll() is None and not (log.exists() and log.read_bytes().count(b"\n") >= 3):
-            assert time.monotonic() < end, "no third frame"
-            time.sleep(0.01)
-        program.send_signal(signal.SIGTERM)
-        program.wait(timeout=300)
-    said = errors.read_text()
-    assert program.returncode == 128 + signal.SIGTERM, said
-    assert "terminated\n" in said and "Traceback" not in said
-    assert f"the same command with hydra.run.dir={tmp_path} goes on" in said
-    done = subprocess.run(command, cwd=CONF.parent, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0 and "going on after frame" in done.stdout + done.stderr, done.stderr
-    for name in ("map.npz", "trajectory.txt"):
-        assert (tmp_path / name).read_bytes() == (whole()[0] / name).read_bytes(), name
+@pytest.mark.parametrize(
+    ("stop", "more", "num_steps"),
+    [
+        (partial(in_step, 3, True), (), range(1, NUM_FRAMES - 1)),
+        pytest.param(partial(in_step, 1, False), (), range(1, NUM_FRAMES - 1), marks=pytest.mark.long),
+        pytest.param(partial(in_step, 3, False), GRAPH, range(1, NUM_FRAMES - 1), marks=pytest.mark.long),
+        pytest.param(partial(in_step, 3, True), ("baseline=voxel",), range(1, NUM_FRAMES - 1), marks=pytest.mark.long),
+        pytest.param(in_export, (), range(1), marks=pytest.mark.long),
+        pytest.param(in_export, GRAPH, range(1), marks=pytest.mark.long),
+    ],
+)
+def test_a_run_that_is_stopped_and_goes_on_has_the_same_bits(tmp_path, monkeypatch, capsys, stop, more, num_steps):
+    with stop(monkeypatch):
+        experiments.run.run(compose(*OVERRIDES, *more), tmp_path)
+    assert (tmp_path / CHECKPOINT_FILE).exists()
+    goes_on(tmp_path, more, num_steps, monkeypatch)
+    assert "going on after frame" in "".join(capsys.readouterr())
 
 
 @pytest.mark.slow
-def test_a_run_that_is_stopped_while_it_writes_takes_no_step_again(tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(experiments.run, "save_outputs", lambda *_: (_ for _ in ()).throw(Stopped))
-        with pytest.raises(Stopped):
-            experiments.run.run(compose(*OVERRIDES), tmp_path)
-    monkeypatch.setattr(drive, "advance", lambda *_: pytest.fail("a step"))
-    assert experiments.run.run(compose(*OVERRIDES), tmp_path)["frames/tracked"] > 0
-
-
-@pytest.mark.slow
-def test_a_run_that_is_stopped_where_its_predictions_are_gathered_ends_before_it_is_written(tmp_path, monkeypatch):
+def test_a_run_that_is_stopped_where_its_predictions_are_gathered_has_written_its_map_in_its_own_unit(
+    tmp_path, monkeypatch
+):
     """Symptom: the mapping was still waiting, so its checkpoint was not written and its path was in another unit."""
-    order = []
+    with in_gathering(NUM_FRAMES - 1, monkeypatch):
+        experiments.run.run(compose(*OVERRIDES, *GRAPH), tmp_path)
+    with np.load(tmp_path / CHECKPOINT_FILE) as file:
+        placed = file["pose"][:, :3, 3]  # as the frames were placed
+    _, written = load_trajectory_tum(tmp_path / "trajectory.txt")
+    factors = np.linalg.norm(np.diff(written[:, :3, 3], axis=0), axis=1) / np.linalg.norm(
+        np.diff(placed, axis=0), axis=1
+    )
+    assert len(placed) >= NUM_FRAMES - 1 and abs(factors[0] - 1) > 1e-4
+    np.testing.assert_allclose(factors, factors[0], rtol=1e-5)
+    goes_on(tmp_path, GRAPH, range(3), monkeypatch)
 
-    def gather(views, *rest):
-        next(views)
-        raise Stopped
 
-    for module, name in ((drive, "in_own_unit"), (drive, "leave_out"), (experiments.run, "save_progress")):
-        monkeypatch.setattr(module, name, lambda *_, name=name: order.append(name))
-    monkeypatch.setattr(experiments.run, "gather", gather)
-    with pytest.raises(Stopped):
-        experiments.run.run(compose(*OVERRIDES), tmp_path)
-    assert order == ["leave_out", "in_own_unit", "save_progress"] and (tmp_path / CHECKPOINT_FILE).exists()
+@pytest.mark.slow
+def test_a_scheduler_ends_a_run_with_one_word_and_the_same_command_goes_on(tmp_path, monkeypatch):
+    folder, said = tmp_path / "run", tmp_path / "said"
+    words = (*TINY, *OVERRIDES, f"hydra.run.dir={folder}")
+    program, log = begin("experiments.run", *words, said=said), folder / "frames.jsonl"
+    wait_for(lambda: log.exists() and log.read_bytes().count(b"\n") >= 3, program)
+    os.kill(program.pid, signal.SIGTERM)
+    assert ended(program) == 128 + signal.SIGTERM, said.read_text()
+    assert "terminated\n" in said.read_text() and "Traceback" not in said.read_text()
+    assert f"the same command with hydra.run.dir={folder} goes on" in said.read_text()
+    steps, advance = [], drive.advance
+    monkeypatch.setattr(drive, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
+    experiments.run.run(compose(*OVERRIDES), folder)
+    assert len(steps) < NUM_FRAMES - 1, "in another process"
+    for name in ("map.npz", "trajectory.txt"):
+        assert (folder / name).read_bytes() == (whole()[0] / name).read_bytes(), name
 
 
 def test_a_run_does_not_go_on_in_the_map_that_it_would_replace(tmp_path):
@@ -150,7 +165,8 @@ def test_a_run_does_not_go_on_in_the_map_that_it_would_replace(tmp_path):
 
 @pytest.mark.slow
 def test_another_command_in_the_folder_begins_anew_and_says_why(tmp_path, monkeypatch, capsys):
-    stopped(tmp_path, monkeypatch, OVERRIDES, 2, False)
+    with in_step(2, False, monkeypatch):
+        experiments.run.run(compose(*OVERRIDES), tmp_path)
     metrics = experiments.run.run(compose(*OVERRIDES, "slam.em.noise=0.5"), tmp_path)
     assert metrics["frames/tracked"] > 0
     text = "".join(capsys.readouterr())

@@ -75,15 +75,25 @@ def test_every_frame_has_one_record_with_its_true_pose_where_the_prior_is_exact(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "damage",
-    [{"points": np.nan}, {"mask": False}, {"T_anchor_view": np.nan}, {"confidence": np.nan}, {"confidence": 0.0}],
+    "damages",
+    [
+        {1: {"points": np.nan}, 2: {"T_anchor_view": np.nan}},
+        {1: {"mask": False}, 2: {"confidence": np.nan}, 3: {"confidence": 0.0}},
+    ],
 )
-def test_a_prediction_without_a_valid_point_or_pose_marks_its_frame_and_leaves_the_map_bit_identical(damage):
-    session, maps = map_tiny(dataset(), EditedPrior(at_inference(2, **damage)))
-    bad = WINDOW_SIZE - 1 + 2
-    record = session.records[bad]
-    assert record.status == "lost" and "no valid point or pose" in record.reason
-    assert same_bits(maps[bad], maps[bad - 1])
+def test_predictions_without_a_valid_point_or_pose_mark_their_frames_and_leave_the_map_bit_identical(damages):
+    def edit(prediction):
+        for number, arrays in damages.items():
+            prediction = at_inference(number, **arrays)(prediction)
+        return prediction
+
+    session, maps = map_tiny(dataset(), EditedPrior(edit))
+    for number in damages:
+        bad = WINDOW_SIZE - 1 + number
+        record = session.records[bad]
+        assert record.status == "lost" and "no valid point or pose" in record.reason
+        assert same_bits(maps[bad], maps[bad - 1])
+    assert (session.records[-1].status == "lost") == (3 in damages), "the frame after them is as all are"
     assert np.isfinite(session.poses).all() and np.isfinite(session.raw_poses).all()
     gaussians = session.state.map.gaussians
     assert np.isfinite(np.asarray(gaussians.means)[np.asarray(gaussians.valid)]).all()
@@ -115,7 +125,7 @@ def test_a_view_without_a_pose_cannot_be_merged():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_empty", [1, WINDOW_SIZE + 1])
+@pytest.mark.parametrize("num_empty", [pytest.param(1, marks=pytest.mark.long), WINDOW_SIZE + 1])
 def test_the_map_starts_at_the_first_frame_with_a_point_and_those_before_are_lost(num_empty):
     """All later frames were degraded, the map stayed empty and nothing said so."""
 
