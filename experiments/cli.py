@@ -1,6 +1,7 @@
 """The commands of the package: `emgs run dataset=…`; `emgs --help` lists them."""
 
 import sys
+from collections.abc import Callable
 from importlib import import_module
 
 from .interrupt import clear_interrupt
@@ -33,6 +34,13 @@ def usage() -> str:
     return "\n".join(lines)
 
 
+def explained(name: str) -> Callable[[], None]:
+    """What shows the help of a command without its imports."""
+    from .command import RUN, command
+
+    return command(RUN if name == "run" else name)(lambda config: None)
+
+
 def main() -> None:
     """Hand the rest of the command line to a command."""
     name, *rest = sys.argv[1:] or ["--help"]
@@ -45,7 +53,7 @@ def main() -> None:
     else:
         sys.argv = [f"emgs {name}", *rest]
         with clear_interrupt():  # the imports take seconds
-            import_module(f".{name}", __package__).main()
+            (explained(name) if {"-h", "--help"} & {*rest} else import_module(f".{name}", __package__).main)()
 
 
 if __name__ == "__main__":

@@ -14,14 +14,16 @@ GROUPS = {
         "running/test_drive.py",
         "running/test_checkpoint.py",
         "scripts/test_query_and_segment.py",
-        "scripts/test_tune.py",
         "scripts/test_sweep_script.py",
+        "scripts/test_predict.py",
+        "scripts/test_quality.py",
         "test_soak.py",
         "test_front_door.py",
         "test_notebooks.py",
         "report/test_live_browser.py",
     ),
     "smoke": ("running/test_coming_back.py", "running/test_segments.py", "scripts/test_walk.py"),
+    "browser": ("report/test_page_browser.py", "report/test_table_page.py", "report/test_viewer.py"),  # one Chromium
     "small": ("test_slam.py", "test_traces.py", "running/test_growth.py", "running/test_stacked.py"),
 }
 _PLACES = {name: (group, place) for group, names in GROUPS.items() for place, name in enumerate(names)}

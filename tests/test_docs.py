@@ -41,17 +41,15 @@ def test_links_lead_to_files_and_headings_that_are_there(page):
 
 
 @pages
-def test_commands_are_scripts_that_are_there(page):
+def test_commands_options_and_files_are_there(page):
+    """And infinity is `inf`, as a command line reads it; YAML's own `.inf` would be text there."""
     for name in re.findall(r"python -m experiments\.([a-z]\w*)", code(page)):
         assert importlib.util.find_spec(f"experiments.{name}"), name
-
-
-@pages
-def test_options_are_files_of_conf(page):
-    for group, option in re.findall(rf"(?<![\w./])({'|'.join(GROUPS)})=([a-z]\w*)", code(page)):
+    for group, option in re.findall(rf"(?<![\w./])({'|'.join(GROUPS)}|slam/\w+)=([a-z]\w*)", code(page)):
         assert (CONF / group / f"{option}.yaml").is_file(), f"{group}={option}"
-    for group, option in re.findall(r"\bslam/(\w+)=(\w+)", code(page)):
-        assert (CONF / "slam" / group / f"{option}.yaml").is_file(), f"slam/{group}={option}"
+    for name in re.findall(r"^((?:emgs_jax|conf|tests|docs|notebooks|experiments)/[\w./]+)$", code(page), re.MULTILINE):
+        assert (ROOT / name).exists(), name
+    assert not re.search(r"=-?\.(inf|nan)", code(page))
 
 
 @pages
@@ -64,18 +62,6 @@ def test_keys_of_the_stages_are_keys_of_the_config(page):
         for name in key.split("."):
             assert name in node, key
             node = node[name]
-
-
-@pages
-def test_infinity_is_written_as_a_command_line_reads_it(page):
-    """`inf`; YAML's own `.inf` would be text there, and no run starts with it."""
-    assert not re.search(r"=-?\.(inf|nan)", code(page))
-
-
-@pages
-def test_files_of_the_project_are_there(page):
-    for name in re.findall(r"^((?:emgs_jax|conf|tests|docs|notebooks|experiments)/[\w./]+)$", code(page), re.MULTILINE):
-        assert (ROOT / name).exists(), name
 
 
 def test_the_readme_lists_every_room_of_the_package():

@@ -4,17 +4,20 @@ import ast
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
+import hydra
 import jax
 import numpy as np
 import pytest
-from tiny_run import NUM_FRAMES, TINY, EditedPrior, compose, dataset
+from hydra.core.global_hydra import GlobalHydra
+from tiny_run import NUM_FRAMES, TINY, dataset
 
 import emgs_jax
 from emgs_jax.gaussian_map import GaussianMap
-from emgs_jax.running.configure import groups
-from emgs_jax.running.inputs import inputs
+from emgs_jax.running.configure import CONF, groups
+from emgs_jax.running.configure import compose as compose_as_typed
 
 PACKAGE = Path(emgs_jax.__file__).parent
 NO_MARK = """
@@ -53,21 +56,29 @@ def test_every_name_is_there_and_none_is_hidden_by_a_folder_of_the_package():
 
 
 def test_editors_see_the_names_that_run():
+    """Of the block that type checkers read, each import names what is there at run time."""
     tree = ast.parse((PACKAGE / "__init__.py").read_text())
     (block,) = [node for node in tree.body if isinstance(node, ast.If)]
-    seen = {(alias.asname or alias.name): node.module for node in block.body for alias in node.names}
-    assert seen == {name: f"emgs_jax.{home}" for name, home in emgs_jax._HOME_OF.items()}
+    names = [(node.module, alias.name, alias.asname or alias.name) for node in block.body for alias in node.names]
+    assert {shown for _, _, shown in names} == set(emgs_jax.__all__) - {"__version__"}
+    for module, name, shown in names:
+        assert getattr(emgs_jax, shown) is getattr(import_module(module), name), shown
 
 
 @pytest.mark.parametrize("name", groups()["dataset"])
-@pytest.mark.parametrize("experiment", [None, *groups()["experiment"]])
-def test_every_data_set_composes_with_every_preset(name, experiment):
+def test_a_preset_sets_keys_of_a_data_set_and_adds_none(name):
     """`experiment=smoke` gave every data set a key of the built-in room, which the others refuse."""
-    config = emgs_jax.load_config(f"dataset={name}", *([f"experiment={experiment}"] if experiment else []))
+    own = set(compose_as_typed(f"dataset={name}").dataset)
+    for experiment in groups()["experiment"]:
+        assert set(compose_as_typed(f"dataset={name}", f"experiment={experiment}").dataset) == own
+
+
+@pytest.mark.parametrize("experiment", groups()["experiment"])
+def test_every_preset_becomes_a_config(experiment):
+    config = emgs_jax.load_config(f"experiment={experiment}")
     assert isinstance(config.slam, emgs_jax.SlamConfig) and isinstance(config.densify, emgs_jax.DensifyConfig)
-    given = set(config.settings["dataset"]) - {"_target_"}
-    written = emgs_jax.load_config(f"dataset={name}").settings["dataset"]
-    assert given == set(written) - {"_target_"}, "a preset may set keys of a data set, but not add any"
+    assert config.settings["slam"]["window_size"] == config.slam.window_size
+    assert config.settings["evaluation"]["protocol"] == config.evaluation.protocol
 
 
 def test_a_config_holds_what_the_command_line_gives():
@@ -78,39 +89,24 @@ def test_a_config_holds_what_the_command_line_gives():
 
 
 @pytest.mark.slow
-def test_a_sequence_becomes_a_map_that_is_saved_loaded_and_carried_on_by_ones_own_loop(tmp_path, capsys):
-    """Oracle: the truth, since the prior is exact; and the run itself for the loop."""
-    config = emgs_jax.load_config(*TINY, "prior.level=0", "compilation_cache=off")
-    run = emgs_jax.map_sequence(config)
+def test_the_snippet_of_the_readme_maps_a_sequence_in_two_ways_with_the_same_bits(tmp_path, monkeypatch, capsys):
+    """Oracles: the truth, since the prior is exact; one way for the other."""
+    monkeypatch.chdir(tmp_path)
+    text = (PACKAGE.parent / "README.md").read_text(encoding="utf-8")
+    (snippet,) = [part.split("```")[0] for part in text.split("```python\n")[1:] if "map_sequence" in part]
+    tiny = ", ".join(repr(word) for word in (*TINY, "prior.level=0", "compilation_cache=off"))
+    assert snippet.count('"dataset=synthetic", "experiment=smoke"') == 2
+    found: dict = {}
+    exec(snippet.replace('"dataset=synthetic", "experiment=smoke"', tiny), found)
     assert "mapping: 100%" in capsys.readouterr().err
+    run = found["run"]
+    assert isinstance(found["map"], GaussianMap) and same_bits(found["map"], run.map)  # saved and loaded
+    assert same_bits(found["state"], run.state)
     truth = np.stack([dataset()[row].T_world_camera for row in range(NUM_FRAMES)])
     np.testing.assert_allclose(run.poses, truth, atol=1e-3)
     np.testing.assert_allclose(run.raw_poses, truth, atol=1e-12)
     assert [record.status for record in run.records] == ["initialization"] + ["tracked"] * (NUM_FRAMES - 1)
-
-    emgs_jax.save_map(tmp_path / "map.npz", run.map)
-    loaded = emgs_jax.load_map(tmp_path / "map.npz")
-    assert isinstance(loaded, GaussianMap) and same_bits(loaded, run.map)
-
-    first, *rest = inputs(dataset(), EditedPrior(), config.slam, emgs_jax.new_run(dataset(), config.slam).clock)
-    camera = emgs_jax.to_camera(dataset())
-    state, _ = emgs_jax.init_state(first.taken.views, first.taken.T_world_views, camera, config.slam)
-    for given in rest:
-        state, info = emgs_jax.step(state, given.taken, camera, config.slam)
-    state = emgs_jax.own_unit(state, first.T_world_anchor[:3, 3])
-    assert int(info.num_gaussians) == run.records[-1].num_gaussians and same_bits(state, run.state)
-
-
-@pytest.mark.slow
-def test_the_snippet_of_the_readme_runs_and_both_ways_give_the_same_map(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    text = (PACKAGE.parent / "README.md").read_text(encoding="utf-8")
-    (snippet,) = [part.split("```")[0] for part in text.split("```python\n")[1:] if "map_sequence" in part]
-    tiny = ", ".join(repr(word) for word in (*TINY, "compilation_cache=off"))
-    assert snippet.count('"dataset=synthetic", "experiment=smoke"') == 2
-    found: dict = {}
-    exec(snippet.replace('"dataset=synthetic", "experiment=smoke"', tiny), found)
-    assert same_bits(found["map"], found["run"].map) and same_bits(found["state"], found["run"].state)
+    assert int(found["info"].num_gaussians) == run.records[-1].num_gaussians
 
 
 def same_bits(tree, other) -> bool:
@@ -120,13 +116,8 @@ def same_bits(tree, other) -> bool:
 
 def test_settings_survive_a_hydra_program_around_them():
     """Composing inside of one of Hydra's programs leaves its state as it is."""
-    import hydra
-    from hydra.core.global_hydra import GlobalHydra
-
-    from emgs_jax.running.configure import CONF
-
     with hydra.initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        compose()
+        compose_as_typed()
         assert GlobalHydra.instance().is_initialized()
         assert hydra.compose("config").slam.window_size == 10
     assert not GlobalHydra.instance().is_initialized()

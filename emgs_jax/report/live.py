@@ -69,12 +69,16 @@ class LiveView:
             if time.monotonic() >= self._due and self._is_idle():
                 self._show(run, image)
             yield view
-        if self._drawing is not None:
-            self._drawing.exception()  # waits for its end
+        self.wait()
         if self._is_idle() and image is not None:
             self._show(run, image)
-            self._drawing.exception()
+            self.wait()
             self._is_idle()
+
+    def wait(self) -> None:
+        """Until nothing is being drawn."""
+        if self._drawing is not None:
+            self._drawing.exception()
 
     def stop(self) -> None:
         """End the server."""

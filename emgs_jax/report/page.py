@@ -19,7 +19,7 @@ from emgs_jax.io.files import atomic_write, jsonable
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report import page_words
 from emgs_jax.report.overview import class_colors, view_from_above
-from emgs_jax.report.page_map import COV_UNIT, feature_layer, map_layers, packed, thinned
+from emgs_jax.report.page_map import COV_UNIT, feature_layer, fitted, map_layers
 from emgs_jax.report.page_pictures import Views, draw_views, jpeg
 from emgs_jax.report.page_strip import PlacedPaths, key_of, placed_paths, strip
 from emgs_jax.report.recorded_run import REPORT_FILE, RecordedRun
@@ -72,7 +72,7 @@ def write_report(run: RecordedRun, dataset: Dataset | None, note: str = "") -> P
     rows = sorted({int(row) for row in np.linspace(0, len(run.poses) - 1, min(_MAX_PICTURES, len(run.poses)))})
     placed = run.is_placed
     views = draw_views(run.map, run.poses, rows, placed, run.camera, config, dataset)
-    arrays, packing, left_out = _packed(layers, _path_arrays(run, paths))
+    arrays, packing, left_out = fitted(layers, _path_arrays(run, paths), _MAP_BYTES)
     about = _about(run, layers, paths) | {"arrays": arrays, "render": _for_shader(config)}
     page = _page(run, paths, views, about, packing, " ".join(filter(None, [note, left_out])))
     target = run.folder / REPORT_FILE
@@ -105,20 +105,6 @@ def _path_arrays(run: RecordedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
         for name, poses in found.items()
         if poses is not None and np.isfinite(poses).any()
     }
-
-
-def _packed(layers: dict[str, np.ndarray], poses: dict[str, np.ndarray]) -> tuple[list[dict[str, Any]], str, str]:
-    """As `packed`, with fewer Gaussians where all of them are too many; the last value says so.
-
-    The paths of some 15,000 frames are too many by themselves: then there is no Gaussian.
-    """
-    count = whole = len(layers["mean"])
-    about, text = packed(layers | poses)
-    while len(text) > _MAP_BYTES and count:
-        count = int(0.95 * count * _MAP_BYTES / len(text))
-        about, text = packed(thinned(layers, count) | poses)
-    note = f"The page shows the {count:,} of {whole:,} Gaussians that most frames agree on; map.npz has all of them."
-    return about, text, note if count < whole else ""
 
 
 def _about(run: RecordedRun, layers: dict[str, np.ndarray], paths: PlacedPaths) -> dict[str, Any]:

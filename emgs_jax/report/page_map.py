@@ -75,6 +75,22 @@ def thinned(layers: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarra
     return {name: values[keep] for name, values in layers.items()}
 
 
+def fitted(
+    layers: Mapping[str, np.ndarray], paths: Mapping[str, np.ndarray], limit: int
+) -> tuple[list[dict[str, Any]], str, str]:
+    """As `packed`, at most `limit` characters: with fewer Gaussians where all of them are too many; the last says so.
+
+    The paths of some 15,000 frames are too many by themselves: then there is no Gaussian.
+    """
+    count = whole = len(layers["mean"])
+    about, text = packed({**layers, **paths})
+    while len(text) > limit and count:
+        count = int(0.95 * count * limit / len(text))
+        about, text = packed(thinned(layers, count) | dict(paths))
+    note = f"The page shows the {count:,} of {whole:,} Gaussians that most frames agree on; map.npz has all of them."
+    return about, text, note if count < whole else ""
+
+
 def packed(arrays: Mapping[str, np.ndarray]) -> tuple[list[dict[str, Any]], str]:
     """Arrays as a list of what they are, and their bytes: column by column, little-endian, deflated, in base64.
 

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from emgs_jax.io.files import flat, jsonable
 from emgs_jax.running.configure import CONF, compose
 
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # of C where it is there: seventy files a report
 _PLAIN = re.compile(r"[A-Za-z_][\w./-]*|/[\w./-]*")
 _WORDS = {"null", "none", "true", "false", "nan", "inf", "on", "off", "yes", "no"}
 
@@ -93,7 +94,7 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    return yaml.load(path.read_text(encoding="utf-8"), _LOADER) or {}
 
 
 def written(value: Any) -> str:

@@ -44,6 +44,22 @@ class Browser:
         """Open an address."""
         self._ask("POST", "/url", {"url": address})
 
+    def fresh(self) -> "Browser":
+        """An empty page and empty logs, for the next who comes."""
+        self.visit("about:blank")
+        for kind in ("browser", "performance"):
+            self.log(kind)
+        return self
+
+    @contextlib.contextmanager
+    def before_pages(self, script: str) -> Iterator[None]:
+        """A script that every page runs before its own, for as long as the block lasts."""
+        name = self._protocol("Page.addScriptToEvaluateOnNewDocument", source=script)["identifier"]
+        try:
+            yield
+        finally:
+            self._protocol("Page.removeScriptToEvaluateOnNewDocument", identifier=name)
+
     def type(self, text: str) -> None:
         """Keys, to what has the focus."""
         keys = [{"type": kind, "value": letter} for letter in text for kind in ("keyDown", "keyUp")]
@@ -76,9 +92,16 @@ class Browser:
         events = [json.loads(entry["message"])["message"] for entry in self.log("performance")]
         return [event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"]
 
+    def errors(self) -> list[str]:
+        """What the console called an error since the last call."""
+        return [entry["message"] for entry in self.log("browser") if entry["level"] == "SEVERE"]
+
     def quit(self) -> None:
         """End the browser."""
         self._ask("DELETE", "")
+
+    def _protocol(self, command: str, **parameters: Any) -> Any:
+        return self._ask("POST", "/goog/cdp/execute", {"cmd": command, "params": parameters})
 
     def _ask(self, method: str, path: str, body: Any = None) -> Any:
         data = None if body is None else json.dumps(body).encode()

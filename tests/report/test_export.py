@@ -1,16 +1,15 @@
 """Runs in other programs' formats; oracles: pycolmap, trimesh, nerfstudio's definition of axes, our own readers."""
 
 import json
-import re
 from dataclasses import replace
 
 import cv2
-import hydra
 import numpy as np
 import pytest
 import trimesh
 from hand_run import random_poses
-from tiny_run import compose
+from omegaconf import OmegaConf
+from tiny_run import dataset
 from written_run import INTRINSICS, SIZE, written_run
 
 from emgs_jax.data.calibration_files import read_calibration
@@ -39,17 +38,23 @@ class Shown:
         return type("Frame", (), {"image": image})()
 
 
-@pytest.fixture
-def run(tmp_path):
-    folder = written_run(tmp_path / "run")
+def a_run(folder):
+    """With points, and poses in all directions."""
     points = np.random.default_rng(0).normal(size=(100, 3))
-    save_points_ply(folder / "points.ply", points, points, np.clip(np.abs(points), 0, 1))
+    save_points_ply(written_run(folder) / "points.ply", points, points, np.clip(np.abs(points), 0, 1))
     run = read_run(folder)
     return replace(run, poses=random_poses(np.random.default_rng(1), len(run.poses)))
 
 
 @pytest.fixture
-def written(run):
+def run(tmp_path):
+    return a_run(tmp_path / "run")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A run beside all that can be exported of it."""
+    run = a_run(tmp_path_factory.mktemp("run"))
     export(run, run.folder, ALL, Shown())
     return run
 
@@ -67,15 +72,10 @@ def test_pycolmap_reads_the_cameras_where_they_are(written):
         np.testing.assert_allclose(image.cam_from_world().rotation.matrix(), pose[:3, :3].T, atol=1e-9)
         assert (written.folder / "colmap" / "images" / image.name).is_file() and image.name.count(".") == 1
     camera = next(iter(model.cameras.values()))
+    assert (camera.width, camera.height) == SIZE, "that of the frames: images on disk may be larger, and bent by a lens"
     # The ray through our principal point, which COLMAP counts from the corner.
     np.testing.assert_allclose(camera.cam_from_img(np.array(INTRINSICS[2:]) + 0.5), 0, atol=1e-6)
     np.testing.assert_allclose(camera.cam_from_img([0.5, 0.5])[0], -INTRINSICS[2] / INTRINSICS[0], rtol=1e-6)
-
-
-def test_the_camera_is_that_of_the_frames_and_not_of_the_images_on_disk(run):
-    """Those may be larger, and bent by a lens."""
-    assert (run.camera.width, run.camera.height) == SIZE
-    np.testing.assert_allclose([*run.camera.focal, *run.camera.center], INTRINSICS)
 
 
 def test_points_keep_place_and_colour(written):
@@ -119,11 +119,14 @@ def test_transforms_look_along_minus_z_with_y_up_and_keep_the_unit(written):
     assert found.size == SIZE and found.distortion == ()
 
 
-def test_what_we_write_we_read(written):
+def test_what_we_write_we_read(written, tmp_path):
     model = load_colmap(written.folder / "colmap" / "sparse" / "0")
     np.testing.assert_allclose(model.T_world_camera, tracked(written), atol=1e-12)
     _, rows = load_transforms(written.folder / "nerfstudio" / "transforms.json")
     np.testing.assert_allclose(np.reshape(rows, (-1, 4, 4)), tracked(written), atol=1e-12)
+    camera = Camera((40.0, 42.0), (22.0, 20.5), 48, 40)
+    save_colmap(tmp_path, camera, ["a b.png"], np.eye(4)[None], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    assert load_colmap(tmp_path).names == ["a b.png"]
 
 
 def test_frustums_are_coloured_by_status_and_the_path_is_cut_where_the_camera_was_lost(written):
@@ -141,75 +144,64 @@ def test_frustums_are_coloured_by_status_and_the_path_is_cut_where_the_camera_wa
     assert ends @ written.poses[0][:3, 2] > 0.04, "it opens in the direction of view"
 
 
-def test_nothing_is_written_over_and_a_failed_export_leaves_nothing(run, monkeypatch):
+def test_a_camera_that_stands_still_is_written_too(tmp_path):
+    camera, poses = Camera((9.0, 9.0), (4.0, 4.0), 9, 9), np.tile(np.eye(4), (2, 1, 1))
+    count = save_frustums(tmp_path / "c.ply", camera, poses, np.ones((2, 3)), np.array([True]), np.ones(3))
+    mesh = trimesh.load(tmp_path / "c.ply", process=False)
+    assert count == len(mesh.faces) and np.isfinite(mesh.vertices).all()
+
+
+def test_nothing_is_written_over_and_a_failed_export_leaves_nothing(run):
     (run.folder / "colmap").mkdir()
     with pytest.raises(ValueError, match=r"colmap is there already: .* out=FOLDER"):
         export(run, run.folder, ALL, Shown())
     assert not (run.folder / "nerfstudio").exists() and not any((run.folder / "colmap").iterdir())
     (run.folder / "colmap").rmdir()
 
-    def full(*_):
-        raise OSError(28, "No space left on device")
+    class Ends(Shown):
+        def __getitem__(self, row: int):
+            if row == 4:
+                raise OSError(28, "No space left on device")
+            return super().__getitem__(row)
 
-    monkeypatch.setattr("emgs_jax.report.export.save_colmap", full)
     with pytest.raises(OSError, match="No space left"):
-        export(run, run.folder, ALL, Shown())
+        export(run, run.folder, ALL, Ends())
     assert not [path for path in run.folder.iterdir() if "colmap" in path.name]
 
 
 def test_bad_input_is_named(run):
-    with pytest.raises(ValueError, match="formats=obj is not known: choose of colmap, nerfstudio, frustums"):
-        export(run, run.folder, ExportConfig(("obj",), 10, None, None), None)
-    with pytest.raises(ValueError, match=r"formats=colmap holds the images.*formats=\[frustums\] needs none"):
-        export(run, run.folder, ExportConfig(("colmap",), 10, None, None), None)
+    def refused(message, formats, images):
+        with pytest.raises(ValueError, match=message):
+            export(run, run.folder, ExportConfig(formats, 10, None, None), images)
+
+    refused("formats=obj is not known: choose of colmap, nerfstudio, frustums", ("obj",), None)
+    refused(r"formats=colmap holds the images.*formats=\[frustums\] needs none", ("colmap",), None)
     (run.folder / "points.ply").unlink()
-    with pytest.raises(ValueError, match=r"lacks points.ply, which formats=colmap needs: run again"):
-        export(run, run.folder, ExportConfig(("colmap",), 10, None, None), Shown())
+    refused(r"lacks points.ply, which formats=colmap needs: run again", ("colmap",), Shown())
     export(run, run.folder, ExportConfig(("frustums",), 10, None, None), None)
 
 
-@pytest.mark.parametrize("override", ["max_points=0", "max_points=1.5", "max_points=.nan"])
-def test_values_out_of_their_range_are_refused_by_their_key(run, override):
-    with pytest.raises(ValueError, match=re.escape(override.split("=")[0])):
-        export_run(compose_export(run.folder, override))
-
-
-def compose_export(folder, *overrides):
-    return configure.compose(f"folder='{folder}'", *overrides, name="export")
-
-
-def test_images_that_are_not_those_that_were_mapped_are_refused(tmp_path):
+def test_values_out_of_their_range_and_images_that_are_not_those_that_were_mapped_are_refused(tmp_path):
     """Symptom: a folder with one image more and one less was as good, and every pose had its neighbour's image."""
     folder = written_run(tmp_path / "run")
+    config = configure.compose(f"folder='{folder}'", "formats=[colmap]", name="export")
+    for value in (0, 1.5, float("nan")):
+        with pytest.raises(ValueError, match="max_points"):
+            export_run(OmegaConf.merge(config, {"max_points": value}))
     path = folder / "metrics.json"
     metrics = json.loads(path.read_text())
     metrics["provenance"]["data"]["fingerprint"] = "of other images"
     path.write_text(json.dumps(metrics))
     with pytest.raises(ValueError, match="they are not those that were mapped. formats=.frustums. needs no images"):
-        export_run(compose_export(folder, "formats=[colmap]"))
+        export_run(config)
 
 
 def test_the_command_writes_the_images_that_the_run_was_made_of(tmp_path):
     """The built-in room makes them again; the frame's picture is that of the data set."""
     folder = written_run(tmp_path / "run")
     save_points_ply(folder / "points.ply", np.ones((3, 3)), np.ones((3, 3)), np.ones((3, 3)))
-    found = export_run(compose_export(folder, "formats=[colmap]", f"out='{tmp_path / 'there'}'"))
+    words = f"folder='{folder}'", "formats=[colmap]", f"out='{tmp_path / 'there'}'"
+    found = export_run(configure.compose(*words, name="export"))
     assert found == [tmp_path / "there" / "colmap"]
-    frame = hydra.utils.instantiate(compose().dataset)[4]
     image = cv2.cvtColor(cv2.imread(str(found[0] / "images" / "000004.png")), cv2.COLOR_BGR2RGB)
-    np.testing.assert_array_equal(image, frame.image)
-
-
-def test_a_camera_that_stands_still_is_written_too(tmp_path):
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    count = save_frustums(
-        tmp_path / "c.ply", Camera((9.0, 9.0), (4.0, 4.0), 9, 9), poses, np.ones((2, 3)), np.array([True]), np.ones(3)
-    )
-    mesh = trimesh.load(tmp_path / "c.ply", process=False)
-    assert count == len(mesh.faces) and np.isfinite(mesh.vertices).all()
-
-
-def test_a_model_keeps_names_with_spaces(tmp_path):
-    camera = Camera((40.0, 42.0), (22.0, 20.5), 48, 40)
-    save_colmap(tmp_path, camera, ["a b.png"], np.eye(4)[None], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    assert load_colmap(tmp_path).names == ["a b.png"]
+    np.testing.assert_array_equal(image, dataset()[4].image)

@@ -1,7 +1,5 @@
 """view=live: what is served follows a run (made by hand, so it is known), and the run neither waits nor ends for it."""
 
-import socket
-import sys
 import threading
 from dataclasses import replace
 from types import SimpleNamespace
@@ -15,6 +13,7 @@ from tiny_run import compose
 
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.ops.camera import Camera
+from emgs_jax.report import live
 from emgs_jax.report.live import LiveConfig, live_view
 from emgs_jax.report.viewer import HOST
 from emgs_jax.running.configure import build
@@ -41,24 +40,28 @@ class GrowingRun:
         self.records = [replace(record, pose=pose) for record, pose in zip(self.records, poses, strict=True)]
 
 
+@pytest.fixture
+def at_once(monkeypatch):
+    """A run is drawn however long that takes."""
+    monkeypatch.setattr(live, "SHARE", np.inf)
+
+
 def served(run, config, kept=range(NUM_FRAMES)):
     pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
-    render = build(compose(), "densify").render
-    return live_view(config, run, render, PRIOR, [*kept])
+    return live_view(config, run, build(compose(), "densify").render, PRIOR, [*kept])
 
 
-def test_what_is_served_follows_the_run_and_at_its_end_is_the_whole_of_it():
+def test_what_is_served_follows_the_run_and_at_its_end_is_the_whole_of_it(at_once):
     run, counts = GrowingRun(), []
-    with served(run, LiveConfig(free_port(), 0.0), kept=[0, 2, 4, 6]) as live:
-        assert live.viewer.server.get_host() == HOST and "No frame" in live.viewer.facts.content
-        live.viewer.words.value = "left"  # asked before there is a map
-        for view in live.watch(run.views(), run):
-            live._drawing.result()  # for the test: the thread has drawn, and is due again
-            live._due = 0.0
-            counts.append((len(live.viewer.layers["mean"]), len(live.viewer.scene.splats.centers)))
-            assert live.viewer.frame.value == len(run.records) - 1, "who looks at the last frame goes on to do so"
-            np.testing.assert_array_equal(live.viewer.picture.image, view.image)
-        viewer = live.viewer
+    with served(run, LiveConfig(free_port(), 0.0), kept=[0, 2, 4, 6]) as view:
+        assert view.viewer.server.get_host() == HOST and "No frame" in view.viewer.facts.content
+        view.viewer.words.value = "left"  # asked before there is a map
+        for seen in view.watch(run.views(), run):
+            view.wait()
+            counts.append((len(view.viewer.layers["mean"]), len(view.viewer.scene.splats.centers)))
+            assert view.viewer.frame.value == len(run.records) - 1, "who looks at the last frame goes on to do so"
+            np.testing.assert_array_equal(view.viewer.picture.image, seen.image)
+        viewer = view.viewer
         assert counts == [(200 * n, 200 * n) for n in range(1, NUM_FRAMES + 1)]
         assert "Gaussians: left" in viewer.answer.content, "words stay asked"
         np.testing.assert_array_equal(viewer.scene.chosen.position, [2.0 * (NUM_FRAMES - 1), 0, 0])
@@ -66,36 +69,35 @@ def test_what_is_served_follows_the_run_and_at_its_end_is_the_whole_of_it():
         assert "frame 6: tracked, residual 0.0123" in viewer.facts.content, "its number in the data set"
 
 
-def test_who_looks_at_an_earlier_frame_is_left_there():
+def test_who_looks_at_an_earlier_frame_is_left_there(at_once):
     run = GrowingRun()
-    with served(run, LiveConfig(free_port(), 0.0)) as live:
-        for row, _ in enumerate(live.watch(run.views(), run)):
-            live._drawing.result()
-            live._due = 0.0
+    with served(run, LiveConfig(free_port(), 0.0)) as view:
+        for row, _ in enumerate(view.watch(run.views(), run)):
+            view.wait()
             if row == 2:
-                live.viewer.frame.value = 1
-        assert live.viewer.frame.value == 1 and "frame 1:" in live.viewer.facts.content
+                view.viewer.frame.value = 1
+        assert view.viewer.frame.value == 1 and "frame 1:" in view.viewer.facts.content
 
 
 def test_a_run_is_not_drawn_more_often_than_asked():
     run, drawn = GrowingRun(), []
-    with served(run, LiveConfig(free_port(), 3600.0)) as live:
-        live.viewer.update = lambda shown: drawn.append(len(shown.frames))
-        for _ in live.watch(run.views(), run):
-            live._drawing.result()
+    with served(run, LiveConfig(free_port(), 3600.0)) as view:
+        view.viewer.update = lambda shown: drawn.append(len(shown.frames))
+        for _ in view.watch(run.views(), run):
+            view.wait()
     assert drawn == [1, NUM_FRAMES]
 
 
 def test_the_run_does_not_wait_for_what_is_drawn():
     run, drawn, may_end = GrowingRun(), [], threading.Event()
-    with served(run, LiveConfig(free_port(), 0.1)) as live:
+    with served(run, LiveConfig(free_port(), 0.1)) as view:
 
         def slow(shown):
             may_end.wait(60)
             drawn.append(len(shown.frames))
 
-        live.viewer.update = slow
-        for row, _ in enumerate(live.watch(run.views(), run)):
+        view.viewer.update = slow
+        for row, _ in enumerate(view.watch(run.views(), run)):
             if row == NUM_FRAMES - 1:
                 may_end.set()  # all frames have passed, and the first picture is still being drawn
     assert drawn == [1, NUM_FRAMES], "the first, and the whole run at its end"
@@ -103,28 +105,18 @@ def test_the_run_does_not_wait_for_what_is_drawn():
 
 def test_a_view_that_fails_is_said_and_ends_no_run(capsys):
     run = GrowingRun()
-    with served(run, LiveConfig(free_port(), 0.0)) as live:
+    with served(run, LiveConfig(free_port(), 0.0)) as view:
 
         def broken(shown):
             raise RuntimeError("no more memory")
 
-        live.viewer.update = broken
-        assert len(list(live.watch(run.views(), run))) == NUM_FRAMES
+        view.viewer.update = broken
+        assert len(list(view.watch(run.views(), run))) == NUM_FRAMES
     assert capsys.readouterr().out.count("the run goes on: RuntimeError('no more memory')") == 1
 
 
-def test_a_taken_port_a_missing_extra_and_a_sweep_are_refused_before_the_first_frame(monkeypatch, tmp_path):
-    with socket.socket() as taken:
-        taken.bind((HOST, 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(ValueError, match=f"port={port} is taken"), served(GrowingRun(), LiveConfig(port, 1.0)):
-            pass
+def test_without_a_config_nothing_is_served_and_a_sweep_is_not_watched(tmp_path):
+    with live_view(None, GrowingRun(), None, PRIOR, []) as view:
+        assert view is None
     with pytest.raises(ValueError, match="view= is for run and evaluate"):
         sweep(compose("view=live", "axes={slam.em.noise:[0.0]}", name="sweep"), tmp_path)
-    with live_view(None, GrowingRun(), None, PRIOR, []) as live:
-        assert live is None
-    monkeypatch.setitem(sys.modules, "viser", None)
-    config = build(compose("view=live"), "view")
-    with pytest.raises(ValueError, match=r'pip install "emgs_jax\[viewer\]"'):
-        live_view(config, GrowingRun(), build(compose(), "densify").render, PRIOR, []).__enter__()

@@ -80,16 +80,28 @@ class Scene:
 
 
 def test_an_estimate_that_is_the_truth_in_another_frame_and_size_has_no_error():
+    """Its centres are every other point, and as right; so are their labels, but for those of the other half."""
     scene = Scene()
-    metrics = scene.score(scene.run())
-    for key in ("trajectory/ate_sim3_m", "reconstruction/accuracy_m", "reconstruction/completion_m"):
+    centers = inverse(scene.ours).apply(scene.cloud.points[::2])
+    labels = LabelledPoints(centers, scene.labels.labels[::2], CLASSES)
+    metrics = scene.score(scene.run(), labels)
+    exact = ("trajectory/ate_sim3_m", "reconstruction/accuracy_m", "reconstruction/completion_m")
+    for key in (*exact, "reconstruction_icp/accuracy_m", "reconstruction_centers/accuracy_m"):
         np.testing.assert_allclose(metrics[key], 0.0, atol=1e-9, err_msg=key)
     np.testing.assert_allclose(metrics["trajectory/scale"], 0.5)
     assert metrics["trajectory/num_frames"] == NUM_FRAMES
+    assert metrics["reconstruction_centers/num_points"] == len(centers)
+    assert metrics["reconstruction_centers/completion_m"] > 0.1, "every other point is missing"
+    assert metrics["reconstruction_centers/alignment_note"] is None
+    assert metrics["segmentation/accuracy_percent"] > 90  # the other half takes a neighbour's label
+    swapped = scene.score(scene.run(), dataclasses.replace(labels, classes=CLASSES[::-1]))
+    assert swapped["segmentation/accuracy_percent"] < 10
     prior = score_prior(scene.run(), scene.raw_prior(), scene.scorer())
     assert all(key.startswith("raw_prior/") for key in prior)
     np.testing.assert_allclose(prior["raw_prior/reconstruction/accuracy_m"], 0.0, atol=1e-9)
     np.testing.assert_allclose(prior["raw_prior/trajectory/scale"], 1.25)
+    unknown = scene.run(true_poses=[None] * NUM_FRAMES)
+    assert scene.score(unknown) == score_prior(unknown, scene.raw_prior(), scene.scorer()) == {}
 
 
 def test_lost_frames_pay_for_their_poses_and_frames_without_a_true_pose_are_not_compared():
@@ -101,17 +113,11 @@ def test_lost_frames_pay_for_their_poses_and_frames_without_a_true_pose_are_not_
     whole = scene.score(run)
     expected = trajectory_metrics(np.stack(run.poses), scene.poses)
     assert {key: whole[key] for key in expected} == expected
-    assert whole["trajectory/ate_sim3_m"] > 0.3
+    assert whole["trajectory/ate_sim3_m"] > 0.3 and not any(key.startswith("segmentation/") for key in whole)
     run.true_poses[LOST] = None
     without = scene.score(run)
     assert without["trajectory/num_frames"] == NUM_FRAMES - 1
     np.testing.assert_allclose(without["trajectory/ate_sim3_m"], 0.0, atol=1e-9)
-
-
-def test_without_any_true_pose_nothing_is_scored():
-    scene = Scene()
-    run = scene.run(true_poses=[None] * NUM_FRAMES)
-    assert scene.score(run) == score_prior(run, scene.raw_prior(), scene.scorer()) == {}
 
 
 @pytest.mark.parametrize(("alignment", "other"), [("sim3", "se3"), ("se3", "sim3")])
@@ -144,8 +150,6 @@ def test_what_an_alignment_by_poses_leaves_open_is_closed_by_the_points_but_for_
     for pose in run.poses:
         pose[:3, 3] *= 1.1
     assert scene.score(run)["reconstruction_icp/accuracy_m"] > 0.05, "the scale is that of the poses"
-    exact = scene.score(scene.run())
-    np.testing.assert_allclose(exact["reconstruction_icp/accuracy_m"], 0.0, atol=1e-9)
 
 
 def test_the_raw_priors_rendering_is_its_own_depth_at_the_scale_of_its_own_path():
@@ -161,26 +165,6 @@ def test_the_raw_priors_rendering_is_its_own_depth_at_the_scale_of_its_own_path(
     assert metrics["raw_prior/rendering/depth_within_5_percent"] == 50.0
     np.testing.assert_allclose(metrics["raw_prior/rendering/depth_l1_m"], 0.0, atol=1e-6)
     assert metrics["raw_prior/rendering/psnr_db"] is None
-
-
-def test_the_centres_are_compared_as_they_are():
-    scene = Scene()
-    metrics = scene.score(scene.run())
-    assert metrics["reconstruction_centers/num_points"] == len(scene.cloud.points[::2])
-    np.testing.assert_allclose(metrics["reconstruction_centers/accuracy_m"], 0.0, atol=1e-9)
-    assert metrics["reconstruction_centers/completion_m"] > 0.1, "every other point is missing"
-    assert metrics["reconstruction_centers/alignment_note"] is None
-
-
-def test_labels_of_the_centres_are_compared_where_the_alignment_puts_the_centres():
-    scene = Scene()
-    centers = inverse(scene.ours).apply(scene.cloud.points[::2])
-    labels = LabelledPoints(centers, scene.labels.labels[::2], CLASSES)
-    metrics = scene.score(scene.run(), labels)
-    assert metrics["segmentation/accuracy_percent"] > 90  # the other half takes a neighbour's label
-    swapped = scene.score(scene.run(), dataclasses.replace(labels, classes=CLASSES[::-1]))
-    assert swapped["segmentation/accuracy_percent"] < 10
-    assert not any(key.startswith("segmentation/") for key in scene.score(scene.run()))
 
 
 class Room:
@@ -238,7 +222,7 @@ def test_a_run_is_described_by_its_counts():
 COV = jnp.diag(jnp.array([0.05, 0.05, 0.01])) ** 2
 
 
-@pytest.mark.parametrize("unit", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("unit", [0.5, 2.0])
 def test_walls_stand_twice_in_metres_whatever_the_unit_of_the_map_is(unit):
     """Two sheets 10 cm apart; the limit is 15 cm."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0, 2, 0.1), np.arange(0, 2, 0.1)))
@@ -259,9 +243,6 @@ def test_seconds_a_frame_are_those_of_steps_that_compiled_nothing():
     assert seconds_per_frame(records(start, ("tracked", 30.0, 29.0), ("tracked", 9.0, 6.0))) == 2.0
     assert seconds_per_frame(records(start)) == 10.0
     assert seconds_per_frame([]) is None
-
-
-def test_phases_compilation_and_the_whole_are_named_seconds():
     metrics = spent(SimpleNamespace(phases={"map": 3.0}, compile_seconds=2.0, total_seconds=7.0))
     assert metrics.pop("memory/peak_mb") > 10
     assert metrics == {"time/map_seconds": 3.0, "time/compile_seconds": 2.0, "time/total_seconds": 7.0}

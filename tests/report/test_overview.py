@@ -17,6 +17,8 @@ from emgs_jax.report.overview import (
     view_from_above,
 )
 
+OURS, TRUTH, MOVED = (228, 87, 46), (27, 153, 139), ((141, 106, 159), (46, 134, 228))  # and loops, as placed
+
 
 def path_along(direction, n=5):
     """Level cameras (OpenCV axes in a z-up world) that look along x and move along `direction`."""
@@ -26,12 +28,9 @@ def path_along(direction, n=5):
     return poses
 
 
-def test_from_above_up_is_up_and_the_path_runs_to_the_right():
+def test_from_above_up_is_up_and_the_path_runs_to_the_right_and_the_view_turns_with_the_world():
     rotation = view_from_above(path_along([0.0, -3.0, 0.2]))
     np.testing.assert_allclose(rotation, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
-
-
-def test_the_view_turns_with_the_world():
     turn = Rotation.from_rotvec([0.3, -1.2, 0.5]).as_matrix()
     poses = path_along([0.5, -3.0, 0.2])
     turned = poses.copy()
@@ -71,99 +70,72 @@ def test_holes_take_the_colour_around_them_and_painted_cells_keep_theirs():
     np.testing.assert_array_equal(filled[0], 0.0)
 
 
-@pytest.mark.parametrize(("num_frames", "num_points", "has_truth"), [(2, 3000, True), (0, 0, False)])
-def test_the_picture_shows_floor_and_paths_and_is_the_same_twice(tmp_path, num_frames, num_points, has_truth):
-    import cv2
+def shares_of(path, *colors) -> list[np.ndarray]:
+    """Where a picture has each of the colours, (h, w) bools."""
+    image = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    return [np.all(np.abs(image - color) <= 8, axis=-1) for color in colors]
 
+
+def a_cloud(points=None, color=(0.0, 0.0, 1.0)) -> PointCloud:
+    points = np.zeros((0, 3)) if points is None else points
+    return PointCloud(points, np.zeros_like(points), np.tile(color, (len(points), 1)))
+
+
+@pytest.mark.parametrize(("num_frames", "num_points", "has_truth"), [(2, 3000, True), (0, 0, False)])
+def test_the_picture_shows_floor_and_paths_and_labels_with_a_legend_and_is_the_same_twice(
+    tmp_path, num_frames, num_points, has_truth
+):
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-2, 2, (num_points, 2)), np.full((num_points, 1), -1.0)], 1)
     points[: num_points // 100] = np.nan
-    colors = np.tile([0.0, 0.0, 1.0], (num_points, 1))
     poses = path_along([1.0, -0.5, 0.0])
-    depth = np.full((24, 32), np.nan)
-    depth[4:, :] = 2.0
+    depth, labels = np.full((24, 32), np.nan), np.full((24, 32), 2)
+    depth[4:, :], labels[:, 16:] = 2.0, -1
     frame = {"image": np.zeros((24, 32, 3), np.uint8), "rendered_color": np.full((24, 32, 3), np.nan)}
-    frame |= {"rendered_depth": depth, "valid": np.ones((24, 32), bool), "title": "frame 0"}
-    for name in ("a.png", "b.png"):
-        paths = Paths(poses, np.ones(len(poses), bool), poses if has_truth else None)
-        cloud = PointCloud(points, np.zeros_like(points), colors)
-        draw_overview(tmp_path / name, cloud, paths, [frame] * num_frames, "a run")
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-    image = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
-    assert min(image.shape[:2]) > 500
-
-    def share(color):
-        return np.all(np.abs(image.astype(int) - color) <= 8, axis=-1).mean()
-
-    assert (share((0, 0, 255)) > 0.1) == (num_points > 0)
-    assert share((228, 87, 46)) > 1e-4
-    assert (share((27, 153, 139)) > 1e-4) == has_truth
+    frame |= {"rendered_depth": depth, "valid": np.ones((24, 32), bool), "title": "frame 0", "labels": labels}
+    paths = Paths(poses, np.ones(len(poses), bool), poses if has_truth else None)
+    for name in ("a.png", "b.png") if num_frames else ("a.png",):
+        classes = ("wall", "floor", "chair") if num_frames else ()
+        draw_overview(tmp_path / name, a_cloud(points), paths, [frame] * num_frames, "a run", classes)
+    path = tmp_path / "a.png"
+    assert not num_frames or path.read_bytes() == (tmp_path / "b.png").read_bytes()
+    floor, ours, truth = shares_of(path, (0, 0, 255), OURS, TRUTH)
+    assert min(floor.shape) > 500 and (floor.mean() > 0.1) == (num_points > 0)
+    assert ours.mean() > 1e-4 and (truth.mean() > 1e-4) == has_truth
+    of_classes = shares_of(path, *(255 * color for color in class_colors(3)))
+    assert [bool(share.sum() > 50) for share in of_classes] == [False, False, num_frames > 0]
+    rows = np.nonzero(of_classes[2].any(1))[0]
+    assert not num_frames or rows.max() > 0.9 * len(floor), "the legend is below the frames"
 
 
 def test_what_is_lost_or_unknown_is_a_gap_and_loops_are_lines_beside_the_path_before(tmp_path):
-    import cv2
-
     truth, estimate, online = (path_along([0.0, 4.0, 0.0], 9) for _ in range(3))
     truth[0, 0, 3] = 1.2  # the highest, beside the legend
     estimate[:, 0, 3], online[:, 0, 3] = 0.8, 0.4
     holed = truth.copy()
     holed[6] = np.nan
-    cloud = PointCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
 
-    def columns_of(paths: Paths, color: tuple[int, int, int]) -> np.ndarray:
-        """Columns of the picture, the path's direction, in which a colour is seen left of the legend."""
-        draw_overview(tmp_path / "a.png", cloud, paths, [], "a run")
-        image = cv2.imread(str(tmp_path / "a.png"))[..., ::-1].astype(int)
-        return np.flatnonzero(np.all(np.abs(image - color) <= 8, axis=-1)[image.shape[0] // 4 :].any(0))
+    def columns_of(paths: Paths, *colors) -> list[np.ndarray]:
+        """Columns of the picture, the path's direction, in which each colour is seen left of the legend."""
+        draw_overview(tmp_path / "a.png", a_cloud(), paths, [], "a run")
+        return [np.flatnonzero(share[len(share) // 4 :].any(0)) for share in shares_of(tmp_path / "a.png", *colors)]
 
-    def longest_gap(paths: Paths, color: tuple[int, int, int]) -> float:
-        columns = columns_of(paths, color)
-        return np.diff(columns).max() / np.ptp(columns)
-
-    whole = Paths(estimate, np.ones(9, bool), truth)
-    for color in ((228, 87, 46), (27, 153, 139)):
-        assert longest_gap(whole, color) < 0.1
-    broken = Paths(estimate, np.arange(9) != 3, holed)
-    for color in ((228, 87, 46), (27, 153, 139)):
-        assert 0.2 < longest_gap(broken, color) < 0.3  # two of eight pieces
-    for color in ((141, 106, 159), (46, 134, 228)):
-        moved = Paths(estimate, np.ones(9, bool), truth, online, ((0, 8),))
-        assert len(columns_of(moved, color)) > 200 and not len(columns_of(whole, color))
-
-
-def test_labels_are_drawn_in_the_colours_of_their_classes_with_a_legend_of_those_that_are_seen(tmp_path):
-    import cv2
-
-    labels, depth = np.full((24, 32), 2), np.full((24, 32), 2.0)
-    labels[:, 16:] = -1
-    frame = {"image": np.zeros((24, 32, 3), np.uint8), "rendered_color": np.zeros((24, 32, 3)), "labels": labels}
-    frame |= {"rendered_depth": depth, "valid": np.ones((24, 32), bool), "title": "frame 0"}
-    cloud = PointCloud(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)))
-    path = tmp_path / "a.png"
-    paths = Paths(path_along([1.0, -0.5, 0.0]), np.ones(5, bool))
-    draw_overview(path, cloud, paths, [frame] * 2, "a run", ("wall", "floor", "chair"))
-    image = cv2.imread(str(path))[..., ::-1].astype(int)
-    shares = [np.all(np.abs(image - 255 * color) <= 3, axis=-1) for color in class_colors(3)]
-    assert [bool(share.sum() > 50) for share in shares] == [False, False, True]
-    rows = np.nonzero(shares[2].any(1))[0]
-    assert rows.max() > 0.9 * len(image)  # the legend is below the frames
+    whole = columns_of(Paths(estimate, np.ones(9, bool), truth), OURS, TRUTH, *MOVED)
+    broken = columns_of(Paths(estimate, np.arange(9) != 3, holed), OURS, TRUTH)
+    moved = columns_of(Paths(estimate, np.ones(9, bool), truth, online, ((0, 8),)), *MOVED)
+    gaps = [[np.diff(columns).max() / np.ptp(columns) for columns in found[:2]] for found in (whole, broken)]
+    assert max(gaps[0]) < 0.1 and 0.2 < min(gaps[1]) <= max(gaps[1]) < 0.3  # two of eight pieces
+    assert min(map(len, moved)) > 200 and not any(map(len, whole[2:]))
 
 
 def test_features_are_drawn_from_above_below_the_map(tmp_path):
     x, z = (values.ravel() for values in np.meshgrid(np.linspace(-2, 2, 100), np.linspace(-2, 2, 100)))
     points = np.stack([x, np.zeros_like(x), z], axis=1)
-    cloud = PointCloud(points, np.zeros_like(points), np.full_like(points, 0.5))
-    teal = PointCloud(points, np.zeros_like(points), np.tile([0.0, 0.6, 0.4], (len(points), 1)))
+    grey, teal = (a_cloud(points, color) for color in ((0.5, 0.5, 0.5), (0.0, 0.6, 0.4)))
     paths = Paths(path_along([1.0, -0.5, 0.0]), np.ones(5, bool))
-
-    def rows_of_teal(name, *features):
-        draw_overview(tmp_path / name, cloud, paths, [], "a run", (), *features)
-        image = np.asarray(Image.open(tmp_path / name).convert("RGB")).astype(int)
-        return np.nonzero(np.all(np.abs(image - [0, 153, 102]) <= 2, axis=-1))[0], len(image)
-
-    rows, height = rows_of_teal("with.png", teal)
-    assert len(rows) > 1000 and rows.min() > height / 2
-    assert not len(rows_of_teal("without.png")[0])
+    draw_overview(tmp_path / "a.png", grey, paths, [], "a run", (), teal)
+    (found,) = shares_of(tmp_path / "a.png", (0, 153, 102))
+    assert found.sum() > 1000 and not found[: len(found) // 2].any()
 
 
 def test_colours_of_many_classes_differ():

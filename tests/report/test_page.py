@@ -14,9 +14,10 @@ from hand_run import random_similarity
 from page_elements import HOSTILE, Elements
 from written_run import CLASSES, two_walls, written_run
 
-from emgs_jax.report import page, page_words
-from emgs_jax.report.page import MAX_BYTES, write_report
-from emgs_jax.report.page_map import COV_UNIT, packed, thinned
+from emgs_jax.features.text import TextEmbeddings, save_text
+from emgs_jax.report import page_words
+from emgs_jax.report.page import write_report
+from emgs_jax.report.page_map import COV_UNIT, fitted, packed, thinned
 from emgs_jax.report.page_strip import placed_paths
 from emgs_jax.report.page_words import DATA_LICENCES, verdict
 from emgs_jax.report.recorded_run import read_run
@@ -33,6 +34,10 @@ def folder(tmp_path_factory):
 
 def text_of(folder) -> str:
     return (folder / "report.html").read_text()
+
+
+def edited(path, change) -> None:
+    path.write_text(change(path.read_text()))
 
 
 def unpacked(elements) -> dict[str, np.ndarray]:
@@ -63,80 +68,60 @@ def test_the_page_holds_the_map_as_it_is(folder):
     assert np.isnan(arrays["online"][0]).all() and np.isfinite(arrays["online"][1:]).all()
 
 
-def test_the_page_asks_for_nothing_and_runs_no_script_but_its_own(folder):
-    text = text_of(folder)
-    elements = Elements(text)
-    for tag, attributes in elements.found:
-        assert not any(name.startswith("on") for name in attributes), (tag, attributes)
-        for name in ("src", "href", "action", "data", "poster", "srcset"):
-            assert str(attributes.get(name) or "data:").startswith("data:"), (tag, attributes)
-    assert "http:" not in text.replace("http-equiv", "") and "https:" not in text
+def test_the_program_that_may_run_is_the_pages_own_and_the_same_run_gives_the_same_bytes(folder, tmp_path):
+    elements = Elements(text_of(folder))
     policy = next(a["content"] for _, a in elements.found if a.get("http-equiv") == "Content-Security-Policy")
     digest = base64.b64encode(hashlib.sha256(elements.scripts[""].encode()).digest()).decode()
     assert policy.startswith("default-src 'none'") and policy.endswith(f"script-src 'sha256-{digest}'")
-
-
-def test_hostile_names_stay_text(tmp_path):
-    folder = written_run(tmp_path, sequence=HOSTILE)
-    lines = (folder / "frames.jsonl").read_text().splitlines()
-    first = json.loads(lines[0]) | {"reason": HOSTILE, "status": HOSTILE}
-    (folder / "frames.jsonl").write_text("\n".join([json.dumps(first), *lines[1:]]) + "\n")
-    write_report(read_run(folder), None)
-    elements, plain = Elements(text_of(folder)), written_run(tmp_path / "plain")
-    write_report(read_run(plain), None)
-    tags = [tag for tag, _ in elements.found]
-    assert tags.count("script") == [tag for tag, _ in Elements(text_of(plain)).found].count("script") == 5
-    assert "alert" not in elements.scripts[""]
-    assert "<" not in elements.scripts["about"]  # an end of a script may have a space or a slash before its >
-    assert json.loads(elements.scripts["about"])["frames"]["reason"][0] == HOSTILE
-    assert not any("onerror" in attributes for _, attributes in elements.found)
-
-
-def test_the_same_run_gives_the_same_bytes(folder, tmp_path):
     other = written_run(tmp_path)
     write_report(read_run(other), None)
     assert (other / "report.html").read_bytes() == (folder / "report.html").read_bytes()
 
 
+def test_hostile_names_stay_text_and_loops_name_frames_as_the_rest_of_the_page_does(folder, tmp_path):
+    """After a skipped image places in use and indices of the data set are not the same."""
+    hostile = written_run(tmp_path, sequence=HOSTILE, has_truth=False)
+    lines = [json.loads(line) for line in (hostile / "frames.jsonl").read_text().splitlines()]
+    lines = [line | {"index": line["index"] + 1} for line in lines]
+    lines[0] |= {"reason": HOSTILE, "status": HOSTILE}
+    (hostile / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    level, words = verdict(read_run(hostile))
+    assert level == "bad" and "no ground truth" in words and "(1 degraded, 1 lost)" in words  # a sixth is lost
+    write_report(read_run(hostile), None)
+    elements = Elements(text_of(hostile))
+    tags, plain = ([tag for tag, _ in page.found] for page in (elements, Elements(text_of(folder))))
+    assert tags.count("script") == plain.count("script") == 5 and "alert" not in elements.scripts[""]
+    assert "<" not in elements.scripts["about"]  # an end of a script may have a space or a slash before its >
+    assert json.loads(elements.scripts["about"])["frames"]["reason"][0] == HOSTILE
+    assert not any(name.startswith("on") for _, attributes in elements.found for name in attributes)
+    assert "None: the data set has no ground truth" in text_of(hostile)
+    assert "frames 6 and 1: accepted" in text_of(hostile) and "frames 5 and 0" not in text_of(hostile)
+
+
 def test_without_a_program_the_words_and_curves_are_there(folder):
     text = re.sub(r"<script.*?</script>", "", text_of(folder), flags=re.DOTALL)
-    assert "SIMULATED" in text
     assert "The path is off by 1.2 cm" in text and "60 % less than the prior alone (3.0 cm)" in text
-    assert "emgs run" in text and "dataset.stop" in text and "paper/sim3" in text
     assert "refused: what both show is in a small part of an image" in text and "frames 5 and 0: accepted" in text
-    assert text.count("<svg") == 8 and "map.npz" in text and "Apache-2.0" in text  # statuses, six curves, loops
+    assert all(
+        word in text for word in ("SIMULATED", "emgs run", "dataset.stop", "paper/sim3", "map.npz", "Apache-2.0")
+    )
+    assert text.count("<svg") == 8  # statuses, six curves, loops
 
 
-def test_a_large_map_is_thinned_to_the_size_of_a_page_and_the_page_says_so(tmp_path, monkeypatch):
-    folder = written_run(tmp_path)
-    monkeypatch.setattr(page, "_MAP_BYTES", 5_000)
-    write_report(read_run(folder), None)
-    elements = Elements(text_of(folder))
-    shown, whole = len(unpacked(elements)["mean"]), len(two_walls().means)
-    assert len(elements.scripts["arrays"]) <= 5_000 and 0 < shown < whole
-    assert f"The page shows the {shown:,} of {whole:,} Gaussians" in text_of(folder)
-    assert len(text_of(folder).encode()) < MAX_BYTES
-
-
-def test_where_the_paths_alone_are_too_many_the_page_has_them_and_no_gaussian(tmp_path, monkeypatch):
+def test_a_large_map_is_thinned_to_what_most_frames_agree_on_and_paths_alone_may_be_too_many():
     """Symptom: after 20,000 frames the run ended with 'cannot reshape array of size 0', and no page."""
-    folder = written_run(tmp_path)
-    monkeypatch.setattr(page, "_MAP_BYTES", 10)
-    write_report(read_run(folder), None)
-    arrays = unpacked(Elements(text_of(folder)))
-    assert len(arrays["mean"]) == 0 and arrays["cov"].shape == (0, 6) and len(arrays["poses"]) == 6
-    assert f"The page shows the 0 of {len(two_walls().means):,} Gaussians" in text_of(folder)
-
-
-def test_loops_name_frames_as_the_rest_of_the_page_does(tmp_path):
-    """After a skipped image places in use and indices of the data set are not the same."""
-    folder = written_run(tmp_path)
-    lines = [json.loads(line) for line in (folder / "frames.jsonl").read_text().splitlines()]
-    lines = [line | {"index": line["index"] + 1} for line in lines]
-    (folder / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    write_report(read_run(folder), None)
-    text = text_of(folder)
-    assert "frames 6 and 1: accepted" in text and "frames 5 and 0" not in text
+    rng = np.random.default_rng(0)
+    layers = {"updates": rng.permutation(1000), "mean": rng.normal(size=(1000, 3)).astype(np.float32)}
+    paths = {"poses": rng.normal(size=(6, 12)).astype(np.float32)}
+    about, text, note = fitted(layers, paths, 5_000)
+    count = about[1]["rows"]
+    assert 4_000 < len(text) <= 5_000 and f"shows the {count:,} of 1,000 Gaussians" in note
+    most = np.flatnonzero(layers["updates"] >= 1000 - count)  # in the order of the map
+    np.testing.assert_array_equal(thinned(layers, count)["mean"], layers["mean"][most])
+    assert fitted(layers, paths, 5_000)[1] == packed(thinned(layers, count) | paths)[1]
+    assert fitted(layers, paths, 10**6) == (*packed(layers | paths), "")
+    about, _, note = fitted(layers, paths, 10)
+    assert [item["rows"] for item in about] == [0, 0, 6] and "shows the 0 of 1,000" in note
 
 
 @pytest.mark.parametrize(
@@ -153,35 +138,11 @@ def test_whether_lengths_are_metres_is_what_the_prior_says_of_itself(settings, i
     assert page_words.is_metric(run) == is_metric
 
 
-def test_thinning_keeps_what_most_frames_agree_on_in_its_order():
-    layers = {"updates": np.array([5, 1, 9, 5, 5]), "mean": np.arange(5)}
-    assert list(thinned(layers, 3)["mean"]) == [0, 2, 3]
-    assert list(thinned(layers, 9)["mean"]) == [0, 1, 2, 3, 4]
-
-
-def test_packing_is_undone_by_reading_columns_and_bytes():
-    values = np.array([[1.5, -2.0], [1e-3, 7.0], [0.0, 4e4]], np.float32)
-    about, text = packed({"a": values, "b": np.array([-3, 300], np.int16)})
-    content = zlib.decompress(base64.b64decode(text))
-    assert [(item["name"], item["rows"], item["columns"], item["offset"]) for item in about] == [
-        ("a", 3, 2, 0),
-        ("b", 2, 1, 24),
-    ]
-    first_bytes = np.ascontiguousarray(values.T).view(np.uint8).reshape(-1, 4)[:, 0]
-    assert content[:6] == first_bytes.tobytes() and content[24:] == bytes([0xFD, 0x2C, 0xFF, 0x01])
-
-
-def test_the_true_path_is_placed_on_ours_as_the_error_is_measured(folder):
-    run = read_run(folder)
-    placed = placed_paths(run, with_scale=True)
-    left = np.linalg.norm(placed.truth[:, :3, 3] - run.poses[:, :3, 3], axis=1)
-    assert left.max() < 0.03  # of .05 m that the paths are apart, and .03 m to the side
-    assert placed.errors["ours"].max() < 0.035 and set(placed.errors) == {"ours", "online", "raw"}
-    assert placed.errors["raw"].max() < 1e-6  # its path is the true one, in this run
-
-
 def test_a_true_path_that_is_ours_in_another_frame_and_size_lies_on_ours(folder):
     run = read_run(folder)
+    placed = placed_paths(run, with_scale=True)
+    assert placed.errors["ours"].max() < 0.035 and set(placed.errors) == {"ours", "online", "raw"}
+    assert placed.errors["raw"].max() < 1e-6  # its path is the true one, in this run
     similarity = random_similarity(np.random.default_rng(0), 2.5)
     run = replace(run, truth=similarity.apply_to_poses(run.poses))
     placed = placed_paths(run, with_scale=True)
@@ -200,79 +161,56 @@ def test_a_true_path_that_is_ours_in_another_frame_and_size_lies_on_ours(folder)
 )
 def test_the_verdict_compares_with_the_raw_prior(tmp_path, metrics, level):
     folder = written_run(tmp_path, **metrics)
-    text = (folder / "frames.jsonl").read_text().replace('"degraded"', '"tracked"').replace('"lost"', '"tracked"')
-    (folder / "frames.jsonl").write_text(text)
+    edited(folder / "frames.jsonl", lambda text: text.replace('"degraded"', '"tracked"').replace('"lost"', '"tracked"'))
     assert verdict(read_run(folder))[0] == level
 
 
-def test_without_truth_only_the_tracking_is_judged(tmp_path):
-    level, words = verdict(read_run(written_run(tmp_path, has_truth=False)))
-    assert level == "bad" and "no ground truth" in words and "(1 degraded, 1 lost)" in words  # a sixth is lost
-    write_report(read_run(tmp_path), None)
-    assert "None: the data set has no ground truth" in text_of(tmp_path)
+def damage(name: str, before: str, after: str):
+    """One edit of a file, once."""
+    return name, lambda text: text.replace(before, after, 1)
 
 
-@pytest.mark.parametrize("name", ["metrics.json", "frames.jsonl", "trajectory.txt", "map.npz"])
-def test_a_folder_that_lacks_a_file_is_refused_by_its_name_and_left_as_it_is(tmp_path, name):
-    folder = written_run(tmp_path)
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (damage("metrics.json", '"format": 1', '"format": 9'), "another version"),
+        (("metrics.json", lambda text: text[:50]), "is not the result of a run"),
+        (damage("metrics.json", '"emgs_jax": ', '"emgs_jaz": '), "provenance.versions.emgs_jax is None"),
+        (damage("metrics.json", '"git": null', '"git": {"a": 1}'), "git has no revision"),
+        (damage("metrics.json", '"git": null', '"gut": null'), "provenance.git is None"),
+        (damage("metrics.json", '"protocol": "', '"prottocol": "'), "provenance.protocol is None"),
+        (
+            ("metrics.json", lambda text: re.sub('"tile_batch": [0-9]+', '"tile_batch": null', text)),
+            "render.tile_batch must be",
+        ),
+        (damage("metrics.json", "0.012", '"0.012"'), "trajectory/ate_sim3_m is '0.012'"),
+        (("metrics.json", lambda text: text.replace('"intrinsics"', '"other"')), "which camera"),
+        (damage("metrics.json", "emgs_jax.data.synthetic.Synthetic", "os.system"), "os.system"),
+        (("frames.jsonl", lambda text: text + '{"index": 3\n'), "frames.jsonl:7 is no record"),
+        (("frames.jsonl", lambda text: "".join(text.splitlines(True)[:-1])), "5 poses and trajectory.txt 6"),
+        (damage("loops.json", "5", "77"), "loops.json names frames"),
+        (damage("loops.json", '"accepted"', '"</script>"'), "loops.json names frames"),
+        (("trajectory_online.txt", lambda text: text + 3 * text.splitlines()[-1] + "\n"), "expected"),
+    ],
+)
+def test_a_damaged_or_foreign_file_is_named_and_the_page_stays_as_it_is(tmp_path, edit, words):
+    folder, (name, change) = written_run(tmp_path), edit
     (folder / "report.html").write_text("old")
-    (folder / name).unlink()
-    with pytest.raises(ValueError, match=f"holds no finished run: it lacks {name}"):
+    edited(folder / name, change)
+    with pytest.raises(ValueError, match=words):
         report(folder)
     assert (folder / "report.html").read_text() == "old"
 
 
-def edited(path, change):
-    path.write_text(change(path.read_text()))
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "words"),
-    [
-        ("metrics.json", lambda text: text.replace('"format": 1', '"format": 9'), "another version"),
-        ("metrics.json", lambda text: text[:50], "is not the result of a run"),
-        (
-            "metrics.json",
-            lambda text: text.replace('"emgs_jax": ', '"emgs_jaz": '),
-            "provenance.versions.emgs_jax is None",
-        ),
-        ("metrics.json", lambda text: text.replace('"git": null', '"git": {"a": 1}'), "git has no revision"),
-        ("metrics.json", lambda text: text.replace('"git": null', '"gut": null'), "provenance.git is None"),
-        (
-            "metrics.json",
-            lambda text: text.replace('"protocol": "', '"prottocol": "', 1),
-            "provenance.protocol is None",
-        ),
-        (
-            "metrics.json",
-            lambda text: re.sub('"tile_batch": [0-9]+', '"tile_batch": null', text),
-            "render.tile_batch must be",
-        ),
-        ("metrics.json", lambda text: text.replace("0.012", '"0.012"'), "trajectory/ate_sim3_m is '0.012'"),
-        ("metrics.json", lambda text: text.replace('"intrinsics"', '"other"'), "which camera"),
-        ("metrics.json", lambda text: text.replace("emgs_jax.data.synthetic.Synthetic", "os.system"), "os.system"),
-        ("frames.jsonl", lambda text: text + '{"index": 3\n', "frames.jsonl:7 is no record"),
-        ("frames.jsonl", lambda text: "".join(text.splitlines(True)[:-1]), "5 poses and trajectory.txt 6"),
-        ("loops.json", lambda text: text.replace("5", "77"), "loops.json names frames"),
-        ("loops.json", lambda text: text.replace('"accepted"', '"</script>"'), "loops.json names frames"),
-        ("trajectory_online.txt", lambda text: text + 3 * text.splitlines()[-1] + "\n", "expected"),
-    ],
-)
-def test_a_damaged_or_foreign_file_is_named_and_nothing_is_written(tmp_path, name, change, words):
-    folder = written_run(tmp_path)
-    edited(folder / name, change)
-    with pytest.raises(ValueError, match=words):
-        report(folder)
-    assert not (folder / "report.html").exists()
-
-
-def test_text_of_another_run_is_refused(tmp_path):
-    from emgs_jax.features.text import TextEmbeddings, save_text
-
+def test_a_folder_that_lacks_a_file_or_has_the_text_of_another_run_is_refused(tmp_path):
     folder = written_run(tmp_path)
     save_text(folder / "text.npz", TextEmbeddings(CLASSES, np.eye(2, 5, dtype=np.float32), (), {}))
     with pytest.raises(ValueError, match="embeddings of width 5 and map.npz features of width 2"):
         write_report(read_run(folder), None)
+    for name in ("map.npz", "trajectory.txt", "frames.jsonl", "metrics.json"):
+        (folder / name).unlink()
+        with pytest.raises(ValueError, match=f"holds no finished run: it lacks .*{name}"):
+            report(folder)
 
 
 def test_settings_of_older_code_make_a_page_without_images_that_says_so(tmp_path, capsys):
@@ -280,7 +218,7 @@ def test_settings_of_older_code_make_a_page_without_images_that_says_so(tmp_path
     edited(folder / "metrics.json", lambda text: text.replace('"on_bad_frame"', '"of_older_code"', 1))
     report(folder)
     assert "the run is of another version (Missing key on_bad_frame)" in capsys.readouterr().out
-    assert "of another version" in (folder / "report.html").read_text()
+    assert "of another version" in text_of(folder)
 
 
 def test_every_data_set_has_a_word_on_its_licence():

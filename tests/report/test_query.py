@@ -1,29 +1,34 @@
 """Questions to a hand-made run, a red wall ("sofa") before a green one ("wall"); oracle: where they stand."""
 
+import contextlib
+import io
 import json
+from functools import cache
 
 import cv2
 import equinox as eqx
 import jax.numpy as jnp
-import matplotlib.image
 import numpy as np
 import pytest
 import trimesh
+from omegaconf import OmegaConf
 from written_run import written_run
 
 from emgs_jax.data.labels import LabelFolder
+from emgs_jax.evaluation.instances import InstanceConfig
 from emgs_jax.features.random import RandomFeatures
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.io.map_file import load_map, save_map
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.report.overview import class_colors
-from emgs_jax.report.query import load_semantic
-from emgs_jax.report.query_pictures import MAX_LEGEND, drawn, frame_view, legend
+from emgs_jax.report.query import Question, ask, load_semantic
+from emgs_jax.report.query_pictures import MAX_LEGEND, drawn, frame_view, legend, save_labels
 from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.vocabulary import vocabulary
 from emgs_jax.running.configure import compose
-from experiments.query import query
+from experiments.query import asked, given_views, named_views, query, rivals
 
-FILES = {"query.json", "query.png", "semantic.npz", "semantic.ply", "features.png"}
+FILES = {"query.json", "query.png", "semantic.npz", "semantic.ply", "features.png", "labels"}
 
 
 @pytest.fixture(scope="module")
@@ -31,15 +36,37 @@ def folder(tmp_path_factory):
     return written_run(tmp_path_factory.mktemp("runs") / "one")
 
 
-def said(folder, *overrides, map=None):
-    return query(compose(f"map={map or folder}", *overrides, name="query"))
+@cache
+def composed(*overrides: str):
+    return compose("map=nowhere", *overrides, name="query")
 
 
-def test_the_object_has_its_place_and_every_file_says_the_same(folder, tmp_path, capsys):
+def asking(folder, *overrides: str, **values):
+    """The config of a question; a value is that of a key, with __ for its dots."""
+    config = composed(*overrides).copy()
+    for key, value in ({"map": str(folder)} | values).items():
+        OmegaConf.update(config, key.replace("__", "."), value)
+    return config
+
+
+def said(folder, *overrides: str, **values):
+    return query(asking(folder, *overrides, **values))
+
+
+@pytest.fixture(scope="module")
+def answered(folder, tmp_path_factory):
+    """The answer to "sofa" with class images, its folder, and what the command printed."""
+    out, words = tmp_path_factory.mktemp("sofa"), io.StringIO()
+    with contextlib.redirect_stdout(words):
+        found = said(folder, text="sofa", label_images=True, out=str(out))
+    return found, out, words.getvalue()
+
+
+def test_the_object_has_its_place_and_every_file_says_the_same(folder, answered):
     """The near wall is at z = 1, from x = -1.5 to .46 and y = -1.5 to 1.46; its features are those of "sofa"."""
-    found = said(folder, "text=sofa", f"out={tmp_path}")
-    assert {path.name for path in tmp_path.iterdir()} == FILES
-    assert json.loads((tmp_path / "query.json").read_text())["words"][0]["word"] == "sofa"
+    found, out, printed = answered
+    assert {path.name for path in out.iterdir()} == FILES
+    assert json.loads((out / "query.json").read_text())["words"][0]["word"] == "sofa"
     means = np.asarray(load_map(folder / "map.npz").gaussians.means, np.float64)
     near = means[:, 2] == 1.0
     (word,) = found["words"]
@@ -49,63 +76,69 @@ def test_the_object_has_its_place_and_every_file_says_the_same(folder, tmp_path,
     np.testing.assert_allclose(sofa["low_m"][0], -1.5 - np.sqrt(3e-3), atol=1e-6)
     np.testing.assert_allclose([sofa["score"], sofa["lead"]], [1.0, 1.0])
     assert found["against"] == ("wall",) and found["features"]["bytes_per_gaussian"] == 8
-    header, arrays = load_semantic(tmp_path / "semantic.npz")
+    header, arrays = load_semantic(out / "semantic.npz")
     assert header["words"] == ["sofa"] and arrays["features"].dtype == np.float16
     np.testing.assert_array_equal(arrays["labels"], np.where(near, 0, -1))
     np.testing.assert_array_equal(arrays["instances"], np.where(near, 0, -1))
     np.testing.assert_array_equal(arrays["means"], means)
-    vertices = trimesh.load(tmp_path / "semantic.ply").metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(arrays["features"], np.where(near[:, None], [0, 1], [1, 0]))
+    vertices = trimesh.load(out / "semantic.ply").metadata["_ply_raw"]["vertex"]["data"]
     np.testing.assert_array_equal(vertices["label"], np.where(near, 0, -1))
-    text = capsys.readouterr().out
-    assert f"sofa: {near.sum()} Gaussians, 1 objects" in text and "8 bytes each, 4 in semantic.npz" in text
+    assert f"sofa: {near.sum()} Gaussians, 1 objects" in printed and "8 bytes each, 4 in semantic.npz" in printed
 
 
 def test_negative_words_a_margin_and_a_least_cosine_say_none_of_these(folder, tmp_path):
-    def count(*overrides):
-        return [word["num_gaussians"] for word in said(folder, f"out={tmp_path}", *overrides)["words"]]
-
-    both = count("text=[sofa,wall]")
-    assert min(both) > 100
-    assert count("text=sofa") == both[:1]
-    assert count("text=sofa", "against=[]") == [sum(both)]  # with nothing else, everything is a sofa
-    assert count("text=sofa", "against=[]", "min_cosine=.5") == both[:1]
-    assert count("text=sofa", "against=wall", "margin=1.1") == [0]
-    save_text(
-        tmp_path / "e.npz",
-        TextEmbeddings(("a", "b"), np.array([[0.6, 0.8], [0.8, 0.6]], np.float32), (), {"prior": "simulated"}),
-    )
-    assert count("text=a", f"features.text={tmp_path / 'e.npz'}") == both[:1]
-    assert count("text=a", f"features.text={tmp_path / 'e.npz'}", "margin=.19") == both[:1]
-    assert count("text=a", f"features.text={tmp_path / 'e.npz'}", "margin=.21") == [0]
-    assert count("text=a", f"features.text={tmp_path / 'e.npz'}", "against=b", "margin=.21") == [0]
-
-
-def test_class_images_show_each_word_where_it_is_and_are_read_as_labels(folder, tmp_path):
-    """The sofa hides the wall as far as column 36 of 64, see above; with ids from 1, and 0 where nothing is asked."""
-    said(folder, "text=[sofa,wall]", "label_images=true", "frame=0", f"out={tmp_path}")
-    read = LabelFolder(tmp_path / "labels", tmp_path / "labels" / "classes.txt", (0,))
-    assert read.names == ("sofa", "wall")
-    image = read.read("000000.jpg")
-    assert (image[8:32, 4:36] == 0).all() and (image[8:32, 46:49] == 1).all()
-    said(folder, "text=wall", "label_images=true", f"out={tmp_path / 'all'}")
+    """The walls' features are (0, 1) and (1, 0); "a" at (.6, .8) is nearer to one, "b" at (.8, .6) to the other."""
     run = read_run(folder)
-    images = sorted((tmp_path / "all" / "labels").glob("*.png"))
-    assert len(images) == run.is_placed.sum()
-    pixels = cv2.imread(str(images[0]), cv2.IMREAD_UNCHANGED)
-    assert pixels.dtype == np.uint16 and (pixels[8:32, 4:36] == 0).all() and (pixels[8:32, 46:49] == 1).all()
+    vectors = np.array([[0.6, 0.8], [0.8, 0.6]], np.float32)
+    save_text(tmp_path / "e.npz", TextEmbeddings(("a", "b"), vectors, (), {"prior": "simulated"}))
+
+    def count(*words, **values):
+        config = asking(folder, text=list(words), **values)
+        texts = vocabulary(run, config.features.text, None)
+        against = rivals(config, words, texts)
+        question = Question(texts.embed(words), against, config.margin, config.min_cosine, InstanceConfig(2.0, 3))
+        labels = ask(run, question).relevance.labels
+        return [int((labels == word).sum()) for word in range(len(words))]
+
+    both = count("sofa", "wall")
+    assert min(both) > 100
+    assert count("sofa") == both[:1]
+    assert count("sofa", against=[]) == [sum(both)]  # with nothing else, everything is a sofa
+    assert count("sofa", against=[], min_cosine=0.5) == both[:1]
+    assert count("sofa", against="wall", margin=1.1) == [0]
+    path = str(tmp_path / "e.npz")
+    assert count("a", features__text=path) == count("a", features__text=path, margin=0.19) == both[:1]
+    assert count("a", features__text=path, margin=0.21) == [0]
+    assert count("a", features__text=path, against="b", margin=0.21) == [0]
 
 
-def test_words_of_a_class_file_are_asked_for(folder, tmp_path):
+def test_class_images_show_each_word_where_it_is_and_are_read_as_labels(folder, answered, tmp_path):
+    """The sofa hides the wall as far as column 36 of 64, see below; with ids from 1, and 0 where nothing is asked."""
+    run, labels = read_run(folder), answered[1] / "labels"
+    assert len(list(labels.glob("*.png"))) == run.is_placed.sum()
+    read = LabelFolder(labels, labels / "classes.txt", (0,))
+    pixels = cv2.imread(str(labels / "0.png"), cv2.IMREAD_UNCHANGED)
+    assert read.names == ("sofa",) and pixels.dtype == np.uint16
+    assert (pixels[8:32, 4:36] == 1).all() and (pixels[8:32, 46:49] == 0).all()
     (tmp_path / "classes.txt").write_text("sofa\nwall\n")
-    found = said(folder, f"classes={tmp_path / 'classes.txt'}", f"out={tmp_path}")
-    assert [word["word"] for word in found["words"]] == ["sofa", "wall"]
+    config = asking(folder, classes=str(tmp_path / "classes.txt"), frame=0)
+    words, texts = asked(config), vocabulary(run, None, None)
+    assert words == ("sofa", "wall")
+    question = Question(texts.embed(words), rivals(config, words, texts), 0.0, 0.0, InstanceConfig(2.0, 3))
+    save_labels(tmp_path / "labels", run, ask(run, question), named_views(run, given_views(config, run)))
+    image = LabelFolder(tmp_path / "labels", tmp_path / "labels" / "classes.txt", (0,)).read("000000.jpg")
+    assert (image[8:32, 4:36] == 0).all() and (image[8:32, 46:49] == 1).all()
 
 
-def test_the_same_question_gives_the_same_bytes(folder, tmp_path):
-    for name in ("a", "b"):
-        said(folder, "text=sofa", f"out={tmp_path / name}")
-    for name in FILES:
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+def test_the_same_question_gives_the_same_bytes_and_a_damaged_answer_is_refused(folder, answered, tmp_path):
+    said(folder, text="sofa", out=str(tmp_path))
+    for name in FILES - {"labels"}:
+        assert (tmp_path / name).read_bytes() == (answered[1] / name).read_bytes(), name
+    path = tmp_path / "semantic.npz"
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(ValueError, match="semantic.npz is no semantic.npz that can be read .*: ask the map again"):
+        load_semantic(path)
 
 
 def test_a_rendered_image_shows_each_gaussian_where_it_is(folder):
@@ -118,44 +151,47 @@ def test_a_rendered_image_shows_each_gaussian_where_it_is(folder):
     assert np.nanmin(image[8:32, 4:36]) > 0.9 and np.nanmax(image[8:32, 46:49]) < 0.05
 
 
-def test_pictures_are_drawn_from_given_poses_and_frames(folder, tmp_path):
-    poses = np.tile(np.eye(4), (2, 1, 1))
+def test_pictures_are_drawn_from_given_poses_or_frames(folder, tmp_path):
+    run, poses = read_run(folder), np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 0.3
     save_trajectory_tum(tmp_path / "poses.txt", [1.0, 2.0], poses)
-    said(folder, "text=sofa", f"out={tmp_path / 'a'}", f"pose={tmp_path / 'poses.txt'}")
-    said(folder, "text=sofa", f"out={tmp_path / 'b'}", "frame=2")
-    heights = [matplotlib.image.imread(tmp_path / name / "query.png").shape[0] for name in "ab"]
-    assert 1.9 < heights[0] / heights[1] < 2.1  # two lines and one
-    with pytest.raises(ValueError, match="has no pose of frame=77: choose one from 0 to 5"):
-        said(folder, "text=sofa", "frame=77")
-    with pytest.raises(ValueError, match="give one of them"):
-        said(folder, "text=sofa", "frame=1", f"pose={tmp_path / 'poses.txt'}")
-    with pytest.raises(ValueError, match="pose=.*nowhere.txt does not exist"):
-        said(folder, "text=sofa", f"pose={tmp_path / 'nowhere.txt'}")
+    views = given_views(asking(folder, pose=str(tmp_path / "poses.txt")), run)
+    assert [view.title for view in views] == ["pose at 1", "pose at 2"]
+    np.testing.assert_allclose(np.stack([view.pose for view in views]), poses)
+    (view,) = given_views(asking(folder, frame=2), run)
+    assert view.title == "frame 2" and (view.pose == run.poses[2]).all()
+    assert given_views(asking(folder), run) is None
+    for values, message in (
+        ({"frame": 77}, "has no pose of frame=77: choose one from 0 to 5"),
+        ({"frame": 1, "pose": str(tmp_path / "poses.txt")}, "give one of them"),
+        ({"pose": "nowhere.txt"}, "pose=.*nowhere.txt does not exist"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            given_views(asking(folder, **values), run)
 
 
 @pytest.mark.parametrize(
-    ("overrides", "message"),
+    ("values", "message"),
     [
-        ([], "nothing is asked: give text=chair"),
-        (["text=[]"], "nothing is asked"),
-        (["text=' '"], "text must be a word or a list of words, none empty"),
-        (["text=1"], "text must be a word or a list of words, none empty and each once, got 1"),
-        (["text=sofa", "against=true"], "against must be a word or a list of words"),
-        (["text=[sofa,sofa]"], "each once, got"),
-        (["text=soaf"], r"'soaf' is no word of .*text.npz; the nearest are sofa\. .*features.text=FILE"),
-        (["text=xyz"], r"'xyz' is no word of .*text.npz; there are wall, sofa\. "),
-        (["text=sofa", "against=sofa"], "against names sofa, which is asked for too"),
-        (["text=sofa", "against=lamp"], "'lamp' is no word of"),
-        (["classes=nowhere.txt"], "class file nowhere.txt does not exist"),
-        (["text=sofa", "margin=-1"], "margin must be a number from 0 to 2, got -1"),
-        (["text=sofa", "instances.reach=0"], "instances.reach must be a number"),
-        (["text=sofa", "features.text=nowhere.npz"], "nowhere.npz does not exist"),
+        ({}, "nothing is asked: give text=chair"),
+        ({"text": []}, "nothing is asked"),
+        ({"text": " "}, "text must be a word or a list of words, none empty"),
+        ({"text": 1}, "text must be a word or a list of words, none empty and each once, got 1"),
+        ({"text": "sofa", "against": True}, "against must be a word or a list of words"),
+        ({"text": ["sofa", "sofa"]}, "each once, got"),
+        ({"text": "soaf"}, r"'soaf' is no word of .*text.npz; the nearest are sofa\. .*features.text=FILE"),
+        ({"text": "xyz"}, r"'xyz' is no word of .*text.npz; there are wall, sofa\. "),
+        ({"text": "sofa", "against": "sofa"}, "against names sofa, which is asked for too"),
+        ({"text": "sofa", "against": "lamp"}, "'lamp' is no word of"),
+        ({"classes": "nowhere.txt"}, "class file nowhere.txt does not exist"),
+        ({"text": "sofa", "margin": -1}, "margin must be a number from 0 to 2, got -1"),
+        ({"text": "sofa", "instances__reach": 0}, "instances.reach must be a number"),
+        ({"text": "sofa", "features__text": "nowhere.npz"}, "nowhere.npz does not exist"),
     ],
 )
-def test_a_question_that_cannot_be_asked_is_named(folder, overrides, message):
+def test_a_question_that_cannot_be_asked_is_named(folder, values, message):
     with pytest.raises(ValueError, match=message):
-        said(folder, *overrides)
+        said(folder, **values)
     assert not (folder / "query.json").exists()
 
 
@@ -163,12 +199,12 @@ def test_embeddings_of_another_width_or_encoder_are_refused_and_both_are_named(f
     wide = TextEmbeddings(("sofa",), np.ones((1, 3), np.float32), (), {"prior": "simulated"})
     save_text(tmp_path / "wide.npz", wide)
     with pytest.raises(ValueError, match=r"wide.npz has embeddings of width 3, and the map's features have width 2"):
-        said(folder, "text=sofa", f"features.text={tmp_path / 'wide.npz'}")
+        said(folder, text="sofa", features__text=str(tmp_path / "wide.npz"))
     save_text(tmp_path / "other.npz", TextEmbeddings(("sofa",), np.ones((1, 2), np.float32), (), {"name": "clip"}))
     with pytest.raises(ValueError, match=r"other.npz was embedded by .*clip.*, but the features are of .*simulated"):
-        said(folder, "text=sofa", f"features.text={tmp_path / 'other.npz'}")
+        said(folder, text="sofa", features__text=str(tmp_path / "other.npz"))
     with pytest.raises(ValueError, match=r"features=random is .*'width': 2.*, but the features of .*simulated"):
-        said(folder, "text=sofa", "features=random", "features.width=2")
+        said(folder, "features=random", text="sofa", features__width=2)
 
 
 def test_a_text_encoder_embeds_any_word_and_what_anything_is_stands_against_it(tmp_path):
@@ -182,42 +218,32 @@ def test_a_text_encoder_embeds_any_word_and_what_anything_is_stands_against_it(t
     near = np.asarray(map.gaussians.means)[:, 2:] == 1.0
     vectors = model.embed(("red chair", "things")).vectors
     features = jnp.asarray(np.where(near, vectors[0], vectors[1]))
-    save_map(folder / "map.npz", eqx.tree_at(lambda m: m.gaussians.features, map, features))
-    found = said(folder, "text='red chair'", "features=random", "features.templates=['a {}.']")
+    valid = map.gaussians.valid.at[5].set(False)
+    save_map(
+        folder / "map.npz", eqx.tree_at(lambda m: (m.gaussians.features, m.gaussians.valid), map, (features, valid))
+    )
+    found = said(folder, "features=random", text="red chair", features__templates=["a {}."])
     assert found["against"] == ("object", "things", "stuff", "texture")
     (chair,) = found["words"][0]["instances"]
     np.testing.assert_allclose(chair["center_m"][2], 1.0, atol=1e-6)
     np.testing.assert_allclose(chair["score"], 1.0, atol=1e-6)
+    _, arrays = load_semantic(folder / "semantic.npz")  # of the rows in use
+    np.testing.assert_allclose(arrays["features"], np.delete(features, 5, axis=0), atol=1e-3)  # float16
     (folder / "text.npz").unlink()
     with pytest.raises(ValueError, match=r"has no text.npz with words, and its features are of .*random"):
-        said(folder, "text='red chair'")
+        said(folder, text="red chair")
 
 
-def test_a_map_without_features_is_refused(tmp_path):
+def test_a_map_without_features_and_a_folder_that_cannot_be_written_are_named(tmp_path):
     folder = written_run(tmp_path / "run")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match=r"nothing can be written into out=.*file/below .*: choose another out=FOLDER"):
+        said(folder, text="sofa", out=str(tmp_path / "file" / "below"))
     map = load_map(folder / "map.npz")
     for features in (map.gaussians.features[:, :0], 0.0 * map.gaussians.features):
         save_map(folder / "map.npz", eqx.tree_at(lambda m: m.gaussians.features, map, features))
-        with pytest.raises(
-            ValueError, match=r"map.npz has no features to compare words with: map again with features="
-        ):
-            said(folder, "text=sofa")
-
-
-def test_a_folder_that_cannot_be_written_or_is_no_run_is_named(folder, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match=r"nothing can be written into out=.*file/below .*: choose another out=FOLDER"):
-        said(folder, "text=sofa", f"out={tmp_path / 'file' / 'below'}")
-    with pytest.raises(ValueError, match="holds no finished run: it lacks metrics.json"):
-        said(folder, "text=sofa", map=tmp_path)
-
-
-def test_a_damaged_semantic_file_is_refused(folder, tmp_path):
-    said(folder, "text=sofa", f"out={tmp_path}")
-    path = tmp_path / "semantic.npz"
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(ValueError, match="semantic.npz is no semantic.npz that can be read .*: ask the map again"):
-        load_semantic(path)
+        with pytest.raises(ValueError, match=r"has no features to compare words with: map again with features="):
+            said(folder, text="sofa")
 
 
 def test_the_legend_of_the_classes_has_the_words_that_are_drawn_in_their_colours() -> None:

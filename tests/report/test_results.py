@@ -10,15 +10,8 @@ from emgs_jax.report.provenance import RESULT_FORMAT
 from emgs_jax.report.results import is_finished, read_estimates, result_folder
 from emgs_jax.report.tables import average, full_table, paper_table, to_csv
 
-PUBLISHED = [
-    {
-        "method": "MASt3R-SLAM",
-        "source": "Table II",
-        "protocol": "its own",
-        "seven_scenes": [0.11, 0.16, 0.05, 85.0, 41.7, 88.4],
-        "tum": [0.08, None, 0.03, 83.8, 44.2, 86.1],
-    }
-]
+QUOTED = {"method": "MASt3R-SLAM", "source": "Table II", "protocol": "its own"}
+QUOTED |= {"seven_scenes": [0.11, 0.16, 0.05, 85.0, 41.7, 88.4], "tum": [0.08, None, 0.03, 83.8, 44.2, 86.1]}
 
 
 def write_result(
@@ -26,21 +19,12 @@ def write_result(
 ):
     folder = result_folder(out, dataset, sequence, variant, seed)
     folder.mkdir(parents=True)
-    block = {
-        "format": RESULT_FORMAT,
-        "protocol": "paper/sim3",
-        "simulated": simulated,
-        "prior": {"name": "simulated" if simulated else "mapanything"},
-        "data": {"name": dataset, "sequence": sequence},
-        "git": {"revision": "abc"},
-        "config": {"dataset": {"root": "here", "stride": 10}, "em": {"noise": 1.0}, "compilation_cache": None},
-    } | block
-    metrics = {
-        "trajectory/ate_sim3_m": ate,
-        "trajectory/ate_se3_m": 2.0,
-        "reconstruction/alignment_note": None,
-        "provenance": block,
-    }
+    config = {"dataset": {"root": "here", "stride": 10}, "em": {"noise": 1.0}, "compilation_cache": None}
+    about = {"format": RESULT_FORMAT, "protocol": "paper/sim3", "simulated": simulated, "config": config}
+    about |= {"prior": {"name": "simulated" if simulated else "mapanything"}, "git": {"revision": "abc"}}
+    block = about | {"data": {"name": dataset, "sequence": sequence}} | block
+    metrics = {"trajectory/ate_sim3_m": ate, "trajectory/ate_se3_m": 2.0, "provenance": block}
+    metrics["reconstruction/alignment_note"] = None
     if block["prior"]:
         metrics["raw_prior/trajectory/ate_sim3_m"] = 10 * ate
     (folder / "metrics.json").write_text(json.dumps(metrics))
@@ -91,7 +75,7 @@ def test_the_table_of_the_paper_labels_simulated_and_quoted_rows(tmp_path):
     write_result(tmp_path, 0.0321, seed=0)
     write_result(tmp_path, 0.0341, seed=1)
     write_result(tmp_path, 0.5, dataset="tum", sequence="freiburg1_xyz", simulated=False)
-    table = paper_table(average(read_estimates(tmp_path), each_sequence=False), PUBLISHED)
+    table = paper_table(average(read_estimates(tmp_path), each_sequence=False), [QUOTED])
     lines = [line for line in table.splitlines() if line.startswith("|")]
     assert "must not be compared with quoted rows" in table
     assert lines[0].count("7-Scenes: ") == lines[0].count("TUM: ") == 6
@@ -106,15 +90,12 @@ def test_the_table_of_the_paper_labels_simulated_and_quoted_rows(tmp_path):
     assert all("**simulated**" in line for line in lines if "7-Scenes 1 × 2" in line)
 
 
-def test_the_trajectory_column_of_the_paper_table_follows_the_alignment(tmp_path):
-    write_result(tmp_path, 1.0, protocol="paper/se3")
-    assert "| 2.000 |" in paper_table(average(read_estimates(tmp_path), each_sequence=False), [])
-
-
-def test_quoted_rows_stand_only_beside_results_of_their_data_sets(tmp_path):
-    write_result(tmp_path, 1.0, dataset="synthetic", sequence="room0")
-    rows = average(read_estimates(tmp_path), each_sequence=False)
-    assert paper_table(rows, PUBLISHED) == ""
+def test_the_trajectory_column_follows_the_alignment_and_quoted_rows_stand_beside_their_data_sets_only(tmp_path):
+    write_result(tmp_path / "se3", 1.0, protocol="paper/se3")
+    assert "| 2.000 |" in paper_table(average(read_estimates(tmp_path / "se3"), each_sequence=False), [])
+    write_result(tmp_path / "room", 1.0, dataset="synthetic", sequence="room0")
+    rows = average(read_estimates(tmp_path / "room"), each_sequence=False)
+    assert paper_table(rows, [QUOTED]) == ""
     line = "| synthetic | room0 | ours, default | **simulated** | paper/sim3 | 1 | 100.00 | 200.00 |"
     assert line in full_table(rows)
 
@@ -146,13 +127,9 @@ def test_the_csv_has_a_line_per_estimate_that_names_what_it_is_of(tmp_path):
     assert float(ours["trajectory/ate_sim3_m"]) == 0.5 and float(raw["trajectory/ate_sim3_m"]) == 5.0
     assert raw["trajectory/ate_se3_m"] == ""
     for line in (ours, raw):
-        assert (line["dataset"], line["sequence"], line["variant"], line["seed"]) == (
-            "seven_scenes",
-            "chess/seq-01",
-            "default",
-            "0",
-        )
-        assert (line["protocol"], line["is_simulated"], line["revision"]) == ("paper/sim3", "True", "abc")
+        names = ("dataset", "sequence", "variant", "seed", "protocol", "is_simulated", "revision")
+        of = ["seven_scenes", "chess/seq-01", "default", "0", "paper/sim3", "True", "abc"]
+        assert [line[name] for name in names] == of
 
 
 def test_a_result_is_finished_if_it_was_made_with_the_same_settings_wherever_the_data_lies(tmp_path):

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -15,6 +16,7 @@ from emgs_jax.report.run_files import OUTPUTS, claim_folder, save_outputs, save_
 from emgs_jax.running.dense import DenseMap
 
 NUM_FRAMES = len(STATUSES)
+ESTIMATE, TRUTH = (228, 87, 46), (27, 153, 139)  # colours of the paths
 
 
 def finished(true_poses=None, gaussians=None):
@@ -23,7 +25,7 @@ def finished(true_poses=None, gaussians=None):
     return hand_run(poses, poses_along(np.full(NUM_FRAMES, 9.0)), true_poses, gaussians=gaussians)
 
 
-def dense_of(run) -> DenseMap:
+def dense_map() -> DenseMap:
     """Two points, one of them without a class."""
     points = np.array([[0.1, 0.2, 2.0], [0.4, -0.3, 2.0]])
     cloud = PointCloud(points, np.array([[0.0, 0.0, -1.0]] * 2), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
@@ -34,10 +36,20 @@ def vertices(path):
     return trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A run whose outputs and progress are written, and their folder; the first frame's true pose is unknown."""
+    folder, truth = tmp_path_factory.mktemp("run"), poses_along(np.linspace(0.0, 1.0, NUM_FRAMES) + 0.3)
+    run = finished([None, *truth[1:]])
+    config = densify_config("render.covariance_scale=2.25", "render.opacity=0.75")
+    assert save_outputs(folder, run, dense_map(), config, "a wall", True) == []
+    save_progress(folder, run)
+    return run, folder
+
+
 def test_the_progress_is_the_map_bit_for_bit_and_our_poses_at_the_frames_times(tmp_path):
     run = finished()
-    rng = np.random.default_rng(0)
-    run.poses[:] = random_poses(rng, NUM_FRAMES)
+    run.poses[:] = random_poses(np.random.default_rng(0), NUM_FRAMES)
     save_progress(tmp_path, run)
     times, poses = load_trajectory_tum(tmp_path / "trajectory.txt")
     np.testing.assert_array_equal(times, [record.timestamp for record in run.records])
@@ -54,14 +66,12 @@ def test_before_there_is_a_map_nothing_is_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_map_ply_holds_the_gaussians_in_use_as_they_are_drawn(tmp_path):
+def test_map_ply_holds_the_gaussians_in_use_as_they_are_drawn(written):
     """The covariances are those that close the surface, the opacity is the drawing's."""
-    run = finished()
-    config = densify_config("render.covariance_scale=2.25", "render.opacity=0.75")
-    assert save_outputs(tmp_path, run, dense_of(run), config, "a wall", True) == []
+    run, folder = written
     gaussians = run.state.map.gaussians
     valid = np.asarray(gaussians.valid)
-    rows = vertices(tmp_path / "map.ply")
+    rows = vertices(folder / "map.ply")
     assert len(rows["x"]) == valid.sum() < len(valid)
     found = np.stack([np.ravel(rows[axis]) for axis in "xyz"], axis=1)
     np.testing.assert_array_equal(found, np.asarray(gaussians.means)[valid])
@@ -74,58 +84,53 @@ def test_map_ply_holds_the_gaussians_in_use_as_they_are_drawn(tmp_path):
     np.testing.assert_allclose(20.0 * red, found[:, 0], atol=1e-5)
 
 
-def test_points_ply_is_the_dense_cloud_with_its_classes(tmp_path):
-    run = finished()
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
-    rows, dense = vertices(tmp_path / "points.ply"), dense_of(run)
+def test_points_ply_is_the_dense_cloud_with_its_classes(written):
+    _, folder = written
+    rows, dense = vertices(folder / "points.ply"), dense_map()
     np.testing.assert_allclose(np.stack([np.ravel(rows[axis]) for axis in "xyz"], 1), dense.cloud.points, rtol=1e-6)
     np.testing.assert_array_equal(np.ravel(rows["nz"]), -1.0)
     np.testing.assert_array_equal(np.ravel(rows["red"]), [255, 0])
     np.testing.assert_array_equal(np.ravel(rows["label"]), [1, -1])
-    assert b"comment label 0 floor\ncomment label 1 wall\n" in (tmp_path / "points.ply").read_bytes()
-    save_outputs(tmp_path, run, DenseMap(dense.cloud), densify_config(), "a wall", True)
-    assert "label" not in vertices(tmp_path / "points.ply").dtype.names
+    assert b"comment label 0 floor\ncomment label 1 wall\n" in (folder / "points.ply").read_bytes()
 
 
-def test_the_mesh_is_the_wall_seen_from_the_cameras_side(tmp_path):
-    run = finished()
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
-    mesh = trimesh.load(tmp_path / "mesh.ply")
+def test_the_mesh_is_the_wall_seen_from_the_cameras_side(written):
+    mesh = trimesh.load(written[1] / "mesh.ply")
     np.testing.assert_allclose(mesh.vertices[:, 2], 2.0, atol=0.02)
     towards = np.average(mesh.face_normals[:, 2], weights=mesh.area_faces)
     assert towards < -0.95, f"the faces' mean normal is {towards:+.2f} along the view"
     assert 1.0 < mesh.area < 3.0  # 1 m x 2 m, and its rim
 
 
-def test_what_could_not_be_made_is_named(tmp_path):
+def test_every_file_that_a_run_writes_is_known_as_an_output(written):
+    names = {"map.ply", "points.ply", "mesh.ply", "overview.png", "trajectory.txt", "map.npz"}
+    assert {path.name for path in written[1].iterdir()} == names <= set(OUTPUTS)
+
+
+def test_what_could_not_be_made_is_named_and_without_classes_or_truth_there_are_none(written, tmp_path):
     run = finished(gaussians=wall(0.0, 0.2))  # 40 Gaussians
-    (note,) = save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
+    (note,) = save_outputs(tmp_path, run, DenseMap(dense_map().cloud), densify_config(), "a wall", True)
     assert note.startswith("no mesh.ply: 40 points") and not (tmp_path / "mesh.ply").exists()
     assert {path.name for path in tmp_path.iterdir()} == {"map.ply", "points.ply", "overview.png"}
+    assert "label" not in vertices(tmp_path / "points.ply").dtype.names
+    for folder, is_known in ((written[1], True), (tmp_path, False)):
+        image = cv2.imread(str(folder / "overview.png"))[..., ::-1].astype(int)
+        estimate, truth = (np.all(np.abs(image - color) <= 8, axis=-1).mean() for color in (ESTIMATE, TRUTH))
+        assert estimate > 1e-4 and (truth > 1e-4) == is_known
 
 
-@pytest.mark.parametrize("num_unknown", [0, 1, NUM_FRAMES])
-def test_the_overview_shows_the_true_path_where_it_is_known(num_unknown, tmp_path):
-    import cv2
-
-    truth = [None] * num_unknown + [*poses_along(np.linspace(0.0, 1.0, NUM_FRAMES) + 0.3)][num_unknown:]
-    run = finished(truth)
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
-    image = cv2.imread(str(tmp_path / "overview.png"))[..., ::-1].astype(int)
-    share = {
-        name: np.all(np.abs(image - color) <= 8, axis=-1).mean()
-        for name, color in (("estimate", (228, 87, 46)), ("truth", (27, 153, 139)))
-    }
-    assert share["estimate"] > 1e-4 and (share["truth"] > 1e-4) == (num_unknown < NUM_FRAMES)
+@pytest.fixture
+def drawn(monkeypatch):
+    """What the overviews that are written now show as paths."""
+    paths = []
+    monkeypatch.setattr("emgs_jax.report.overview.draw_overview", lambda path, cloud, shown, *_: paths.append(shown))
+    monkeypatch.setattr("emgs_jax.report.run_files.save_mesh_ply", lambda *_: None)
+    return paths
 
 
 @pytest.mark.parametrize("with_scale", [True, False])
-def test_the_overview_shows_the_true_path_where_the_estimate_fits_it_best(with_scale, tmp_path, monkeypatch):
+def test_the_overview_shows_the_true_path_where_the_estimate_fits_it_best(with_scale, tmp_path, drawn):
     """A map in another frame and unit is not drawn as one that drifts."""
-    from emgs_jax.report import overview
-
-    drawn = []
-    monkeypatch.setattr(overview, "draw_overview", lambda path, cloud, paths, *rest: drawn.append(paths))
     unknown, turned = 2, np.eye(4)
     turned[:3, :3] = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     bent = poses_along(np.linspace(0.0, 1.0, NUM_FRAMES))
@@ -134,7 +139,7 @@ def test_the_overview_shows_the_true_path_where_the_estimate_fits_it_best(with_s
     truth[:, :3, 3] = 2.0 * truth[:, :3, 3] + [5.0, -3.0, 1.0]
     run = finished([None if row == unknown else pose for row, pose in enumerate(truth)])
     run.poses[:] = bent
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", with_scale)
+    save_outputs(tmp_path, run, dense_map(), densify_config(), "a wall", with_scale)
     (paths,) = drawn
     known = np.arange(NUM_FRAMES) != unknown
     middle = bent[known, :3, 3].mean(0)
@@ -144,19 +149,15 @@ def test_the_overview_shows_the_true_path_where_the_estimate_fits_it_best(with_s
     assert np.isnan(paths.truth[unknown]).all()
 
 
-def test_the_overview_shows_loops_between_the_frames_of_the_back_end_and_the_path_before(tmp_path, monkeypatch):
-    from emgs_jax.report import overview
-
-    drawn = []
-    monkeypatch.setattr(overview, "draw_overview", lambda path, cloud, paths, *rest: drawn.append(paths))
+def test_the_overview_shows_loops_between_the_frames_of_the_back_end_and_the_path_before(tmp_path, drawn):
     run, later = finished(), poses_along(np.full(NUM_FRAMES - 2, 5.0))
     loops = [SimpleNamespace(a=3, b=5), SimpleNamespace(a=1, b=5)]  # the first three nodes are a saved map's
     poses = [np.eye(4)] * 3 + [*later]
     online = [pose + 1.0 for pose in poses]
     run.back_end = SimpleNamespace(accepted=loops, closures=[None], poses=poses, online=online, first=3)
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
+    save_outputs(tmp_path, run, dense_map(), densify_config(), "a wall", True)
     run.back_end.closures = []  # as where frames are only located in a saved map: its loops are there, and no node
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
+    save_outputs(tmp_path, run, dense_map(), densify_config(), "a wall", True)
     (paths, without) = drawn
     assert paths.loops == ((2, 4),) and without.loops == () and without.online is None
     np.testing.assert_array_equal(paths.online, later + 1.0)
@@ -174,10 +175,3 @@ def test_a_new_run_never_lies_beside_the_outputs_of_another(tmp_path):
         assert {path.name for path in (tmp_path / target).iterdir()} == set(OUTPUTS)
         assert {path.read_text() for path in (tmp_path / target).iterdir()} == {text}
         assert not any((tmp_path / name).exists() for name in OUTPUTS) and (tmp_path / "notes.txt").exists()
-
-
-def test_every_file_that_a_run_writes_is_known_as_an_output(tmp_path):
-    run = finished()
-    save_progress(tmp_path, run)
-    save_outputs(tmp_path, run, dense_of(run), densify_config(), "a wall", True)
-    assert {path.name for path in tmp_path.iterdir()} <= set(OUTPUTS)

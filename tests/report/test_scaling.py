@@ -3,10 +3,12 @@
 import json
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from hand_run import random_poses
+from omegaconf import OmegaConf
 from written_run import written_run
 
 from emgs_jax import load_map
@@ -38,8 +40,13 @@ def run(tmp_path):
     return read_run(folder)
 
 
-def words(run, *overrides):
-    return configure.compose(f"folder='{run.folder}'", *overrides, name="export")
+@cache
+def composed():
+    return configure.compose("folder=nowhere", name="export")
+
+
+def exported(run, **values):
+    return export_run(OmegaConf.merge(composed(), {"folder": str(run.folder), **values}))
 
 
 def test_poses_map_and_clouds_grow_together_and_everything_else_stays(run, tmp_path):
@@ -59,13 +66,7 @@ def test_poses_map_and_clouds_grow_together_and_everything_else_stays(run, tmp_p
     online = [load_trajectory_tum(at / "trajectory_online.txt")[1] for at in (run.folder, folder)]
     np.testing.assert_allclose(online[1][:, :3, 3], FACTOR * online[0][:, :3, 3], atol=1e-8)
 
-
-def test_what_a_camera_sees_of_the_cloud_does_not_change(run, tmp_path):
-    """A scale shows in no image: pixels of all points from all cameras are the same."""
-    folder = tmp_path / "new"
-    folder.mkdir()
-    write_scaled(run, folder, FACTOR)
-
+    # A scale shows in no image: pixels of all points from all cameras are the same.
     def pixels(at):
         cloud, (_, poses) = read_vertices(at / "points.ply"), load_trajectory_tum(at / "trajectory.txt")
         points = np.stack([cloud[name] for name in "xyz"], 1).astype(float)
@@ -103,7 +104,7 @@ def test_a_known_length_between_two_cameras_becomes_that_length(run):
     factor = factor_of(run, [1, 5, 3.4])
     a, b = run.poses[1][:3, 3], run.poses[5][:3, 3]
     assert math.dist(factor * a, factor * b) == pytest.approx(3.4)
-    export_run(words(run, "length=[1,5,3.4]", "formats=[frustums]"))
+    exported(run, length=[1, 5, 3.4], formats=["frustums"])
     _, poses = load_trajectory_tum(run.folder / "scaled" / "trajectory.txt")
     assert math.dist(poses[1][:3, 3], poses[5][:3, 3]) == pytest.approx(3.4, abs=1e-7)
     assert json.loads((run.folder / "scaled" / "scale.json").read_text())["factor"] == pytest.approx(factor)
@@ -112,7 +113,7 @@ def test_a_known_length_between_two_cameras_becomes_that_length(run):
 
 def test_exports_are_in_the_new_unit_and_the_run_stays(run):
     before = {path.name: path.read_bytes() for path in run.folder.iterdir()}
-    export_run(words(run, f"scale={FACTOR}", "formats=[nerfstudio]"))
+    exported(run, scale=FACTOR, formats=["nerfstudio"])
     frames = json.loads((run.folder / "scaled" / "nerfstudio" / "transforms.json").read_text())["frames"]
     centers = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
     np.testing.assert_allclose(centers, FACTOR * np.delete(run.poses, 3, 0)[:, :3, 3], atol=1e-7)
@@ -120,42 +121,38 @@ def test_exports_are_in_the_new_unit_and_the_run_stays(run):
     np.testing.assert_allclose(cloud["x"], FACTOR * read_vertices(run.folder / "points.ply")["x"], rtol=1e-6)
     assert {name: (run.folder / name).read_bytes() for name in before} == before
     with pytest.raises(ValueError, match="scaled is there already: remove it, or write elsewhere"):
-        export_run(words(run, "scale=2", "formats=[]"))
-    export_run(words(run, "scale=2", "formats=[]", f"out='{run.folder / 'twice'}'"))
+        exported(run, scale=2, formats=[])
+    exported(run, scale=2, formats=[], out=str(run.folder / "twice"))
     assert not (run.folder / "twice" / "nerfstudio").exists()
 
 
 def test_a_failed_copy_leaves_nothing(run):
     (run.folder / "points.ply").write_bytes((run.folder / "points.ply").read_bytes()[:-1])
     with pytest.raises(ValueError, match="points.ply has .* bytes after its header"):
-        export_run(words(run, "scale=2", "formats=[]"))
+        exported(run, scale=2, formats=[])
     assert not [path for path in run.folder.iterdir() if "scaled" in path.name]
 
 
 @pytest.mark.parametrize(
-    "override, message",
+    ("values", "message"),
     [
-        ("length=[1,5]", r"length must be \[frame,frame,metres\]"),
-        ("length=[1,5,0]", r"length must be \[frame,frame,metres\]"),
-        ("length=[1.5,5,2]", r"length must be \[frame,frame,metres\]"),
-        ("length=[1,9,2]", "frame 9 is none of the run's"),
-        ("length=[1,3,2]", "frame 3 is lost, so its pose is a guess"),
-        ("length=[1,1,2]", "these two cameras are at one place"),
-        ("scale=0", "scale must be .*, got 0"),
-        ("scale=nan", "scale must be"),
-        ("scale=-1", "scale must be"),
-        ("scale=inf", "scale must be"),
+        ({"length": [1, 5]}, r"length must be \[frame,frame,metres\]"),
+        ({"length": [1, 5, 0]}, r"length must be \[frame,frame,metres\]"),
+        ({"length": [1.5, 5, 2]}, r"length must be \[frame,frame,metres\]"),
+        ({"length": [1, 9, 2]}, "frame 9 is none of the run's"),
+        ({"length": [1, 3, 2]}, "frame 3 is lost, so its pose is a guess"),
+        ({"length": [1, 1, 2]}, "these two cameras are at one place"),
+        ({"scale": 0}, "scale must be .*, got 0"),
+        ({"scale": math.nan}, "scale must be"),
+        ({"scale": -1}, "scale must be"),
+        ({"scale": math.inf}, "scale must be"),
+        ({"scale": 2, "length": [1, 5, 2]}, "give one of them"),
     ],
 )
-def test_a_length_or_scale_that_says_nothing_is_refused(run, override, message):
+def test_a_length_or_scale_that_says_nothing_is_refused(run, values, message):
     with pytest.raises(ValueError, match=message):
-        export_run(words(run, override))
+        exported(run, **values)
     assert not (run.folder / "scaled").exists()
-
-
-def test_scale_and_length_together_are_refused(run):
-    with pytest.raises(ValueError, match="give one of them"):
-        export_run(words(run, "scale=2", "length=[1,5,2]"))
 
 
 def test_frames_are_counted_as_frames_jsonl_counts_them(run):

@@ -82,13 +82,9 @@ def test_brighter_is_better_in_the_picture_of_either_kind_of_metric(tmp_path):
         ys, xs = np.nonzero(colored)
         top, bottom, left, right = ys.min(), ys.max(), xs.min(), xs.max()
         height, width = (bottom - top) // 8, (right - left) // 12
-        light[key] = [
-            image[rows_, columns].mean()
-            for rows_, columns in (
-                (slice(top + 2, top + height), slice(left + 2, left + width)),
-                (slice(bottom - height, bottom - 2), slice(right - width, right - 2)),
-            )
-        ]
+        first = image[top + 2 : top + height, left + 2 : left + width]
+        last = image[bottom - height : bottom - 2, right - width : right - 2]
+        light[key] = first.mean(), last.mean()
     assert light[ATE][0] > light[ATE][1] + 20 and light[F1][1] > light[F1][0] + 20
 
 

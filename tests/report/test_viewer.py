@@ -1,5 +1,6 @@
 """emgs view: what is asked is answered right (hand-made cosines and rays), and in Chromium the words reach the map."""
 
+import contextlib
 import io
 import socket
 import sys
@@ -8,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browser import MISSING, browser
+from omegaconf import OmegaConf
 from PIL import Image
 from written_run import CLASSES, two_walls, written_run
 
@@ -138,44 +139,48 @@ def test_a_click_tells_the_numbers_of_the_near_wall(viewer):
     assert "There is no Gaussian." in viewer.number.content
 
 
-def test_names_from_a_file_are_text_and_no_markup(tmp_path):
+@contextlib.contextmanager
+def looked_for(run, words: str):
+    """A viewer of its own in which words are looked for."""
     pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
-    folder = written_run(tmp_path / "run")
-    found = read_run(folder)
-    found.frames[0]["reason"] = "<img src=x onerror=alert(1)>"
-    hostile = replace(found, text=found.text.__class__(("<script>", "b"), found.text.vectors, (), {}))
-    viewer = Viewer(shown(hostile), free_port())
+    viewer = Viewer(shown(run), free_port())
     try:
-        viewer.words.value = "<script>"
+        viewer.words.value = words
         viewer.recolor()
-        said = viewer.answer.content + viewer.facts.content + viewer._known()
-        assert "<script" not in said and "<img" not in said and "&lt;script&gt;" in said
+        yield viewer
     finally:
         viewer.stop()
+
+
+def test_names_from_a_file_are_text_and_no_markup(tmp_path):
+    found = read_run(written_run(tmp_path))
+    found.frames[0]["reason"] = "<img src=x onerror=alert(1)>"
+    text = replace(found.text, names=("<script>", "b"))
+    with looked_for(replace(found, text=text), "<script>") as viewer:
+        said = [viewer.answer.content, viewer.facts.content]
+        viewer.words.value = ""
+        viewer.recolor()
+        said.append(viewer.answer.content)  # the words that there are
+        assert not any("<script" in words or "<img" in words for words in said)
+        assert "&lt;script&gt;" in said[0] and "&lt;img" in said[1] and "&lt;script&gt;" in said[2]
 
 
 def test_a_map_without_features_says_what_a_text_needs(tmp_path):
-    pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
-    folder = written_run(tmp_path / "run")
+    folder = written_run(tmp_path)
     (folder / "text.npz").unlink()
-    viewer = Viewer(shown(read_run(folder)), free_port())
-    try:
-        viewer.words.value = "sofa"
-        viewer.recolor()
+    with looked_for(read_run(folder), "sofa") as viewer:
         assert "no features" in viewer.answer.content and "features=dinov3_text" in viewer.answer.content
         assert "class" not in viewer.layer.options
-    finally:
-        viewer.stop()
 
 
-def test_a_taken_port_an_incomplete_run_and_a_missing_extra_are_clear(run, tmp_path, monkeypatch):
-    def config(*words):
-        return configure.compose(*words, name="view")
+def test_a_taken_port_and_a_missing_extra_are_clear(run, monkeypatch):
+    config = configure.compose(f"folder='{run.folder}'", name="view")
+
+    def with_values(**values):
+        return OmegaConf.merge(config, values)
 
     with pytest.raises(ValueError, match="port must be a whole number from 1 to 65535"):
-        view(config(f"folder='{run.folder}'", "port=0"))
-    with pytest.raises(ValueError, match=r"holds no finished run: it lacks metrics.json"):
-        view(config(f"folder='{tmp_path}'"))
+        view(with_values(port=0))
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "viser", None)
         with pytest.raises(ValueError, match=r'pip install "emgs_jax\[viewer\]"'):
@@ -183,10 +188,9 @@ def test_a_taken_port_an_incomplete_run_and_a_missing_extra_are_clear(run, tmp_p
     pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
     with socket.socket() as taken:
         taken.bind((HOST, 0))
-        taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(ValueError, match=f"port={port} is taken .*port={port + 1}"):
-            view(config(f"folder='{run.folder}'", f"port={port}"))
+            view(with_values(port=port))
 
 
 def wait(condition, what, timeout=120.0):
@@ -196,42 +200,42 @@ def wait(condition, what, timeout=120.0):
         time.sleep(0.2)
 
 
-@pytest.mark.skipif(MISSING is not None, reason=str(MISSING))
-def test_in_a_browser_typing_a_word_recolours_and_nothing_is_asked_of_other_machines(viewer):
+def test_in_a_browser_typing_a_word_recolours_and_nothing_is_asked_of_other_machines(viewer, chromium):
+    page = chromium.fresh()
+
     def picture():
-        return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+        image = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+        return image[:, :700]  # left of the panel
 
     def settled():
-        """Two pictures alike: the map fades in."""
-        before = picture()
-        for _ in range(40):
-            time.sleep(1.0)
-            after = picture()
-            if np.abs(after - before).max() < 8:
-                break
-            before = after
-        return after[:, :700]  # left of the panel
+        """A map, in two pictures alike: it fades in."""
+        last = [picture()]
 
-    with browser() as page:
-        page.visit(viewer.address)
-        wait(viewer.server.get_clients, "no browser has connected")
-        wait(lambda: page.run("return document.querySelectorAll('canvas, input').length") > 2, "no page")
-        before = settled()
-        assert len(np.unique((before // 16).reshape(-1, 3), axis=0)) > 20, "a map is drawn"
-        x, y = page.run(  # the first box that is seen
-            "const shown = [...document.querySelectorAll('input')].map(e => e.getBoundingClientRect());"
-            "const b = shown.find(e => e.width > 0); return [b.x + b.width / 2, b.y + b.height / 2]"
-        )
-        page.pointer(("down", x, y), ("up", x, y))
-        page.type("sof")  # not to its end
-        wait(lambda: viewer.words.value == "sof", "the box does not reach the program")
-        wait(lambda: f"Gaussians: {CLASSES[1]}" in viewer.answer.content, "no answer")
-        after = settled()
-        assert (np.abs(after - before).max(-1) > 40).mean() > 0.05, "the picture is of other colours"
-        assert CLASSES[1] in page.run("return document.body.innerText")
-        assert "Share" not in page.run("return document.body.innerText")
-        asked = {address.split("/")[2] for address in page.requests() if address.startswith(("http", "ws"))}
-        assert asked == {viewer.address.removeprefix("http://")}
-        wrong = [entry["message"] for entry in page.log("browser") if entry["level"] == "SEVERE"]
-        # viser 1.1.1 says the first of any splats.
-        assert not [message for message in wrong if "computeBoundingSphere" not in message], wrong
+        def is_settled():
+            last.append(picture())
+            is_drawn = len(np.unique((last[-1] // 16).reshape(-1, 3), axis=0)) > 20
+            return is_drawn and np.abs(last[-1] - last[-2]).max() < 8
+
+        wait(is_settled, "no map is drawn")
+        return last[-1]
+
+    page.visit(viewer.address)
+    wait(viewer.server.get_clients, "no browser has connected")
+    wait(lambda: page.run("return document.querySelectorAll('canvas, input').length") > 2, "no page")
+    before = settled()
+    x, y = page.run(  # the first box that is seen
+        "const shown = [...document.querySelectorAll('input')].map(e => e.getBoundingClientRect());"
+        "const b = shown.find(e => e.width > 0); return [b.x + b.width / 2, b.y + b.height / 2]"
+    )
+    page.pointer(("down", x, y), ("up", x, y))
+    page.type("sof")  # not to its end
+    wait(lambda: viewer.words.value == "sof", "the box does not reach the program")
+    wait(lambda: f"Gaussians: {CLASSES[1]}" in viewer.answer.content, "no answer")
+    wait(lambda: (np.abs(picture() - before).max(-1) > 40).mean() > 0.05, "the picture is not of other colours")
+    wait(lambda: CLASSES[1] in page.run("return document.body.innerText"), "the page does not say what was found")
+    assert "Share" not in page.run("return document.body.innerText")
+    asked = {address.split("/")[2] for address in page.requests() if address.startswith(("http", "ws"))}
+    assert asked == {viewer.address.removeprefix("http://")}
+    # viser 1.1.1 says the first of any splats.
+    assert not [message for message in page.errors() if "computeBoundingSphere" not in message]
+    page.fresh()

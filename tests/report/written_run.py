@@ -1,7 +1,9 @@
 """The folder of a run that is made by hand: two walls, cameras that look at them, and what a run says of itself."""
 
 import json
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax.numpy as jnp
@@ -43,44 +45,50 @@ def two_walls() -> Gaussians:
     )
 
 
-def written_run(folder: Path, *, has_truth: bool = True, sequence: str = "room", **metrics: Any) -> Path:
-    """Write what a run of six frames writes, one of them lost, with a back end and classes; returns the folder."""
-    folder.mkdir(parents=True, exist_ok=True)
+@cache
+def _settings() -> tuple[dict[str, Any], str]:
+    """Config and fingerprint of the room that the run says it is of; composed once."""
+    composed = compose("render.tile_capacity=512")
+    return OmegaConf.to_container(composed, resolve=True), build_dataset(composed).fingerprint()
+
+
+@cache
+def _files(has_truth: bool) -> dict[str, bytes]:
+    """All files but metrics.json by name; made once."""
     poses = poses_along(np.linspace(0.0, 0.5, len(STATUSES)))
     truth = poses_along(np.linspace(0.0, 0.55, len(STATUSES)))
     truth[:, 1, 3] = [0.0, 0.02, 0.0, 0.01, 0.0, 0.03]
     run = hand_run(poses, poses, list(truth) if has_truth else [None] * len(poses), gaussians=two_walls())
-    save_progress(folder, run)
-    times = [record.timestamp for record in run.records]
-    save_trajectory_tum(folder / "trajectory_online.txt", times[1:], poses_along(np.linspace(0.1, 0.7, 5)))
-    save_text(folder / "text.npz", TextEmbeddings(CLASSES, np.eye(2, dtype=np.float32), (), {"prior": "simulated"}))
-    with FrameLog(folder / "frames.jsonl") as log:
-        for row, record in enumerate(run.records):
-            line = {"index": row, "name": record.name, "status": record.status, "reason": None, "inliers": 100 * row}
-            known = {"true_pose": to_tum(truth[row]) if has_truth else None, "raw_pose": to_tum(truth[row] * 1.0)}
-            log.append(line | known | {"pose": to_tum(poses[row]), "seconds": 0.25, "new": row} | SAME)
-    loops = [{"frame": 5, "other": 0, "outcome": "accepted"}]
-    loops.append({"frame": 4, "other": 1, "outcome": "refused", "gate": "hull", "measured": 0.01})
-    write_json(folder / "loops.json", loops)
-    composed = compose("render.tile_capacity=512")
-    config = OmegaConf.to_container(composed, resolve=True)
-    block = {
-        "format": 1,
-        "protocol": "paper/sim3",
-        "simulated": True,
-        "prior": {"name": "simulated", "settings": {}},
-        "data": {
-            "name": "synthetic",
-            "sequence": sequence,
-            "fingerprint": build_dataset(composed).fingerprint(),
-            "camera": {"size": [640, 480], "intrinsics": [500.0, 500.0, 320.0, 240.0]},  # of the images on disk
-            "frames": {"size": SIZE, "intrinsics": INTRINSICS},
-        },
-        "git": None,
-        "versions": {"emgs_jax": "0"},
-        "device": {"kind": "cpu"},
-        "config": config,
-    }
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        save_progress(folder, run)
+        times = [record.timestamp for record in run.records]
+        save_trajectory_tum(folder / "trajectory_online.txt", times[1:], poses_along(np.linspace(0.1, 0.7, 5)))
+        save_text(folder / "text.npz", TextEmbeddings(CLASSES, np.eye(2, dtype=np.float32), (), {"prior": "simulated"}))
+        with FrameLog(folder / "frames.jsonl") as log:
+            for row, record in enumerate(run.records):
+                line = {"index": row, "name": record.name, "status": record.status, "reason": None}
+                known = {"true_pose": to_tum(truth[row]) if has_truth else None, "raw_pose": to_tum(truth[row] * 1.0)}
+                known |= {"pose": to_tum(poses[row]), "seconds": 0.25, "new": row, "inliers": 100 * row}
+                log.append(line | known | SAME)
+        loops = [{"frame": 5, "other": 0, "outcome": "accepted"}]
+        loops.append({"frame": 4, "other": 1, "outcome": "refused", "gate": "hull", "measured": 0.01})
+        write_json(folder / "loops.json", loops)
+        return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def written_run(folder: Path, *, has_truth: bool = True, sequence: str = "room", **metrics: Any) -> Path:
+    """Write what a run of six frames writes, one of them lost, with a back end and classes; returns the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, content in _files(has_truth).items():
+        (folder / name).write_bytes(content)
+    config, fingerprint = _settings()
+    data = {"name": "synthetic", "sequence": sequence, "fingerprint": fingerprint}
+    data["camera"] = {"size": [640, 480], "intrinsics": [500.0, 500.0, 320.0, 240.0]}  # of the images on disk
+    data["frames"] = {"size": SIZE, "intrinsics": INTRINSICS}
+    block = {"format": 1, "protocol": "paper/sim3", "simulated": True, "git": None, "device": {"kind": "cpu"}}
+    block |= {"prior": {"name": "simulated", "settings": {}}, "versions": {"emgs_jax": "0"}}
+    block |= {"data": data, "config": config}
     errors = {"trajectory/ate_sim3_m": 0.012, "raw_prior/trajectory/ate_sim3_m": 0.03} if has_truth else {}
     (folder / "metrics.json").write_text(json.dumps(errors | metrics | {"provenance": block}))
     return folder

@@ -1,7 +1,7 @@
 """The benchmark; oracles: the slow reference for the baselines, the library for what both compute, the files."""
 
 import json
-import time
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +12,7 @@ from tiny_run import compose
 import experiments.benchmark
 from emgs_jax.render.composite import RenderConfig
 from experiments.benchmarks import baselines
-from experiments.benchmarks.comparisons import time_em, time_icp, time_render
+from experiments.benchmarks.comparisons import time_icp, time_render
 from experiments.benchmarks.data import enlarged, first_state, load
 from experiments.benchmarks.timing import Candidate, compare, interleaved, spread
 
@@ -38,15 +38,9 @@ def gaussian_arrays(count: int, seed: int) -> dict[str, np.ndarray]:
 
 
 def test_the_array_form_of_em_is_what_the_equations_say_point_by_point():
-    config = SimpleNamespace(num_neighbours=5, noise=0.0, determinant_weight=0.5, normal_weight=5.0, feature_weight=2.0)
-    config = SimpleNamespace(
-        **vars(config),
-        min_normal_cos=0.5,
-        max_mahalanobis_sq=4.0,
-        max_log_gap=8.0,
-        min_responsibility=1.0,
-        min_std=0.01,
-    )
+    weights = {"noise": 0.0, "determinant_weight": 0.5, "normal_weight": 5.0, "feature_weight": 2.0}
+    gates = {"min_normal_cos": 0.5, "max_mahalanobis_sq": 4.0, "max_log_gap": 8.0, "min_responsibility": 1.0}
+    config = SimpleNamespace(num_neighbours=5, min_std=0.01, **weights, **gates)
     g, points = gaussian_arrays(30, 0), gaussian_arrays(200, 1)
     points["points"] = points.pop("means")
     update = baselines.em(g, points, np.zeros((200, 3)), config)
@@ -83,28 +77,45 @@ def test_compositing_without_tiles_is_the_reference_pixel_by_pixel():
     assert expected.max() > 0.3
 
 
-def test_candidates_take_turns_and_a_ratio_compares_the_same_turn():
-    order = []
-
-    def wait(name: str, seconds: float) -> Candidate:
-        return Candidate(lambda: (order.append(name), time.sleep(seconds)))
-
-    timings = compare(interleaved("part", {"a": wait("a", 0.02), "b": wait("b", 0.005)}, 3), "a")
+def test_candidates_take_turns_and_a_ratio_compares_the_same_turn(monkeypatch):
+    order, clock = [], iter(np.cumsum([0, 5, 0, 1, 0, 20, 0, 5, 0, 40, 0, 5, 0, 80, 0, 5]) / 1e3)
+    monkeypatch.setattr("experiments.benchmarks.timing.time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    timings = compare(interleaved("part", {name: Candidate(partial(order.append, name)) for name in "ab"}, 3), "a")
     assert order == ["a", "b"] * 4  # the first turn does not count
-    middle, low, high = timings[1].facts["times_faster_than"]["a"]
-    assert 1.5 < low <= middle <= high and len(timings[0].seconds) == 3
+    np.testing.assert_allclose(timings[0].seconds, [0.02, 0.04, 0.08])
+    np.testing.assert_allclose(timings[1].facts["times_faster_than"]["a"], (8, 4, 16))
     assert spread([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
 
 
+def written(folder, timings) -> str:
+    """benchmark.md, after a look whether both files have every timing."""
+    about, text = json.loads((folder / "benchmark.json").read_text()), (folder / "benchmark.md").read_text()
+    assert [row["name"] for row in about["timings"]] == [timing.name for timing in timings]
+    assert all(f"| {timing.name} |" in text for timing in timings) and about["provenance"]["device"]["kind"] in text
+    assert all(len(timing.seconds) == 2 and min(timing.seconds) > 0 for timing in timings)
+    return text
+
+
 @pytest.mark.slow
-def test_em_agrees_with_numpy_and_scipy_on_the_same_points():
+def test_em_agrees_with_numpy_and_scipy_on_the_same_points_and_the_files_say_so(tmp_path):
     # Of 200, one gets a single point, and whether its 1 exceeds `min_responsibility`, 1, is a matter of rounding.
-    ours, theirs = time_em(load(benchmark_config(), thin=1), 250, 1)
+    config = benchmark_config("benchmark.num_gaussians=250", "parts=[em]")
+    ours, theirs = experiments.benchmark.benchmark(config, tmp_path)
     assert ours.facts["same_neighbours_percent"] >= 99.9 and ours.facts["responsibility_error"] <= 1e-4
     assert ours.facts["mean_error_m_999"] <= 1e-5 and ours.compile_seconds > 0 and theirs.compile_seconds is None
+    assert "same_neighbours_percent" in written(tmp_path, [ours, theirs])
 
 
-@pytest.mark.slow
+def test_what_cannot_be_timed_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="parts must be some of stages, em.*got speed"):
+        experiments.benchmark.benchmark(benchmark_config("parts=[speed]"), tmp_path)
+    with pytest.raises(ValueError, match="4 frames"):
+        load(benchmark_config("dataset.stop=3"))
+    with pytest.raises(ValueError, match="benchmark.turns is no key"):
+        benchmark_config("benchmark.turns=3")
+
+
+@pytest.mark.long
 def test_both_registrations_find_the_pose_of_exact_views():
     config = benchmark_config("prior.level=0", "slam.fit.points_per_gaussian=264", "dataset.num_frames=100")
     for timing in time_icp(load(config), (0.08, 0.04), 1):  # starts 8 cm and 2.3 degrees away
@@ -112,13 +123,13 @@ def test_both_registrations_find_the_pose_of_exact_views():
         assert timing.facts["rotation_error_deg"][0] < 0.6, timing.name
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_drawing_agrees_with_compositing_without_tiles():
     ours = time_render(load(benchmark_config("render.tile_capacity=256"), thin=1), 1, 200, 1)[0]
     assert ours.facts["tile_overflow"] == 0 and ours.facts["color_error_999"] < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_map_is_enlarged_by_copies_that_no_camera_sees():
     state, _ = first_state(load(benchmark_config()))
     count = int(state.map.gaussians.valid.sum())
@@ -129,20 +140,10 @@ def test_a_map_is_enlarged_by_copies_that_no_camera_sees():
     assert int(large.gaussians.valid.sum()) == 3 * count and large.weight.shape == (6 * count,)
 
 
-@pytest.mark.slow
-def test_the_tables_hold_every_part_and_unknown_parts_are_refused(tmp_path):
+@pytest.mark.long
+def test_the_tables_hold_every_part(tmp_path):
     sizes = ("benchmark.num_settings=[2]", "benchmark.map_sizes=[100,400]", "benchmark.image_sizes=[[64,48]]")
     timings = experiments.benchmark.benchmark(benchmark_config(*sizes, "parts=[stages,sweep,growth]"), tmp_path)
-    written = json.loads((tmp_path / "benchmark.json").read_text())
-    assert [row["name"] for row in written["timings"]] == [timing.name for timing in timings]
-    text = (tmp_path / "benchmark.md").read_text()
-    assert all(f"| {timing.name} |" in text for timing in timings) and written["provenance"]["device"]["kind"] in text
+    written(tmp_path, timings)
     names = {timing.name for timing in timings}
     assert {"E-step", "whole step", "2 settings, vmap", "64x48, 400 Gaussians"} <= names
-    assert all(len(timing.seconds) == 2 and min(timing.seconds) > 0 for timing in timings)
-    with pytest.raises(ValueError, match="parts must be some of stages, em.*got speed"):
-        experiments.benchmark.benchmark(benchmark_config("parts=[speed]"), tmp_path)
-    with pytest.raises(ValueError, match="4 frames"):
-        load(benchmark_config("dataset.stop=3"))
-    with pytest.raises(ValueError, match="benchmark.turns is no key"):
-        benchmark_config("benchmark.turns=3")

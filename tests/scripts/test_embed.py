@@ -2,34 +2,28 @@
 
 import numpy as np
 import pytest
-from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
-from hydra.errors import ConfigCompositionException
 from hydra.utils import instantiate
-from tiny_run import CONF, compose, dataset
+from tiny_run import compose, dataset
 
+from emgs_jax.running import configure
 from emgs_jax.running.configure import build_prior
 from experiments.embed import embed
 
 
 def write(path, *overrides, features="random"):
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        return embed(hydra_compose("embed", [f"features={features}", f"out={path}", *overrides]))
+    return embed(configure.compose(f"features={features}", f"out={path}", *overrides, name="embed"))
 
 
 def test_a_run_with_the_file_has_the_embeddings_of_a_run_with_the_classes(tmp_path, capsys):
     path = write(tmp_path / "new" / "text.npz", "classes=[wall,floor,chair]")
     assert "3 classes of width 16" in capsys.readouterr().out
+    assert build_prior(compose("features=random"), dataset()).feature_names == tuple(dataset().classes)
     prior = build_prior(compose("features=random", f"features.text={path}"), dataset())
     live = build_prior(compose("features=random", "features.classes=[wall,floor,chair]"), dataset())
     assert prior.feature_names == live.feature_names == ("wall", "floor", "chair")
     np.testing.assert_array_equal(prior.text_features, live.text_features)
     chosen = build_prior(compose("features=random", f"features.text={path}", "features.classes=[chair]"), dataset())
     np.testing.assert_array_equal(chosen.text_features, live.text_features[2:])
-
-
-def test_without_classes_or_a_file_the_data_sets_classes_are_embedded():
-    assert build_prior(compose("features=random"), dataset()).feature_names == tuple(dataset().classes)
 
 
 def test_a_file_of_another_width_is_refused(tmp_path):
@@ -44,11 +38,8 @@ def test_what_cannot_be_embedded_is_refused(tmp_path):
     for classes in ("[]", "[wall,wall]"):
         with pytest.raises(ValueError, match="classes must name at least one class, each once"):
             write(tmp_path / "text.npz", f"classes={classes}")
-    with (
-        pytest.raises(ConfigCompositionException, match="features"),
-        initialize_config_dir(version_base="1.3", config_dir=str(CONF)),
-    ):
-        hydra_compose("embed", ["classes=[wall]", f"out={tmp_path / 'text.npz'}"])
+    with pytest.raises(ValueError, match="features"):
+        configure.compose("classes=[wall]", f"out={tmp_path / 'text.npz'}", name="embed")
 
 
 def test_dinov2s_images_have_mapanythings_patches():

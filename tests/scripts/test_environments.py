@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from tiny_run import TINY
 
+from emgs_jax.features.text import read_text
 from emgs_jax.prior.recorded import Recorded
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -27,24 +28,35 @@ WITHOUT_JAX = """
 import runpy, sys
 for name in ("jax", "jaxlib", "equinox", "optimistix", "jaxlie"):
     sys.modules[name] = None  # an import of it fails
-script, sys.argv = sys.argv[1], sys.argv[1:]
-runpy.run_module(script, run_name="__main__")
+words, begin = sys.argv[1:], 0
+while begin < len(words):  # commands, each with its words, one after the other
+    end = words.index("then", begin)
+    sys.argv = words[begin:end]
+    runpy.run_module(sys.argv[0], run_name="__main__")
+    begin = end + 1
 """
 
 
-@pytest.mark.slow
-def test_recording_and_embedding_need_no_jax(tmp_path):
-    features = ("features=random", "features.classes=[wall,floor]")
-    python(WITHOUT_JAX, "experiments.predict", *TINY, *features, f"out={tmp_path / 'live'}")
-    recording = Recorded(tmp_path / "live")
-    assert recording.provenance.name == "simulated+random" and recording.feature_names == ("wall", "floor")
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """What three commands write without JAX: a recording, a recording of that, and embeddings."""
+    folder = tmp_path_factory.mktemp("recorded")
+    replay = ("prior=recorded", f"prior.folder={folder / 'live'}", f"out={folder / 'again'}")
+    words = "experiments.predict", *TINY, "features=random", "features.classes=[wall,floor]", f"out={folder / 'live'}"
     # A recording of a recording: the same with a prior that is neither simulated nor a network.
-    replay = ("prior=recorded", f"prior.folder={tmp_path / 'live'}", f"out={tmp_path / 'again'}")
-    python(WITHOUT_JAX, "experiments.predict", *TINY, *replay)
-    for path in (tmp_path / "live").iterdir():
-        assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes(), path.name
-    python(WITHOUT_JAX, "experiments.embed", "features=random", "classes=[lamp]", f"out={tmp_path / 'text.npz'}")
-    assert (tmp_path / "text.npz").exists()
+    again = "experiments.predict", *TINY, *replay
+    text = "experiments.embed", "features=random", "classes=[lamp]", f"out={folder / 'text.npz'}"
+    python(WITHOUT_JAX, *words, "then", *again, "then", *text, "then")
+    return folder
+
+
+@pytest.mark.slow
+def test_recording_and_embedding_need_no_jax(recorded):
+    recording = Recorded(recorded / "live")
+    assert recording.provenance.name == "simulated+random" and recording.feature_names == ("wall", "floor")
+    for path in (recorded / "live").iterdir():
+        assert path.read_bytes() == (recorded / "again" / path.name).read_bytes(), path.name
+    assert read_text(recorded / "text.npz").names == ("lamp",)
 
 
 MAPPING = """
@@ -69,15 +81,11 @@ print([name for name in sys.modules if name.split(".")[0] in ("torch", "transfor
 
 
 @pytest.mark.slow
-def test_mapping_a_recording_imports_no_pytorch(tmp_path):
+def test_mapping_a_recording_imports_no_pytorch(recorded, tmp_path):
     """Packages of these names that can be imported stand in the way, so that an import would be seen anywhere."""
     for name in ("torch", "transformers"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").touch()
-    program = "import runpy, sys; sys.argv = sys.argv[1:]; runpy.run_module(sys.argv[0], run_name='__main__')"
-    python(program, "experiments.predict", *TINY, "features=random", f"out={tmp_path / 'recording'}")
-    text = ("experiments.embed", "features=random", "classes=[lamp]", f"out={tmp_path / 'text.npz'}")
-    python(program, *text)
-    replay = ("prior=recorded", f"prior.folder={tmp_path / 'recording'}", f"features.text={tmp_path / 'text.npz'}")
+    replay = ("prior=recorded", f"prior.folder={recorded / 'live'}", f"features.text={recorded / 'text.npz'}")
     said = python(MAPPING, *TINY, *replay, path=tmp_path)
     assert said.splitlines() == ["features 16 inferences 4", "[]"]

@@ -2,12 +2,11 @@
 
 import csv
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 
-import hydra
+import own_process
 import pytest
 import yaml
 from hydra.core.hydra_config import HydraConfig
@@ -20,10 +19,16 @@ from emgs_jax.io.files import write_json
 from emgs_jax.report.gate import read_gate
 from emgs_jax.report.provenance import RESULT_FORMAT
 from emgs_jax.report.results import METRICS_FILE
-from emgs_jax.running.configure import compose
+from emgs_jax.running.configure import compose, groups
 from experiments.command import clear_errors
 
-ENVIRONMENT = os.environ | {"JAX_PLATFORMS": "cpu"}
+
+def composed(*words: str) -> dict:
+    return OmegaConf.to_container(compose(*words, name="evaluate"), resolve=True, throw_on_missing=True)
+
+
+def jobs_of(*words: str) -> list:
+    return list(experiments.evaluate.plan(composed(*words)))
 
 
 @pytest.fixture
@@ -46,17 +51,18 @@ def evaluate(tmp_path, monkeypatch):
     def evaluation(*overrides):
         evaluation.runs.clear()
         rooms = "suite.data.synthetic.sequences=[0,1]"
-        with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-            config = hydra.compose("evaluate", ["suite=smoke", rooms, f"out={tmp_path / 'out'}", *overrides])
-            return experiments.evaluate.evaluate(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+        words = "suite=smoke", rooms, f"out={tmp_path / 'out'}", *overrides
+        return experiments.evaluate.evaluate(composed(*words))
 
     evaluation.runs, evaluation.broken, evaluation.out = [], {}, tmp_path / "out"
     monkeypatch.setattr(experiments.evaluate, "run", run)
     return evaluation
 
 
-def test_every_sequence_is_run_with_every_seed_and_variant(evaluate):
-    assert evaluate("seeds=[0,2]", "+variants.wide={slam.window_size:7}") == []
+def test_every_sequence_is_run_with_every_seed_and_variant_and_what_is_finished_is_skipped(evaluate):
+    """Results that the command does not name stay, and never enter its tables: they may have other settings."""
+    wide = "+variants.wide={slam.window_size:7}"
+    assert evaluate("seeds=[0,2]", wide) == []
     assert evaluate.runs == [(0, 0), (0, 2), (1, 0), (1, 2)] * 2
     configs = {
         path.relative_to(evaluate.out).parent.as_posix(): json.loads(path.read_text())["provenance"]["config"]
@@ -68,15 +74,32 @@ def test_every_sequence_is_run_with_every_seed_and_variant(evaluate):
         for variant, size in (("default", 4), ("wide", 7))
         for seed in (0, 2)
     }
+    kept = evaluate.out / "synthetic/0/default/0" / METRICS_FILE
+    before = kept.read_bytes()
+    assert evaluate("seeds=[0,1]") == [] and evaluate.runs == [(0, 1), (1, 1)] and kept.read_bytes() == before
+    lines = list(csv.DictReader((evaluate.out / "results.csv").open()))
+    assert {(line["seed"], line["variant"]) for line in lines} == {("0", "default"), ("1", "default")}
+    with pytest.raises(ValueError, match=r"window_size was 4, now 7.*\+variants.NAME"):
+        evaluate("seeds=[0,3]", 'overrides=["slam.window_size=7"]')
+    assert evaluate.runs == []
+    kept.write_bytes(before.replace(b'"format": %d' % RESULT_FORMAT, b'"format": -1'))
+    with pytest.raises(ValueError, match="written by another version"):
+        evaluate("seeds=[0,3]")
+    assert evaluate.runs == []
 
 
-def test_what_is_finished_is_skipped_and_the_rest_is_run(evaluate):
-    evaluate("seeds=[0]")
-    kept = (evaluate.out / "synthetic/0/default/0" / METRICS_FILE).read_bytes()
-    assert evaluate("seeds=[0,1]") == []
-    assert evaluate.runs == [(0, 1), (1, 1)]
-    assert (evaluate.out / "synthetic/0/default/0" / METRICS_FILE).read_bytes() == kept
-    assert evaluate("seeds=[0,1]") == [] and evaluate.runs == []
+def test_the_shards_do_every_job_once_and_are_parts_of_a_whole_and_no_gate(evaluate):
+    """One after the other, so that each sees other jobs finished: what is whose must not depend on it."""
+    done = []
+    for part in (1, 2, 3):
+        assert evaluate("seeds=[0,1]", f"shard={part}/3") == []
+        done += evaluate.runs
+    assert done == [(0, 0), (0, 1), (1, 0), (1, 1)]
+    for wrong in ("0/2", "3/2", "half"):
+        with pytest.raises(ValueError, match="shard must be n/m"):
+            evaluate(f"shard={wrong}")
+    with pytest.raises(ValueError, match="run once more without shard"):
+        evaluate("shard=1/2", "gate=some.yaml")
 
 
 def test_a_job_that_fails_does_not_stop_the_others_and_is_named_at_the_end(evaluate, capsys):
@@ -107,39 +130,6 @@ def test_an_interrupted_evaluation_has_the_tables_of_what_is_finished_and_resume
     assert evaluate("seeds=[0,1]") == [] and evaluate.runs == [(1, 0), (1, 1)]
 
 
-def test_the_shards_do_every_job_once(evaluate):
-    """One after the other, so that each sees other jobs finished: what is whose must not depend on it."""
-    done = []
-    for part in (1, 2, 3):
-        assert evaluate("seeds=[0,1]", f"shard={part}/3") == []
-        done += evaluate.runs
-    assert done == [(0, 0), (0, 1), (1, 0), (1, 1)]
-
-
-def test_a_shard_is_a_part_of_a_whole_and_no_gate(evaluate):
-    for wrong in ("0/2", "3/2", "half"):
-        with pytest.raises(ValueError, match="shard must be n/m"):
-            evaluate(f"shard={wrong}")
-    with pytest.raises(ValueError, match="run once more without shard"):
-        evaluate("shard=1/2", "gate=some.yaml")
-
-
-def test_other_settings_never_replace_a_finished_result_and_nothing_runs(evaluate):
-    evaluate("seeds=[0]")
-    with pytest.raises(ValueError, match=r"window_size was 4, now 7.*\+variants.NAME"):
-        evaluate("seeds=[0,1]", 'overrides=["slam.window_size=7"]')
-    assert evaluate.runs == []
-
-
-def test_results_that_the_command_does_not_name_stay_but_never_enter_its_tables(evaluate):
-    """They may have other settings: seed 5 has another window here."""
-    evaluate("seeds=[5]", 'overrides=["slam.window_size=7"]')
-    evaluate("seeds=[0]")
-    lines = list(csv.DictReader((evaluate.out / "results.csv").open()))
-    assert {line["seed"] for line in lines} == {"0"}
-    assert (evaluate.out / "synthetic/0/default/5" / METRICS_FILE).is_file()
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -152,15 +142,6 @@ def test_a_value_or_name_that_is_refused_ends_the_evaluation_before_it_begins(ev
     with pytest.raises(ValueError, match=message):
         evaluate(override)
     assert evaluate.runs == [] and not evaluate.out.exists()
-
-
-def test_a_result_of_another_version_ends_the_evaluation_before_it_begins(evaluate):
-    evaluate("seeds=[0]")
-    path = evaluate.out / "synthetic/1/default/0" / METRICS_FILE
-    path.write_text(path.read_text().replace(f'"format": {RESULT_FORMAT}', '"format": -1'))
-    with pytest.raises(ValueError, match="written by another version"):
-        evaluate("seeds=[0,1]")
-    assert evaluate.runs == []
 
 
 def test_the_gate_passes_with_the_same_results_and_names_what_is_worse(evaluate, tmp_path):
@@ -180,29 +161,23 @@ def test_a_prior_without_a_seed_is_evaluated_with_one(evaluate):
     recorded = 'overrides=["prior=recorded","prior.folder=predictions/\\${dataset.seed}"]'
     with pytest.raises(ValueError, match=r"prior.seed is no key of .*Recorded: give one seed, seeds=\[0\]"):
         evaluate("seeds=[0,1]", recorded)
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        config = hydra.compose("evaluate", ["suite=smoke", recorded])
-        jobs = list(experiments.evaluate.plan(OmegaConf.to_container(config, resolve=True)))
+    jobs = jobs_of("suite=smoke", recorded)
     assert [job.config.prior.folder for job in jobs] == ["predictions/0"]
 
 
 def test_the_committed_baseline_holds_every_metric_of_the_suite_and_the_protocol_of_its_name():
     baseline = read_gate(CONF / "baseline" / "smoke.yaml")
     assert {name: entry["protocol"] for name, entry in baseline.items()} == {"synthetic/room0/default": "paper/sim3"}
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        tolerances = hydra.compose("evaluate", ["suite=smoke"]).tolerances
+    tolerances = composed("suite=smoke")["tolerances"]
     for entry in baseline.values():
         directions = {key: rule["direction"] for key, rule in entry["metrics"].items()}
-        assert directions == {key: rule.direction for key, rule in tolerances.items()}
+        assert directions == {key: rule["direction"] for key, rule in tolerances.items()}
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "suite").glob("*.yaml")))
+@pytest.mark.parametrize("name", groups()["suite"])
 def test_every_suite_makes_jobs_that_know_their_sequence_and_name_no_path_of_a_machine(name):
     assert "/" not in yaml.safe_load((CONF / "suite" / f"{name}.yaml").read_text()).get("root", "???")
-    root = [] if name == "smoke" else ["suite.root=some folder"]
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        config = hydra.compose("evaluate", [f"suite={name}", *root])
-        jobs = list(experiments.evaluate.plan(OmegaConf.to_container(config, resolve=True, throw_on_missing=True)))
+    jobs = jobs_of(f"suite={name}", *([] if name == "smoke" else ["suite.root=some folder"]))
     sequences = [job.config.dataset.get("sequence", job.config.dataset.get("seed")) for job in jobs]
     count = {"seven_scenes": 7, "tum": 9, "tum_loops": 3, "replica": 8, "slices": 4, "smoke": 1}[name]
     assert len({job.folder for job in jobs}) == len(set(sequences)) == count
@@ -227,8 +202,7 @@ def test_words_that_are_no_key_of_an_evaluation_go_to_its_runs_as_they_are():
     arguments = experiments.evaluate.delegated([*words[:1], *own, *words[1:]])
     assert arguments[1:] == own and experiments.evaluate.delegated(own) == own
     given = [text for text in arguments if text[0] != "-" and not text.startswith(("hydra", "suite.root"))]
-    config = compose(*given, "suite.root='some folder'", name="evaluate")
-    jobs = list(experiments.evaluate.plan(OmegaConf.to_container(config, resolve=True)))
+    jobs = jobs_of(*given, "suite.root='some folder'")
     for job in jobs:
         sequence = job.config.dataset.sequence
         assert job.config.prior.folder == f"my predictions/{sequence}" and job.config.dataset.root == "some folder"
@@ -238,34 +212,24 @@ def test_words_that_are_no_key_of_an_evaluation_go_to_its_runs_as_they_are():
         experiments.evaluate.delegated(["prior=recorded", "overrides=['prior.seed=1']"])
 
 
-def run_script(*arguments):
-    command = [sys.executable, "-m", "experiments.evaluate", *arguments]
-    return subprocess.run(
-        command, cwd=CONF.parent, env=ENVIRONMENT, capture_output=True, text=True, timeout=500, check=False
-    )
-
-
-def tiny(*overrides):
-    return "overrides=[" + ",".join(f"'{override}'" for override in (*TINY, *overrides)) + "]"
-
-
 @pytest.mark.slow
 def test_the_exit_status_says_that_a_job_failed(tmp_path):
-    done = run_script("suite=tum", f"suite.root={tmp_path}", f"out={tmp_path / 'out'}")
+    done = own_process.run("experiments.evaluate", "suite=tum", f"suite.root={tmp_path}", f"out={tmp_path / 'out'}")
     assert done.returncode == 1
     assert "problems: 9" in done.stderr and "freiburg1_xyz does not exist" in done.stderr
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("launcher", ["basic", "joblib", "submitit_local"])
 def test_shards_run_on_the_launchers_of_hydra(tmp_path, launcher):
     """One shard fails: the other one's result is there, and the command says what is wrong."""
     if launcher != "basic":
         pytest.importorskip(f"hydra_plugins.hydra_{launcher.removesuffix('_local')}_launcher")
-    out = tmp_path / "out"
-    shards = ("-m", f"hydra/launcher={launcher}", "shard=1/2,2/2", "suite=smoke")
-    done = run_script(*shards, "suite.data.synthetic.sequences=[-1,0]", f"out={out}", tiny())
+    out, tiny = tmp_path / "out", "overrides=[" + ",".join(f"'{word}'" for word in TINY) + "]"
+    words = ("-m", f"hydra/launcher={launcher}", "shard=1/2,2/2", "suite=smoke", tiny, f"out={out}")
+    command = [sys.executable, "-m", "experiments.evaluate", *words, "suite.data.synthetic.sequences=[-1,0]"]
+    done = subprocess.run(command, cwd=CONF.parent, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 1, done.stderr
     assert "dataset.seed must be 0 or more" in done.stderr + done.stdout
     assert [path.parent.relative_to(out).as_posix() for path in out.rglob(METRICS_FILE)] == ["synthetic/0/default/0"]

@@ -1,5 +1,8 @@
 """The commands' own keys: a value of another kind is named with its key, and what conf/ says passes."""
 
+import math
+from functools import cache
+
 import pytest
 from omegaconf import OmegaConf
 
@@ -16,54 +19,49 @@ NEEDED = {
 }
 
 
+@cache
+def composed(name: str):
+    return compose(*NEEDED.get(name, []), name=name)
+
+
 @pytest.mark.parametrize(
-    ("name", "override", "message"),
+    ("name", "key", "value", "message"),
     [
-        ("sweep", "at_once=abc", "at_once must be a whole number from 1 on or null, got 'abc'"),
-        ("sweep", "chunk=nan", "chunk must be a whole number from 1 on, got nan"),
-        ("tune", "at_once=2.5", "at_once must be a whole number from 1 on or null, got 2.5"),
-        ("evaluate", "seeds=3", "seeds must be a list of whole numbers, got 3"),
-        ("evaluate", "seeds=null", "seeds must be a list of whole numbers, got null"),
-        ("evaluate", "seeds=[]", r"seeds must be a list of whole numbers, got \[\]"),
-        ("evaluate", "seeds=[true]", "seeds must be a list of whole numbers"),
-        ("evaluate", "variants=3", "variants must be NAME: {KEY: VALUE}, one or more, got 3"),
-        ("evaluate", "overrides=abc", "overrides must be a list of KEY=VALUE, got 'abc'"),
-        ("evaluate", "overrides=[abc]", "overrides must be a list of KEY=VALUE"),
-        ("export", "formats=3", "formats must be a list of names, got 3"),
-        ("effects", "folder=3", "folder must be text, got 3"),
-        ("segment", "map=[a,3]", r"map must be a folder or a list of folders, got \['a', 3\]"),
-        ("segment", "map=[]", r"map must be a folder or a list of folders, got \[\]"),
-        ("predict", "out=null", "out must be text, got null"),
-        ("embed", "classes=3", "classes must be a list of names, got 3"),
-        ("benchmark", "benchmark.repetitions=0", "benchmark.repetitions must be a whole number from 1 on, got 0"),
-        ("benchmark", "benchmark.num_gaussians=nan", "benchmark.num_gaussians must be a whole number"),
-        ("benchmark", "benchmark.image_sizes=[320,240]", r"benchmark.image_sizes must be a list of \[width,height\]"),
-        ("benchmark", "benchmark.icp_offset=[0,inf]", r"benchmark.icp_offset must be \[m,rad\]"),
+        ("sweep", "at_once", "abc", "at_once must be a whole number from 1 on or null, got 'abc'"),
+        ("sweep", "chunk", math.nan, "chunk must be a whole number from 1 on, got nan"),
+        ("tune", "at_once", 2.5, "at_once must be a whole number from 1 on or null, got 2.5"),
+        ("evaluate", "seeds", 3, "seeds must be a list of whole numbers, got 3"),
+        ("evaluate", "seeds", None, "seeds must be a list of whole numbers, got null"),
+        ("evaluate", "seeds", [], r"seeds must be a list of whole numbers, got \[\]"),
+        ("evaluate", "seeds", [True], "seeds must be a list of whole numbers"),
+        ("evaluate", "variants", 3, "variants must be NAME: {KEY: VALUE}, one or more, got 3"),
+        ("evaluate", "overrides", "abc", "overrides must be a list of KEY=VALUE, got 'abc'"),
+        ("evaluate", "overrides", ["abc"], "overrides must be a list of KEY=VALUE"),
+        ("export", "formats", 3, "formats must be a list of names, got 3"),
+        ("effects", "folder", 3, "folder must be text, got 3"),
+        ("segment", "map", ["a", 3], r"map must be a folder or a list of folders, got \['a', 3\]"),
+        ("segment", "map", [], r"map must be a folder or a list of folders, got \[\]"),
+        ("predict", "out", None, "out must be text, got null"),
+        ("embed", "classes", 3, "classes must be a list of names, got 3"),
+        ("benchmark", "benchmark.repetitions", 0, "benchmark.repetitions must be a whole number from 1 on, got 0"),
+        ("benchmark", "benchmark.num_gaussians", math.nan, "benchmark.num_gaussians must be a whole number"),
+        ("benchmark", "benchmark.image_sizes", [320, 240], r"benchmark.image_sizes must be a list of \[width,height\]"),
+        ("benchmark", "benchmark.icp_offset", [0, math.inf], r"benchmark.icp_offset must be \[m,rad\]"),
     ],
 )
-def test_a_value_of_another_kind_is_named_with_its_key(name, override, message):
-    needed = [word for word in NEEDED.get(name, []) if word.split("=")[0] != override.split("=")[0]]
+def test_a_value_of_another_kind_is_named_with_its_key(name, key, value, message):
+    config = composed(name).copy()
+    OmegaConf.update(config, key, value)
     with pytest.raises(ValueError, match=message):
-        check_keys(name, compose(*needed, override, name=name))
+        check_keys(name, config)
 
 
 @pytest.mark.parametrize("name", sorted({*KEYS, *NEEDED, "config"}))
-def test_what_conf_says_passes(name):
-    check_keys(name, compose(*NEEDED.get(name, []), name=name))
-
-
-def test_an_export_may_be_of_the_scaled_copies_alone():
-    check_keys("export", compose("folder=a", "scale=1.07", "formats=[]", name="export"))
-
-
-def test_segment_takes_one_folder_or_several():
-    """A list, as docs/semantics.md has it, was refused."""
-    for given in ("map=a", "map=[a,b]"):
-        check_keys("segment", compose(given, "truth=frames", name="segment"))
-
-
-@pytest.mark.parametrize("name", KEYS)
-def test_every_key_that_is_checked_is_there(name):
+def test_what_conf_says_passes_and_every_key_that_is_checked_is_there(name):
+    """An export may be of the scaled copies alone; segment takes one folder or several, which was refused."""
+    assert check_keys(name, composed(name)) is None
     own = OmegaConf.load(CONF / f"{name}.yaml")
-    for key in KEYS[name]:
+    for key in KEYS.get(name, ()):
         assert OmegaConf.is_missing(own, key) or OmegaConf.select(own, key, default="absent") != "absent"
+    other = {"export": {"scale": 1.07, "formats": []}, "segment": {"map": ["a", "b"]}}.get(name, {})
+    assert check_keys(name, OmegaConf.merge(composed(name), other)) is None

@@ -107,39 +107,39 @@ def test_another_result_is_never_replaced_but_the_same_one_may_be_made_again(tmp
     assert path.read_bytes() == before
 
 
+def times_of_another_clock(path, ply, truth):
+    save_trajectory_tum(path, truth[0] + 1000.0, truth[1])
+
+
+def no_points(path, ply, truth):
+    save_points_ply(ply, truth[2].points[:0], truth[2].normals[:0], truth[2].colors[:0])
+
+
+def points_that_are_not_finite(path, ply, truth):
+    content = bytearray(ply.read_bytes())
+    begin = content.index(b"end_header\n") + len(b"end_header\n")
+    content[begin : begin + 4] = np.float32("nan").tobytes()
+    ply.write_bytes(content)
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        ("times", r"no pose is within 0.01 s .* are 1000.000 to 1005.000, .* 0.000 to 5.000: .*max_time_difference"),
-        ("no trajectory", "path.txt does not exist: give a file with"),
-        ("empty trajectory", "no pose is within 0.01 s .* timestamps are none"),
-        ("no cloud", "cloud.ply does not exist: give a PLY"),
-        ("empty cloud", "cloud.ply has no points"),
-        ("text", "cloud.ply is no PLY file"),
-        ("cut", r"cloud.ply has [0-9]+ bytes after its header, which announces [0-9]+ .*: it is truncated"),
-        ("no z", "cloud.ply has no element vertex with the properties x, y and z"),
-        ("nan", r"cloud.ply: 1 of [0-9]+ points are not finite"),
+        (
+            times_of_another_clock,
+            r"no pose is within 0.01 s .* are 1000.000 to 1005.000, .* 0.000 to 5.000: .*max_time_difference",
+        ),
+        (lambda path, *_: path.unlink(), "path.txt does not exist: give a file with"),
+        (lambda path, *_: path.write_text("# nothing\n"), "no pose is within 0.01 s .* timestamps are none"),
+        (lambda path, ply, _: ply.unlink(), "cloud.ply does not exist: give a PLY"),
+        (lambda path, ply, _: ply.write_text("# nothing\n"), "cloud.ply is no PLY file"),
+        (no_points, "cloud.ply has no points"),
+        (points_that_are_not_finite, r"cloud.ply: 1 of [0-9]+ points are not finite"),
     ],
 )
 def test_bad_files_are_named_with_a_remedy_and_leave_no_result(tmp_path, truth, damage, message):
-    times, poses, cloud = truth
-    files = write_system(tmp_path, times + (1000.0 if damage == "times" else 0.0), poses, cloud)
-    path, ply = tmp_path / "path.txt", tmp_path / "cloud.ply"
-    if damage in ("no trajectory", "no cloud"):
-        (path if damage == "no trajectory" else ply).unlink()
-    elif damage in ("empty trajectory", "text"):
-        (path if damage == "empty trajectory" else ply).write_text("# nothing\n")
-    elif damage == "empty cloud":
-        save_points_ply(ply, cloud.points[:0], cloud.normals[:0], cloud.colors[:0])
-    elif damage == "nan":
-        content = bytearray(ply.read_bytes())
-        begin = content.index(b"end_header\n") + len(b"end_header\n")
-        content[begin : begin + 4] = np.float32("nan").tobytes()
-        ply.write_bytes(content)
-    elif damage == "cut":
-        ply.write_bytes(ply.read_bytes()[: -len(ply.read_bytes()) // 3])
-    elif damage == "no z":
-        ply.write_bytes(ply.read_bytes().replace(b"float z\n", b"float w\n"))
+    files = write_system(tmp_path, *truth)
+    damage(tmp_path / "path.txt", tmp_path / "cloud.ply", truth)
     with pytest.raises((ValueError, OSError), match=message):
         scored(*files)
     assert not (tmp_path / "out").exists()

@@ -2,28 +2,27 @@
 
 import csv
 import json
-from functools import cache
 from pathlib import Path
-from tempfile import mkdtemp
 
-import hydra
 import numpy as np
 import pytest
-from tiny_run import CONF, compose
+from tiny_run import compose
 
 import experiments.run
 import experiments.sweep
+from emgs_jax.running import configure
+from emgs_jax.running.configure import groups
 from experiments.grid import notes, read_axes, variants
-from experiments.together import chunks_of
 
 AXES = "axes={slam.em.max_mahalanobis_sq:[1.0,9.0],slam.em.average.gain:[count,ema_printed]}"
 COMPARED = ("trajectory/", "reconstruction", "raw_prior/", "map/", "frames/")
 
 
-@cache
-def swept() -> tuple[Path, list[dict]]:
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory) -> tuple[Path, list[dict]]:
     """Folder and rows of a sweep over two axes, two settings a chunk."""
-    folder = Path(mkdtemp())
+    folder = tmp_path_factory.mktemp("sweep")
+    (folder / ".sweep.999999999.tmp.json").write_text("{")  # as a kill leaves it
     return folder, experiments.sweep.sweep(compose(AXES, "chunk=2", name="sweep"), folder)
 
 
@@ -38,17 +37,17 @@ def assert_same_metrics(row: dict, metrics: dict, rtol: float) -> None:
 
 
 @pytest.mark.slow
-def test_every_setting_has_the_metrics_of_a_run_with_its_values(tmp_path):
-    for row in swept()[1]:
-        values = [f"{name}={row[name]}" for name in ("slam.em.max_mahalanobis_sq", "slam.em.average.gain")]
-        metrics = experiments.run.run(compose(*values), tmp_path)
-        assert_same_metrics(row, metrics, 1e-5)
-    assert len({row["trajectory/ate_sim3_m"] for row in swept()[1]}) == 4  # the axes do something
+@pytest.mark.parametrize("number", [1, *(pytest.param(number, marks=pytest.mark.long) for number in (0, 2, 3))])
+def test_every_setting_has_the_metrics_of_a_run_with_its_values(swept, tmp_path, number):
+    row = swept[1][number]
+    values = [f"{name}={row[name]}" for name in ("slam.em.max_mahalanobis_sq", "slam.em.average.gain")]
+    assert_same_metrics(row, experiments.run.run(compose(*values), tmp_path), 1e-5)
+    assert len({row["trajectory/ate_sim3_m"] for row in swept[1]}) == 4  # the axes do something
 
 
 @pytest.mark.slow
-def test_the_files_hold_every_row_and_the_recorded_predictions_are_removed():
-    folder, rows = swept()
+def test_the_files_hold_every_row_and_the_recorded_predictions_are_removed(swept):
+    folder, rows = swept
     names = {"sweep.json", "sweep.csv", "heat_map.png", "report.html", "pictures"}
     assert {path.name for path in folder.iterdir()} == names and len(list((folder / "pictures").iterdir())) == 4
     with open(folder / "sweep.csv", newline="") as file:
@@ -62,8 +61,8 @@ def test_the_files_hold_every_row_and_the_recorded_predictions_are_removed():
 
 
 @pytest.mark.slow
-def test_a_finished_setting_is_not_mapped_again_and_another_sweep_is_not_mixed_in(monkeypatch, tmp_path):
-    folder, rows = swept()
+def test_a_finished_setting_is_not_mapped_again_and_another_sweep_is_not_mixed_in(swept, monkeypatch, tmp_path):
+    folder, rows = swept
     (tmp_path / "sweep.json").write_bytes((folder / "sweep.json").read_bytes())
     monkeypatch.setattr(experiments.sweep, "map_and_score", None)  # calling it would fail
     subset = compose("axes={slam.em.max_mahalanobis_sq:[9.0],slam.em.average.gain:[count]}", name="sweep")
@@ -77,55 +76,27 @@ def test_a_finished_setting_is_not_mapped_again_and_another_sweep_is_not_mixed_i
 
 
 @pytest.mark.slow
-def test_an_interrupted_sweep_keeps_its_chunks(monkeypatch, tmp_path):
-    done = []
-
-    def interrupted(work, chunk, bar):
-        if done:
-            raise KeyboardInterrupt
-        done.extend(variant.setting for variant in chunk)
-        return [{"map/num_gaussians": 1}] * len(chunk)
-
-    monkeypatch.setattr(experiments.sweep, "map_and_score", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        experiments.sweep.sweep(compose(AXES, "chunk=2", name="sweep"), tmp_path)
-    kept = json.loads((tmp_path / "sweep.json").read_text())["settings"]
-    assert [row["setting"] for row in kept] == done and len(done) == 2
-
-
-@pytest.mark.slow
-def test_a_sweep_that_is_stopped_and_goes_on_has_the_same_bits_and_the_same_chunks(monkeypatch, tmp_path, capsys):
-    folder, _ = swept()
-    chunks, map_and_score = [], experiments.sweep.map_and_score
+def test_a_sweep_that_is_stopped_keeps_its_chunks_and_goes_on_with_those_of_the_whole_grid(
+    monkeypatch, tmp_path, capsys
+):
+    """On an accelerator a chunk is stacked, and stacks of other sizes may round otherwise."""
+    chunks = []
 
     def stopped(work, chunk, bar):
         chunks.append([variant.setting for variant in chunk])
         if len(chunks) == 2:
             raise KeyboardInterrupt
-        return map_and_score(work, chunk, bar)
+        return [{"map/num_gaussians": 1}] * len(chunk)
 
+    config = compose(AXES.replace("9.0]", "4.0,9.0]"), "chunk=2", name="sweep")
     monkeypatch.setattr(experiments.sweep, "map_and_score", stopped)
     with pytest.raises(KeyboardInterrupt):
-        experiments.sweep.sweep(compose(AXES, "chunk=2", name="sweep"), tmp_path)
-    (tmp_path / ".sweep.999999999.tmp.json").write_text("{")  # as a kill leaves it
-    experiments.sweep.sweep(compose(AXES, "chunk=2", name="sweep"), tmp_path)
-    assert "going on: 2 of 4 settings are left" in capsys.readouterr().out
-    assert len(chunks) == 3 and chunks[2] == chunks[1]
-    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in folder.iterdir()}
-    assert (tmp_path / "sweep.csv").read_bytes() == (folder / "sweep.csv").read_bytes()
-    kept, whole = (json.loads((place / "sweep.json").read_text())["settings"] for place in (tmp_path, folder))
-    assert kept == whole
-    assert (tmp_path / "report.html").read_bytes() == (folder / "report.html").read_bytes()
-
-
-def test_what_is_left_is_in_the_chunks_of_the_whole_grid():
-    """On an accelerator a chunk is stacked, and stacks of other sizes may round otherwise."""
-    config = compose("axes={slam.em.normal_weight:[0,1,2,3,4,5,6]}", name="sweep")
-    whole = chunks_of(variants(config, read_axes(config)), 3)
-    for count in range(len(whole) + 1):
-        done = [variant.setting for chunk in whole[:count] for variant in chunk]
-        assert experiments.sweep._left(whole, done) == whole[count:]
-    assert [len(chunk) for chunk in experiments.sweep._left(whole, [whole[0][1].setting])] == [2, 2, 2]
+        experiments.sweep.sweep(config, tmp_path)
+    kept = json.loads((tmp_path / "sweep.json").read_text())["settings"]
+    assert [row["setting"] for row in kept] == chunks[0] and len(kept) == 2
+    experiments.sweep.sweep(config, tmp_path)
+    assert "going on: 4 of 6 settings are left" in capsys.readouterr().out
+    assert chunks[2] == chunks[1] and [len(chunk) for chunk in chunks] == [2] * 4
 
 
 def test_the_grid_is_every_combination_and_shared_nodes_change_wherever_they_are_used():
@@ -144,11 +115,9 @@ def test_one_at_a_time_keeps_the_other_keys_as_the_config_has_them():
     config = compose(axes, "grid=one_at_a_time", name="sweep")
     settings = [tuple(v.setting.values()) for v in variants(config, read_axes(config))]
     assert settings == [(5.0, "count"), (0, "count"), (9, "count"), (5.0, "ema_printed")]
-
-
-def test_a_grid_that_is_none_is_refused():
+    config.grid = "random"
     with pytest.raises(ValueError, match="grid must be one of product, one_at_a_time, got 'random'"):
-        read_axes(compose(AXES, "grid=random", name="sweep"))
+        read_axes(config)
 
 
 @pytest.mark.parametrize("word", ["baseline=voxel", "graph=default"])
@@ -166,18 +135,20 @@ def test_an_infinite_value_is_text_in_the_results():
 @pytest.mark.parametrize(
     ("axes", "message"),
     [
-        ("null", "no axis: choose one with sweep=gates"),
-        ("{slam.em.max_mahalanobis:[3]}", r"no key of a stage; near names: slam\.em\.max_mahalanobis_sq"),
-        ("{max_mahalanobis_sq:[3]}", r"near names: .*em\.max_mahalanobis_sq|near names: .*max_mahalanobis_sq"),
-        ("{slam.em.noise:3}", r"must be a list of values, got 3: write slam\.em\.noise: \[3"),
-        ("{slam.em.noise:[]}", "must be a list of values"),
-        ("{slam.em.noise:[[1,2]]}", "numbers or names"),
-        ("{prior.seed:[0,1]}", r"experiments\.sweep -m prior\.seed"),
+        (None, "no axis: choose one with sweep=gates"),
+        ({"slam.em.max_mahalanobis": [3]}, r"no key of a stage; near names: slam\.em\.max_mahalanobis_sq"),
+        ({"max_mahalanobis_sq": [3]}, r"near names: .*em\.max_mahalanobis_sq|near names: .*max_mahalanobis_sq"),
+        ({"slam.em.noise": 3}, r"must be a list of values, got 3: write slam\.em\.noise: \[3"),
+        ({"slam.em.noise": []}, "must be a list of values"),
+        ({"slam.em.noise": [[1, 2]]}, "numbers or names"),
+        ({"prior.seed": [0, 1]}, r"experiments\.sweep -m prior\.seed"),
     ],
 )
 def test_an_axis_that_is_none_is_refused_with_the_remedy(axes, message):
+    config = compose(name="sweep")
+    config.axes = axes
     with pytest.raises(ValueError, match=message):
-        read_axes(compose(f"axes={axes}", name="sweep"))
+        read_axes(config)
 
 
 def test_a_static_axis_says_that_it_compiles_for_each_value_and_a_traced_one_says_nothing():
@@ -192,10 +163,9 @@ def test_a_static_axis_says_that_it_compiles_for_each_value_and_a_traced_one_say
     ]
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "sweep").glob("*.yaml")))
+@pytest.mark.parametrize("name", groups()["sweep"])
 def test_every_sweep_of_conf_has_axes_whose_values_build_configs(name):
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        config = hydra.compose("sweep", overrides=[f"sweep={name}"])
+    config = configure.compose(f"sweep={name}", name="sweep")
     axes = read_axes(config)
     sizes = [len(values) for values in axes.values()]
     assert len(variants(config, axes)) == (np.prod(sizes) if config.grid == "product" else sum(sizes) - len(axes) + 1)

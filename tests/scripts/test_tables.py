@@ -51,14 +51,6 @@ def test_rows_are_mean_and_deviation_over_the_seeds_and_the_map_is_counted_again
     assert counts.count(" 1,") + counts.count(" 1.") == len(COLUMNS)
 
 
-def test_every_device_is_named(tmp_path):
-    paths = [written(tmp_path / "default", seed) for seed in (3, 4)]
-    metrics = json.loads(paths[1].read_text())
-    metrics["provenance"]["device"] = {"kind": "gpu", "cpu_count": 16}
-    paths[1].write_text(json.dumps(metrics))
-    assert "device cpu, 2 CPU cores, gpu, 16 CPU cores;" in block(paths, {"synthetic": "room"})
-
-
 def test_the_short_table_has_what_is_named_and_the_best_of_each_column_in_bold(tmp_path):
     """Lengths of ours are the smaller ones, and so are its shares, which is worse."""
     paths = [written(tmp_path / "default", 3, ours=0.02, raw=0.03), written(tmp_path / "level 2", 3, ours=0.01)]
@@ -74,17 +66,14 @@ def test_the_short_table_has_what_is_named_and_the_best_of_each_column_in_bold(t
     assert [cells(line)[0] for line in alone.splitlines() if "ours" in line] == ["room, level 2"]
 
 
-def test_the_line_above_a_table_says_where_it_comes_from(tmp_path):
-    about = block([written(tmp_path, 3), written(tmp_path, 4)], {"synthetic": "room"}).strip().splitlines()[0]
-    for fact in (
-        "simulated",
-        "synthetic room0 (40 frames)",
-        "3, 4",
-        "paper/sim3",
-        "cpu, 2 CPU cores",
-        "`0123456789ab`",
-    ):
-        assert fact in about, fact
+def test_the_line_above_a_table_says_where_it_comes_from_and_names_every_device(tmp_path):
+    paths = [written(tmp_path, seed) for seed in (3, 4)]
+    metrics = json.loads(paths[1].read_text())
+    metrics["provenance"]["device"] = {"kind": "gpu", "cpu_count": 16}
+    paths[1].write_text(json.dumps(metrics))
+    about = block(paths, {"synthetic": "room"}).strip().splitlines()[0]
+    facts = "simulated", "synthetic room0 (40 frames)", "3, 4", "paper/sim3", "`0123456789ab`"
+    assert all(fact in about for fact in (*facts, "device cpu, 2 CPU cores, gpu, 16 CPU cores;")), about
 
 
 @pytest.mark.parametrize(
@@ -123,8 +112,8 @@ def settings(tmp_path):
         config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
         settings = {"default": {}, "level 2": {"prior.level": 2}}
         config["tables"] = {"some": [{"data": ["synthetic"], "seeds": [3, 4], "settings": settings}]}
-        (tmp_path / "page.md").write_text(PAGE)
-        (tmp_path / "full.md").write_text(PAGE)
+        for name in ("page.md", "full.md"):
+            (tmp_path / name).write_text(PAGE)
         yield config
 
 
@@ -160,18 +149,12 @@ def test_what_is_finished_is_not_run_again_and_the_page_is_written_when_all_is_t
     assert len(runs) == 5 and (page.read_text(), Path(settings["full_page"]).read_text()) == (text, full)
 
 
-@pytest.mark.parametrize("key", ["page", "full_page"])
-def test_both_pages_have_the_places_of_all_tables_and_every_row_has_a_title(key):
-    config = OmegaConf.load(CONF / "tables.yaml")
-    text = (CONF.parent / config[key]).read_text()
-    for name, entries in config.tables.items():
-        assert text.count(f"<!-- table: {name} -->") == 1
-        assert {data for entry in entries for data in entry.data} <= set(config.titles)
-    assert text.count("<!-- end -->") == len(config.tables)
-
-
-def test_both_pages_are_of_one_commit():
-    config = OmegaConf.load(CONF / "tables.yaml")
-    pages = [(CONF.parent / config[key]).read_text() for key in ("page", "full_page")]
-    about = [[line for line in page.splitlines() if line.startswith("Prior ") and "commit `" in line] for page in pages]
+def test_both_pages_have_the_places_of_all_tables_every_row_has_a_title_and_both_are_of_one_commit():
+    config, about = OmegaConf.load(CONF / "tables.yaml"), []
+    for key in ("page", "full_page"):
+        text = (CONF.parent / config[key]).read_text()
+        assert all(text.count(f"<!-- table: {name} -->") == 1 for name in config.tables)
+        assert text.count("<!-- end -->") == len(config.tables)
+        about.append([line for line in text.splitlines() if line.startswith("Prior ") and "commit `" in line])
+    assert {data for rows in config.tables.values() for row in rows for data in row.data} <= set(config.titles)
     assert about[0] == about[1] and len(about[0]) == len(config.tables)

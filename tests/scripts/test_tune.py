@@ -62,100 +62,97 @@ def test_the_search_finds_what_is_known_to_be_better_and_begins_with_the_configs
     assert sum(late) / len(late) < 0.6  # a uniform draw of the logarithm is .83 off on average
 
 
-def test_what_is_held_out_is_measured_after_the_search_and_decides_nothing(measured, tmp_path):
-    rows = experiments.tune.tune(WORDS, tmp_path)
-    seeds = [seed for seed, _ in measured]
-    assert seeds == [0, 0, 0, 3] and measured[-1][1][0] == {GATE: 4.6, GAP: 8.0}
-    with open(tmp_path / "trials.csv", newline="") as file:
-        lines = list(csv.DictReader(file))
-    best = [row for row, line in zip(rows, lines, strict=True) if line["is_best"] == "True"]
-    assert all(not (other[ATE] < row[ATE] and other[F1] > row[F1]) for row in best for other in rows)
-    held_out = {setting[GATE] for setting in measured[-1][1]}
-    assert best and held_out == {4.6, *(row[GATE] for row in best)}
-    text = (tmp_path / "tune.md").read_text()
-    assert "| **held out** | other, simulated | default |" in text and "| tuned | own, simulated | raw prior |" in text
-    assert (tmp_path / "tune.png").read_bytes()[:4] == b"\x89PNG"
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Folder and rows of a search that nobody stopped; made by the first test that asks."""
-    folder, found = tmp_path_factory.mktemp("whole"), []
+    """Folder, rows and chunks of a search that nobody stopped; made by the first test that asks."""
+    found = []
 
-    def search() -> tuple[Path, list[dict]]:
-        found.append(found[0] if found else experiments.tune.tune(WORDS, folder))
-        return folder, found[0]
+    def search(measured) -> tuple[Path, list[dict], list]:
+        if not found:
+            folder = tmp_path_factory.mktemp("whole") / "a, b=c"
+            found.append((folder, experiments.tune.tune(WORDS, folder), [*measured]))
+            measured.clear()
+        return found[0]
 
     return search
 
 
-def test_a_search_that_is_stopped_goes_on_with_the_trials_of_one_that_is_not(measured, tmp_path, whole):
-    folder, rows = whole()
-    measured.clear()
-    for stop_after in (0, 1, 3):  # in the first batch, in the second, before what is held out
-        measured.stop_after = stop_after
-        with pytest.raises(KeyboardInterrupt):
-            experiments.tune.tune(WORDS, tmp_path)
+def test_what_is_held_out_is_measured_after_the_search_and_decides_nothing(measured, whole):
+    folder, rows, chunks = whole(measured)
+    assert [seed for seed, _ in chunks] == [0, 0, 0, 3] and chunks[-1][1][0] == {GATE: 4.6, GAP: 8.0}
+    with open(folder / "trials.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    best = [row for row, line in zip(rows, lines, strict=True) if line["is_best"] == "True"]
+    assert all(not (other[ATE] < row[ATE] and other[F1] > row[F1]) for row in best for other in rows)
+    held_out = {setting[GATE] for setting in chunks[-1][1]}
+    assert best and held_out == {4.6, *(row[GATE] for row in best)}
+    text = (folder / "tune.md").read_text()
+    assert "| **held out** | other, simulated | default |" in text and "| tuned | own, simulated | raw prior |" in text
+    assert (folder / "tune.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_best_are_options_that_a_run_takes_whatever_else_is_chosen(measured, whole):
+    folder, _, chunks = whole(measured)
+    files = sorted((folder / "best").iterdir())
+    assert 1 <= len(files) <= 2
+    for path in files:
+        line = path.read_text().splitlines()[1]
+        words = shlex.split(line.removeprefix("# ").removesuffix(" …"))[2:]
+        check_arguments("config", words)
+        config = compose("experiment=smoke", *words)
+        setting = {GATE: config.slam.em.max_mahalanobis_sq, GAP: config.slam.em.max_log_gap}
+        assert str(setting) in [str(one) for one in chunks[-1][1]] and config.slam.window_size == 4
+
+
+def stopped(monkeypatch, measured, folder: Path, place: int | str) -> None:
+    """A search that ends early: after so many chunks, or in the middle of a batch as trial `place` is told."""
+    tell, numbers = optuna.Study.tell, []
+
+    def told(study, number, *values, **state):
+        if f"trial {number}" == place and not numbers:
+            numbers.append(number)
+            raise KeyboardInterrupt
+        return tell(study, number, *values, **state)
+
+    measured.stop_after = place if isinstance(place, int) else None
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(optuna.Study, "tell", told)
+        experiments.tune.tune(WORDS, folder)
     measured.stop_after = None
+
+
+def test_a_search_that_is_stopped_goes_on_with_the_trials_of_one_that_is_not(measured, tmp_path, monkeypatch, whole):
+    """In the second batch, and as it is told: what was told of it must not change the rest of it, or the next one."""
+    folder, rows, _ = whole(measured)
+    for place in (1, "trial 4"):
+        stopped(monkeypatch, measured, tmp_path, place)
     assert experiments.tune.tune(WORDS, tmp_path) == rows
-    settings = [str(setting) for seed, chunk in measured for setting in chunk if seed == 0]
-    assert (
-        len(settings) == len(set(settings)) == len({str((row[GATE], row[GAP])) for row in rows})
-    )  # none of them twice
     for name in ("trials.csv", "tune.md"):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()
     measured.clear()
     assert experiments.tune.tune(WORDS, tmp_path) == rows and not measured  # and once more changes nothing
 
 
-@pytest.mark.parametrize("last", [1, 4])
-def test_a_search_that_is_stopped_while_it_is_told_goes_on_with_the_same_trials(
-    measured, tmp_path, monkeypatch, whole, last
+def test_more_trials_go_on_another_search_is_not_mixed_in_and_one_that_was_told_nothing_begins_anew(
+    measured, tmp_path, monkeypatch
 ):
-    """In the middle of a batch: what was told of it must not change the rest of it, or the next one."""
-    (_, rows), tell, numbers = whole(), optuna.Study.tell, []
-
-    def stopped(study, number, *values, **state):
-        if number == last and not numbers:
-            numbers.append(number)
-            raise KeyboardInterrupt
-        return tell(study, number, *values, **state)
-
-    monkeypatch.setattr(optuna.Study, "tell", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        experiments.tune.tune(WORDS, tmp_path)
-    assert experiments.tune.tune(WORDS, tmp_path) == rows and numbers == [last]
-
-
-def test_a_default_that_is_not_in_the_space_is_measured_and_is_no_trial(measured, tmp_path):
-    rows = experiments.tune.tune([*WORDS, f"{GATE}=40"], tmp_path)
+    stopped(monkeypatch, measured, tmp_path, 0)
+    with_few = [*WORDS, f"{GATE}=40", "trials=4"]  # the default is not in the space: it is measured, and is no trial
+    rows = experiments.tune.tune(with_few, tmp_path)
     assert all(1 <= row[GATE] <= 20 for row in rows) and measured[0][1][0][GATE] == measured[-1][1][0][GATE] == 40
     assert "| default |" in (tmp_path / "tune.md").read_text()
-
-
-def test_more_trials_go_on_and_another_search_is_not_mixed_in(measured, tmp_path):
-    rows = experiments.tune.tune([*WORDS, "trials=6"], tmp_path)
-    assert experiments.tune.tune(WORDS, tmp_path)[:6] == rows
+    assert experiments.tune.tune([*with_few, "trials=6"], tmp_path)[:4] == rows
     with pytest.raises(ValueError, match=rf"holds a search with search.space.{GATE}.high 20.0, and this one has 10.0"):
-        experiments.tune.tune([*WORDS, f"space={{{GATE}:{{low:1,high:10,log:true}}}}"], tmp_path)
+        experiments.tune.tune([*with_few, f"space={{{GATE}:{{low:1,high:10,log:true}}}}"], tmp_path)
     with pytest.raises(ValueError, match=r"em\.noise 1\.0, and this one has 0\.5: .*another folder"):
-        experiments.tune.tune([*WORDS, "slam.em.noise=0.5"], tmp_path)
+        experiments.tune.tune([*with_few, "slam.em.noise=0.5"], tmp_path)
 
 
-def test_a_search_that_was_told_nothing_is_begun_anew_with_other_words(measured, tmp_path):
-    measured.stop_after = 0
-    with pytest.raises(KeyboardInterrupt):
-        experiments.tune.tune(WORDS, tmp_path)
-    measured.stop_after = None
-    assert len(experiments.tune.tune([*WORDS, f"objectives=[maximize {F1}]"], tmp_path)) == 8
-
-
-def test_a_metric_that_is_none_is_named_with_near_ones(measured, tmp_path):
+def test_a_metric_that_is_none_is_named_and_a_trial_without_a_value_fails_and_the_others_go_on(
+    measured, tmp_path, monkeypatch
+):
     with pytest.raises(ValueError, match=f"trajectory/ate_sim_m of own is no metric; near names: {ATE}"):
-        experiments.tune.tune([*WORDS, "objectives=[minimize trajectory/ate_sim_m]"], tmp_path)
-
-
-def test_a_trial_without_a_value_fails_and_the_others_go_on(measured, tmp_path, monkeypatch):
+        experiments.tune.tune([*WORDS, "objectives=[minimize trajectory/ate_sim_m]"], tmp_path / "other")
     measure = experiments.tune.map_and_score
 
     def lost(work, chunk, bar):
@@ -169,26 +166,18 @@ def test_a_trial_without_a_value_fails_and_the_others_go_on(measured, tmp_path, 
     assert "is_best" in (tmp_path / "trials.csv").read_text().splitlines()[0]
 
 
-@pytest.mark.parametrize("name", ["plain", "a, b=c"])
-def test_the_best_are_options_that_a_run_takes(measured, tmp_path, name):
-    experiments.tune.tune(WORDS, tmp_path / name)
-    files = sorted((tmp_path / name / "best").iterdir())
-    assert 1 <= len(files) <= 2
-    for path in files:
-        line = path.read_text().splitlines()[1]
-        words = shlex.split(line.removeprefix("# ").removesuffix(" …"))[2:]
-        check_arguments("config", words)
-        config = compose("experiment=smoke", *words)  # whatever else is chosen, the values found win
-        setting = {GATE: config.slam.em.max_mahalanobis_sq, GAP: config.slam.em.max_log_gap}
-        assert str(setting) in [str(one) for one in measured[-1][1]] and config.slam.window_size == 4
+def told_trials(path, space, own, values, objectives):
+    """A study whose first trials have these values."""
+    study = open_study(path / "study.jsonl", {}, objectives)
+    for trial, value in zip(ask(study, space, own, len(values), 0, 9), values, strict=True):
+        study.tell(trial.number, value)
+    return study
 
 
-def test_the_front_has_what_nothing_beats_and_is_thinned_evenly(tmp_path):
-    space = {GATE: Between(0.0, 10.0, False, False)}
-    study = open_study(tmp_path / "study.jsonl", {}, {ATE: "minimize", F1: "maximize"})
+def test_the_front_has_what_nothing_beats_and_is_thinned_evenly_and_one_objective_has_one_best(tmp_path):
     values = [(3.0, 3.0), (1.0, 1.0), (2.0, 2.0), (5.0, 2.5), (4.0, 4.0), (5.0, 5.0), (2.5, 1.0)]
-    for trial, pair in zip(ask(study, space, {GATE: 1.0}, len(values), 0, 9), values, strict=True):
-        study.tell(trial.number, pair)
+    space = {GATE: Between(0.0, 10.0, False, False)}, {GATE: 1.0}
+    study = told_trials(tmp_path, *space, values, {ATE: "minimize", F1: "maximize"})
     unbeaten = [
         number
         for number, (a, b) in sorted(enumerate(values), key=lambda item: item[1])
@@ -196,21 +185,16 @@ def test_the_front_has_what_nothing_beats_and_is_thinned_evenly(tmp_path):
     ]
     assert [trial.number for trial in front(study, 9)] == unbeaten == [1, 2, 0, 4, 5]
     assert [trial.number for trial in front(study, 3)] == [1, 0, 5]
-
-
-def test_of_one_objective_the_best_is_one_trial(tmp_path):
-    study = open_study(tmp_path / "study.jsonl", {}, {F1: "maximize"})
-    for trial in ask(study, {GATE: Between(0.0, 10.0, False, False)}, {GATE: 1.0}, 4, 0, 9):
-        study.tell(trial.number, [3.0, 9.0, 1.0, 2.0][trial.number])
+    (tmp_path / "one").mkdir()
+    study = told_trials(tmp_path / "one", *space, [3.0, 9.0, 1.0, 2.0], {F1: "maximize"})
     assert [trial.number for trial in front(study, 5)] == [1]
 
 
 def test_whole_numbers_stay_whole(tmp_path):
-    space = read_space(compose("space={slam.em.num_neighbours:{low:4,high:32,log:true}}", name="tune"))
+    key = "slam.em.num_neighbours"
+    space = read_space(compose(f"space={{{key}:{{low:4,high:32,log:true}}}}", name="tune"))
     study = open_study(tmp_path / "study.jsonl", {}, {F1: "maximize"})
-    drawn = [
-        trial.params["slam.em.num_neighbours"] for trial in ask(study, space, {"slam.em.num_neighbours": 8}, 5, 0, 9)
-    ]
+    drawn = [trial.params[key] for trial in ask(study, space, {key: 8}, 5, 0, 9)]
     assert drawn[0] == 8 and all(type(value) is int and 4 <= value <= 32 for value in drawn)
 
 
@@ -219,7 +203,6 @@ def test_whole_numbers_stay_whole(tmp_path):
     [
         ([], "nothing to search: choose a space with tune=gates, or 'space="),
         (["space={slam.em.max_mahalanobis:{low:1,high:2}}"], rf"no key of a stage; near names: {GATE}"),
-        (["space={prior.seed:{low:0,high:2}}"], "space: prior.seed is no key of a stage"),
         ([f"space={{{GATE}:{{low:-1,high:2}}}}"], rf"{GATE} must be a number from 0 to inf, got -1"),
         ([f"space={{{GATE}:{{low:1,high:inf}}}}"], "cannot be drawn up to inf: give a finite end"),
         ([f"space={{{GATE}:{{low:2,high:1}}}}"], "needs low < high"),
@@ -228,7 +211,6 @@ def test_whole_numbers_stay_whole(tmp_path):
         ([f"space={{{GATE}:[3,-4]}}"], rf"{GATE} must be a number from 0 to inf, got -4"),
         (["space={slam.em.support:{low:0,high:1}}"], r"write slam.em.support: \[printed, normalized\]"),
         ([SPACE], r"held_out names no sequence.*'held_out=\{fresh:\{prior\.seed:3\}\}'"),
-        ([SPACE, "held_out={same:{prior.seed:0}}"], "held_out.same is the tuned sequence own"),
         ([SPACE, "held_out={same:{on_bad_frame:skip}}"], "held_out.same is the tuned sequence own"),
         ([SPACE, "held_out={../up:{prior.seed:3}}"], "plain names"),
         ([SPACE, f"held_out={{other:{{{GATE}:3}}}}"], "gives .* a value, but it is searched"),
