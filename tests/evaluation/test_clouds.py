@@ -5,14 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.evaluation.clouds import (
-    PointCloud,
-    fuse_clouds,
-    read_cloud,
-    register,
-    transform_cloud,
-    voxel_downsample,
-)
+from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, read_cloud, register, transform_cloud, voxel_downsample
 from emgs_jax.evaluation.trajectory import Alignment
 from emgs_jax.io.ply import save_points_ply
 

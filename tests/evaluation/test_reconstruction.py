@@ -220,10 +220,7 @@ def test_distances_are_those_of_open3d_as_mean_and_as_clipped_rmse():
     distances = [np.asarray(a.compute_point_cloud_distance(b)) for a, b in ((there, back), (back, there))]
     exact = dataclasses.replace(CONFIG, voxel_m=1e-5)
     clipped = dataclasses.replace(exact, statistic="rmse", max_distance_m=0.1)
-    for config, average in (
-        (exact, np.mean),
-        (clipped, lambda values: np.sqrt(np.mean(np.minimum(values, 0.1) ** 2))),
-    ):
+    for config, average in ((exact, np.mean), (clipped, lambda values: np.sqrt(np.mean(np.minimum(values, 0.1) ** 2)))):
         metrics = reconstruction_metrics(estimate, reference(truth, config), config)
         for name, values in zip(("accuracy_m", "completion_m"), distances, strict=True):
             np.testing.assert_allclose(metrics[f"reconstruction/{name}"], average(values), rtol=1e-6)

@@ -48,10 +48,7 @@ def member(shape: str, data: bytes, descr: str = "<f8") -> bytes:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (
-            member("(30064771072,)", b"\0" * 16),
-            "announces float64 .* is 240518168576 bytes, and holds 16",
-        ),
+        (member("(30064771072,)", b"\0" * 16), "announces float64 .* is 240518168576 bytes, and holds 16"),
         (member("(1,)", b"\0" * 16), "is 8 bytes, and holds 16"),
         (member("(-2, -1)", b"\0" * 16), "announces float64"),
         (member("(2,)", b"\0" * 16, "|O"), "Object arrays cannot be loaded"),

@@ -28,11 +28,7 @@ def site(tmp_path, monkeypatch):
             'RuntimeError("operator torchvision::nms does not exist")',
             "--force-reinstall torch torchvision",
         ),
-        (
-            "torchaudio",
-            'OSError("libcudart.so.13: cannot open shared object file\\nmore")',
-            "pip uninstall torchaudio",
-        ),
+        ("torchaudio", 'OSError("libcudart.so.13: cannot open shared object file\\nmore")', "pip uninstall torchaudio"),
     ],
 )
 def test_a_package_of_another_torch_is_named_with_the_cause_and_the_remedy(site, name, error, remedy):

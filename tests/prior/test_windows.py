@@ -14,10 +14,7 @@ def test_one_frame_gives_the_first_window_only():
 
 
 def test_five_frames_with_a_window_of_four():
-    assert list(windows(5, 4)) == [
-        Window(0, (0, 1, 2, 3), (0, 1, 2, 3), 3),
-        Window(1, (0, 1, 2, 3, 4), (3, 4), 4),
-    ]
+    assert list(windows(5, 4)) == [Window(0, (0, 1, 2, 3), (0, 1, 2, 3), 3), Window(1, (0, 1, 2, 3, 4), (3, 4), 4)]
 
 
 def test_twelve_frames_with_a_window_of_four():
