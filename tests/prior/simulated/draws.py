@@ -1,4 +1,4 @@
-"""What the tests of the simulated prior ask it: small frames whose relative poses are known by heart, and its errors."""
+"""What the tests of the simulated prior ask: small frames whose relative poses are known by heart, and its errors."""
 
 import hashlib
 from dataclasses import replace
