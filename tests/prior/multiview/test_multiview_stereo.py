@@ -127,7 +127,7 @@ def test_the_lens_is_known_once_a_key_view_has_gone(room, answered, distortions)
     measured = []
     answers(make_prior("prior.structure.keys.max_keys=0"), room, measured)
     assert measured[-1] == measured[-2] and distortions[-1] != distortions[-2]
-    assert measured[0] == distortions[0] != 0
+    assert measured[0] == pytest.approx(distortions[0], rel=1e-3) and measured[0] != 0
 
 
 @pytest.mark.slow
