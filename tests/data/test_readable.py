@@ -63,18 +63,20 @@ def test_a_sequence_without_any_readable_frame_says_why():
 
 
 class WithTruth(Damaged):
-    """Frames of which some have no true pose, and some a damaged one."""
+    """Frames of which some have no true pose, and some a damaged one; all from number 3 on are far away."""
 
     has_ground_truth = True
 
-    def __init__(self, lost=(), damaged=()):
+    def __init__(self, lost=(), damaged=(), far=0.0):
         super().__init__()
-        self.lost, self.damaged = lost, damaged
+        self.lost, self.damaged, self.far = lost, damaged, far
 
     def pose(self, index):
         if index in self.damaged:
             raise BadFrameError(f"poses.txt, line {index}")
-        return None if index in self.lost else np.eye(4)
+        pose = np.eye(4)
+        pose[0, 3] = self.far * (index > 2)
+        return None if index in self.lost else pose
 
     def __getitem__(self, index):
         self.pose(index)
@@ -97,24 +99,11 @@ def test_all_true_poses_are_read_before_the_first_frame():
 
 def test_a_step_of_the_truth_that_no_walk_has_is_named_before_the_first_frame():
     """A jump of 900 m between two frames was taken for a walk."""
-
-    class Jump(WithTruth):
-        far = 900.0
-
-        def pose(self, index):
-            pose = super().pose(index)
-            if pose is not None and index > 2:
-                pose[0, 3] = self.far
-            return pose
-
     with pytest.raises(BadFrameError, match=r"damaged one: the true pose of frame 3 is 900 m from that of frame 2, "):
-        ReadableFrames(Jump())
+        ReadableFrames(WithTruth(far=900.0))
     with pytest.raises(BadFrameError, match=r"frame 3 is 900 m from that of frame 1, "):  # one between has none
-        ReadableFrames(Jump(lost=(2,)))
-    without = Jump()
+        ReadableFrames(WithTruth(far=900.0, lost=(2,)))
+    without = WithTruth(far=900.0)
     without.has_ground_truth = False  # poses of a unit of its own
-    assert len(ReadableFrames(without)) == 5
-    Jump.far = 120.0
-    assert len(ReadableFrames(Jump(lost=(2,)))) == 5  # two steps
-    Jump.far = 99.0
-    assert len(ReadableFrames(Jump())) == 5
+    for frames in (without, WithTruth(far=120.0, lost=(2,)), WithTruth(far=99.0)):  # two steps; one
+        assert len(ReadableFrames(frames)) == 5
