@@ -2,20 +2,13 @@
 
 import numpy as np
 import pytest
+from cloud_scene import INTRINSICS, SHAPE, plane_depth
 from scene import evaluation_config
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.evaluation.reconstruction import window_normals
 
 CONFIG = evaluation_config()
-INTRINSICS = (110.0, 95.0, 61.0, 47.0)  # fx ≠ fy, centre not in the middle
-SHAPE = (90, 120)
-
-
-def plane_depth(normal, distance):
-    """Depth image of the plane normal · p = distance."""
-    rays = backproject(np.ones(SHAPE), INTRINSICS)
-    return distance / (rays @ np.asarray(normal))
 
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.5, -0.3, 0.8), (-0.6, 0.5, 0.62)])
