@@ -156,15 +156,7 @@ def test_scenes_are_added_or_averaged():
     assert table_metrics([np.zeros((2, 3), int)], [], protocol("ovo"))["miou"] is None
 
 
-def test_words_that_are_no_choice_and_other_classes_are_refused():
-    with pytest.raises(ValueError, match=r"protocol.compared_at must be truth or map, got 'mesh'"):
-        protocol("ovo", compared_at="mesh")
-    points, _, truth = scene()
-    with pytest.raises(ValueError, match="same classes"):
-        scene_confusion(LabelledPoints(points, np.zeros(25, int), ("sofa",)), truth, [], protocol("ovo"))
-
-
-def test_points_without_a_class_vote_for_none_where_the_protocol_says_so():
+def test_points_without_a_class_vote_for_none_where_the_protocol_says_so_and_other_classes_are_refused():
     """Three of the five nearest have none, two are chairs."""
     points = np.array([[0.01 * i, 0.0, 0.0] for i in range(5)])
     found = LabelledPoints(points, np.array([-1, 1, -1, 1, -1]), CLASSES)
@@ -172,3 +164,7 @@ def test_points_without_a_class_vote_for_none_where_the_protocol_says_so():
     for none_votes, column in ((True, 4), (False, 1)):
         p = protocol("rayfronts", voxel_m=0.0, none_votes=none_votes)
         assert scene_confusion(found, truth, [], p)[1].tolist() == [int(i == column) for i in range(5)]
+    with pytest.raises(ValueError, match=r"protocol.compared_at must be truth or map, got 'mesh'"):
+        protocol("ovo", compared_at="mesh")
+    with pytest.raises(ValueError, match="same classes"):
+        scene_confusion(replace(found, classes=("sofa",)), truth, [], protocol("ovo"))

@@ -108,9 +108,6 @@ def test_the_stated_uncertainty_holds_the_error():
         assert (std[:3] < 0.05).all() and (std[3:6] < np.radians(1.5)).all() and std[6] < 0.03
 
 
-# ---------------------------------------------------------------------------------------------------- what is refused
-
-
 def test_another_place_and_blank_images_have_too_few_matches():
     nothing = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32)
     blank = Keyframe(3, *nothing, INTRINSICS, SIZE, np.zeros((6, 8), np.float16))
@@ -132,17 +129,13 @@ def with_few_points(view):
     return dataclasses.replace(view, points=np.where(np.arange(len(view.points))[:, None] < 15, view.points, np.nan))
 
 
-def test_points_are_needed_in_both_directions():
+def test_points_are_needed_in_both_directions_and_must_say_the_same_pose():
+    """The query's points are right for a camera 60 cm aside, the candidate's for the camera that there is."""
     a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
     assert_refused(verify(b, with_few_points(a), [], verification_config()), Gate.POSE)
     assert_refused(verify(with_few_points(b), a, [], verification_config()), Gate.POSE)
-
-
-def test_points_of_either_that_say_different_poses_are_refused():
-    """The query's points are right for a camera 60 cm aside, the candidate's for the camera that there is."""
-    a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
-    b = dataclasses.replace(b, points=b.points + np.float32([0.6, 0, 0]))
-    assert_refused(verify(b, a, [], verification_config()), Gate.POSES_DISAGREE)
+    aside = dataclasses.replace(b, points=b.points + np.float32([0.6, 0, 0]))
+    assert_refused(verify(aside, a, [], verification_config()), Gate.POSES_DISAGREE)
 
 
 def test_points_in_a_corner_of_the_image_near_a_line_or_of_one_small_object_are_refused():
@@ -157,12 +150,9 @@ def test_points_in_a_corner_of_the_image_near_a_line_or_of_one_small_object_are_
     assert_refused(measured(box, query, overrides=("alignment.min_hull=0.0",)), Gate.SMALL)
 
 
-def test_depths_that_are_noise_are_refused():
+def test_depths_that_are_noise_and_a_scale_that_a_metric_prior_does_not_have_are_refused():
     # From one and the same place: no depth is wrong there by its reprojection.
     assert_refused(measured(query=CANDIDATE, noise=0.15), Gate.DEPTHS)
-
-
-def test_a_scale_that_a_metric_prior_does_not_have_is_refused():
     loop, info = measured(scale_b=1.3)
     assert loop is None and info.refused_by == Gate.SCALE
     np.testing.assert_allclose(info.measured, -np.log(1.3), atol=1e-4)
@@ -188,9 +178,6 @@ def test_refusals_are_counted_by_name_in_the_order_of_the_gates():
     assert {name: count for name, count in counts.items() if count} == {"matches": 1, "hull": 2, "accepted": 1}
     with pytest.raises(Exception, match="6 or more"):  # fewer points than a pose needs
         verification_config("alignment.min_pose_points=5")
-
-
-# -------------------------------------------------------------------------------------------------------- agreement
 
 
 def test_an_innovation_is_measured_in_standard_deviations_of_its_dimension():
@@ -285,9 +272,6 @@ def test_a_statement_that_is_contradicted_falls_with_all_that_agree_one_after_th
     assert agreeing(loops, elsewhere, poses, scales, config).all()
 
 
-# ---------------------------------------------------------------------------------------------------- contradiction
-
-
 def showing(depths, scale=1.0):
     """A keyframe of which only the depths matter."""
     return dataclasses.replace(keyframe(room(), np.eye(4)), depths=np.float16(scale * depths))
@@ -327,9 +311,6 @@ def test_what_hides_behind_something_else_is_no_contradiction():
     aside = matrix((0, 0, 0), (0.5, 0, 0))
     assert contradicted_share(seen_from(0.0), seen_from(0.5), at(aside), 0.15) == 0.0
     assert contradicted_share(seen_from(0.0), seen_from(0.5), at(np.eye(4)), 0.15) > 0.05
-
-
-# ------------------------------------------------------------------------------------------------------- apartment
 
 
 @cache
