@@ -168,14 +168,13 @@ def test_the_threshold_is_that_quantile_of_the_similarity_to_the_last_neighbours
 
 def test_a_blank_image_has_a_keyframe_and_is_no_candidate():
     points, mask = ramp()
-    blank = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
-    config = appearance_config("min_gap=1", "num_words=8")
+    blank, config = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8), appearance_config("min_gap=1", "num_words=8")
     database = Database()
-    for frame in range(4):
-        database = extend(database, describe(frame, blank, points, mask, INTRINSICS, config), config)
-    assert propose(database, 3, config) == [] and not len(database.words)
-    database = extend(database, dataclasses.replace(described(), frame=4), config)
-    database = extend(database, describe(5, blank, points, mask, INTRINSICS, config), config)
+    for frame in range(6):
+        if frame == 4:
+            assert propose(database, 3, config) == [] and not len(database.words)
+        shown = picture() if frame == 4 else blank
+        database = extend(database, describe(frame, shown, points, mask, INTRINSICS, config), config)
     assert database.words.shape == (8, 128) and propose(database, 5, config) == []
 
 

@@ -13,10 +13,7 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.data.base import Frame
 from emgs_jax.prior.network.framework import NORMALIZATIONS
 
-KEYS = {
-    *("img", "data_norm_type", "intrinsics", "ray_directions", "depth_z", "camera_poses", "is_metric_scale"),
-    *("true_shape", "idx", "instance"),
-}
+KEYS = {"img", "data_norm_type", "intrinsics", "camera_poses", "is_metric_scale", "true_shape", "instance"}
 
 
 def rigid(rotation, translation):
