@@ -40,6 +40,8 @@ def test_skipping_leaves_out_exactly_the_unreadable_frames_and_renumbers_the_res
     assert frames.skipped == {1: "1.png is truncated", 4: "4.png is truncated"}
     assert [(frame.index, frame.timestamp) for frame in frames] == [(0, 0.0), (1, 20.0), (2, 30.0)]
     assert frames.kept == (0, 2, 3) and len(frames) == 3
+    whole, without_1, without_2 = (ReadableFrames(Damaged(*bad), "skip").fingerprint() for bad in ((), (1,), (2,)))
+    assert whole == "whole" and len({whole, without_1, without_2}) == 3
 
 
 def test_without_skipping_nothing_is_read_before_its_turn_and_the_error_names_the_file():
@@ -48,14 +50,6 @@ def test_without_skipping_nothing_is_read_before_its_turn_and_the_error_names_th
     assert damaged.reads == [] and len(frames) == 5
     with pytest.raises(BadFrameError, match="2.png"):
         frames[2]
-
-
-def test_the_fingerprint_changes_only_where_frames_are_left_out():
-    whole, without_1, without_2 = (ReadableFrames(Damaged(*bad), "skip").fingerprint() for bad in ((), (1,), (2,)))
-    assert whole == "whole" and len({whole, without_1, without_2}) == 3
-
-
-def test_a_sequence_without_any_readable_frame_says_why():
     with pytest.raises(ValueError, match="no frame that can be read: 0.png is truncated"):
         ReadableFrames(Damaged(*range(5)), "skip")
     with pytest.raises(ValueError, match="on_bad_frame must be error or skip, got 'maybe'"):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import hydra
 import numpy as np
 import pytest
+from listed_frames import Listed
 from scene import compose
 from stereo_scene import similarity_error
 from tiny_run import SMALL_STEREO
@@ -21,25 +22,10 @@ from emgs_jax.running.inputs import predictions
 WINDOW_SIZE, NUM_FRAMES = 5, 8
 
 
-class Edited:
-    """A data set with some images replaced, which are kept so that a frame is drawn once."""
-
-    def __init__(self, frames, images=(), like=None):
-        dataset = like or frames
-        self.name, self.sequence, self.size = dataset.name, dataset.sequence, dataset.size
-        self.intrinsics, self.classes, self.has_ground_truth = dataset.intrinsics, dataset.classes, True
-        self._frames = [frames[index] for index in range(len(frames))]
-        for index, image in dict(images).items():
-            self._frames[index] = replace(self._frames[index], image=image)
-
-    def __len__(self):
-        return len(self._frames)
-
-    def __getitem__(self, index):
-        return self._frames[index]
-
-    def fingerprint(self):
-        return "edited"
+def edited(frames, images):
+    """The data set with some images replaced."""
+    shown = [replace(frame, image=images.get(index, frame.image)) for index, frame in enumerate(frames)]
+    return Listed(frames, shown)
 
 
 def make_prior(*overrides):
@@ -48,7 +34,8 @@ def make_prior(*overrides):
 
 @pytest.fixture(scope="module")
 def room():
-    return Edited(Synthetic(num_frames=40, stop=NUM_FRAMES, size=(128, 96)))
+    drawn = Synthetic(num_frames=40, stop=NUM_FRAMES, size=(128, 96))
+    return Listed(drawn, drawn)  # so that a frame is drawn once
 
 
 def answers(prior, dataset, distortions=None):
@@ -203,7 +190,7 @@ def test_a_recording_that_was_interrupted_is_completed_to_the_same_bits(tmp_path
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_blank_image_has_no_pose_and_the_next_is_placed_again(room, answered):
-    found = answers(make_prior(), Edited(room, {5: blank(room)}))
+    found = answers(make_prior(), edited(room, {5: blank(room)}))
     for answer in found:
         row = dict(zip(answer.window.views, answer.T_anchor_view, strict=True))
         assert all(np.isfinite(row[index]).all() == (index != 5) for index in row)
@@ -214,7 +201,7 @@ def test_a_blank_image_has_no_pose_and_the_next_is_placed_again(room, answered):
 
 
 def test_images_without_texture_give_no_geometry_and_nothing_that_a_map_could_start_from(room):
-    images = Edited(room, {index: blank(room) for index in range(NUM_FRAMES)})
+    images = edited(room, {index: blank(room) for index in range(NUM_FRAMES)})
     found = answers(make_prior(), images)
     for answer in found:
         np.testing.assert_array_equal(answer.T_anchor_view[0], np.eye(4))
@@ -227,7 +214,7 @@ def test_images_without_texture_give_no_geometry_and_nothing_that_a_map_could_st
 
 @pytest.mark.slow
 def test_a_sequence_may_begin_with_images_that_show_nothing(room):
-    found = answers(make_prior(), Edited(room, {index: blank(room) for index in range(3)}))
+    found = answers(make_prior(), edited(room, {index: blank(room) for index in range(3)}))
     assert not found[0].mask.any()  # two images with texture are confirmed by nothing
     assert found[1].window.current == 5 and found[1].mask[1].any()
     poses = known_poses(found[1:])
@@ -241,7 +228,7 @@ def test_after_a_loss_a_known_place_is_found_again(room):
     gap, back = WINDOW_SIZE + 2, (6, 5, 4)
     nothing = replace(room[0], image=blank(room))  # the anchor, too: it would place the others
     frames = [nothing, *(room[index] for index in range(1, NUM_FRAMES)), *[nothing] * gap, *(room[i] for i in back)]
-    images = Edited([replace(frame, index=index) for index, frame in enumerate(frames)], like=room)
+    images = Listed(room, frames)
     found = answers(make_prior(), images)
     before = dict(zip(found[2].window.views, found[2].T_anchor_view, strict=True))
     after = dict(zip(found[-1].window.views, found[-1].T_anchor_view, strict=True))
@@ -255,7 +242,7 @@ def two_rooms(room):
     """The room, and from frame `NUM_FRAMES` on another one, of which nothing is known."""
     other = Synthetic(num_frames=40, stop=NUM_FRAMES, size=(128, 96), seed=5)
     frames = [*(room[index] for index in range(NUM_FRAMES)), *(other[index] for index in range(NUM_FRAMES))]
-    return Edited([replace(frame, index=index) for index, frame in enumerate(frames)], like=room)
+    return Listed(room, frames)
 
 
 @pytest.mark.slow
@@ -297,7 +284,7 @@ def test_few_lost_images_begin_nothing_and_a_structure_without_a_relation_is_rec
 
 
 def test_windows_out_of_order_images_of_another_size_and_short_windows_are_refused(room):
-    images = Edited(room, {index: blank(room) for index in range(NUM_FRAMES)})
+    images = edited(room, {index: blank(room) for index in range(NUM_FRAMES)})
     prior, calls = make_prior("prior.dense.min_support=1.5"), list(windows(NUM_FRAMES, WINDOW_SIZE))
 
     def ask(number):
@@ -308,7 +295,7 @@ def test_windows_out_of_order_images_of_another_size_and_short_windows_are_refus
     ask(0)
     with pytest.raises(ValueError, match="expected window 1, got 3; ask for all windows in order"):
         ask(3)
-    images = Edited(room, {2: blank(room)[:90], 0: blank(room), 1: blank(room)})
+    images = edited(room, {2: blank(room)[:90], 0: blank(room), 1: blank(room)})
     with pytest.raises(ValueError, match=r"frame 2 has size \(128, 90\).*\(128, 96\).*dataset.size"):
         ask(0)
     with pytest.raises(ValueError, match="at least 3 images, got slam.window_size=2"):

@@ -85,6 +85,15 @@ def test_the_anchors_pose_and_its_flag_are_switches_that_reach_the_network(overr
     assert settings["masks"]["max_edge_step"] == 0.03
     assert settings["anchor_pose"] is bool(anchor_keys)
     assert settings["anchor_is_metric"] == (("anchor_is_metric=true" in overrides) if anchor_keys else None)
+    assert isinstance(prior, Prior) and make(Double(data)).report() == {}
+    report = prior.report()
+    assert report["prior/num_inferences"] == 1 and report["prior/peak_gpu_mib"] == 3
+    assert 0 < report["prior/seconds_per_inference"] < 10
+    other = make(double, "model=da3_nested")  # is told neither calibration nor pose
+    ask(other, data, window)
+    assert all(keys == {"img", "data_norm_type"} for keys in double.seen)
+    told = {"is_calibrated": False, "anchor_pose": False, "scale": "metric"}
+    assert told.items() <= other.provenance.settings.items()
 
 
 @pytest.mark.parametrize("model", ["mapanything", "vggt"])
@@ -117,16 +126,6 @@ def test_windows_of_a_network_without_a_unit_agree_at_the_anchors_median_depth()
         for index, points in zip(window.dense, prediction.points, strict=True):
             depth = data.depth(index, frame_matrix(data), (56, 42))
             np.testing.assert_allclose(points[..., 2], scale * depth, rtol=1e-5)
-
-
-def test_only_a_conditioned_network_is_told_calibration_and_pose():
-    data = Sphere()
-    double = Double(data)
-    prior = make(double, "model=da3_nested")
-    ask(prior, data, calls(data)[0])
-    assert all(keys == {"img", "data_norm_type"} for keys in double.seen)
-    settings = prior.provenance.settings
-    assert (settings["is_calibrated"], settings["anchor_pose"], settings["scale"]) == (False, False, "metric")
 
 
 def blind_anchor(index, output):
@@ -199,14 +198,3 @@ def test_outputs_and_frames_that_do_not_fit_are_refused():
 def test_a_value_without_sense_is_named(overrides, text):
     with pytest.raises(hydra.errors.InstantiationException, match=text):
         make(Double(Sphere()), *overrides)
-
-
-def test_seconds_and_gpu_memory_are_reported_once_there_is_an_inference():
-    data = Sphere()
-    prior = make(Double(data))
-    assert isinstance(prior, Prior) and prior.report() == {}
-    for window in calls(data)[:2]:
-        ask(prior, data, window)
-    report = prior.report()
-    assert report["prior/num_inferences"] == 2 and report["prior/peak_gpu_mib"] == 3
-    assert 0 < report["prior/seconds_per_inference"] < 10

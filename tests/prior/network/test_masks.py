@@ -174,9 +174,9 @@ def shares(row, depths, K, T, absolute, relative):
 
 def test_the_share_of_agreeing_views_is_upstreams(views):
     arrays = [jnp.asarray(a, jnp.float32) for a in views]
-    for row in range(3):
-        share, number = consistent_share(jnp.asarray(row), *arrays, config())
-        expected_share, expected_number = shares(row, *views, 0.02, 0.02)
+    for row, relative in ((0, 0.02), (1, 0.02), (2, 0.02), (1, 0.12)):  # 40 cm decide by whose depth the share is of
+        share, number = consistent_share(jnp.asarray(row), *arrays, config(consistent_depth_share=relative))
+        expected_share, expected_number = shares(row, *views, 0.02, relative)
         # At a pixel's border float32 may fall to the other side.
         assert (np.asarray(number) == expected_number).mean() > 0.98
         assert (np.abs(np.asarray(share) - expected_share) < 1e-6).mean() > 0.98
