@@ -49,16 +49,13 @@ def assert_refused(result, gate):
     assert loop is None and info.refused_by == gate, info
 
 
-def test_the_pose_of_the_query_in_the_candidates_frame_is_exact():
+def test_the_pose_of_the_query_in_the_candidates_frame_is_exact_and_three_edges_around_a_triangle_close():
+    """An edge the wrong way round would not."""
     loop, info = measured()
     assert info.refused_by is None and np.isnan(info.measured)
     assert (loop.a, loop.b) == (3, 500) and loop.num_inliers > 100
     np.testing.assert_allclose(loop.Z_a_b, TRUTH, atol=1e-5)  # float32 points and pixels
     assert abs(loop.log_ratio) < 1e-5
-
-
-def test_three_edges_around_a_triangle_close():
-    """An edge the wrong way round would not."""
     poses = [CANDIDATE, QUERY, matrix((-2, 5, 0), (-0.1, 0.1, 0.1))]
     views = [keyframe(room(), T, frame) for frame, T in enumerate(poses)]
     config = verification_config("min_neighbours=0")
@@ -108,18 +105,14 @@ def test_the_stated_uncertainty_holds_the_error():
         assert (std[:3] < 0.05).all() and (std[3:6] < np.radians(1.5)).all() and std[6] < 0.03
 
 
-def test_another_place_and_blank_images_have_too_few_matches():
+def test_another_place_blank_images_and_matches_that_no_motion_explains_are_refused():
     nothing = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32)
     blank = Keyframe(3, *nothing, INTRINSICS, SIZE, np.zeros((6, 8), np.float16))
     a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
     other = dataclasses.replace(b, descriptors=looks(300, 8)[: len(b.pixels)])
     for query, candidate in ((other, a), (b, blank), (blank, b)):
         assert_refused(verify(query, candidate, [], verification_config()), Gate.MATCHES)
-
-
-def test_matches_most_of_which_no_motion_explains_are_refused():
-    a = keyframe(room(600), CANDIDATE, 3)
-    b = with_wrong(keyframe(room(600), QUERY, 500), 0.8)
+    a, b = keyframe(room(600), CANDIDATE, 3), with_wrong(keyframe(room(600), QUERY, 500), 0.8)
     result = verify(b, a, [], verification_config("alignment.min_matches=20"))
     assert_refused(result, Gate.MATCH_SHARE)
 
@@ -181,15 +174,13 @@ def test_refusals_are_counted_by_name_in_the_order_of_the_gates():
 
 
 def test_an_innovation_is_measured_in_standard_deviations_of_its_dimension():
+    """Correlated drift is open only in its own direction."""
     covariance = np.diag([0.04, 0.01, 0.01, 1e-4, 1e-4, 1e-4])
     limit = np.sqrt(20.06)  # χ²₆ with the probability .9973 of three standard deviations
     direction = np.array([0.2, 0, 0, 0, 0, 0.01]) / np.sqrt(2)
     assert is_consistent(0.99 * limit * direction, covariance, 3.0)
     assert not is_consistent(1.01 * limit * direction, covariance, 3.0)
     assert is_consistent(np.array([2.99]), np.eye(1), 3.0) and not is_consistent(np.array([3.01]), np.eye(1), 3.0)
-
-
-def test_correlated_drift_is_open_only_in_its_own_direction_and_no_covariance_is_refused():
     along = np.array([1.0, 1.0]) / np.sqrt(2)
     covariance = 1e-4 * np.eye(2) + 4.0 * np.outer(along, along)
     assert is_consistent(3 * along, covariance, 3.0)
@@ -281,7 +272,7 @@ def at(T, log_ratio=0.0):
     return Similarity(T, log_ratio, np.eye(7))
 
 
-def test_a_wall_where_the_other_looks_through_is_a_contradiction_in_both_orders():
+def test_a_wall_where_the_other_looks_through_is_a_contradiction_in_both_orders_in_one_unit_from_one_place():
     hall, shorter = np.full((24, 32), 6.0), np.full((24, 32), 6.0)
     shorter[6:18, 8:24] = 4.0  # a quarter of the image
     a, b = showing(hall), showing(shorter)
@@ -290,14 +281,10 @@ def test_a_wall_where_the_other_looks_through_is_a_contradiction_in_both_orders(
     assert contradicted_share(a, b, at(np.eye(4)), 0.4) == 0.0  # within the margin
     assert contradicted_share(a, a, at(np.eye(4)), 0.15) == 0.0
     assert contradicted_share(a, showing(0 * hall), at(np.eye(4)), 0.15) == 0.0
-
-
-def test_depths_are_compared_in_one_unit_and_from_one_place():
-    wall = np.full((24, 32), 6.0)
-    a, b = showing(wall), showing(wall - 2.0, 2.0)  # 2 m nearer, in half metres
-    assert contradicted_share(a, b, at(matrix((0, 0, 0), (0, 0, 2.0)), -np.log(2)), 0.15) == 0.0
-    assert contradicted_share(a, b, at(np.eye(4), -np.log(2)), 0.15) == 1.0
-    assert contradicted_share(a, b, at(matrix((0, 0, 0), (0, 0, 2.0))), 0.15) > 0.9
+    nearer, ahead = showing(hall - 2.0, 2.0), matrix((0, 0, 0), (0, 0, 2.0))  # 2 m, in half metres
+    assert contradicted_share(a, nearer, at(ahead, -np.log(2)), 0.15) == 0.0
+    assert contradicted_share(a, nearer, at(np.eye(4), -np.log(2)), 0.15) == 1.0
+    assert contradicted_share(a, nearer, at(ahead), 0.15) > 0.9
 
 
 def test_what_hides_behind_something_else_is_no_contradiction():

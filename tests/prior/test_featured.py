@@ -104,10 +104,11 @@ def test_features_are_added_to_a_recording_without_the_prior(tmp_path, textured)
 def test_a_recording_is_compared_with_the_classes_of_a_file(tmp_path, textured):
     record(Featured(Simulated(), make_model()), textured, WINDOW_SIZE, tmp_path / "recording")
     save_text(tmp_path / "lamp.npz", make_model().embed(("lamp", "wall")))
-    prior = Requeried(Recorded(tmp_path / "recording"), str(tmp_path / "lamp.npz"))
+    recorded = Recorded(tmp_path / "recording")
+    prior = Requeried(recorded, str(tmp_path / "lamp.npz"))
     assert prior.feature_names == ("lamp", "wall")
     np.testing.assert_array_equal(prior.text_features, make_model(classes=("lamp", "wall")).text.vectors)
-    for got, expected in zip(predictions(prior, textured), predictions(prior._prior, textured), strict=True):
+    for got, expected in zip(predictions(prior, textured), predictions(recorded, textured), strict=True):
         assert got.features.tobytes() == expected.features.tobytes()
     save_text(tmp_path / "other.npz", make_model(seed=1).embed(("lamp",)))
     with pytest.raises(ValueError, match="other.npz was embedded by .*'seed': 1.*but the features are of .*'seed': 0"):
