@@ -1,12 +1,14 @@
-"""Small sequences of a known scene, written to disk in every layout, and the real ones of the development slice."""
+"""Small sequences of a known scene, written once in every layout, and the real ones of the development slice."""
 
 import json
+import shutil
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from written_scene import color_image, plane_depth, scene_pose, write_depth
+from written_scene import color_image, moved, plane_depth, scene_pose, write_depth
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 NUM_FRAMES = 3
@@ -24,21 +26,18 @@ def shared_data():
     return find
 
 
-@pytest.fixture
-def seven_scenes_root(tmp_path: Path) -> Path:
-    folder = tmp_path / "kitchen" / "seq-01"
+def write_seven_scenes(root: Path) -> None:
+    folder = root / "kitchen" / "seq-01"
     folder.mkdir(parents=True)
     for i in range(NUM_FRAMES):
         depth = plane_depth(scene_pose(i), (585, 585, 320, 240), (640, 480))
         write_depth(folder / f"frame-{i:06d}.depth.png", depth, 1000)
         cv2.imwrite(str(folder / f"frame-{i:06d}.color.{'jpg' if i else 'png'}"), color_image(i, (640, 480)))
         np.savetxt(folder / f"frame-{i:06d}.pose.txt", scene_pose(i))
-    return tmp_path
 
 
-@pytest.fixture
-def tum_root(tmp_path: Path) -> Path:
-    folder = tmp_path / "rgbd_dataset_freiburg3_plane"
+def write_tum(root: Path) -> None:
+    folder = root / "rgbd_dataset_freiburg3_plane"
     (folder / "rgb").mkdir(parents=True)
     (folder / "depth").mkdir()
     lists = {"rgb": "# color\n", "depth": "# depth\n", "groundtruth": "# t tx ty tz qx qy qz qw\n"}
@@ -54,30 +53,51 @@ def tum_root(tmp_path: Path) -> Path:
         lists["groundtruth"] += f"{time - 0.005:.4f} {x} {y} {z} 0 {np.sin(half)} 0 {np.cos(half)}\n"
     for name, text in lists.items():
         (folder / f"{name}.txt").write_text(text)
-    return tmp_path
 
 
-@pytest.fixture
-def replica_root(tmp_path: Path) -> Path:
-    folder = tmp_path / "office9" / "results"
+def write_replica(root: Path) -> None:
+    folder = root / "office9" / "results"
     folder.mkdir(parents=True)
     camera = {"w": 120, "h": 68, "fx": 60.0, "fy": 60.0, "cx": 59.5, "cy": 33.5, "scale": 6553.5}
-    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    (root / "cam_params.json").write_text(json.dumps({"camera": camera}))
     for i in range(NUM_FRAMES):
         cv2.imwrite(str(folder / f"frame{i:06d}.jpg"), color_image(i, (120, 68)))
         write_depth(folder / f"depth{i:06d}.png", plane_depth(scene_pose(i), (60, 60, 59.5, 33.5), (120, 68)), 6553.5)
     rows = [" ".join(f"{v:.9e}" for v in scene_pose(i).ravel()) for i in range(NUM_FRAMES)]
-    (tmp_path / "office9" / "traj.txt").write_text("\n".join(rows))
-    return tmp_path
+    (root / "office9" / "traj.txt").write_text("\n".join(rows))
 
 
-@pytest.fixture
-def images_root(tmp_path: Path) -> Path:
-    folder = tmp_path / "images"
-    folder.mkdir()
+def write_images(root: Path) -> None:
     for i, name in enumerate(("img2.png", "img10.JPG", "IMG33.jpeg")):
-        cv2.imwrite(str(folder / name), color_image(i, (160, 120)))
+        cv2.imwrite(str(root / name), color_image(i, (160, 120)))
+
+
+@pytest.fixture(scope="session")
+def written(tmp_path_factory):
+    """Folder of a scene in the layout that a function writes."""
+
+    @cache
+    def folder(write) -> Path:
+        root = tmp_path_factory.mktemp(write.__name__)
+        write(root)
+        return root
+
     return folder
+
+
+def copy_of(write):
+    """A fixture: the scene in a folder that the test may change."""
+
+    @pytest.fixture
+    def root(tmp_path, written) -> Path:
+        return Path(shutil.copytree(written(write), tmp_path / write.__name__))
+
+    return root
+
+
+seven_scenes_root, tum_root, replica_root, images_root = map(
+    copy_of, (write_seven_scenes, write_tum, write_replica, write_images)
+)
 
 
 @pytest.fixture
@@ -85,18 +105,12 @@ def depth_gaps():
     """Depth that frame j has at the points of frame i, less the points' z; metres, positive = floats in front."""
 
     def measure(dataset, i: int, j: int, edge: float = 0.05) -> np.ndarray:
-        a, b = dataset[i], dataset[j]
-        (fx, fy, cx, cy), (w, h) = dataset.intrinsics, dataset.size
-        v, u = np.nonzero(a.depth > 0)
-        z = a.depth[v, u].astype(np.float64)
-        points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z, np.ones_like(z)])
-        x, y, z = (np.linalg.inv(b.T_world_camera) @ a.T_world_camera @ points)[:3]
-        ahead = z > 0.1
-        x, y, z = x[ahead], y[ahead], z[ahead]
-        column, row = np.rint(fx * x / z + cx).astype(int), np.rint(fy * y / z + cy).astype(int)
+        b, (w, h) = dataset[j], dataset.size
+        _, (column, row, z) = moved(dataset, i, j)
+        column, row = np.rint(column).astype(int), np.rint(row).astype(int)
         # The image's gradient bounds what half a pixel of rounding can do: steps in depth are left out.
         steps = cv2.dilate(b.depth, np.ones((3, 3))) - cv2.erode(b.depth, np.ones((3, 3)))
-        inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
+        inside = (z > 0.1) & (column >= 0) & (column < w) & (row >= 0) & (row < h)
         column, row, z = column[inside], row[inside], z[inside]
         seen = (b.depth[row, column] > 0) & (steps[row, column] < edge)
         return (b.depth[row, column] - z)[seen]

@@ -13,23 +13,16 @@ class_names: ['0', 'backpack', 'base-cabinet']
 
 
 def written(tmp_path, text, name="classes.txt"):
-    (tmp_path / name).write_text(text)
+    if text is not None:
+        (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     return tmp_path / name
 
 
-def test_a_name_a_line_has_no_ids(tmp_path):
-    found = read_classes(written(tmp_path, "# rooms\nwall\n tv screen  # flat\n\n"))
-    assert (found.names, found.positions) == (("wall", "tv screen"), None)
+def test_a_name_a_line_has_no_ids_and_an_id_and_a_name_a_line_has_and_0_is_undefined(tmp_path):
+    found = read_classes(written(tmp_path, "# rooms\nwall\n tv screen  # flat\n2 seater sofa\n\n"))
+    assert (found.names, found.positions) == (("wall", "tv screen", "2 seater sofa"), None)
     with pytest.raises(ValueError, match=r"classes.txt has names without ids, which x.txt needs: .*`id name`"):
         found.positions_of(np.array([1]), "x.txt")
-
-
-def test_a_name_may_begin_with_a_number(tmp_path):
-    found = read_classes(written(tmp_path, "table\n2 seater sofa\nchair\n"))
-    assert found.names == ("table", "2 seater sofa", "chair") and found.positions is None
-
-
-def test_an_id_and_a_name_a_line_and_0_is_undefined(tmp_path):
     found = read_classes(written(tmp_path, "7 tv screen\n3 wall\n"))
     assert found.names == ("tv screen", "wall")
     np.testing.assert_array_equal(found.positions_of(np.array([3, 7, 0, 3]), "x"), [1, 0, -1, 1])
@@ -72,17 +65,11 @@ def test_an_id_without_a_name_and_one_that_was_cut_to_8_bits_are_told_apart(tmp_
         ("a.yaml", "class_names_reduced: wall\nmap_to_reduced: {}", "expected a list, got str"),
         ("a.yaml", "class_names_reduced: [3]\nmap_to_reduced: {}", "3 is no name"),
         ("a.yaml", "a: [", "a.yaml is no class file"),
+        ("a.txt", None, "class file .*a.txt does not exist: "),
+        ("a.txt", b"\xff\xfe\x00", "a.txt cannot be read"),
     ],
 )
 def test_what_is_no_class_file_is_named_with_a_remedy(tmp_path, name, text, message):
     with pytest.raises(ValueError, match=message) as caught:
         read_classes(written(tmp_path, text, name))
     assert "give a name a line" in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(ValueError, match="class file .*nothing.txt does not exist: give a name a line"):
-        read_classes(tmp_path / "nothing.txt")
-    (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ValueError, match="bytes.txt cannot be read"):
-        read_classes(tmp_path / "bytes.txt")

@@ -34,6 +34,14 @@ DAMAGED = [
     ("replica", "office9/results/frame000001.jpg"),
     ("images", "img10.JPG"),
 ]
+BAD_VALUES = [
+    ("start", 3),
+    ("stop", 99),
+    ("stride", 0),
+    ("size", [320]),
+    ("size", [0, 1]),
+    ("intrinsics", [1, 1, 9999, 1]),
+]
 
 
 def load(name, root, **options):
@@ -52,7 +60,7 @@ def test_yaml_keys_and_values_are_the_constructors_parameters_and_defaults(path)
 
 
 @pytest.mark.parametrize("name", ON_DISK)
-def test_missing_root_and_sequence_name_the_path_and_the_layout(name, request):
+def test_what_is_missing_or_a_bad_value_names_the_path_or_key_and_the_fingerprint_follows_the_options(name, request):
     root = request.getfixturevalue(f"{name}_root")
     with pytest.raises(ValueError, match="dataset.root is not set: give dataset.root=FOLDER with the layout root"):
         ON_DISK[name][0]()
@@ -60,21 +68,9 @@ def test_missing_root_and_sequence_name_the_path_and_the_layout(name, request):
         load(name, root / "gone")
     with pytest.raises(FileNotFoundError, match="nowhere does not exist; expected the layout root"):
         load(name, root, sequence="nowhere")
-
-
-@pytest.mark.parametrize("name", ON_DISK)
-@pytest.mark.parametrize(
-    "key, value",
-    [("start", 3), ("stop", 99), ("stride", 0), ("size", [320]), ("size", [0, 1]), ("intrinsics", [1, 1, 9999, 1])],
-)
-def test_a_bad_value_names_its_key(name, key, value, request):
-    with pytest.raises(ValueError, match=f"dataset.{key} "):
-        load(name, request.getfixturevalue(f"{name}_root"), **{key: value})
-
-
-@pytest.mark.parametrize("name", ON_DISK)
-def test_the_fingerprint_is_stable_and_follows_the_options(name, request):
-    root = request.getfixturevalue(f"{name}_root")
+    for key, value in BAD_VALUES:
+        with pytest.raises(ValueError, match=f"dataset.{key} "):
+            load(name, root, **{key: value})
     assert load(name, root).fingerprint() == load(name, root).fingerprint()
     assert load(name, root).fingerprint() != load(name, root, stride=2).fingerprint()
     assert load(name, root).fingerprint() != load(name, root, size=(64, 48)).fingerprint()

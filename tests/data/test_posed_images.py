@@ -15,19 +15,12 @@ from emgs_jax.data.readable import ReadableFrames
 
 SIZE = (160, 120)
 NAMES = ("img10.png", "img2.png", "img33.png")  # in the order of the files, which is not that of the numbers
-CAMERAS = {
-    "PINHOLE": "130 128 81 59.5",
-    "SIMPLE_PINHOLE": "130 81 59.5",
-    "SIMPLE_RADIAL": "130 81 59.5 .02",
-    "RADIAL": "130 81 59.5 .02 -.004",
-    "OPENCV": "130 128 81 59.5 .02 -.004 .001 -.002",
-}
-NUMBERS = {  # the same as dataset.intrinsics, whose pixels are counted from the centre of the first
-    "PINHOLE": [130, 128, 80.5, 59],
-    "SIMPLE_PINHOLE": [130, 130, 80.5, 59],
-    "SIMPLE_RADIAL": [130, 130, 80.5, 59, 0.02, 0, 0, 0],
-    "RADIAL": [130, 130, 80.5, 59, 0.02, -0.004, 0, 0],
-    "OPENCV": [130, 128, 80.5, 59, 0.02, -0.004, 0.001, -0.002],
+CAMERAS = {  # the same as dataset.intrinsics, whose pixels are counted from the centre of the first
+    "PINHOLE": ("130 128 81 59.5", [130, 128, 80.5, 59]),
+    "SIMPLE_PINHOLE": ("130 81 59.5", [130, 130, 80.5, 59]),
+    "SIMPLE_RADIAL": ("130 81 59.5 .02", [130, 130, 80.5, 59, 0.02, 0, 0, 0]),
+    "RADIAL": ("130 81 59.5 .02 -.004", [130, 130, 80.5, 59, 0.02, -0.004, 0, 0]),
+    "OPENCV": ("130 128 81 59.5 .02 -.004 .001 -.002", [130, 128, 80.5, 59, 0.02, -0.004, 0.001, -0.002]),
 }
 
 
@@ -37,12 +30,12 @@ def write_images(folder) -> None:
         cv2.imwrite(str(folder / name), color_image(i, SIZE))
 
 
-def write_colmap(folder, camera: str = "PINHOLE", second: str = "") -> None:
-    """Two lines an image; the second may list points."""
+def write_colmap(folder, camera: str = "PINHOLE", second: str = ""):
+    """Two lines an image; the second may list points. Returns the folder of the model."""
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
     write_images(folder / "images")
-    (model / "cameras.txt").write_text(f"# cameras\n7 {camera} 160 120 {CAMERAS.get(camera, '130 81 59.5 .1')}\n")
+    (model / "cameras.txt").write_text(f"# cameras\n7 {camera} 160 120 {CAMERAS[camera][0]}\n")
     lines = ["# images"]
     for i, name in enumerate(NAMES):
         pose = np.linalg.inv(scene_pose(i))
@@ -50,6 +43,7 @@ def write_colmap(folder, camera: str = "PINHOLE", second: str = "") -> None:
         lines += [f"{i + 3} {w} {x} {y} {z} {pose[0, 3]} {pose[1, 3]} {pose[2, 3]} 7 {name}", second]
     (model / "images.txt").write_text("\n".join(lines) + "\n")
     (model / "points3D.txt").write_text("1 0 0 1 255 0 0 -1\n")
+    return model
 
 
 def write_nerfstudio(folder, **changes) -> None:
@@ -63,16 +57,10 @@ def write_nerfstudio(folder, **changes) -> None:
     (folder / "transforms.json").write_text(json.dumps(values | changes))
 
 
-@pytest.fixture(params=["colmap", "nerfstudio"])
-def posed(request, tmp_path):
-    """Class and folder of both."""
-    {"colmap": write_colmap, "nerfstudio": write_nerfstudio}[request.param](tmp_path)
-    return {"colmap": Colmap, "nerfstudio": Nerfstudio}[request.param], tmp_path
-
-
-def test_images_come_in_the_order_of_their_numbers_with_their_poses(posed):
-    build, root = posed
-    dataset = build(str(root), size=SIZE)
+@pytest.mark.parametrize(("build", "write"), [(Colmap, write_colmap), (Nerfstudio, write_nerfstudio)])
+def test_images_come_in_the_order_of_their_numbers_with_their_poses(build, write, tmp_path):
+    write(tmp_path)
+    dataset = build(str(tmp_path), size=SIZE)
     frames = [dataset[index] for index in range(len(dataset))]
     assert [frame.timestamp for frame in frames] == [2, 10, 33]
     for frame, i in zip(frames, (1, 0, 2), strict=True):
@@ -81,24 +69,25 @@ def test_images_come_in_the_order_of_their_numbers_with_their_poses(posed):
         assert frame.depth is None
     np.testing.assert_allclose(dataset.intrinsics, (130, 128, 80.5, 59))
     assert not dataset.has_ground_truth and len(ReadableFrames(dataset, "skip")) == 3
-
-
-def test_a_stretch_and_a_size_are_chosen_as_everywhere(posed):
-    build, root = posed
-    dataset = build(str(root), start=1, stride=1, stop=2, size=(80, 60))
-    assert [frame.timestamp for frame in (dataset[i] for i in range(len(dataset)))] == [10]
-    np.testing.assert_allclose(dataset.intrinsics, (65, 64, 40, 29.25))
-    np.testing.assert_allclose(dataset[0].T_world_camera, scene_pose(0), atol=1e-12)
-    other = build(str(root), size=(80, 60))
-    assert dataset.fingerprint() == build(str(root), start=1, stop=2, size=(80, 60)).fingerprint()
-    assert dataset.fingerprint() != other.fingerprint()
+    # A stretch and a size are chosen as everywhere.
+    part = build(str(tmp_path), start=1, stride=1, stop=2, size=(80, 60))
+    assert [frame.timestamp for frame in (part[i] for i in range(len(part)))] == [10]
+    np.testing.assert_allclose(part.intrinsics, (65, 64, 40, 29.25))
+    np.testing.assert_allclose(part[0].T_world_camera, scene_pose(0), atol=1e-12)
+    assert part.fingerprint() == build(str(tmp_path), start=1, stop=2, size=(80, 60)).fingerprint()
+    assert part.fingerprint() != build(str(tmp_path), size=(80, 60)).fingerprint()
+    (tmp_path / "images" / "img2.png").unlink()  # one image that is missing is a bad frame
+    dataset = build(str(tmp_path), size=SIZE)
+    with pytest.raises(BadFrameError, match="img2.png is missing"):
+        dataset[0]
+    assert ReadableFrames(dataset, "skip").kept == (1, 2)
 
 
 @pytest.mark.parametrize("model", CAMERAS)
 def test_a_lens_of_colmap_is_the_lens_of_the_same_numbers(model, tmp_path):
     write_colmap(tmp_path, model)
     dataset = Colmap(str(tmp_path), size=SIZE)
-    same = Images(str(tmp_path / "images"), size=SIZE, intrinsics=NUMBERS[model])
+    same = Images(str(tmp_path / "images"), size=SIZE, intrinsics=CAMERAS[model][1])
     np.testing.assert_allclose(dataset.intrinsics, same.intrinsics)
     for index in range(3):
         np.testing.assert_array_equal(dataset[index].image, same[index].image)
@@ -107,17 +96,14 @@ def test_a_lens_of_colmap_is_the_lens_of_the_same_numbers(model, tmp_path):
 @pytest.mark.parametrize("second", ["", "10.5 20.25 -1 30 40 1"])
 def test_binary_and_text_of_pycolmap_are_read_alike(second, tmp_path):
     pycolmap = pytest.importorskip("pycolmap", reason="oracle: pip install -e .[oracles]")
-    write_colmap(tmp_path, "OPENCV", second)
+    model = write_colmap(tmp_path, "OPENCV", second)
     text = Colmap(str(tmp_path), size=SIZE)
-    model = tmp_path / "sparse" / "0"
     if second:
         (model / "points3D.txt").write_text("1 0 0 1 255 0 0 -1 3 1 4 1 5 1\n")
     found = pycolmap.Reconstruction(str(model))
-    (tmp_path / "binary").mkdir()
-    (tmp_path / "text").mkdir()
-    found.write_binary(str(tmp_path / "binary"))
-    found.write_text(str(tmp_path / "text"))
-    for name in ("binary", "text"):
+    for name, write in (("binary", found.write_binary), ("text", found.write_text)):
+        (tmp_path / name).mkdir()
+        write(str(tmp_path / name))
         dataset = Colmap(str(tmp_path), model=name, size=SIZE)
         np.testing.assert_allclose(dataset.intrinsics, text.intrinsics)
         for index in range(3):
@@ -126,14 +112,6 @@ def test_binary_and_text_of_pycolmap_are_read_alike(second, tmp_path):
     for image in found.images.values():
         row = sorted(NAMES, key=lambda name: int(name[3:-4])).index(image.name)
         np.testing.assert_allclose(text.pose(row)[:3, 3], image.projection_center(), atol=1e-9)
-
-
-def test_a_binary_that_is_none_is_a_clear_error(tmp_path):
-    write_colmap(tmp_path)
-    for path in (tmp_path / "sparse" / "0").iterdir():
-        path.rename(path.with_suffix(".bin"))
-    with pytest.raises(ValueError, match=r"cameras\.bin is damaged: "):
-        Colmap(str(tmp_path))
 
 
 def replaced(path, old, new):
@@ -157,17 +135,21 @@ def replaced(path, old, new):
     ],
 )
 def test_a_damaged_or_foreign_model_is_named(name, old, new, message, tmp_path):
-    write_colmap(tmp_path)
-    replaced(tmp_path / "sparse" / "0" / name, old, new)
+    model = write_colmap(tmp_path)
+    replaced(model / name, old, new)
     with pytest.raises(ValueError, match=message):
+        Colmap(str(tmp_path))
+    for path in model.iterdir():
+        path.rename(path.with_suffix(".bin"))
+    with pytest.raises(ValueError, match=r"cameras\.bin is damaged: "):
         Colmap(str(tmp_path))
 
 
 def test_two_cameras_are_refused_unless_they_are_the_same(tmp_path):
-    write_colmap(tmp_path)
-    cameras = tmp_path / "sparse" / "0" / "cameras.txt"
-    replaced(tmp_path / "sparse" / "0" / "images.txt", " 7 img33", " 8 img33")
-    line = f"8 PINHOLE 160 120 {CAMERAS['PINHOLE']}\n"
+    model = write_colmap(tmp_path)
+    cameras = model / "cameras.txt"
+    replaced(model / "images.txt", " 7 img33", " 8 img33")
+    line = f"8 PINHOLE 160 120 {CAMERAS['PINHOLE'][0]}\n"
     cameras.write_text(cameras.read_text() + line)
     assert len(Colmap(str(tmp_path))) == 3
     cameras.write_text(cameras.read_text().replace(line, line.replace("130", "140")))
@@ -176,8 +158,7 @@ def test_two_cameras_are_refused_unless_they_are_the_same(tmp_path):
 
 
 def test_no_model_no_registered_image_and_no_images_are_errors(tmp_path):
-    write_colmap(tmp_path)
-    images = tmp_path / "sparse" / "0" / "images.txt"
+    images = write_colmap(tmp_path) / "images.txt"
     with pytest.raises(FileNotFoundError, match="no cameras and images .* in .*nowhere"):
         Colmap(str(tmp_path), model="nowhere")
     with pytest.raises(FileNotFoundError, match=r"none of them is in .*photos: put the images there"):
@@ -192,15 +173,6 @@ def test_no_model_no_registered_image_and_no_images_are_errors(tmp_path):
         Nerfstudio(str(tmp_path))
 
 
-def test_one_image_that_is_missing_is_a_bad_frame(posed):
-    build, root = posed
-    (root / "images" / "img2.png").unlink()
-    dataset = build(str(root), size=SIZE)
-    with pytest.raises(BadFrameError, match="img2.png is missing"):
-        dataset[0]
-    assert ReadableFrames(dataset, "skip").kept == (1, 2)
-
-
 @pytest.mark.parametrize(
     "changes, message",
     [
@@ -213,17 +185,15 @@ def test_one_image_that_is_missing_is_a_bad_frame(posed):
         ({"w": 320, "h": 240}, "is for images of 320x240"),
     ],
 )
-def test_a_damaged_transforms_json_is_named(changes, message, tmp_path):
+def test_a_damaged_transforms_json_is_named_and_a_pose_that_is_not_finite_is_none(changes, message, tmp_path):
     write_nerfstudio(tmp_path, **changes)
     with pytest.raises(ValueError, match=message) as error:
         Nerfstudio(str(tmp_path))
     assert "transforms.json" in str(error.value)
-
-
-def test_a_frame_whose_pose_is_not_finite_has_none(tmp_path):
-    write_nerfstudio(tmp_path)
-    values = json.loads((tmp_path / "transforms.json").read_text())
+    write_nerfstudio(tmp_path / "sound")
+    path = tmp_path / "sound" / "transforms.json"
+    values = json.loads(path.read_text())
     values["frames"][1]["transform_matrix"][0][3] = float("nan")
-    (tmp_path / "transforms.json").write_text(json.dumps(values))
-    dataset = Nerfstudio(str(tmp_path), size=SIZE)
+    path.write_text(json.dumps(values))
+    dataset = Nerfstudio(str(path.parent), size=SIZE)
     assert dataset.pose(0) is None and dataset.pose(1) is not None

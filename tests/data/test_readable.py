@@ -40,6 +40,8 @@ def test_skipping_leaves_out_exactly_the_unreadable_frames_and_renumbers_the_res
     assert frames.skipped == {1: "1.png is truncated", 4: "4.png is truncated"}
     assert [(frame.index, frame.timestamp) for frame in frames] == [(0, 0.0), (1, 20.0), (2, 30.0)]
     assert frames.kept == (0, 2, 3) and len(frames) == 3
+    whole, without_1, without_2 = (ReadableFrames(Damaged(*bad), "skip").fingerprint() for bad in ((), (1,), (2,)))
+    assert whole == "whole" and len({whole, without_1, without_2}) == 3
 
 
 def test_without_skipping_nothing_is_read_before_its_turn_and_the_error_names_the_file():
@@ -48,14 +50,6 @@ def test_without_skipping_nothing_is_read_before_its_turn_and_the_error_names_th
     assert damaged.reads == [] and len(frames) == 5
     with pytest.raises(BadFrameError, match="2.png"):
         frames[2]
-
-
-def test_the_fingerprint_changes_only_where_frames_are_left_out():
-    whole, without_1, without_2 = (ReadableFrames(Damaged(*bad), "skip").fingerprint() for bad in ((), (1,), (2,)))
-    assert whole == "whole" and len({whole, without_1, without_2}) == 3
-
-
-def test_a_sequence_without_any_readable_frame_says_why():
     with pytest.raises(ValueError, match="no frame that can be read: 0.png is truncated"):
         ReadableFrames(Damaged(*range(5)), "skip")
     with pytest.raises(ValueError, match="on_bad_frame must be error or skip, got 'maybe'"):
@@ -63,18 +57,20 @@ def test_a_sequence_without_any_readable_frame_says_why():
 
 
 class WithTruth(Damaged):
-    """Frames of which some have no true pose, and some a damaged one."""
+    """Frames of which some have no true pose, and some a damaged one; all from number 3 on are far away."""
 
     has_ground_truth = True
 
-    def __init__(self, lost=(), damaged=()):
+    def __init__(self, lost=(), damaged=(), far=0.0):
         super().__init__()
-        self.lost, self.damaged = lost, damaged
+        self.lost, self.damaged, self.far = lost, damaged, far
 
     def pose(self, index):
         if index in self.damaged:
             raise BadFrameError(f"poses.txt, line {index}")
-        return None if index in self.lost else np.eye(4)
+        pose = np.eye(4)
+        pose[0, 3] = self.far * (index > 2)
+        return None if index in self.lost else pose
 
     def __getitem__(self, index):
         self.pose(index)
@@ -97,24 +93,11 @@ def test_all_true_poses_are_read_before_the_first_frame():
 
 def test_a_step_of_the_truth_that_no_walk_has_is_named_before_the_first_frame():
     """A jump of 900 m between two frames was taken for a walk."""
-
-    class Jump(WithTruth):
-        far = 900.0
-
-        def pose(self, index):
-            pose = super().pose(index)
-            if pose is not None and index > 2:
-                pose[0, 3] = self.far
-            return pose
-
     with pytest.raises(BadFrameError, match=r"damaged one: the true pose of frame 3 is 900 m from that of frame 2, "):
-        ReadableFrames(Jump())
+        ReadableFrames(WithTruth(far=900.0))
     with pytest.raises(BadFrameError, match=r"frame 3 is 900 m from that of frame 1, "):  # one between has none
-        ReadableFrames(Jump(lost=(2,)))
-    without = Jump()
+        ReadableFrames(WithTruth(far=900.0, lost=(2,)))
+    without = WithTruth(far=900.0)
     without.has_ground_truth = False  # poses of a unit of its own
-    assert len(ReadableFrames(without)) == 5
-    Jump.far = 120.0
-    assert len(ReadableFrames(Jump(lost=(2,)))) == 5  # two steps
-    Jump.far = 99.0
-    assert len(ReadableFrames(Jump())) == 5
+    for frames in (without, WithTruth(far=120.0, lost=(2,)), WithTruth(far=99.0)):  # two steps; one
+        assert len(ReadableFrames(frames)) == 5

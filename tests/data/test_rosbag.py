@@ -33,31 +33,30 @@ def test_images_and_camera_are_those_that_were_recorded(version, kind, tmp_path)
     assert dataset.fingerprint() != RosBag(str(path), size=SIZE, stride=2).fingerprint()
 
 
-def test_a_bag_without_camera_info_names_the_key_that_replaces_it(tmp_path):
-    path = write_bag(tmp_path, info=False)
-    with pytest.raises(ValueError, match=r"has no camera_info, so dataset.intrinsics must say the camera"):
-        RosBag(str(path))
-    dataset = RosBag(str(path), size=SIZE, intrinsics=[130, 128, 80.5, 59])
+def test_topics_and_the_camera_are_chosen_and_what_cannot_be_read_is_refused_with_the_key(tmp_path):
+    path = str(write_bag(tmp_path))
+    assert len(RosBag(path, topic="/cam/image_raw", info_topic="/cam/camera_info", size=SIZE)) == 3
+    dataset = RosBag(write(tmp_path / "bare", info=False), size=SIZE, intrinsics=[130, 128, 80.5, 59])
     np.testing.assert_array_equal(dataset[1].image[..., ::-1], color_image(1, SIZE))
-
-
-def test_topics_are_chosen_and_those_that_are_there_are_named(tmp_path):
-    path = write_bag(tmp_path)
-    assert len(RosBag(str(path), topic="/cam/image_raw", info_topic="/cam/camera_info", size=SIZE)) == 3
-    with pytest.raises(
-        ValueError, match="no topic /eye of sensor_msgs/Image: give dataset.topic= one of /cam/image_raw"
+    for bag, options, message in (
+        (tmp_path / "bare" / "walk", {}, r"has no camera_info, so dataset.intrinsics must say the camera"),
+        (path, {"topic": "/eye"}, "no topic /eye of sensor_msgs/Image: give dataset.topic= one of /cam/image_raw"),
+        (path, {"info_topic": "/eye"}, "dataset.info_topic= one of /cam/camera_info"),
+        (write(tmp_path / "fish", model="equidistant", bent=D[:4]), {}, "distortion 'equidistant'.*dataset.intrinsics"),
+        (write(tmp_path / "bayer", encoding="bayer_rggb8"), {}, "encoding 'bayer_rggb8'.*dataset.topic"),
+        (
+            write(tmp_path / "rect", name="rect", P=np.zeros(12)),
+            {},
+            "no P for the rectified /cam/image_rect: give dataset.intrinsics",
+        ),
     ):
-        RosBag(str(path), topic="/eye")
-    with pytest.raises(ValueError, match="dataset.info_topic= one of /cam/camera_info"):
-        RosBag(str(path), info_topic="/eye")
+        with pytest.raises(ValueError, match=message):
+            RosBag(str(bag), **options)
 
 
-def test_a_lens_or_encoding_that_is_not_read_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="distortion 'equidistant'.*dataset.intrinsics"):
-        RosBag(str(write_bag(tmp_path, model="equidistant", bent=D[:4])))
-    (tmp_path / "bayer").mkdir()
-    with pytest.raises(ValueError, match="encoding 'bayer_rggb8'.*dataset.topic"):
-        RosBag(str(write_bag(tmp_path / "bayer", encoding="bayer_rggb8")))
+def write(folder, **options):
+    folder.mkdir()
+    return str(write_bag(folder, **options))
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -70,26 +69,11 @@ def test_a_rectified_topic_has_the_camera_that_it_was_made_for(version, kind, tm
     np.testing.assert_array_equal(dataset[1].image[..., ::-1], color_image(1, SIZE))
 
 
-@pytest.mark.parametrize(
-    ("topic", "is_rectified"),
-    [
-        ("/cam/image_rect", True),
-        ("/cam/image_rect_color/compressed", True),
-        ("/zed/rgb/color/rect/image", True),
-        ("/cam/image_raw", False),
-        ("/direct/color", False),
-        ("/correct_cam/rgb/compressed", False),
-        ("/cam/image_corrected", False),
-    ],
-)
-def test_what_is_rectified_is_told_by_a_word_of_the_topic(topic, is_rectified):
-    assert bool(RECTIFIED.search(topic)) == is_rectified
-
-
-def test_a_rectified_topic_without_its_camera_is_refused(tmp_path):
-    path = write_bag(tmp_path, name="rect", P=np.zeros(12))
-    with pytest.raises(ValueError, match="no P for the rectified /cam/image_rect: give dataset.intrinsics"):
-        RosBag(str(path))
+def test_what_is_rectified_is_told_by_a_word_of_the_topic():
+    for topic in ("/cam/image_rect", "/cam/image_rect_color/compressed", "/zed/rgb/color/rect/image"):
+        assert RECTIFIED.search(topic), topic
+    for topic in ("/cam/image_raw", "/direct/color", "/correct_cam/rgb/compressed", "/cam/image_corrected"):
+        assert not RECTIFIED.search(topic), topic
 
 
 def test_a_damaged_bag_and_a_missing_library_are_clear(tmp_path, monkeypatch):

@@ -32,3 +32,13 @@ def color_image(index: int, size: tuple[int, int]) -> np.ndarray:
     """A smooth BGR image that names its frame by its mean."""
     u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
     return np.stack([u * 120 // size[0], v * 120 // size[1], np.full(u.shape, 40 * index + 20)], -1).astype(np.uint8)
+
+
+def moved(dataset, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (row, column) of frame i that have depth, and where frame j shows them: column, row and z."""
+    a, (fx, fy, cx, cy) = dataset[i], dataset.intrinsics
+    v, u = np.nonzero(a.depth > 0)
+    z = a.depth[v, u].astype(np.float64)
+    points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z, np.ones_like(z)])
+    x, y, z = (np.linalg.inv(dataset[j].T_world_camera) @ a.T_world_camera @ points)[:3]
+    return np.stack([v, u]), np.stack([fx * x / z + cx, fy * y / z + cy, z])

@@ -2,50 +2,30 @@
 
 import numpy as np
 import pytest
+from cloud_scene import random_cloud
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.evaluation.clouds import (
-    PointCloud,
-    fuse_clouds,
-    read_cloud,
-    register,
-    transform_cloud,
-    voxel_downsample,
-)
+from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, read_cloud, register, transform_cloud, voxel_downsample
 from emgs_jax.evaluation.trajectory import Alignment
 from emgs_jax.io.ply import save_points_ply
 
 
-def random_cloud(rng, n=400):
-    normals = rng.normal(size=(n, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return PointCloud(rng.uniform(-1, 1, (n, 3)), normals, rng.uniform(size=(n, 3)))
-
-
-def test_points_of_a_voxel_become_their_mean_and_twice_is_once():
-    rng = np.random.default_rng(3)
-    cloud = random_cloud(rng, 5000)
+def test_points_of_a_voxel_become_their_means_and_twice_is_once():
+    """Its normal is the direction of the mean, and zero where the sides cancel."""
+    cloud = random_cloud(np.random.default_rng(7), 5000)
     small = voxel_downsample(cloud, 0.2)
     cells, inverse = np.unique(np.floor(cloud.points / 0.2), axis=0, return_inverse=True)
-    means = np.stack([cloud.points[inverse.ravel() == cell].mean(0) for cell in range(len(cells))])
-    np.testing.assert_allclose(small.points, means, rtol=0, atol=1e-12)
-    again = voxel_downsample(small, 0.2)
-    for name in ("points", "normals", "colors"):
-        np.testing.assert_allclose(getattr(again, name), getattr(small, name), atol=1e-12)
-
-
-def test_a_voxels_normal_is_the_direction_of_the_mean_and_zero_where_the_sides_cancel():
-    rng = np.random.default_rng(7)
-    cloud = random_cloud(rng, 5000)
-    small = voxel_downsample(cloud, 0.2)
-    cells, inverse = np.unique(np.floor(cloud.points / 0.2), axis=0, return_inverse=True)
-    means = np.stack([cloud.normals[inverse.ravel() == cell].mean(0) for cell in range(len(cells))])
-    length = np.linalg.norm(means, axis=1, keepdims=True)
+    rows = [inverse.ravel() == cell for cell in range(len(cells))]
+    points, normals, colors = (
+        np.stack([values[row].mean(0) for row in rows]) for values in (cloud.points, cloud.normals, cloud.colors)
+    )
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
     assert 0.01 < (length < 0.1).mean() < 0.5, "both kinds of voxels are there"
-    np.testing.assert_allclose(small.normals, np.where(length > 0.1, means / length, 0.0), rtol=0, atol=1e-12)
-    colors = np.stack([cloud.colors[inverse.ravel() == cell].mean(0) for cell in range(len(cells))])
-    np.testing.assert_allclose(small.colors, colors, rtol=0, atol=1e-12)
+    again, expected = voxel_downsample(small, 0.2), np.where(length > 0.1, normals / length, 0.0)
+    for name, values in (("points", points), ("normals", expected), ("colors", colors)):
+        np.testing.assert_allclose(getattr(small, name), values, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(getattr(again, name), getattr(small, name), atol=1e-12)
 
 
 def test_a_similarity_moves_the_points_and_only_turns_the_normals():
@@ -60,7 +40,7 @@ def test_a_similarity_moves_the_points_and_only_turns_the_normals():
 
 
 def test_fusing_pieces_is_reducing_the_whole(monkeypatch):
-    monkeypatch.setattr("emgs_jax.evaluation.clouds._MERGE_ROWS", 50)
+    monkeypatch.setattr("emgs_jax.evaluation.clouds._MERGE_ROWS", 50)  # or a million points are needed for one merge
     cloud = random_cloud(np.random.default_rng(4), 900)
     pieces = [PointCloud(cloud.points[i::7], cloud.normals[i::7], cloud.colors[i::7]) for i in range(7)]
     whole, fused = voxel_downsample(cloud, 0.1), fuse_clouds(iter(pieces), 0.1)
@@ -77,7 +57,6 @@ def test_registration_takes_the_steps_of_open3ds_point_to_point_icp(num_steps):
     import open3d as o3d
 
     registration = o3d.pipelines.registration
-    import open3d as o3d
 
     rng = np.random.default_rng(5)
     target = rng.uniform(-1, 1, (800, 3))

@@ -38,10 +38,7 @@ def test_what_is_within_reach_step_by_step_is_one_object_and_a_gap_parts_it():
     assert clusters(chain, 0.25, 2).tolist() == [0] * 10
     assert clusters(np.delete(chain, 4, 0), 0.25, 2).tolist() == [0] * 4 + [1] * 5
     assert clusters(chain, 0.19, 2).tolist() == [-1] * 10
-
-
-def test_without_answers_or_neighbours_there_is_no_object():
-    none = np.zeros((0, 3)), np.zeros((0, 3, 3))
+    none = np.zeros((0, 3)), np.zeros((0, 3, 3))  # without answers or neighbours there is no object
     assert find_instances(np.zeros(0, int), none, (np.zeros(0), np.zeros(0)), 0.3, 3) == []
     assert reach_of(np.zeros((1, 3)), CONFIG) == 0.0
     one = np.zeros((1, 3)), np.eye(3)[None]

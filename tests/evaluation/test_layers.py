@@ -26,10 +26,10 @@ def test_a_second_layer_counts_between_two_deviations_and_15_cm(gap, share):
     assert double_wall_share(*both(wall(0.0), wall(gap))) == share
 
 
-def test_only_what_has_another_behind_it_counts():
+def test_only_what_has_another_behind_it_counts_and_a_lone_gaussian_has_no_share():
     assert double_wall_share(*wall(0.0)) == 0.0
-    small = wall(0.08, size=10)
-    assert double_wall_share(*both(wall(0.0), small)) == pytest.approx(2 * 100 / 500, abs=0.05)
+    assert double_wall_share(*both(wall(0.0), wall(0.08, size=10))) == pytest.approx(2 * 100 / 500, abs=0.05)
+    assert double_wall_share(*(rows[:1] for rows in wall(0.0))) is None
 
 
 def test_the_two_sides_of_a_board_and_a_slope_are_no_double_wall():
@@ -39,7 +39,3 @@ def test_the_two_sides_of_a_board_and_a_slope_are_no_double_wall():
     assert double_wall_share(*both(wall(0.0), (means, tilted, covs))) == 0.0
     turn = np.array([[0.8, 0.0, -0.6], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
     assert double_wall_share(means @ turn.T, normals @ turn.T, turn @ covs @ turn.T) == 0.0
-
-
-def test_a_lone_gaussian_has_no_share():
-    assert double_wall_share(*(rows[:1] for rows in wall(0.0))) is None

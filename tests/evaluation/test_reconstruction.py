@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cloud_scene import INTRINSICS, SHAPE, plane_depth, random_cloud
 from scene import evaluation_config
 from scipy.spatial.transform import Rotation
 
@@ -22,14 +23,6 @@ from emgs_jax.evaluation.trajectory import Alignment
 
 REPLICA = Path(__file__).resolve().parents[3] / "shared" / "data" / "replica"
 CONFIG = evaluation_config()
-INTRINSICS = (110.0, 95.0, 61.0, 47.0)  # fx ≠ fy, centre not in the middle
-SHAPE = (90, 120)
-
-
-def plane_depth(normal, distance):
-    """Depth image of the plane normal · p = distance."""
-    rays = backproject(np.ones(SHAPE), INTRINSICS)
-    return distance / (rays @ np.asarray(normal))
 
 
 def grid_cloud(offset=0.0, n=40, spacing=0.05):
@@ -38,63 +31,34 @@ def grid_cloud(offset=0.0, n=40, spacing=0.05):
     return PointCloud(points, np.tile([0.0, 0.0, 1.0], (n * n, 1)), np.full((n * n, 3), 0.5))
 
 
-def random_cloud(rng, n=400):
-    normals = rng.normal(size=(n, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return PointCloud(rng.uniform(-1, 1, (n, 3)), normals, rng.uniform(size=(n, 3)))
-
-
 def a_frame(depth, pose=None, index=0):
     image = np.full((*depth.shape, 3), 51, np.uint8)
     return Frame(index, float(index), "f", image, depth.astype(np.float32), np.eye(4) if pose is None else pose)
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
+def test_wrong_config_values_are_named():
+    for name, value, message in (
         ("alignment", "sim2", "alignment must be sim3 or se3, got 'sim2'"),
         ("statistic", "median", "statistic must be mean or rmse, got 'median'"),
         ("voxel_m", 0.0, "voxel_m must be positive, got 0.0"),
         ("max_distance_m", float("nan"), "max_distance_m must be positive, got nan"),
-    ],
-)
-def test_wrong_config_values_are_named(name, value, message):
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(CONFIG, **{name: value})
+    ):
+        with pytest.raises(ValueError, match=message):
+            dataclasses.replace(CONFIG, **{name: value})
 
 
-def test_protocols_and_alignments_are_options_and_each_names_itself():
-    assert evaluation_config().protocol == "paper/sim3"
-    for protocol in ("paper", "mast3r", "nice_slam"):
-        for alignment in ("sim3", "se3"):
-            config = evaluation_config(f"evaluation={protocol}", f"evaluation.alignment={alignment}")
-            assert (config.protocol, config.alignment) == (f"{protocol}/{alignment}", alignment)
-
-
-def test_a_cloud_against_itself_is_perfect():
+@pytest.mark.parametrize("protocol", ["paper", "mast3r", "nice_slam"])
+def test_a_protocol_and_its_alignment_name_themselves_and_a_cloud_against_itself_is_perfect(protocol):
+    config = evaluation_config(f"evaluation={protocol}", "evaluation.alignment=se3")
+    assert (config.protocol, config.alignment) == (f"{protocol}/se3", "se3") and CONFIG.protocol == "paper/sim3"
     cloud = random_cloud(np.random.default_rng(0))
-    metrics = reconstruction_metrics(cloud, reference(cloud, CONFIG), CONFIG)
+    metrics = reconstruction_metrics(cloud, reference(cloud, config), config)
     assert metrics["reconstruction/accuracy_m"] == metrics["reconstruction/completion_m"] == 0.0
-    percents = [value for key, value in metrics.items() if key.endswith("percent")]
-    assert len(percents) == 8
-    np.testing.assert_allclose(percents, 100.0)
+    np.testing.assert_allclose([value for key, value in metrics.items() if key.endswith("percent")], 100.0)
 
 
-def test_parallel_planes_differ_by_their_distance():
-    """10 cm apart: inside the 20 cm threshold, outside the 5 cm one; normals agree up to sign."""
-    estimate = grid_cloud(0.1)
-    estimate = dataclasses.replace(estimate, normals=-estimate.normals)
-    metrics = reconstruction_metrics(estimate, reference(grid_cloud(), CONFIG), CONFIG)
-    np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 0.1, rtol=1e-9)
-    np.testing.assert_allclose(metrics["reconstruction/completion_m"], 0.1, rtol=1e-9)
-    assert metrics["reconstruction/f1_20cm_percent"] == 100.0
-    assert metrics["reconstruction/f1_5cm_percent"] == 0.0
-    assert metrics["reconstruction/normals_abs_cos_percent"] == 100.0
-    assert metrics["reconstruction/num_points"] == 1600
-
-
-def test_normals_that_are_turned_by_known_angles_agree_by_their_cosines():
-    """Half of the points by 20 degrees, half by 40: only the first half is within 30."""
+def test_parallel_planes_differ_by_their_distance_and_normals_by_the_cosines_of_their_angles():
+    """10 cm apart: inside the 20 cm threshold, outside the 5 cm one; half of the normals turned by 20°, half by 40°."""
     truth = grid_cloud()
     angles = np.radians(np.where(np.arange(len(truth)) % 2, 40.0, 20.0))
     turned = np.stack([np.sin(angles), np.zeros_like(angles), np.cos(angles)], 1)
@@ -102,9 +66,22 @@ def test_normals_that_are_turned_by_known_angles_agree_by_their_cosines():
     expected = 50 * (np.cos(np.radians(20.0)) + np.cos(np.radians(40.0)))
     np.testing.assert_allclose(metrics["reconstruction/normals_abs_cos_percent"], expected, rtol=1e-9)
     assert metrics["reconstruction/normals_within_30deg_percent"] == 50.0
+    estimate = dataclasses.replace(grid_cloud(0.1), normals=-truth.normals)  # normals agree up to sign
+    metrics = reconstruction_metrics(estimate, reference(truth, CONFIG), CONFIG)
+    np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 0.1, rtol=1e-9)
+    np.testing.assert_allclose(metrics["reconstruction/completion_m"], 0.1, rtol=1e-9)
+    assert metrics["reconstruction/f1_20cm_percent"] == 100.0
+    assert metrics["reconstruction/f1_5cm_percent"] == 0.0
+    assert metrics["reconstruction/normals_abs_cos_percent"] == 100.0
+    assert metrics["reconstruction/num_points"] == 1600
+    # A random choice of points is the same each time; the distances grow with the gaps.
+    few = dataclasses.replace(CONFIG, max_points=400)
+    first, second = (reconstruction_metrics(estimate, reference(truth, few), few) for _ in range(2))
+    assert first == second and first["reconstruction/num_points"] == 1600
+    assert 0.1 < first["reconstruction/accuracy_m"] < 0.12 and first["reconstruction/f1_20cm_percent"] == 100.0
 
 
-def test_half_a_plane_has_full_precision_and_half_the_recall():
+def test_half_a_plane_has_full_precision_and_half_the_recall_and_a_far_outlier_counts_in_full():
     truth = grid_cloud()
     left = truth.points[:, 0] < 1.0
     half = PointCloud(truth.points[left], truth.normals[left], truth.colors[left])
@@ -116,10 +93,6 @@ def test_half_a_plane_has_full_precision_and_half_the_recall():
     assert metrics["reconstruction/accuracy_m"] == 0.0
     # Columns 1 … 20 of the missing half are 5, 10 … 100 cm away: the mean over all is half their mean.
     np.testing.assert_allclose(metrics["reconstruction/completion_m"], 0.5 * 0.05 * 10.5)
-
-
-def test_one_far_outlier_counts_in_full():
-    truth = grid_cloud()
     points = np.concatenate([truth.points, [[0.003, 0.003, 1600.003]]])
     estimate = PointCloud(points, np.zeros_like(points), np.zeros_like(points))
     metrics = reconstruction_metrics(estimate, reference(truth, CONFIG), CONFIG)
@@ -192,6 +165,11 @@ def test_the_prior_of_true_points_is_the_ground_truth_and_moves_with_the_poses()
     np.testing.assert_allclose(camera[on_plane] @ normal, 2.0, atol=1e-5)
     cosines = truth.normals @ move[:3, :3] @ normal / np.linalg.norm(normal)
     assert (cosines[on_plane] < -0.99).mean() > 0.95
+    depth = np.full(SHAPE, 3.0)
+    depth[:, 60:] = 5.0  # beyond the limit of a protocol
+    cloud = ground_truth_cloud([a_frame(depth)], INTRINSICS, evaluation_config("evaluation=mast3r"))
+    assert len(cloud) > 1000
+    np.testing.assert_allclose(cloud.points[:, 2], 3.0)
 
 
 def test_a_cloud_is_aligned_by_the_poses_with_scale_or_without():
@@ -220,10 +198,7 @@ def test_distances_are_those_of_open3d_as_mean_and_as_clipped_rmse():
     distances = [np.asarray(a.compute_point_cloud_distance(b)) for a, b in ((there, back), (back, there))]
     exact = dataclasses.replace(CONFIG, voxel_m=1e-5)
     clipped = dataclasses.replace(exact, statistic="rmse", max_distance_m=0.1)
-    for config, average in (
-        (exact, np.mean),
-        (clipped, lambda values: np.sqrt(np.mean(np.minimum(values, 0.1) ** 2))),
-    ):
+    for config, average in ((exact, np.mean), (clipped, lambda values: np.sqrt(np.mean(np.minimum(values, 0.1) ** 2)))):
         metrics = reconstruction_metrics(estimate, reference(truth, config), config)
         for name, values in zip(("accuracy_m", "completion_m"), distances, strict=True):
             np.testing.assert_allclose(metrics[f"reconstruction/{name}"], average(values), rtol=1e-6)
@@ -248,24 +223,6 @@ def test_icp_of_a_protocol_takes_back_a_small_motion_that_the_poses_do_not_show(
     assert without["reconstruction/accuracy_m"] > 0.01
     found = compare_clouds(moved, reference(truth, refined), (estimated, poses), refined)
     assert found["reconstruction/accuracy_m"] < 1e-9
-
-
-def test_true_depth_beyond_the_limit_of_a_protocol_is_left_out():
-    depth = np.full(SHAPE, 3.0)
-    depth[:, 60:] = 5.0
-    cloud = ground_truth_cloud([a_frame(depth)], INTRINSICS, evaluation_config("evaluation=mast3r"))
-    assert len(cloud) > 1000
-    np.testing.assert_allclose(cloud.points[:, 2], 3.0)
-
-
-def test_a_protocol_compares_a_random_choice_of_points_that_is_the_same_each_time():
-    """Of two parallel planes every choice has the precision of the whole; the distances grow with the gaps."""
-    few = dataclasses.replace(CONFIG, max_points=400)
-    first, second = (reconstruction_metrics(grid_cloud(0.1), reference(grid_cloud(), few), few) for _ in range(2))
-    assert first == second
-    assert first["reconstruction/num_points"] == 1600
-    assert 0.1 < first["reconstruction/accuracy_m"] < 0.12
-    assert first["reconstruction/f1_20cm_percent"] == 100.0
 
 
 @pytest.mark.skipif(not REPLICA.exists(), reason="the shared Replica sequence is not here")

@@ -49,23 +49,12 @@ def test_true_points_of_an_ignored_class_do_not_count_but_points_lost_to_it_do()
     np.testing.assert_allclose(metrics["segmentation/miou_percent"], 60.0)
     np.testing.assert_allclose(metrics["segmentation/mean_recall_percent"], 60.0)
     assert metrics["segmentation/num_points"] == 10
-
-
-def test_a_perfect_answer_is_100_percent_and_none_is_0():
     truth = np.repeat(np.arange(4), [3, 1, 7, 2])
-    perfect = segmentation_metrics(confusion_matrix(truth, truth, 6))
-    silent = segmentation_metrics(confusion_matrix(truth, np.full_like(truth, -1), 6))
-    for name in ("miou", "fmiou", "mean_recall", "accuracy"):
-        assert perfect[f"segmentation/{name}_percent"] == 100.0
-        assert silent[f"segmentation/{name}_percent"] == 0.0
+    for answer, percent in ((truth, 100.0), (np.full_like(truth, -1), 0.0)):
+        metrics = segmentation_metrics(confusion_matrix(truth, answer, 6))
+        for name in ("miou", "fmiou", "mean_recall", "accuracy"):
+            assert metrics[f"segmentation/{name}_percent"] == percent
     assert segmentation_metrics(np.zeros((3, 4), int))["segmentation/miou_percent"] is None
-
-
-def test_scenes_are_joined_by_adding_their_matrices():
-    rng = np.random.default_rng(0)
-    truth, predicted = rng.integers(-1, 5, 400), rng.integers(-1, 5, 400)
-    parts = [confusion_matrix(truth[i::3], predicted[i::3], 5) for i in range(3)]
-    np.testing.assert_array_equal(sum(parts), confusion_matrix(truth, predicted, 5))
 
 
 def test_a_target_takes_the_most_frequent_label_of_its_neighbours():
@@ -139,11 +128,9 @@ def test_the_class_of_a_voxel_is_that_of_most_views_and_a_view_counts_once(monke
     assert found.classes == ("a", "b", "c") and len(LabelGrid(0.1).points(("a",)).labels) == 0
 
 
-def test_labels_are_translated_by_name_and_a_class_that_the_others_lack_stays_an_answer():
+def test_labels_are_translated_by_name_and_the_nearest_class_is_by_angle():
+    """A class that the others lack stays an answer; a missing feature has none."""
     found = translate(np.array([[0, 1], [2, -1]]), ("chair", "wall", "cat"), ("wall", "chair"))
     np.testing.assert_array_equal(found, [[1, 0], [2, -1]])
-
-
-def test_the_nearest_class_is_by_angle_and_a_missing_feature_has_none():
     features = np.array([[[5.0, 1.0], [0.0, 0.0], [0.1, 0.2]]], np.float16)
     np.testing.assert_array_equal(nearest_classes(features, np.array([[3.0, 0], [0, 1.0]])), [[0, -1, 1]])

@@ -27,7 +27,7 @@ def model_of(folder, **options):
     return LabelFeatures(str(folder), str(folder / "classes.txt"), **options)
 
 
-def test_each_class_has_an_axis_and_an_unknown_pixel_is_zero(folder):
+def test_each_class_has_an_axis_an_unknown_pixel_is_zero_and_labels_are_sampled_at_the_frames_size(folder):
     model = model_of(folder)
     assert isinstance(model, FeatureModel) and model.text.names == ("wall", "cup")
     features = model.extract(FRAME)
@@ -35,11 +35,8 @@ def test_each_class_has_an_axis_and_an_unknown_pixel_is_zero(folder):
     np.testing.assert_array_equal(features.argmax(-1)[IDS > 0], (IDS[IDS > 0] == 5).astype(int))
     np.testing.assert_array_equal(np.linalg.norm(features, axis=-1), IDS > 0)
     assert model.identity == {"name": "labels", "version": 1, "classes": ["wall", "cup"]}
-
-
-def test_labels_are_sampled_at_the_frames_size(folder):
     cv2.imwrite(str(folder / "a.png"), np.repeat(np.repeat(IDS, 3, 0), 3, 1))
-    np.testing.assert_array_equal(model_of(folder).extract(FRAME)[0, :, 1], [0, 0, 1, 1])
+    np.testing.assert_array_equal(model_of(folder).extract(FRAME), features)
 
 
 def test_a_file_of_embeddings_gives_the_vectors_and_the_identity(folder):
@@ -53,7 +50,7 @@ def test_a_file_of_embeddings_gives_the_vectors_and_the_identity(folder):
         _ = model_of(folder, text=str(folder / "t.npz")).text
 
 
-def test_scores_give_the_mean_of_the_vectors(folder):
+def test_scores_give_the_mean_of_the_vectors_of_more_classes_than_opencv_has_channels_too(folder):
     scores = np.zeros((2, 4, 2), np.float32)
     scores[0, 0], scores[0, 1] = [0.9, 0.3], [0.0, 2.0]
     np.save(folder / "a.npy", scores)
@@ -61,6 +58,24 @@ def test_scores_give_the_mean_of_the_vectors(folder):
     np.testing.assert_allclose(features[0, 0], np.array([3, 1]) / np.sqrt(10), atol=1e-3)
     np.testing.assert_array_equal(features[0, 1], [0, 1])
     assert not features[1].any()
+    (folder / "classes.txt").write_text("".join(f"{i + 1} class {i}\n" for i in range(700)))
+    scores = np.zeros((1, 2, 700), np.float32)
+    scores[0, 0, 650], scores[0, 1, 3] = 1.0, 1.0
+    np.save(folder / "a.npy", scores)
+    np.testing.assert_array_equal(model_of(folder).extract(FRAME).argmax(-1), [[650, 650, 3, 3]] * 2)
+
+
+def archive() -> bytes:
+    file = io.BytesIO()
+    np.savez(file, scores=np.zeros((2, 4, 2)))
+    return file.getvalue()
+
+
+def announcing(rows: int) -> bytes:
+    """A file whose header says that there are more rows than a computer holds."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (rows, 4, 2)})
+    return file.getvalue() + bytes(64)
 
 
 @pytest.mark.parametrize(
@@ -72,51 +87,16 @@ def test_scores_give_the_mean_of_the_vectors(folder):
         (np.zeros((4, 4, 2)), "not of the shape of the 4x2 frame"),
         (np.array([[["a", "b"]]]), "must hold scores"),
         (np.zeros((0, 0, 2)), "must hold scores"),
+        (b"\x93NUMPY\x01\x00\x10", "is no array of scores, or damaged"),
+        (archive(), "is no array of scores, or damaged"),
+        (announcing(2**40), "is no array of scores, or damaged"),
     ],
 )
 def test_bad_scores_are_named(folder, scores, problem):
-    np.save(folder / "a.npy", scores)
-    with pytest.raises(BadFrameError, match=re.escape(str(folder / "a.npy")) + f".*{problem}"):
+    path = folder / "a.npy"
+    path.write_bytes(scores) if isinstance(scores, bytes) else np.save(path, scores)
+    with pytest.raises(BadFrameError, match=f"{re.escape(str(path))}.*{problem}"):
         model_of(folder).extract(FRAME)
-
-
-def test_scores_that_are_no_array_and_labels_of_another_shape_are_named(folder):
-    cv2.imwrite(str(folder / "a.png"), np.full((4, 4), 2, np.uint8))
-    with pytest.raises(BadFrameError, match=r"a\.png is 4x4, which is not of the shape of the 4x2 frame"):
-        model_of(folder).extract(FRAME)
-    for content in (b"\x93NUMPY\x01\x00\x10", _archive(), _announcing(2**40)):
-        (folder / "a.npy").write_bytes(content)
-        with pytest.raises(BadFrameError, match=r"a\.npy is no array of scores, or damaged"):
-            model_of(folder).extract(FRAME)
-
-
-def _archive() -> bytes:
-    file = io.BytesIO()
-    np.savez(file, scores=np.zeros((2, 4, 2)))
-    return file.getvalue()
-
-
-def _announcing(rows: int) -> bytes:
-    """A file whose header says that there are more rows than a computer holds."""
-    file = io.BytesIO()
-    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (rows, 4, 2)})
-    return file.getvalue() + bytes(64)
-
-
-def test_more_classes_than_opencv_has_channels(folder):
-    names = [f"class {i}" for i in range(700)]
-    (folder / "classes.txt").write_text("".join(f"{i + 1} {name}\n" for i, name in enumerate(names)))
-    scores = np.zeros((1, 2, 700), np.float32)
-    scores[0, 0, 650], scores[0, 1, 3] = 1.0, 1.0
-    np.save(folder / "a.npy", scores)
-    np.testing.assert_array_equal(model_of(folder).extract(FRAME).argmax(-1), [[650, 650, 3, 3]] * 2)
-
-
-def test_labels_of_a_few_pixels_are_no_class_image(folder):
-    cv2.imwrite(str(folder / "a.png"), np.full((3, 4), 2, np.uint8))
-    frame = Frame(0, 0.0, "images/a.jpg", np.zeros((120, 160, 3), np.uint8))
-    with pytest.raises(BadFrameError, match=r"a\.png is 4x3, too coarse for a frame of 160x120"):
-        model_of(folder).extract(frame)
 
 
 class Dataset(list):
@@ -126,21 +106,24 @@ class Dataset(list):
         return self[index]
 
 
-def test_every_image_needs_a_file_and_the_images_must_be_those_that_were_segmented(folder):
-    model = model_of(folder)
+def test_labels_that_do_not_fit_the_images_or_classes_are_named(folder):
+    model, bent = model_of(folder), Dataset([["x/a.png"]])
     model.check(Dataset([["x/a.png"], []]))
     with pytest.raises(ValueError, match=r"b\.png does not exist, nor do those of 1 of 2 images"):
         model.check(Dataset([["x/a.png"], ["x/b.jpg"]]))
-    bent = Dataset([["x/a.png"]])
     bent.calibration = {"distortion": [0.1, 0.0]}
     with pytest.raises(ValueError, match="straightens its images"):
         model.check(bent)
-
-
-def test_a_name_that_is_no_class_is_refused(folder):
     with pytest.raises(ValueError, match=r"\['dog'\] are no classes of .*classes\.txt, which has wall, cup"):
-        model_of(folder).embed(("dog",))
+        model.embed(("dog",))
     with pytest.raises(ValueError, match=r"features\.unknown must be a list"):
         model_of(folder, unknown="0")
-    assert model_of(folder).settings["unknown"] is None
-    assert model_of(folder, unknown=[0, 7]).settings["unknown"] == [0, 7]
+    assert model.settings["unknown"] is None and model_of(folder, unknown=[0, 7]).settings["unknown"] == [0, 7]
+    large = Frame(0, 0.0, "images/a.jpg", np.zeros((120, 160, 3), np.uint8))
+    for shape, frame, message in (
+        ((4, 4), FRAME, r"a\.png is 4x4, which is not of the shape of the 4x2 frame"),
+        ((3, 4), large, r"a\.png is 4x3, too coarse for a frame of 160x120"),
+    ):
+        cv2.imwrite(str(folder / "a.png"), np.full(shape, 2, np.uint8))
+        with pytest.raises(BadFrameError, match=message):
+            model_of(folder).extract(frame)

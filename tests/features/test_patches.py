@@ -6,25 +6,19 @@ import pytest
 from emgs_jax.features.images import ImageConfig, grid_size, network_input
 
 
-@pytest.mark.parametrize(
-    ("size", "patch", "long_side", "grid"),
-    [
+def test_the_grid_is_the_one_of_the_nearest_aspect_ratio_and_a_side_of_broken_patches_is_refused():
+    for size, patch, long_side, grid in (
         ((640, 480), 16, 640, (40, 30)),
         ((320, 240), 16, 1024, (64, 48)),
         ((640, 480), 14, 518, (37, 28)),  # MapAnything's 518x392
         ((1200, 680), 14, 518, (37, 21)),  # MapAnything's 518x294
         ((480, 640), 14, 518, (28, 37)),
         ((900, 10), 16, 64, (4, 1)),
-    ],
-)
-def test_the_grid_is_the_one_of_the_nearest_aspect_ratio(size, patch, long_side, grid):
-    assert grid_size(size, patch, long_side) == grid
-
-
-@pytest.mark.parametrize("long_side", [8, 650])
-def test_a_side_of_broken_patches_is_refused(long_side):
-    with pytest.raises(ValueError, match="long_side must be a multiple of the network's patch, 16; got"):
-        grid_size((640, 480), 16, long_side)
+    ):
+        assert grid_size(size, patch, long_side) == grid
+    for long_side in (8, 650):
+        with pytest.raises(ValueError, match="long_side must be a multiple of the network's patch, 16; got"):
+            grid_size((640, 480), 16, long_side)
 
 
 def test_an_image_of_that_size_is_only_normalised():

@@ -28,15 +28,12 @@ def test_a_cell_is_the_unit_projection_of_its_mean_colour():
     assert features.tobytes() != make(seed=5).extract(Frame(0, 0.0, "", image)).tobytes()
 
 
-def test_an_embedding_is_the_mean_of_its_prompts():
+def test_an_embedding_is_the_mean_of_its_prompts_and_a_width_or_cell_of_nothing_is_refused():
     model = make(templates=("a {}.", "the {}."))
     assert isinstance(model, FeatureModel)
     mean = random_embeddings(["a b.", "the b."], 6).mean(axis=0)
     np.testing.assert_allclose(model.text.vectors[1], mean / np.linalg.norm(mean), atol=1e-6)
     assert make(classes=()).text.vectors.shape == (0, 6)
-
-
-def test_a_width_or_cell_of_nothing_is_refused():
     for changes in ({"width": 0}, {"cell": 0}, {"seed": -1}):
         with pytest.raises(ValueError, match="must be ≥"):
             make(**changes)

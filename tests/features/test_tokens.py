@@ -47,12 +47,8 @@ WORDS_UPSTREAM = {
 }
 
 
-@pytest.mark.parametrize("text", WORDS_UPSTREAM)
-def test_words_are_those_of_dino_txts_own_tokenizer(text):
-    assert words_of(text) == WORDS_UPSTREAM[text]
-
-
-def test_words_are_those_of_ftfy_and_regex_where_they_are_installed():
+def test_words_are_those_of_dino_txts_own_tokenizer_and_of_ftfy_and_regex_where_they_are_installed():
+    assert {text: words_of(text) for text in WORDS_UPSTREAM} == WORDS_UPSTREAM
     ftfy = pytest.importorskip("ftfy", reason="ftfy is the oracle")
     regex = pytest.importorskip("regex", reason="regex is the oracle")
     expression = regex.compile(r"'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+", regex.IGNORECASE)
@@ -61,21 +57,15 @@ def test_words_are_those_of_ftfy_and_regex_where_they_are_installed():
         assert words_of(text) == expression.findall(cleaned), text
 
 
-def test_pairs_merge_in_the_order_of_the_vocabulary(vocabulary):
-    tokenizer = Tokenizer(vocabulary, 512 + len(MERGES) + 2, 8)
-    names = [*byte_symbols().values(), *(s + "</w>" for s in byte_symbols().values()), *MERGES]
-    assert [names[n] for n in tokenizer(["the photo"])[0, 1:3]] == ["th e</w>", "ph oto</w>"]
-
-
-def test_a_long_text_is_cut_before_its_end_mark(vocabulary):
+def test_pairs_merge_in_the_order_of_the_vocabulary_and_a_long_text_is_cut_before_its_end_mark(vocabulary):
     number = 512 + len(MERGES)
-    row = Tokenizer(vocabulary, number + 2, 6)(["a " * 20])[0]
+    names = [*byte_symbols().values(), *(s + "</w>" for s in byte_symbols().values()), *MERGES]
+    tokenizer = Tokenizer(vocabulary, number + 2, 6)
+    assert [names[n] for n in tokenizer(["the photo"])[0, 1:3]] == ["th e</w>", "ph oto</w>"]
+    row = tokenizer(["a " * 20])[0]
     assert row[0] == number and row[-1] == number + 1 and len(set(row[1:-1])) == 1
-
-
-def test_a_vocabulary_that_does_not_fit_is_refused(vocabulary):
     with pytest.raises(ValueError, match="bpe.txt.gz must hold 100 pairs"):
         Tokenizer(vocabulary, 614, 8)
     vocabulary.write_bytes(vocabulary.read_bytes()[:-12])
     with pytest.raises(ValueError, match="bpe.txt.gz is no vocabulary of CLIP, or damaged"):
-        Tokenizer(vocabulary, 512 + len(MERGES) + 2, 8)
+        Tokenizer(vocabulary, number + 2, 8)

@@ -12,29 +12,29 @@ NUM_HEADS, DIM, TEXT_DIM, NUM_TOKENS, LENGTH = 2, 16, 12, 516, 10
 MERGES = ["w a", "l l</w>"]
 
 
+def drawn(shapes: dict[str, tuple[int, ...]], seed: int) -> dict[str, torch.Tensor]:
+    generator = torch.manual_seed(seed)
+    return {name: 0.5 * torch.randn(shape, generator=generator) for name, shape in shapes.items()}
+
+
 def random_head(dim: int, blocks: str = "blocks") -> dict[str, torch.Tensor]:
     """Weights of a vision head whose layers all matter; `blocks` is DINOv3's name for them."""
-    generator = torch.manual_seed(0)
     shapes = {"attn.qkv.weight": (3 * dim, dim), "ls1.gamma": (dim,), "ls2.gamma": (dim,)}
     shapes |= {f"{norm}.{kind}": (dim,) for norm in ("norm1", "norm2") for kind in ("weight", "bias")}
     for name, out, inside in (("attn.proj", dim, dim), ("mlp.w1", 24, dim), ("mlp.w2", 24, dim), ("mlp.w3", dim, 24)):
         shapes |= {f"{name}.weight": (out, inside), f"{name}.bias": (out,)}
     shapes = {f"{blocks}.{number}.{name}": shape for number in (0, 1) for name, shape in shapes.items()}
     shapes |= {"ln_final.weight": (dim,), "ln_final.bias": (dim,)}
-    return {name: 0.5 * torch.randn(shape, generator=generator) for name, shape in shapes.items()}
+    return drawn(shapes, 0)
 
 
 def random_text_encoder(dim: int, num_tokens: int, length: int, out: int) -> dict[str, torch.Tensor]:
     """Weights of a text tower."""
-    generator = torch.manual_seed(1)
     shapes = {"attention.qkv.weight": (3 * dim, dim)}
     for name in ("attention_norm", "ffn_norm"):
         shapes |= {f"{name}.weight": (dim,), f"{name}.bias": (dim,)}
-    for name, rows, columns in (
-        ("attention.proj", dim, dim),
-        ("feed_forward.fc1", 24, dim),
-        ("feed_forward.fc2", dim, 24),
-    ):
+    linear = ("attention.proj", dim, dim), ("feed_forward.fc1", 24, dim), ("feed_forward.fc2", dim, 24)
+    for name, rows, columns in linear:
         shapes |= {f"{name}.weight": (rows, columns), f"{name}.bias": (rows,)}
     shapes = {f"blocks.{number}.{name}": shape for number in (0, 1) for name, shape in shapes.items()}
     shapes |= {"token_embedding.weight": (num_tokens, dim), "positional_embedding": (length, dim)}
@@ -42,7 +42,7 @@ def random_text_encoder(dim: int, num_tokens: int, length: int, out: int) -> dic
     shapes = {f"backbone.{name}": shape for name, shape in shapes.items()} | {
         "head.linear_projection.weight": (out, dim)
     }
-    return {name: 0.5 * torch.randn(shape, generator=generator) for name, shape in shapes.items()}
+    return drawn(shapes, 1)
 
 
 def dinov3(dim: int = DIM) -> torch.nn.Module:

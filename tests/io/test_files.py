@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import resource
 import subprocess
 import sys
 
@@ -57,20 +58,13 @@ def test_every_line_of_the_frame_log_is_on_disk_at_once_and_a_cut_one_is_taken_b
         assert [json.loads(line) for line in path.read_text().splitlines()] == [
             {"frame": 0, "residual": None, "counts": [0, 1]}
         ]
-        real = log._file
-
-        class Full:
-            def write(self, data):
-                real.write(data[:5])
-                raise OSError(errno.ENOSPC, "No space left on device")
-
-            def __getattr__(self, name):
-                return getattr(real, name)
-
-        log._file = Full()
-        with pytest.raises(OSError, match="No space left.*frames.jsonl"):
-            log.append({"frame": 1})
-        log._file = real
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 5, limits[1]))  # room for five bytes
+        try:
+            with pytest.raises(OSError, match="File too large.*frames.jsonl"):
+                log.append({"frame": 1})
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         log.append({"frame": 2})
     assert [json.loads(line)["frame"] for line in path.read_text().splitlines()] == [0, 2]
 

@@ -1,5 +1,6 @@
 """Pose graphs in g2o's format; oracles: matrices, g2o's own definition of its error, and the way there and back."""
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -71,15 +72,18 @@ def test_what_is_written_comes_back(tmp_path, half_angles):
         strict=True,
     ):
         np.testing.assert_allclose(one, other, atol=1e-15)
-    with jax.enable_x64(True):
-        np.testing.assert_allclose(*(np.sum(np.asarray(residuals(g)) ** 2, axis=1) for g in (graph, again)), rtol=1e-9)
+    np.testing.assert_allclose(graph.edges.sqrt_info, again.edges.sqrt_info, atol=1e-9)
 
 
-def test_information_of_less_than_full_rank_is_read(tmp_path):
+def test_information_of_less_than_full_rank_is_read_and_scales_are_not_written_silently(tmp_path):
     upper = " ".join(f"{x:g}" for x in np.diag([1.0, 4, 0, 0, 0, 9])[np.triu_indices(6)])
     graph = load_graph_g2o(written(tmp_path, *VERTICES, f"EDGE_SE3:QUAT 7 3 0 0 0 0 0 0 1 {upper}"))
     root = np.asarray(graph.edges.sqrt_info[0])
     np.testing.assert_allclose(np.diag(root.T @ root), [1, 4, 0, 0, 0, 9, 0], atol=1e-12)
+    scaled = eqx.tree_at(lambda g: g.nodes.log_scale, graph, graph.nodes.log_scale + 0.1)
+    with pytest.raises(ValueError, match="no scales"):
+        save_graph_g2o(tmp_path / "again.g2o", scaled)
+    assert not (tmp_path / "again.g2o").exists()
 
 
 @pytest.mark.parametrize(
@@ -102,13 +106,3 @@ def test_information_of_less_than_full_rank_is_read(tmp_path):
 def test_a_broken_line_is_named_with_its_remedy(tmp_path, lines, message):
     with pytest.raises(ValueError, match=message):
         load_graph_g2o(written(tmp_path, *lines))
-
-
-def test_scales_are_not_written_silently(tmp_path):
-    import equinox as eqx
-
-    graph = load_graph_g2o(written(tmp_path, *VERTICES, *EDGES))
-    scaled = eqx.tree_at(lambda g: g.nodes.log_scale, graph, graph.nodes.log_scale + 0.1)
-    with pytest.raises(ValueError, match="no scales"):
-        save_graph_g2o(tmp_path / "again.g2o", scaled)
-    assert not (tmp_path / "again.g2o").exists()

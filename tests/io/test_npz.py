@@ -2,6 +2,7 @@
 
 import io
 import json
+import warnings
 import zipfile
 
 import numpy as np
@@ -45,13 +46,19 @@ def member(shape: str, data: bytes, descr: str = "<f8") -> bytes:
     return buffer.getvalue()
 
 
+def twice() -> bytes:
+    buffer = io.BytesIO(member("(2,)", b"\0" * 16))
+    with zipfile.ZipFile(buffer, "a") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of zipfile, which notices
+        archive.writestr("a.npy", b"")
+    return buffer.getvalue()
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (
-            member("(30064771072,)", b"\0" * 16),
-            "announces float64 .* is 240518168576 bytes, and holds 16",
-        ),
+        (twice(), "two arrays of one name"),
+        (member("(30064771072,)", b"\0" * 16), "announces float64 .* is 240518168576 bytes, and holds 16"),
         (member("(1,)", b"\0" * 16), "is 8 bytes, and holds 16"),
         (member("(-2, -1)", b"\0" * 16), "announces float64"),
         (member("(2,)", b"\0" * 16, "|O"), "Object arrays cannot be loaded"),
@@ -64,11 +71,3 @@ def member(shape: str, data: bytes, descr: str = "<f8") -> bytes:
 def test_a_file_that_says_more_than_it_holds_is_refused(content, message):
     with pytest.raises(ValueError, match=message):
         read_npz(content)
-
-
-def test_two_arrays_of_one_name_are_refused():
-    buffer = io.BytesIO(member("(2,)", b"\0" * 16))
-    with zipfile.ZipFile(buffer, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
-        archive.writestr("a.npy", b"")
-    with pytest.raises(ValueError, match="two arrays of one name"):
-        read_npz(buffer.getvalue())

@@ -21,27 +21,18 @@ def site(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "error", "remedy"),
+    ("name", "error", "said", "remedy"),
     [
-        (
-            "torchvision",
-            'RuntimeError("operator torchvision::nms does not exist")',
-            "--force-reinstall torch torchvision",
-        ),
-        (
-            "torchaudio",
-            'OSError("libcudart.so.13: cannot open shared object file\\nmore")',
-            "pip uninstall torchaudio",
-        ),
+        ("torchvision", 'RuntimeError("operator nms does not exist")', "operator nms", "--force-reinstall torch torch"),
+        ("torchaudio", 'OSError("libcudart.so.13: none\\nmore")', "libcudart.so.13: none", "pip uninstall torchaudio"),
     ],
 )
-def test_a_package_of_another_torch_is_named_with_the_cause_and_the_remedy(site, name, error, remedy):
+def test_a_package_of_another_torch_is_named_with_the_cause_and_the_remedy(site, name, error, said, remedy):
     assert companion_problem() is None
     sys.modules.pop(name)
     (site / f"{name}.py").write_text(f"raise {error}\n")
     problem = companion_problem()
-    assert problem.startswith(f"{name} ") and remedy in problem
-    assert error.partition('"')[2].partition("\\")[0].rstrip('")') in problem and "more" not in problem
+    assert problem.startswith(f"{name} ") and remedy in problem and said in problem and "more" not in problem
 
 
 def test_the_first_line_of_an_error_or_its_type():

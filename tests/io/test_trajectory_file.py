@@ -27,19 +27,11 @@ def test_a_trajectory_comes_back_with_unit_quaternions_in_tum_order(tmp_path):
     assert load_trajectory_tum(tmp_path / "trajectory.txt")[1].shape == (0, 4, 4)
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "1 2 3",
-        "1 0 0 0 0 0 0 0",
-        "1 a 0 0 0 0 0 1",
-        "1 nan 0 0 0 0 0 1",
-        "\x00\xff",
-        "1 0 0 0 0 0 0 1e200",
-        "1 1e300 0 0 0 0 0 1",
-        "1 0 0 0 0 0 0 2",
-    ],
-)
+BROKEN = ("1 2 3", "1 0 0 0 0 0 0 0", "1 a 0 0 0 0 0 1", "1 nan 0 0 0 0 0 1", "\x00\xff", "1 0 0 0 0 0 0 1e200")
+BROKEN += ("1 1e300 0 0 0 0 0 1", "1 0 0 0 0 0 0 2")
+
+
+@pytest.mark.parametrize("line", BROKEN)
 def test_a_broken_trajectory_names_file_and_line(tmp_path, line):
     (tmp_path / "t.txt").write_text("# comment\n0 0 0 0 0 0 0 1\n" + line + "\n", encoding="latin-1")
     with pytest.raises(ValueError, match=r"t\.txt:3: expected"):

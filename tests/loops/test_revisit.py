@@ -48,11 +48,15 @@ def test_an_exact_answer_in_any_unit_is_the_similarity_between_the_two_inference
     assert found.log_ratio == pytest.approx(np.log(1.1 / 0.9), abs=1e-3)
 
 
-def test_its_deviation_grows_with_the_distance_between_the_visits():
+def test_its_deviation_grows_with_the_distance_and_what_agrees_is_within_the_limit():
     config = replace(CONFIG, std=0.03, std_share=0.1, std_deg=2.0, log_ratio_std=0.05)
-    found = measured_again(told(), keyframe(3, 1.0), keyframe(70, 1.0), config)
+    a, b = keyframe(3, 1.0), keyframe(70, 1.0)
+    found = measured_again(told(), a, b, config)
     stds = [0.03 + 0.1 * np.linalg.norm(T_A_B[:3, 3])] * 3 + [np.radians(2.0)] * 3 + [0.05]
     np.testing.assert_allclose(found.covariance, np.diag(np.square(stds)), rtol=1e-3)
+    assert combined(measured((0.02, 0, 0)), measured_again(told(), a, b, CONFIG))[1] < CONFIG.max_misfit
+    twin = matrix((0, 0, 0), (6.0, 0.0, 0.0)) @ T_A_B  # a room that looks the same, 6 m on
+    assert combined(measured(), measured_again(told(twin), a, b, CONFIG))[1] > CONFIG.max_misfit
 
 
 def test_without_a_pose_or_depths_in_common_nothing_is_said():
@@ -81,16 +85,6 @@ def test_two_measurements_are_one_by_their_information():
     information = both.sqrt_info.T @ both.sqrt_info
     np.testing.assert_allclose(np.diag(information)[:3], 1 / 0.02**2 + 1 / 0.04**2)
     assert (both.a, both.b, both.num_inliers) == (3, 70, 50) and np.allclose(both.sqrt_info, np.triu(both.sqrt_info))
-
-
-def test_a_rotation_between_them_is_shared_likewise():
-    covariance = np.diag([0.01] * 3 + [np.radians(0.5) ** 2] * 3 + [1.0])
+    covariance = np.diag([0.01] * 3 + [np.radians(0.5) ** 2] * 3 + [1.0])  # a rotation is shared likewise
     both, _ = combined(measured(), Similarity(T_A_B @ matrix((0, 2.0, 0)), 0.0, covariance))
     assert gap_between(T_A_B, both.Z_a_b)[1] == pytest.approx(1.0, abs=1e-6)
-
-
-def test_what_agrees_is_within_the_limit_and_another_place_is_not():
-    a, b = keyframe(3, 1.0), keyframe(70, 1.0)
-    assert combined(measured((0.02, 0, 0)), measured_again(told(), a, b, CONFIG))[1] < CONFIG.max_misfit
-    twin = matrix((0, 0, 0), (6.0, 0.0, 0.0)) @ T_A_B  # a room that looks the same, 6 m on
-    assert combined(measured(), measured_again(told(twin), a, b, CONFIG))[1] > CONFIG.max_misfit

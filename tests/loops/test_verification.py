@@ -49,16 +49,13 @@ def assert_refused(result, gate):
     assert loop is None and info.refused_by == gate, info
 
 
-def test_the_pose_of_the_query_in_the_candidates_frame_is_exact():
+def test_the_pose_of_the_query_in_the_candidates_frame_is_exact_and_three_edges_around_a_triangle_close():
+    """An edge the wrong way round would not."""
     loop, info = measured()
     assert info.refused_by is None and np.isnan(info.measured)
     assert (loop.a, loop.b) == (3, 500) and loop.num_inliers > 100
     np.testing.assert_allclose(loop.Z_a_b, TRUTH, atol=1e-5)  # float32 points and pixels
     assert abs(loop.log_ratio) < 1e-5
-
-
-def test_three_edges_around_a_triangle_close():
-    """An edge the wrong way round would not."""
     poses = [CANDIDATE, QUERY, matrix((-2, 5, 0), (-0.1, 0.1, 0.1))]
     views = [keyframe(room(), T, frame) for frame, T in enumerate(poses)]
     config = verification_config("min_neighbours=0")
@@ -66,16 +63,12 @@ def test_three_edges_around_a_triangle_close():
     np.testing.assert_allclose(Z[0] @ Z[1] @ Z[2], np.eye(4), atol=2e-5)
 
 
-def test_lengths_are_those_of_the_candidates_inference_and_the_ratio_is_its_unit_over_the_querys():
-    loop, _ = measured(scale_a=1.05, scale_b=0.98)
-    np.testing.assert_allclose(loop.Z_a_b, rescaled(TRUTH, 1.05), atol=2e-5)
-    np.testing.assert_allclose(loop.log_ratio, np.log(1.05 / 0.98), atol=1e-5)
-
-
-def test_a_prior_without_a_metric_may_have_any_ratio():
-    loop, _ = measured(scale_a=0.5, scale_b=2.0, overrides=("alignment.scale_std=.inf",))
-    np.testing.assert_allclose(loop.log_ratio, np.log(0.25), atol=1e-5)
-    np.testing.assert_allclose(loop.Z_a_b, rescaled(TRUTH, 0.5), atol=2e-5)
+@pytest.mark.parametrize(("scale_a", "scale_b", "std"), [(1.05, 0.98, 0.05), (0.5, 2.0, ".inf")])
+def test_lengths_are_in_the_candidates_unit_and_the_ratio_is_it_over_the_querys(scale_a, scale_b, std):
+    """A prior without a metric may have any ratio."""
+    loop, _ = measured(scale_a=scale_a, scale_b=scale_b, overrides=(f"alignment.scale_std={std}",))
+    np.testing.assert_allclose(loop.Z_a_b, rescaled(TRUTH, scale_a), atol=2e-5)
+    np.testing.assert_allclose(loop.log_ratio, np.log(scale_a / scale_b), atol=1e-5)
 
 
 def with_wrong(view, share, seed=0):
@@ -112,33 +105,14 @@ def test_the_stated_uncertainty_holds_the_error():
         assert (std[:3] < 0.05).all() and (std[3:6] < np.radians(1.5)).all() and std[6] < 0.03
 
 
-def test_it_is_the_same_each_time():
-    first, second = measured(noise=0.02), measured(noise=0.02)
-    np.testing.assert_array_equal(first[0].Z_a_b, second[0].Z_a_b)
-    np.testing.assert_array_equal(first[0].sqrt_info, second[0].sqrt_info)
-
-
-# ---------------------------------------------------------------------------------------------------- what is refused
-
-
-def test_another_place_has_too_few_matches():
-    b = keyframe(room(), QUERY, 500)
-    b = dataclasses.replace(b, descriptors=looks(300, 8)[: len(b.pixels)])
-    a = keyframe(room(), CANDIDATE, 3)
-    assert_refused(verify(b, a, [], verification_config()), Gate.MATCHES)
-
-
-def test_blank_images_are_refused():
+def test_another_place_blank_images_and_matches_that_no_motion_explains_are_refused():
     nothing = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32)
     blank = Keyframe(3, *nothing, INTRINSICS, SIZE, np.zeros((6, 8), np.float16))
-    other = keyframe(room(), QUERY, 500)
-    assert_refused(verify(other, blank, [], verification_config()), Gate.MATCHES)
-    assert_refused(verify(blank, other, [], verification_config()), Gate.MATCHES)
-
-
-def test_matches_most_of_which_no_motion_explains_are_refused():
-    a = keyframe(room(600), CANDIDATE, 3)
-    b = with_wrong(keyframe(room(600), QUERY, 500), 0.8)
+    a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
+    other = dataclasses.replace(b, descriptors=looks(300, 8)[: len(b.pixels)])
+    for query, candidate in ((other, a), (b, blank), (blank, b)):
+        assert_refused(verify(query, candidate, [], verification_config()), Gate.MATCHES)
+    a, b = keyframe(room(600), CANDIDATE, 3), with_wrong(keyframe(room(600), QUERY, 500), 0.8)
     result = verify(b, a, [], verification_config("alignment.min_matches=20"))
     assert_refused(result, Gate.MATCH_SHARE)
 
@@ -148,65 +122,46 @@ def with_few_points(view):
     return dataclasses.replace(view, points=np.where(np.arange(len(view.points))[:, None] < 15, view.points, np.nan))
 
 
-def test_points_are_needed_in_both_directions():
+def test_points_are_needed_in_both_directions_and_must_say_the_same_pose():
+    """The query's points are right for a camera 60 cm aside, the candidate's for the camera that there is."""
     a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
     assert_refused(verify(b, with_few_points(a), [], verification_config()), Gate.POSE)
     assert_refused(verify(with_few_points(b), a, [], verification_config()), Gate.POSE)
+    aside = dataclasses.replace(b, points=b.points + np.float32([0.6, 0, 0]))
+    assert_refused(verify(aside, a, [], verification_config()), Gate.POSES_DISAGREE)
 
 
-def test_points_of_either_that_say_different_poses_are_refused():
-    """The query's points are right for a camera 60 cm aside, the candidate's for the camera that there is."""
-    a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
-    b = dataclasses.replace(b, points=b.points + np.float32([0.6, 0, 0]))
-    assert_refused(verify(b, a, [], verification_config()), Gate.POSES_DISAGREE)
-
-
-def test_points_in_a_corner_of_the_image_are_refused():
-    far = room()
+def test_points_in_a_corner_of_the_image_near_a_line_or_of_one_small_object_are_refused():
+    far, rng = room(), np.random.default_rng(0)
     far[:, :2] *= 0.15
     assert_refused(measured(far), Gate.HULL)
-
-
-def test_points_near_a_line_are_refused():
-    rng = np.random.default_rng(0)
     along = np.linspace(-1.2, 1.2, 200)
     rail = np.column_stack([along, 0.6 * along, 2.6 + 0.9 * along]) + rng.uniform(-0.02, 0.02, (200, 3))
     assert_refused(measured(rail, overrides=("alignment.min_hull=0.0",)), Gate.COLLINEAR)
-
-
-def test_points_of_one_small_object_are_refused():
     box = np.array([0.1, 0.05, 0.9]) + np.random.default_rng(0).uniform(-0.1, 0.1, (300, 3))
     query = matrix((1, -2, 0), (0.15, 0.02, 0.25))
     assert_refused(measured(box, query, overrides=("alignment.min_hull=0.0",)), Gate.SMALL)
 
 
-def test_depths_that_are_noise_are_refused():
+def test_depths_that_are_noise_and_a_scale_that_a_metric_prior_does_not_have_are_refused():
     # From one and the same place: no depth is wrong there by its reprojection.
     assert_refused(measured(query=CANDIDATE, noise=0.15), Gate.DEPTHS)
-
-
-def test_a_scale_that_a_metric_prior_does_not_have_is_refused():
     loop, info = measured(scale_b=1.3)
     assert loop is None and info.refused_by == Gate.SCALE
     np.testing.assert_allclose(info.measured, -np.log(1.3), atol=1e-4)
     assert measured(scale_b=1.1)[0] is not None
 
 
-def test_a_candidate_whose_neighbours_are_not_verified_is_refused():
-    a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
-    one = neighbours_of(room(), CANDIDATE)[:1]
-    elsewhere = keyframe(room(), CANDIDATE @ matrix((0, 180, 0)), 901)
-    result = verify(b, a, [*one, Neighbour(elsewhere, matrix((0, 180, 0)))], verification_config())
-    assert_refused(result, Gate.NEIGHBOURS)
-    assert result[1].measured == 1
-
-
-@pytest.mark.parametrize("wrong", [matrix((0, 0, 0), (0.15, 0, 0)), matrix((0, 4, 0))])
-def test_neighbours_that_put_the_query_elsewhere_are_refused(wrong):
+def test_neighbours_that_are_not_verified_or_put_the_query_elsewhere_are_refused():
     a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
     first, second = neighbours_of(room(), CANDIDATE)
-    second = dataclasses.replace(second, T_candidate_neighbour=wrong @ second.T_candidate_neighbour)
-    assert_refused(verify(b, a, [first, second], verification_config()), Gate.NEIGHBOURS_DISAGREE)
+    elsewhere = keyframe(room(), CANDIDATE @ matrix((0, 180, 0)), 901)
+    result = verify(b, a, [first, Neighbour(elsewhere, matrix((0, 180, 0)))], verification_config())
+    assert_refused(result, Gate.NEIGHBOURS)
+    assert result[1].measured == 1
+    for wrong in (matrix((0, 0, 0), (0.15, 0, 0)), matrix((0, 4, 0))):
+        moved = dataclasses.replace(second, T_candidate_neighbour=wrong @ second.T_candidate_neighbour)
+        assert_refused(verify(b, a, [first, moved], verification_config()), Gate.NEIGHBOURS_DISAGREE)
 
 
 def test_refusals_are_counted_by_name_in_the_order_of_the_gates():
@@ -214,33 +169,22 @@ def test_refusals_are_counted_by_name_in_the_order_of_the_gates():
     counts = tally(infos)
     assert list(counts) == [*(gate.value for gate in Gate), "accepted"]
     assert {name: count for name, count in counts.items() if count} == {"matches": 1, "hull": 2, "accepted": 1}
-
-
-def test_fewer_points_than_a_pose_needs_are_refused_in_the_config():
-    with pytest.raises(Exception, match="6 or more"):
+    with pytest.raises(Exception, match="6 or more"):  # fewer points than a pose needs
         verification_config("alignment.min_pose_points=5")
 
 
-# -------------------------------------------------------------------------------------------------------- agreement
-
-
 def test_an_innovation_is_measured_in_standard_deviations_of_its_dimension():
+    """Correlated drift is open only in its own direction."""
     covariance = np.diag([0.04, 0.01, 0.01, 1e-4, 1e-4, 1e-4])
     limit = np.sqrt(20.06)  # χ²₆ with the probability .9973 of three standard deviations
     direction = np.array([0.2, 0, 0, 0, 0, 0.01]) / np.sqrt(2)
     assert is_consistent(0.99 * limit * direction, covariance, 3.0)
     assert not is_consistent(1.01 * limit * direction, covariance, 3.0)
     assert is_consistent(np.array([2.99]), np.eye(1), 3.0) and not is_consistent(np.array([3.01]), np.eye(1), 3.0)
-
-
-def test_correlated_drift_is_open_only_in_its_own_direction():
     along = np.array([1.0, 1.0]) / np.sqrt(2)
     covariance = 1e-4 * np.eye(2) + 4.0 * np.outer(along, along)
     assert is_consistent(3 * along, covariance, 3.0)
     assert not is_consistent(0.5 * np.array([1.0, -1.0]), covariance, 3.0)
-
-
-def test_what_is_no_covariance_is_refused():
     with pytest.raises(ValueError, match="positive definite"):
         is_consistent(np.ones(2), np.diag([1.0, -1.0]), 3.0)
     with pytest.raises(ValueError, match=r"\(6, 6\)"):
@@ -282,10 +226,9 @@ def test_loops_of_one_query_are_one_witness_and_distant_ones_none():
     assert agreeing([*far[:2], loop(2, 502)], [], poses, scales, config).all()
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_pairs_of_nearby_queries_are_all_that_is_compared(seed):
+def test_pairs_of_nearby_queries_are_all_that_is_compared():
     """Oracle: every pair."""
-    frames = np.random.default_rng(seed).integers(0, 40, 60)
+    frames = np.random.default_rng(0).integers(0, 40, 60)
     one, other = pairs_within(frames, 3)
     expected = np.nonzero(np.abs(frames[:, None] - frames) <= 3)
     assert sorted(zip(one, other, strict=True)) == sorted(zip(*expected, strict=True))
@@ -294,15 +237,13 @@ def test_pairs_of_nearby_queries_are_all_that_is_compared(seed):
 def test_many_loops_are_compared_in_memory_that_grows_as_they_do():
     """Symptom: matrices of all loops with all, 1.3 GB for 7,500."""
     poses, scales, loop = drifted_path()
-    poses |= {600 + frame: poses[500] for frame in range(20_000)}
+    poses |= {600 + frame: poses[500] for frame in range(8_000)}
     scales |= dict.fromkeys(poses, 0.0)
-    first = loop(0, 500)
-    loops = [replace(first, b=600 + frame) for frame in range(20_000)]
-    config = loops_config("agreement.max_query_gap=4")["agreement"]
+    loops = [replace(loop(0, 500), b=600 + frame) for frame in range(8_000)]
     tracemalloc.start()
     try:
-        assert agreeing(loops, [], poses, scales, config).all()
-        assert tracemalloc.get_traced_memory()[1] < 300e6
+        assert agreeing(loops, [], poses, scales, loops_config("agreement.max_query_gap=4")["agreement"]).all()
+        assert tracemalloc.get_traced_memory()[1] < 120e6
     finally:
         tracemalloc.stop()
 
@@ -322,9 +263,6 @@ def test_a_statement_that_is_contradicted_falls_with_all_that_agree_one_after_th
     assert agreeing(loops, elsewhere, poses, scales, config).all()
 
 
-# ---------------------------------------------------------------------------------------------------- contradiction
-
-
 def showing(depths, scale=1.0):
     """A keyframe of which only the depths matter."""
     return dataclasses.replace(keyframe(room(), np.eye(4)), depths=np.float16(scale * depths))
@@ -334,7 +272,7 @@ def at(T, log_ratio=0.0):
     return Similarity(T, log_ratio, np.eye(7))
 
 
-def test_a_wall_where_the_other_looks_through_is_a_contradiction_in_both_orders():
+def test_a_wall_where_the_other_looks_through_is_a_contradiction_in_both_orders_in_one_unit_from_one_place():
     hall, shorter = np.full((24, 32), 6.0), np.full((24, 32), 6.0)
     shorter[6:18, 8:24] = 4.0  # a quarter of the image
     a, b = showing(hall), showing(shorter)
@@ -343,14 +281,10 @@ def test_a_wall_where_the_other_looks_through_is_a_contradiction_in_both_orders(
     assert contradicted_share(a, b, at(np.eye(4)), 0.4) == 0.0  # within the margin
     assert contradicted_share(a, a, at(np.eye(4)), 0.15) == 0.0
     assert contradicted_share(a, showing(0 * hall), at(np.eye(4)), 0.15) == 0.0
-
-
-def test_depths_are_compared_in_one_unit_and_from_one_place():
-    wall = np.full((24, 32), 6.0)
-    a, b = showing(wall), showing(wall - 2.0, 2.0)  # 2 m nearer, in half metres
-    assert contradicted_share(a, b, at(matrix((0, 0, 0), (0, 0, 2.0)), -np.log(2)), 0.15) == 0.0
-    assert contradicted_share(a, b, at(np.eye(4), -np.log(2)), 0.15) == 1.0
-    assert contradicted_share(a, b, at(matrix((0, 0, 0), (0, 0, 2.0))), 0.15) > 0.9
+    nearer, ahead = showing(hall - 2.0, 2.0), matrix((0, 0, 0), (0, 0, 2.0))  # 2 m, in half metres
+    assert contradicted_share(a, nearer, at(ahead, -np.log(2)), 0.15) == 0.0
+    assert contradicted_share(a, nearer, at(np.eye(4), -np.log(2)), 0.15) == 1.0
+    assert contradicted_share(a, nearer, at(ahead), 0.15) > 0.9
 
 
 def test_what_hides_behind_something_else_is_no_contradiction():
@@ -364,9 +298,6 @@ def test_what_hides_behind_something_else_is_no_contradiction():
     aside = matrix((0, 0, 0), (0.5, 0, 0))
     assert contradicted_share(seen_from(0.0), seen_from(0.5), at(aside), 0.15) == 0.0
     assert contradicted_share(seen_from(0.0), seen_from(0.5), at(np.eye(4)), 0.15) > 0.05
-
-
-# ------------------------------------------------------------------------------------------------------- apartment
 
 
 @cache
@@ -392,7 +323,7 @@ def on_the_walk(walk, query, candidate):
     return verify(seen(walk, query)[0], a, neighbours, verification_config())
 
 
-@pytest.mark.parametrize(("query", "candidate"), [(306, 24), (334, 48), (384, 96), (276, 6)])
+@pytest.mark.parametrize(("query", "candidate"), [(306, 24), (384, 96)])
 def test_a_place_of_the_first_lap_is_known_again_on_the_second(query, candidate):
     loop, info = on_the_walk("two_laps", query, candidate)
     assert loop is not None, info
@@ -401,14 +332,11 @@ def test_a_place_of_the_first_lap_is_known_again_on_the_second(query, candidate)
     assert distance < 0.03 and turn < 1.0 and abs(loop.log_ratio) < 0.01
 
 
-@pytest.mark.parametrize(("query", "candidate"), [(366, 108), (396, 78)])
-def test_a_place_seen_from_the_other_side_is_refused(query, candidate):
-    assert_refused(on_the_walk("out_and_back", query, candidate), Gate.MATCHES)
-
-
-@pytest.mark.parametrize(("query", "candidate"), [(220, 24), (160, 96), (250, 48)])
-def test_other_rooms_are_refused(query, candidate):
-    assert_refused(on_the_walk("two_laps", query, candidate), Gate.MATCHES)
+@pytest.mark.parametrize(
+    ("walk", "query", "candidate"), [("out_and_back", 366, 108), ("two_laps", 220, 24), ("two_laps", 160, 96)]
+)
+def test_a_place_seen_from_the_other_side_and_other_rooms_are_refused(walk, query, candidate):
+    assert_refused(on_the_walk(walk, query, candidate), Gate.MATCHES)
 
 
 def test_loops_from_one_twin_room_to_the_other_fall_with_what_is_seen_of_the_hall_before_them():

@@ -11,14 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import Frame
-from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.prior.network.framework import NORMALIZATIONS
-from emgs_jax.prior.network.resize import plan_resize, resize_image
 
-KEYS = {
-    *("img", "data_norm_type", "intrinsics", "ray_directions", "depth_z", "camera_poses", "is_metric_scale"),
-    *("true_shape", "idx", "instance"),
-}
+KEYS = {"img", "data_norm_type", "intrinsics", "camera_poses", "is_metric_scale", "true_shape", "instance"}
 
 
 def rigid(rotation, translation):
@@ -64,26 +59,6 @@ class Sphere:
         offset = self.pose(index)[:3, 3] - self.center
         a, b, c = (rays**2).sum(-1), rays @ offset, offset @ offset - self.radius**2
         return (np.sqrt(b**2 - a * c) - b) / a
-
-
-class DrawnRoom:
-    """The package's synthetic room, cast at whatever grid the network has."""
-
-    def __init__(self, dataset, seed, num_frames):
-        self._frames, self._seed, self._num_frames = [dataset[i] for i in range(len(dataset))], seed, num_frames
-
-    def pose(self, index):
-        return self._frames[index].T_world_camera
-
-    def which(self, image):
-        resize = plan_resize(self._frames[0].image.shape[1::-1], image.shape[1::-1])
-        differences = [np.abs(resize_image(frame.image, resize) / 255 - image).sum() for frame in self._frames]
-        return int(np.argmin(differences))
-
-    def depth(self, index, intrinsics, size):
-        focal_and_center = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].astype(float)
-        room = Synthetic(self._seed, self._num_frames, size=size, intrinsics=focal_and_center.tolist())
-        return room[index].depth
 
 
 class Double:

@@ -50,10 +50,4 @@ def test_features_are_of_the_classes_that_others_are_taken_for_as_far_as_the_lev
     expected = confused(frame.labels, frame.T_world_camera, CLASSES, 1.0, 0)
     known = expected >= 0
     assert (found == expected)[known].mean() > 0.9 and (found == frame.labels)[known].mean() < 0.5
-
-
-def test_only_a_probability_is_one_and_it_is_part_of_the_provenance():
-    with pytest.raises(ValueError, match=r"prior\.confusion is a probability"):
-        Simulated(confusion=1.5)
-    assert Simulated(confusion=0.2).provenance.settings["confusion"] == 0.2
-    assert "confusion" not in Simulated().provenance.settings
+    assert prior.provenance.settings["confusion"] == 1.0 and "confusion" not in Simulated().provenance.settings

@@ -44,7 +44,7 @@ def predictions(prior, dataset):
         yield prior.predict(window, [dataset[i] for i in window.views], dataset.intrinsics)
 
 
-def test_geometry_is_bit_identical_and_features_are_the_models(textured):
+def test_geometry_is_bit_identical_and_features_are_the_models_which_describes_each_image_once(textured):
     plain, model = Simulated(seed=3, classes=textured.classes), make_model()
     prior = Featured(plain, model)
     assert isinstance(prior, Prior)
@@ -54,13 +54,7 @@ def test_geometry_is_bit_identical_and_features_are_the_models(textured):
         frames = [textured[index] for index in got.window.dense]
         np.testing.assert_array_equal(got.features, np.stack([RandomFeatures.extract(model, f) for f in frames]))
         assert got.features.shape[1:] == (6, 8, 8) and got.features.dtype == np.float16
-
-
-def test_each_image_is_described_once_though_it_is_dense_in_two_windows(textured):
-    model = make_model()
-    for _ in predictions(Featured(Simulated(), model), textured):
-        pass
-    assert model.num_images == len(textured)
+    assert model.num_images == len(textured), "though an image is dense in two windows"
 
 
 def test_another_image_of_the_same_number_is_described_anew(textured):
@@ -72,27 +66,19 @@ def test_another_image_of_the_same_number_is_described_anew(textured):
     np.testing.assert_array_equal(features, model.extract(second))
 
 
-def test_provenance_tells_the_geometry_and_the_features():
+def test_provenance_tells_the_geometry_and_the_features_and_a_sequential_prior_stays_one():
     geometry = Simulated(level=0.5, seed=3)
-    provenance = Featured(geometry, make_model(seed=7)).provenance
-    assert provenance.name == "simulated+random" and provenance.is_simulated
-    assert provenance.settings == geometry.provenance.settings | {
-        "features": {
-            "model": {"name": "random", "version": 1, "width": 8, "seed": 7},
-            "cell": 5,
-            "templates": ["a {}."],
-        }
-    }
+    prior = Featured(geometry, make_model(seed=7))
+    assert prior.provenance.name == "simulated+random" and prior.provenance.is_simulated
+    model = {"name": "random", "version": 1, "width": 8, "seed": 7}
+    told = {"features": {"model": model, "cell": 5, "templates": ["a {}."]}}
+    assert prior.provenance.settings == geometry.provenance.settings | told
+    assert not prior.is_sequential
+    geometry.is_sequential = True
+    assert Featured(geometry, make_model()).is_sequential
 
 
-def test_features_leave_a_sequential_prior_sequential():
-    prior = Simulated()
-    assert not Featured(prior, make_model()).is_sequential
-    prior.is_sequential = True
-    assert Featured(prior, make_model()).is_sequential
-
-
-def test_replay_of_features_text_and_provenance_is_the_live_prior_bit_for_bit(tmp_path, textured):
+def test_replay_is_the_live_prior_bit_for_bit_and_a_recording_with_other_features_is_not_mixed(tmp_path, textured):
     prior = Featured(Simulated(seed=1), make_model())
     record(prior, textured, WINDOW_SIZE, tmp_path)
     replay = Recorded(tmp_path)
@@ -101,12 +87,8 @@ def test_replay_of_features_text_and_provenance_is_the_live_prior_bit_for_bit(tm
     for live, again in zip(predictions(prior, textured), predictions(replay, textured), strict=True):
         assert (live.features.shape, live.features.tobytes()) == (again.features.shape, again.features.tobytes())
         assert live.points.tobytes() == again.points.tobytes()
-
-
-def test_a_recording_with_other_features_is_not_mixed(tmp_path, textured):
-    record(Featured(Simulated(), make_model()), textured, WINDOW_SIZE, tmp_path)
     with pytest.raises(ValueError, match="holds a recording with provenance.*choose another folder"):
-        record(Featured(Simulated(), make_model(seed=1)), textured, WINDOW_SIZE, tmp_path)
+        record(Featured(Simulated(seed=1), make_model(seed=1)), textured, WINDOW_SIZE, tmp_path)
 
 
 def test_features_are_added_to_a_recording_without_the_prior(tmp_path, textured):
@@ -122,10 +104,11 @@ def test_features_are_added_to_a_recording_without_the_prior(tmp_path, textured)
 def test_a_recording_is_compared_with_the_classes_of_a_file(tmp_path, textured):
     record(Featured(Simulated(), make_model()), textured, WINDOW_SIZE, tmp_path / "recording")
     save_text(tmp_path / "lamp.npz", make_model().embed(("lamp", "wall")))
-    prior = Requeried(Recorded(tmp_path / "recording"), str(tmp_path / "lamp.npz"))
+    recorded = Recorded(tmp_path / "recording")
+    prior = Requeried(recorded, str(tmp_path / "lamp.npz"))
     assert prior.feature_names == ("lamp", "wall")
     np.testing.assert_array_equal(prior.text_features, make_model(classes=("lamp", "wall")).text.vectors)
-    for got, expected in zip(predictions(prior, textured), predictions(prior._prior, textured), strict=True):
+    for got, expected in zip(predictions(prior, textured), predictions(recorded, textured), strict=True):
         assert got.features.tobytes() == expected.features.tobytes()
     save_text(tmp_path / "other.npz", make_model(seed=1).embed(("lamp",)))
     with pytest.raises(ValueError, match="other.npz was embedded by .*'seed': 1.*but the features are of .*'seed': 0"):

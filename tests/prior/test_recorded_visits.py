@@ -1,9 +1,8 @@
 """Which windows of two visits a recording holds: those of frames that show one place twice, found without a pose."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from listed_frames import Listed
 from loop_scene import loops_config
 
 from emgs_jax.data.synthetic import Synthetic
@@ -15,29 +14,11 @@ WINDOW_SIZE = 3
 ROWS = (0, 2, 4, 6, 8, 20, 30, 9, 7, 5, 3, 1)  # of a walk of 40: there, elsewhere, and back
 
 
-class Returning:
-    """A room on a way that comes back to where it began."""
-
-    def __init__(self) -> None:
-        whole = Synthetic(num_frames=40, size=(160, 120))
-        self.name, self.sequence, self.size, self.classes = whole.name, "returning", whole.size, ()
-        self.intrinsics, self.has_ground_truth = whole.intrinsics, True
-        self._frames = [replace(whole[row], index=index) for index, row in enumerate(ROWS)]
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, index: int):
-        return self._frames[index]
-
-    def fingerprint(self) -> str:
-        return "returning"
-
-
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """Data set, folder of its recording, and what looks alike in it."""
-    dataset, folder = Returning(), tmp_path_factory.mktemp("recording")
+    whole, folder = Synthetic(num_frames=40, size=(160, 120)), tmp_path_factory.mktemp("recording")
+    dataset = Listed(whole, [whole[row] for row in ROWS])
     record(Simulated(), dataset, WINDOW_SIZE, folder)
     config = loops_config("appearance.min_gap=5", "appearance.suppressed_gap=1", "appearance.num_neighbours=2")
     pairs = places_seen_twice(

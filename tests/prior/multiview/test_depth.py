@@ -45,15 +45,9 @@ def test_without_a_source_at_the_end_of_the_range_or_with_nothing_like_it_there_
     strict = "prior.dense.depth.max_cost=0.2"  # a random match costs about .35, the better two of four
     assert np.mean(estimate(gray, noise, overrides=(strict,)) > 0) < 0.05
     assert np.mean(estimate(gray, sources, overrides=(strict,))[INSIDE] > 0) > 0.9
-
-
-def test_a_plane_must_stand_out_by_the_margin():
-    gray, _ = plane_image(np.eye(4), 0.0)
-    sources = [plane_image(T, 0.0)[0] for T in POSES]
-    margins = {
-        margin: estimate(gray, sources, overrides=(f"prior.dense.depth.min_margin={margin}",)) for margin in (0, 9)
-    }
-    assert np.mean(margins[0][INSIDE] > 0) > 0.97 and not margins[9].any()
+    for margin, share in ((0, 1.0), (9, 0.0)):  # a plane must stand out by so much
+        found = estimate(gray, sources, overrides=(f"prior.dense.depth.min_margin={margin}",))
+        assert np.mean(found[INSIDE] > 0) == pytest.approx(share, abs=0.03)
 
 
 def test_the_parabola_through_three_costs_has_its_minimum_where_the_cost_had_it():
@@ -100,9 +94,15 @@ def test_the_median_is_scipys_and_keeps_holes():
     assert not np.asarray(_median(jnp.asarray(depth), 2))[:, 3:].any()
 
 
+jitted_agreeing = eqx.filter_jit(count_agreeing)
+
+
 def agreeing(depth, others, poses):
-    maps = jnp.asarray(np.stack(others))
-    return np.asarray(count_agreeing(jnp.asarray(depth), maps, relative(poses), small_camera(), depth_config()))
+    """With as many more views as make four, which have no depth."""
+    more = 4 - len(others)
+    maps = jnp.asarray(np.stack([*others, *[np.zeros_like(depth)] * more]))
+    poses = relative([*poses, *[np.eye(4)] * more])
+    return np.asarray(jitted_agreeing(jnp.asarray(depth), maps, poses, small_camera(), depth_config()))
 
 
 def test_true_depths_of_other_views_agree_and_false_or_missing_ones_do_not():
@@ -116,16 +116,11 @@ def test_true_depths_of_other_views_agree_and_false_or_missing_ones_do_not():
     assert not agreeing(np.zeros_like(depth), others, POSES).any()
 
 
-@pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
-def test_views_agree_within_a_share_of_the_depth_whatever_its_unit(size):
-    depth = size * plane_image(np.eye(4), 0.4)[1]
+def test_views_agree_within_a_share_of_the_depth_whatever_its_unit_and_not_behind_or_beside():
     tolerance = float(depth_config().max_depth_step)
-    for share, expected in ((0.8, 1), (1.2, 0)):
-        np.testing.assert_array_equal(agreeing(depth * (1 + share * tolerance), [depth], [np.eye(4)]), expected)
-
-
-def test_a_point_behind_or_beside_another_view_is_not_confirmed_by_it():
-    _, depth = plane_image(np.eye(4), 0.0)
-    turned = matrix(rotation=(0, np.pi, 0))
-    beside = matrix(translation=(30.0, 0, 0))
+    for size in (0.1, 1.0, 10.0):
+        depth = size * plane_image(np.eye(4), 0.4)[1]
+        for share, expected in ((0.8, 1), (1.2, 0)):
+            np.testing.assert_array_equal(agreeing(depth * (1 + share * tolerance), [depth], [np.eye(4)]), expected)
+    turned, beside = matrix(rotation=(0, np.pi, 0)), matrix(translation=(30.0, 0, 0))
     assert not agreeing(depth, [depth, depth], [turned, beside]).any()

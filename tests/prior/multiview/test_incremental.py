@@ -49,16 +49,12 @@ def started():
 
 
 def test_the_first_window_has_the_true_poses_up_to_a_similarity(started):
+    """The first view is the reference, and its median landmark has the given depth."""
     structure, truth = started
     assert len(structure.placed()) == NUM_VIEWS
     poses = np.stack([structure.views[frame].T_ref_view for frame in range(NUM_VIEWS)])
     assert similarity_error(poses[:, :3, 3], truth[:, :3, 3]) < 0.01 * np.linalg.norm(truth[-1, :3, 3])
-    turned = np.linalg.inv(truth[0])[:3, :3] @ truth[:, :3, :3]
-    np.testing.assert_allclose(poses[:, :3, :3], turned, atol=0.01)
-
-
-def test_the_first_view_is_the_reference_and_its_median_landmark_has_the_given_depth(started):
-    structure, _ = started
+    np.testing.assert_allclose(poses[:, :3, :3], np.linalg.inv(truth[0])[:3, :3] @ truth[:, :3, :3], atol=0.01)
     first = structure.views[0]
     np.testing.assert_allclose(first.T_ref_view, np.eye(4), atol=1e-9)
     depth = structure.points[first.landmark[structure.known(first)], 2]
@@ -121,19 +117,14 @@ def test_a_structure_begins_with_views_that_have_parallax():
         assert bool(structure.placed()) == has_begun
 
 
-def test_without_parallax_the_first_window_is_refused():
-    turning = np.stack([matrix((0.0, 0.02 * i, 0.0)) for i in range(NUM_VIEWS)])
-    structure = linked(turning)
-    assert not begin(structure)
-    assert not structure.placed() and np.isnan(structure.points).all()
-
-
-def test_without_matches_the_first_window_is_refused():
+def test_without_parallax_or_matches_the_first_window_is_refused():
+    turning = linked(np.stack([matrix((0.0, 0.02 * i, 0.0)) for i in range(NUM_VIEWS)]))
+    assert not begin(turning)
+    assert not turning.placed() and np.isnan(turning.points).all()
     structure = linked(arc(3))
     for view in structure.views.values():
         view.landmark[:] = NONE
-    assert not begin(structure)
-    assert not structure.placed()
+    assert not begin(structure) and not structure.placed()
 
 
 def test_later_views_keep_the_frame_and_scale_while_old_ones_and_their_landmarks_go():
@@ -204,23 +195,17 @@ def test_the_landmarks_that_most_views_see_take_part_in_the_refinement():
 
 
 def test_observations_that_do_not_fit_are_dropped_and_landmarks_that_fewer_than_two_views_still_show():
-    structure = seen_by(4, 2, 3)
+    structure, error = seen_by(4, 2, 3), np.zeros((4, 3))
     limit = CONFIG.matching.max_reprojection_error
-    error = np.zeros((4, 3))
     error[0, 0] = 2 * limit  # three views remain
     error[1, 1] = np.inf  # one view remains
     error[:2, 2] = 1.1 * limit  # one view remains
     _drop(structure, [0, 1, 2, 3], [], np.arange(3), error, CONFIG)
     np.testing.assert_array_equal(np.isnan(structure.points[:, 0]), [False, True, True])
     shown = np.stack([view.landmark for view in structure.views.values()])
-    np.testing.assert_array_equal(shown[:, 0], [NONE, 0, 0, 0])
-    np.testing.assert_array_equal(shown[:, 1], [1, NONE, NONE, NONE])
-    np.testing.assert_array_equal(shown[:, 2], [NONE, NONE, 2, NONE])
-
-
-def test_views_that_are_held_keep_what_does_not_fit_for_now():
+    np.testing.assert_array_equal(shown.T, [[NONE, 0, 0, 0], [1, NONE, NONE, NONE], [NONE, NONE, 2, NONE]])
     structure, error = seen_by(4, 2, 3), np.zeros((4, 3))
-    error[:3, 0] = 2 * CONFIG.matching.max_reprojection_error  # one view remains
+    error[:3, 0] = 2 * limit  # one view remains, but two are held: they keep what does not fit for now
     _drop(structure, [0, 1, 2, 3], [0, 1], np.arange(3), error, CONFIG)
     shown = np.stack([view.landmark for view in structure.views.values()])
     np.testing.assert_array_equal(shown[:, 0], [0, 0, NONE, 0])

@@ -35,10 +35,7 @@ def test_a_view_that_leaves_stays_where_it_is_far_from_the_key_before_it():
     assert stay(structure, (6, 7), KeyConfig(8, 0.1)) == [0, 3, 5]
     assert stay(structure, (0, 6, 7), KeyConfig(8, 0.1)) == [1, 4], "view 0 is in the window anyway"
     assert stay(structure, (6, 7), KeyConfig(0, 0.1)) == []
-
-
-def test_those_go_that_share_least_with_the_newest_view():
-    structure = shifted(0, 10, 20, 30, 40)
+    structure = shifted(0, 10, 20, 30, 40)  # those go that share least with the newest view
     structure.views[1].landmark[5:] = -1
     assert stay(structure, (4,), KeyConfig(3, 0.1)) == [0, 2, 3]
     structure.views[1].landmark[:] = -1

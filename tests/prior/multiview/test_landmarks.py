@@ -21,14 +21,20 @@ from emgs_jax.prior.multiview.memory import Memory, remember
 NUM_POINTS = 60
 
 
-@pytest.fixture
-def config():
-    return structure_config().matching
+CONFIG = structure_config().matching
 
 
 @pytest.fixture
 def views():
     return views_of(cloud(NUM_POINTS), arc(4))
+
+
+def linked(views):
+    structure = structure_of(views[:1])
+    for frame, view in enumerate(views[1:], start=1):
+        structure.views[frame] = view
+        link(structure, frame, CONFIG)
+    return structure
 
 
 def tracks(structure):
@@ -41,34 +47,30 @@ def tracks(structure):
     return found
 
 
-def test_a_blob_is_detected_at_its_centre_with_pixel_centres_at_integers(config):
+def test_blobs_are_detected_at_their_centres_with_unit_descriptors_and_a_blank_image_has_none(views):
+    """Pixel centres are at integers, and the product of descriptors is a cosine."""
     y, x = np.mgrid[:48, :64]
     gray = np.zeros((48, 64))
     for u, v in ((20.0, 15.0), (40.25, 30.5)):
         gray += 200 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 2.5**2))
-    found = detect(np.uint8(gray), config).pixels
+    found = detect(np.uint8(gray), CONFIG).pixels
     for center in ((20.0, 15.0), (40.25, 30.5)):
         assert np.linalg.norm(found - center, axis=1).min() < 0.06
-
-
-def test_descriptors_are_unit_so_that_their_product_is_a_cosine(config):
-    found = detect(np.uint8(np.random.default_rng(0).uniform(0, 255, (96, 128))), config)
+    found = detect(np.uint8(np.random.default_rng(0).uniform(0, 255, (96, 128))), CONFIG)
     assert len(found.descriptors) > 5 and found.descriptors.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1.0, rtol=1e-5)
-
-
-def test_a_blank_image_has_no_keypoint_and_no_match(config, views):
-    blank = detect(np.full((48, 64), 128, np.uint8), config)
+    blank = detect(np.full((48, 64), 128, np.uint8), CONFIG)
     assert blank.pixels.shape == (0, 2) and blank.descriptors.shape == (0, 128) and blank.landmark.shape == (0,)
-    assert not len(match(blank, views[0], calibration(), config)[0])
-    assert not len(match(views[0], blank, calibration(), config)[1])
+    few = views_of(cloud(CONFIG.min_matches - 1), arc(2))
+    for pair in ((blank, views[0]), (views[0], blank), few):
+        assert not len(match(*pair, calibration(), CONFIG)[0])
 
 
-def test_matches_are_right_and_the_same_from_either_side(config, views):
-    rows_a, rows_b = match(views[0], views[1], calibration(), config)
+def test_matches_are_right_and_the_same_from_either_side(views):
+    rows_a, rows_b = match(views[0], views[1], calibration(), CONFIG)
     assert len(rows_a) > 0.9 * NUM_POINTS
     np.testing.assert_array_equal(whose(views[1], views[0])[rows_b], rows_a)
-    back_b, back_a = match(views[1], views[0], calibration(), config)
+    back_b, back_a = match(views[1], views[0], calibration(), CONFIG)
     assert set(zip(rows_a, rows_b, strict=True)) == set(zip(back_a, back_b, strict=True))
 
 
@@ -96,54 +98,39 @@ def with_keypoint(view, pixel, descriptor):
     )
 
 
-@pytest.mark.parametrize("times", [0.95, 1.05])
-def test_a_match_is_distinct_if_its_distance_is_that_ratio_of_the_next_ones(times, views):
-    """Of the distances, not of their squares: |d|² = 2 - 2 cos."""
+def test_of_keypoints_that_look_alike_one_that_stands_out_is_matched(views):
+    """By the ratio of the distances, not of their squares: |d|² = 2 - 2 cos; and only the more alike of two."""
     config = structure_config("prior.structure.matching.max_ratio=0.8").matching
     a, b = views[:2]
     place_b = int(np.flatnonzero(whose(b, a) == 0)[0])
-    b = with_keypoint(b, b.pixels[place_b] + 5.0, turned(a.descriptors[0], 1 - 0.1, 0))
-    b.descriptors[place_b] = turned(a.descriptors[0], 1 - 0.1 * (times * 0.8) ** 2, 1)
-    rows_a, _ = match(a, b, calibration(), config)
-    assert (0 in rows_a) == (times < 1)
-
-
-def test_of_two_keypoints_that_look_like_one_only_the_more_alike_is_matched(config, views):
-    a, b = views[:2]
+    near = with_keypoint(b, b.pixels[place_b] + 5.0, turned(a.descriptors[0], 1 - 0.1, 0))
+    for times in (0.95, 1.05):
+        near.descriptors[place_b] = turned(a.descriptors[0], 1 - 0.1 * (times * 0.8) ** 2, 1)
+        assert (0 in match(a, near, calibration(), config)[0]) == (times < 1)
     twin = with_keypoint(a, a.pixels[3], turned(a.descriptors[3], 0.97, 2))
-    rows_a, rows_b = match(twin, b, calibration(), config)
+    rows_a, rows_b = match(twin, b, calibration(), CONFIG)
     assert 3 in rows_a and NUM_POINTS not in rows_a and len(set(rows_b)) == len(rows_b)
 
 
-def test_a_view_never_shows_a_landmark_twice(config, views):
+def test_a_view_never_shows_a_landmark_twice(views):
     """The landmark looks different in the two older views, and the new view has a keypoint like either."""
-    structure = structure_of(views[:1])
-    structure.views[1] = views[1]
-    link(structure, 1, config)
-    first, second, new = *views[:2], views[2]
+    structure = linked(views[:2])
+    first, second, new = views[:3]
     number = first.landmark[0]
     assert number != NONE
     here = int(np.flatnonzero(whose(new, first) == 0)[0])
     other_look = turned(first.descriptors[0], 0.6, 3)
     second.descriptors[second.landmark == number] = other_look
     structure.views[2] = with_keypoint(new, new.pixels[here], other_look)
-    link(structure, 2, config)
+    link(structure, 2, CONFIG)
     landmarks = structure.views[2].landmark
     assert (landmarks == number).sum() == 1
     shown = landmarks[landmarks != NONE]
     assert len(set(shown)) == len(shown) > 0.9 * NUM_POINTS
 
 
-def test_too_few_keypoints_give_no_match(config):
-    views = views_of(cloud(config.min_matches - 1), arc(2))
-    assert not len(match(*views, calibration(), config)[0])
-
-
-def test_linking_gives_every_point_one_landmark_in_all_views(config, views):
-    structure = structure_of(views[:1])
-    for frame, view in enumerate(views[1:], start=1):
-        structure.views[frame] = view
-        link(structure, frame, config)
+def test_every_point_is_one_landmark_in_all_views_and_forgetting_views_keeps_those_of_the_others(views):
+    structure = linked(views)
     found = tracks(structure)
     assert len(structure.points) == len(found) and np.isnan(structure.points).all()
     for members in found.values():
@@ -151,19 +138,12 @@ def test_linking_gives_every_point_one_landmark_in_all_views(config, views):
         assert len({frame for frame, _ in members}) == len(members) >= 2
     points = [members[0][1] for members in found.values()]
     assert len(set(points)) == len(points) > 0.9 * NUM_POINTS
-
-
-def test_forgetting_views_keeps_the_tracks_and_points_of_the_others(config, views):
-    structure = structure_of(views[:1])
-    for frame, view in enumerate(views[1:], start=1):
-        structure.views[frame] = view
-        link(structure, frame, config)
     structure.points[:] = np.arange(len(structure.points))[:, None]
     structure.views[2].landmark[:5] = NONE
     structure.views[3].landmark[:] = NONE
     view = structure.views[2]
     before = np.where(view.landmark >= 0, view.landmark, -5)
-    forget(structure, [0, 1], config)
+    forget(structure, [0, 1], CONFIG)
     assert sorted(structure.views) == [2, 3]
     assert len(structure.points) == np.sum(before >= 0)  # those of views 0 and 1 only are gone
     assert (view.landmark[:5] == NONE).all() and (structure.views[3].landmark == NONE).all()
@@ -172,7 +152,7 @@ def test_forgetting_views_keeps_the_tracks_and_points_of_the_others(config, view
     np.testing.assert_array_equal(structure.points[view.landmark[has], 0], before[has])
 
 
-def after_a_loss(config, num_known=NUM_POINTS):
+def after_a_loss(num_known=NUM_POINTS):
     """A structure whose placed views were forgotten with `num_known` landmarks, and the true poses."""
     poses, points = arc(4), cloud(NUM_POINTS)
     structure = structure_of(views_of(points, poses))
@@ -183,16 +163,16 @@ def after_a_loss(config, num_known=NUM_POINTS):
     # Landmark i is keypoint i of view 0.
     seen = projected(poses[0], points)
     structure.points = points[np.linalg.norm(seen - structure.views[0].pixels[:, None], axis=2).argmin(axis=1)]
-    forget(structure, [0, 1], config)
+    forget(structure, [0, 1], CONFIG)
     return structure, poses
 
 
-def test_a_view_after_a_loss_is_placed_by_what_was_left_behind_and_shows_it_again(config):
+def test_a_view_after_a_loss_is_placed_by_what_was_left_behind_and_shows_it_again():
     """Symptom: on a walk of 187 frames the first 68 were mapped, the last 119 lost."""
-    structure, poses = after_a_loss(config)
+    structure, poses = after_a_loss()
     view = structure.views[2]
     assert not structure.placed() and len(structure.memory.points) == NUM_POINTS
-    assert not place(structure, view, config) and refind(structure, view, config)
+    assert not place(structure, view, CONFIG) and refind(structure, view, CONFIG)
     np.testing.assert_allclose(view.T_ref_view, poses[2], atol=1e-4)
     known = structure.known(view)
     assert known.sum() + len(structure.memory.points) == NUM_POINTS and known.mean() > 0.9
@@ -200,24 +180,23 @@ def test_a_view_after_a_loss_is_placed_by_what_was_left_behind_and_shows_it_agai
     np.testing.assert_allclose(shown, view.pixels[known], atol=1e-3)
 
 
-def test_tracks_of_other_lost_views_get_the_points_that_one_finds_again(config):
-    structure, poses = after_a_loss(config)
-    link(structure, 3, config)  # views 2 and 3 see each other, without a position
-    assert not place(structure, structure.views[3], config)
-    assert refind(structure, structure.views[2], config) and place(structure, structure.views[3], config)
+def test_tracks_of_other_lost_views_get_the_points_that_one_finds_again():
+    structure, poses = after_a_loss()
+    link(structure, 3, CONFIG)  # views 2 and 3 see each other, without a position
+    assert not place(structure, structure.views[3], CONFIG)
+    assert refind(structure, structure.views[2], CONFIG) and place(structure, structure.views[3], CONFIG)
     np.testing.assert_allclose(structure.views[3].T_ref_view, poses[3], atol=1e-3)
 
 
-def test_an_unknown_place_or_too_few_landmarks_place_nothing(config):
-    structure, _ = after_a_loss(config, num_known=config.min_refound - 1)
-    before = structure.views[2].landmark.copy()
-    assert not refind(structure, structure.views[2], config)
-    structure, _ = after_a_loss(config)
-    rng = np.random.default_rng(0)
-    structure.views[2].pixels[:] = rng.permutation(structure.views[2].pixels)  # looks alike, lies elsewhere
-    assert not refind(structure, structure.views[2], config)
-    assert structure.views[2].T_ref_view is None
-    np.testing.assert_array_equal(structure.views[2].landmark, before)
+def test_an_unknown_place_or_too_few_landmarks_place_nothing():
+    for num_known in (CONFIG.min_refound - 1, NUM_POINTS):
+        structure, _ = after_a_loss(num_known)
+        view = structure.views[2]
+        if num_known == NUM_POINTS:  # looks alike, lies elsewhere
+            view.pixels[:] = np.random.default_rng(0).permutation(view.pixels)
+        before = view.landmark.copy()
+        assert not refind(structure, view, CONFIG) and view.T_ref_view is None
+        np.testing.assert_array_equal(view.landmark, before)
 
 
 def test_the_memory_is_bounded_and_keeps_the_newest():
@@ -240,19 +219,19 @@ def placed_structure(poses, points, seen_by):
     return structure
 
 
-def test_exact_rays_meet_in_the_point_and_one_ray_or_none_gives_none(config):
+def test_exact_rays_meet_in_the_point_and_one_ray_or_none_gives_none():
     poses, points = arc(3, step=0.2), cloud(12)
     seen_by = np.ones((3, 12), bool)
     seen_by[1:, 0] = False
     structure = placed_structure(poses, points, seen_by)
     structure.points[1] = 7.0  # it has a position, which is not for triangulation to change
-    triangulate(structure, config)
+    triangulate(structure, CONFIG)
     assert np.isnan(structure.points[0]).all()
     np.testing.assert_array_equal(structure.points[1], 7.0)
     np.testing.assert_allclose(structure.points[2:], points[2:], atol=1e-9)
 
 
-def test_two_skew_rays_give_the_middle_of_their_common_perpendicular(config):
+def test_two_skew_rays_give_the_middle_of_their_common_perpendicular():
     poses, points = arc(2, step=0.5), np.array([[0.2, 0.1, 2.0]])
     structure = placed_structure(poses, points, np.ones((2, 1), bool))
     structure.views[1].pixels += (0.0, 0.5)
@@ -261,55 +240,44 @@ def test_two_skew_rays_give_the_middle_of_their_common_perpendicular(config):
         ray = view.T_ref_view[:3, :3] @ np.linalg.inv(calibration()) @ [*view.pixels[0], 1]
         rays.append(ray / np.linalg.norm(ray))
     s, t = np.linalg.lstsq(np.stack([rays[0], -rays[1]], axis=1), origins[1] - origins[0], rcond=None)[0]
-    triangulate(structure, config)
+    triangulate(structure, CONFIG)
     np.testing.assert_allclose(structure.points[0], 0.5 * (origins[0] + s * rays[0] + origins[1] + t * rays[1]))
 
 
-def test_rays_without_parallax_or_that_do_not_meet_give_no_point(config):
+def test_rays_without_parallax_or_that_do_not_meet_give_no_point():
     points = cloud(6)
     still = np.stack([arc(1)[0]] * 3)
     structure = placed_structure(still, points, np.ones((3, 6), bool))
-    triangulate(structure, config)
+    triangulate(structure, CONFIG)
     assert np.isnan(structure.points).all()
     structure = placed_structure(arc(3), points, np.ones((3, 6), bool))
-    structure.views[2].pixels += (0.0, 4 * config.max_reprojection_error)
-    triangulate(structure, config)
+    structure.views[2].pixels += (0.0, 4 * CONFIG.max_reprojection_error)
+    triangulate(structure, CONFIG)
     assert np.isnan(structure.points).all()
 
 
-def test_a_view_is_placed_where_it_is_despite_wrong_landmarks(config):
-    poses, points = arc(4), cloud(NUM_POINTS)
-    structure = placed_structure(poses, points, np.ones((4, NUM_POINTS), bool))
-    structure.points = points.copy()
-    view = structure.views[3]
-    view.T_ref_view = None
-    view.pixels[:15] += (15.0, -9.0)
-    assert place(structure, view, config)
-    np.testing.assert_allclose(view.T_ref_view, poses[3], atol=1e-5)
+def test_a_view_is_placed_where_it_is_despite_wrong_landmarks_and_with_too_few_it_is_not():
+    poses, points, seen_by = arc(4), cloud(NUM_POINTS), np.ones((4, NUM_POINTS), bool)
+    for count in (NUM_POINTS, CONFIG.min_matches - 1):
+        seen_by[3, count:] = False
+        structure = placed_structure(poses, points, seen_by)
+        structure.points, view = points.copy(), structure.views[3]
+        view.T_ref_view = None
+        view.pixels[:15] += (15.0, -9.0) if count == NUM_POINTS else 0.0
+        assert place(structure, view, CONFIG) == (count == NUM_POINTS)
+        if count == NUM_POINTS:
+            np.testing.assert_allclose(view.T_ref_view, poses[3], atol=1e-5)
+    assert view.T_ref_view is None
 
 
-def test_a_view_with_too_few_landmarks_is_not_placed(config):
-    points = cloud(NUM_POINTS)
-    seen_by = np.ones((4, NUM_POINTS), bool)
-    seen_by[3, config.min_matches - 1 :] = False
-    structure = placed_structure(arc(4), points, seen_by)
-    structure.points = points.copy()
-    structure.views[3].T_ref_view = None
-    assert not place(structure, structure.views[3], config)
-    assert structure.views[3].T_ref_view is None
-
-
-def test_the_relative_pose_is_the_true_one_up_to_the_length_of_the_baseline(config):
+def test_the_relative_pose_is_the_true_one_up_to_the_length_of_the_baseline():
     poses = arc(3)
     structure = placed_structure(poses, cloud(NUM_POINTS), np.ones((3, NUM_POINTS), bool))
-    near, far = (relative_pose(structure.views[0], structure.views[b], calibration(), config) for b in (1, 2))
+    near, far = (relative_pose(structure.views[0], structure.views[b], calibration(), CONFIG) for b in (1, 2))
     expected = np.linalg.inv(poses[0]) @ poses[2]
     expected[:3, 3] /= np.linalg.norm(expected[:3, 3])
     np.testing.assert_allclose(far[0], expected, atol=1e-4)
     assert far[1] == near[1] == NUM_POINTS
     assert far[2] > 1.5 * near[2]  # twice the parallax
-
-
-def test_fewer_matches_than_a_pose_needs_are_refused_in_the_config():
-    with pytest.raises(Exception, match="at least 6"):
+    with pytest.raises(Exception, match="at least 6"):  # fewer matches than a pose needs
         structure_config("prior.structure.matching.min_matches=5")

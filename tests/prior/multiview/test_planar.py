@@ -55,30 +55,25 @@ def test_the_depth_of_images_of_a_blank_wall_in_a_painted_frame_is_within_2_perc
     assert np.mean(certain[blank]) < np.mean(spread[blank])
 
 
-@pytest.mark.parametrize("why", ["uncertain", "few", "two surfaces", "noise"])
+@pytest.mark.parametrize("why", ["uncertain", "few", "two surfaces", "noise", "line"])
 def test_without_matches_that_lie_on_one_plane_a_wall_stays_as_uncertain_as_it_was(why):
-    depth, spread = with_a_hollow(0.7)
+    depth, spread = with_a_hollow(0.7, noise=0.0 if why == "line" else 0.3)
     rim = WALL & ~INNER
     if why == "uncertain":
         spread[rim] = 3.0
     elif why == "few":
         depth[rim & (U > 15)] = 0.0
+    elif why == "line":
+        spread[WALL] = 8.0
+        spread[WALL & (U == 25)] = 0.5
     elif why == "two surfaces":
         depth = np.where(rim & (CENTER[0] < U), 0.5 * depth, depth)
     else:
         depth = np.where(rim, np.random.default_rng(2).uniform(1, 6, depth.shape), depth)
-    overrides = ("prior.dense.planar.min_matches=250",) if why == "few" else ()
+    overrides = {"few": ("prior.dense.planar.min_matches=250",), "line": ("prior.dense.planar.min_matches=10",)}.get(
+        why, ()
+    )
     found, certain = fill_planes(depth, spread, painted_around(WALL), SPACING, planar_config(*overrides))
-    np.testing.assert_allclose(found, depth, rtol=1e-6)
-    np.testing.assert_array_equal(certain, spread)
-
-
-def test_matches_on_a_line_do_not_make_a_plane():
-    depth, spread = with_a_hollow(0.7, noise=0.0)
-    spread[WALL] = 8.0
-    spread[WALL & (U == 25)] = 0.5
-    few = planar_config("prior.dense.planar.min_matches=10")
-    found, certain = fill_planes(depth, spread, painted_around(WALL), SPACING, few)
     np.testing.assert_allclose(found, depth, rtol=1e-6)
     np.testing.assert_array_equal(certain, spread)
 

@@ -13,14 +13,11 @@ def test_the_parallax_is_the_sine_of_the_angle_between_the_rays():
     np.testing.assert_allclose(parallax(points, np.zeros(3), np.array([1.0, 0, 0])), expected, atol=1e-12)
 
 
-def test_the_side_to_which_the_camera_turns_has_its_sources():
+def test_the_side_to_which_the_camera_turns_has_its_sources_and_most_parallax_is_chosen_best_first():
     """Symptom: four old views with wide baselines, none of which showed the right half of the image."""
     left, right = np.repeat([1.0, 0.0], [45, 45]), np.repeat([0.0, 1.0], [45, 45])
     worth = {index: 0.9 * left for index in range(4)} | {9: 0.1 * left + 0.3 * right}
     assert sorted(choose(worth, 4)) == [0, 1, 2, 9]
-
-
-def test_of_views_that_show_the_same_those_with_most_parallax_are_chosen_best_first():
     worth = {index: np.full(20, value) for index, value in enumerate((0.2, 0.9, 0.5, 0.7, 0.0))}
     assert choose(worth, 2) == [1, 3]
     assert choose(worth, 9) == [1, 3, 2, 0]  # the last shows nothing

@@ -11,7 +11,7 @@ from network_stand_in import Loaded
 @pytest.fixture
 def torch(monkeypatch, tmp_path):
     module = pytest.importorskip("torch")
-    monkeypatch.setattr(module.hub, "_hub_dir", str(tmp_path / "hub"))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.setenv("HF_HUB_OFFLINE", "0")
     monkeypatch.setenv("TRANSFORMERS_OFFLINE", "0")
     return module

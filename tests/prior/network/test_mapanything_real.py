@@ -1,11 +1,12 @@
 """The real package with a tiny random MapAnything: interfaces only, since random weights give no geometry."""
 
 import json
-from math import inf
+from pathlib import Path
 
 import hydra
 import numpy as np
 import pytest
+import yaml
 from network_double import Sphere
 from tiny_run import compose
 
@@ -15,105 +16,9 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 models = pytest.importorskip("mapanything.models", reason="the package mapanything is not installed")
 safetensors = pytest.importorskip("safetensors.torch", reason="safetensors is not installed")
 
-WIDTH = 32
-
-
-def geometric(name, channels, kind):
-    config = {"name": name, "in_chans": channels, "encoder_str": kind, "intermediate_dims": [8, 16]}
-    return config | ({"apply_pe": False} if kind == "dense_rep_encoder" else {})
-
 
 def tiny():
-    """Arguments of the smallest MapAnything; its encoder needs no download."""
-    bounds = {"ray_directions_vmin": -inf, "ray_directions_vmax": inf, "ray_directions_z_dir_min": -inf}
-    return {
-        "name": "mapanything_tiny",
-        "info_sharing_mlp_layer_str": "swiglufused",
-        "use_register_tokens_from_encoder": True,
-        "encoder_config": {
-            "encoder_str": "patch_embedder",
-            "name": "tiny",
-            "data_norm_type": "dinov2",
-            "patch_size": 14,
-            "enc_embed_dim": WIDTH,
-            "input_size": 56,
-            "uses_torch_hub": False,
-        },
-        "info_sharing_config": {
-            "model_type": "alternating_attention",
-            "model_return_type": "intermediate_features",
-            "custom_positional_encoding": None,
-            "module_args": {
-                "name": "tiny_aat",
-                "indices": [1, 2],
-                "norm_intermediate": True,
-                "size": "4_layers",
-                "depth": 4,
-                "distinguish_ref_and_non_ref_views": True,
-                "gradient_checkpointing": False,
-                "dim": WIDTH,
-                "num_heads": 2,
-                "mlp_ratio": 2,
-                "qkv_bias": True,
-                "qk_norm": False,
-                "init_values": 1e-5,
-            },
-        },
-        "pred_head_config": {
-            "type": "dpt+pose",
-            "feature_head": {
-                "feature_dim": 16,
-                "hooks": [0, 1, 2, 3],
-                "layer_dims": [8, 8, 16, 16],
-                "checkpoint_gradient": False,
-            },
-            "regressor_head": {"output_dim": 6, "checkpoint_gradient": False},
-            "pose_head": {"num_resconv_block": 1, "rot_representation_dim": 4},
-            "scale_head": {"output_dim": 1, "hidden_dim": 16},
-            "adaptor_type": "raydirs+depth+pose+confidence+mask",
-            "dpt_adaptor": bounds
-            | {
-                "name": "a",
-                "ray_directions_mode": "linear",
-                "ray_directions_normalize_to_unit_sphere": True,
-                "ray_directions_normalize_to_unit_image_plane": False,
-                "ray_directions_clamp_min_of_z_dir": False,
-                "depth_mode": "exp",
-                "depth_vmin": 0,
-                "depth_vmax": inf,
-                "confidence_type": "exp",
-                "confidence_vmin": 1,
-                "confidence_vmax": inf,
-            },
-            "pose_adaptor": {
-                "name": "a",
-                "cam_trans_mode": "linear",
-                "cam_trans_vmin": -inf,
-                "cam_trans_vmax": inf,
-                "quaternions_mode": "linear",
-                "quaternions_normalize": True,
-                "quaternions_vmin": -inf,
-                "quaternions_vmax": inf,
-            },
-            "scale_adaptor": {"name": "a", "mode": "exp", "vmin": 1e-8, "vmax": inf},
-        },
-        "geometric_input_config": {
-            "ray_dirs_encoder_config": geometric("r", 3, "dense_rep_encoder"),
-            "depth_encoder_config": geometric("d", 1, "dense_rep_encoder"),
-            "cam_rot_encoder_config": geometric("q", 4, "global_rep_encoder"),
-            "cam_trans_encoder_config": geometric("t", 3, "global_rep_encoder"),
-            "scale_encoder_config": geometric("s", 1, "global_rep_encoder"),
-            "overall_prob": 0,
-            "dropout_prob": 1,
-            "ray_dirs_prob": 0,
-            "depth_prob": 0,
-            "cam_prob": 0,
-            "sparse_depth_prob": 0,
-            "sparsification_removal_percent": 0,
-            "depth_scale_norm_all_prob": 0,
-            "pose_scale_norm_all_prob": 0,
-        },
-    }
+    return yaml.safe_load(Path(__file__).with_name("tiny_mapanything.yaml").read_text())
 
 
 @pytest.fixture(scope="module")

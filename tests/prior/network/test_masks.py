@@ -9,14 +9,24 @@ from scene import compose
 
 from emgs_jax.prior.network import masks
 
-pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
-
 SHAPE = (14, 17)
+TRACES = []
+normal_edges, depth_edges, above_percentile = map(
+    jax.jit, (masks.normal_edges, masks.depth_edges, masks.above_percentile)
+)
+consistent_share, consistent, grid_normals = map(
+    jax.jit, (masks.consistent_share, masks.consistent, masks.grid_normals)
+)
+
+
+@jax.jit
+def usable(*arguments):
+    TRACES.append(arguments)
+    return masks.usable(*arguments)
 
 
 def config(**changes):
-    values = {key: value for key, value in compose("prior=mapanything").prior.masks.items()}
-    return hydra.utils.instantiate(values | changes)
+    return hydra.utils.instantiate(dict(compose("prior=mapanything").prior.masks) | changes)
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +48,14 @@ def corner_normals(points, mask):
     points, (height, width) = points.astype(float), mask.shape
     normals, has_any = np.zeros_like(points), np.zeros_like(mask)
     around = [(-1, 0), (0, -1), (1, 0), (0, 1)]  # up, left, down, right; each makes a corner with the next
-    for y in range(height):
-        for x in range(width):
-            for (ay, ax), (by, bx) in zip(around, around[1:] + around[:1], strict=True):
-                corners = [(y, x), (y + ay, x + ax), (y + by, x + bx)]
-                if all(0 <= r < height and 0 <= c < width and mask[r, c] for r, c in corners):
-                    a, b = points[corners[1]] - points[y, x], points[corners[2]] - points[y, x]
-                    normals[y, x] += unit(np.cross(a, b))
-                    has_any[y, x] = True
-            normals[y, x] = unit(normals[y, x])
+    for y, x in np.ndindex(*mask.shape):
+        for (ay, ax), (by, bx) in zip(around, around[1:] + around[:1], strict=True):
+            corners = [(y, x), (y + ay, x + ax), (y + by, x + bx)]
+            if all(0 <= r < height and 0 <= c < width and mask[r, c] for r, c in corners):
+                a, b = points[corners[1]] - points[y, x], points[corners[2]] - points[y, x]
+                normals[y, x] += unit(np.cross(a, b))
+                has_any[y, x] = True
+        normals[y, x] = unit(normals[y, x])
     return normals, has_any
 
 
@@ -81,31 +90,19 @@ def assert_same_above(got, values, threshold, where=True):
     np.testing.assert_array_equal(np.asarray(got)[decided], (values > threshold)[decided])
 
 
-def test_normals_and_normal_edges_are_upstreams(scene):
+def test_normals_normal_edges_and_depth_edges_are_upstreams(scene):
     points, mask = scene
     expected, has_any = corner_normals(points, mask)
-    normals, has_normal = masks.grid_normals(jnp.asarray(points), jnp.asarray(mask))
+    normals, has_normal = grid_normals(points, mask)
     np.testing.assert_array_equal(has_normal, has_any)
     np.testing.assert_allclose(normals, expected, atol=2e-4)  # differences of neighbours in float32
+    angles = largest_angles(np.asarray(normals, float), has_any)
     for degrees in (5.0, 20.0, 60.0):
-        got = masks.normal_edges(normals, has_normal, jnp.float32(degrees))
-        angles = largest_angles(np.asarray(normals, float), has_any)
+        got = normal_edges(normals, has_normal, jnp.float32(degrees))
         assert_same_above(got, angles, np.deg2rad(degrees))
         assert np.asarray(got).any()
-
-
-def test_a_plane_that_faces_the_camera_has_the_normal_towards_it():
-    v, u = np.indices(SHAPE)
-    points = jnp.asarray(np.stack([u, v, np.full(SHAPE, 5.0)], axis=-1), jnp.float32)
-    normals, has_normal = masks.grid_normals(points, jnp.ones(SHAPE, bool))
-    assert has_normal.all()
-    np.testing.assert_allclose(normals, np.broadcast_to([0, 0, -1], (*SHAPE, 3)), atol=1e-6)
-
-
-def test_depth_edges_are_upstreams(scene):
-    points, mask = scene
     for step in (0.01, 0.03, 0.1):
-        got = masks.depth_edges(jnp.asarray(points[..., 2]), jnp.asarray(mask), jnp.float32(step))
+        got = depth_edges(points[..., 2], mask, jnp.float32(step))
         assert_same_above(got, depth_ranges(points[..., 2], mask), step, mask)
 
 
@@ -113,47 +110,35 @@ def test_the_percentile_is_numpys_and_zero_keeps_all():
     confidence = np.random.default_rng(0).uniform(1, 9, SHAPE).astype(np.float32)
     for percentile in (10.0, 37.5, 90.0):
         expected = confidence > np.percentile(confidence, percentile)
-        np.testing.assert_array_equal(
-            masks.above_percentile(jnp.asarray(confidence), jnp.float32(percentile)), expected
-        )
+        np.testing.assert_array_equal(above_percentile(confidence, jnp.float32(percentile)), expected)
+    assert above_percentile(confidence, jnp.float32(0.0)).all()
     for percentile in (0.0, 10.0, 90.0):  # constant: a view of a network without confidence was dropped as a whole
-        assert masks.above_percentile(jnp.ones(SHAPE), jnp.float32(percentile)).all()
+        assert above_percentile(jnp.ones(SHAPE), jnp.float32(percentile)).all()
 
 
-def test_the_mask_of_a_view_is_upstreams_combination(scene):
+def test_the_mask_of_a_view_is_upstreams_combination_and_neutral_values_turn_every_part_off(scene):
     points, mask = scene
     confidence = np.random.default_rng(1).uniform(1, 9, SHAPE).astype(np.float32)
     before = mask & (confidence > np.percentile(confidence, 10))
-    normals, has_any = corner_normals(points, before)
-    angles = largest_angles(normals, has_any)
+    angles = largest_angles(*corner_normals(points, before))
     ranges = depth_ranges(points[..., 2], before)
     expected = before & ~((angles > np.deg2rad(5)) & (ranges > 0.03))
-    got = np.asarray(masks.usable(*map(jnp.asarray, (points, confidence, mask)), config(confidence_percentile=10)))
+    got = np.asarray(usable(points, confidence, mask, config(confidence_percentile=10)))
     decided = (np.abs(ranges - 0.03) > 1e-4) & (np.abs(angles - np.deg2rad(5)) > 1e-3)
     np.testing.assert_array_equal(got[decided], expected[decided])
     assert 0.2 < expected.sum() / before.sum() < 0.9 and decided.mean() > 0.9
-
-
-@pytest.mark.parametrize("poison", [np.nan, np.inf, -1.0, 0.0])
-def test_a_point_that_is_none_is_left_out_and_harms_only_its_neighbours(scene, poison):
-    points, mask = scene
-    clean = np.asarray(masks.usable(jnp.asarray(points), jnp.ones(SHAPE), jnp.asarray(mask), config()))
-    spoiled = points.copy()
-    spoiled[7, 8] = poison
-    got = np.asarray(masks.usable(jnp.asarray(spoiled), jnp.ones(SHAPE), jnp.asarray(mask), config()))
-    assert not got[7, 8]
-    far = np.ones(SHAPE, bool)
+    ones = np.ones(SHAPE, np.float32)
+    assert usable(points, ones, mask, config(drop_ambiguous=0, max_edge_step=float("inf"))).all()
+    np.testing.assert_array_equal(usable(points, ones, mask, config(max_edge_degrees=float("inf"))), mask)
+    clean, far = np.asarray(usable(points, ones, mask, config())), np.ones(SHAPE, bool)
     far[4:11, 5:12] = False
-    np.testing.assert_array_equal(got[far], clean[far])
-
-
-def test_neutral_values_turn_every_part_off(scene):
-    points, mask = scene
-    off = config(drop_ambiguous=0, max_edge_step=float("inf"))
-    assert masks.usable(jnp.asarray(points), jnp.ones(SHAPE), jnp.asarray(mask), off).all()
-    only_ambiguous = config(max_edge_degrees=float("inf"))
-    got = masks.usable(jnp.asarray(points), jnp.ones(SHAPE), jnp.asarray(mask), only_ambiguous)
-    np.testing.assert_array_equal(got, mask)
+    for poison in (np.nan, np.inf, -1.0, 0.0):  # a point that is none harms only its neighbours
+        spoiled = points.copy()
+        spoiled[7, 8] = poison
+        got = np.asarray(usable(spoiled, ones, mask, config()))
+        assert not got[7, 8]
+        np.testing.assert_array_equal(got[far], clean[far])
+    assert len(TRACES) == 1, "one compilation serves all thresholds"
 
 
 @pytest.fixture(scope="module")
@@ -187,40 +172,22 @@ def shares(row, depths, K, T, absolute, relative):
     return share, number
 
 
-@pytest.mark.parametrize("row", [0, 1, 2])
-def test_the_share_of_agreeing_views_is_upstreams(views, row):
+def test_the_share_of_agreeing_views_is_upstreams(views):
     arrays = [jnp.asarray(a, jnp.float32) for a in views]
-    share, number = masks.consistent_share(jnp.asarray(row), *arrays, config())
-    expected_share, expected_number = shares(row, *views, 0.02, 0.02)
-    # At a pixel's border float32 may fall to the other side.
-    assert (np.asarray(number) == expected_number).mean() > 0.98
-    assert (np.abs(np.asarray(share) - expected_share) < 1e-6).mean() > 0.98
-    assert {0, 0.5, 1} <= set(expected_share.ravel()) and expected_number.min() == 0
+    for row, relative in ((0, 0.02), (1, 0.02), (2, 0.02), (1, 0.12)):  # 40 cm decide by whose depth the share is of
+        share, number = consistent_share(jnp.asarray(row), *arrays, config(consistent_depth_share=relative))
+        expected_share, expected_number = shares(row, *views, 0.02, relative)
+        # At a pixel's border float32 may fall to the other side.
+        assert (np.asarray(number) == expected_number).mean() > 0.98
+        assert (np.abs(np.asarray(share) - expected_share) < 1e-6).mean() > 0.98
+        assert {0, 0.5, 1} <= set(expected_share.ravel()) and expected_number.min() == 0
 
 
 def test_a_pixel_is_contradicted_by_those_that_see_it_and_not_by_those_that_do_not(views):
     _, K, T = (jnp.asarray(a, jnp.float32) for a in views)
     depths = jnp.asarray(3.0 - views[2][:, 2, 3][:, None, None] * np.ones((3, *SHAPE)), jnp.float32)
     flying = depths.at[0, 7, 8].set(2.0)
-    ask = jax.jit(masks.consistent)
-    kept = ask(jnp.asarray(0), flying, K, T, config(min_consistent_share=0.6))
+    kept = consistent(jnp.asarray(0), flying, K, T, config(min_consistent_share=0.6))
     assert not kept[7, 8] and kept.sum() == kept.size - 1
-    alone = ask(jnp.asarray(0), flying[:1], K[:1], T[:1], config(min_consistent_share=0.6))
+    alone = consistent(jnp.asarray(0), flying.at[1:].set(0.0), K, T, config(min_consistent_share=0.6))
     assert alone.all()
-
-
-def test_one_compilation_serves_all_thresholds_and_many_views(scene):
-    points, mask = scene
-    batch = jnp.stack([jnp.asarray(points)] * 2), jnp.ones((2, *SHAPE)), jnp.stack([jnp.asarray(mask)] * 2)
-    traces = []
-
-    def counted(points, confidence, is_clear, settings):
-        traces.append(None)
-        return jax.vmap(masks.usable, (0, 0, 0, None))(points, confidence, is_clear, settings)
-
-    jitted = jax.jit(counted)
-    for step in (0.01, 0.03, 1):
-        many = jitted(*batch, config(max_edge_step=step))
-        one = masks.usable(*(array[0] for array in batch), config(max_edge_step=step))
-        np.testing.assert_array_equal(many[1], one)
-    assert len(traces) == 1

@@ -23,14 +23,21 @@ UPSTREAM = {
 }
 
 
-@pytest.mark.parametrize("name", UPSTREAM)
-def test_grid_and_intrinsics_are_those_of_the_framework_to_the_last_digit(name):
-    frame, intrinsics, grid, expected = UPSTREAM[name]
-    assert choose_grid(frame, 518) == grid
-    matrix = resize_intrinsics(intrinsics, plan_resize(frame, grid))
-    assert matrix.dtype == np.float32
-    np.testing.assert_allclose(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], expected, atol=6e-5)  # four digits are printed
-    np.testing.assert_array_equal(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
+def test_grid_crop_and_intrinsics_are_those_of_the_framework_to_the_last_digit():
+    for frame, intrinsics, grid, expected in UPSTREAM.values():
+        assert choose_grid(frame, 518) == grid
+        matrix = resize_intrinsics(intrinsics, plan_resize(frame, grid))
+        assert matrix.dtype == np.float32
+        np.testing.assert_allclose(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], expected, atol=6e-5)  # four digits are printed
+        np.testing.assert_array_equal(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
+    scenes, replica = plan_resize((640, 480), (518, 392)), plan_resize((1200, 680), (518, 294))
+    assert (scenes.scaled, scenes.corner) == ((522, 392), (2, 0)) and abs(scenes.scale - 0.8166667) < 1e-6
+    assert (replica.scaled, replica.corner) == ((518, 294), (0, 0)) and abs(replica.scale - 0.4323529) < 1e-6
+    for resolution_set, patch in ((518, 14), (512, 16), (504, 14)):
+        for aspect in (1.0, 1.33, 1.5, 1.78, 2.0, 3.2, 0.75, 0.65, 0.56, 0.5):
+            grid = choose_grid((round(1000 * aspect), 1000), resolution_set)
+            assert max(grid) == resolution_set and grid[0] % patch == grid[1] % patch == 0
+            assert abs(grid[0] / grid[1] / aspect - 1) < 0.06
 
 
 @pytest.mark.parametrize(("frame", "grid", "beside"), [((1200, 680), (518, 294), 0.41), ((640, 480), (518, 392), 0.33)])
@@ -42,20 +49,6 @@ def test_what_a_grid_pixel_shows_is_beside_its_ray_by_what_upstreams_rounding_ma
     matrix = resize_intrinsics(intrinsics, resize)
     of_camera = matrix[0, 0] * (np.arange(frame[0]) - cx) / fx + matrix[0, 2]
     assert abs(np.abs(of_camera - columns).max() - beside) < 0.005
-
-
-def test_scaled_size_and_crop_are_those_of_the_framework():
-    scenes, replica = plan_resize((640, 480), (518, 392)), plan_resize((1200, 680), (518, 294))
-    assert (scenes.scaled, scenes.corner) == ((522, 392), (2, 0)) and abs(scenes.scale - 0.8166667) < 1e-6
-    assert (replica.scaled, replica.corner) == ((518, 294), (0, 0)) and abs(replica.scale - 0.4323529) < 1e-6
-
-
-def test_every_grid_of_a_set_is_made_of_whole_patches_and_is_chosen_for_its_own_aspect():
-    for resolution_set, patch in ((518, 14), (512, 16), (504, 14)):
-        for aspect in (1.0, 1.33, 1.5, 1.78, 2.0, 3.2, 0.75, 0.65, 0.56, 0.5):
-            grid = choose_grid((round(1000 * aspect), 1000), resolution_set)
-            assert max(grid) == resolution_set and grid[0] % patch == grid[1] % patch == 0
-            assert abs(grid[0] / grid[1] / aspect - 1) < 0.06
 
 
 def test_a_frame_of_the_grids_size_stays_as_it_is():

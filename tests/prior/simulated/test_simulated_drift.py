@@ -3,59 +3,32 @@
 The tolerances of the empirical figures are three to four standard errors of the number of draws, with fixed seeds.
 """
 
-import hashlib
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from draws import INTRINSICS, NO_DEPTH_NOISE, SEEDS, along, ask, digest, errors, prior_with
 
-from emgs_jax.data.base import Frame
 from emgs_jax.prior.base import Window, windows
 from emgs_jax.prior.recorded import record
 from emgs_jax.prior.simulated.noise import random_walk
 from emgs_jax.prior.simulated.prior import Simulated
 
-INTRINSICS = (9.0, 9.0, 4.0, 3.0)
-SEEDS = range(300)
-
-
-def ask(prior, dataset, window):
-    return prior.predict(window, [dataset[i] for i in window.views], dataset.intrinsics)
-
-
-def digest(prediction):
-    parts = prediction.T_anchor_view, prediction.points, prediction.confidence, prediction.mask, prediction.features
-    return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
-
-
-def turned_away(num_frames, step):
-    """Frames 8 × 6, `step` metres apart along x, of which the first looks the other way: they share nothing with it."""
-    frames = []
-    for index in range(num_frames):
-        T_world_camera = np.diag([-1.0, 1.0, -1.0, 1.0]) if index == 0 else np.eye(4)
-        T_world_camera[0, 3] = step * index
-        depth = np.full((6, 8), 2, np.float32)
-        frames.append(Frame(index, 0.0, f"{index}", np.zeros((6, 8, 3), np.uint8), depth, T_world_camera))
-    return frames
-
 
 def window_errors(step, inference=9, version=2, level=1.0, seeds=SEEDS):
     """(v, ω) of the middle camera, frame 6, of each seed (n, 6), in metres and radians, without the scale."""
-    frames, window = turned_away(8, step), Window(inference, (0, 5, 6, 7), (6, 7), 7)
+    frames, window = along(8, step, is_turned=True), Window(inference, (0, 5, 6, 7), (6, 7), 7)
     T_true, found = np.linalg.inv(frames[0].T_world_camera) @ frames[6].T_world_camera, []
+    standard = NO_DEPTH_NOISE | {"scale": 0.0, "scale_walk": 0.0}
     for seed in seeds:
-        prior = Simulated(seed=seed, version=version, level=level)
-        prior.standard = replace(prior.standard, scale=0.0, scale_walk=0.0)
-        T = prior.predict(window, [frames[i] for i in window.views], INTRINSICS).T_anchor_view[2]
-        error = np.linalg.inv(T_true) @ T
-        found.append([*error[:3, 3], *Rotation.from_matrix(error[:3, :3]).as_rotvec()])
-    return np.array(found)
+        prior = prior_with(standard, seed=seed, version=version, level=level)
+        found.append(prior.predict(window, [frames[i] for i in window.views], INTRINSICS).T_anchor_view[2])
+    return errors(T_true, np.stack(found))
 
 
 def test_while_the_anchor_is_seen_only_the_walk_of_the_scale_is_new(room):
-    """The same bits but for one factor, which multiplies points and translations alike."""
+    """The same bits but for one factor, which multiplies points and translations alike; without the two, the same."""
     for window in windows(len(room), 3):
         first, second = (ask(Simulated(seed=3, version=v, classes=room.classes), room, window) for v in (1, 2))
         factor = math.exp(0.003 * random_walk(3, window.inference))
@@ -64,27 +37,18 @@ def test_while_the_anchor_is_seen_only_the_walk_of_the_scale_is_new(room):
         np.testing.assert_allclose(second.points, factor * first.points, rtol=3e-7)  # one rounding to float32 each
         for name in ("confidence", "mask", "features"):
             np.testing.assert_array_equal(getattr(second, name), getattr(first, name))
+        without = prior_with({"scale_walk": 0.0, "min_shared": 0.0}, seed=3, version=2, classes=room.classes)
+        assert digest(ask(without, room, window)) == digest(first)
 
 
-def test_without_its_two_disturbances_version_2_has_the_bits_of_version_1(room):
-    for window in windows(len(room), 3):
-        prior = Simulated(seed=3, version=2)
-        prior.standard = replace(prior.standard, scale_walk=0.0, min_shared=0.0)
-        assert digest(ask(prior, room, window)) == digest(ask(Simulated(seed=3), room, window))
-
-
-def test_level_0_is_exact_in_version_2_too():
-    np.testing.assert_allclose(window_errors(0.5, level=0.0, seeds=[1]), 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("step", [0.2, 0.5])
-@pytest.mark.parametrize("level", [1.0, 0.5])
+@pytest.mark.parametrize(("step", "level"), [(0.2, 1.0), (0.5, 1.0), (0.5, 0.5)])
 def test_an_unseen_anchor_is_off_by_10_percent_of_the_distance_and_5_degrees(step, level):
     error = window_errors(step, level=level)
     np.testing.assert_allclose(error[:, :3].std(axis=0), level * 0.1 * 6 * step, rtol=0.16)
     np.testing.assert_allclose(error[:, :3].std(), level * 0.1 * 6 * step, rtol=0.1)
     np.testing.assert_allclose(error[:, 3:].std(), level * math.radians(5.0), rtol=0.1)
     assert np.abs(error.mean(axis=0)[:3]).max() < 0.25 * level * 0.1 * 6 * step  # of any direction
+    np.testing.assert_allclose(window_errors(step, level=0.0, seeds=[1]), 0.0, atol=1e-12)
 
 
 def test_an_unseen_anchor_never_holds_better_than_in_version_1():
@@ -107,59 +71,47 @@ def test_the_error_without_a_hold_is_correlated_by_the_power_of_09_of_the_infere
         assert np.corrcoef(first[half].ravel(), later[half].ravel())[0, 1] == pytest.approx(0.9**15, abs=0.12)
 
 
-def test_the_log_scale_walks_by_a_standard_normal_step_each_inference():
+def test_the_log_scale_walks_by_independent_steps_of_03_percent_an_inference():
+    """Standard deviation .3 % · √100 = 3 % after 100 inferences, of the other disturbances nothing."""
     walks = np.array([[random_walk(seed, inference) for inference in range(60)] for seed in range(400)])
     assert not walks[:, 0].any()
     steps = np.diff(walks, axis=1)
     assert steps.std() == pytest.approx(1.0, abs=0.03) and abs(steps.mean()) < 0.03
     assert np.corrcoef(steps[:, :-1].ravel(), steps[:, 1:].ravel())[0, 1] == pytest.approx(0.0, abs=0.03)
     assert walks[:, 49].std() == pytest.approx(7.0, rel=0.15)
-
-
-def test_the_scale_of_a_prediction_drifts_by_03_percent_an_inference():
-    """Standard deviation .3 % · √100 = 3 % after 100 inferences, of the other disturbances nothing."""
-    frames, logs = turned_away(2, 0.1), []
+    frames, logs = along(2, 0.1, is_turned=True), []
     for seed in SEEDS:
-        prior = Simulated(seed=seed, version=2)
-        prior.standard = replace(prior.standard, scale=0.0, warp=(0.0, 0.0), pixel=0.0, flying_share=0.0)
+        prior = prior_with(NO_DEPTH_NOISE | {"scale": 0.0}, seed=seed, version=2)
         points = prior.predict(Window(100, (0, 1), (1,), 1), frames, INTRINSICS).points
         logs.append(math.log(points[0, 3, 4, 2] / 2.0))
     assert np.std(logs) == pytest.approx(0.03, rel=0.13)
 
 
 def test_one_inference_alone_gives_the_bits_of_a_whole_run_in_any_order_where_it_drifts():
-    class Away:
-        intrinsics = INTRINSICS
+    calls, frames = list(windows(9, 3)), along(9, 0.3, is_turned=True)
 
-        def __getitem__(self, index):
-            return turned_away(9, 0.3)[index]
+    def digests(order, prior=None, seed=3):
+        asked = ((prior or Simulated(seed=seed, version=2), [frames[i] for i in one.views], one) for one in order)
+        return [digest(one.predict(window, views, INTRINSICS)) for one, views, window in asked]
 
-    calls, dataset = list(windows(9, 3)), Away()
     prior = Simulated(seed=3, version=2)
-    forward = [digest(ask(prior, dataset, window)) for window in calls]
-    backward = [digest(ask(prior, dataset, window)) for window in reversed(calls)][::-1]
-    alone = [digest(ask(Simulated(seed=3, version=2), dataset, window)) for window in calls]
-    assert forward == backward == alone and len(set(forward)) == len(calls)
-    others = [digest(ask(Simulated(seed=4, version=2), dataset, window)) for window in calls]
-    assert not {*forward} & {*others}
+    forward, backward = digests(calls, prior), digests(calls[::-1], prior)[::-1]
+    assert forward == backward == digests(calls) and len(set(forward)) == len(calls)
+    assert not {*forward} & {*digests(calls, seed=4)}
 
 
 def test_the_depth_of_anchor_and_middle_view_is_needed_and_a_frame_without_it_is_named(room):
     window = Window(2, (0, 2, 3, 4), (3, 4), 4)
     frames = [room[i] for i in window.views]
+
+    def without(row):
+        given = [replace(frame, depth=None) if i == row else frame for i, frame in enumerate(frames)]
+        return Simulated(version=2).predict(window, given, room.intrinsics)
+
     for row in (0, 2):
-        without = [replace(frame, depth=None) if i == row else frame for i, frame in enumerate(frames)]
         with pytest.raises(ValueError, match=rf"frame {window.views[row]} .*has no depth"):
-            Simulated(version=2).predict(window, without, room.intrinsics)
-    without = [replace(frame, depth=None) if i == 1 else frame for i, frame in enumerate(frames)]
-    given, all_of_them = (Simulated(version=2).predict(window, f, room.intrinsics) for f in (without, frames))
-    assert digest(given) == digest(all_of_them)
-
-
-@pytest.mark.parametrize("version", [0, 3, 1.5])
-def test_another_version_is_refused_by_name(version):
-    with pytest.raises(ValueError, match=r"prior.version must be 1 .* or 2 .*, got"):
-        Simulated(version=version)
+            without(row)
+    assert digest(without(1)) == digest(without(None))
 
 
 def test_every_result_says_the_version_and_recordings_of_the_two_do_not_mix(room, tmp_path):
