@@ -122,7 +122,6 @@ def init_state(
         views: the window's observations, camera frames, oldest first.
         T_world_views: their poses.
         camera: of the full images.
-        config: all stages.
         call: how an executable is called.
 
     Returns:

@@ -10,9 +10,7 @@ code and, inside JAX, a pickle: as JAX's cache the folder has to be the user's o
 """
 
 import contextlib
-import dataclasses
 import hashlib
-import importlib
 import json
 import os
 import platform
@@ -20,7 +18,6 @@ import re
 import sys
 import threading
 import time
-import zlib
 from collections.abc import Callable
 from functools import cache, partial
 from importlib.metadata import version
@@ -32,11 +29,11 @@ import jax
 import jax.monitoring
 from jax.experimental import serialize_executable
 
-from emgs_jax.io.files import atomic_write
+from emgs_jax.running.executable_files import described, read, rebuilt, remove, write
 
 PACKAGES = ("jax", "jaxlib", "equinox", "jaxlie", "optimistix", "lineax", "numpy")
 ROOT = Path(__file__).parents[1]
-TRUSTED = ("emgs_jax.", "jaxlie.")  # whose classes an entry may name
+COMPILED = "/jax/core/compile/backend_compile_duration"
 # Defaults, but executables that are asked for with one of them are others to JAX's cache: what was taken from there
 # cannot be kept again, as on CPUs it has lost its functions (jaxlib 0.10.1). The second is for a file that was damaged.
 _OPTIONS = {"xla_embed_ir_in_executable": False}, {"xla_dump_hlo_as_text": False}, {"xla_dump_hlo_as_proto": False}
@@ -62,7 +59,7 @@ def stored(function: Callable) -> Callable:
 def ready(function: Callable, *arguments: Any) -> Callable | None:
     """The executable of a function for arguments like these, loaded or compiled; None where nothing is kept."""
     leaves, tree = jax.tree.flatten(arguments)
-    if _folder() is None or not all(_is_plain(leaf) for leaf in leaves):
+    if _folder() is None or not _are_plain(leaves):
         return None
     about = tuple(_about(leaf) for leaf in leaves)
     key = function, tree, about, jax.config.jax_default_matmul_precision, jax.config.jax_enable_x64
@@ -75,7 +72,7 @@ def outputs(function: Callable, *arguments: Any) -> Any:
     """`eqx.filter_eval_shape`, which traces the function, or what is kept of that."""
     leaves, tree = jax.tree.flatten(arguments)
     entry = None if _folder() is None else _entry(_digest(function, tree, tuple(map(_about, leaves))))
-    return eqx.filter_eval_shape(function, *arguments) if entry is None else _rebuilt(entry["outputs"])
+    return eqx.filter_eval_shape(function, *arguments) if entry is None else rebuilt(entry["outputs"])
 
 
 def forget() -> None:
@@ -88,11 +85,12 @@ def _folder() -> Path | None:
     return None if folder is None else Path(folder)
 
 
-def _is_plain(leaf: Any) -> bool:
-    """No tracer, and on the device on which all else is."""
-    if isinstance(leaf, jax.core.Tracer):
+def _are_plain(leaves: list) -> bool:
+    """No tracers, and all arrays on the device on which all else is."""
+    device = {jax.devices()[0]}
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
         return False
-    return not isinstance(leaf, jax.Array) or leaf.devices() == {jax.devices()[0]}
+    return all(leaf.devices() == device for leaf in leaves if isinstance(leaf, jax.Array))
 
 
 def _about(leaf: Any) -> Any:
@@ -101,25 +99,37 @@ def _about(leaf: Any) -> Any:
 
 def _made(function: Callable, arguments: tuple, digest: str) -> Callable:
     """The executable of an entry, or of a new one where it is missing, damaged or refused."""
-    entry = _entry(digest)
-    found = None if entry is None else _runnable(entry["program"], arguments, _rebuilt(entry["outputs"]))
-    return found or _compile(function, arguments, digest)
+    begin, entry = time.perf_counter(), _entry(digest)
+    found = None if entry is None else _runnable(entry["program"], arguments, rebuilt(entry["outputs"]))
+    if found is None:
+        return _compile(function, arguments, digest)
+    name = function.__wrapped__.__name__  # as JAX says it of what it takes from its cache
+    jax.monitoring.record_event_duration_secs(COMPILED, time.perf_counter() - begin, fun_name=name)
+    return found
 
 
 def _compile(function: Callable, arguments: tuple, digest: str) -> Callable:
     """The executable of a new entry: that of the same program in another entry, or compiled and kept."""
     lowered = function.lower(*arguments)
     outputs, text = eqx.filter_eval_shape(function, *arguments), lowered.as_text()
-    program = _hash(*_machine(), text)
+    program = _hash(*_machine(), text, *_used(lowered, digest))
     found = _runnable(program, arguments, outputs)
     if found is None:
         found, is_new = _compiled(lowered)
         if not is_new or "callback" in text:  # which knows where it is in this process
             return found
-        _write(program, serialize_executable.serialize(found.compiled)[0])
+        write(_folder(), program, serialize_executable.serialize(found.compiled)[0])
     with contextlib.suppress(TypeError):  # something comes out that has no description
-        _write(digest, json.dumps({"program": program, "outputs": _described(outputs)}).encode())
+        write(_folder(), digest, json.dumps({"program": program, "outputs": described(outputs)}).encode())
     return found
+
+
+def _used(lowered: Any, digest: str) -> list[object]:
+    """Numbers of the arguments that a program takes, which its text does not tell; else it is shared by none."""
+    try:
+        return sorted(lowered.lowered._lowering.compile_args["kept_var_idx"])
+    except (AttributeError, KeyError):
+        return [digest]
 
 
 def _compiled(lowered: Any) -> tuple[Callable, bool]:
@@ -135,7 +145,7 @@ def _compiled(lowered: Any) -> tuple[Callable, bool]:
 
 def _runnable(program: str, arguments: tuple, outputs: Any) -> Callable | None:
     """The kept executable of a program, as a function of such arguments."""
-    payload = _read(program)
+    payload = read(_folder(), program)
     if payload is None:
         return None
     leaves, structure = jax.tree.flatten(outputs)
@@ -148,7 +158,7 @@ def _runnable(program: str, arguments: tuple, outputs: Any) -> Callable | None:
             payload, inputs, marked, execution_devices=jax.devices()[:1]
         )
     except Exception as error:  # whatever XLA dislikes
-        _remove(program, error)
+        remove(_folder(), program, error)
         return None
 
     def run(*arguments: Any) -> Any:
@@ -183,10 +193,8 @@ def _listen() -> None:
 def _digest(function: Callable, tree: Any, about: tuple) -> str:
     """Of all that a program is made from."""
     named = function.__wrapped__
-    values = {
-        name: getattr(jax.config, name, value) for name, value in jax.config.values.items()
-    }  # those of `with`, too
-    settings = [f"{name}={values[name]}" for name in sorted(values) if "cache" not in name]
+    inside = {name: getattr(jax.config, name, value) for name, value in jax.config.values.items()}  # of `with`
+    settings = [f"{name}={inside[name]}" for name in sorted(inside) if "cache" not in name]
     return _hash(*_machine(), *settings, *_source(named.__module__), named.__qualname__, tree, about)
 
 
@@ -224,84 +232,6 @@ def _numbers(names: dict[str, Any]) -> list[tuple[str, Any]]:
     return sorted((key, value) for key, value in names.items() if key.isupper() and isinstance(value, (int, float)))
 
 
-def _described(node: Any) -> Any:
-    """A tree of shapes as JSON.
-
-    Raises:
-        TypeError: there is something in it that `_rebuilt` could not make again.
-    """
-    if isinstance(node, jax.ShapeDtypeStruct):
-        return {"shape": node.shape, "dtype": node.dtype.name, "weak_type": node.weak_type}
-    if node is None or isinstance(node, (bool, int, float, str)):
-        return {"value": node}
-    if type(node) in (tuple, list):
-        return {type(node).__name__: [_described(part) for part in node]}
-    name = f"{type(node).__module__}:{type(node).__qualname__}"
-    if not dataclasses.is_dataclass(node) or not name.startswith(TRUSTED):
-        raise TypeError(name)
-    return {
-        "class": name,
-        "fields": {one.name: _described(getattr(node, one.name)) for one in dataclasses.fields(node)},
-    }
-
-
-def _rebuilt(said: Any) -> Any:
-    match said:
-        case {"shape": shape, "dtype": dtype, "weak_type": weak_type}:
-            return jax.ShapeDtypeStruct(tuple(shape), dtype, weak_type=weak_type)
-        case {"value": value}:
-            return value
-        case {"tuple": parts}:
-            return tuple(map(_rebuilt, parts))
-        case {"list": parts}:
-            return list(map(_rebuilt, parts))
-    module, name = said["class"].split(":")
-    if not module.startswith(TRUSTED):
-        raise ValueError(f"{module} is not of this package")
-    kind = getattr(importlib.import_module(module), name)
-    new = object.__new__(kind)
-    for field, value in said["fields"].items():
-        object.__setattr__(new, field, _rebuilt(value))
-    return new
-
-
 def _entry(digest: str) -> dict[str, Any] | None:
-    data = _read(digest)
+    data = read(_folder(), digest)
     return None if data is None else json.loads(data)
-
-
-def _paths(name: str) -> tuple[Path, Path]:
-    """A file and when it was used last, named as JAX's cache does, which removes what was not used for longest."""
-    return tuple(_folder() / f"{name}-{what}" for what in ("cache", "atime"))
-
-
-def _read(name: str) -> bytes | None:
-    """Content of a file that is whole."""
-    path, used = _paths(name)
-    try:
-        data = path.read_bytes()
-        if hashlib.sha256(data[32:]).digest() != data[:32]:
-            raise ValueError("it is damaged")
-        used.write_bytes(time.time_ns().to_bytes(8, "little"))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        _remove(name, error)
-        return None
-    return zlib.decompress(data[32:])
-
-
-def _write(name: str, content: bytes) -> None:
-    path, used = _paths(name)
-    data = zlib.compress(content, 1)
-    with contextlib.suppress(OSError):  # a full disk keeps nothing, and is no failure
-        used.write_bytes(time.time_ns().to_bytes(8, "little"))
-        with atomic_write(path) as file:
-            file.write(hashlib.sha256(data).digest() + data)
-
-
-def _remove(name: str, error: Exception) -> None:
-    print(f"warning: an executable is compiled anew, {_paths(name)[0]}: {error}", file=sys.stderr)
-    for path in _paths(name):
-        with contextlib.suppress(OSError):
-            path.unlink()

@@ -11,10 +11,15 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from scene import observe_room, path_pose, predict_room, slam_config, stack_poses
 
 from emgs_jax.ops.camera import Camera
-from emgs_jax.running import executables
+from emgs_jax.ops.pytree import stack
+from emgs_jax.running import executable_files, executables
+from emgs_jax.running.convert import FirstWindow
 from emgs_jax.running.executables import call, outputs, ready, stored
+from emgs_jax.running.growth import start
+from emgs_jax.slam import step
 
 TRACES = []
 ROOM = 3.0  # a number of the module, as thresholds of a stage that are no config
@@ -105,6 +110,20 @@ def test_another_source_of_the_same_program_compiles_nothing_again(folder, monke
     assert TRACES and len(programs) == 1 and len(entries(folder)) == 3
 
 
+def either(first, second):
+    return 2.0 * (first if ROOM == 3.0 else second)
+
+
+def test_programs_that_differ_in_which_argument_they_take_are_two(folder, monkeypatch):
+    one, other = jnp.ones(3), jnp.zeros(3)
+    np.testing.assert_array_equal(call(eqx.filter_jit(either), one, other), 2.0 * one)
+    as_a_new_process()
+    monkeypatch.setattr(sys.modules[__name__], "ROOM", 4.0)
+    np.testing.assert_array_equal(call(eqx.filter_jit(either), one, other), 2.0 * other)
+    as_a_new_process()
+    np.testing.assert_array_equal(call(eqx.filter_jit(either), one, other), 2.0 * other)
+
+
 @pytest.mark.parametrize("harm", [b"", b"x" * 100, "cut", "flipped"])
 def test_a_damaged_file_is_compiled_anew_and_replaced(folder, harm, capsys):
     expected = call(function, *arguments())
@@ -124,8 +143,8 @@ def test_a_class_of_others_is_not_made_and_what_xla_refuses_is_compiled(folder, 
     (entry,) = (path for path in entries(folder) if path.stat().st_size < 1000)
     (program,) = set(entries(folder)) - {entry}
     with pytest.raises(ValueError, match="subprocess is not of this package"):
-        executables._rebuilt({"class": "subprocess:Popen", "fields": {}})
-    executables._write(program.name.removesuffix("-cache"), b"sound, but no executable")
+        executable_files.rebuilt({"class": "subprocess:Popen", "fields": {}})
+    executable_files.write(folder, program.name.removesuffix("-cache"), b"sound, but no executable")
     as_a_new_process()
     assert_same(call(function, *arguments()), expected)
     assert str(program) in capsys.readouterr().err
@@ -167,3 +186,17 @@ def test_a_new_process_that_lowers_nothing_finds_lapack(tmp_path):
         ended = subprocess.run([sys.executable, "-c", program], env=variables, capture_output=True, text=True)
         assert (ended.returncode, ended.stdout) == (0, "[4. 3.]\n"), ended.stderr
     assert len(entries(tmp_path)) == 2
+
+
+@pytest.mark.long  # the whole step is compiled twice
+def test_a_step_of_kept_executables_has_the_bits_of_a_step_without(folder, camera):
+    config = slam_config("slam.initialization=merged")
+    poses = [path_pose(i) for i in range(3)]
+    first = FirstWindow(stack([observe_room(T, camera, num_features=2) for T in poses]), stack_poses(poses))
+    state, config = start(first, camera, config)
+    given = predict_room(3, camera, num_features=2), camera, config
+    expected = step(state, *given)
+    as_a_new_process()
+    for _ in range(2):  # compiled, and loaded
+        assert_same(step(state, *given, call), expected)
+        as_a_new_process()
