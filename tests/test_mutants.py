@@ -37,6 +37,7 @@ KEPT = [
     'print("ä", 3 - 1)',
     'x = "a" + b',
     "x = folder / name",
+    "x: int = static(high=64)",
 ]
 
 

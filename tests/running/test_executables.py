@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from jax._src.lru_cache import LRUCache
 from scene import observe_room, path_pose, predict_room, slam_config, stack_poses
 
 from emgs_jax.ops.camera import Camera
@@ -166,6 +167,15 @@ def test_a_folder_that_cannot_be_written_is_no_failure(folder):
     (folder / "file").touch()
     as_a_new_process()
     assert_same(call(function, *arguments()), expected)
+
+
+def test_the_bound_of_jaxs_cache_holds_for_kept_executables_and_removes_what_was_not_used_for_longest(folder):
+    executable_files.write(folder, "emgs-old", b"old")
+    executable_files.write(folder, "emgs-new", b"new")
+    assert executable_files.read(folder, "emgs-old") == b"old"  # and so it is the one used last
+    size = sum(path.stat().st_size for path in entries(folder))
+    LRUCache(str(folder), max_size=size).put("other", b"x")
+    assert [path.name for path in entries(folder)] == ["emgs-old-cache"]
 
 
 def test_a_new_process_that_lowers_nothing_finds_lapack(tmp_path):

@@ -200,7 +200,7 @@ def inside(node: ast.AST) -> Iterator[ast.AST]:
             pass
         case ast.AnnAssign(value=value):
             parts = [value] if value else []
-        case ast.Raise() | ast.Assert() | ast.JoinedStr() | ast.keyword(arg="axis" | "strict" | "exist_ok"):
+        case ast.Raise() | ast.Assert() | ast.JoinedStr() | ast.keyword(arg="axis" | "strict" | "exist_ok" | "high"):
             parts = []
         case ast.Assign(targets=[ast.Name(id=name)]) if name in SIZES:
             parts = []
