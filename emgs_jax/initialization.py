@@ -1,5 +1,7 @@
 """Initialisation (Method B): the map from the merged predictions of the first window."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ from emgs_jax.gaussians import FitConfig, Gaussians, cluster, spacing
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
-from emgs_jax.ops.precision import full_precision
+from emgs_jax.ops.precision import directly, full_precision
 
 
 @eqx.filter_jit
@@ -28,7 +30,12 @@ def merge(
 
 @full_precision
 def initialize(
-    views: Observation, T_world_views: jaxlie.SE3, camera: Camera, thin: int, config: FitConfig
+    views: Observation,
+    T_world_views: jaxlie.SE3,
+    camera: Camera,
+    thin: int,
+    config: FitConfig,
+    call: Callable = directly,
 ) -> tuple[Gaussians, Float[Array, "g"], Observation]:
     """Cluster the merged points of all views: K = num_points / (λ · num_views) Gaussians.
 
@@ -38,11 +45,12 @@ def initialize(
         camera: of the full images.
         thin: the observations' thinning.
         config: λ and how points become Gaussians.
+        call: how an executable is called.
 
     Returns:
         The Gaussians, their number of points in units of λ, and the views in the world frame.
     """
     num_views = views.valid.shape[0]
-    world, merged, order = merge(views, T_world_views, downscale(camera, thin))
-    gaussians, weight = cluster(merged, order, spacing(camera, thin, config) * num_views, config)
+    world, merged, order = call(merge, views, T_world_views, downscale(camera, thin))
+    gaussians, weight = call(cluster, merged, order, spacing(camera, thin, config) * num_views, config)
     return gaussians, weight * num_views, world

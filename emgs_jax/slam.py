@@ -31,7 +31,7 @@ from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.linalg import Whitening, whitening
 from emgs_jax.ops.neighbours import Groups, group_points, order_of
-from emgs_jax.ops.precision import full_precision
+from emgs_jax.ops.precision import directly, full_precision
 from emgs_jax.ops.pytree import static, static_choice, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
 from emgs_jax.registration.belief import Belief, certain
@@ -118,7 +118,7 @@ def _first_weight(weight: Float[Array, "g"], config: AverageConfig) -> Float[Arr
 
 @full_precision
 def init_state(
-    views: Observation, T_world_views: jaxlie.SE3, camera: Camera, config: SlamConfig
+    views: Observation, T_world_views: jaxlie.SE3, camera: Camera, config: SlamConfig, call: Callable = directly
 ) -> tuple[SlamState, Int[Array, ""]]:
     """The map of the first window, whose last view becomes the previous frame.
 
@@ -126,14 +126,14 @@ def init_state(
         views: the window's observations, camera frames, oldest first.
         T_world_views: their poses.
         camera: of the full images.
-        config: all stages.
+        call: how an executable is called.
 
     Returns:
         The state, and how many Gaussians did not fit into the map's capacity.
     """
     thin = config.observation.thin
-    gaussians, weight, world = initialize(views, T_world_views, camera, thin, config.fit)
-    return _first_state(gaussians, weight, world, T_world_views, config)
+    gaussians, weight, world = initialize(views, T_world_views, camera, thin, config.fit, call)
+    return call(_first_state, gaussians, weight, world, T_world_views, config)
 
 
 @eqx.filter_jit
@@ -155,7 +155,7 @@ def step(
     prediction: Prediction,
     camera: Camera,
     config: SlamConfig,
-    call: Callable = lambda executable, *arguments: executable(*arguments),
+    call: Callable = directly,
 ) -> tuple[SlamState, StepInfo]:
     """Integrate one frame: localise, select, E-step, M-step, refine, insert (the paper's pipeline figure).
 

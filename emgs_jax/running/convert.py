@@ -13,9 +13,10 @@ from emgs_jax.observation import Observation, ObservationConfig, Prediction, obs
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.pytree import stack
 from emgs_jax.prior.base import PriorPrediction
+from emgs_jax.running.executables import stored
 from emgs_jax.slam import SlamConfig
 
-_observe = eqx.filter_jit(observe)
+_observe = stored(observe)
 
 
 class FirstWindow(eqx.Module):

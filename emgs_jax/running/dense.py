@@ -17,10 +17,11 @@ from emgs_jax.evaluation.segmentation import LabelledPoints, translate
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.running.convert import to_se3
+from emgs_jax.running.executables import stored
 from emgs_jax.running.labelling import LabelledMap
 from emgs_jax.running.record import MappingRun, with_truth
 
-_densify = eqx.filter_jit(densify)
+_densify = stored(densify)
 
 
 @dataclass(frozen=True)

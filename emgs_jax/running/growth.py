@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -18,14 +19,16 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.belief import certain
 from emgs_jax.running.convert import FirstWindow
+from emgs_jax.running.executables import call, outputs, ready
 from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
 
 _insert = eqx.filter_jit(insert)
+_init, _step = partial(init_state, call=call), partial(step, call=call)
 _prepared: set[tuple] = set()  # shapes whose step this process has compiled
 
 
 def start(
-    first: FirstWindow, camera: Camera, config: SlamConfig, init: Callable = init_state
+    first: FirstWindow, camera: Camera, config: SlamConfig, init: Callable = _init
 ) -> tuple[SlamState, SlamConfig]:
     """State of the first window, and the config with the capacity that it needs.
 
@@ -73,9 +76,9 @@ def with_part(map: GaussianMap, part: GaussianMap, config: SlamConfig) -> tuple[
 
 
 def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
-    """Compile the executables of `step` side by side, which takes as many cores as there are.
+    """Load or compile the executables of `step` side by side, which takes as many cores as there are.
 
-    Each is called once, with zeros; what a process has compiled already is not called again.
+    Where none are kept each is called once, with zeros; what a process has already is not called again.
 
     Args:
         first: whose shapes the observations of the sequence have.
@@ -86,7 +89,7 @@ def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
 
     def note(executable: Callable, *arguments: Any) -> Any:
         calls.append((executable, arguments))
-        return _zeros(eqx.filter_eval_shape(executable, *arguments))
+        return _zeros(outputs(executable, *arguments))
 
     view = _zeros(jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), first.views))
     pose, poses = (jaxlie.SE3(jnp.asarray(np.eye(1, 7).repeat(n, 0).squeeze(), jnp.float32)) for n in (1, 3))
@@ -100,10 +103,15 @@ def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
         return
     state = SlamState(map, view, pose, certain(), jnp.asarray(0, jnp.int32))
     step(state, prediction, camera, config, note)
-    run = full_precision(lambda call: jax.block_until_ready(call[0](*call[1])))  # as inside `step`: else it is another
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        list(threads.map(run, calls))
+        list(threads.map(lambda noted: _prepare(*noted), calls))
     _prepared.add(key)
+
+
+@full_precision  # as inside `step`: else it is another
+def _prepare(executable: Callable, arguments: tuple) -> None:
+    if ready(executable, *arguments) is None:
+        jax.block_until_ready(executable(*arguments))
 
 
 def _of_map(overflow: jax.Array) -> Overflow:
@@ -119,7 +127,7 @@ def _zeros(shapes: Any) -> Any:
 
 
 def advance(
-    state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig, step: Callable = step
+    state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig, step: Callable = _step
 ) -> tuple[SlamState, StepInfo, SlamConfig]:
     """One step; a map or submap that is full is doubled and the frame repeated.
 

@@ -1,0 +1,108 @@
+"""Plausible bugs that no operator makes: a unit, a frame, an order, a convention."""
+
+BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there instead, the bug
+    (
+        "registration/problem",
+        "jnp.stack(uncertainty.pose), 3)",
+        "jnp.stack(uncertainty.pose[::-1]), 3)",
+        "metres for radians",
+    ),
+    ("registration/problem", "rays @ T.rotation().as_matrix().T", "rays", "rays stay in the camera's frame"),
+    (
+        "graph/deform",
+        "view, jnp.ones(())), motions.scale[row])",
+        "view, motions.scale[row]), jnp.ones(()))",
+        "a view scaled about the world's origin",
+    ),
+    (
+        "localization",
+        "scale_translation(raw_current.inverse() @ raw_newest, scale)",
+        "raw_current.inverse() @ raw_newest",
+        "the newest pose without its scale",
+    ),
+    (
+        "localization",
+        "coarse.depth_noise * coarse.mean_depth, coarse.depth_noise",
+        "coarse.depth_noise, coarse.depth_noise",
+        "a fraction of the depth for metres",
+    ),
+    (
+        "registration/pose_noise",
+        "anchor @ previous]), scale)",
+        "anchor @ previous]), 1.0)",
+        "each answer in its own unit",
+    ),
+    (
+        "registration/belief",
+        "A @ covariance @ A.T + ",
+        "covariance + ",
+        "the errors stay in the axes of the camera before",
+    ),
+    (
+        "registration/belief",
+        "update(belief.world_covariance, difference",
+        "update(belief.covariance, difference",
+        "one P for both",
+    ),
+    ("observation", "moments[..., 0] - count * mean[..., 0] ** 2", "moments[..., 0]", "second moments about the pixel"),
+    ("gaussians", "(0.299, 0.587, 0.114)", "(0.333, 0.333, 0.333)", "luminance as a plain mean"),
+    (
+        "initialization",
+        "transform(T, view, jnp.ones(()))",
+        "transform(T.inverse(), view, jnp.ones(()))",
+        "poses the wrong way round",
+    ),
+    ("em", "second - outer(mean[:, :3])", "second", "a covariance about the old mean"),
+    ("existence", "gaussians.means - origins", "gaussians.means", "all is seen from the world's origin"),
+    (
+        "running/measuring",
+        "np.linalg.inv(poses[-1]) @ poses[row]",
+        "np.linalg.inv(poses[row]) @ poses[-1]",
+        "edges the other way round",
+    ),
+    (
+        "running/segments",
+        "np.array([unit] * 3 + [1.0] * 4)",
+        "np.array([scale] * 3 + [1.0] * 4)",
+        "the unit of a place is that of the map after it has moved",
+    ),
+    (
+        "loops/alignment",
+        "rescaled(np.linalg.inv(T_b_a), np.exp(log_ratio))",
+        "rescaled(np.linalg.inv(T_b_a), np.exp(-log_ratio))",
+        "the reverse pose is brought into the wrong unit",
+    ),
+    (
+        "prior/simulated/noise",
+        "T[:3, :3] = Rotation.from_rotvec(rotation * ",
+        "T[:3, :3] = Rotation.from_rotvec(translation * ",
+        "metres for radians",
+    ),
+    ("io/g2o", "[6, 3, 4, 5, 0, 1, 2]", "[3, 4, 5, 6, 0, 1, 2]", "quaternions with w first are read"),
+    (
+        "io/trajectory",
+        "Rotation.from_quat(values[is_finite, 3:])",
+        "Rotation.from_quat(values[is_finite][:, [6, 3, 4, 5]])",
+        "quaternions with w first are read",
+    ),
+    ("io/ply", "[:, [3, 0, 1, 2]]", "[:, [0, 1, 2, 3]]", "quaternions with w last"),
+    ("data/reading", "return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)", "return image", "BGR for RGB"),
+    (
+        "data/seven_scenes",
+        "T_world_depth @ np.linalg.inv(T_COLOR_DEPTH) if is_moved",
+        "T_world_depth @ T_COLOR_DEPTH if is_moved",
+        "the colour camera on the other side",
+    ),
+    (
+        "data/calibration_files",
+        'return fx, fy, values["cx"] - 0.5, values["cy"] - 0.5',
+        'return fx, fy, values["cx"], values["cy"]',
+        "COLMAP's corner taken for the centre of a pixel",
+    ),
+    (
+        "data/transforms_json",
+        "np.vstack([m, bottom])) * FLIP)",
+        "np.vstack([m, bottom])))",
+        "nerfstudio's axes are taken for OpenCV's",
+    ),
+)
