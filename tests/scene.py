@@ -27,7 +27,12 @@ SMALL = (
         "slam.window_size=3",
     ),
     *("slam.fit.points_per_gaussian=2116", "slam.fit.num_fit_neighbours=8", "slam.fit.num_kmeans_iterations=2"),
-    *("slam.submap.map_capacity=256", "slam.submap.submap_capacity=192", "slam.em.num_neighbours=6", "slam.em.num_candidates=192"),
+    *(
+        "slam.submap.map_capacity=256",
+        "slam.submap.submap_capacity=192",
+        "slam.em.num_neighbours=6",
+        "slam.em.num_candidates=192",
+    ),
     *("render.tile_size=8", "render.tile_capacity=192", "render.covariance_scale=2.0", "render.radius=3.0"),
     "slam.localization.icp.num_points=256",
 )
