@@ -64,10 +64,9 @@ def same(nodes: Nodes, others: Nodes) -> bool:
 
 
 @needs_graphs
-@pytest.mark.parametrize("start", [pytest.param("given", marks=pytest.mark.long), "spread"])
-@pytest.mark.parametrize(
-    ("name", "optimum"), [pytest.param("sphere2500", 675.7010, marks=pytest.mark.long), ("parking-garage", 0.6342)]
-)
+@pytest.mark.long  # thousands of nodes
+@pytest.mark.parametrize("start", ["given", "spread"])
+@pytest.mark.parametrize(("name", "optimum"), [("sphere2500", 675.7010), ("parking-garage", 0.6342)])
 def test_known_optima_are_reached(name, optimum, start):
     """½χ² by GTSAM 4.3.0."""
     _, info = optimize(load_graph_g2o(GRAPHS / f"{name}.g2o"), config(kernel=np.inf, start=start))
