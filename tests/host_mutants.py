@@ -365,7 +365,7 @@ MUTANTS = (
         "emgs_jax/running/correction.py",
         'record.depth_noise if record.status == "tracked" else None',
         "record.depth_noise if record.status in PLACED else None",
-        BACK_END,
+        SEGMENTS,
         "a map that begins anew is believed to be joined by a frame that fits nothing",
     ),
     Mutant(
