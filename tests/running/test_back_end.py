@@ -171,23 +171,6 @@ def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatc
     np.testing.assert_allclose(run.prior_motion.as_matrix(), change @ motion.as_matrix(), atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("status", "expected"), [("tracked", 0.001), ("initialization", None), ("degraded", None), ("lost", None)]
-)
-def test_only_what_a_tracked_frame_differs_from_the_map_by_says_how_sure_its_poses_are(
-    graph, monkeypatch, status, expected
-):
-    """Symptom: where a map begins anew its frame fits nothing, and its edge was believed to .04 mm."""
-    end, looks = walked(graph, ring()), []
-    record = FrameRecord(0, None, None, status, pose=np.eye(4), depth_noise=0.001)
-    run = MappingRun(None, None, state=state_of(ring()), records=[record], back_end=end)
-    frame, raw = SimpleNamespace(index=COUNT, image=None), SimpleNamespace(points=None, mask=None)
-    monkeypatch.setattr(end, "add", lambda look, *rest: looks.append(look))
-    monkeypatch.setattr(end, "look_for_loops", lambda look: [])
-    correct(run, SimpleNamespace(frames=[frame], raw=[raw], T_anchor_views={}))
-    assert [look.depth_noise for look in looks] == [expected]
-
-
 def test_a_loop_that_cannot_be_solved_changes_nothing(graph):
     poses = ring()
     end, state = walked(graph, poses), state_of(poses)
@@ -391,23 +374,17 @@ def test_of_a_closure_the_loops_with_most_inliers_are_asked_for(graph):
     assert len(calls) == 1 and calls[0][0] == 6
 
 
-def test_what_is_known_already_takes_nobodys_turn(graph, monkeypatch):
+def test_what_is_known_already_takes_nobodys_turn(graph):
     """Four loops that the poses fit, with more inliers, were asked for, and a false one with less moved the poses."""
     poses = ring()
     end = with_keyframes(walked(graph, poses))
-    run = MappingRun(None, None, state=state_of(poses), back_end=end)
-    run.records = [FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0) for i, pose in enumerate(poses)]
     known = [replace(loop(poses, row), num_inliers=90) for row in range(1, 5)]
     false = [replace(loop(ring(1.9 * np.pi), row), num_inliers=40) for row in range(5, 9)]
     end.verified = [*known, *false]
-    run.ask, calls = told_again(poses)
-    monkeypatch.setattr(BackEnd, "look_for_loops", lambda end, look: end.recent())
-    monkeypatch.setattr(BackEnd, "recent", lambda end: end.new(end.agreed()))
-    monkeypatch.setattr(correction, "looks_of", lambda given: [look(poses, COUNT - 1)])
-    monkeypatch.setattr(BackEnd, "add", lambda *_: None)
-    correct(run, SimpleNamespace(frames=[None]))
+    ask, calls = told_again(poses)
+    ask_again(end, end.news(end.new(end.verified)), ask)
     assert sorted(a for a, _ in calls) == [5, 6, 7] and end.accepted == []
-    assert error(end.poses, poses) == 0
+    assert [one.a for one in end.news(end.verified)] == [8], "asked for, the prior says what the poses say"
 
 
 def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
@@ -486,11 +463,12 @@ def test_a_map_whose_visits_were_joined_is_settled_at_the_end_with_the_noise_of_
     truth, drifted = ring(), ring(1.95 * np.pi)
     end = walked(graph, drifted)
     end.verified = [loop(truth, row) for row in range(1, 9)] if has_loop else []
-    records = [FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0) for i, pose in enumerate(drifted)]
-    records = [replace(record, depth_noise=0.01 * (i % 3)) for i, record in enumerate(records)]
-    records += [replace(records[0], status="degraded", depth_noise=9.0)] * 90  # fits nothing
-    monkeypatch.setattr(correction, "row_of_first_node", lambda run: 0)
-    monkeypatch.setattr(correction, "_take_poses", lambda run: None)
+    records = [
+        FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0, depth_noise=0.01 * (i % 3))
+        if i < COUNT // 3
+        else FrameRecord(i, None, None, "degraded", pose=pose, scale=1.0, depth_noise=9.0)  # fits nothing
+        for i, pose in enumerate(drifted)
+    ]
     run, asked = MappingRun(None, SimpleNamespace(existence="gates"), state=state_of(drifted), records=records), []
     run.back_end = end
 

@@ -53,6 +53,9 @@ def test_parts_of_other_frames_and_units_are_joined_where_they_meet_the_map():
     np.testing.assert_allclose(scale_of(run.records[one].similarity), 1 / UNITS[2], rtol=0.02)
     np.testing.assert_allclose(scale_of(run.records[other].similarity), UNITS[1], rtol=0.02)
     assert not run.aside and set(end.segments) == {0}
+    anew, noise = said.index("anew"), config().graph.noise
+    (chain,) = (edge for edge in end.edges if edge.a == anew and edge.a == edge.b + 1 and edge.sqrt_info[6, 6])
+    assert chain.sqrt_info[5, 5] == pytest.approx(1 / (noise.depth * noise.pair)), "what begins anew fits nothing"
     metrics = score_back_end(run)
     assert metrics["location/segment"] == metrics["location/joined"] == 2
 

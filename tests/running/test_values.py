@@ -10,7 +10,7 @@ from tiny_run import TINY, compose
 from emgs_jax.ops.pytree import choice, static, traced
 from emgs_jax.ops.ranges import number
 from emgs_jax.running import configure
-from emgs_jax.running.configure import build, load_config
+from emgs_jax.running.configure import build, groups, load_config
 from emgs_jax.running.values import check_values, declared
 from experiments.grid import read_axes, variants
 
@@ -23,9 +23,16 @@ def check_all(*overrides: str) -> None:
         check_values(config, part)
 
 
-def test_the_check_passes_every_value_of_conf():
-    """One composition with all presets that can stand together; other options are built by other tests."""
-    check_all("graph=default", "baseline=all", "features=random", "experiment=paper", "prior=multiview_stereo")
+def test_every_value_of_conf_is_in_its_range():
+    """The first options of all groups together, then the second ones, …; what is wrong is named by its full key."""
+    others = ("suite", "sweep", "tune", "experiment", "experiment_on", "protocol")
+    options = {group: names for group, names in groups().items() if group not in others}
+    options["baseline"] = [name for name in options["baseline"] if name != "smoke"]
+    for place in range(max(map(len, options.values()))):
+        config = configure.compose(*(f"{group}={names[place % len(names)]}" for group, names in options.items()))
+        for part in PARTS:
+            check_values(config, part)
+    check_all("experiment=paper")
 
 
 @pytest.mark.parametrize("option", ["conceptgraphs", "ovo", "rayfronts"])
