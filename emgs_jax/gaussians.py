@@ -174,9 +174,13 @@ def intensity(colors: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
     return colors @ jnp.array(LUMINANCE, colors.dtype)
 
 
-def color_gradients(gaussians: Gaussians, groups: Groups, num_neighbours: int) -> Float[Array, "n 3"]:
-    """Intensity gradient (1/m) of every Gaussian in its tangent plane, fitted to its neighbours; orthogonal to n."""
+def color_gradients(gaussians: Gaussians, num_neighbours: int, groups: Groups | None = None) -> Float[Array, "n 3"]:
+    """Intensity gradient (1/m) of every Gaussian in its tangent plane, fitted to its neighbours; orthogonal to n.
+
+    `groups` are those of the valid means, see `group_points`; None makes them here.
+    """
     means, valid = gaussians.means, gaussians.valid
+    groups = group_points(means, valid) if groups is None else groups
     rows, found = nearest(means, valid, means, groups, num_neighbours, order=order_of(groups, valid.shape[0]))
     basis = tangent_basis(gaussians.normals)
     offsets = jnp.einsum("nkd,nda->nka", gaussians.means[rows] - gaussians.means[:, None], basis)

@@ -13,6 +13,7 @@ import numpy as np
 from emgs_jax import load_config
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
+from emgs_jax.ops.neighbours import group_points
 from emgs_jax.registration.matching import Matches, Surface
 from emgs_jax.registration.problem import Problem, rows_of
 
@@ -48,7 +49,10 @@ def random_problem(rng: np.random.Generator) -> tuple[Matches, Problem]:
     )
     one, zeros = jnp.ones(()), jnp.zeros((1, 3))
     nothing = Gaussians(zeros, jnp.eye(3)[None], zeros, zeros, jnp.zeros((1, 0)), jnp.zeros(1, bool))
-    surface = Surface(nothing, jnp.zeros((1, 6)), one[None], one[None], zeros)  # what is matched does not look at it
+    groups = group_points(nothing.means, nothing.valid)
+    surface = Surface(
+        nothing, groups, jnp.zeros((1, 6)), one[None], one[None], zeros
+    )  # what is matched does not look at it
     return matches, Problem(source, surface, T, jnp.full(NUM_POINTS, 0.01), 0.005 * one, jnp.eye(7), 0.01 * one)
 
 

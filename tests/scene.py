@@ -12,10 +12,12 @@ import numpy as np
 from reference import room_view
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.em import EStep
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation, Prediction
 from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.neighbours import Nearby
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 # λ is 8 pixels of an image of 32 × 24, or 32 of one of 64 × 48.
@@ -273,3 +275,18 @@ def assert_rows_near(actual, expected, atol, names=("means", "covs", "normals", 
     """These fields of two trees, within one tolerance."""
     for name in names:
         np.testing.assert_allclose(getattr(actual, name), getattr(expected, name), atol=atol, err_msg=name)
+
+
+def explained(rows, responsibilities, is_fused) -> EStep:
+    """An E-step of points, each a block by itself, of which the Gaussians and their shares are given (m, k)."""
+    rows, shares = device(np.int32(rows)), device(np.float32(responsibilities))
+    queries, nothing = jnp.arange(len(rows))[:, None], jnp.full(len(rows), jnp.inf)
+    return EStep(Nearby(queries, rows, rows >= 0, nothing), shares[:, None], device(np.asarray(is_fused, bool)))
+
+
+def shares_of(step: EStep, num_gaussians: int) -> np.ndarray:
+    """Responsibilities of every Gaussian for every point (m, n)."""
+    shares = np.zeros((len(step.is_fused) + 1, num_gaussians))  # room in a block is a point past the last
+    queries, rows = np.asarray(step.near.queries)[:, :, None], np.asarray(step.near.rows)[:, None]
+    np.add.at(shares, (queries, rows), np.asarray(step.responsibilities))
+    return shares[:-1]

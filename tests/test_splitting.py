@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scene import assert_same, at, device, fresh_map, on_host, random_gaussians, replace, rows_of
+from scene import assert_same, at, device, explained, fresh_map, on_host, random_gaussians, replace, rows_of, shares_of
 
-from emgs_jax.em import EStep, em_update, owners
+from emgs_jax.em import em_update, owners
 from emgs_jax.gaussian_map import GaussianMap, insert
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
@@ -38,7 +38,7 @@ def explained_by_first(count: int, share: float = 1.0):
     """The owners of points of which the first Gaussian explains so many."""
     shares = np.tile([share, 0.0], (NUM_POINTS, 1)) * (np.arange(NUM_POINTS) < count)[:, None]
     arrays = np.tile(np.int32([0, 1]), (NUM_POINTS, 1)), shares, shares[:, 0] > 0
-    return owned(EStep(*map(device, arrays)), 2)
+    return owned(explained(*arrays), 2)
 
 
 def verdict(map, points, settings, noise=0.0, explained=None):
@@ -167,7 +167,7 @@ def frames_of_a_checkerboard(config, splitting, num_frames=12):
         fused, step, map, overflow = seen_again(map, points, noise, config.em, splitting)
         assert overflow == 0
         counts.append(int(map.gaussians.valid.sum()))
-    shown = np.einsum("mk,mkc->mc", step.responsibilities, fused.gaussians.colors[step.rows])
+    shown = shares_of(step, len(fused.weight)) @ fused.gaussians.colors
     return counts, float(np.mean(np.abs(shown - points.colors)[step.is_fused]))
 
 

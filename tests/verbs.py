@@ -77,7 +77,7 @@ def coarse_of(seed: int) -> localization.CoarsePose:
 def estep_of(seed: int) -> em.EStep:
     rng = np.random.default_rng(seed)
     rows, shares = rng.integers(0, 32, (40, 3)).astype(np.int32), rng.dirichlet(np.ones(3), 40)
-    return em.EStep(*map(sc.device, (rows, shares, np.ones(40, bool))))
+    return sc.explained(rows, shares, np.ones(40, bool))
 
 
 def points(seed: int):

@@ -173,7 +173,7 @@ def nearest(
         groups: of those that count.
         k: number of neighbours, static.
         size: queries of a block, static.
-        count: length of a block's list; by default 4 k, at least 32.
+        count: length of a block's list; by default 6 k, at least 32.
         order: of the queries; None: along the curve.
 
     Returns:
@@ -181,7 +181,7 @@ def nearest(
     """
     near, rows, distance_sq = _search(queries, asked, points, groups, k, size, count, order)
     rows, exists = (of_queries(near, values, queries.shape[0]) for values in (rows, distance_sq < FAR))
-    return rows, exists
+    return jnp.where(exists, rows, 0), exists
 
 
 def knn(
@@ -237,7 +237,7 @@ def _search(
 ) -> tuple[Nearby, Int[Array, "b q k"], Float[Array, "b q k"]]:
     """What is near each block, and of every query the k nearest of these with their squared distances."""
     queries, points = jax.lax.stop_gradient((queries, points))
-    near = nearby(queries, asked, groups, count or max(4 * k, 32), size, order)
+    near = nearby(queries, asked, groups, count or max(6 * k, 32), size, order)
     blocks = queries.at[near.queries].get(mode="clip")
     offsets = between(blocks, jnp.where(near.exists[..., None], points[near.rows], FAR))
     distance_sq = dot(offsets, offsets)

@@ -64,7 +64,7 @@ def surface_of(
     # Only where colour counts: the gradients cost a neighbour search over the submap.
     gradients = jax.lax.cond(
         has_color,
-        lambda: color_gradients(gaussians, groups, num_color_neighbours),
+        lambda: color_gradients(gaussians, num_color_neighbours, groups),
         lambda: jnp.zeros_like(gaussians.means),
     )
     return Surface(
