@@ -11,7 +11,7 @@ def kth_smallest(values: Float[Array, "p"], valid: Bool[Array, "p"], ranks: Int[
     Floats are ordered as their bits are, once those of negative ones are turned round. The bits of an answer are found
     from the highest on, by how many values are smaller than each of the numbers that begin with what is known.
     """
-    bits = jax.lax.bitcast_convert_type(values, jnp.int32)
+    bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(values), jnp.int32)
     turned = bits ^ ((bits >> 31) & jnp.int32(0x7FFFFFFF))
     top = jnp.uint32(1 << 31)
     keys = jnp.where(valid, jax.lax.bitcast_convert_type(turned, jnp.uint32) ^ top, jnp.uint32(0xFFFFFFFF))
@@ -23,7 +23,7 @@ def kth_smallest(values: Float[Array, "p"], valid: Bool[Array, "p"], ranks: Int[
         begins = known[:, None] | (digits << shift)
         num_smaller = jnp.sum(keys < begins[..., None], axis=-1)
         known |= jnp.sum(num_smaller <= ranks[:, None], axis=-1).astype(jnp.uint32) << shift
-    found = known ^ top
-    bits = jax.lax.bitcast_convert_type(found, jnp.int32)
-    found = jax.lax.bitcast_convert_type(bits ^ ((bits >> 31) & jnp.int32(0x7FFFFFFF)), jnp.float32)
+    # The value itself, which has a gradient: where its bits are.
+    is_it = keys == known[:, None]
+    found = values[jnp.argmax(is_it, axis=-1)]
     return jnp.where(ranks < jnp.sum(valid), found, jnp.nan)
