@@ -280,7 +280,7 @@ def assert_rows_near(actual, expected, atol, names=("means", "covs", "normals", 
 def explained(rows, responsibilities, is_fused) -> EStep:
     """An E-step of points, each a block by itself, of which the Gaussians and their shares are given (m, k)."""
     rows, shares = device(np.int32(rows)), device(np.float32(responsibilities))
-    queries, nothing = jnp.arange(len(rows))[:, None], jnp.full(len(rows), jnp.inf)
+    queries, nothing = jnp.arange(len(rows))[:, None], jnp.zeros(len(rows))
     return EStep(Nearby(queries, rows, rows >= 0, nothing), shares[:, None], device(np.asarray(is_fused, bool)))
 
 
