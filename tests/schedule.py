@@ -24,7 +24,7 @@ GROUPS = {
     ),
     "smoke": ("running/test_coming_back.py", "running/test_segments.py", "scripts/test_walk.py"),
     "browser": ("report/test_page_browser.py", "report/test_table_page.py", "report/test_viewer.py"),  # one Chromium
-    "small": ("test_slam.py", "test_traces.py", "running/test_growth.py", "running/test_stacked.py"),
+    "small": ("test_slam.py", "running/test_growth.py", "running/test_stacked.py"),
 }
 _PLACES = {name: (group, place) for group, names in GROUPS.items() for place, name in enumerate(names)}
 

@@ -307,5 +307,5 @@ def compact_rows(mask: Bool[Array, "n"], capacity: int) -> tuple[Int[Array, "c"]
     """
     count = jnp.sum(mask)
     places = jnp.where(mask, jnp.cumsum(mask) - 1, capacity)
-    rows = jnp.full(capacity, mask.shape[0]).at[places].set(jnp.arange(mask.shape[0]), mode="drop")
+    rows = jnp.full(capacity, mask.shape[0], jnp.int32).at[places].set(jnp.arange(mask.shape[0]), mode="drop")
     return rows, jnp.arange(capacity) < count, jnp.maximum(count - capacity, 0)

@@ -101,7 +101,8 @@ def test_em_agrees_with_numpy_and_scipy_on_the_same_points_and_the_files_say_so(
     # Of 200, one gets a single point, and whether its 1 exceeds `min_responsibility`, 1, is a matter of rounding.
     config = benchmark_config("benchmark.num_gaussians=250", "parts=[em]")
     ours, theirs = experiments.benchmark.benchmark(config, tmp_path)
-    assert ours.facts["neighbours_listed_percent"] >= 99.9 and ours.facts["responsibility_error"] <= 1e-4
+    # The list that a block of points shares may lack the farthest neighbour of one of them.
+    assert ours.facts["neighbours_listed_percent"] >= 99 and ours.facts["responsibility_error"] <= 1e-4
     assert ours.facts["mean_error_m_999"] <= 1e-5 and ours.compile_seconds > 0 and theirs.compile_seconds is None
     assert "neighbours_listed_percent" in written(tmp_path, [ours, theirs])
 

@@ -44,7 +44,7 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
         "update(belief.covariance, difference",
         "one P for both",
     ),
-    ("observation", "moments[..., 0] - count * mean[..., 0] ** 2", "moments[..., 0]", "second moments about the pixel"),
+    ("observation", "xx - count * x**2", "xx", "second moments about the pixel"),
     ("gaussians", "(0.299, 0.587, 0.114)", "(0.333, 0.333, 0.333)", "luminance as a plain mean"),
     (
         "initialization",
