@@ -24,7 +24,7 @@ os.environ["XLA_FLAGS"] = " ".join([*QUICK, os.environ.get("XLA_FLAGS", "")])
 import jax  # noqa: E402
 import pytest  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
-from schedule import in_order, scheduler  # noqa: E402
+from schedule import SLOW, TESTS, in_order, scheduler  # noqa: E402
 
 MAX_MAPS = 30000  # and no file of tests makes as many again
 PACKAGE = Path(__file__).resolve().parents[1] / "emgs_jax"
@@ -35,8 +35,12 @@ install_import_hook(
 )
 
 
+@pytest.hookimpl(tryfirst=True)  # before `-m` chooses
 def pytest_collection_modifyitems(config, items):
     """Long tests are left out unless `-m` names them, and what shares executables stands together."""
+    for item in items:
+        if item.path.is_relative_to(TESTS) and item.path.relative_to(TESTS).as_posix() in SLOW:
+            item.add_marker("slow")
     if "long" not in config.option.markexpr:
         left_out = [item for item in items if item.get_closest_marker("long")]
         config.hook.pytest_deselected(items=left_out)

@@ -26,6 +26,21 @@ GROUPS = {
     "browser": ("report/test_page_browser.py", "report/test_table_page.py", "report/test_viewer.py"),  # one Chromium
     "small": ("test_slam.py", "running/test_growth.py", "running/test_stacked.py"),
 }
+# What the quick subset (-m "not slow") takes nothing of, beside the marked tests: six CPU seconds and more each.
+SLOW = {
+    "data/test_apartment.py",
+    "graph/test_graph_optimize.py",
+    "loops/test_verification.py",
+    "registration/test_pose_noise.py",
+    *(f"report/{name}.py" for name in ("test_page", "test_page_browser", "test_query", "test_repeat")),
+    *(f"running/{name}.py" for name in ("test_back_end", "test_compilation", "test_executables", "test_locating")),
+    "running/test_values.py",
+    *(f"scripts/{name}.py" for name in ("test_command_line", "test_evaluate", "test_score", "test_sweep_script")),
+    "scripts/test_tune.py",
+    "test_front_door.py",
+    "test_mutants.py",
+    "test_splitting.py",
+}
 _PLACES = {name: (group, place) for group, names in GROUPS.items() for place, name in enumerate(names)}
 
 

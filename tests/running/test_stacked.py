@@ -53,7 +53,7 @@ def assert_close(a, b):
         assert differs.mean() <= 0.02 and np.abs(a - b).max() < 0.05 * np.abs(b).max(), np.flatnonzero(differs)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_one_is_full(sequence, camera):
     configs, roomy = (
         [at(at(base, "em.max_mahalanobis_sq", x), "refinement.max_mahalanobis_sq_2d", x) for x in (0.0, 4.6, 20.0)]
