@@ -133,7 +133,8 @@ def e_step(
     """
     groups = group_points(gaussians.means, gaussians.valid) if groups is None else groups
     near = nearby(points.points, points.valid, groups, config.num_candidates, BLOCK)
-    table = gaussians, whitening(gaussians.covs) if white is None else white
+    meaning = eqx.tree_at(lambda g: g.features, gaussians, safe_normalize(gaussians.features))
+    table = meaning, whitening(gaussians.covs) if white is None else white
     blocks, noise = take_rows((points, noise), near.queries)
     # Where a block has room left there is no point.
     blocks = eqx.tree_at(lambda o: o.valid, blocks, blocks.valid & (near.queries < points.valid.shape[0]))
@@ -141,7 +142,7 @@ def e_step(
     explained = jax.lax.map(lambda part: _explain(table, *part, config), parts)
     responsibilities, is_fused, best = join_rows(explained, near.rows.shape[0])
     is_fused, best = (of_queries(near, values, points.valid.shape[0]) for values in (is_fused, best))
-    return EStep(near, responsibilities, is_fused & points.valid), best
+    return EStep(near, responsibilities, is_fused), best
 
 
 def _explain(
@@ -162,7 +163,7 @@ def _explain(
     feature_gap = 0.0
     if gaussians.features.shape[-1]:
         both = has_feature(points.features)[:, :, None] & has_feature(gaussians.features)[:, None]
-        cosine = jnp.einsum("bqf,bcf->bqc", points.features, safe_normalize(gaussians.features))
+        cosine = jnp.einsum("bqf,bcf->bqc", points.features, gaussians.features)
         feature_gap = jnp.where(both, cosine - 1.0, 0.0)
     log_det_term = -config.determinant_weight * (logdets[:, None] + log_growth)
     log_joint = -0.5 * distance_sq + log_det_term

@@ -48,7 +48,6 @@ def kmeans(
     Returns:
         Centroids, which of them have points, and how many; an empty cluster stays where it was and becomes invalid.
     """
-
     near = nearby(points, valid, group_points(seeds, seed_exists), NUM_CANDIDATES, BLOCK)
     blocks, counts = take_rows((points, valid), near.queries)
     counts &= near.queries < points.shape[0]

@@ -179,9 +179,8 @@ def nearest(
     Returns:
         Row numbers into `points`, and which of them exist.
     """
-    near, rows, distance_sq = _search(queries, asked, points, groups, k, size, count, order)
-    rows, exists = (of_queries(near, values, queries.shape[0]) for values in (rows, distance_sq < FAR))
-    return jnp.where(exists, rows, 0), exists
+    near, *found = _search(queries, asked, points, groups, k, size, count, order)
+    return _neighbours(near, *found, queries.shape[0])
 
 
 def knn(
@@ -220,8 +219,14 @@ def knn(
         negative, rows = jax.lax.top_k(-jnp.where(valid, distance_sq, 3.0 * FAR**2), k)
         return [found[0].at[block].set(rows), found[1].at[block].set(-negative)]
 
-    rows, distance_sq = jax.lax.fori_loop(0, jnp.sum(is_open), look_at_all, found)
-    rows, exists = (of_queries(near, values, queries.shape[0]) for values in (rows, distance_sq < FAR))
+    return _neighbours(near, *jax.lax.fori_loop(0, jnp.sum(is_open), look_at_all, found), queries.shape[0])
+
+
+def _neighbours(
+    near: Nearby, rows: Int[Array, "b q k"], distance_sq: Float[Array, "b q k"], num_queries: int
+) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
+    """What was found for the queries of all blocks, in the order of the queries, and which of it exists; else row 0."""
+    rows, exists = (of_queries(near, values, num_queries) for values in (rows, distance_sq < FAR))
     return jnp.where(exists, rows, 0), exists
 
 

@@ -12,7 +12,7 @@ from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import Whitening, dot, gather_entries, gather_offsets, mahalanobis_sq, whiten, whitening, widen
 from emgs_jax.ops.neighbours import Groups, group_points
 
-Candidates: TypeAlias = tuple[Int[Array, "p k"], Bool[Array, "p k"]]  # of `knn`: rows of the Gaussians, which exist
+Candidates: TypeAlias = tuple[Int[Array, "p k"], Bool[Array, "p k"]]  # of `nearest`: rows of the Gaussians, which exist
 
 
 class Surface(eqx.Module):
