@@ -17,8 +17,8 @@ from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import Whitening
 from emgs_jax.ops.neighbours import Groups
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.registration.matching import Matches, surface_of
-from emgs_jax.registration.noise import confidence_levels, noise_of_levels, num_independent, robust_std
+from emgs_jax.registration.matching import Candidates, Matches, surface_of
+from emgs_jax.registration.noise import level_edges, levels_of, noise_of_levels, num_independent
 from emgs_jax.registration.problem import (
     DISTRIBUTION,
     IcpConfig,
@@ -47,7 +47,8 @@ class IcpInfo(eqx.Module):
         residual: root mean square distance of the inliers to their Gaussians' planes, as a fraction of their depth.
         misfit: the same fraction of all points within `max_misfit`, as 1.4826 times the median, a robust standard
             deviation; 0 without any.
-        misfit_of_levels: likewise of the points in each of the `confidence_levels`.
+        misfit_of_levels: likewise of the points in each level of confidence.
+        level_edges: where these levels end.
         information: of the points alone, of (xi, log s).
         num_effective: how many independent measurements the points are worth, see `num_independent`.
         min_eigenvalue: smallest eigenvalue of what planes and colours say of the pose, per effective point (1/m² and
@@ -61,6 +62,7 @@ class IcpInfo(eqx.Module):
     residual: Float[Array, ""]
     misfit: Float[Array, ""]
     misfit_of_levels: Float[Array, "l"]
+    level_edges: Float[Array, "e"]
     information: Float[Array, "7 7"]
     num_effective: Float[Array, ""]
     min_eigenvalue: Float[Array, ""]
@@ -69,7 +71,12 @@ class IcpInfo(eqx.Module):
 
 
 def _observed(
-    y: Float[Array, "7"], matches: Matches, problem: Problem, noise: Noise, config: IcpConfig
+    y: Float[Array, "7"],
+    matches: Matches,
+    levels: Int[Array, "p"],
+    problem: Problem,
+    noise: Noise,
+    config: IcpConfig,
 ) -> tuple[Uncertainty, Float[Array, "p"], tuple[Float[Array, ""], Float[Array, "l"]]]:
     """What the points' distances from their Gaussians say of the uncertainty, of which `noise` is the least.
 
@@ -78,8 +85,7 @@ def _observed(
     """
     source = problem.source
     distance, is_near = distances(y, matches, problem, config)
-    levels = confidence_levels(source.confidence, source.valid)
-    misfit, of_levels = robust_std(distance, is_near), noise_of_levels(distance, is_near, levels)
+    misfit, of_levels = noise_of_levels(distance, is_near, levels)
     depth = jnp.maximum(of_levels, noise[1])[levels]
     factor = jnp.maximum(misfit / noise[1], 1.0)
     uncertainty = Uncertainty(
@@ -94,14 +100,15 @@ def _search_and_solve(
     carry: _Carry,
     is_first: Bool[Array, ""],
     problem_of: Callable[[Uncertainty], Problem],
+    levels: Int[Array, "p"],
     noise: Noise,
     config: IcpConfig,
-) -> tuple[_Carry, tuple[Matches, Int[Array, ""], Bool[Array, ""]]]:
+) -> tuple[_Carry, tuple[Candidates, Int[Array, ""], Bool[Array, ""]]]:
     """Look up the Gaussians near every point, see how well the points fit them, and solve for y from there."""
     y, before = carry
     problem = problem_of(before)
     candidates = candidates_at(y, problem, config)
-    seen, _, _ = _observed(y, matches_at(y, candidates, problem, config), problem, noise, config)
+    seen, _, _ = _observed(y, matches_at(y, candidates, problem, config), levels, problem, noise, config)
     # y is the coarse pose at first, and only then do the distances say what that is worth.
     pose = jax.tree.map(lambda now, then: jnp.where(is_first, now, then), seen.pose, before.pose)
     uncertainty = Uncertainty(pose=pose, depth=seen.depth, num_effective=seen.num_effective)
@@ -110,11 +117,10 @@ def _search_and_solve(
         rtol=config.tolerance, atol=config.tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
     )
     args = candidates, problem_of(uncertainty), config
-    solution = optx.least_squares(residuals, solver, y, args, has_aux=True, max_steps=config.max_steps, throw=False)
+    solution = optx.least_squares(residuals, solver, y, args, max_steps=config.max_steps, throw=False)
     y = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, y)
     is_converged = solution.result == optx.RESULTS.successful
-    # Not `solution.aux`, which lags one accepted step behind.
-    return (y, uncertainty), (solution.state.aux, solution.stats["num_steps"], is_converged)
+    return (y, uncertainty), (candidates, solution.stats["num_steps"], is_converged)
 
 
 @full_precision
@@ -159,13 +165,16 @@ def icp(
     def problem_of(uncertainty: Uncertainty) -> Problem:
         return pose_problem(source, surface, T_world_coarse, noise[1], uncertainty, config, known)
 
-    step = partial(_search_and_solve, problem_of=problem_of, noise=noise, config=config)
+    edges = level_edges(source.confidence, source.valid)
+    levels = levels_of(source.confidence, edges)
+    step = partial(_search_and_solve, problem_of=problem_of, levels=levels, noise=noise, config=config)
     given = Uncertainty(pose=noise, depth=jnp.full(source.valid.shape, noise[1]), num_effective=jnp.ones(()))
     (y, uncertainty), rounds = jax.lax.scan(step, (jnp.zeros(7), given), jnp.arange(config.num_searches) == 0)
-    matches, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
+    candidates, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
     problem = problem_of(uncertainty)
+    matches = matches_at(y, candidates, problem, config)
     T, scale = pose_of(y, problem)
-    seen, distance, (misfit, misfit_of_levels) = _observed(y, matches, problem, noise, config)
+    seen, distance, (misfit, misfit_of_levels) = _observed(y, matches, levels, problem, noise, config)
     num_inliers = jnp.sum(matches.is_inlier)
     info = IcpInfo(
         num_inliers=num_inliers,
@@ -173,6 +182,7 @@ def icp(
         residual=jnp.sqrt(jnp.sum(jnp.where(matches.is_inlier, distance, 0.0) ** 2) / jnp.maximum(num_inliers, 1)),
         misfit=misfit,
         misfit_of_levels=misfit_of_levels,
+        level_edges=edges,
         information=data_information(y, matches, problem, config),
         num_effective=seen.num_effective,
         min_eigenvalue=jnp.linalg.eigvalsh(information(T, scale, matches, problem, config))[0],

@@ -150,8 +150,8 @@ def distances(
 
 def residuals(
     y: Float[Array, "7"], args: tuple[Candidates, Problem, IcpConfig]
-) -> tuple[tuple[Float[Array, "p 5"], Float[Array, "7"]], Matches]:
-    """Rows of every point and of the prior, in standard deviations; beside them the matches.
+) -> tuple[Float[Array, "p 5"], Float[Array, "7"]]:
+    """Rows of every point and of the prior, in standard deviations.
 
     The matches carry no gradient. The derivative is made here, once, and the solver gets rows that are linear in y:
     otherwise each of its uses of the derivative would be compiled, and computed, anew.
@@ -161,7 +161,7 @@ def residuals(
     matches = jax.lax.stop_gradient(matches_at(fixed, candidates, problem, config))
     jacobian = jax.lax.stop_gradient(jax.jacfwd(rows_of)(fixed, matches, problem, config))
     rows = rows_of(fixed, matches, problem, config) + jacobian @ (y - fixed)
-    return (rows, problem.prior @ y), matches
+    return rows, problem.prior @ y
 
 
 def rows_of(y: Float[Array, "7"], matches: Matches, problem: Problem, config: IcpConfig) -> Float[Array, "p 5"]:

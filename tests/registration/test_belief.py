@@ -91,7 +91,7 @@ def test_a_frame_that_is_tracked_is_known_as_its_points_say_and_another_as_befor
     twice = jaxlie.SE3(device(np.tile(MOTION.wxyz_xyz, (2, 1))))
     before = jax.device_get(eqx.tree_at(lambda b: b.repeats.said, both_known(), twice))
     zero, one, information = device(0.0), device(np.int32(1)), 1e4 * np.eye(7)
-    numbers = zero, zero, device(0.04), device(np.zeros(8)), device(information), zero, zero
+    numbers = zero, zero, device(0.04), device(np.zeros(8)), device(np.zeros(7)), device(information), zero, zero
     found = IcpInfo(one, *numbers, one, device(True))
     arguments = before, found, np.float32(0.02), np.float32(1.1)
     after = next_belief(*arguments, np.array(True), np.float32(5.0))
