@@ -4,7 +4,6 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -16,6 +15,7 @@ import numpy as np
 from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert
 from emgs_jax.observation import Prediction, transform
 from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.executable import calling
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.belief import certain
 from emgs_jax.running.convert import FirstWindow
@@ -23,7 +23,7 @@ from emgs_jax.running.executables import call, outputs, ready
 from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
 
 _insert = eqx.filter_jit(insert)
-_init, _step = partial(init_state, call=call), partial(step, call=call)
+_init, _step = (calling(call)(function) for function in (init_state, step))  # by executables that are kept
 _prepared: set[tuple] = set()  # shapes whose step this process has compiled
 
 
@@ -102,7 +102,8 @@ def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
     if key in _prepared:
         return
     state = SlamState(map, view, pose, certain(), jnp.asarray(0, jnp.int32))
-    step(state, prediction, camera, config, note)
+    with calling(note):
+        step(state, prediction, camera, config)
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         list(threads.map(lambda noted: _prepare(*noted), calls))
     _prepared.add(key)
