@@ -9,6 +9,7 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.render.project import Splats
 
 CHUNK = 32  # splats of a tile that are composited at once; the last of a tile may have fewer
+WORD = 2**31  # what an integer holds
 
 
 class TileLists(eqx.Module):
@@ -105,7 +106,7 @@ def _sorted(
     tile: Int[Array, "e"], splat: Int[Array, "e"], num_lists: int, num_splats: int
 ) -> tuple[Int[Array, "e"], Int[Array, "e"]]:
     """Pairs by tile and then by splat. One word for both, where it holds them, is sorted several times faster."""
-    if (num_lists + 1) * num_splats < 2**31:
+    if (num_lists + 1) * num_splats < WORD:
         return jnp.divmod(jax.lax.sort(tile * num_splats + splat, is_stable=False), num_splats)
     tile, splat = jax.lax.sort((tile, splat), num_keys=2, is_stable=False)
     return tile, splat
