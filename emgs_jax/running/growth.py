@@ -132,7 +132,7 @@ def advance(
 ) -> tuple[SlamState, StepInfo, SlamConfig]:
     """One step; a map or submap that is full is doubled and the frame repeated.
 
-    That gives the same map as starting with the larger capacity. Splats that find their tile full are only counted:
+    That gives the same map as starting with the larger capacity. Splats for which there is no room are only counted:
     they change what is drawn, not what is kept. `step` is `slam.step`, or what does the same for stacked states.
     """
     new, info = step(state, prediction, camera, config)
