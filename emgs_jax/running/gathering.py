@@ -12,6 +12,7 @@ from emgs_jax.evaluation.baselines import BaselineConfig, Fusion, Pinhole, View
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, posed
 from emgs_jax.evaluation.segmentation import LabelGrid, LabelledPoints, nearest_classes
+from emgs_jax.evaluation.trajectory import rotated
 from emgs_jax.io.spool import Spool
 from emgs_jax.observation import known_surface
 from emgs_jax.running.inputs import RawView
@@ -100,7 +101,7 @@ def gather(
                 labels = resize_nearest(nearest_classes(features, text[1]).astype(np.int32), depth.shape[::-1])
                 classes.append(labels)
                 seen = mask & (labels >= 0)
-                grid.add(points[seen] @ pose[:3, :3].T + pose[:3, 3], labels[seen])
+                grid.add(rotated(points[seen], pose[:3, :3]) + pose[:3, 3], labels[seen])
             if baselines is not None:
                 known = mask & np.isfinite(points).all(-1)
                 baselines.add(row, View(depth, image, cloud), points, known, pose)
