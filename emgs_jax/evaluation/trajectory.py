@@ -40,7 +40,7 @@ class Alignment:
 
 
 def rotated(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """R v of each vector (..., 3). Not by BLAS, whose threads wait for each other longer than so thin a product takes."""
+    """R v of each vector (..., 3). Not by BLAS: its threads wait for each other longer than so thin a product takes."""
     return np.einsum("ij,...j->...i", rotation, vectors)
 
 
