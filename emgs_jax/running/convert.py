@@ -58,7 +58,7 @@ def _check(prediction: PriorPrediction, frames: Mapping[int, Frame]) -> None:
 
 
 def _observation(prediction: PriorPrediction, view: int, frame: Frame, config: ObservationConfig) -> Observation:
-    image, mask = frame.image.astype(np.float32) / np.float32(255.0), np.asarray(prediction.mask[view])
+    image, mask = frame.image * np.float32(1.0 / 255.0), np.asarray(prediction.mask[view])
     points, features, confidence = (
         np.asarray(values[view], np.float32)
         for values in (prediction.points, prediction.features, prediction.confidence)
