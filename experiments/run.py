@@ -3,6 +3,7 @@
 import contextlib
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -85,8 +86,10 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         with _said(clock, "evaluate", compared and f"comparing with the truth: {compared}"):
             scorer = new_scorer(dataset, evaluation, prior)
             labels = None if labelled is None else labelled.centers
-            metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
-            metrics |= dense.rendering | score_prior(session, raw, scorer)
+            with ThreadPoolExecutor(1, "raw prior") as thread:
+                of_prior = thread.submit(score_prior, session, raw, scorer)
+                metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
+                metrics |= dense.rendering | of_prior.result()
             metrics |= score_baselines(session, baselines, raw, scorer)
         metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()
     metrics["provenance"] = origin
