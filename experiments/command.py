@@ -5,16 +5,17 @@ import logging
 import os
 import re
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from functools import wraps
-from typing import Any
+from typing import Any, TextIO
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from emgs_jax.running.compilation import use_compilation_cache
@@ -39,7 +40,7 @@ def command(
             if not HydraConfig.get().verbose:
                 for library in TALKATIVE:
                     logging.getLogger(library).setLevel(logging.WARNING)
-            with clear_errors():
+            with kept_words(HydraConfig.get().job_logging), clear_errors():
                 check_keys(name, config)
                 leave_memory_to_torch(config)
                 if "compilation_cache" in config:
@@ -60,6 +61,39 @@ def command(
         return main
 
     return decorate
+
+
+class Spoken:
+    """Standard output that writes what goes there into a file, too."""
+
+    def __init__(self, console: TextIO, file: TextIO) -> None:
+        self._console, self._file = console, file
+
+    def write(self, text: str) -> int:
+        self._file.write(text)
+        return self._console.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._console, name)
+
+
+@contextlib.contextmanager
+def kept_words(logging: DictConfig) -> Iterator[None]:
+    """Keep what a job says, how it failed included, in the file that Hydra has for its log; without one nowhere."""
+    path = OmegaConf.select(logging, "handlers.file.filename")
+    if path is None:
+        yield
+        return
+    with open(path, "a", buffering=1, encoding="utf-8") as file:
+        try:
+            with contextlib.redirect_stdout(Spoken(sys.stdout, file)):
+                yield
+        except SystemExit as end:
+            file.write(f"{end}\n")
+            raise
+        except BaseException:
+            file.write(traceback.format_exc())
+            raise
 
 
 def help_of(name: str) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from emgs_jax.evaluation.trajectory import Alignment, align
+from emgs_jax.evaluation.trajectory import Alignment, align, rotated
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.ops.ranges import MAX_LENGTH_M
 
@@ -72,7 +72,7 @@ def _fitted_normals(points: np.ndarray, num_neighbours: int) -> np.ndarray:
 
 def transform_cloud(cloud: PointCloud, alignment: Alignment) -> PointCloud:
     """Bring a cloud into the reference's frame."""
-    return PointCloud(alignment.apply(cloud.points), cloud.normals @ alignment.rotation.T, cloud.colors)
+    return PointCloud(alignment.apply(cloud.points), rotated(cloud.normals, alignment.rotation), cloud.colors)
 
 
 class VoxelGrid:

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.evaluation.trajectory import rotated
 
 _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
 
@@ -37,7 +38,7 @@ def label_cells(frame: Frame, dataset: Dataset, voxel: float, max_depth: float) 
         return np.empty((0, 4), np.int64)
     known = (frame.labels >= 0) & (frame.depth > 0) & (frame.depth <= max_depth)
     points = backproject(frame.depth, dataset.intrinsics)[known]
-    index = np.floor((points @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]) / voxel)
+    index = np.floor((rotated(points, frame.T_world_camera[:3, :3]) + frame.T_world_camera[:3, 3]) / voxel)
     return _distinct(np.column_stack([index, frame.labels[known]]).astype(np.int64))
 
 

@@ -15,6 +15,7 @@ from matplotlib.patheffects import withStroke
 from PIL import Image, ImageDraw
 
 from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.evaluation.trajectory import rotated
 from emgs_jax.io.files import atomic_write
 
 _ESTIMATE, _TRUTH, _ONLINE, _LOOP, _INK = "#e4572e", "#1b998b", "#8d6a9f", "#2e86e4", "#333333"
@@ -183,7 +184,7 @@ def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
     rotation = view_from_above(paths.estimate)
     path = paths.estimate[:, :3, 3] @ rotation.T
     finite = np.isfinite(cloud.points).all(1)
-    points, colors = cloud.points[finite] @ rotation.T, cloud.colors[finite].clip(0.0, 1.0)
+    points, colors = rotated(cloud.points[finite], rotation), cloud.colors[finite].clip(0.0, 1.0)
     if len(points):
         image, extent = seen_from_above(points, colors, path[:, 2])
         axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=1)

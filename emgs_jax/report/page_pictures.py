@@ -5,7 +5,6 @@ import io
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jaxlie
 import matplotlib
@@ -18,6 +17,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
 from emgs_jax.running.convert import to_se3
+from emgs_jax.running.executables import stored
 
 WIDTH = 200  # pixels; a picture is not wider
 QUALITY = 80  # of JPEG
@@ -41,7 +41,7 @@ class Views(NamedTuple):
     far: float
 
 
-@eqx.filter_jit
+@stored
 def _drawn(gaussians: Gaussians, pose: jaxlie.SE3, camera: Camera, config: RenderConfig) -> tuple[jax.Array, jax.Array]:
     drawing = render(gaussians, gaussians.colors, pose, camera, config)
     return drawing.values, drawing.depth

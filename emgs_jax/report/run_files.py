@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.evaluation.clouds import PointCloud
@@ -22,13 +21,13 @@ from emgs_jax.io.trajectory import from_tum, save_trajectory_tum
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import loop_list, metric_graph
+from emgs_jax.report.page_map import feature_colors
 from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, REPORT_FILE, TEXT_FILE
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.first_frame import seen_from
 from emgs_jax.running.places import save_places
 from emgs_jax.running.record import SEGMENT, UNJOINED, MappingRun, row_of_first_node, with_truth
-from emgs_jax.semantics import principal_colors
 
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (
@@ -120,7 +119,7 @@ def save_outputs(
         title: of the picture.
         with_scale: the true path is drawn where it fits best by a similarity, not by a rigid motion, as it is scored.
     """
-    gaussians = jax.device_get(confirmed(run.state.map))
+    gaussians = jax.device_get(shown := confirmed(run.state.map))
     valid = gaussians.valid
     # As drawn: the covariances are those that close the surface.
     covs = gaussians.covs[valid] * float(config.render.covariance_scale)
@@ -136,7 +135,7 @@ def save_outputs(
     is_placed = np.array([record.status != "lost" for record in run.records])
     paths = Paths(np.stack(run.poses), is_placed, _placed_truth(run, with_scale), *_moved(run))
     classes = () if dense.labels is None else dense.labels.classes
-    draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes, feature_cloud(gaussians))
+    draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes, feature_cloud(shown))
     return [] if no_mesh is None else [f"no mesh.ply: {no_mesh}"]
 
 
@@ -145,7 +144,7 @@ def feature_cloud(gaussians: Gaussians) -> PointCloud | None:
     valid = np.asarray(gaussians.valid)
     if not np.asarray(gaussians.features)[valid].any():
         return None
-    colors = np.asarray(principal_colors(jax.tree.map(jnp.asarray, gaussians)))
+    colors = np.asarray(feature_colors(gaussians))
     return PointCloud(*(np.asarray(values)[valid] for values in (gaussians.means, gaussians.normals, colors)))
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jaxlie
 import numpy as np
 
 from emgs_jax.data.base import Dataset
@@ -86,11 +85,9 @@ def dense_map(
 def _drawn_ahead(run: MappingRun, rows: list[int], config: DensifyConfig) -> Iterator[DenseView]:
     """The views of frames on the host; the next is being drawn while one is looked at."""
     pending: DenseView | None = None
-    poses = to_se3(np.reshape([run.poses[row] for row in rows], (-1, 4, 4)))
-    gaussians = confirmed(run.state.map)
-    for position in range(len(rows)):
-        pose = jaxlie.SE3(poses.wxyz_xyz[position])
-        view = _densify(gaussians, pose, run.camera, config)
+    gaussians, poses = confirmed(run.state.map), run.poses
+    for row in rows:
+        view = _densify(gaussians, to_se3(poses[row]), run.camera, config)
         drawing = eqx.tree_at(lambda view: view.rendering, view, None)  # nobody looks at it, so it is not fetched
         if pending is not None:
             yield jax.device_get(pending)

@@ -1,6 +1,7 @@
 """What streams by while a sequence is mapped, gathered for comparison: what the prior alone says, and baselines."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -9,9 +10,10 @@ import numpy as np
 from emgs_jax.data.base import Dataset
 from emgs_jax.data.reading import resize_nearest
 from emgs_jax.evaluation.baselines import BaselineConfig, Fusion, Pinhole, View
-from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
+from emgs_jax.evaluation.clouds import PointCloud, VoxelGrid
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, posed
 from emgs_jax.evaluation.segmentation import LabelGrid, LabelledPoints, nearest_classes
+from emgs_jax.evaluation.trajectory import rotated
 from emgs_jax.io.spool import Spool
 from emgs_jax.observation import known_surface
 from emgs_jax.running.inputs import RawView
@@ -79,7 +81,7 @@ def gather(
     baselines: Baselines | None = None,
     text: Text | None = None,
 ) -> RawPrior:
-    """Take all views of a sequence, one after the other.
+    """Take all views of a sequence, one after the other: each in another thread, while the next frame is mapped.
 
     Args:
         views: of all frames.
@@ -88,23 +90,31 @@ def gather(
         baselines: that take the views, too.
         text: names of the classes that the views are asked for, and their embeddings; None: they are not.
     """
-    depths, classes, grid = Spool(), Spool(), LabelGrid(evaluation.voxel_m)
+    depths, classes, labelled, whole = Spool(), Spool(), LabelGrid(evaluation.voxel_m), VoxelGrid(evaluation.voxel_m)
 
-    def clouds() -> Iterator[PointCloud]:
-        for row, (points, mask, image, pose, features) in enumerate(views):
-            depth = np.where(mask & np.isfinite(points[..., 2]), points[..., 2], 0.0).astype(np.float32)
-            cloud = camera_cloud(points, mask, image, evaluation)
-            if keeps_depths:
-                depths.append(depth)
-            if text is not None:
-                labels = resize_nearest(nearest_classes(features, text[1]).astype(np.int32), depth.shape[::-1])
-                classes.append(labels)
-                seen = mask & (labels >= 0)
-                grid.add(points[seen] @ pose[:3, :3].T + pose[:3, 3], labels[seen])
-            if baselines is not None:
-                known = mask & np.isfinite(points).all(-1)
-                baselines.add(row, View(depth, image, cloud), points, known, pose)
-            yield posed(cloud, pose)
+    def take(row: int, view: RawView) -> None:
+        points, mask, image, pose, features = view
+        depth = np.where(mask & np.isfinite(points[..., 2]), points[..., 2], 0.0).astype(np.float32)
+        cloud = camera_cloud(points, mask, image, evaluation)
+        if keeps_depths:
+            depths.append(depth)
+        if text is not None:
+            labels = resize_nearest(nearest_classes(features, text[1]).astype(np.int32), depth.shape[::-1])
+            classes.append(labels)
+            seen = mask & (labels >= 0)
+            labelled.add(rotated(points[seen], pose[:3, :3]) + pose[:3, 3], labels[seen])
+        if baselines is not None:
+            known = mask & np.isfinite(points).all(-1)
+            baselines.add(row, View(depth, image, cloud), points, known, pose)
+        whole.add(posed(cloud, pose))
 
-    cloud = fuse_clouds(clouds(), evaluation.voxel_m)
-    return RawPrior(cloud, depths) if text is None else RawPrior(cloud, depths, classes, grid.points(text[0]))
+    with ThreadPoolExecutor(1, "raw prior") as thread:
+        taken: Future[None] | None = None
+        for row, view in enumerate(views):
+            if taken is not None:
+                taken.result()  # one at a time: no more of them are in memory, and an error ends the mapping
+            taken = thread.submit(take, row, view)
+        if taken is not None:
+            taken.result()
+    cloud = whole.cloud()
+    return RawPrior(cloud, depths) if text is None else RawPrior(cloud, depths, classes, labelled.points(text[0]))

@@ -18,7 +18,7 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.belief import certain
-from emgs_jax.running.convert import FirstWindow
+from emgs_jax.running.convert import FirstWindow, on_device
 from emgs_jax.running.executables import call, outputs, ready
 from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
 
@@ -92,16 +92,16 @@ def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
         return _zeros(outputs(executable, *arguments))
 
     view = _zeros(jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), first.views))
-    pose, poses = (jaxlie.SE3(jnp.asarray(np.eye(1, 7).repeat(n, 0).squeeze(), jnp.float32)) for n in (1, 3))
-    unknown = jnp.asarray(False)
+    pose, poses = (jaxlie.SE3(on_device(np.eye(1, 7, dtype=np.float32).repeat(n, 0).squeeze())) for n in (1, 3))
+    unknown = on_device(np.bool_(False))
     prediction = Prediction(
         current=view, previous=view, T_world_views=poses, T_world_anchor=pose, has_newest=unknown, is_repeat=unknown
     )
-    map = empty_map(config.submap.map_capacity, view.features.shape[-1])
+    map = _zeros(jax.eval_shape(lambda: empty_map(config.submap.map_capacity, view.features.shape[-1])))
     key = jax.tree.structure((map, view, config)), tuple(leaf.shape for leaf in jax.tree.leaves((map, view)))
     if key in _prepared:
         return
-    state = SlamState(map, view, pose, certain(), jnp.asarray(0, jnp.int32))
+    state = SlamState(map, view, pose, _zeros(jax.eval_shape(certain)), on_device(np.int32(0)))
     with calling(note):
         step(state, prediction, camera, config)
     with ThreadPoolExecutor(os.cpu_count()) as threads:
@@ -124,7 +124,7 @@ def _of_map(overflow: jax.Array) -> Overflow:
 def _zeros(shapes: Any) -> Any:
     """Arrays of zeros from NumPy, which compiles nothing; what is no shape stays."""
     is_shape = lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct)  # noqa: E731
-    return jax.tree.map(lambda leaf: jnp.asarray(np.zeros(leaf.shape, leaf.dtype)) if is_shape(leaf) else leaf, shapes)
+    return jax.tree.map(lambda leaf: on_device(np.zeros(leaf.shape, leaf.dtype)) if is_shape(leaf) else leaf, shapes)
 
 
 def advance(

@@ -15,10 +15,11 @@ import pytest
 from omegaconf import OmegaConf
 from own_process import run
 from tiny_run import CONF
+from tqdm import tqdm
 
 from emgs_jax.running.configure import compose, groups
 from experiments.cli import COMMANDS, main
-from experiments.command import check_arguments
+from experiments.command import check_arguments, kept_words
 from experiments.evaluate import delegated
 from experiments.interrupt import clear_interrupt
 from experiments.report import positional
@@ -104,6 +105,23 @@ def test_the_help_of_a_command_names_its_keys_and_its_examples_are_ones(name, mo
     rewritten = delegated if name == "evaluate" else positional
     for _, _, *words in examples:
         check_arguments(name, rewritten(words))
+
+
+@pytest.mark.parametrize("error", [SystemExit("error: no such file"), ZeroDivisionError("division by zero"), None])
+def test_the_log_of_a_job_has_the_consoles_words_and_how_it_failed(error, tmp_path, capsys):
+    logging = OmegaConf.create({"handlers": {"file": {"filename": str(tmp_path / "run.log")}}})
+    with pytest.raises(type(error)) if error else contextlib.nullcontext(), kept_words(logging):
+        print("Wände")
+        tqdm.write("a line")
+        if error:
+            raise error
+    assert capsys.readouterr().out == "Wände\na line\n"
+    first, second, *rest = (tmp_path / "run.log").read_text(encoding="utf-8").splitlines()
+    assert (first, second) == ("Wände", "a line") and bool(rest) == bool(error)
+    assert not error or str(error) in rest[-1]
+    with kept_words(OmegaConf.create({"handlers": {"console": {}}})):
+        print("nowhere")
+    assert capsys.readouterr().out == "nowhere\n" and {path.name for path in tmp_path.iterdir()} == {"run.log"}
 
 
 HELPS = """
