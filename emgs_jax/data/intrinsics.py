@@ -89,14 +89,15 @@ def find_lens(given: Given, pictures: Pictures) -> Lens:
         what, camera = "dataset.intrinsics", from_numbers(given)
     elif given == "exif":
         what, camera = "dataset.intrinsics=exif", from_exif(pictures)
-        about = {"source": given, "note": f"from EXIF: focal length {camera.intrinsics[0]:.1f} px"}
+        about = {"source": given, "note": f"intrinsics from EXIF: focal length {camera.intrinsics[0]:.1f} px"}
     elif given == "estimate":
         what = "dataset.intrinsics=estimate"
         camera, about = from_images(pictures)
     else:
         path = Path(given).expanduser()
         what, camera = str(path), read_calibration(path)
-        about = {"source": path.name, "note": f"from {path.name}: {[round(v, 2) for v in camera.intrinsics]}"}
+        values = [round(value, 2) for value in camera.intrinsics]
+        about = {"source": path.name, "note": f"intrinsics from {path.name}: {values}"}
     return to_lens(camera, pictures.size, what, about, pictures.name)
 
 
@@ -120,6 +121,12 @@ def to_lens(camera: Calibration, size: Size, what: str, about: Mapping[str, Any]
         return Lens(raw, None, about)
     straight, maps = undistortion(raw, camera.distortion, size, what)
     return Lens(straight, maps, about)
+
+
+def with_notes(about: Mapping[str, Any], *notes: str | None) -> Mapping[str, Any]:
+    """The description of a lens whose `note` also says what `notes` say of the images."""
+    said = [note for note in (about.get("note"), *notes) if note]
+    return {**about, "note": "; ".join(said)} if said else about
 
 
 def from_numbers(given: Sequence[Number]) -> Calibration:
@@ -194,7 +201,7 @@ def from_images(pictures: Pictures) -> tuple[Calibration, dict[str, Any]]:
     (w, h) = pictures.size
     about = {
         "source": "estimate",
-        "note": describe(found),
+        "note": f"intrinsics {describe(found)}",
         "focal_px": found.value,
         "focal_deviation_px": found.spread,
         "focal_quartiles_px": [*found.quartiles],

@@ -65,6 +65,11 @@ def select(count: int, start: int, stop: int | None, stride: int, where: object)
     return range(start, count if stop is None else stop, stride)
 
 
+def limit(start: int, stop: int | None) -> int | None:
+    """How many images have to be counted before `select`; None = all, also where `start` and `stop` make no sense."""
+    return stop if isinstance(start, int) and isinstance(stop, int) and 0 <= start < stop else None
+
+
 def check_index(index: int, count: int) -> None:
     """IndexError outside of 0..count-1, so that a plain for loop over the data set ends."""
     if not 0 <= index < count:

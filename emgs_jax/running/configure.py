@@ -209,7 +209,7 @@ def build_dataset(config: DictConfig) -> ReadableFrames:
     """The data set of a config, without unreadable frames where it says so."""
     dataset = build(config, "dataset")
     if "note" in dataset.calibration:
-        tqdm.write(f"intrinsics {dataset.calibration['note']}")
+        tqdm.write(dataset.calibration["note"])
     progress = partial(tqdm, desc="checking", unit="frame")
     return ReadableFrames(dataset, config.on_bad_frame, config.checksums, progress)
 
