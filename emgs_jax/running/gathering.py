@@ -1,6 +1,6 @@
 """What streams by while a sequence is mapped, gathered for comparison: what the prior alone says, and baselines."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -9,9 +9,9 @@ import numpy as np
 from emgs_jax.data.base import Dataset
 from emgs_jax.data.reading import resize_nearest
 from emgs_jax.evaluation.baselines import BaselineConfig, Fusion, Pinhole, View
-from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
+from emgs_jax.evaluation.clouds import PointCloud, SpooledCloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, posed
-from emgs_jax.evaluation.segmentation import LabelGrid, LabelledPoints, nearest_classes
+from emgs_jax.evaluation.segmentation import SpooledLabels, nearest_classes
 from emgs_jax.io.spool import Spool
 from emgs_jax.observation import known_surface
 from emgs_jax.running.inputs import RawView
@@ -27,16 +27,16 @@ class RawPrior:
     """What the prior alone says of a sequence.
 
     Args:
-        cloud: its points at its poses, averaged per voxel.
+        cloud: its points at its poses; a voxel's side in its lengths is known once the poses are aligned.
         depths: camera-space z of each frame (h, w), in the prior's own lengths; 0 where it says none.
         classes: of each frame's pixels (h, w), as positions in the prior's names, -1 = none; None without classes.
-        labels: its points, averaged likewise, with the class that most frames see there; None without classes.
+        labels: its points likewise, each with the class that its frame sees there; None without classes.
     """
 
-    cloud: PointCloud
+    cloud: SpooledCloud
     depths: Spool
     classes: Spool | None = None
-    labels: LabelledPoints | None = None
+    labels: SpooledLabels | None = None
 
 
 class Baselines:
@@ -83,28 +83,25 @@ def gather(
 
     Args:
         views: of all frames.
-        evaluation: points of one of its voxels are averaged.
+        evaluation: how normals are fitted.
         keeps_depths: the truth is known.
         baselines: that take the views, too.
         text: names of the classes that the views are asked for, and their embeddings; None: they are not.
     """
-    depths, classes, grid = Spool(), Spool(), LabelGrid(evaluation.voxel_m)
-
-    def clouds() -> Iterator[PointCloud]:
-        for row, (points, mask, image, pose, features) in enumerate(views):
-            depth = np.where(mask & np.isfinite(points[..., 2]), points[..., 2], 0.0).astype(np.float32)
-            cloud = camera_cloud(points, mask, image, evaluation)
-            if keeps_depths:
-                depths.append(depth)
-            if text is not None:
-                labels = resize_nearest(nearest_classes(features, text[1]).astype(np.int32), depth.shape[::-1])
-                classes.append(labels)
-                seen = mask & (labels >= 0)
-                grid.add(points[seen] @ pose[:3, :3].T + pose[:3, 3], labels[seen])
-            if baselines is not None:
-                known = mask & np.isfinite(points).all(-1)
-                baselines.add(row, View(depth, image, cloud), points, known, pose)
-            yield posed(cloud, pose)
-
-    cloud = fuse_clouds(clouds(), evaluation.voxel_m)
-    return RawPrior(cloud, depths) if text is None else RawPrior(cloud, depths, classes, grid.points(text[0]))
+    cloud, depths, classes = SpooledCloud(), Spool(), Spool()
+    labels = None if text is None else SpooledLabels(text[0])
+    for row, (points, mask, image, pose, features) in enumerate(views):
+        depth = np.where(mask & np.isfinite(points[..., 2]), points[..., 2], 0.0).astype(np.float32)
+        seen = camera_cloud(points, mask, image, evaluation)
+        if keeps_depths:
+            depths.append(depth)
+        if text is not None:
+            found = resize_nearest(nearest_classes(features, text[1]).astype(np.int32), depth.shape[::-1])
+            classes.append(found)
+            has_class = mask & (found >= 0)
+            labels.append(points[has_class] @ pose[:3, :3].T + pose[:3, 3], found[has_class])
+        if baselines is not None:
+            known = mask & np.isfinite(points).all(-1)
+            baselines.add(row, View(depth, image, seen), points, known, pose)
+        cloud.append(posed(seen, pose))
+    return RawPrior(cloud, depths) if text is None else RawPrior(cloud, depths, classes, labels)
