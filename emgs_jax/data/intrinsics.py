@@ -16,6 +16,7 @@ from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.calibration_files import Calibration, read_calibration
 from emgs_jax.data.focal_length import describe, estimate_focal_length
+from emgs_jax.data.plausible_camera import is_impossible, oddities, other_reading
 from emgs_jax.data.reading import Intrinsics, Number, Size
 
 Given = str | Sequence[Number]  # dataset.intrinsics
@@ -112,10 +113,12 @@ def to_lens(camera: Calibration, size: Size, what: str, about: Mapping[str, Any]
         images: names them, likewise.
 
     Raises:
-        ValueError: it is for images of another size, or the distortion leaves nothing of the image.
+        ValueError: it is for images of another size, no lens has such a view, or the distortion leaves nothing of the
+            image.
     """
     check_image_size(camera, size, what)
     raw = reading.check_intrinsics(camera.intrinsics, size, what, images)
+    about = with_notes(about, check_plausible(camera, size, what, images))
     about = {**about, "size": [*size], "intrinsics": [*raw], "distortion": [*camera.distortion]}
     if not any(camera.distortion):
         return Lens(raw, None, about)
@@ -220,6 +223,25 @@ def check_image_size(camera: Calibration, size: Size, what: str) -> None:
     if (w, h) == (height, width):
         reason = "they are turned, maybe by their EXIF orientation; calibrate the images as they are shown"
     raise ValueError(f"{what} is for images of {w}x{h}, but the images are {width}x{height}: {reason}")
+
+
+def check_plausible(camera: Calibration, size: Size, what: str, images: str) -> str | None:
+    """What is odd about a camera for images of that size; None where nothing is.
+
+    Raises:
+        ValueError: no lens has such a view; or the numbers fit as another camera's, and no size stands beside them.
+    """
+    found = oddities(camera.intrinsics, size)
+    if not found:
+        return None
+    other = other_reading(camera.intrinsics, size)
+    odd = f"{what} {[*camera.intrinsics]} is odd for the {size[0]}x{size[1]} {images}: {', '.join(found)}"
+    if is_impossible(camera.intrinsics, size):
+        remedy = other or "give fx, fy, cx, cy in pixels of the images on disk"
+        raise ValueError(f"{odd}; {remedy}")
+    if other and camera.size is None:
+        raise ValueError(f"{odd}; {other}, or, where they are right, a calibration file with width and height")
+    return f"{odd}; {other or 'check it'}"
 
 
 def undistortion(
