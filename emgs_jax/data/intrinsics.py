@@ -18,6 +18,7 @@ from emgs_jax.data.calibration_files import Calibration, read_calibration
 from emgs_jax.data.focal_length import describe, estimate_focal_length
 from emgs_jax.data.plausible_camera import is_impossible, oddities, other_reading
 from emgs_jax.data.reading import Intrinsics, Number, Size
+from emgs_jax.data.tones import Tones, read_shown
 
 Given = str | Sequence[Number]  # dataset.intrinsics
 DIAGONAL_35_MM = 43.27  # of 36 mm x 24 mm; cameras scale by the diagonal, whatever their aspect (COLMAP's rule)
@@ -72,9 +73,9 @@ class Lens:
         return depth if self.maps is None else cv2.remap(depth, *self.maps, cv2.INTER_NEAREST)
 
 
-def pictures_of(files: Sequence[Path], size: Size) -> Pictures:
-    """Image files of one size."""
-    return Pictures(size, len(files), lambda index: reading.read_color(files[index], size), files)
+def pictures_of(files: Sequence[Path], size: Size, tones: Tones | None = None) -> Pictures:
+    """Image files of one size; `tones` of those with more than 8 bits."""
+    return Pictures(size, len(files), lambda index: read_shown(files[index], size, tones), files)
 
 
 def find_lens(given: Given, pictures: Pictures) -> Lens:

@@ -2,7 +2,6 @@
 
 import hashlib
 import math
-import re
 import struct
 import zlib
 from collections.abc import Iterable, Sequence
@@ -21,6 +20,7 @@ Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy; pixel centres 
 MAX_SIDE = 16384  # pixels; more is a slip of the hand, and would ask for gigabytes
 MAX_POSITION_M = 1000.0  # from the origin: steps of float32 are .06 mm there, and 6 cm at 1e6 m
 RIGID_TOLERANCE = 1e-2  # text files round; a flipped digit moves R^T R by more
+OWN_BITS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH  # BGR in 8 or 16 bits, or float
 REMEDY = "fetch the file again or set on_bad_frame=skip"
 
 
@@ -39,12 +39,6 @@ def find_sequence(root: str | None, sequence: str | None, layout: str, source: s
         names = ", ".join(sorted(p.name for p in near.iterdir() if not p.name.startswith("."))[:8])
         raise FileNotFoundError(f"{path} does not exist; expected the layout {layout} ({source}); {near} has: {names}")
     return path
-
-
-def natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key under which frame2 comes before frame10."""
-    parts = re.split(r"([0-9]+)", path.name.casefold())
-    return [(1, int(p), p) if p and p[0] in "0123456789" else (0, 0, p) for p in parts]
 
 
 def select(count: int, start: int, stop: int | None, stride: int, where: object) -> range:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
 from emgs_jax.data.calibration_files import Calibration
+from emgs_jax.data.file_names import natural_key
 from emgs_jax.data.intrinsics import Given, find_lens, pictures_of, to_lens
 from emgs_jax.data.reading import Intrinsics, Number, Size
 
@@ -98,7 +99,7 @@ def find_images(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} does not exist; expected the layout {LAYOUT} ({SOURCE})")
     found = [p for p in folder.iterdir() if re.fullmatch(r"frame[0-9]+\.(jpe?g|png)", p.name, re.IGNORECASE)]
-    return sorted(found, key=reading.natural_key)
+    return sorted(found, key=natural_key)
 
 
 def number_of(path: Path) -> int:

@@ -22,8 +22,10 @@ class Video:
 
     Attributes:
         count: frames that can be read, up to `stop`.
-        note: where the header announces more frames than there are; else None.
+        notes: where the header announces more frames than there are.
     """
+
+    tones = None  # a decoder gives 8 bits
 
     def __init__(self, path: Path, stop: int | None = None) -> None:
         self._path, self.folder = path, path.parent
@@ -32,7 +34,7 @@ class Video:
         self._times = _times(self._capture, stop)
         self.count = self._next = len(self._times)  # _next: number of the frame that the capture gives next
         is_short = math.isfinite(announced) and self.count < (announced if stop is None else min(announced, stop))
-        self.note = f"{path} announces {announced:.0f} frames, {self.count} can be read" if is_short else None
+        self.notes = [f"{path} announces {announced:.0f} frames, {self.count} can be read"] if is_short else []
 
     def _open(self) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(str(self._path))
