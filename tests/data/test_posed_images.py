@@ -102,9 +102,7 @@ def test_equal_cameras_in_the_frames_are_one_and_different_ones_are_named(above,
     assert dataset.calibration["intrinsics"] == [130, 128, 80.5, 59] and dataset.calibration["distortion"][0] == 0.02
     values["frames"][2]["fl_x"] = 131
     (tmp_path / "transforms.json").write_text(json.dumps(values))
-    with pytest.raises(
-        ValueError, match="fl_x is 130 in frame 0 and 131 in frame 2.*dataset=images"
-    ):
+    with pytest.raises(ValueError, match="fl_x is 130 in frame 0 and 131 in frame 2.*dataset=images"):
         Nerfstudio(str(tmp_path), size=SIZE)
 
 
