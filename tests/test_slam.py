@@ -496,7 +496,7 @@ def test_room_is_doubled_where_rows_did_not_fit(settings):
 
 
 def test_a_frame_is_repeated_from_the_same_state_until_it_fits(state, stepped, settings):
-    """With a step that says so for a map of less than four times the room; a splat without room alone repeats nothing."""
+    """By a step that says so below four times the room; a splat without room alone repeats nothing."""
     calls, prediction = [], exact(FRAME)
 
     def crowded(given, _, __, chosen):

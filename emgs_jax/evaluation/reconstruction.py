@@ -9,7 +9,14 @@ from scipy.spatial import cKDTree
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
-from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, register, transform_cloud, voxel_downsample
+from emgs_jax.evaluation.clouds import (
+    PointCloud,
+    SpooledCloud,
+    fuse_clouds,
+    register,
+    transform_cloud,
+    voxel_downsample,
+)
 from emgs_jax.evaluation.trajectory import Alignment, align_poses
 from emgs_jax.ops.ranges import number
 
@@ -129,22 +136,30 @@ def reference(truth: PointCloud, config: EvaluationConfig) -> Reference:
 
 
 def compare_clouds(
-    cloud: PointCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
+    cloud: PointCloud | SpooledCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
 ) -> dict[str, float | int | str | None]:
     """Bring the estimate's cloud into the frame of the truth, then measure how far they are apart."""
     aligned, note = align_cloud(cloud, truth, poses, config)
     return reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
 
 
+def own_voxel(alignment: Alignment, config: EvaluationConfig) -> float:
+    """Side of a voxel of `voxel_m` in the lengths of the estimate that is aligned."""
+    return config.voxel_m / alignment.scale if alignment.scale > 0 else config.voxel_m
+
+
 def align_cloud(
-    cloud: PointCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
+    cloud: PointCloud | SpooledCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
 ) -> tuple[PointCloud, str | None]:
     """Bring the estimate's cloud into the frame of the truth; what the poses left open is noted, see `align_poses`.
 
-    The alignment is that of the poses, estimated and true (n, 4, 4). ICP, where the protocol has it, then moves the
+    The alignment is that of the poses, estimated and true (n, 4, 4). A `SpooledCloud` is averaged by `voxel_m` of the
+    truth, so that its own unit does not matter. ICP, where the protocol has it, then moves the
     cloud rigidly: the scale stays that of the poses.
     """
     alignment, note = align_poses(*poses, with_scale=config.alignment == "sim3")
+    if isinstance(cloud, SpooledCloud):
+        cloud = cloud.averaged(own_voxel(alignment, config))
     aligned = transform_cloud(cloud, alignment)
     if config.icp_distance_m > 0:
         source = voxel_downsample(aligned, config.icp_voxel_m).points

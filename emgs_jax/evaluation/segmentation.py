@@ -5,14 +5,17 @@ columns predicted ones, and the last column counts points without an answer. Mat
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
-from emgs_jax.evaluation.trajectory import rotated
+from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, Reference, align_cloud, own_voxel
+from emgs_jax.evaluation.trajectory import align_poses, rotated
+from emgs_jax.io.spool import Spool
 
 _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
 
@@ -48,6 +51,21 @@ def true_labels(cells: Sequence[np.ndarray], dataset: Dataset, voxel: float) -> 
         return None
     rows = _distinct(np.concatenate(cells))
     return LabelledPoints((rows[:, :3] + 0.5) * voxel, rows[:, 3], tuple(dataset.classes))
+
+
+def align_labels(
+    labels: "LabelledPoints | SpooledLabels",
+    truth: Reference,
+    poses: tuple[np.ndarray, np.ndarray],
+    config: EvaluationConfig,
+) -> LabelledPoints:
+    """Bring points with classes into the frame of the truth, as `align_cloud` does with those of a cloud."""
+    if isinstance(labels, SpooledLabels):
+        alignment, _ = align_poses(*poses, with_scale=config.alignment == "sim3")
+        labels = labels.points(own_voxel(alignment, config))
+    nothing = np.zeros_like(labels.points)
+    aligned, _ = align_cloud(PointCloud(labels.points, nothing, nothing), truth, poses, config)
+    return replace(labels, points=aligned.points)
 
 
 def compare_labels(found: LabelledPoints, truth: LabelledPoints, num_neighbours: int) -> dict[str, float | int | None]:
@@ -104,6 +122,28 @@ class LabelGrid:
         rows = rows[np.lexsort(rows.T[:4])]
         begins = np.flatnonzero(np.append(True, (np.diff(rows[:, :4], axis=0) != 0).any(1)))
         return np.column_stack([rows[begins, :4], np.add.reduceat(rows[:, 4], begins)])
+
+
+class SpooledLabels:
+    """The points of many views with their classes, in a temporary file, counted once the side of a voxel is known.
+
+    See `clouds.SpooledCloud`. float32 (n, 4) a view: x, y, z and the class.
+    """
+
+    def __init__(self, classes: Sequence[str]) -> None:
+        self._parts, self._classes = Spool(), tuple(classes)
+
+    def append(self, points: np.ndarray, labels: np.ndarray) -> None:
+        """Add a view: points (n, 3) and their classes (n,)."""
+        self._parts.append(np.column_stack([points, labels]).astype(np.float32))
+
+    def points(self, voxel: float) -> LabelledPoints:
+        """As `LabelGrid.points`, for voxels of this side [lengths of the points]."""
+        grid = LabelGrid(voxel)
+        for row in range(len(self._parts)):
+            part = self._parts[row].astype(np.float64)
+            grid.add(part[:, :3], part[:, 3].astype(np.int64))
+        return grid.points(self._classes)
 
 
 def transfer_labels(points: np.ndarray, labels: np.ndarray, targets: np.ndarray, num_neighbours: int) -> np.ndarray:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from emgs_jax.io.timestamps import resolution
+
 _MIN_SPREAD_M = 1e-6  # below this RMS distance from its centroid a path gives no direction and no scale
 
 
@@ -47,6 +49,8 @@ def rotated(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
     """Pair timestamps (n,) and (m,), in seconds, that are each other's nearest within `max_difference`.
 
+    Times that differ by it are within it, however float64 rounds them: seconds since 1970 by 2e-7.
+
     Returns indices into a and into b, int (k,), in the order of a; no index occurs twice.
     """
     times_a, times_b = np.asarray(times_a, np.float64), np.asarray(times_b, np.float64)
@@ -54,7 +58,7 @@ def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -
         return np.empty(0, np.int64), np.empty(0, np.int64)
     to_b, to_a = _nearest(times_a, times_b), _nearest(times_b, times_a)
     rows = np.arange(len(times_a))
-    keep = (to_a[to_b] == rows) & (np.abs(times_a - times_b[to_b]) <= max_difference)
+    keep = (to_a[to_b] == rows) & (np.abs(times_a - times_b[to_b]) <= max_difference + resolution(times_a, times_b))
     return rows[keep], to_b[keep]
 
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
-from emgs_jax.evaluation.reconstruction import EvaluationConfig
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, own_voxel
 from emgs_jax.evaluation.rendering import Rendered
 from emgs_jax.evaluation.segmentation import LabelledPoints, translate
+from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.running.convert import to_se3
@@ -54,7 +55,8 @@ def dense_map(
         run: finished.
         dataset: for the images in the pictures, and the truth.
         config: what becomes a point.
-        evaluation: points of one of its voxels are averaged, and views are compared with the truth under it.
+        evaluation: points of one of its voxels, of the truth where that is known, are averaged, and views are
+            compared with the truth under it.
         labelled: `labelled_map` of the run, which says the class of each point.
         num_pictures: frames that are shown, evenly spread.
     """
@@ -76,10 +78,17 @@ def dense_map(
                 *(rows[view.valid].astype(np.float64) for rows in (view.points, view.normals, view.colors))
             )
 
-    cloud = fuse_clouds(clouds(), evaluation.voxel_m)
+    cloud = fuse_clouds(clouds(), _voxel(with_truth(run, run.poses), evaluation))
     points = cloud.points
     labels = None if labelled is None else LabelledPoints(points, labelled.classes_of(points), labelled.classes)
     return DenseMap(cloud, labels, pictures, rendered.metrics())
+
+
+def _voxel(poses: tuple[np.ndarray, np.ndarray] | None, config: EvaluationConfig) -> float:
+    """Side of a voxel in the map's lengths: `voxel_m`, of the truth where the map's unit is larger than a metre."""
+    if poses is None:
+        return config.voxel_m
+    return min(config.voxel_m, own_voxel(align_poses(*poses, with_scale=True)[0], config))
 
 
 def _drawn_ahead(run: MappingRun, rows: list[int], config: DensifyConfig) -> Iterator[DenseView]:

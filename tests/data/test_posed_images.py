@@ -57,6 +57,55 @@ def write_nerfstudio(folder, **changes) -> None:
     (folder / "transforms.json").write_text(json.dumps(values | changes))
 
 
+def test_clips_in_folders_follow_each_other(tmp_path):
+    """Images of one name in several folders; COLMAP sorts by the name with its folder."""
+    model = write_colmap(tmp_path)
+    names = [f"clip{clip}/{i:04d}.png" for clip in (2, 10) for i in range(3)]
+    for i, name in enumerate(names):
+        (tmp_path / "images" / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "images" / name), color_image(i, SIZE))
+    lines = [f"{i + 1} 1 0 0 0 {-0.1 * i} 0 0 7 {name}\n\n" for i, name in enumerate(names)]
+    (model / "images.txt").write_text("".join(reversed(lines)))
+    frames = [*Colmap(str(tmp_path), size=SIZE)]
+    assert [frame.name.split("images/")[1] for frame in frames] == names
+    np.testing.assert_allclose([frame.T_world_camera[0, 3] for frame in frames], np.arange(6) / 10)
+    assert [frame.timestamp for frame in frames] == [0, 1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda name: f"images\\{name}", lambda name: f"./images/{name[:-4]}", lambda name: f"images\\{name[:-4]}"],
+)
+@pytest.mark.parametrize("has_ending_in_capitals", [False, True])
+def test_names_with_backslashes_and_without_ending_are_found(change, has_ending_in_capitals, tmp_path):
+    write_nerfstudio(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    for frame, name in zip(values["frames"], NAMES, strict=True):
+        frame["file_path"] = change(name)
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    for path in [*(tmp_path / "images").iterdir()] if has_ending_in_capitals and "." not in change("a.png")[2:] else []:
+        path.rename(path.with_suffix(".PNG"))
+    dataset = Nerfstudio(str(tmp_path), size=SIZE)
+    for i, row in enumerate((1, 0, 2)):
+        np.testing.assert_array_equal(dataset[i].image[..., ::-1], color_image(row, SIZE))
+
+
+@pytest.mark.parametrize("above", [(), ("w", "h"), ("fl_x", "fl_y", "cx", "cy", "w", "h")])
+def test_equal_cameras_in_the_frames_are_one_and_different_ones_are_named(above, tmp_path):
+    write_nerfstudio(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    camera = {key: values.pop(key) for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
+    values |= {key: camera[key] for key in above}
+    values["frames"] = [frame | camera | {"k1": 0.02} for frame in values["frames"]]
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    dataset = Nerfstudio(str(tmp_path), size=SIZE)
+    assert dataset.calibration["intrinsics"] == [130, 128, 80.5, 59] and dataset.calibration["distortion"][0] == 0.02
+    values["frames"][2]["fl_x"] = 131
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with pytest.raises(ValueError, match="fl_x is 130 in frame 0 and 131 in frame 2.*dataset=images"):
+        Nerfstudio(str(tmp_path), size=SIZE)
+
+
 @pytest.mark.parametrize(("build", "write"), [(Colmap, write_colmap), (Nerfstudio, write_nerfstudio)])
 def test_images_come_in_the_order_of_their_numbers_with_their_poses(build, write, tmp_path):
     write(tmp_path)

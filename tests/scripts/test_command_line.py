@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from emgs_jax.running.configure import compose, groups
 from experiments.cli import COMMANDS, main
-from experiments.command import check_arguments, kept_words
+from experiments.command import check_arguments, check_missing, kept_words
 from experiments.evaluate import delegated
 from experiments.interrupt import clear_interrupt
 from experiments.report import positional
@@ -147,6 +147,39 @@ def test_the_wrong_word_ends_a_command_with_one_line():
     done = run("experiments.run", "slam.em=paper")
     assert done.returncode == 1 and done.stderr.startswith("error: slam.em=paper would put a word")
     assert "Traceback" not in done.stderr
+
+
+def test_a_word_that_is_no_override_says_how_to_write_it():
+    for words in (["dataset.root=my", "folder"], ["dataset=images", "stop", "-m"]):
+        with pytest.raises(ValueError, match=r"is no KEY=VALUE: put a value with spaces into quotes.*emgs run --help"):
+            check_arguments("config", words)
+    check_arguments("config", ["--cfg", "job", "--package", "slam", "~hydra.run", "-m"])
+
+
+def test_what_has_to_be_given_is_named_with_the_command():
+    for name, key in (("view", "folder"), ("report", "folder"), ("export", "folder"), ("effects", "folder")):
+        with pytest.raises(ValueError, match=f"^{key} is not given .*: emgs {name} {key}=…$"):
+            check_missing(name, compose(name=name))
+    check_missing("view", compose("folder=x", name="view"))
+
+
+def test_options_of_a_folder_of_ones_own_are_options(tmp_path):
+    """`--config-dir` is in Hydra's help, and what stood in that folder was refused."""
+    (tmp_path / "dataset").mkdir()
+    (tmp_path / "dataset" / "mine.yaml").write_text("_target_: emgs_jax.data.images.Images\nroot: walk\n")
+    for option in (["--config-dir", str(tmp_path)], [f"--config-dir={tmp_path}"], ["-cd", str(tmp_path)]):
+        check_arguments("config", [*option, "dataset=mine", "dataset.root=other"])
+        with pytest.raises(ValueError, match="is no key of the config"):
+            check_arguments("config", [*option, "dataset=mine", "dataset.nothing=other"])
+    with pytest.raises(ValueError, match="--config-dir nowhere is no folder"):
+        check_arguments("config", ["--config-dir", "nowhere"])
+
+
+def test_a_command_that_comes_to_nothing_leaves_nothing(tmp_path):
+    folder = tmp_path / "my runs" / "first"
+    done = run("experiments.run", "dataset=images", "dataset.root=Küche (1)", f"hydra.run.dir={folder}")
+    assert done.returncode == 1 and done.stderr.startswith("error: dataset.root=Küche (1) does not exist")
+    assert not folder.exists()
 
 
 @pytest.mark.parametrize("word", ["terminated", "interrupted"])
