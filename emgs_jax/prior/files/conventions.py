@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 
 from emgs_jax.ops.axes import FLIP
 
-MAX_MISFIT = 0.1  # of the depth, median; predictions of any use are better
-MIN_GAIN = 4.0  # by which another convention must fit better to be named
+MAX_MISFIT = 0.02  # of the depth, median; below, poses are right enough whatever else fits
+MIN_GAIN, GOOD_MISFIT = 3.0, 0.05  # by which another convention must fit better to be named, and how well at least
 MIN_SHARED = 100  # points
 STEP = 4  # every fourth pixel of every fourth row
 MILLIMETRES = 1000.0
@@ -39,11 +39,11 @@ def check_conventions(pairs: Iterable[tuple[Sight, Sight]], intrinsics: Sequence
     if not found or not found["as they are"] > MAX_MISFIT:
         return
     best = min(found, key=lambda name: found[name])
-    if found[best] * MIN_GAIN < found["as they are"]:
+    if found[best] < min(found["as they are"] / MIN_GAIN, GOOD_MISFIT):
         raise ValueError(
-            f"{source}: depths of one view and of the next differ by {100 * found['as they are']:.0f} %, and by "
-            f"{100 * found[best]:.0f} % where the poses are taken as {best}: expected are camera -> world, axes of "
-            "OpenCV (x right, y down, z ahead), and one unit for poses and depths"
+            f"{source}: the depths of two views differ by {100 * found['as they are']:.1f} % (inf: they share "
+            f"nothing), and by {100 * found[best]:.1f} % where the poses are taken as {best}: expected are camera -> "
+            "world, axes of OpenCV (x right, y down, z ahead), and one unit for poses and depths"
         )
 
 

@@ -29,7 +29,7 @@ from emgs_jax.prior.files.view import Camera, Predictions, View, at_frame, grid_
 SCALES = ("auto", "metric", "arbitrary")
 ROOM = (0.05, 100.0)  # m, median depth of a view that is metric
 FOCAL_NOTE, FOCAL_ERROR = 1.03, 1.5  # ratio of the files' focal length and the data set's
-NUM_PAIRS, PAIR_GAPS = 5, (1, 5)  # of views that are compared, and how many frames apart they are
+NUM_PAIRS, PAIR_GAP = 5, 5  # of views that are compared, and how many frames apart they are
 
 
 class Files(Prior):
@@ -128,8 +128,8 @@ class Files(Prior):
     def _pairs(self, known: list[int], camera: Camera) -> list[tuple[Sight, Sight]]:
         """Views with a pose, some frames apart, from all of the sequence."""
         known = [index for index in known if np.isfinite(self._pose(index)).all()]
-        places = np.linspace(0, max(len(known) - 1 - max(PAIR_GAPS), 0), NUM_PAIRS).astype(int)
-        chosen = {(known[p], known[min(p + gap, len(known) - 1)]) for p in set(places) for gap in PAIR_GAPS}
+        places = np.linspace(0, max(len(known) - 1 - PAIR_GAP, 0), NUM_PAIRS).astype(int)
+        chosen = {(known[place], known[min(place + PAIR_GAP, len(known) - 1)]) for place in places}
         sights = {}
         for index in sorted({index for pair in chosen for index in pair}):
             points, _, mask = self._at_frame(index, camera)
