@@ -16,6 +16,8 @@ from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.prior.base import Prior, relative_poses
 from emgs_jax.prior.files.prior import Files
 from emgs_jax.prior.files.view import Camera, View, at_frame, whole_image
+from emgs_jax.running import configure
+from experiments.command import check_arguments
 
 NAMES = Named().names
 SIZE = (48, 64)
@@ -295,3 +297,52 @@ def test_a_list_of_poses_of_another_length_or_without_a_name_is_named(tmp_path):
 def test_a_key_without_sense_is_named(keys, message, own):
     with pytest.raises(ValueError, match=message):
         Files(own, **(KEYS | keys))
+
+
+def test_the_script_of_the_documentation_writes_what_the_prior_reads(tmp_path, monkeypatch):
+    """Against the truth, with a model that knows it."""
+    page = (tiny_run.CONF.parent / "docs" / "priors.md").read_text()
+    section = page[page.index("### Files: predictions of your own") :]
+    script = section[section.index("```python\n") + 10 :].partition("```")[0]
+    assert len([line for line in script.splitlines() if line]) <= 10
+    monkeypatch.chdir(tmp_path)
+    Path("images").mkdir()
+    names = sorted(NAMES)  # as the script orders them
+    for name in names:
+        Path("images", f"{name}.jpg").touch()
+    frames = [truth()[NAMES.index(name)] for name in names]
+
+    def my_model(images):
+        assert [image.stem for image in images] == names
+        depths, poses = (np.stack([getattr(f, key) for f in frames]) for key in ("depth", "T_world_camera"))
+        return depths, depths + 1, poses, np.tile(tiny_run.dataset().intrinsics, (len(frames), 1))
+
+    exec(script, {"my_model": my_model})
+    _, predictions = asked(tmp_path / "predictions")
+    for prediction in predictions:
+        views, dense = list(prediction.window.views), list(prediction.window.dense)
+        poses = relative_poses([truth()[index].T_world_camera for index in views])
+        np.testing.assert_allclose(prediction.T_anchor_view, poses, atol=1e-12)
+        depth = np.stack([truth()[index].depth for index in dense])
+        np.testing.assert_allclose(prediction.points[..., 2], depth, rtol=1e-6)
+        np.testing.assert_allclose(prediction.confidence, depth + 1, rtol=1e-6)
+
+
+MINE = """
+from emgs_jax.prior.base import Prior, Provenance
+class Mine(Prior):
+    def __init__(self, size):
+        self.provenance = Provenance("mine", {"size": size})
+    def predict(self, window, frames, intrinsics):
+        raise NotImplementedError
+"""
+
+
+def test_a_class_from_outside_of_the_repository_is_a_prior_as_the_documentation_says(tmp_path, monkeypatch):
+    (tmp_path / "mine_outside.py").write_text(MINE)
+    (tmp_path / "conf" / "prior").mkdir(parents=True)
+    (tmp_path / "conf" / "prior" / "Mine.yaml").write_text("_target_: mine_outside.Mine\nsize: 3\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    words = [f"hydra.searchpath=[file://{tmp_path}/conf]", "prior=Mine", "prior.size=4"]
+    check_arguments("config", words)
+    assert configure.build(configure.compose(*words), "prior").provenance.settings == {"size": 4}
