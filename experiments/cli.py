@@ -7,7 +7,7 @@ from importlib import import_module
 from .interrupt import clear_interrupt
 
 COMMANDS = {  # name: (what it does, an example)
-    "run": ("map one sequence", "emgs run dataset=tum dataset.root=tum dataset.sequence=rgbd_dataset_freiburg1_desk"),
+    "run": ("map a video, a folder of images or a data set", "emgs run video.mp4"),
     "evaluate": ("data sets × sequences × variants × seeds, with one table", "emgs evaluate suite=smoke seeds=[0,1,2]"),
     "score": ("any other system under the same protocol", "emgs score trajectory=poses.txt method=peer dataset=tum …"),
     "sweep": ("a grid of settings on one sequence", "emgs sweep sweep=gates experiment=smoke"),

@@ -43,6 +43,7 @@ from emgs_jax.running.places import load_saved
 from emgs_jax.running.record import FrameRecord, MappingRun, new_run, to_line
 
 from .command import command
+from .shorthand import with_source
 
 
 def run(config: DictConfig, folder: Path) -> dict[str, Any]:
@@ -158,7 +159,7 @@ def _map(
             raise
 
 
-@command("config")
+@command("config", rewritten=with_source)
 def main(config: DictConfig) -> float:
     """Run, print the table and the folder; returns the trajectory error for Hydra's sweepers, inf without one."""
     folder = Path(HydraConfig.get().runtime.output_dir)

@@ -10,10 +10,22 @@ import numpy as np
 from numpy.lib import format as npy
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+MAX_INFLATED = 2**33  # bytes of an array that is compressed; more is no array of anyone's
 
 
-def read_npz(content: bytes | IO[bytes], names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+def read_npz(
+    content: bytes | IO[bytes],
+    names: Sequence[str] | None = None,
+    optional: Sequence[str] = (),
+    may_be_compressed: bool = False,
+) -> dict[str, np.ndarray]:
     """Arrays of an .npz as `numpy.savez` writes it, all or those of `names`.
+
+    Args:
+        content: of the file, or the open file.
+        names: that must be there; None: all that are there.
+        optional: that are read beside `names` where they are there.
+        may_be_compressed: as `numpy.savez_compressed` writes it.
 
     Raises:
         ValueError: it is damaged or compressed, lacks a name, or an array's header does not fit its bytes.
@@ -24,17 +36,30 @@ def read_npz(content: bytes | IO[bytes], names: Sequence[str] | None = None) -> 
             missing = [name for name in names or () if name not in members]
             if missing or len(members) < len(archive.infolist()):
                 raise ValueError(f"it lacks {', '.join(missing)}" if missing else "it has two arrays of one name")
-            return {name: _read_array(archive, members[name]) for name in names or members}
+            chosen = members if names is None else [*names, *(name for name in optional if name in members)]
+            return {name: _read_array(archive, members[name], may_be_compressed) for name in chosen}
     except ValueError:
         raise
     except Exception as error:  # a broken zip raises a dozen types
         raise ValueError(repr(error)) from error
 
 
-def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+def npz_names(content: IO[bytes]) -> list[str]:
+    """The names of the arrays of an .npz; ValueError where it is none."""
+    try:
+        with zipfile.ZipFile(content) as archive:
+            return [name.removesuffix(".npy") for name in archive.namelist()]
+    except Exception as error:
+        raise ValueError(repr(error)) from error
+
+
+def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, may_be_compressed: bool) -> np.ndarray:
     """One array; its bytes are there before its shape is believed."""
-    if member.compress_type != zipfile.ZIP_STORED:
+    is_compressed = member.compress_type != zipfile.ZIP_STORED
+    if is_compressed and not may_be_compressed:
         raise ValueError(f"{member.filename} is compressed, which numpy.savez does not do")
+    if is_compressed and member.file_size > MAX_INFLATED:
+        raise ValueError(f"{member.filename} announces {member.file_size} bytes, more than {MAX_INFLATED}")
     data = archive.read(member)  # whole, so that the checksum is tested
     handle = io.BytesIO(data)
     read_header = _HEADERS.get(npy.read_magic(handle))

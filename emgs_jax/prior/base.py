@@ -128,3 +128,11 @@ def with_frames(calls: Iterable[Window], dataset: Dataset) -> Iterator[tuple[Win
     for window in calls:
         frames = {index: frames[index] if index in frames else dataset[index] for index in window.views}
         yield window, frames
+
+
+def relative_poses(T_reference_view: Sequence[np.ndarray]) -> np.ndarray:
+    """Poses in the camera of view 0, float64 (v, 4, 4), of poses in any common frame; the first is the identity."""
+    poses = np.asarray(T_reference_view, np.float64)
+    relative = np.linalg.inv(poses[0]) @ poses
+    relative[0] = np.eye(4)
+    return relative

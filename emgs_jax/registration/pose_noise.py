@@ -3,6 +3,8 @@
 The answer before the current one has the current frame as its newest, and the previous one as its current: it has said
 how the camera moved from there to here, and where it was then relative to the anchor. The current one says both again.
 Depths tell less: a prior may keep those of an image, and one that solves for poses knows them better than any depth.
+Two answers that are the same to rounding are one answer, of a prior that has one pose for a frame: that it does not
+contradict itself says nothing about how wrong it is, and the pose is as uncertain as without a repeat.
 """
 
 import equinox as eqx
@@ -18,7 +20,8 @@ from emgs_jax.registration.rigid import pose_row, scale_translation
 LOG_OF_SQUARE = -0.36898  # mean logarithm of χ²/3 with three degrees of freedom: ψ(3/2) - log(3/2)
 LEAST_NOISE = 2e-4  # of the depth; keeps the covariance of an exact prior regular
 NO_INFORMATION = 1e-6  # in place of 0
-SMALLEST_SQUARE = 1e-14  # of what two answers differ by: rounding
+SMALLEST_SQUARE = 1e-14  # in a logarithm
+SAME_SQUARE = 1e-10  # of what one answer differs by from itself: rounding, of lengths up to a hundred mean depths
 
 
 class Repeats(eqx.Module):
@@ -28,7 +31,7 @@ class Repeats(eqx.Module):
         said: both as the last answer has them, m of the map.
         is_said: False where it has none; `said` is the identity then.
         log_squares: mean logarithm of the mean square, per axis, of the differences: of lengths in mean depths, angles.
-        counts: differences in that mean.
+        counts: differences in that mean; an answer that is the same again is none.
     """
 
     said: jaxlie.SE3
@@ -55,7 +58,7 @@ def repeat_poses(
     mean_depth: Float[Array, ""],
     max_count: Float[Array, ""],
 ) -> tuple[Repeats, Float[Array, "2 2"]]:
-    """The repeats with those of this answer, and the mean squares of these alone: 0 where it says nothing again.
+    """The repeats with those of this answer, and the mean squares of these alone: 0 where it says nothing new again.
 
     Args:
         prediction: the answer.
@@ -71,7 +74,9 @@ def repeat_poses(
     again = jnp.where(is_again[:, None], again, before.said.wxyz_xyz)
     units = jnp.stack([mean_depth, jnp.ones(())])[:, None]
     differences = (before.said.inverse() @ jaxlie.SE3(again)).log().reshape(2, 2, 3) / units
-    squares = jnp.where(is_again[:, None], jnp.mean(differences**2, axis=-1), 0.0)
+    squares = jnp.mean(differences**2, axis=-1)
+    is_again = is_again & jnp.any(squares > SAME_SQUARE, axis=-1)
+    squares = jnp.where(is_again[:, None], squares, 0.0)
     counts = jnp.minimum(before.counts + is_again, max_count)
     changes = (jnp.log(squares + SMALLEST_SQUARE) - before.log_squares) / jnp.maximum(counts, 1.0)[:, None]
     log_squares = before.log_squares + jnp.where(is_again[:, None], changes, 0.0)

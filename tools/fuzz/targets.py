@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
 
 from emgs_jax import load_config
-from emgs_jax.data.base import Dataset
+from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.checksums import SUMS_FILE
 from emgs_jax.data.class_file import read_classes
 from emgs_jax.data.images import Images
@@ -45,6 +45,7 @@ from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.loops.appearance import Keyframe, extend
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import windows
+from emgs_jax.prior.files.prior import Files
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.simulated.prior import Simulated
 from emgs_jax.report.page import write_report
@@ -264,6 +265,36 @@ def read_recording(folder: Path) -> None:
         assert np.isfinite(found.points[found.mask]).all()
 
 
+def _frames() -> list[Frame]:
+    return [_recorded()[0][index] for index in range(NUM_FRAMES)]
+
+
+def write_predictions(folder: Path) -> None:
+    for frame in _frames():
+        keys = {"depth": frame.depth, "confidence": 1 + frame.depth, "intrinsics": _recorded()[0].intrinsics}
+        np.savez_compressed(folder / f"{frame.index}.npz", T_world_camera=frame.T_world_camera, **keys)
+
+
+def write_depth_images(folder: Path) -> None:
+    for frame in _frames():
+        cv2.imwrite(str(folder / f"{frame.index}.png"), np.rint(1000 * frame.depth).astype(np.uint16))
+    poses = {str(frame.index): frame.T_world_camera.tolist() for frame in _frames()}
+    (folder / "poses.json").write_text(
+        json.dumps({"T_world_camera": poses, "intrinsics": [*_recorded()[0].intrinsics]})
+    )
+
+
+def read_predictions(folder: Path) -> None:
+    dataset = _recorded()[0]
+    prior = Files(folder, scale="auto", median_depth=2.0, depth_scale=1000.0, max_depth_step=0.03)
+    prior.check(dataset, 2)
+    for window in windows(len(dataset), 2):
+        found = prior.predict(window, [dataset[i] for i in window.views], dataset.intrinsics)
+        assert np.isfinite(found.points[found.mask]).all() and (found.points[found.mask][:, 2] > 0).all()
+        assert np.isfinite(found.confidence).all() and (found.confidence >= 1).all()
+        assert is_rigid(found.T_anchor_view[np.isfinite(found.T_anchor_view).all((1, 2))])
+
+
 def _reseal(folder: Path) -> None:
     """Make the checksums fit, as a forger would: what is behind them is looked at, too."""
     path = folder / "recording" / "manifest.json"
@@ -481,6 +512,8 @@ def targets() -> Iterator[Target]:
     yield Target("trajectory", write_trajectory, read_trajectory, {".txt": TEXT})
     yield Target("recording", write_recording, read_recording, {".npz": BYTES, ".json": TEXT})
     yield Target("forged recording", write_recording, read_forged_recording, {".npz": BYTES, ".json": TEXT})
+    yield Target("predictions", write_predictions, read_predictions, {".npz": BYTES})
+    yield Target("depth images", write_depth_images, read_predictions, {".png": BYTES, ".json": TEXT})
     yield Target("map", write_map, read_map, {".npz": BYTES})
     yield Target("places", write_places, read_places, {".npz": BYTES})
     yield Target("points", write_cloud, read_points, {".ply": (*BYTES, *TEXT)})

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.data.base import Frame
-from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
+from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, relative_poses
 from emgs_jax.prior.network.framework import (
     MODELS,
     ComputeConfig,
@@ -241,14 +241,6 @@ def no_prediction(window: Window, size: Size) -> PriorPrediction:
     poses[0] = np.eye(4)
     points, features = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 0), np.float16)
     return PriorPrediction(window, poses, points, np.ones(shape, np.float32), np.zeros(shape, bool), features)
-
-
-def relative_poses(T_reference_view: Sequence[np.ndarray]) -> np.ndarray:
-    """Poses in the camera of view 0, float64 (v, 4, 4), of poses in any common frame; the first is the identity."""
-    poses = np.asarray(T_reference_view, np.float64)
-    relative = np.linalg.inv(poses[0]) @ poses
-    relative[0] = np.eye(4)
-    return relative
 
 
 def scale_output(output: ViewOutput, scale: float) -> ViewOutput:

@@ -122,9 +122,20 @@ def to_frame(
     resize: Resize,
     max_depth_step: float,
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Points, confidence and mask of a view at every pixel of its frame.
+    """Points, confidence and mask of a view at every pixel of its frame, see `at_pixels`."""
+    return at_pixels(points, confidence, mask, frame_on_grid(resize), max_depth_step)
 
-    The nearest grid pixel decides the mask and the confidence, and beyond the crop the mask is off. The point is
+
+def at_pixels(
+    points: Float32[np.ndarray, "gh gw 3"],
+    confidence: Float32[np.ndarray, "gh gw"],
+    mask: Bool[np.ndarray, "gh gw"],
+    pixels: tuple[Float[np.ndarray, " w"], Float[np.ndarray, " h"]],
+    max_depth_step: float,
+) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Points, confidence and mask on a grid, at pixels that need not be the grid's own.
+
+    The nearest grid pixel decides the mask and the confidence, and beyond the grid the mask is off. The point is
     interpolated where the four grid pixels around are all valid and of one surface, else it is the nearest one's.
     Ray and inverse depth are what is interpolated: both are linear on a plane.
 
@@ -132,13 +143,13 @@ def to_frame(
         points: camera frame, metres, at the pixels of the grid.
         confidence: at least 1.
         mask: True where the point can be used.
-        resize: from the frame to the grid.
+        pixels: grid column of every column that is asked for, and grid row of every row.
         max_depth_step: relative depth difference above which pixels lie on different surfaces.
 
     Returns:
         Where the mask is off, the point is 0 and the confidence 1.
     """
-    columns, rows = frame_on_grid(resize)
+    columns, rows = pixels
     height, width = mask.shape
     column, row = np.floor(columns + 0.5).astype(int), np.floor(rows + 0.5).astype(int)
     is_inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))

@@ -9,8 +9,7 @@ import pytest
 from network_double import Double, Sphere, network_of
 from tiny_run import compose
 
-from emgs_jax.prior.base import Prior, windows
-from emgs_jax.prior.network.mapanything import relative_poses
+from emgs_jax.prior.base import Prior, relative_poses, windows
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 

@@ -1,0 +1,1 @@
+"""Predictions that stand in files, one a frame: `prior=files`."""

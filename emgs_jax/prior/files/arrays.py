@@ -1,0 +1,158 @@
+"""Arrays of files of anyone, checked: what is wrong is named with its file and key."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from emgs_jax.data.reading import decode, is_rigid, natural_key
+from emgs_jax.io.npz import npz_names, read_npz
+from emgs_jax.prior.files.view import Intrinsics, View, usable
+
+MAX_POSITION = 1e6  # in the unit of the file
+EXR_CHANNELS = ("Z", "Y", "R", "V")  # of which the first that is there is the depth
+
+
+def files_of(folder: Path, suffix: str) -> list[Path]:
+    """The files of a folder with a suffix, in natural order."""
+    found = (path for path in folder.glob(f"*{suffix}") if not path.name.startswith("."))
+    return sorted(found, key=lambda path: (natural_key(path), path.name))
+
+
+def load_npz(path: Path, names: Sequence[str] = (), optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
+    """Arrays of an .npz, compressed or not; ValueError names the file and what it lacks and has."""
+    try:
+        with path.open("rb") as handle:
+            return read_npz(handle, names, optional, may_be_compressed=True)
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{path}: {error}; it has {', '.join(names_in(path)) or 'nothing'}") from error
+
+
+def names_in(path: Path) -> list[str]:
+    """Names of the arrays of an .npz; none where it is none."""
+    try:
+        with path.open("rb") as handle:
+            return npz_names(handle)
+    except (ValueError, OSError):
+        return []
+
+
+def load_npy(path: Path) -> np.ndarray:
+    """The array of an .npy."""
+    try:
+        return np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise ValueError(f"{path} is no .npy that can be read ({error}): write it again") from error
+
+
+def load_png(path: Path, units_per_metre: float) -> np.ndarray:
+    """Depths of a 16-bit image, 0 where it has none (raw 0 and 65535)."""
+    raw = decode(path, cv2.IMREAD_UNCHANGED)
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise ValueError(f"{path} must be a 16-bit depth image with one channel, got {raw.dtype} {raw.shape}")
+    return np.where(raw == 65535, 0, raw).astype(np.float32) / np.float32(units_per_metre)
+
+
+def load_exr(path: Path) -> np.ndarray:
+    """Depths of an OpenEXR file; needs the package OpenEXR."""
+    try:
+        import OpenEXR  # noqa: PLC0415 (an extra)
+    except ImportError as error:
+        raise ValueError(f'{path}: EXR needs the package OpenEXR: pip install "emgs_jax[exr]"') from error
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    except Exception as error:  # the library raises what it likes
+        raise ValueError(f"{path} is no EXR that can be read ({error}): write it again") from error
+    known = [name for name in EXR_CHANNELS if name in channels] or [*channels][: len(channels) == 1]
+    if not known:
+        raise ValueError(f"{path} has the channels {', '.join(channels)}: one of {', '.join(EXR_CHANNELS)} is expected")
+    return channels[known[0]].astype(np.float32)
+
+
+def load_json(path: Path) -> Any:
+    """What a JSON file holds."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except (ValueError, OSError, RecursionError) as error:
+        raise ValueError(f"{path} is no JSON that can be read ({error}): write it again") from error
+
+
+def load_numbers(path: Path, shape: tuple[int, ...]) -> np.ndarray:
+    """A text file of numbers, inf and nan among them."""
+    try:
+        return np.array([float(word) for word in path.read_text(encoding="utf-8-sig").split()]).reshape(shape)
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{path} must hold numbers {shape} ({error}): write it again") from error
+
+
+def as_poses(values: Any, where: str) -> np.ndarray:
+    """T_world_camera (n, 4, 4) of (n, 3, 4), (n, 4, 4) or (n, 16); all of a pose is NaN where some is not finite."""
+    try:
+        poses = np.asarray(values, np.float64)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{where} must be a matrix of 4 by 4 numbers, camera -> world") from error
+    poses = poses.reshape(-1, 4, 4) if poses.shape[1:] == (16,) else poses
+    if poses.shape[1:] == (3, 4):
+        poses = np.concatenate([poses, np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (len(poses), 1, 4))], axis=1)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        raise ValueError(f"{where} must be a matrix of 4 by 4 numbers, camera -> world, got {poses.shape[1:]}")
+    poses = np.where(np.isfinite(poses).all((1, 2), keepdims=True), poses, np.nan)
+    for row in np.flatnonzero(np.isfinite(poses).all((1, 2))):
+        if not is_rigid(poses[row]) or np.abs(poses[row, :3, 3]).max() > MAX_POSITION:
+            name = where if len(poses) == 1 else f"{where}, row {row},"
+            raise ValueError(f"{name} is no rigid motion within {MAX_POSITION:g}: camera -> world is expected")
+    return poses
+
+
+def as_intrinsics(values: Any, where: str) -> Intrinsics:
+    """fx, fy, cx, cy of four numbers or a camera matrix (3, 3) or (4, 4)."""
+    try:
+        given = np.asarray(values, np.float64)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{where} must be [fx, fy, cx, cy] or a camera matrix") from error
+    if given.shape in ((3, 3), (4, 4)):
+        given = given[[0, 1, 0, 1], [0, 1, 2, 2]]
+    if given.shape != (4,) or not np.isfinite(given).all() or min(given[:2]) <= 0:
+        raise ValueError(f"{where} must be [fx, fy, cx, cy] or a camera matrix, in pixels of the file, got {values}")
+    return tuple(map(float, given))
+
+
+def as_view(
+    source: str, geometry: np.ndarray, confidence: np.ndarray | None = None, intrinsics: Intrinsics | None = None
+) -> View:
+    """A view, checked.
+
+    Args:
+        source: file, for messages.
+        geometry: depths (h, w) or (h, w, 1), or points (h, w, 3).
+        confidence: (h, w) or (h, w, 1), at least 1 where there is a depth.
+        intrinsics: of this grid.
+    """
+    geometry = _plane(geometry)
+    if geometry.dtype.kind not in "fui" or geometry.ndim not in (2, 3) or geometry.shape[2:] not in ((), (3,)):
+        raise ValueError(f"{source} must be depths (h, w) or points (h, w, 3), got {geometry.dtype} {geometry.shape}")
+    if min(geometry.shape[:2]) < 2:
+        raise ValueError(f"{source} is {geometry.shape[1]}x{geometry.shape[0]}, and must have two rows and columns")
+    if confidence is not None:
+        confidence = _plane(confidence)
+        if confidence.shape != geometry.shape[:2] or confidence.dtype.kind not in "fui":
+            raise ValueError(
+                f"{source}: confidence must be numbers {geometry.shape[:2]}, as what it is of, got {confidence.dtype} "
+                f"{confidence.shape}"
+            )
+        known = confidence[usable(geometry)]
+        if not (np.isfinite(known) & (known >= 1)).all():
+            least = np.nan if np.isnan(known).any() else known.min()
+            raise ValueError(
+                f"{source}: confidence must be at least 1 where there is a depth, and is {least:.3g}: of what begins "
+                "at 0, such as probabilities, give 1 + confidence"
+            )
+    return View(source, geometry, confidence, intrinsics)
+
+
+def _plane(values: np.ndarray) -> np.ndarray:
+    return values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values

@@ -1,0 +1,110 @@
+"""The layout of one's own: a file a frame, as docs/priors.md has it."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from emgs_jax.io.trajectory import load_trajectory_tum
+from emgs_jax.prior.files.arrays import (
+    as_intrinsics,
+    as_poses,
+    as_view,
+    files_of,
+    load_exr,
+    load_json,
+    load_npy,
+    load_npz,
+    load_png,
+    names_in,
+)
+from emgs_jax.prior.files.view import Predictions, View, whole_image
+
+SUFFIXES = (".npz", ".exr", ".npy", ".png")  # the first that is there is read
+POSES = ("poses.txt", "poses.json")
+GIVES_POSES = (
+    "prior=files needs poses beside depths, and finds none itself: prior=multiview_stereo finds poses and depths from "
+    "the images alone, prior=mapanything by a network"
+)
+
+
+def read_own(folder: Path, units_per_metre: float) -> Predictions:
+    """A folder with .npz, .exr, .npy or 16-bit .png files, and poses in the .npz, in poses.txt or in poses.json.
+
+    Raises:
+        ValueError: no such file, no poses, a file that is wrong.
+    """
+    suffix = next((suffix for suffix in SUFFIXES if files_of(folder, suffix)), None)
+    if suffix is None:
+        raise ValueError(
+            f"prior.folder={folder} has no file *{', *'.join(SUFFIXES)} and no layout that is known (docs/priors.md)"
+        )
+    paths = files_of(folder, suffix)
+    names = [path.stem for path in paths]
+    lists = [folder / name for name in POSES if (folder / name).is_file()]
+    if lists:
+        poses, source = _listed_poses(lists[0], names), str(lists[0])
+    elif suffix == ".npz":
+        poses, source = np.concatenate([_own_pose(path) for path in paths]), f"T_world_camera of {folder}/*.npz"
+    else:
+        raise ValueError(f"{folder} has {len(paths)} files *{suffix} and neither of {', '.join(POSES)}: {GIVES_POSES}")
+    if suffix == ".npz":
+        return Predictions(
+            "npz", names, poses, source, lambda row: _read_npz(paths[row]), paths + lists, True, whole_image
+        )
+    given = load_json(lists[0]).get("intrinsics") if lists[0].suffix == ".json" else None
+    intrinsics = None if given is None else as_intrinsics(given, f"{lists[0]}: intrinsics")
+    load = {".exr": load_exr, ".npy": load_npy, ".png": partial(load_png, units_per_metre=units_per_metre)}[suffix]
+
+    def read(row: int) -> View:
+        return as_view(str(paths[row]), load(paths[row]), None, intrinsics)
+
+    return Predictions(suffix[1:], names, poses, source, read, paths + lists, True, whole_image)
+
+
+def _own_pose(path: Path) -> np.ndarray:
+    """The pose (1, 4, 4) of an .npz; an error that says where poses are from where it has none."""
+    if "T_world_camera" not in names_in(path):
+        load_npz(path)  # where it is no .npz at all
+        raise ValueError(f"{path} lacks T_world_camera; it has {', '.join(names_in(path))}: {GIVES_POSES}")
+    return as_poses(load_npz(path, ("T_world_camera",))["T_world_camera"][None], f"{path}: T_world_camera")
+
+
+def _read_npz(path: Path) -> View:
+    arrays = load_npz(path, (), ("depth", "points", "confidence", "intrinsics"))
+    if ("depth" in arrays) == ("points" in arrays):
+        raise ValueError(f"{path} must have depth or points, one of them; it has {', '.join(names_in(path))}")
+    key = "depth" if "depth" in arrays else "points"
+    expected = (2, 3) if key == "depth" else (3,)
+    if arrays[key].ndim not in expected or (
+        arrays[key].ndim == 3 and arrays[key].shape[2] != (1 if key == "depth" else 3)
+    ):
+        raise ValueError(
+            f"{path}: {key} must be {'(h, w)' if key == 'depth' else '(h, w, 3)'}, got {arrays[key].shape}"
+        )
+    given = arrays.get("intrinsics")
+    intrinsics = None if given is None else as_intrinsics(given, f"{path}: intrinsics")
+    return as_view(f"{path}: {key}", arrays[key], arrays.get("confidence"), intrinsics)
+
+
+def _listed_poses(path: Path, names: list[str]) -> np.ndarray:
+    """Poses of a list, in the order of `names`: of TUM's format row by row, of JSON by name."""
+    if path.suffix == ".txt":
+        _, poses = load_trajectory_tum(path)
+        if len(poses) != len(names):
+            raise ValueError(
+                f"{path} has {len(poses)} poses for {len(names)} files: it must have one for each, in the order of "
+                "their names; or give poses.json, which has them by name"
+            )
+        return as_poses(poses, str(path))
+    given = load_json(path)
+    given = given.get("T_world_camera") if isinstance(given, dict) else None
+    if not isinstance(given, dict):
+        raise ValueError(f'{path} must hold {{"T_world_camera": {{"name of the file without suffix": [[...], ...]}}}}')
+    missing = [name for name in names if name not in given]
+    if missing:
+        raise ValueError(f"{path} lacks T_world_camera of {len(missing)} of {len(names)} files, first {missing[0]}")
+    rows = [np.full((4, 4), np.nan) if given[name] is None else given[name] for name in names]
+    return np.concatenate(
+        [as_poses([row], f"{path}: T_world_camera of {name}") for name, row in zip(names, rows, strict=True)]
+    )

@@ -1,0 +1,197 @@
+"""Predictions of anyone as a prior: a folder with one file a frame, or what other programs write.
+
+*Frame.* A file says where its camera is in one world, so every window gets the same answer about a frame: poses are
+relative to the anchor's, points in their own camera. Where the anchor has no pose they are in that world itself.
+
+*Scale.* Lengths are metres, or all of them, poses too, are multiplied by one factor, by which the median depth of the
+first view becomes `median_depth`.
+
+*Grid.* A file has a size of its own. Its pixels are those of the image, resized, and its points lie where its own
+intrinsics have them; without, on the rays of the data set's camera. Only sensors with a calibration of their own
+(ScanNet) are looked up ray by ray.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.data.reading import check_depth_scale, fingerprint
+from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, relative_poses
+from emgs_jax.prior.files.conventions import Sight, check_conventions
+from emgs_jax.prior.files.exports import find_export, read_cut3r, read_export
+from emgs_jax.prior.files.own import GIVES_POSES, read_own
+from emgs_jax.prior.files.scans import DEPTH_MAPS, read_colmap_workspace, read_record3d, read_scannet
+from emgs_jax.prior.files.view import Camera, Predictions, View, at_frame, grid_intrinsics, usable
+
+SCALES = ("auto", "metric", "arbitrary")
+ROOM = (0.05, 100.0)  # m, median depth of a view that is metric
+FOCAL_NOTE, FOCAL_ERROR = 1.03, 1.5  # ratio of the files' focal length and the data set's
+NUM_PAIRS, PAIR_GAP = 5, 5  # of views that are compared, and how many frames apart they are
+
+
+class Files(Prior):
+    """A prior that reads its answers from files.
+
+    Args:
+        folder: of one of the layouts that docs/priors.md lists, or an .npz with all images.
+        scale: `metric`, `arbitrary` (right up to one factor), or `auto`: what the layout is known to be.
+        median_depth: m, of the first view where the scale is arbitrary.
+        depth_scale: units of a metre in 16-bit .png files.
+        max_depth_step: relative depth difference across which nothing is interpolated.
+    """
+
+    def __init__(
+        self, folder: Path | str, scale: str, median_depth: float, depth_scale: float, max_depth_step: float
+    ) -> None:
+        if scale not in SCALES:
+            raise ValueError(f"prior.scale must be one of {', '.join(SCALES)}, got {scale!r}")
+        if not 0 < median_depth < np.inf:
+            raise ValueError(f"prior.median_depth must be above 0 m, got {median_depth}")
+        self.folder = Path(folder).expanduser()
+        self._found = read_predictions(self.folder, check_depth_scale(depth_scale, "prior.depth_scale"))
+        if not np.isfinite(self._found.poses).all((1, 2)).any():
+            raise ValueError(f"{self._found.pose_source}: none of {len(self._found.poses)} is known: {GIVES_POSES}")
+        self._max_depth_step = float(max_depth_step)
+        self._is_metric = self._found.is_metric if scale == "auto" else scale == "metric"
+        self._factor = 1.0 if self._is_metric else median_depth / self._first_depth()[1]
+        self._rows: list[int | None] = []  # of the frames
+        self._points: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}  # of the last window, by frame
+        settings = {"layout": self._found.layout, "scale": "metric" if self._is_metric else "arbitrary"}
+        settings |= {} if self._is_metric else {"median_depth": float(median_depth)}
+        settings |= {"depth_scale": float(depth_scale), "max_depth_step": self._max_depth_step}
+        settings |= {"fingerprint": fingerprint(self.folder, self._found.files, {})}
+        self.provenance = Provenance("files", settings)
+
+    def check(self, dataset: Dataset, window_size: int) -> None:
+        """Say what was found; ValueError where it does not fit the data set or itself."""
+        found = self._found
+        self._rows = rows_of(dataset, found, self.folder)
+        known = [index for index, row in enumerate(self._rows) if row is not None]
+        camera = Camera((dataset.size[0], dataset.size[1]), dataset.intrinsics)
+        view, depth = self._first_depth()
+        if self._is_metric and not ROOM[0] <= depth <= ROOM[1]:
+            raise ValueError(
+                f"{view.source} has a median of {depth:.4g}, which is no depth in metres: write metres, give "
+                "prior.depth_scale (units of a metre in .png files; 1000: mm), or prior.scale=arbitrary"
+            )
+        scale = "metres" if self._is_metric else f"up to scale, times {self._factor:.4g}"
+        lacking = f", {len(self._rows) - len(known)} frames have none" if len(known) < len(self._rows) else ""
+        tqdm.write(
+            f"prior=files: {self.folder}, layout {found.layout}, {scale}{lacking}{_focal_note(view, camera, found)}"
+        )
+        check_conventions(self._pairs(known, camera), dataset.intrinsics, found.pose_source)
+
+    def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
+        """What the files say of the views; `check` comes first, as it finds whose file is whose."""
+        if not self._rows:
+            raise ValueError("Files.check(dataset, window_size) finds which file is of which frame: call it first")
+        size = frames[0].image.shape[1::-1]
+        camera = Camera((size[0], size[1]), intrinsics)
+        poses = np.stack([self._pose(index) for index in window.views])
+        T_anchor_view = relative_poses(poses) if np.isfinite(poses[0]).all() else poses
+        before, self._points = self._points, {}
+        for index in window.dense:
+            self._points[index] = before.get(index) or self._at_frame(index, camera)
+        points, confidence, mask = (np.stack(parts) for parts in zip(*self._points.values(), strict=True))
+        return PriorPrediction(window, T_anchor_view, points, confidence, mask, np.zeros((*mask.shape, 0), np.float16))
+
+    def _pose(self, index: int) -> np.ndarray:
+        """T_world_camera of a frame, NaN where it has none."""
+        row = self._rows[index]
+        pose = np.full((4, 4), np.nan) if row is None else self._found.poses[row].copy()
+        pose[:3, 3] *= self._factor
+        return pose
+
+    def _at_frame(self, index: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points, confidence and mask of a frame; without a pose or a file none can be used."""
+        width, height = camera.size
+        row = self._rows[index]
+        if row is None or not np.isfinite(self._found.poses[row]).all():
+            shape = height, width
+            return np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, bool)
+        view = self._found.read(row)
+        points, confidence, mask = at_frame(view, camera, self._found.place, self._max_depth_step)
+        return points * np.float32(self._factor), confidence, mask
+
+    def _first_depth(self) -> tuple[View, float]:
+        """The first view that has a depth, and its median."""
+        for row in range(len(self._found.names)):
+            view = self._found.read(row)
+            depth = view.geometry if view.geometry.ndim == 2 else view.geometry[..., 2]
+            if usable(view.geometry).any():
+                return view, float(np.median(depth[usable(view.geometry)]))
+        raise ValueError(f"{self.folder}: none of its {len(self._found.names)} files has a depth above 0")
+
+    def _pairs(self, known: list[int], camera: Camera) -> list[tuple[Sight, Sight]]:
+        """Views with a pose, some frames apart, from all of the sequence."""
+        known = [index for index in known if np.isfinite(self._pose(index)).all()]
+        places = np.linspace(0, max(len(known) - 1 - PAIR_GAP, 0), NUM_PAIRS).astype(int)
+        chosen = {(known[place], known[min(place + PAIR_GAP, len(known) - 1)]) for place in places}
+        sights = {}
+        for index in sorted({index for pair in chosen for index in pair}):
+            points, _, mask = self._at_frame(index, camera)
+            sights[index] = Sight(points, mask, self._pose(index))
+        return [(sights[a], sights[b]) for a, b in sorted(chosen) if a != b]
+
+
+def read_predictions(folder: Path, units_per_metre: float) -> Predictions:
+    """What a folder holds, whose layout is told by the files that are there."""
+    if not folder.exists():
+        raise ValueError(f"prior.folder={folder} does not exist: give the folder of the predictions (docs/priors.md)")
+    export = find_export(folder)
+    if export is not None:
+        return read_export(export)
+    if (folder / DEPTH_MAPS).is_dir():
+        return read_colmap_workspace(folder)
+    if (folder / "depth").is_dir() and (folder / "camera").is_dir():
+        return read_cut3r(folder)
+    if (folder / "depth").is_dir() and (folder / "pose").is_dir():
+        return read_scannet(folder)
+    if (folder / "depth").is_dir() and (folder / "metadata.json").is_file():
+        return read_record3d(folder)
+    return read_own(folder, units_per_metre)
+
+
+def rows_of(dataset: Dataset, found: Predictions, folder: Path) -> list[int | None]:
+    """Row of every frame: by the names of the images, or in order where these say nothing.
+
+    Raises:
+        ValueError: a frame has no file, or there are not as many files as frames.
+    """
+    files = [dataset.files(index)[:1] for index in range(len(dataset))]
+    stems = [file[0].stem if file else "" for file in files]
+    rows = {name: row for row, name in enumerate(found.names)}
+    if len({*stems}) == len(stems) and {*stems} & rows.keys():
+        missing = [stem for stem in stems if stem not in rows]
+        if missing and not found.may_lack:
+            raise ValueError(
+                f"{folder} has no file for {len(missing)} of {len(stems)} frames, the first is {missing[0]}: predict "
+                "it, write one whose T_world_camera is nan, or leave the frame out (dataset.start, stop, stride)"
+            )
+        return [rows.get(stem) for stem in stems]
+    if len(found.names) != len(dataset):
+        raise ValueError(
+            f"{folder} has {len(found.names)} predictions ({found.names[0]} ...) and the data set {len(dataset)} "
+            f"frames ({stems[0] or 'without names'} ...), and their names do not tell which is whose: name the files "
+            "as the images, or choose the frames that were predicted (dataset.start, stop, stride)"
+        )
+    return list(range(len(dataset)))
+
+
+def _focal_note(view: View, camera: Camera, found: Predictions) -> str:
+    """Words where the intrinsics of a file are not those of the data set; ValueError where they cannot be."""
+    if view.intrinsics is None:
+        return ""
+    expected = grid_intrinsics(camera, found.place(camera, view))
+    ratio = view.intrinsics[0] / expected[0]
+    words = (
+        f"{view.source}: intrinsics say f = {view.intrinsics[0]:.1f}, and dataset.intrinsics {expected[0]:.1f} there"
+    )
+    if not 1 / FOCAL_ERROR < ratio < FOCAL_ERROR:
+        raise ValueError(f"{words}: give those of the file's own size ({view.grid[0]}x{view.grid[1]}), or correct one")
+    if 1 / FOCAL_NOTE < ratio < FOCAL_NOTE:
+        return ""
+    return f"; {words}: points lie where the files' have them; dataset.intrinsics times {ratio:.3f} would agree"

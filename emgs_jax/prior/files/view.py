@@ -1,0 +1,149 @@
+"""One frame's prediction as a file has it, and its points at the pixels of the frame."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from emgs_jax.data.backprojection import backproject
+from emgs_jax.data.reading import Size
+from emgs_jax.prior.network.resize import at_pixels
+
+Intrinsics = tuple[float, float, float, float]
+MAX_ASPECT_ERROR = 0.05  # of what shows a whole image: networks round a side to whole patches
+LEAST_DEPTH = 1e-6  # below: no value
+
+
+@dataclass(frozen=True)
+class View:
+    """What a file says of one frame, on a grid (gh, gw) of its own.
+
+    Args:
+        source: the file, for messages.
+        geometry: depths (camera-space z) (gh, gw), or points (gh, gw, 3) of the camera; 0 or not finite = no value.
+        confidence: (gh, gw), at least 1; None = all alike.
+        intrinsics: fx, fy, cx, cy of the grid; None = those of the frames.
+    """
+
+    source: str
+    geometry: np.ndarray
+    confidence: np.ndarray | None = None
+    intrinsics: Intrinsics | None = None
+
+    @property
+    def grid(self) -> Size:
+        """(width, height)."""
+        return self.geometry.shape[1], self.geometry.shape[0]
+
+
+class Camera(NamedTuple):
+    """The camera of the frames: (width, height) and fx, fy, cx, cy there."""
+
+    size: Size
+    intrinsics: Sequence[float]
+
+    @property
+    def aspect(self) -> float:
+        """Of the image as it was taken, whose pixels are square, however the frames are resized."""
+        (width, height), (fx, fy, *_) = self.size, self.intrinsics
+        return width * fy / (height * fx)
+
+
+class Part(NamedTuple):
+    """Which part of the image a grid shows: the whole image in the grid's pixels, and where the grid begins in it."""
+
+    scaled: tuple[float, float]
+    corner: tuple[float, float]
+
+
+Place = Callable[[Camera, View], Part]
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """What a folder holds.
+
+    Args:
+        layout: its name, for people.
+        names: of each view: the stem of its image's name, or its own.
+        poses: T_world_camera (n, 4, 4), NaN where it is not known.
+        pose_source: file and key of the poses, for messages.
+        read: the view of a row.
+        files: all that is read.
+        is_metric: lengths are metres.
+        may_lack: a frame without a view is one that the program could not solve.
+        place: what the grids show of the image.
+    """
+
+    layout: str
+    names: list[str]
+    poses: np.ndarray
+    pose_source: str
+    read: Callable[[int], View]
+    files: list[Path]
+    is_metric: bool
+    place: Place
+    may_lack: bool = False
+
+
+def whole_image(camera: Camera, view: View) -> Part:
+    """Of a grid that shows the whole image, whatever its size; ValueError where its sides say that it does not."""
+    width, height = view.grid
+    if abs(math.log(width / height / camera.aspect)) > MAX_ASPECT_ERROR:
+        raise ValueError(
+            f"{view.source} is {width}x{height} and the image {camera.aspect:.3f} times as wide as high: a file must "
+            "show the whole image; where it was cropped, write it onto the whole image with 0 where nothing is known"
+        )
+    return Part((width, height), (0, 0))
+
+
+def by_rays(camera: Camera, view: View) -> Part:
+    """Of a sensor with a calibration of its own, at the place of the camera: a pixel is where its ray is."""
+    assert view.intrinsics is not None
+    (width, height), (fx, fy, cx, cy) = camera.size, view.intrinsics
+    x, y = fx / camera.intrinsics[0], fy / camera.intrinsics[1]
+    corner = (camera.intrinsics[2] + 0.5) * x - 0.5 - cx, (camera.intrinsics[3] + 0.5) * y - 0.5 - cy
+    return Part((width * x, height * y), corner)
+
+
+def at_frame(
+    view: View, camera: Camera, place: Place, max_depth_step: float
+) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Points, confidence and mask of a view at every pixel of the frame, see `resize.at_pixels`.
+
+    The points lie where the view's own calibration has them, at the pixel that shows the same of the image.
+
+    Raises:
+        ValueError: the view does not show what it should.
+    """
+    scaled, corner = place(camera, view)
+    mask = usable(view.geometry)
+    confidence = np.ones(mask.shape) if view.confidence is None else view.confidence
+    geometry = np.where(mask if view.geometry.ndim == 2 else mask[..., None], view.geometry, 0)
+    intrinsics = view.intrinsics or grid_intrinsics(camera, Part(scaled, corner))
+    points = backproject(geometry, intrinsics) if geometry.ndim == 2 else geometry
+    columns, rows = (
+        (np.arange(size) + 0.5) * (length / size) - 0.5 - start
+        for size, length, start in zip(camera.size, scaled, corner, strict=True)
+    )
+    on_grid = points.astype(np.float32), np.where(mask, confidence, 1).astype(np.float32), mask
+    return at_pixels(*on_grid, (columns, rows), max_depth_step)
+
+
+def usable(geometry: Float[np.ndarray, "gh gw *c"]) -> Bool[np.ndarray, "gh gw"]:
+    """Where a view has a depth or a point."""
+    depth = geometry if geometry.ndim == 2 else geometry[..., 2]
+    with np.errstate(invalid="ignore"):
+        is_before = depth > LEAST_DEPTH
+    return is_before & (np.isfinite(geometry) if geometry.ndim == 2 else np.isfinite(geometry).all(-1))
+
+
+def grid_intrinsics(camera: Camera, part: Part) -> Intrinsics:
+    """fx, fy, cx, cy of a grid that has the rays of the frames."""
+    (x, y), (left, top) = (length / size for length, size in zip(part.scaled, camera.size, strict=True)), part.corner
+    fx, fy, cx, cy = camera.intrinsics
+    return fx * x, fy * y, (cx + 0.5) * x - 0.5 - left, (cy + 0.5) * y - 0.5 - top

@@ -1,0 +1,85 @@
+"""`emgs run video.mp4`: what a video or a folder of images alone implies; keys that are given win."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+VALUED = ("--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--config-path", "-cp", "--config-dir", "-cd")
+NUM_PIXELS, SIDE = 320 * 240, 16  # of a frame, and what its sides are multiples of
+
+
+def with_source(arguments: list[str]) -> list[str]:
+    """The arguments of `emgs run` with the keys that a path among them stands for, which are printed.
+
+    Raises:
+        ValueError: a word is neither a key with a value, nor an option, nor a path, or there are several paths.
+    """
+    paths = [row for row, word in enumerate(arguments) if _is_path(word, arguments[:row])]
+    if not paths:
+        return arguments
+    if len(paths) > 1:
+        words = ", ".join(arguments[row] for row in paths)
+        raise ValueError(f"{words}: give one video or folder of images, and all else as key=value")
+    path = Path(arguments[paths[0]]).expanduser()
+    if not path.exists():
+        raise ValueError(f"{path} is no file or folder, and no key=value: emgs run --help lists the keys")
+    given = [word for row, word in enumerate(arguments) if row != paths[0]]
+    found = implied(path, keys_of(given))
+    print(f"{path}: {' '.join(found)}; keys that you give win")
+    return [*found, *given]
+
+
+def keys_of(arguments: Sequence[str]) -> dict[str, str]:
+    """Key and value of each override."""
+    return dict(word.lstrip("+~").split("=", 1) for word in arguments if "=" in word and not word.startswith("-"))
+
+
+def implied(path: Path, given: dict[str, str]) -> list[str]:
+    """The overrides that a video or folder of images stands for, without those whose key is given."""
+    if given.get("dataset", "images") != "images":
+        return [f"dataset.root={_quoted(path)}"]
+    found = {"dataset": "images", "dataset.root": _quoted(path)}
+    if "dataset.size" not in given or "dataset.intrinsics" not in given:
+        size, intrinsics = _look(path)
+        found |= {"dataset.size": f"[{size[0]},{size[1]}]", "dataset.intrinsics": intrinsics}
+    if given.get("prior", "multiview_stereo") == "multiview_stereo":
+        found["prior"] = "multiview_stereo"
+        if "baseline" not in given:  # it fuses frames where they were placed, the back end moves them afterwards
+            found["graph"] = "up_to_scale"
+    return [f"{key}={value}" for key, value in found.items() if key not in given]
+
+
+def frame_size(width: int, height: int) -> tuple[int, int]:
+    """(width, height) with the shape of an image and about as many pixels as the frames of the data sets."""
+    scale = math.sqrt(NUM_PIXELS / (width * height))
+    return max(round(width * scale / SIDE), 1) * SIDE, max(round(height * scale / SIDE), 1) * SIDE
+
+
+def _look(path: Path) -> tuple[tuple[int, int], str]:
+    """The size of frames, and `exif` where the first image says its focal length, else `estimate`."""
+    from emgs_jax.data.images import VIDEO_SUFFIXES, Folder, Video
+    from emgs_jax.data.intrinsics import exif_focal_length
+
+    if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
+        return frame_size(*Video(path).find_size(range(1))), "estimate"
+    images = Folder(path)
+    if images.count == 0:
+        raise ValueError(f"{path} has no images, and is no video")
+    size = images.find_size(range(images.count))
+    try:
+        has_exif = exif_focal_length(images.file(0), size) is not None
+    except (OSError, SyntaxError, ValueError):  # Pillow's for what is no image, and of an image that was cut
+        has_exif = False
+    return frame_size(*size), "exif" if has_exif else "estimate"
+
+
+def _is_path(word: str, before: Sequence[str]) -> bool:
+    """Whether a word is no override (~key deletes one), no option and no value of one."""
+    is_other = "=" in word or word.startswith("-") or (word.startswith("~") and not word.startswith("~/"))
+    return not is_other and (not before or before[-1] not in VALUED)
+
+
+def _quoted(path: Path) -> str:
+    """A path as Hydra's grammar reads it."""
+    text = str(path)
+    return text if all(c.isalnum() or c in "/._-" for c in text) else "'" + text.replace("'", r"\'") + "'"

@@ -1,0 +1,59 @@
+"""Poses that depths contradict: against views of a wall and a floor, which are known in closed form."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.data.backprojection import backproject
+from emgs_jax.prior.files.conventions import Sight, check_conventions, misfit
+
+INTRINSICS, SIZE = (60.0, 60.0, 31.5, 23.5), (48, 64)
+
+
+def sight(pose: np.ndarray, said: np.ndarray | None = None, noise: float = 0.0) -> Sight:
+    """What a camera sees of the wall z = 3 and the floor y = 1; `said`: what is said of its pose."""
+    rays = backproject(np.ones(SIZE), INTRINSICS) @ pose[:3, :3].T
+    with np.errstate(divide="ignore"):
+        wall, floor = (3 - pose[2, 3]) / rays[..., 2], (1 - pose[1, 3]) / rays[..., 1]
+    depth = np.minimum(np.where(wall > 0, wall, np.inf), np.where(floor > 0, floor, np.inf))
+    depth = np.where(np.isfinite(depth), depth, 0) * np.exp(noise * np.random.default_rng(0).normal(size=SIZE))
+    return Sight(backproject(depth, INTRINSICS), depth > 0, pose if said is None else said)
+
+
+def pose(turn: float, x: float, z: float) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec([0.05, turn, 0.02]).as_matrix(), (x, 0, z)
+    return T
+
+
+A, B = pose(0.1, 0.2, 0.1), pose(-0.15, -0.3, 0.5)
+
+
+def test_true_poses_fit_and_others_do_not():
+    assert misfit(sight(A), sight(B), np.linalg.inv(A) @ B, INTRINSICS) < 0.01  # to the nearest pixel
+    assert misfit(sight(A), sight(B), np.linalg.inv(B) @ A, INTRINSICS) > 0.05
+    assert misfit(sight(A), sight(B), pose(3.0, 0, 0), INTRINSICS) == np.inf
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_right_poses_are_left_alone_however_noisy_the_depths(noise):
+    check_conventions([(sight(A, noise=noise), sight(B, noise=noise))], INTRINSICS, "poses")
+
+
+def test_views_that_share_nothing_say_nothing():
+    check_conventions([(sight(A), sight(pose(2.0, 0, 0)))], INTRINSICS, "poses")
+    check_conventions([], INTRINSICS, "poses")
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        (np.linalg.inv, "as world -> camera:"),
+        (lambda T: T * [1, -1, -1, 1], "as camera -> world of OpenGL's axes:"),
+        (lambda T: np.linalg.inv(T * [1, -1, -1, 1]), "as world -> camera of OpenGL's axes:"),
+        (lambda T: T * np.where(np.eye(4)[3] > 0, [[1000]] * 3 + [[1]], 1), "as in millimetres:"),
+    ],
+)
+def test_a_pose_of_another_convention_is_named(said, words):
+    with pytest.raises(ValueError, match=f"poses.txt: the depths .*{words}"):
+        check_conventions([(sight(A, said(A)), sight(B, said(B)))], INTRINSICS, "poses.txt")

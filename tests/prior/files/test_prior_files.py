@@ -1,0 +1,348 @@
+"""`prior=files`: against the exact prior, the truth that was written, and analytic planes."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import jax
+import numpy as np
+import pytest
+import tiny_run
+from written_predictions import KEYS, Named, asked, by_frame, truth, write_npz
+
+from emgs_jax.data.backprojection import backproject
+from emgs_jax.io.trajectory import save_trajectory_tum
+from emgs_jax.prior.base import Prior, relative_poses
+from emgs_jax.prior.files.prior import Files
+from emgs_jax.prior.files.view import Camera, View, at_frame, whole_image
+from emgs_jax.running import configure
+from experiments.command import check_arguments
+
+NAMES = Named().names
+SIZE = (48, 64)
+
+
+@pytest.fixture
+def own(tmp_path):
+    return write_npz(tmp_path / "own", NAMES)
+
+
+class Describing(Prior):
+    """Files with the features and the confidence of the exact prior, so that a run has the shapes of the exact one."""
+
+    def __init__(self, files: Files) -> None:
+        self._files, self._exact = files, tiny_run.EditedPrior()
+        self.provenance, self.feature_names = self._exact.provenance, self._exact.feature_names
+        self.text_features = self._exact.text_features
+
+    def predict(self, window, frames, intrinsics):
+        exact = self._exact.predict(window, frames, intrinsics)
+        found = self._files.predict(window, frames, intrinsics)
+        return replace(found, features=exact.features, confidence=exact.confidence)
+
+
+def test_true_depths_and_poses_make_the_map_of_an_exact_prior_bit_for_bit(own):
+    prior, _ = asked(own)
+    run, maps = tiny_run.map_tiny(tiny_run.dataset(), Describing(prior))
+    exact, exact_maps = tiny_run.exact()
+    for found, expected in zip(jax.tree.leaves(maps[-1]), jax.tree.leaves(exact_maps[-1]), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    assert [record.status for record in run.records] == [record.status for record in exact.records]
+
+
+def test_every_window_says_the_same_of_a_frame_and_poses_are_relative_to_the_anchor(own):
+    _, predictions = asked(own)
+    poses = np.stack([frame.T_world_camera for frame in truth()])
+    expected = backproject(np.stack([frame.depth for frame in truth()]), tiny_run.dataset().intrinsics)
+    for prediction in predictions:
+        views = list(prediction.window.views)
+        np.testing.assert_allclose(prediction.T_anchor_view, relative_poses(poses[views]), atol=1e-12)
+        np.testing.assert_array_equal(prediction.points, expected[list(prediction.window.dense)].astype(np.float32))
+        assert prediction.features.shape == (len(prediction.window.dense), *SIZE, 0)
+        assert prediction.confidence.dtype == np.float32 and np.all(prediction.confidence == 1)
+
+
+def write_depths(folder: Path, suffix: str) -> None:
+    folder.mkdir()
+    for name, frame in zip(NAMES, truth(), strict=True):
+        path = folder / f"{name}{suffix}"
+        if suffix == ".png":
+            cv2.imwrite(str(path), np.rint(frame.depth * 1000).astype(np.uint16))
+        elif suffix == ".npy":
+            np.save(path, frame.depth)
+        else:
+            openexr = pytest.importorskip("OpenEXR")
+            header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+            with openexr.File(header, {"Z": frame.depth}) as file:
+                file.write(str(path))
+
+
+def write_poses(folder: Path, suffix: str, **more) -> None:
+    poses = [frame.T_world_camera for frame in truth()]
+    if suffix == ".txt":
+        save_trajectory_tum(folder / "poses.txt", range(len(poses)), poses)
+    else:
+        named = {name: pose.tolist() for name, pose in zip(NAMES, poses, strict=True)}
+        (folder / "poses.json").write_text(json.dumps({"T_world_camera": named} | more))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "poses", "tolerance"),
+    [(".png", ".txt", 0.9e-3), (".exr", ".json", 1e-6), (".npy", ".json", 1e-6)],  # half a millimetre along the ray
+)
+def test_depth_images_with_a_list_of_poses_say_the_same_as_npz(suffix, poses, tolerance, own, tmp_path):
+    folder = tmp_path / "images"
+    write_depths(folder, suffix)
+    write_poses(folder, poses)
+    _, expected = asked(own)
+    _, found = asked(folder)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one.points, other.points, atol=tolerance)
+        np.testing.assert_allclose(one.T_anchor_view, other.T_anchor_view, atol=1e-8)  # of nine digits
+        np.testing.assert_array_equal(one.mask, other.mask)
+
+
+def test_points_say_what_depths_do(own, tmp_path):
+    intrinsics = tiny_run.dataset().intrinsics
+    points = write_npz(tmp_path / "points", NAMES, depth=None, points=lambda f: backproject(f.depth, intrinsics))
+    for one, other in zip(asked(points)[1], asked(own)[1], strict=True):
+        np.testing.assert_array_equal(one.points, other.points)
+
+
+def plane(camera: Camera) -> np.ndarray:
+    """Depths of z (n · ray) = 2 at every pixel."""
+    rays = backproject(np.ones(camera.size[::-1]), camera.intrinsics)
+    return 2 / (rays @ [0.2, -0.1, 1.0])
+
+
+@pytest.mark.parametrize("grid", [(128, 96), (32, 24), (70, 50), (64, 48)])
+@pytest.mark.parametrize("longer", [None, 1.04])
+def test_a_file_of_any_size_shows_the_same_plane_on_its_own_rays(grid, longer):
+    """Between pixels as well; `longer`: the file's focal length in that of the data set, None: it has none."""
+    camera = Camera((64, 48), (60.0, 61.0, 31.0, 24.5))
+    x, y = grid[0] / 64, grid[1] / 48
+    same = (60.0 * x, 61.0 * y, 31.5 * x - 0.5, 25.0 * y - 0.5)
+    intrinsics = same if longer is None else (same[0] * longer, same[1] * longer, *same[2:])
+    depth = plane(Camera(grid, intrinsics))
+    view = View("file", depth, None, None if longer is None else intrinsics)
+    points, _, mask = at_frame(view, camera, whole_image, 0.1)
+    inner = np.s_[2:-2, 2:-2]  # at the edge of a coarser grid the nearest pixel stands for what lies beyond
+    assert mask.all()
+    np.testing.assert_allclose(points[inner] @ [0.2, -0.1, 1.0], 2, atol=1e-5)
+    rays = backproject(np.ones((48, 64)), camera.intrinsics)
+    scale = np.array([longer or 1.0] * 2 + [1.0])
+    np.testing.assert_allclose((points / points[..., 2:])[inner] * scale, rays[inner], atol=1e-5)
+
+
+def test_where_a_file_has_no_value_there_is_no_point(tmp_path):
+    def holed(frame):
+        depth = frame.depth.copy()
+        depth[:2], depth[2:4], depth[4:6] = 0, np.nan, np.inf
+        return depth
+
+    _, predictions = asked(write_npz(tmp_path / "holed", NAMES, depth=holed, confidence=lambda f: f.depth + 1))
+    for index, (points, mask, confidence) in by_frame(predictions).items():
+        assert not mask[:6].any() and mask[6:].all()
+        assert not points[:6].any() and np.all(confidence[:6] == 1)
+        np.testing.assert_allclose(confidence[6:], truth()[index].depth[6:] + 1, rtol=1e-6)
+
+
+def test_what_is_right_up_to_a_factor_gets_the_median_depth_that_is_asked_for(own, tmp_path):
+    def far(frame):
+        pose = frame.T_world_camera.copy()
+        pose[:3, 3] *= 700
+        return pose
+
+    folder = write_npz(tmp_path / "far", NAMES, depth=lambda f: f.depth * 700, T_world_camera=far)
+    median = float(np.median(truth()[0].depth))
+    prior, found = asked(folder, scale="arbitrary", median_depth=1.5)
+    for one, other in zip(found, asked(own)[1], strict=True):
+        np.testing.assert_allclose(one.points, other.points * 1.5 / median, rtol=1e-5, atol=1e-6)
+        expected = other.T_anchor_view.copy()
+        expected[:, :3, 3] *= 1.5 / median
+        np.testing.assert_allclose(one.T_anchor_view, expected, atol=1e-6)
+    assert prior.provenance.settings["scale"] == "arbitrary" and prior.provenance.settings["median_depth"] == 1.5
+
+
+@pytest.mark.parametrize("lost", [0, 2])
+def test_a_frame_whose_pose_is_not_known_has_no_points_and_the_others_stay_in_one_frame(lost, tmp_path):
+    unknown = lambda f: np.full((4, 4), np.nan) if f.index == lost else f.T_world_camera  # noqa: E731
+    _, predictions = asked(write_npz(tmp_path / "lost", NAMES, T_world_camera=unknown))
+    first = np.eye(4) if lost == 0 else np.linalg.inv(truth()[0].T_world_camera)
+    for prediction in predictions:
+        for row, index in enumerate(prediction.window.views):
+            expected = np.full((4, 4), np.nan) if index == lost else first @ truth()[index].T_world_camera
+            np.testing.assert_allclose(prediction.T_anchor_view[row], expected, atol=1e-12)
+        for row, index in enumerate(prediction.window.dense):
+            assert prediction.mask[row].any() == (index != lost)
+
+
+def test_files_are_found_by_the_name_of_the_image_and_else_by_their_order(own, tmp_path):
+    """IMG_13 comes after IMG_8, and a video has no names."""
+    expected = by_frame(asked(own)[1])
+    turned = Named(names=NAMES[::-1])
+    for index, (points, *_) in by_frame(asked(own, turned)[1]).items():
+        np.testing.assert_array_equal(points, expected[len(NAMES) - 1 - index][0])
+    video = Named(names=["walk"] * len(NAMES), suffix=".mp4")
+    for index, (points, *_) in by_frame(asked(own, video)[1]).items():
+        np.testing.assert_array_equal(points, expected[index][0])
+
+
+def test_the_provenance_tells_files_apart_by_what_they_hold(own, tmp_path):
+    other = write_npz(tmp_path / "other", NAMES, depth=lambda f: f.depth + 1e-3)
+    same = write_npz(tmp_path / "same", NAMES)
+    settings = [Files(folder, **KEYS).provenance.settings for folder in (own, other, same)]
+    assert settings[0] == settings[2] != settings[1] and settings[0]["scale"] == "metric"
+
+
+def test_what_was_found_is_one_line_and_says_by_how_much_focal_lengths_differ(tmp_path, capsys):
+    fx, fy, cx, cy = tiny_run.dataset().intrinsics
+    near = write_npz(tmp_path / "near", NAMES, intrinsics=lambda f: [fx * 1.02, fy * 1.02, cx, cy])
+    asked(near)
+    assert capsys.readouterr().out.splitlines() == [f"prior=files: {near}, layout npz, metres"]
+    far = write_npz(tmp_path / "far", NAMES, intrinsics=lambda f: np.diag([fx * 1.1, fy * 1.1, 1]) + [[0, 0, cx]] * 3)
+    with pytest.raises(ValueError, match=r"camera matrix|intrinsics"):  # a matrix with numbers below the diagonal
+        asked(write_npz(tmp_path / "no", NAMES, intrinsics=lambda f: [fx, fy, cx]))
+    asked(far)
+    assert "dataset.intrinsics times 1.100 would agree" in capsys.readouterr().out
+
+
+def matrix(frame, **scaled):
+    pose = frame.T_world_camera.copy()
+    pose[:3, 3] *= scaled.get("unit", 1)
+    pose[:3, :3] *= scaled.get("turn", 1)
+    return pose
+
+
+FAULTS = {
+    "no poses": ({"T_world_camera": None}, r"IMG_8.npz lacks T_world_camera; it has depth.*multiview_stereo"),
+    "neither": ({"depth": None}, r"IMG_8.npz must have depth or points, one of them; it has T_world_camera"),
+    "a row": ({"depth": lambda f: f.depth.ravel()}, r"IMG_8.npz: depth must be \(h, w\), got \(3072,\)"),
+    "cropped": ({"depth": lambda f: f.depth[:, :30]}, r"IMG_8.npz: depth is 30x48 .* must show the whole image"),
+    "mm": ({"depth": lambda f: f.depth * 1000}, r"IMG_8.npz: depth has a median of \d+, which is no depth in metres"),
+    "no rotation": ({"T_world_camera": lambda f: matrix(f, turn=2)}, r"IMG_8.npz: T_world_camera is no rigid motion"),
+    "poses in mm": (
+        {"T_world_camera": lambda f: matrix(f, unit=1000)},
+        r"T_world_camera of .*own/\*\.npz: the depths of two views .* are taken as in mill",
+    ),
+    "inverse": (
+        {"T_world_camera": lambda f: np.linalg.inv(f.T_world_camera)},
+        "are taken as world -> camera: expected are camera -> world",
+    ),
+    "OpenGL": (
+        {"T_world_camera": lambda f: f.T_world_camera * [1, -1, -1, 1]},
+        "are taken as camera -> world of OpenGL's axes",
+    ),
+    "probabilities": (
+        {"confidence": lambda f: np.full(SIZE, 0.3)},
+        r"IMG_8.npz: depth: confidence must be at least 1 .* is 0.3: .* give 1 \+ confidence",
+    ),
+    "confidence of another size": (
+        {"confidence": lambda f: np.ones((4, 5))},
+        r"confidence must be numbers \(48, 64\)",
+    ),
+    "intrinsics of the image": ({"intrinsics": lambda f: [999, 999, 320, 240]}, r"own size \(64x48\)"),
+    "nothing to see": ({"depth": lambda f: f.depth * np.nan}, "none of its 6 files has a depth above 0"),
+    "never known": ({"T_world_camera": lambda f: np.full((4, 4), np.nan)}, "none of 6 is known"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_is_wrong_is_named_with_file_and_key(fault, tmp_path):
+    changes, message = FAULTS[fault]
+    with pytest.raises(ValueError, match=message):
+        asked(write_npz(tmp_path / "own", NAMES, **changes))
+
+
+def test_a_file_that_is_missing_too_many_or_no_file_at_all_is_named(own, tmp_path):
+    with pytest.raises(ValueError, match=r"does not exist: give the folder"):
+        asked(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match=r"has no file \*.npz, \*.exr"):
+        asked(tmp_path)
+    with pytest.raises(ValueError, match=r"has 6 predictions \(IMG_8 ...\) and the data set 5 frames \(a ...\)"):
+        asked(own, Named(names=["a", "b", "c", "d", "e"]))
+    (own / "IMG_9.npz").unlink()
+    with pytest.raises(ValueError, match=r"has no file for 1 of 6 frames, the first is IMG_9"):
+        asked(own)
+    (own / "IMG_9.npz").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"IMG_9.npz: .*; it has nothing"):
+        asked(own)
+
+
+def test_a_list_of_poses_of_another_length_or_without_a_name_is_named(tmp_path):
+    folder = tmp_path / "images"
+    write_depths(folder, ".npy")
+    with pytest.raises(
+        ValueError, match=r"has 6 files \*.npy and neither of poses.txt, poses.json: .*multiview_stereo"
+    ):
+        asked(folder)
+    save_trajectory_tum(folder / "poses.txt", range(5), [np.eye(4)] * 5)
+    with pytest.raises(ValueError, match=r"poses.txt has 5 poses for 6 files"):
+        asked(folder)
+    (folder / "poses.txt").unlink()
+    (folder / "poses.json").write_text('{"T_world_camera": {"IMG_8": null}}')
+    with pytest.raises(ValueError, match=r"poses.json lacks T_world_camera of 5 of 6 files, first IMG_9"):
+        asked(folder)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"scale": "relative"}, "prior.scale must be one of auto, metric, arbitrary"),
+        ({"median_depth": 0.0}, "prior.median_depth must be above 0 m"),
+        ({"depth_scale": 0.0}, "prior.depth_scale must be raw units per metre"),
+    ],
+)
+def test_a_key_without_sense_is_named(keys, message, own):
+    with pytest.raises(ValueError, match=message):
+        Files(own, **(KEYS | keys))
+
+
+def test_the_script_of_the_documentation_writes_what_the_prior_reads(tmp_path, monkeypatch):
+    """Against the truth, with a model that knows it."""
+    page = (tiny_run.CONF.parent / "docs" / "priors.md").read_text()
+    section = page[page.index("### Files: predictions of your own") :]
+    script = section[section.index("```python\n") + 10 :].partition("```")[0]
+    assert len([line for line in script.splitlines() if line]) <= 10
+    monkeypatch.chdir(tmp_path)
+    Path("images").mkdir()
+    names = sorted(NAMES)  # as the script orders them
+    for name in names:
+        Path("images", f"{name}.jpg").touch()
+    frames = [truth()[NAMES.index(name)] for name in names]
+
+    def my_model(images):
+        assert [image.stem for image in images] == names
+        depths, poses = (np.stack([getattr(f, key) for f in frames]) for key in ("depth", "T_world_camera"))
+        return depths, depths + 1, poses, np.tile(tiny_run.dataset().intrinsics, (len(frames), 1))
+
+    exec(script, {"my_model": my_model})
+    _, predictions = asked(tmp_path / "predictions")
+    for prediction in predictions:
+        views, dense = list(prediction.window.views), list(prediction.window.dense)
+        poses = relative_poses([truth()[index].T_world_camera for index in views])
+        np.testing.assert_allclose(prediction.T_anchor_view, poses, atol=1e-12)
+        depth = np.stack([truth()[index].depth for index in dense])
+        np.testing.assert_allclose(prediction.points[..., 2], depth, rtol=1e-6)
+        np.testing.assert_allclose(prediction.confidence, depth + 1, rtol=1e-6)
+
+
+MINE = """
+from emgs_jax.prior.base import Prior, Provenance
+class Mine(Prior):
+    def __init__(self, size):
+        self.provenance = Provenance("mine", {"size": size})
+    def predict(self, window, frames, intrinsics):
+        raise NotImplementedError
+"""
+
+
+def test_a_class_from_outside_of_the_repository_is_a_prior_as_the_documentation_says(tmp_path, monkeypatch):
+    (tmp_path / "mine_outside.py").write_text(MINE)
+    (tmp_path / "conf" / "prior").mkdir(parents=True)
+    (tmp_path / "conf" / "prior" / "Mine.yaml").write_text("_target_: mine_outside.Mine\nsize: 3\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    words = [f"hydra.searchpath=[file://{tmp_path}/conf]", "prior=Mine", "prior.size=4"]
+    check_arguments("config", words)
+    assert configure.build(configure.compose(*words), "prior").provenance.settings == {"size": 4}

@@ -1,0 +1,101 @@
+"""`emgs run video.mp4`: against the keys that one would type, which Hydra takes."""
+
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from emgs_jax.running.configure import compose
+from experiments.command import check_arguments
+from experiments.shorthand import frame_size, keys_of, with_source
+
+
+@pytest.fixture
+def video(tmp_path):
+    """Five frames of 96 by 64."""
+    path = tmp_path / "it's a walk.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (96, 64))
+    for shade in range(5):
+        writer.write(np.full((64, 96, 3), 40 * shade, np.uint8))
+    writer.release()
+    return path
+
+
+def write_images(folder, millimetres=None):
+    folder.mkdir()
+    exif = Image.Exif()
+    if millimetres is not None:
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = millimetres
+    for name in ("a.jpg", "b.jpg"):
+        Image.fromarray(np.zeros((96, 54, 3), np.uint8)).save(folder / name, exif=exif)
+    return folder
+
+
+def test_a_video_stands_for_the_keys_that_map_it_and_one_line_says_so(video, capsys):
+    words = with_source([str(video)])
+    found = keys_of(words)
+    assert found.pop("dataset.root").strip("'").replace("\\'", "'") == str(video)
+    assert found == {
+        "dataset": "images",
+        "dataset.size": "[336,224]",
+        "dataset.intrinsics": "estimate",
+        "prior": "multiview_stereo",
+        "graph": "up_to_scale",
+    }
+    said = capsys.readouterr().out
+    assert said.count("\n") == 1 and all(word in said for word in words)
+    check_arguments("config", words)
+    assert compose(*words).dataset.root == str(video)
+
+
+def test_a_folder_has_the_intrinsics_of_its_exif_where_there_are_any(tmp_path):
+    plain, known = write_images(tmp_path / "plain"), write_images(tmp_path / "known", 26)
+    assert keys_of(with_source([str(plain)]))["dataset.intrinsics"] == "estimate"
+    found = keys_of(with_source([str(known), "slam.window_size=4"]))
+    assert found["dataset.intrinsics"] == "exif" and found["dataset.size"] == "[208,368]"
+    assert found["slam.window_size"] == "4"
+
+
+def test_keys_that_are_given_win(video):
+    given = ["dataset.intrinsics=[90,90,48,32]", "dataset.size=[64,48]", "graph=none", "dataset.stride=2"]
+    found = with_source([*given, str(video)])
+    assert sorted(word for word in found if word in given) == sorted(given) and len(keys_of(found)) == len(found) == 7
+    # Another prior may have a unit, another data set its own calibration, and a baseline does without a back end.
+    assert not {"prior", "graph"} & {word.partition("=")[0] for word in with_source([str(video), "prior=files"])[:-1]}
+    assert with_source([str(video), "dataset=tum"])[1:] == ["dataset=tum"]
+    assert "graph" not in keys_of(with_source([str(video), "baseline=voxel"]))
+
+
+def test_what_is_no_path_is_left_alone():
+    for words in (["--cfg", "job", "prior=recorded"], ["-m", "slam.em.noise=0,1"], ["~graph"], []):
+        assert with_source(words) == words
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nowhere.mp4"], r"nowhere.mp4 is no file or folder, and no key=value: emgs run --help"),
+        (["a", "b"], "a, b: give one video"),
+    ],
+)
+def test_a_word_that_leads_nowhere_is_one_clear_error(words, message):
+    with pytest.raises(ValueError, match=message):
+        with_source(words)
+
+
+def test_a_folder_without_images_is_a_clear_error(tmp_path):
+    with pytest.raises(ValueError, match="has no images, and is no video"):
+        with_source([str(tmp_path)])
+
+
+@pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1080, 1920), (4032, 3024), (50, 2000)])
+def test_frames_keep_the_shape_of_the_image_and_have_as_many_pixels_as_those_of_the_data_sets(size):
+    width, height = frame_size(*size)
+    assert width % 16 == height % 16 == 0
+    rounding = (8 / np.array([width, height])).sum() * 1.2  # of both sides to the next multiple, in a logarithm
+    assert abs(np.log(width / height * size[1] / size[0])) <= rounding
+    assert abs(np.log(width * height / (320 * 240))) <= rounding
+
+
+def test_a_picture_of_four_by_three_has_the_size_of_the_data_sets():
+    assert frame_size(4032, 3024) == (320, 240)
