@@ -1,5 +1,6 @@
 """Shared by all tests of the core: shapes and types checked at every call, one small config, one small camera."""
 
+import gc
 import os
 from importlib.metadata import version
 from pathlib import Path
@@ -18,8 +19,12 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 # Likewise: small arrays need no thorough compilation, and an oracle holds for any. Flags of the user come last and win.
 QUICK = ["--xla_backend_optimization_level=0"]
 if tuple(map(int, version("jaxlib").split(".")[:2])) <= (0, 10):  # XLA ends the process at a flag that it does not know
-    QUICK.append("--xla_cpu_use_fusion_emitters=false")
+    # And one thread for each executable: to split a small one costs a sixth more than it saves.
+    QUICK += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ["XLA_FLAGS"] = " ".join([*QUICK, os.environ.get("XLA_FLAGS", "")])
+
+# Programs are kept, thousands of objects each: to look through them again and again is a tenth of the time.
+gc.set_threshold(100_000, 20, 50)
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
