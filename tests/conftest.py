@@ -28,9 +28,11 @@ gc.set_threshold(100_000, 20, 50)
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
+import yaml  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 from schedule import SLOW, TESTS, in_order, scheduler  # noqa: E402
 
+yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # a composition by Hydra reads some thirty files
 MAX_MAPS = 30000  # and no file of tests makes as many again
 PACKAGE = Path(__file__).resolve().parents[1] / "emgs_jax"
 # Before anything imports the package: every file that declares shapes of JAX arrays has them checked at every call.
@@ -75,12 +77,18 @@ def camera():
 
 
 @pytest.fixture(scope="session")
-def exact_run(tmp_path_factory):
+def shared_folder(tmp_path_factory):
+    """One for all processes of this call of pytest."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+@pytest.fixture(scope="session")
+def exact_run(shared_folder):
     """Folder and metrics of a tiny run with the exact prior, made once for all processes: nobody writes into it."""
     from tiny_run import make_exact_run  # after the hook
 
-    base = tmp_path_factory.getbasetemp()
-    return make_exact_run(base.parent if "PYTEST_XDIST_WORKER" in os.environ else base)
+    return make_exact_run(shared_folder)
 
 
 @pytest.fixture(autouse=True, scope="module")
