@@ -2,6 +2,7 @@
 
 import gc
 import os
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -27,12 +28,21 @@ os.environ["XLA_FLAGS"] = " ".join([*QUICK, os.environ.get("XLA_FLAGS", "")])
 gc.set_threshold(100_000, 20, 50)
 
 import jax  # noqa: E402
+import omegaconf._utils  # noqa: E402
 import pytest  # noqa: E402
 import yaml  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 from schedule import SLOW, TESTS, in_order, scheduler  # noqa: E402
 
-yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # a composition by Hydra reads some thirty files
+
+def loader_of_c(make=omegaconf._utils.get_yaml_loader):
+    """OmegaConf's loader on that of libyaml: a composition by Hydra reads some thirty files."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(yaml, "SafeLoader", getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        return make()
+
+
+omegaconf._utils.get_yaml_loader = cache(loader_of_c)
 MAX_MAPS = 30000  # and no file of tests makes as many again
 PACKAGE = Path(__file__).resolve().parents[1] / "emgs_jax"
 # Before anything imports the package: every file that declares shapes of JAX arrays has them checked at every call.
