@@ -268,4 +268,5 @@ FORWARD = {"icp", "localize_fine"}
 # Medians: where rows move apart, another one takes the median's place at once.
 ROWS_TOGETHER = {"localize_coarse", "localize_fine"}
 # Each is the larger part of another verb, which is compiled in its place.
-INSIDE_ANOTHER = {"icp", "m_step", "fit_to_points", "cluster", "render", "project_gaussians", "residuals", "knn"}
+INSIDE_ANOTHER = {"icp", "m_step", "fit_to_points", "cluster", "kmeans", "render", "project_gaussians"}
+INSIDE_ANOTHER |= {"residuals", "knn"}

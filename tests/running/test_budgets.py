@@ -11,7 +11,7 @@ import jax
 import jax.monitoring
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
-from tiny_run import NUM_FRAMES, compose
+from tiny_run import NUM_FRAMES, compose, make_exact_run
 
 import experiments.run
 from emgs_jax.data.synthetic import Synthetic
@@ -32,7 +32,7 @@ def counted():
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
+def runs(tmp_path_factory, shared_folder):
     """The same run with an empty compilation cache, and again without an executable in memory."""
     before, folder = jax.config.jax_compilation_cache_dir, tmp_path_factory.mktemp("cache")
     found, read = {}, Synthetic.__getitem__
@@ -50,6 +50,7 @@ def runs(tmp_path_factory):
             found[name] = SimpleNamespace(folder=out, metrics=metrics, events=events, reads=Counter(reads))
     jax.config.update("jax_compilation_cache_dir", before)
     compilation_cache.reset_cache()
+    make_exact_run(shared_folder, found["cold"].folder)
     return SimpleNamespace(**found)
 
 
@@ -76,6 +77,7 @@ def test_no_frame_is_read_more_often_than_it_was(runs):
     """
     for run in (runs.cold, runs.warm):
         assert set(run.reads) == set(range(NUM_FRAMES)) and max(run.reads.values()) <= 6
+        assert sum(run.reads.values()) <= 5 * NUM_FRAMES + 4  # so many are pictured
 
 
 def test_most_of_the_time_goes_into_the_mapping(runs):

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from tiny_run import TINY, compose
 
@@ -14,11 +15,16 @@ from emgs_jax.running.configure import build, groups, load_config
 from emgs_jax.running.values import check_values, declared
 from experiments.grid import read_axes, variants
 
+GROUPS = groups()
 PARTS = ("slam", "densify", "evaluation", "graph", "dataset", "prior", "features", "baseline.voxel", "baseline.tsdf")
 
 
 def check_all(*overrides: str) -> None:
-    config = compose(*overrides)
+    """The groups are chosen by Hydra, and then the values are put where it would put them, as it reads them."""
+    words = [word for word in overrides if word.split("=")[0] in GROUPS]
+    config = compose(*words)
+    for word in OverridesParser.create().parse_overrides([word for word in overrides if word not in words]):
+        OmegaConf.update(config, word.key_or_group, word.value(), merge=False)
     for part in PARTS:
         check_values(config, part)
 
