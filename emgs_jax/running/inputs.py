@@ -101,7 +101,8 @@ def predictions(
     dataset: Dataset, prior: Prior, window_size: int, clock: Clock
 ) -> Iterator[tuple[PriorPrediction, dict[int, Frame]]]:
     """Ask the prior window by window; a frame is read when a window needs it and dropped when none does."""
-    for window, frames in clock.each("load", with_frames(windows(len(dataset), window_size), dataset)):
+    calls = windows(len(dataset), window_size, prior.num_newer(window_size))
+    for window, frames in clock.each("load", with_frames(calls, dataset)):
         with clock.phase("predict"):
             prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
         yield prediction, frames

@@ -2,7 +2,9 @@
 
 Structure from motion of the window gives the poses, a plane sweep against some of the other views the depth, and the
 matches on a blank region its plane (`planar.py`). What was found for an image (keypoints, matches, depth) is kept while
-the image is in the window, so the windows of a sequence must be asked for in order. The confidence of a depth is
+the image is in the window, so the windows of a sequence must be asked for in order. The current image is in the middle
+of its window, so that its depth is matched, and compared with that of other views, on both sides. The confidence of a
+depth is
 
     1 + n exp(-spread / tolerated_spread),
 
@@ -92,9 +94,13 @@ class MultiviewStereo(Prior):
     def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:
         self._structure_config, self._dense_config = structure, dense
         settings = {"structure": _values(structure), "dense": _values(dense)}
-        self.provenance = Provenance("multiview_stereo", {"version": 6} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 7} | settings)
         self._next = 0
         self._structure = Structure(np.eye(3))
+
+    def num_newer(self, window_size: int) -> int:
+        """Half of the window, so that a depth is matched with views on both sides: a third of it and what checks it."""
+        return max(window_size // 2, 1)
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Raise ValueError where a window has too few images to confirm a depth."""
@@ -147,8 +153,8 @@ class MultiviewStereo(Prior):
         elif initialize(self._structure, *given):
             self._has_begun = True
         if self._structure.distortion != distortion:
-            lens = self._structure.lens()
-            self._grays = {frame: rectify(shown, lens) for frame, shown in self._shown.items()}
+            grays = rectify(np.stack([*self._shown.values()]), self._structure.lens())
+            self._grays = dict(zip(self._shown, grays, strict=True))
 
     def _forget(self, window: Window) -> None:
         config = self._structure_config.keys
@@ -177,7 +183,8 @@ class MultiviewStereo(Prior):
 
     def _answer(self, window: Window) -> PriorPrediction:
         placed, lens = self._structure.placed(), self._structure.lens()
-        for frame in window.dense:
+        ahead = range(window.current + 1, (window.current + window.views[-1]) // 2 + 1)  # which confirm it
+        for frame in (*window.dense, *ahead):
             if frame not in self._depths or not self._depths[frame].any():  # it may have been placed since
                 self._depths[frame], self._spreads[frame] = self._depth(frame)
         confidence = np.stack([as_shown(self._confidence(frame), lens) for frame in window.dense])
