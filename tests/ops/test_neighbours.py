@@ -27,7 +27,7 @@ def check(queries, points, valid, k, asked=None):
     rows, found = search(queries, points, valid, k) if asked is None else search(queries, points, valid, k, asked)
     valid, is_answer = np.asarray(valid), np.ones(len(queries), bool) if asked is None else asked
     kept, num_found = points[valid].astype(float), min(k, int(valid.sum()))
-    assert (found[is_answer] == (np.arange(k) < num_found)).all()
+    assert (found[is_answer] == (np.arange(k) < num_found)).all() and not rows[~found].any()
     if num_found == 0:
         return
     expected, _ = cKDTree(kept).query(queries[is_answer].astype(float), np.arange(1, num_found + 1))
