@@ -21,6 +21,7 @@ LINES = {  # each line, and all that a generator makes of it
     "x = a[1:, :n, 0]": ["x = a[(1) + 1:, :n, 0]", "x = a[1:, :(n) - 1, 0]", "x = a[1:, :n, 1]"],
     "x = jnp.minimum(a, b)": ["x = jnp.maximum(a, b)"],
     "x = jnp.where(a, b, c)": ["x = jnp.where(a, c, b)"],
+    "x = jnp.zeros_like(a[0])": ["x = jnp.ones_like(a[0])"],
     "x = jnp.stack(a, axis=-1)": ["x = jnp.stack(a, axis=0)"],
     "x = jnp.sum(a, where=valid)": ["x = jnp.sum(a)"],
     "x = T.inverse()": ["x = (T)"],

@@ -16,6 +16,7 @@ from emgs_jax.ops.pytree import fill_rows, join_rows, split_rows
 GROUP = 16  # points per group: near each other
 NUM_GROUPS = 24  # groups that a block of queries looks into
 BLOCK = 8  # queries of a block of `knn`
+LEAST_LISTED = 32  # points near a block of queries, of which six times as many as are wanted
 RANKED = 12  # values that are compared with all others at once
 CURVE_BITS = 8  # per axis, of the cells of the Hilbert curve
 FAR = 1e18  # m; where what does not count stands: its squared distance is finite, and larger than any other
@@ -242,7 +243,7 @@ def _search(
 ) -> tuple[Nearby, Int[Array, "b q k"], Float[Array, "b q k"]]:
     """What is near each block, and of every query the k nearest of these with their squared distances."""
     queries, points = jax.lax.stop_gradient((queries, points))
-    near = nearby(queries, asked, groups, count or max(6 * k, 32), size, order)
+    near = nearby(queries, asked, groups, count or max(6 * k, LEAST_LISTED), size, order)
     blocks = queries.at[near.queries].get(mode="clip")
     offsets = between(blocks, jnp.where(near.exists[..., None], points[near.rows], FAR))
     distance_sq = dot(offsets, offsets)

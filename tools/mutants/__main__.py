@@ -30,7 +30,7 @@ class Session:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._known = json.loads(path.read_text()) if path.exists() else {}
-        self._is_sound: dict[str, bool] = {}
+        self._sound: set[str] = set()  # tests, and files of them, that pass without a change
         self._lock = threading.Lock()
         self._trees: queue.Queue[Tree] = queue.Queue()
 
@@ -74,11 +74,14 @@ class Session:
         tree.write(mutant.file, changed(source, mutant.edit))
         failure = tree.failure(test)
         tree.write(mutant.file, source)
-        if failure and failure not in self._is_sound:
-            self._is_sound[failure] = not tree.failure(failure if "::" in failure else test)
-            if not self._is_sound[failure]:
-                print(f"left out, as it fails without a change: {failure}", flush=True)
-        return failure if failure and self._is_sound[failure] else ""
+        if not failure or test in self._sound or failure in self._sound:
+            self._sound.add(failure or test)
+            return failure
+        if tree.failure(failure if "::" in failure else test):
+            print(f"left out, as it fails without a change: {failure}", flush=True)
+            return ""
+        self._sound.add(failure)
+        return failure
 
     def _keep(self, found: dict, test: str, killer: str, seconds: float) -> None:
         with self._lock:
