@@ -96,7 +96,7 @@ def test_what_is_known_is_the_prior_of_the_unknowns_and_worth_less_where_the_poi
 
     @on_host
     def prior_of(noise, depth, known, settings: IcpConfig) -> jax.Array:
-        uncertainty = Uncertainty((jnp.asarray(0.05), noise), depth, jnp.ones(()))
+        uncertainty = Uncertainty(noise, depth, jnp.ones(()))
         given = problem.source, problem.surface, problem.T_world_coarse, jnp.asarray(0.02)
         return pose_problem(*given, uncertainty, settings, known).prior
 
