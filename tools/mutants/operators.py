@@ -200,7 +200,12 @@ def inside(node: ast.AST) -> Iterator[ast.AST]:
             pass
         case ast.AnnAssign(value=value):
             parts = [value] if value else []
-        case ast.Raise() | ast.Assert() | ast.JoinedStr() | ast.keyword(arg="axis" | "strict" | "exist_ok" | "high"):
+        case (
+            ast.Raise()
+            | ast.Assert()
+            | ast.JoinedStr()
+            | ast.keyword(arg="axis" | "strict" | "exist_ok" | "high" | "disable")
+        ):
             parts = []
         case ast.Assign(targets=[ast.Name(id=name)]) if name in SIZES:
             parts = []
