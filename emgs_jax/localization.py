@@ -269,9 +269,8 @@ def localize_fine(
         T_world_camera, the observation in the world frame, and the outcome.
     """
     scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
-    noise = coarse.depth_noise * coarse.mean_depth, coarse.depth_noise
     known = root_information(coarse.belief.covariance)
-    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, noise, config.icp, white, known, groups)
+    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, known, coarse.depth_noise, config.icp, white, groups)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     # The length has no gradient where a step is zero, which it is to the bit with an exact prior; this has.
     step_m, step_rad = (part @ safe_normalize(part) for part in (step[:3], step[3:]))

@@ -16,6 +16,7 @@ from emgs_jax.ops.pytree import fill_rows, join_rows, split_rows
 GROUP = 16  # points per group: near each other
 NUM_GROUPS = 24  # groups that a block of queries looks into
 BLOCK = 8  # queries of a block of `knn`
+LEAST_LISTED = 32  # points near a block of queries, of which six times as many as are wanted
 RANKED = 12  # values that are compared with all others at once
 CURVE_BITS = 8  # per axis, of the cells of the Hilbert curve
 FAR = 1e18  # m; where what does not count stands: its squared distance is finite, and larger than any other
@@ -179,7 +180,7 @@ def nearest(
     Returns:
         Row numbers into `points`, and which of them exist.
     """
-    near, distance_sq, rank = _ranked(queries, asked, points, groups, size, count or max(6 * k, 32), order)
+    near, distance_sq, rank = _ranked(queries, asked, points, groups, size, count or max(6 * k, LEAST_LISTED), order)
     return _existing(_first(near, distance_sq, rank, k, queries.shape[0]))
 
 
@@ -208,7 +209,7 @@ def knn(
     queries, points = jax.lax.stop_gradient((queries, points))  # a row number has no gradient
     asked = jnp.ones(queries.shape[0], bool) if asked is None else asked
     groups = group_points(points, valid)
-    near, distance_sq, rank = _ranked(queries, asked, points, groups, BLOCK, max(6 * k, 32), None)
+    near, distance_sq, rank = _ranked(queries, asked, points, groups, BLOCK, max(6 * k, LEAST_LISTED), None)
     found = _first(near, distance_sq, rank, k, queries.shape[0])
     blocks = queries.at[near.queries].get(mode="clip")
     is_asked = asked.at[near.queries].get(mode="fill", fill_value=False)

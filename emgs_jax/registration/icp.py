@@ -22,7 +22,6 @@ from emgs_jax.registration.noise import level_edges, levels_of, noise_of_levels,
 from emgs_jax.registration.problem import (
     DISTRIBUTION,
     IcpConfig,
-    Noise,
     Problem,
     Uncertainty,
     candidates_at,
@@ -75,7 +74,7 @@ def _observed(
     matches: Matches,
     levels: Int[Array, "p"],
     problem: Problem,
-    noise: Noise,
+    noise: Float[Array, ""],
     config: IcpConfig,
 ) -> tuple[Uncertainty, Float[Array, "p"], tuple[Float[Array, ""], Float[Array, "l"]]]:
     """What the points' distances from their Gaussians say of the uncertainty, of which `noise` is the least.
@@ -86,10 +85,9 @@ def _observed(
     source = problem.source
     distance, is_near = distances(y, matches, problem, config)
     misfit, of_levels = noise_of_levels(distance, is_near, levels)
-    depth = jnp.maximum(of_levels, noise[1])[levels]
-    factor = jnp.maximum(misfit / noise[1], 1.0)
+    depth = jnp.maximum(of_levels, noise)[levels]
     uncertainty = Uncertainty(
-        pose=(noise[0] * factor, noise[1] * factor),
+        common=noise * jnp.maximum(misfit / noise, 1.0),
         depth=depth,
         num_effective=num_independent(distance / depth, source.points, is_near),
     )
@@ -101,7 +99,7 @@ def _search_and_solve(
     is_first: Bool[Array, ""],
     problem_of: Callable[[Uncertainty], Problem],
     levels: Int[Array, "p"],
-    noise: Noise,
+    noise: Float[Array, ""],
     config: IcpConfig,
 ) -> tuple[_Carry, tuple[Candidates, Int[Array, ""], Bool[Array, ""]]]:
     """Look up the Gaussians near every point, see how well the points fit them, and solve for y from there."""
@@ -110,8 +108,8 @@ def _search_and_solve(
     candidates = candidates_at(y, problem, config)
     seen, _, _ = _observed(y, matches_at(y, candidates, problem, config), levels, problem, noise, config)
     # y is the coarse pose at first, and only then do the distances say what that is worth.
-    pose = jax.tree.map(lambda now, then: jnp.where(is_first, now, then), seen.pose, before.pose)
-    uncertainty = Uncertainty(pose=pose, depth=seen.depth, num_effective=seen.num_effective)
+    common = jnp.where(is_first, seen.common, before.common)
+    uncertainty = Uncertainty(common=common, depth=seen.depth, num_effective=seen.num_effective)
     # Seven unknowns: on a CPU the normal equations take a fraction of a QR of all rows.
     solver = optx.LevenbergMarquardt(
         rtol=config.tolerance, atol=config.tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
@@ -128,18 +126,18 @@ def icp(
     source: Observation,
     target: Gaussians,
     T_world_coarse: jaxlie.SE3,
-    noise: Noise,
+    known: Float[Array, "7 7"],
+    noise: Float[Array, ""],
     config: IcpConfig,
     white: Whitening | None = None,
-    known: Float[Array, "7 7"] | None = None,
     groups: Groups | None = None,
 ) -> tuple[jaxlie.SE3, Float[Array, ""], IcpInfo]:
     """Place camera-frame `source` on `target`: argmin over xi and s of data + prior, T = T_world_coarse exp(xi).
 
     The data term is a truncated least-squares sum over the points, scaled so that all of them together weigh as much
-    as `num_effective` independent ones. The prior holds xi at 0 with `prior_information`, and the scale s of the
-    points about the camera at 1 with `scale_noise`: the predictions of one call share an error of scale, and only the
-    map remembers the scale of the calls before.
+    as `num_effective` independent ones. The prior holds xi at 0 and the scale s of the points about the camera at 1 by
+    what is `known`: the predictions of one call share an error of scale, and only the map remembers the scale of the
+    calls before.
 
     `noise` is a lower bound. Where the points do not fit the map at the coarse pose as well as that, the coarse pose is
     worth no more than they fit there, and the depths no more than they fit where they are looked up: a prior may repeat
@@ -149,11 +147,10 @@ def icp(
         source: points to align, camera frame.
         target: Gaussians of the submap, world frame.
         T_world_coarse: where to start, and the mean of the prior.
-        noise: standard deviation of the coarse pose in metres, and of the points' depth as a fraction of it.
+        known: root of the information of the coarse pose and scale, (xi, log s), where there is a prior.
+        noise: standard deviation of the points' depth as a fraction of it.
         config: terms and gates.
         white: `whitening` of the target's covariances; None makes it here.
-        known: root of the information of the coarse pose and scale, (xi, log s), where there is a prior; None: that of
-            `noise`.
         groups: `group_points` of the valid Gaussians' means; None makes it here.
 
     Returns:
@@ -163,12 +160,12 @@ def icp(
     surface = surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, white, groups)
 
     def problem_of(uncertainty: Uncertainty) -> Problem:
-        return pose_problem(source, surface, T_world_coarse, noise[1], uncertainty, config, known)
+        return pose_problem(source, surface, T_world_coarse, noise, uncertainty, config, known)
 
     edges = level_edges(source.confidence, source.valid)
     levels = levels_of(source.confidence, edges)
     step = partial(_search_and_solve, problem_of=problem_of, levels=levels, noise=noise, config=config)
-    given = Uncertainty(pose=noise, depth=jnp.full(source.valid.shape, noise[1]), num_effective=jnp.ones(()))
+    given = Uncertainty(common=noise, depth=jnp.full(source.valid.shape, noise), num_effective=jnp.ones(()))
     (y, uncertainty), rounds = jax.lax.scan(step, (jnp.zeros(7), given), jnp.arange(config.num_searches) == 0)
     candidates, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
     problem = problem_of(uncertainty)

@@ -110,7 +110,7 @@ def _seen(dataset: Dataset | None, row: int) -> str:
 def _painted(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     """Depth in colours, uint8 (h, w, 3); grey where there is none."""
     share = (depth - near) / max(far - near, 1e-9)
-    colors = np.rint(255 * matplotlib.colormaps["turbo"](share.clip(0.0, 1.0))[..., :3]).astype(np.uint8)
+    colors = np.rint(255 * matplotlib.colormaps["turbo"](share)[..., :3]).astype(np.uint8)
     return np.where((depth > 0)[..., None], colors, np.uint8(_NO_DEPTH))
 
 

@@ -82,7 +82,7 @@ def time_icp(data: Data, offset: tuple[float, float], repetitions: int) -> list[
     target = gaussians_of(data, 3 * count // 4)
     stride = max(reference.valid.shape[0] // config.num_points, 1)
     cases = [_icp_case(data, row, offset) for row in range(1, len(data.true_poses))]
-    arguments = [(points, target, start, (jnp.asarray(0.02), jnp.asarray(0.01)), config) for points, start, _ in cases]
+    arguments = [(points, target, start, jnp.eye(7), jnp.asarray(0.01), config) for points, start, _ in cases]
     ours = executable(icp, *arguments[0])
     clouds = [
         (_host(jax.tree.map(lambda leaf: leaf[::stride], points)), start.as_matrix()) for points, start, _ in cases

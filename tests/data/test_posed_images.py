@@ -1,6 +1,7 @@
 """Projects of COLMAP and folders of nerfstudio; oracles: pycolmap, poses that are known, the lens of dataset=images."""
 
 import json
+import struct
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from written_scene import color_image, scene_pose
 
 from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.colmap_model import load_colmap
 from emgs_jax.data.images import Images
 from emgs_jax.data.posed_images import Colmap, Nerfstudio
 from emgs_jax.data.readable import ReadableFrames
@@ -161,6 +163,26 @@ def test_binary_and_text_of_pycolmap_are_read_alike(second, tmp_path):
     for image in found.images.values():
         row = sorted(NAMES, key=lambda name: int(name[3:-4])).index(image.name)
         np.testing.assert_allclose(text.pose(row)[:3, 3], image.projection_center(), atol=1e-9)
+
+
+PARAMETERS = (  # of the models in the order of their numbers, as COLMAP's documentation of its cameras lists them
+    *("f cx cy", "fx fy cx cy", "f cx cy k", "f cx cy k1 k2", "fx fy cx cy k1 k2 p1 p2", "fx fy cx cy k1 k2 k3 k4"),
+    *("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "fx fy cx cy omega", "f cx cy k", "f cx cy k1 k2"),
+    *("fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1", "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3"),
+)
+
+
+def test_a_binary_camera_of_each_model_has_its_parameters(tmp_path):
+    """One after the other, so that one that is read too short or too long moves all after it."""
+    counts = [len(names.split()) for names in PARAMETERS]
+    records = [struct.pack(f"<IiQQ{n}d", key, key, 160, 120, *range(n)) for key, n in enumerate(counts)]
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", len(counts)) + b"".join(records))
+    image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 3) + b"a.png\0" + struct.pack("<Q", 0)
+    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 1) + image)
+    cameras = load_colmap(tmp_path).cameras
+    assert [[float(word) for word in cameras[key][1:]] for key in range(len(counts))] == [
+        [160, 120, *range(n)] for n in counts
+    ]
 
 
 def replaced(path, old, new):

@@ -11,11 +11,11 @@ from emgs_jax.registration import belief
 from emgs_jax.registration.belief import certain
 from emgs_jax.registration.icp import IcpInfo
 
-measured, moved, next_belief, predict, root_information, update = (
+measured, moved, next_belief, predict, rescaled, root_information, update = (
     on_host(f)
     for f in (
-        *(belief.measured, belief.moved, belief.next_belief),
-        *(belief.predict, belief.root_information, belief.update),
+        *(belief.measured, belief.moved, belief.next_belief, belief.predict),
+        *(belief.rescaled_belief, belief.root_information, belief.update),
     )
 )
 MOTION = pose((0.2, -0.1, 0.3), (0.3, 0.05, -0.4))
@@ -52,6 +52,20 @@ def test_the_errors_of_the_next_pose_are_distributed_as_predicted():
 def test_a_motion_that_is_not_finite_only_adds_noise():
     P, lost = covariance(), jaxlie.SE3(device(np.full(7, np.nan)))
     np.testing.assert_allclose(predict(P, lost, np.full(7, 0.1, np.float32)), P + 0.01 * np.eye(7), rtol=1e-6)
+
+
+def test_in_another_unit_of_length_all_is_known_as_well_as_before():
+    """Of which a metre has three times as many: motion, noise and errors of the pose are three times as long."""
+    factor, units = np.float32(3.0), np.float32([3.0] * 3 + [1.0] * 4)
+    longer = jaxlie.SE3(MOTION.wxyz_xyz * np.float32([1.0] * 4 + [3.0] * 3))
+    found = moved(rescaled(both_known(), factor), longer, units * NOISE)
+    expected = rescaled(moved(both_known(), MOTION, NOISE), factor)
+    for name in ("covariance", "world_covariance"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-4, atol=1e-9)
+        np.testing.assert_array_equal(
+            getattr(rescaled(both_known(), factor), name)[3:, 3:], getattr(both_known(), name)[3:, 3:]
+        )
+    assert expected.log_scale == pytest.approx(np.log(3.0))
 
 
 def test_an_update_is_that_of_the_kalman_filter():

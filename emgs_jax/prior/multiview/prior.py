@@ -81,6 +81,16 @@ def _values(config: StructureConfig | DenseConfig) -> dict:
     return jsonable(given)
 
 
+def tried_depths(z: np.ndarray, margin: float) -> np.ndarray:
+    """The nearest and the farthest depth that is tried: of all landmarks but a hundredth at either end, and a margin.
+
+    Args:
+        z: depths of those that a view shows, m.
+        margin: factor by which the range goes beyond theirs.
+    """
+    return np.float32([np.percentile(z, 1) / margin, np.percentile(z, 99) * margin])
+
+
 class MultiviewStereo(Prior):
     """Structure from motion and plane-sweep stereo of a sliding window.
 
@@ -213,8 +223,7 @@ class MultiviewStereo(Prior):
         z = z[z > 0]
         if not len(z):
             return nothing, nothing
-        margin = self._dense_config.depth_margin
-        depth_range = np.float32([np.percentile(z, 1) / margin, np.percentile(z, 99) * margin])
+        depth_range = tried_depths(z, self._dense_config.depth_margin)
         count = self._dense_config.num_sources
         is_used = np.arange(count) < len(sources)
         sources = (sources * count)[:count]

@@ -14,6 +14,7 @@ from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.io.files import jsonable
 from emgs_jax.prior.base import Prior, windows
 from emgs_jax.prior.multiview.lens import Lens, grid, rectify, straight
+from emgs_jax.prior.multiview.prior import tried_depths
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.convert import to_first_window, to_se3
@@ -98,6 +99,14 @@ def test_poses_and_depths_are_the_true_ones_up_to_one_scale(room, answered):
     scale = assert_true_up_to_one_scale(room, known_poses(answered))
     for answer in answered:
         assert_true_depths(room, answer, range(len(answer.window.dense)), scale)
+
+
+def test_all_depths_of_landmarks_are_tried_but_for_the_few_that_are_wrong():
+    """The room's own are too much alike for that: its farthest wall is within the margin of the median."""
+    right, margin = np.geomspace(1.0, 10.0, 400), 1.2
+    near, far = tried_depths(np.append(right, [0.01, 900.0]), margin)
+    # Ten landmarks are a fortieth of all, and .06 of their depth.
+    assert right[0] <= near * margin <= right[10] and right[-11] <= far / margin <= right[-1]
 
 
 @pytest.mark.slow
