@@ -9,9 +9,9 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
+from emgs_jax.data.spool import Spool
 from emgs_jax.evaluation.trajectory import Alignment, align, rotated
 from emgs_jax.io.ply_reader import read_vertices
-from emgs_jax.io.spool import Spool
 from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 _NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")

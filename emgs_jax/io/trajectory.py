@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.data.timestamps import in_seconds
 from emgs_jax.io.files import atomic_write
-from emgs_jax.io.timestamps import in_seconds
 
 MAX_VALUE, MAX_NORM_ERROR = 1e9, 1e-2  # of other systems, whose units are their own and whose digits may be few
 
