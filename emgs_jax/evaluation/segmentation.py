@@ -8,10 +8,10 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.evaluation.clouds import tree_of
 from emgs_jax.evaluation.trajectory import rotated
 
 _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
@@ -116,7 +116,7 @@ def transfer_labels(points: np.ndarray, labels: np.ndarray, targets: np.ndarray,
     if not len(points):
         return np.full(len(targets), -1)
     k = min(num_neighbours, len(points))
-    votes = labels[cKDTree(points).query(targets, k=[*range(1, k + 1)], workers=-1)[1]]
+    votes = labels[tree_of(points).query(targets, k=[*range(1, k + 1)], workers=-1)[1]]
     counts = (votes[:, :, None] == votes[:, None, :]).sum(-1)
     candidates = np.where(counts == counts.max(1, keepdims=True), votes, np.iinfo(np.int64).max)
     return candidates.min(1)
