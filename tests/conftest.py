@@ -105,8 +105,8 @@ def exact_run(shared_folder):
 def drop_executables():
     """Every executable holds some 13 memory maps, of which Linux gives 65530: past that, compiling segfaults.
 
-    Until then they are kept, because other files need the same: a tiny run is 290 of them, and making them anew costs
-    10 CPU seconds. No memory is gained by dropping them.
+    Until then they are kept, because other files need the same: making anew what a tiny run takes costs 10 CPU
+    seconds. No memory is gained by dropping them.
     """
     yield
     if num_maps() > MAX_MAPS:

@@ -151,6 +151,11 @@ def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     return fuse_clouds([cloud], voxel)
 
 
+def tree_of(points: np.ndarray) -> cKDTree:
+    """For nearest points of (n, 3): a cloud's tree is built, and even searched, in half the time if not balanced."""
+    return cKDTree(points, balanced_tree=False, compact_nodes=False)
+
+
 def register(points: np.ndarray, target: cKDTree, max_distance: float, max_steps: int) -> Alignment:
     """Find the rigid motion of points (n, 3) onto those of a tree by point-to-point ICP (Besl and McKay 1992).
 

@@ -15,6 +15,7 @@ from emgs_jax.evaluation.clouds import (
     fuse_clouds,
     register,
     transform_cloud,
+    tree_of,
     voxel_downsample,
 )
 from emgs_jax.evaluation.trajectory import Alignment, align_poses
@@ -132,7 +133,7 @@ class Reference:
 def reference(truth: PointCloud, config: EvaluationConfig) -> Reference:
     """Prepare a true cloud for comparisons under `config`, with either alignment and with or without ICP."""
     cloud = voxel_downsample(truth, config.voxel_m)
-    return Reference(cloud, _tree(cloud.points), cKDTree(voxel_downsample(truth, config.icp_voxel_m).points))
+    return Reference(cloud, tree_of(cloud.points), tree_of(voxel_downsample(truth, config.icp_voxel_m).points))
 
 
 def compare_clouds(
@@ -188,9 +189,9 @@ def reconstruction_metrics(
         return metrics
     rng = np.random.default_rng(0)  # one for both: equally long clouds must not keep the same rows
     estimate, true = _chosen(estimate, config.max_points, rng), _chosen(true, config.max_points, rng)
-    tree = truth.tree if true is truth.cloud else _tree(true.points)
+    tree = truth.tree if true is truth.cloud else tree_of(true.points)
     to_truth, partner = tree.query(estimate.points, workers=-1)
-    to_estimate, back = _tree(estimate.points).query(true.points, workers=-1)
+    to_estimate, back = tree_of(estimate.points).query(true.points, workers=-1)
     values = [_average(distances, config) for distances in (to_truth, to_estimate)]
     for threshold in config.f1_thresholds_m:
         precision, recall = 100.0 * np.mean(to_truth <= threshold), 100.0 * np.mean(to_estimate <= threshold)
@@ -225,11 +226,6 @@ def _metric_names(config: EvaluationConfig) -> list[str]:
         names += [f"{kind}_{100 * threshold:g}cm_percent" for kind in ("f1", "precision", "recall")]
     names += ["normals_abs_cos_percent", f"normals_within_{config.max_normal_angle_deg:g}deg_percent"]
     return [f"reconstruction/{name}" for name in names]
-
-
-def _tree(points: np.ndarray) -> cKDTree:
-    # Without balancing and compacting the tree is built, and here even searched, in half the time.
-    return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def _abs_cosines(normals: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -8,12 +8,11 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.spool import Spool
-from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.evaluation.clouds import PointCloud, tree_of
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, Reference, align_cloud, own_voxel
 from emgs_jax.evaluation.trajectory import align_poses, rotated
 
@@ -156,7 +155,7 @@ def transfer_labels(points: np.ndarray, labels: np.ndarray, targets: np.ndarray,
     if not len(points):
         return np.full(len(targets), -1)
     k = min(num_neighbours, len(points))
-    votes = labels[cKDTree(points).query(targets, k=[*range(1, k + 1)], workers=-1)[1]]
+    votes = labels[tree_of(points).query(targets, k=[*range(1, k + 1)], workers=-1)[1]]
     counts = (votes[:, :, None] == votes[:, None, :]).sum(-1)
     candidates = np.where(counts == counts.max(1, keepdims=True), votes, np.iinfo(np.int64).max)
     return candidates.min(1)
