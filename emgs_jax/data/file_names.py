@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emgs_jax.io.timestamps import UNITS, unit_of
+from emgs_jax.data.timestamps import UNITS, unit_of
 
 # 20261127_142233, 2026-11-27 14.22.33.250: year, month, day, hour, minute, second and maybe milliseconds.
 DATE = re.compile(r"(?<!\d)(20\d\d)([-_.]?)(\d\d)\2(\d\d)[-_.T ]?(\d\d)([-_.:]?)(\d\d)\6(\d\d)(?:[-_.]?(\d{3}))?(?!\d)")

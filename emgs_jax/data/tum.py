@@ -15,8 +15,8 @@ from emgs_jax.data.file_names import find_image
 from emgs_jax.data.intrinsics import ALTERNATIVES, Given, find_lens, pictures_of, with_notes
 from emgs_jax.data.labels import LabelFolder, as_unknown
 from emgs_jax.data.reading import Intrinsics, Number
+from emgs_jax.data.timestamps import in_seconds, resolution
 from emgs_jax.data.tones import read_shown, tones_of
-from emgs_jax.io.timestamps import in_seconds, resolution
 
 LAYOUT = "root/SEQUENCE/{rgb.txt, depth.txt, groundtruth.txt, rgb/, depth/}"
 SOURCE = "TUM RGB-D benchmark, project page of the Computer Vision Group of TU Munich"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emgs_jax.io.timestamps import resolution
+from emgs_jax.data.timestamps import resolution
 
 _MIN_SPREAD_M = 1e-6  # below this RMS distance from its centroid a path gives no direction and no scale
 
