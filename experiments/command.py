@@ -190,7 +190,8 @@ def nothing_left() -> Iterator[None]:
             is_multirun = HydraConfig.get().mode == RunMode.MULTIRUN  # Hydra writes there at the end
             if not is_multirun and all(path.name == ".hydra" or path.suffix == ".log" for path in folder.iterdir()):
                 shutil.rmtree(folder)
-                for parent in folder.parents if folder.is_relative_to(Path.cwd()) else ():
+                below = [parent for parent in folder.parents if Path.cwd() in parent.parents]
+                for parent in below:
                     parent.rmdir()  # ends at the first that has something else
         raise
 

@@ -29,7 +29,7 @@ from emgs_jax.report.metrics import (
 )
 from emgs_jax.report.page import write_report
 from emgs_jax.report.printout import frame_lines, last_words, time_words
-from emgs_jax.report.provenance import print_metrics_table, provenance, signature, write_metrics
+from emgs_jax.report.provenance import is_metric, print_metrics_table, provenance, signature, write_metrics
 from emgs_jax.report.recorded_run import REPORT_FILE, read_run
 from emgs_jax.report.run_files import claim_folder, save_classes, save_outputs, save_progress
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE, Keeper
@@ -81,7 +81,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             dense = dense_map(session, dataset, densify, evaluation, labelled)
         with _said(clock, "export", "writing the map, its points, a mesh and the overview"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
-            notes = save_outputs(folder, session, dense, densify, title, evaluation.alignment == "sim3")
+            unit = "m" if is_metric(prior.provenance.settings) else "units"
+            notes = save_outputs(folder, session, dense, densify, title, evaluation.alignment == "sim3", unit)
             save_classes(folder, prior)
         compared = ", ".join(["the map", "the raw prior", *fused]) if dataset.has_ground_truth else ""
         with _said(clock, "evaluate", compared and f"comparing with the truth: {compared}"):

@@ -9,6 +9,7 @@ from emgs_jax.data.reading import Intrinsics, Size, resize_intrinsics
 USUAL_VIEW_DEG = 10.0, 150.0  # of lenses that a pinhole camera describes
 NARROWEST_VIEW_DEG = 2.0  # of a telescope
 MAX_OFFSET = 0.1  # of the principal point from the middle, of the side; lenses and mounts are off by some per cent
+MAX_ALIKE, ALIKE = 0.04, 0.012  # likewise where it is off by the same share of both sides, as in another resolution
 MAX_SQUEEZE = 0.1  # of fx / fy from 1: pixels are square, but images may have been squeezed
 FIT = 0.03  # another reading of the numbers fits where it comes so near to the middle and to square pixels
 
@@ -24,8 +25,10 @@ def oddities(intrinsics: Intrinsics, size: Size) -> list[str]:
     for angle, side in zip(views, ("wide", "high"), strict=True):
         if not USUAL_VIEW_DEG[0] <= angle <= USUAL_VIEW_DEG[1]:
             found.append(f"the view is {angle:.3g} degrees {side}")
-    for offset, side in zip(_offsets(intrinsics, size), ("width", "height"), strict=True):
-        if abs(offset) > MAX_OFFSET:
+    offsets = _offsets(intrinsics, size)
+    limit = MAX_ALIKE if abs(offsets[0] - offsets[1]) < ALIKE else MAX_OFFSET
+    for offset, side in zip(offsets, ("width", "height"), strict=True):
+        if abs(offset) > limit:
             found.append(f"the principal point is {100 * abs(offset):.0f} % of the {side} from the middle")
     if abs(math.log(intrinsics[0] / intrinsics[1])) > math.log1p(MAX_SQUEEZE):
         found.append(f"pixels would not be square (fx / fy = {intrinsics[0] / intrinsics[1]:.3g})")

@@ -35,9 +35,9 @@ class EvaluationConfig:
     max_depth_m: float = number(low=1e-6, high=math.inf)  # true depth farther away is left out
     icp_distance_m: float = number(low=0)  # ICP after the alignment takes pairs within this distance; 0 = no ICP
     placement_icp_m: float = number(low=1e-6)  # likewise for reconstruction_icp/…, whatever the protocol does
-    icp_voxel_m: float = number(low=1e-6)
+    icp_voxel_m: float = number(low=1e-4)  # a grid has 2^20 cells to each side of the origin
     icp_max_steps: int = number(low=0, high=10000)
-    voxel_m: float = number(low=1e-6)
+    voxel_m: float = number(low=1e-4)
     max_points: int | None = number(low=1, high=1e9)  # compare a random choice of so many points of each cloud
     f1_thresholds_m: tuple[float, ...] = number(low=1e-9)
     max_normal_angle_deg: float = number(low=0, high=180)

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.data.timestamps import in_seconds
 from emgs_jax.io.files import atomic_write
 
 MAX_VALUE, MAX_NORM_ERROR = 1e9, 1e-2  # of other systems, whose units are their own and whose digits may be few
@@ -42,10 +41,7 @@ def from_tum(values: np.ndarray) -> np.ndarray:
 
 
 def load_trajectory_tum(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """Read a TUM trajectory: timestamps (n,) in seconds and T_world_camera (n, 4, 4), float64; `#` starts a comment.
-
-    Programs write nanoseconds, too (EuRoC's clock): those become seconds, see `in_seconds`.
-    """
+    """Read a TUM trajectory: timestamps (n,) and T_world_camera (n, 4, 4), float64; `#` starts a comment."""
     rows = []
     for number, line in enumerate(Path(path).read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
         fields = line.split("#")[0].split()
@@ -63,4 +59,4 @@ def load_trajectory_tum(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray
         if fields:
             rows.append(values)
     rows = np.array(rows, np.float64).reshape(-1, 8)
-    return in_seconds(rows[:, 0]), from_tum(rows[:, 1:])
+    return rows[:, 0], from_tum(rows[:, 1:])

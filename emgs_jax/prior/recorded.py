@@ -29,7 +29,7 @@ import numpy as np
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.io.files import atomic_write, remove_temporaries
 from emgs_jax.io.npz import read_npz
-from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows, with_frames
+from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, check_unit, windows, with_frames
 from emgs_jax.prior.recorded_checks import (
     FIELDS,
     REMEDY,
@@ -67,6 +67,7 @@ def record(
     asked = range(max(missing, default=-1) + 1) if prior.is_sequential else missing
     for window, frames in with_frames((call for call in progress(calls) if call.inference in asked), dataset):
         prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
+        check_unit(prediction, prior.provenance.name)
         if window.inference in missing:
             name = names[window.inference]
             files[name] = _write(folder / name, _npz(_arrays(prediction)))

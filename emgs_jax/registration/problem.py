@@ -43,7 +43,7 @@ class IcpConfig(eqx.Module):
         num_neighbours: Gaussians near a point, which every step of a solve compares.
         num_color_neighbours: Gaussians from which a Gaussian's intensity gradient is fitted.
         max_steps: of every solve.
-        tolerance: relative and absolute, of the solver.
+        tolerance: relative and absolute, of the solver; float32 tells no smaller differences apart than the least.
     """
 
     residual: Float[Array, "*b"] = choice(*RESIDUALS)
@@ -59,7 +59,7 @@ class IcpConfig(eqx.Module):
     num_neighbours: int = static(low=1, high=256)
     num_color_neighbours: int = static(low=1, high=256)
     max_steps: int = static(low=0, high=1000)
-    tolerance: float = static(low=0, high=1)
+    tolerance: float = static(low=1e-7, high=1)
 
 
 class Uncertainty(eqx.Module):

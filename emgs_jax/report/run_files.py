@@ -111,13 +111,20 @@ def save_classes(folder: Path, prior: Prior) -> None:
 
 
 def save_outputs(
-    folder: Path, run: MappingRun, dense: DenseMap, config: DensifyConfig, title: str, with_scale: bool
+    folder: Path,
+    run: MappingRun,
+    dense: DenseMap,
+    config: DensifyConfig,
+    title: str,
+    with_scale: bool,
+    unit: str = "m",
 ) -> list[str]:
     """Write the files that show the map; returns what could not be made, and why.
 
     Args:
         title: of the picture.
         with_scale: the true path is drawn where it fits best by a similarity, not by a rigid motion, as it is scored.
+        unit: of the map's lengths, as the picture says it.
     """
     gaussians = jax.device_get(shown := confirmed(run.state.map))
     valid = gaussians.valid
@@ -133,7 +140,7 @@ def save_outputs(
     centers = center_cloud(run)
     no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, centers.colors)
     is_placed = np.array([record.status != "lost" for record in run.records])
-    paths = Paths(np.stack(run.poses), is_placed, _placed_truth(run, with_scale), *_moved(run))
+    paths = Paths(np.stack(run.poses), is_placed, _placed_truth(run, with_scale), *_moved(run), unit=unit)
     classes = () if dense.labels is None else dense.labels.classes
     draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes, feature_cloud(shown))
     return [] if no_mesh is None else [f"no mesh.ply: {no_mesh}"]

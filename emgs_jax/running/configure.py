@@ -5,6 +5,7 @@ Nothing here needs JAX, because predictions are recorded where there may be none
 
 import copy
 import difflib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -152,6 +153,8 @@ def _explained(error: Exception, name: str, overrides: Sequence[str]) -> str:
     """What is wrong with the overrides, and what might have been meant."""
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     options = groups()
+    if needed := re.match(r"You must specify '([\w/]+)'", str(error)):
+        return f"{needed[1]} is not given: choose {needed[1]}= one of {', '.join(options.get(needed[1], ()))}"
     choices = [override for override in parsed if override.key_or_group.split("@")[0] in options]
     paths = [override for override in parsed if override.key_or_group == "hydra.searchpath"]  # of options beside ours
     for override in () if paths else choices:

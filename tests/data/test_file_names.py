@@ -51,7 +51,7 @@ def test_lists_and_trajectories_in_nanoseconds_fit_those_in_seconds(tmp_path):
     path = tmp_path / "t.txt"
     path.write_text("".join(f"{time} {pose}\n" for time in times))
     seconds = np.array(times) / 1e9
-    for read in (load_trajectory_tum(path)[0], read_list(path, 8)[0]):
+    for read in (in_seconds(load_trajectory_tum(path)[0]), read_list(path, 8)[0]):
         np.testing.assert_allclose(read, seconds, atol=1e-6)
         assert associate(read, seconds, 1e-3)[0].tolist() == [0, 1, 2]
         assert nearest_rows(read, seconds, 0.0) == [0, 1, 2]  # below what float64 tells apart

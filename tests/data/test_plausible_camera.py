@@ -40,7 +40,7 @@ def slips(fx, fy, cx, cy):
     yield "normalised by the width", (fx / w, fy / w, u / w, v / w)
     yield "in the order fx, cx, fy, cy", (fx, cx, fy, cy)
     yield "with cx and cy exchanged", (fx, fy, cy, cx)
-    for scale in (1 / 6, 1 / 3, 1 / 2, 2 / 3):
+    for scale in (1 / 6, 1 / 3, 1 / 2, 2 / 3, 5 / 6):
         yield (
             f"of images of {SIZE[0] * scale:.0f}x{SIZE[1] * scale:.0f}",
             (fx * scale, fy * scale, u * scale - 0.5, v * scale - 0.5),

@@ -10,8 +10,10 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from hydra.types import RunMode
 from omegaconf import OmegaConf
 from own_process import run
 from tiny_run import CONF
@@ -19,7 +21,7 @@ from tqdm import tqdm
 
 from emgs_jax.running.configure import compose, groups
 from experiments.cli import COMMANDS, main
-from experiments.command import check_arguments, check_missing, kept_words
+from experiments.command import check_arguments, check_missing, kept_words, nothing_left
 from experiments.evaluate import delegated
 from experiments.interrupt import clear_interrupt
 from experiments.report import positional
@@ -163,6 +165,11 @@ def test_what_has_to_be_given_is_named_with_the_command():
     check_missing("view", compose("folder=x", name="view"))
 
 
+def test_a_choice_that_has_to_be_made_is_named_with_its_options():
+    with pytest.raises(ValueError, match="^features is not given: choose features= one of dinov2_text, dinov3_text"):
+        compose(name="embed")
+
+
 def test_options_of_a_folder_of_ones_own_are_options(tmp_path):
     """`--config-dir` is in Hydra's help, and what stood in that folder was refused."""
     (tmp_path / "dataset").mkdir()
@@ -175,7 +182,28 @@ def test_options_of_a_folder_of_ones_own_are_options(tmp_path):
         check_arguments("config", ["--config-dir", "nowhere"])
 
 
-def test_a_command_that_comes_to_nothing_leaves_nothing(tmp_path):
+def test_a_command_that_comes_to_nothing_leaves_nothing(tmp_path, monkeypatch):
+    """Neither the folder that Hydra made nor those above it, up to where the user is."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "outputs" / "synthetic" / "now"
+    monkeypatch.setattr("experiments.command.HydraConfig", SimpleNamespace(get=lambda: hydra_of(folder)))
+    for kept in (None, "frames.jsonl"):
+        (folder / ".hydra").mkdir(parents=True)
+        (folder / "run.log").touch()
+        if kept:
+            (folder / kept).touch()
+        with pytest.raises(ValueError, match="wrong"), nothing_left():
+            raise ValueError("wrong")
+        assert tmp_path.exists() and folder.exists() == (kept is not None)
+        assert [path.name for path in tmp_path.iterdir()] == (["outputs"] if kept else [])
+
+
+def hydra_of(folder: Path) -> SimpleNamespace:
+    """What Hydra says of a run."""
+    return SimpleNamespace(runtime=SimpleNamespace(output_dir=str(folder)), mode=RunMode.RUN)
+
+
+def test_a_name_with_any_signs_is_read_and_a_run_of_nothing_leaves_nothing(tmp_path):
     folder = tmp_path / "my runs" / "first"
     done = run("experiments.run", "dataset=images", "dataset.root=Küche (1)", f"hydra.run.dir={folder}")
     assert done.returncode == 1 and done.stderr.startswith("error: dataset.root=Küche (1) does not exist")
