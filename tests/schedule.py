@@ -16,6 +16,7 @@ GROUPS = {
         "scripts/test_query_and_segment.py",
         "scripts/test_sweep_script.py",
         "scripts/test_predict.py",
+        "prior/files/test_prior_files.py",
         "scripts/test_quality.py",
         "test_soak.py",
         "test_front_door.py",

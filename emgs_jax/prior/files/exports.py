@@ -107,9 +107,10 @@ def read_export(path: Path) -> Predictions:
     @cache  # all images are one array
     def dense() -> dict[str, np.ndarray]:
         arrays = load_npz(path, (kind.depth,), (kind.confidence, kind.mask))
-        for name, array in (arrays | cameras).items():
-            if len(array) != count:
-                raise ValueError(f"{path}: {name} has {len(array)} rows and {kind.poses} {count}: predict them again")
+        for name, array in (arrays | {kind.intrinsics: cameras[kind.intrinsics]}).items():
+            sides = 1 if name == kind.intrinsics else 3
+            if array.shape[:sides] != (count, *arrays[kind.depth].shape[1:sides]) or array.ndim < 3:
+                raise ValueError(f"{path}: {name} is {array.shape}, with {count} {kind.poses}: predict them again")
         return arrays
 
     def read(row: int) -> View:

@@ -86,12 +86,13 @@ def read_record3d(folder: Path) -> Predictions:
         rows = np.array(about["poses"], np.float64).reshape(-1, 7)
         matrix = np.array(about["K"], np.float64).reshape(3, 3).T
         raw_size = int(about["w"]), int(about["h"])
+        turns = Rotation.from_quat(rows[:, :4]).as_matrix()
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} must have poses, K, w and h as Record3D writes them ({error!r})") from error
     if len(rows) != len(paths):
         raise ValueError(f"{path} has {len(rows)} poses for {len(paths)} files of {folder / 'depth'}: export it again")
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_quat(rows[:, :4]).as_matrix(), rows[:, 4:]
+    poses[:, :3, :3], poses[:, :3, 3] = turns, rows[:, 4:]
     camera = as_intrinsics(matrix, f"{path}: K")
 
     def read(row: int) -> View:
