@@ -158,7 +158,7 @@ def test_an_answer_obeys_the_protocol(room, answered, distortions):
         got = {name: (getattr(answer, name).dtype, getattr(answer, name).shape) for name in expected}
         assert got == expected
         assert answer.confidence.min() >= 1 and not answer.points[~answer.mask].any()
-        confirmed = 1 + compose(*SMALL_STEREO).prior.dense.min_support
+        confirmed = 1 + compose(*SMALL_STEREO).prior.dense.min_probability
         assert answer.mask.any() and (answer.confidence[answer.mask] >= confirmed).all()
         x, y, z = np.moveaxis(answer.points, -1, 0)
         z_or_1 = np.where(answer.mask, z, 1)
@@ -169,7 +169,7 @@ def test_an_answer_obeys_the_protocol(room, answered, distortions):
 
 @pytest.mark.slow
 def test_the_error_falls_with_the_confidence(room, answered):
-    """The law is 1 + n exp(-spread / 4); bins of it, and what one weak match supports is left out."""
+    """Bins of the probability, from what is given on."""
     error, confidence = [], []
     for answer in answered:
         for row, index in enumerate(answer.window.dense):
@@ -178,7 +178,7 @@ def test_the_error_falls_with_the_confidence(room, answered):
             error.append(np.abs(scale * answer.points[row, ..., 2] / truth - 1)[mask])
             confidence.append(answer.confidence[row][mask])
     error, confidence = np.concatenate(error), np.concatenate(confidence)
-    edges = [1.75, 2.5, 3.5, 4.5, 5.01]
+    edges = [1.5, 1.8, 1.9, 1.95, 2.01]
     bins = [error[(confidence >= low) & (confidence < high)] for low, high in zip(edges, edges[1:], strict=False)]
     means = [np.minimum(values, 1).mean() for values in bins]
     assert all(len(values) > 500 for values in bins)
@@ -305,7 +305,7 @@ def test_few_lost_images_begin_nothing_and_a_structure_without_a_relation_is_rec
 
 def test_windows_out_of_order_images_of_another_size_and_short_windows_are_refused(room):
     images = edited(room, {index: blank(room) for index in range(NUM_FRAMES)})
-    prior, calls = make_prior("prior.dense.min_support=1.5"), list(windows(NUM_FRAMES, WINDOW_SIZE, NUM_NEWER))
+    prior, calls = make_prior("prior.dense.min_probability=0.8"), list(windows(NUM_FRAMES, WINDOW_SIZE, NUM_NEWER))
 
     def ask(number):
         return prior.predict(calls[number], [images[index] for index in calls[number].views], images.intrinsics)
