@@ -11,7 +11,7 @@ import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
 from emgs_jax.data.checksums import find_checksums
-from emgs_jax.io.spool import Spool
+from emgs_jax.data.spool import Spool
 
 MAX_KEPT_BYTES = 2**30  # of frames that were read, uncompressed; the others are read anew
 ARRAYS = ("image", "depth", "labels")  # of a frame

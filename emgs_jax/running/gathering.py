@@ -9,12 +9,12 @@ import numpy as np
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.data.reading import resize_nearest
+from emgs_jax.data.spool import Spool
 from emgs_jax.evaluation.baselines import BaselineConfig, Fusion, Pinhole, View
 from emgs_jax.evaluation.clouds import PointCloud, VoxelGrid
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, posed
 from emgs_jax.evaluation.segmentation import LabelGrid, LabelledPoints, nearest_classes
 from emgs_jax.evaluation.trajectory import rotated
-from emgs_jax.io.spool import Spool
 from emgs_jax.observation import known_surface
 from emgs_jax.running.inputs import RawView
 from emgs_jax.running.record import PLACED, MappingRun

@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, EditedPrior, at_inference, compose, dataset, exact, map_tiny
 
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.data.spool import Spool
 from emgs_jax.evaluation.reconstruction import ground_truth_cloud
 from emgs_jax.io.map_file import load_map_npz
-from emgs_jax.io.spool import Spool
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import new_scorer, score_map, score_prior
