@@ -125,3 +125,16 @@ def test_baselines_are_compared_at_the_poses_that_they_were_built_at(gathered):
         assert metrics[f"baseline_{name}_ours/rendering/psnr_db"] > 40.0
     run.true_poses = [None] * len(STATUSES)
     assert score_baselines(run, baselines, raw, Scorer(Walls(), config, truth, None, None)) == {}
+
+
+def test_what_goes_wrong_in_gathering_ends_the_mapping_one_frame_later():
+    asked = []
+
+    def views():
+        for number in range(9):
+            asked.append(number)
+            yield RawView(np.zeros((2, 2)), np.ones((2, 2), bool), np.zeros((2, 2, 3)), np.eye(4), np.zeros((1, 1, 0)))
+
+    with pytest.raises(IndexError):
+        gather(views(), evaluation_config(), True)
+    assert asked == [0, 1]
