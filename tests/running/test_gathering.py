@@ -165,3 +165,16 @@ def test_the_map_is_averaged_by_a_centimetre_of_the_truth_and_never_by_more_than
         own[:, :3, 3] /= unit
         assert _voxel((own, true), config) == pytest.approx(side * config.voxel_m)
     assert _voxel(None, config) == config.voxel_m
+
+
+def test_what_goes_wrong_in_gathering_ends_the_mapping_one_frame_later():
+    asked = []
+
+    def views():
+        for number in range(9):
+            asked.append(number)
+            yield RawView(np.zeros((2, 2)), np.ones((2, 2), bool), np.zeros((2, 2, 3)), np.eye(4), np.zeros((1, 1, 0)))
+
+    with pytest.raises(IndexError):
+        gather(views(), evaluation_config(), True)
+    assert asked == [0, 1]
