@@ -104,7 +104,7 @@ def predictions(
     for window, frames in clock.each("load", with_frames(windows(len(dataset), window_size), dataset)):
         with clock.phase("predict"):
             prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
-            check_unit(prediction, prior.provenance.name)
+            check_unit(prediction)
         yield prediction, frames
 
 
