@@ -25,13 +25,21 @@ def find_image(folder: Path, name: str) -> Path:
     """
     written = folder / name
     for path in dict.fromkeys((written, folder / name.replace("\\", "/"))):
-        if path.is_file():
+        if is_file(path):
             return path
         for suffix in IMAGE_SUFFIXES:
             for ended in (path.with_name(path.name + suffix), path.with_name(path.name + suffix.upper())):
-                if ended.is_file():
+                if is_file(ended):
                     return ended
     return folder / name.replace("\\", "/")
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; not where no file can have that name (too long, or with a zero byte)."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def natural_key(path: Path) -> list[list[tuple[int, int, str]]]:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
-from emgs_jax.data.file_names import find_image
+from emgs_jax.data.file_names import find_image, is_file
 from emgs_jax.data.intrinsics import ALTERNATIVES, Given, find_lens, pictures_of, with_notes
 from emgs_jax.data.labels import LabelFolder, as_unknown
 from emgs_jax.data.reading import Intrinsics, Number
@@ -196,7 +196,7 @@ def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[l
 def _file_name(line: str, first_word: str, folder: Path) -> str:
     """What stands behind the time, where that is a file; else its first word, as there may be more columns."""
     whole = re.split(r"[,\s]+", line.strip(), maxsplit=1)[1].strip(" \t,\"'")
-    return whole if find_image(folder, whole).is_file() else first_word.strip("\"'")
+    return whole if is_file(find_image(folder, whole)) else first_word.strip("\"'")
 
 
 def matched_rows(

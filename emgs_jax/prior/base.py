@@ -105,13 +105,13 @@ MAX_MEDIAN_DEPTH = (
 )
 
 
-def check_unit(prediction: PriorPrediction, name: str) -> None:
-    """Raise ValueError where depths are so large that they can be no metres; `name`: of the prior."""
+def check_unit(prediction: PriorPrediction) -> None:
+    """Raise ValueError where depths are so large that they can be no metres."""
     depths = prediction.points[..., 2][prediction.mask & np.isfinite(prediction.points).all(-1)]
     median = float(np.median(depths)) if len(depths) else 0.0
     if median > MAX_MEDIAN_DEPTH:
         raise ValueError(
-            f"the points of the prior {name} have a median depth of {median:.4g} in its inference "
+            f"the prior's points have a median depth of {median:.4g} in its inference "
             f"{prediction.window.inference}, and a map's thresholds are for metres, or a unit in which a scene is some "
             "units deep: are these millimetres? Divide points and the translations of T_anchor_view by 1000"
         )

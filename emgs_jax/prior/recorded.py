@@ -67,7 +67,7 @@ def record(
     asked = range(max(missing, default=-1) + 1) if prior.is_sequential else missing
     for window, frames in with_frames((call for call in progress(calls) if call.inference in asked), dataset):
         prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
-        check_unit(prediction, prior.provenance.name)
+        check_unit(prediction)
         if window.inference in missing:
             name = names[window.inference]
             files[name] = _write(folder / name, _npz(_arrays(prediction)))

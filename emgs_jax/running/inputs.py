@@ -105,7 +105,7 @@ def predictions(
     for window, frames in clock.each("load", with_frames(calls, dataset)):
         with clock.phase("predict"):
             prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
-            check_unit(prediction, prior.provenance.name)
+            check_unit(prediction)
         yield prediction, frames
 
 
