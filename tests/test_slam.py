@@ -1,8 +1,6 @@
 """Whole steps and runs on the box room: exact poses, nothing fused when not tracked, growth that changes nothing, and a
 map of noisy predictions that is better than they are."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jaxlie
@@ -15,6 +13,7 @@ from scene import FULL, ROOM, WHOLE
 from emgs_jax import slam
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.executable import calling
 from emgs_jax.running.convert import FirstWindow, opening
 from emgs_jax.running.executables import call
 from emgs_jax.running.growth import advance, start, with_room
@@ -23,7 +22,7 @@ from emgs_jax.slam import Overflow, SlamState, StepInfo
 FRAME = 3
 pytestmark = pytest.mark.slow  # one compilation of the whole step is half a minute
 # With executables that are kept, as runs have them: those that test_growth.py compiled.
-init_state, step = partial(slam.init_state, call=call), partial(slam.step, call=call)
+init_state, step = (calling(call)(function) for function in (slam.init_state, slam.step))
 # An exact chain, lenient checks: the room is coarse at this resolution.
 LENIENT = {"localization.max_residual": 1.0, "localization.min_eigenvalue": 0.0}
 
