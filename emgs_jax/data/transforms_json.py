@@ -1,12 +1,15 @@
 """nerfstudio's transforms.json as it is read: camera → world with OpenGL's axes, pixels from the image's corner."""
 
 import json
+import math
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from emgs_jax.data import reading
+from emgs_jax.data.file_names import find_image
 from emgs_jax.ops.axes import FLIP
 
 
@@ -35,8 +38,7 @@ def load_transforms(path: Path) -> tuple[list[str], list[list[float]]]:
 
 def with_frames_camera(values: Mapping[str, Any], keys: Collection[str], path: Path) -> Mapping[str, Any]:
     """`values` with the camera that stands in every frame; ValueError where frames have different ones."""
-    frames = values.get("frames")
-    found = [{key: frame[key] for key in keys & frame.keys()} for frame in frames or () if isinstance(frame, dict)]
+    found = [{key: frame[key] for key in keys & frame.keys()} for frame in _frames(values)]
     whole = [{**{key: values[key] for key in keys & values.keys()}, **own} for own in found]
     for number, camera in enumerate(whole):
         if camera != whole[0]:
@@ -46,3 +48,31 @@ def with_frames_camera(values: Mapping[str, Any], keys: Collection[str], path: P
                 f"{number}: take images of one camera, with focus and zoom locked, or map them as dataset=images"
             )
     return {**values, **whole[0]} if whole else values
+
+
+def with_angle_of_view(values: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
+    """`values` with the camera that an angle of view means, as Blender's files have it, where no focal length stands.
+
+    The size is that of the images where it does not stand either, and the centre is in the middle.
+    """
+    angle = values.get("camera_angle_x")
+    if "fl_x" in values or not _is_number(angle) or not 0 < angle < math.pi:
+        return values
+    size = [values.get("w"), values.get("h")]
+    if not all(map(_is_number, size)):
+        names = [frame.get("file_path") for frame in _frames(values)]
+        files = (find_image(path.parent, name) for name in names if isinstance(name, str))
+        size = [*reading.first_size(files, path)]
+    width, height = size
+    focal = width / (2 * math.tan(angle / 2))
+    return {"fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2, "w": width, "h": height} | dict(values)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _frames(values: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The frames that are mappings; what else stands in their place is refused where they are read."""
+    frames = values.get("frames")
+    return [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []

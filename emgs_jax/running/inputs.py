@@ -73,11 +73,13 @@ def inputs(dataset: Dataset, prior: Prior, config: SlamConfig, clock: Clock | No
     The pose of the first frame is the true one where it is known, else the identity.
 
     Raises:
-        ValueError: no frame has a point and a pose from which a map can start.
+        ValueError: no frame has a point and a pose from which a map can start, or predictions are in no unit that
+            thresholds are for.
     """
     done: dict[int, np.ndarray] = {}  # raw poses
     is_started, clock, structure, known = False, clock or Clock(), 0, set()
     for prediction, frames in predictions(dataset, prior, config.window_size, clock):
+        check_unit(prediction)
         here = {index for index, pose in _poses(prediction).items() if np.isfinite(pose).all()}
         structure += bool(is_started and known and here and not here & known)
         known = here or known
@@ -105,7 +107,6 @@ def predictions(
     for window, frames in clock.each("load", with_frames(calls, dataset)):
         with clock.phase("predict"):
             prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
-            check_unit(prediction)
         yield prediction, frames
 
 

@@ -59,6 +59,19 @@ def write_nerfstudio(folder, **changes) -> None:
     (folder / "transforms.json").write_text(json.dumps(values | changes))
 
 
+@pytest.mark.parametrize("has_size", [False, True])
+def test_an_angle_of_view_is_a_camera_as_in_blenders_files(has_size, tmp_path):
+    """Its names have no ending, and its size is that of the images."""
+    write_nerfstudio(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    frames = [frame | {"file_path": f"./{frame['file_path'][:-4]}"} for frame in values["frames"]]
+    values = {"camera_angle_x": 2 * np.arctan(0.5), "frames": frames} | ({"w": 160, "h": 120} if has_size else {})
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    dataset = Nerfstudio(str(tmp_path), size=SIZE)
+    np.testing.assert_allclose(dataset.intrinsics, (160, 160, 79.5, 59.5))
+    np.testing.assert_array_equal(dataset[0].image[..., ::-1], color_image(1, SIZE))
+
+
 def test_clips_in_folders_follow_each_other(tmp_path):
     """Images of one name in several folders; COLMAP sorts by the name with its folder."""
     model = write_colmap(tmp_path)

@@ -20,6 +20,7 @@ from tiny_run import CONF
 from tqdm import tqdm
 
 from emgs_jax.running.configure import compose, groups
+from emgs_jax.running.overrides import parsed, readable
 from experiments.cli import COMMANDS, main
 from experiments.command import check_arguments, check_missing, kept_words, nothing_left
 from experiments.evaluate import delegated
@@ -168,6 +169,13 @@ def test_what_has_to_be_given_is_named_with_the_command():
 def test_a_choice_that_has_to_be_made_is_named_with_its_options():
     with pytest.raises(ValueError, match="^features is not given: choose features= one of dinov2_text, dinov3_text"):
         compose(name="embed")
+
+
+def test_a_folder_with_any_signs_is_the_first_word():
+    for name in ("/runs/Küche (1), [a=b]", "it's", "outputs/a b"):
+        (word, *rest) = readable(positional(readable([name, "port=1"])))
+        assert parsed(word).key_or_group == "folder" and parsed(word).value() == name and rest == ["port=1"]
+    assert positional(["folder=x"]) == ["folder=x"] and positional(["-m"]) == ["-m"]
 
 
 def test_options_of_a_folder_of_ones_own_are_options(tmp_path):
