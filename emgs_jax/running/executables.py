@@ -112,7 +112,8 @@ def _compile(function: Callable, arguments: tuple, digest: str) -> Callable:
     """The executable of a new entry: that of the same program in another entry, or compiled and kept."""
     lowered = function.lower(*arguments)
     outputs, text = eqx.filter_eval_shape(function, *arguments), lowered.as_text()
-    program = _hash(*_machine(), text, *_used(lowered, digest))
+    shapes = [_about(leaf) for leaf in _arrays(arguments)]  # of those it does not take, too: each call checks them
+    program = _hash(*_machine(), text, *_used(lowered, digest), shapes)
     found = _runnable(program, arguments, outputs)
     if found is None:
         found, is_new = _compiled(lowered)
