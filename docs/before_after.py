@@ -45,7 +45,8 @@ class Panel(NamedTuple):
 def before(run: RecordedRun, dataset, prior, config) -> Panel:
     """What the prior says by itself."""
     views = (view for given in inputs(dataset, prior, build(config, "slam")) for view in given.raw)
-    cloud = gather(views, build(config, "evaluation"), keeps_depths=False).cloud
+    evaluation = build(config, "evaluation")
+    cloud = gather(views, evaluation, keeps_depths=False).cloud.averaged(evaluation.voxel_m)
     errors = run.metrics["raw_prior/trajectory/ate_sim3_m"], run.metrics["raw_prior/reconstruction/accuracy_m"]
     return Panel("Before: the predictions as they come", cloud.points, cloud.colors, run.raw, *errors)
 

@@ -1,11 +1,13 @@
 """MonoEM-GS as pure functions in JAX: everything that a user needs, by name.
 
 `map_sequence(load_config("dataset=images", …))` maps a sequence; `init_state` and `step` are the same for a loop of
-your own. Importing this module loads nothing else: a name is fetched when it is first used.
+your own. Importing this module loads nothing else: a name is fetched when it is first used. Import it before JAX, or
+JAX prints a line for every executable that it reads from the compilation cache.
 """
 
 # ruff: noqa: F401 (names for type checkers)
 
+import os
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
@@ -59,6 +61,10 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.semantics import classify
     from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
     from emgs_jax.splitting import SplittingConfig, split
+
+# jaxlib 0.10.1 logs an error for every executable that it reads from a cache, for a hint to the compiler that no CPU
+# lists as a feature. What does fail raises an exception. It reads this as it is loaded.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 _HOMES = {
     "continuation": ("ContinuationConfig", "continued"),
@@ -115,4 +121,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})

@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.observation import Observation
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import kmeans, strided_seeds
+from emgs_jax.ops.executable import executable
 from emgs_jax.ops.linalg import dot, inverse_2x2, outer, safe_normalize, tangent_basis, whiten, whitening
 from emgs_jax.ops.neighbours import Groups, group_points, nearest, order_of
 from emgs_jax.ops.precision import full_precision
@@ -104,7 +105,7 @@ def fit_to_points(
     return where_rows(valid, fitted, empty_gaussians(centers.shape[0], observation.features.shape[-1]))
 
 
-@eqx.filter_jit
+@executable
 @full_precision
 def cluster(
     observation: Observation, order: Int[Array, "p"], spacing: int, config: FitConfig

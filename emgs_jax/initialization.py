@@ -1,8 +1,5 @@
 """Initialisation (Method B): the map from the merged predictions of the first window."""
 
-from collections.abc import Callable
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -12,10 +9,11 @@ from emgs_jax.gaussians import FitConfig, Gaussians, cluster, spacing
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
-from emgs_jax.ops.precision import directly, full_precision
+from emgs_jax.ops.executable import executable
+from emgs_jax.ops.precision import full_precision
 
 
-@eqx.filter_jit
+@executable
 def merge(
     views: Observation, T_world_views: jaxlie.SE3, camera: Camera
 ) -> tuple[Observation, Observation, Int[Array, "q"]]:
@@ -35,7 +33,6 @@ def initialize(
     camera: Camera,
     thin: int,
     config: FitConfig,
-    call: Callable = directly,
 ) -> tuple[Gaussians, Float[Array, "g"], Observation]:
     """Cluster the merged points of all views: K = num_points / (λ · num_views) Gaussians.
 
@@ -45,12 +42,11 @@ def initialize(
         camera: of the full images.
         thin: the observations' thinning.
         config: λ and how points become Gaussians.
-        call: how an executable is called.
 
     Returns:
         The Gaussians, their number of points in units of λ, and the views in the world frame.
     """
     num_views = views.valid.shape[0]
-    world, merged, order = call(merge, views, T_world_views, downscale(camera, thin))
-    gaussians, weight = call(cluster, merged, order, spacing(camera, thin, config) * num_views, config)
+    world, merged, order = merge(views, T_world_views, downscale(camera, thin))
+    gaussians, weight = cluster(merged, order, spacing(camera, thin, config) * num_views, config)
     return gaussians, weight * num_views, world

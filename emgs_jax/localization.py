@@ -3,6 +3,7 @@
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
@@ -16,7 +17,7 @@ from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
 from emgs_jax.registration.belief import Belief, certain, measured, moved, next_belief, root_information
 from emgs_jax.registration.icp import IcpInfo, icp
-from emgs_jax.registration.noise import confidence_levels
+from emgs_jax.registration.noise import levels_of
 from emgs_jax.registration.pose_noise import LEAST_NOISE, NO_INFORMATION, axis_std, repeat_poses
 from emgs_jax.registration.problem import IcpConfig
 from emgs_jax.registration.repeat import repeat_error, repeat_scale, through_previous
@@ -31,7 +32,7 @@ REASONS = (
     "the geometry does not determine the pose",
 )
 
-FUSED = 3
+ANCHORED, FUSED = 2, 3  # readings of `LocalizationConfig.coarse`
 
 
 class LocalizationConfig(eqx.Module):
@@ -157,9 +158,16 @@ def _readings(
     raw_previous, raw_current = pose_row(prediction.T_world_views, 0), pose_row(prediction.T_world_views, 1)
     motion = scale_translation(raw_previous.inverse() @ raw_current, scale)
     anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, scale)
-    last = previous, T_world_previous, motion
-    via_previous, same_image = through_previous(prediction, *last, scale, camera, config.max_pair_distance)
-    linked = stack([via_previous, same_image, T_world_previous @ motion]).wxyz_xyz
+    chain = T_world_previous @ motion
+    # Only where it is read: two robust fits over all points.
+    via_previous, same_image = jax.lax.cond(
+        config.coarse < ANCHORED,
+        lambda: through_previous(
+            prediction, previous, T_world_previous, motion, scale, camera, config.max_pair_distance
+        ),
+        lambda: (chain, chain),
+    )
+    linked = stack([via_previous, same_image, chain]).wxyz_xyz
     is_linked = (jnp.sum(paired) >= MIN_PAIRS) & jnp.all(jnp.isfinite(linked), axis=-1)
     via_previous, same_image, chain = map(jaxlie.SE3, jnp.where(is_linked[:, None], linked, anchored.wxyz_xyz))
     return motion, anchored, stack([via_previous, same_image, anchored, chain]), is_linked[2]
@@ -261,9 +269,8 @@ def localize_fine(
         T_world_camera, the observation in the world frame, and the outcome.
     """
     scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
-    noise = coarse.depth_noise * coarse.mean_depth, coarse.depth_noise
     known = root_information(coarse.belief.covariance)
-    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, noise, config.icp, white, known, groups)
+    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, known, coarse.depth_noise, config.icp, white, groups)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     # The length has no gradient where a step is zero, which it is to the bit with an exact prior; this has.
     step_m, step_rad = (part @ safe_normalize(part) for part in (step[:3], step[3:]))
@@ -290,7 +297,7 @@ def localize_fine(
         scale=scale,
         repeat_rms=coarse.repeat_rms,
         depth_noise=info.misfit,
-        noise=info.misfit_of_levels[confidence_levels(current.confidence, current.valid)],
+        noise=info.misfit_of_levels[levels_of(current.confidence, info.level_edges)],
         step_m=step_m,
         step_rad=step_rad,
         belief=belief,

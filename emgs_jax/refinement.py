@@ -118,12 +118,11 @@ def merge_weights(
     rows, distance_sq, found = match
     some = found | ~jnp.any(found, axis=-1, keepdims=True)  # a softmax over nothing would be NaN
     omega = jax.nn.softmax(-0.5 * distance_sq, axis=-1, where=some)
-    if old.features.shape[-1]:
-        mapped, fresh = (safe_normalize(g.features) for g in (old, candidates))
-        cosine = jnp.einsum("gkf,gf->gk", mapped[rows], fresh)
-        both = has_feature(candidates.features)[:, None] & has_feature(old.features)[rows]
-        share = config.cosine_weight * jnp.maximum(cosine, 0.0) + (1.0 - config.cosine_weight)
-        omega = omega * jnp.where(both, share, 1.0)  # opposite meanings do not merge
+    mapped, fresh = (safe_normalize(g.features) for g in (old, candidates))
+    cosine = jnp.einsum("gkf,gf->gk", mapped[rows], fresh)
+    both = has_feature(candidates.features)[:, None] & has_feature(old.features)[rows]
+    share = config.cosine_weight * jnp.maximum(cosine, 0.0) + (1.0 - config.cosine_weight)
+    omega = omega * jnp.where(both, share, 1.0)  # opposite meanings do not merge
     is_match = found & (candidates.valid & on_surface)[:, None] & (distance_sq < config.max_mahalanobis_sq_2d)
     return jnp.where(is_match, omega, 0.0)
 

@@ -1,8 +1,5 @@
 """The pipeline: `init_state` makes the map of the first window, `step` integrates one frame. Both are pure."""
 
-from collections.abc import Callable
-from typing import TypeAlias
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,16 +26,15 @@ from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationIn
 from emgs_jax.observation import Observation, ObservationConfig, Prediction, transform
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
+from emgs_jax.ops.executable import executable
 from emgs_jax.ops.linalg import Whitening, whitening
 from emgs_jax.ops.neighbours import Groups, group_points, order_of
-from emgs_jax.ops.precision import directly, full_precision
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, static_choice, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
 from emgs_jax.registration.belief import Belief, certain
 from emgs_jax.registration.rigid import median, pose_row
 from emgs_jax.splitting import SplittingConfig, split
-
-Index: TypeAlias = tuple[Whitening, Groups]  # of the submap's Gaussians
 
 
 class SlamConfig(eqx.Module):
@@ -111,6 +107,64 @@ class StepInfo(eqx.Module):
     overflow: Overflow
 
 
+class Submap(eqx.Module):
+    """M*, the part of the map that a step works on, with what is found once for all stages.
+
+    Args:
+        map: its Gaussians.
+        rows: where they are in the whole map; its capacity where there is none.
+        white: `whitening` of their covariances.
+        groups: `group_points` of their means.
+        overflow: how many Gaussians did not fit.
+    """
+
+    map: GaussianMap
+    rows: Int[Array, "s"]
+    white: Whitening
+    groups: Groups
+    overflow: Int[Array, ""]
+
+
+class Frame(eqx.Module):
+    """A frame at its fine pose.
+
+    Args:
+        T_world_camera: its pose.
+        points: its observation, world frame.
+        localization: how it was found.
+        time: its number.
+    """
+
+    T_world_camera: jaxlie.SE3
+    points: Observation
+    localization: LocalizationInfo
+    time: Int[Array, ""]
+
+    @property
+    def trusted(self) -> Observation:
+        """Its points, none of them valid where it is not tracked."""
+        points = self.points
+        return eqx.tree_at(lambda o: o.valid, points, points.valid & self.localization.is_tracked)
+
+
+class Fused(eqx.Module):
+    """What a frame's points make of the submap.
+
+    Args:
+        map: the submap's Gaussians after EM and splitting.
+        halves: the second halves of what was split.
+        rest: the points that no Gaussian explains; they continue the map's surfaces.
+        origin: median birth of what explains the others; the frame's own time where nothing does.
+        em: counts.
+    """
+
+    map: GaussianMap
+    halves: GaussianMap
+    rest: Observation
+    origin: Int[Array, ""]
+    em: EmInfo
+
+
 def _first_weight(weight: Float[Array, "g"], config: AverageConfig) -> Float[Array, "g"]:
     """Weight of a new Gaussian: α_0 = 1 as printed, or the number of images that its points amount to."""
     return jnp.where(config.gain > 0, weight, 1.0)
@@ -118,7 +172,7 @@ def _first_weight(weight: Float[Array, "g"], config: AverageConfig) -> Float[Arr
 
 @full_precision
 def init_state(
-    views: Observation, T_world_views: jaxlie.SE3, camera: Camera, config: SlamConfig, call: Callable = directly
+    views: Observation, T_world_views: jaxlie.SE3, camera: Camera, config: SlamConfig
 ) -> tuple[SlamState, Int[Array, ""]]:
     """The map of the first window, whose last view becomes the previous frame.
 
@@ -126,17 +180,16 @@ def init_state(
         views: the window's observations, camera frames, oldest first.
         T_world_views: their poses.
         camera: of the full images.
-        call: how an executable is called.
+        config: all stages.
 
     Returns:
         The state, and how many Gaussians did not fit into the map's capacity.
     """
-    thin = config.observation.thin
-    gaussians, weight, world = initialize(views, T_world_views, camera, thin, config.fit, call)
-    return call(_first_state, gaussians, weight, world, T_world_views, config)
+    gaussians, weight, world = initialize(views, T_world_views, camera, config.observation.thin, config.fit)
+    return _first_state(gaussians, weight, world, T_world_views, config)
 
 
-@eqx.filter_jit
+@executable
 def _first_state(
     gaussians: Gaussians, weight: Float[Array, "g"], world: Observation, T_world_views: jaxlie.SE3, config: SlamConfig
 ) -> tuple[SlamState, Int[Array, ""]]:
@@ -150,16 +203,10 @@ def _first_state(
 
 
 @full_precision
-def step(
-    state: SlamState,
-    prediction: Prediction,
-    camera: Camera,
-    config: SlamConfig,
-    call: Callable = directly,
-) -> tuple[SlamState, StepInfo]:
+def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig) -> tuple[SlamState, StepInfo]:
     """Integrate one frame: localise, select, E-step, M-step, refine, insert (the paper's pipeline figure).
 
-    Called as it is, each line is an executable of its own, so that a larger map compiles the look-up and the insertion
+    Called as it is, each stage is an executable of its own, so that a larger map compiles the look-up and the insertion
     anew and not the work on the submap; inside another jit or vmap all of it is one, which rounds differently.
 
     Args:
@@ -167,128 +214,103 @@ def step(
         prediction: of this one.
         camera: of the full images.
         config: all stages.
-        call: how an executable is called; `running.growth.prepare` learns from it what there is to compile.
     """
-    thin, last = config.observation.thin, (state.previous, state.T_world_previous, state.belief)
-    coarse, guess = call(_approach, prediction, last, camera, thin, config.localization)
-    submap, index, rows, submap_overflow = call(_select, state.map, (state.previous, guess), config.submap)
-    T, aligned, localization = call(_place, prediction.current, submap, coarse, config.localization, index)
-    rows_each, place = spacing(camera, thin, config.fit), (aligned, T, localization)
-    fine = rows_each, downscale(camera, thin), config.em, config.continuation, config.splitting
-    submap, rest, em, halves, origin = call(_fuse, submap, index, *place, state.time, *fine)
-    candidates, weight = call(cluster, rest, call(_order, camera, thin), rows_each, config.fit)
-    submap, fresh, refinement = call(_refine, submap, candidates, T, camera, thin, config.refinement)
-    look = (fresh, weight, halves), place, state.time
-    map, count, map_overflow, time = call(_store, state.map, submap, rows, *look, camera, config)
+    view = downscale(camera, config.observation.thin)  # its pixels are an observation's rows
+    num_rows = spacing(camera, config.observation.thin, config.fit)
+    last = state.previous, state.T_world_previous, state.belief
+
+    coarse, guess = _localize_coarse(prediction, *last, view, config.localization)
+    submap = _select(state.map, state.previous, guess, config.submap)
+    frame = _localize_fine(prediction.current, submap, coarse, state.time, config.localization)
+    fused = _fuse(submap, frame, view, num_rows, (config.em, config.continuation, config.splitting))
+    candidates, weight = cluster(fused.rest, _order(view), num_rows, config.fit)
+    refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config.refinement)
+    new = fresh, weight, fused.halves
+    map, num_gaussians, overflow, time = _store(state.map, (refined, submap.rows), new, frame, view, config)
 
     info = StepInfo(
-        T_world_camera=T,
+        T_world_camera=frame.T_world_camera,
         T_world_newest=coarse.T_world_newest,
-        localization=localization,
-        em=em,
+        localization=frame.localization,
+        em=fused.em,
         refinement=refinement,
-        origin=origin,
-        num_gaussians=count,
-        overflow=Overflow(map_overflow, submap_overflow, refinement.overflow),
+        origin=fused.origin,
+        num_gaussians=num_gaussians,
+        overflow=Overflow(overflow, submap.overflow, refinement.overflow),
     )
-    return SlamState(map, aligned, T, localization.belief, time), info
+    return SlamState(map, frame.points, frame.T_world_camera, frame.localization.belief, time), info
 
 
-@eqx.filter_jit
-def _approach(
+@executable
+def _localize_coarse(
     prediction: Prediction,
-    last: tuple[Observation, jaxlie.SE3, Belief],
-    camera: Camera,
-    thin: int,
+    previous: Observation,
+    T_world_previous: jaxlie.SE3,
+    belief: Belief,
+    view: Camera,
     config: LocalizationConfig,
 ) -> tuple[CoarsePose, Observation]:
     """The coarse pose, and the current frame placed by it."""
-    coarse = localize_coarse(prediction, *last[:2], downscale(camera, thin), config, last[2])
+    coarse = localize_coarse(prediction, previous, T_world_previous, view, config, belief)
     return coarse, transform(coarse.T_world_camera, prediction.current, coarse.scale)
 
 
-@eqx.filter_jit
-def _select(
-    map: GaussianMap, clouds: tuple[Observation, ...], config: SubmapConfig
-) -> tuple[GaussianMap, Index, Int[Array, "s"], Int[Array, ""]]:
-    """`select_submap` with what is found once for all stages until EM, while its Gaussians stay as they are."""
-    submap, rows, overflow = select_submap(map, clouds, config)
+@executable
+def _select(map: GaussianMap, previous: Observation, guess: Observation, config: SubmapConfig) -> Submap:
+    submap, rows, overflow = select_submap(map, (previous, guess), config)
     gaussians = submap.gaussians
-    index = whitening(gaussians.covs), group_points(gaussians.means, gaussians.valid)
-    return submap, index, rows, overflow
+    white, groups = whitening(gaussians.covs), group_points(gaussians.means, gaussians.valid)
+    return Submap(submap, rows, white, groups, overflow)
 
 
-@eqx.filter_jit
-def _place(
-    current: Observation, submap: GaussianMap, coarse: CoarsePose, config: LocalizationConfig, index: Index
-) -> tuple[jaxlie.SE3, Observation, LocalizationInfo]:
-    """The fine pose, against what is confirmed."""
-    white, groups = index
-    target = confirmed(submap)
-    of_confirmed = group_points(target.means, target.valid, order_of(groups, target.valid.shape[0]))
-    return localize_fine(current, target, coarse, config, white, of_confirmed)
+@executable
+def _localize_fine(
+    current: Observation, submap: Submap, coarse: CoarsePose, time: Int[Array, ""], config: LocalizationConfig
+) -> Frame:
+    """The frame at its fine pose, against what is confirmed."""
+    target = confirmed(submap.map)
+    groups = group_points(target.means, target.valid, order_of(submap.groups, target.valid.shape[0]))
+    T, aligned, localization = localize_fine(current, target, coarse, config, submap.white, groups)
+    return Frame(T, aligned, localization, time)
 
 
-@eqx.filter_jit
+@executable
 def _fuse(
-    submap: GaussianMap,
-    index: Index,
-    aligned: Observation,
-    T: jaxlie.SE3,
-    localization: LocalizationInfo,
-    time: Int[Array, ""],
-    spacing: int,
+    submap: Submap,
+    frame: Frame,
     view: Camera,
-    config: EmConfig,
-    continuation: ContinuationConfig,
-    splitting: SplittingConfig,
-) -> tuple[GaussianMap, Observation, EmInfo, GaussianMap, Int[Array, ""]]:
-    """Fuse the points of a frame that is tracked, and split what they show to be too coarse.
-
-    Returns the submap, the points that no Gaussian explains (they go on from the map), counts, the second halves of
-    what was split, and the median birth of what explains the others.
-    """
-    trusted = _trusted(aligned, localization)
-    noise = localization.noise[:, None] * (trusted.points - T.translation())
-    before = submap
-    submap, explained, em = em_update(submap, trusted, noise, config, *index)
-    owned = owners(explained, submap.birth.shape[0])
-    births = take_rows(submap.birth, owned).astype(jnp.float32)
-    origin = jnp.where(em.num_fused > 0, median(births, explained.is_fused), time).astype(jnp.int32)
-    submap, halves = split(submap, trusted, noise, owned, spacing, splitting)
-    explained_by, spread = take_rows(before, owned), (localization.noise, T, view)
-    rest = continued(trusted, explained_by, explained.is_fused, *spread, continuation)
+    num_rows: int,
+    configs: tuple[EmConfig, ContinuationConfig, SplittingConfig],
+) -> Fused:
+    """Fuse the points of a frame that is tracked, and split what they show to be too coarse."""
+    (em, continuation, splitting), T, trusted = configs, frame.T_world_camera, frame.trusted
+    noise = frame.localization.noise[:, None] * (trusted.points - T.translation())
+    map, explained, info = em_update(submap.map, trusted, noise, em, submap.white, submap.groups)
+    owned = owners(explained, map.birth.shape[0])
+    births = take_rows(map.birth, owned).astype(jnp.float32)
+    origin = jnp.where(info.num_fused > 0, median(births, explained.is_fused), frame.time).astype(jnp.int32)
+    map, halves = split(map, trusted, noise, owned, num_rows, splitting)
+    explained_by = take_rows(submap.map, owned)
+    rest = continued(trusted, explained_by, explained.is_fused, frame.localization.noise, T, view, continuation)
     rest = eqx.tree_at(lambda o: o.valid, rest, trusted.valid & ~explained.is_fused)
-    return submap, rest, em, halves, origin
+    return Fused(map, halves, rest, origin, info)
 
 
-def _trusted(aligned: Observation, localization: LocalizationInfo) -> Observation:
-    """The frame without a valid row where it is not tracked."""
-    return eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & localization.is_tracked)
-
-
-@eqx.filter_jit
-def _order(camera: Camera, thin: int) -> Int[Array, "p"]:
-    view = downscale(camera, thin)
+@executable
+def _order(view: Camera) -> Int[Array, "p"]:
     return morton_order(view.height, view.width)
 
 
-@eqx.filter_jit
-def _refine(
-    submap: GaussianMap, candidates: Gaussians, T: jaxlie.SE3, camera: Camera, thin: int, config: RefinementConfig
-) -> tuple[GaussianMap, Gaussians, RefinementInfo]:
-    return refine(submap, candidates, T, downscale(camera, thin), config)
+_refine = executable(refine)
 
 
-@eqx.filter_jit
+@executable
 def _store(
     map: GaussianMap,
-    submap: GaussianMap,
-    rows: Int[Array, "s"],
+    submap: tuple[GaussianMap, Int[Array, "s"]],
     new: tuple[Gaussians, Float[Array, "g"], GaussianMap],
-    place: tuple[Observation, jaxlie.SE3, LocalizationInfo],
-    time: Int[Array, ""],
-    camera: Camera,
+    frame: Frame,
+    view: Camera,
     config: SlamConfig,
 ) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
     """The map with the submap written back, judged by this look; fresh Gaussians and second halves in free rows.
@@ -296,14 +318,13 @@ def _store(
     Returns:
         The map, the number of its Gaussians, how many did not fit, and the time of the next frame.
     """
-    (aligned, T, localization), (fresh, weight, halves) = place, new
-    thinned, noise = downscale(camera, config.observation.thin), localization.depth_noise
-    trusted = _trusted(aligned, localization)
-    use = usefulness(map, submap, rows)
-    map, is_seen = judge(write_back(map, submap, rows), use, trusted, T, thinned, noise, config.existence)
+    (gaussians, rows), (fresh, weight, halves) = submap, new
+    T, noise = frame.T_world_camera, frame.localization.depth_noise
+    use = usefulness(map, gaussians, rows)
+    map, is_seen = judge(write_back(map, gaussians, rows), use, frame.trusted, T, view, noise, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
-    submap = join_layers(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
-    born = new_map(fresh, _first_weight(weight, config.em.average), config.existence.birth, time)
+    joined = join_layers(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
+    born = new_map(fresh, _first_weight(weight, config.em.average), config.existence.birth, frame.time)
     born = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), born, halves)
-    map, _, overflow = insert(write_back(map, submap, rows), born)
-    return map, jnp.sum(map.gaussians.valid), overflow, time + 1
+    map, _, overflow = insert(write_back(map, joined, rows), born)
+    return map, jnp.sum(map.gaussians.valid), overflow, frame.time + 1

@@ -4,26 +4,34 @@ import contextlib
 import logging
 import os
 import re
+import shutil
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from functools import wraps
-from typing import Any
+from pathlib import Path
+from typing import Any, TextIO
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from emgs_jax.running.compilation import use_compilation_cache
 from emgs_jax.running.configure import CONF, compose, first_of_sweep, message_of
 from emgs_jax.running.gpu import leave_memory_to_torch
+from emgs_jax.running.overrides import quoted, readable
 
 from .interrupt import clear_interrupt
 from .keys import check_keys
 
+OPTIONS_WITH_A_VALUE = {
+    *("--cfg", "-c", "--package", "-p", "--info", "-i", "--config-path", "-cp", "--config-name", "-cn"),
+    "--experimental-rerun",
+}
 RUN = "config"  # conf/config.yaml, whose help lists every choice, by Hydra
 TALKATIVE = ("jax", "numexpr", "websockets")  # libraries that log at INFO which accelerators and threads are not there
 
@@ -39,7 +47,8 @@ def command(
             if not HydraConfig.get().verbose:
                 for library in TALKATIVE:
                     logging.getLogger(library).setLevel(logging.WARNING)
-            with clear_errors():
+            with kept_words(HydraConfig.get().job_logging), clear_errors(), nothing_left():
+                check_missing(name, config)
                 check_keys(name, config)
                 leave_memory_to_torch(config)
                 if "compilation_cache" in config:
@@ -52,7 +61,7 @@ def command(
                 return
             with clear_interrupt():
                 with clear_errors():
-                    sys.argv[1:] = rewritten(sys.argv[1:])
+                    sys.argv[1:] = readable(rewritten(readable(sys.argv[1:])))
                     check_arguments(name, sys.argv[1:])
                 hydra.main(version_base="1.3", config_path=str(CONF.resolve()), config_name=name)(job)()
 
@@ -60,6 +69,39 @@ def command(
         return main
 
     return decorate
+
+
+class Spoken:
+    """Standard output that writes what goes there into a file, too."""
+
+    def __init__(self, console: TextIO, file: TextIO) -> None:
+        self._console, self._file = console, file
+
+    def write(self, text: str) -> int:
+        self._file.write(text)
+        return self._console.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._console, name)
+
+
+@contextlib.contextmanager
+def kept_words(logging: DictConfig) -> Iterator[None]:
+    """Keep what a job says, how it failed included, in the file that Hydra has for its log; without one nowhere."""
+    path = OmegaConf.select(logging, "handlers.file.filename")
+    if path is None:
+        yield
+        return
+    with open(path, "a", buffering=1, encoding="utf-8") as file:
+        try:
+            with contextlib.redirect_stdout(Spoken(sys.stdout, file)):
+                yield
+        except SystemExit as end:
+            file.write(f"{end}\n")
+            raise
+        except BaseException:
+            file.write(traceback.format_exc())
+            raise
 
 
 def help_of(name: str) -> str:
@@ -88,15 +130,70 @@ def overrides_of(arguments: list[str]) -> list[str]:
 
 
 def check_arguments(name: str, arguments: list[str]) -> None:
-    """Raise ValueError with near names where an override names no key or option."""
+    """Raise ValueError with near names where an override names no key or option, and where a word is no override."""
+    folders = check_words(name, arguments)
     try:
         parsed = OverridesParser.create().parse_overrides(overrides_of(arguments))
-    except HydraException:
-        return  # Hydra shows the place
+    except HydraException as error:
+        raise ValueError(f"{str(error).splitlines()[0]}: write each as KEY=VALUE, in quotes: 'KEY=VALUE'") from error
     # Of Hydra's own keys one has options of the user in it: what emgs tune has found.
     own = [o for o in parsed if not o.key_or_group.startswith("hydra") or o.key_or_group == "hydra.searchpath"]
     overrides = [first_of_sweep(override) for override in own]
+    if folders and not any(o.key_or_group == "hydra.searchpath" for o in own):
+        overrides.append(f"hydra.searchpath=[{','.join(quoted(f'file://{Path(f).resolve()}') for f in folders)}]")
     compose(*overrides, name=name)
+
+
+def check_words(name: str, arguments: list[str]) -> list[str]:
+    """The folders of --config-dir; raises ValueError where a word is neither an override nor an option or its value."""
+    folders, rest = [], [*arguments]
+    while rest:
+        word, rest = rest[0], rest[1:]
+        option, has_value, value = word.partition("=")
+        if option in ("--config-dir", "-cd"):
+            value, rest = (value, rest) if has_value else (rest[0] if rest else "", rest[1:])
+            if not Path(value).is_dir():
+                raise ValueError(f"{option} {value} is no folder: give one with options such as dataset/my.yaml")
+            folders.append(value)
+        elif option in OPTIONS_WITH_A_VALUE and not has_value:
+            rest = rest[1:]
+        elif not has_value and not word.startswith(("-", "~")):
+            raise ValueError(
+                f"{word!r} is no KEY=VALUE: put a value with spaces into quotes ('KEY=VALUE'); "
+                f"emgs {name_of(name)} --help lists the keys"
+            )
+    return folders
+
+
+def name_of(name: str) -> str:
+    """The command of conf/`name`.yaml."""
+    return "run" if name == RUN else name
+
+
+def check_missing(name: str, config: DictConfig) -> None:
+    """Raise ValueError where one of conf/`name`.yaml's own keys has to be given and is not."""
+    lines = (CONF / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
+    for line in lines:
+        if (found := re.match(r"(\w+): \?\?\?(?: # (.*))?", line)) and OmegaConf.is_missing(config, found[1]):
+            what = f" ({found[2]})" if found[2] else ""
+            raise ValueError(f"{found[1]} is not given{what}: emgs {name_of(name)} {found[1]}=…")
+
+
+@contextlib.contextmanager
+def nothing_left() -> Iterator[None]:
+    """Remove the folder that Hydra made where nothing came of the command: it has no result."""
+    try:
+        yield
+    except (ValueError, OSError, InstantiationException, OmegaConfBaseException):
+        folder = Path(HydraConfig.get().runtime.output_dir)
+        with contextlib.suppress(OSError):
+            is_multirun = HydraConfig.get().mode == RunMode.MULTIRUN  # Hydra writes there at the end
+            if not is_multirun and all(path.name == ".hydra" or path.suffix == ".log" for path in folder.iterdir()):
+                shutil.rmtree(folder)
+                below = [parent for parent in folder.parents if Path.cwd() in parent.parents]
+                for parent in below:
+                    parent.rmdir()  # ends at the first that has something else
+        raise
 
 
 @contextlib.contextmanager

@@ -25,6 +25,7 @@ from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, wr
 from emgs_jax.report.results import is_finished, read_estimates, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
 from emgs_jax.running.configure import compose, message_of
+from emgs_jax.running.overrides import quoted
 from emgs_jax.running.values import check_values
 
 from .command import command, overrides_of
@@ -67,12 +68,8 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
 
 def _override(key: str, value: Any) -> str:
     """`key=value` as Hydra reads it; text with anything special in it is quoted."""
-    is_plain = not isinstance(value, str) or re.fullmatch(r"[\w./-]+", value)
-    return f"{key}={value}" if is_plain else f"{key}={_quoted(value)}"
-
-
-def _quoted(text: str) -> str:
-    return "'" + text.replace("'", "\\'") + "'"
+    is_plain = not isinstance(value, str) or re.fullmatch(r"[A-Za-z0-9_./-]+", value)
+    return f"{key}={value}" if is_plain else f"{key}={quoted(value)}"
 
 
 def delegated(arguments: Sequence[str]) -> list[str]:
@@ -85,7 +82,7 @@ def delegated(arguments: Sequence[str]) -> list[str]:
             f"{rest[0]} is for the runs: write it into overrides=[…], or all of those as words of their own"
         )
     # Interpolations are the run's, so they are not resolved here.
-    words = [_quoted(text.replace("${", r"\${")) for text in rest]
+    words = [quoted(text.replace("${", r"\${")) for text in rest]
     return [f"overrides=[{','.join(words)}]", *kept] if rest else kept  # options such as --cfg come last
 
 

@@ -15,6 +15,7 @@ from emgs_jax.data.class_file import read_classes
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.ops.ranges import Range
+from emgs_jax.report.provenance import is_metric
 from emgs_jax.report.query import Question, ask, write_answer
 from emgs_jax.report.query_pictures import (
     FEATURES_PICTURE,
@@ -70,7 +71,7 @@ def query(config: DictConfig) -> dict[str, Any]:
     draw_features(folder / FEATURES_PICTURE, run, chosen)
     if config.label_images:
         save_labels(folder / LABELS_FOLDER, run, answer, named_views(run, views))
-    print("\n".join(lines_of(said)))
+    print("\n".join(lines_of(said, "m" if is_metric(run.provenance["prior"].get("settings", {})) else "units")))
     about = said["features"]
     print(
         f"{about['num_gaussians']} Gaussians, {about['num_with_feature']} with a feature of width {about['width']}: "
@@ -130,15 +131,16 @@ def named_views(run: RecordedRun, views: list[View] | None) -> dict[str, View]:
     return {name: View(name, run.poses[row]) for name, row in zip(names, rows, strict=True)}
 
 
-def lines_of(said: dict[str, Any]) -> list[str]:
-    """A line for each word, with its best object."""
+def lines_of(said: dict[str, Any], unit: str) -> list[str]:
+    """A line for each word, with its best object; lengths are in `unit`."""
     lines = []
     for found in said["words"]:
         line = f"{found['word']}: {found['num_gaussians']} Gaussians, {len(found['instances'])} objects"
         if found["instances"]:
             best = found["instances"][0]
             center, extent = (", ".join(f"{float(x):.2f}" for x in best[key]) for key in ("center_m", "extent_m"))
-            line += f"; the best at ({center}) m, {extent} m large, cosine {best['score']:.2f}, lead {best['lead']:.2f}"
+            line += f"; the best at ({center}) {unit}, {extent} {unit} large, cosine {best['score']:.2f}, "
+            line += f"lead {best['lead']:.2f}"
         lines.append(line)
     return lines
 

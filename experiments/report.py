@@ -10,6 +10,7 @@ from emgs_jax.report.page import write_report
 from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.repeat import check_targets
 from emgs_jax.running.configure import build_dataset, message_of
+from emgs_jax.running.overrides import quoted
 
 from .command import command
 
@@ -43,7 +44,7 @@ def images_of(run: RecordedRun) -> tuple[ReadableFrames | None, str]:
 def positional(arguments: list[str]) -> list[str]:
     """A first word that is no override is the folder."""
     is_folder = bool(arguments) and not arguments[0].startswith("-") and "=" not in arguments[0]
-    return [f"folder='{arguments[0]}'", *arguments[1:]] if is_folder else arguments
+    return [f"folder={quoted(arguments[0])}", *arguments[1:]] if is_folder else arguments
 
 
 @command("report", positional)

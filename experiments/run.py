@@ -2,6 +2,8 @@
 
 import contextlib
 import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +28,9 @@ from emgs_jax.report.metrics import (
     spent,
 )
 from emgs_jax.report.page import write_report
-from emgs_jax.report.printout import frame_lines, last_words
-from emgs_jax.report.provenance import print_metrics_table, provenance, signature, write_metrics
-from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.printout import frame_lines, last_words, time_words
+from emgs_jax.report.provenance import is_metric, print_metrics_table, provenance, signature, write_metrics
+from emgs_jax.report.recorded_run import REPORT_FILE, read_run
 from emgs_jax.report.run_files import claim_folder, save_classes, save_outputs, save_progress
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.running.clock import Clock
@@ -74,30 +76,45 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             tqdm.write(note)
         raw = _map(session, dataset, prior, (baselines, evaluation), folder, keeper, live)
         save_progress(folder, session)
-        with clock.phase("densify"):
+        with _said(clock, "densify", "drawing the map from the pose of every frame"):
             labelled = labelled_map(session, prior)
             dense = dense_map(session, dataset, densify, evaluation, labelled)
-        with clock.phase("export"):
+        with _said(clock, "export", "writing the map, its points, a mesh and the overview"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
-            notes = save_outputs(folder, session, dense, densify, title, evaluation.alignment == "sim3")
+            unit = "m" if is_metric(prior.provenance.settings) else "units"
+            notes = save_outputs(folder, session, dense, densify, title, evaluation.alignment == "sim3", unit)
             save_classes(folder, prior)
-        with clock.phase("evaluate"):
+        compared = ", ".join(["the map", "the raw prior", *fused]) if dataset.has_ground_truth else ""
+        with _said(clock, "evaluate", compared and f"comparing with the truth: {compared}"):
             scorer = new_scorer(dataset, evaluation, prior)
             labels = None if labelled is None else labelled.centers
-            metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
-            metrics |= dense.rendering | score_prior(session, raw, scorer)
+            with ThreadPoolExecutor(1, "raw prior") as thread:
+                of_prior = thread.submit(score_prior, session, raw, scorer)
+                metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
+                metrics |= dense.rendering | of_prior.result()
             metrics |= score_baselines(session, baselines, raw, scorer)
         metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()
     metrics["provenance"] = origin
     write_metrics(folder / "metrics.json", metrics)
     keeper.drop()
-    write_report(read_run(folder), dataset)
+    with _said(clock, "report", f"writing {REPORT_FILE}"):
+        write_report(read_run(folder), dataset)
     if live is not None:
         notes = [*notes, f"the live view has ended; emgs view {folder} shows the finished run"]
     notes = [*notes, *revisit_note(session.back_end, prior.is_sequential)]
-    for note in [*frame_lines(session.records, len(dataset.skipped)), *notes]:
+    counts, took = frame_lines(session.records, len(dataset.skipped)), time_words(clock, len(session.records))
+    for note in [*counts, *notes, took]:
         tqdm.write(note)
     return metrics
+
+
+@contextlib.contextmanager
+def _said(clock: Clock, phase: str, words: str) -> Iterator[None]:
+    """A phase of a run that says what it does before it does it; no words, no line."""
+    if words:
+        tqdm.write(f"{words} …")
+    with clock.phase(phase):
+        yield
 
 
 def _map(
@@ -152,8 +169,7 @@ def main(config: DictConfig) -> float:
     for key, value in metrics.items():
         if value is not None and (key.startswith("prior/") or key == "segmentation/miou_percent"):
             print(f"{key} {value:.4g}")
-    pace = f"{metrics['time/seconds_per_frame']:.2f} s a frame"
-    print(f"{last_words(metrics)}{pace}; everything is in {folder}, report.html shows it")
+    print(f"{last_words(metrics)}everything is in {folder}, {REPORT_FILE} shows it")
     error = metrics.get("trajectory/ate_sim3_m")
     return math.inf if error is None else error
 

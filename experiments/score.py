@@ -11,6 +11,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.data.timestamps import in_seconds
 from emgs_jax.evaluation.clouds import PointCloud, read_cloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, compare_clouds
 from emgs_jax.evaluation.trajectory import associate, trajectory_metrics
@@ -62,6 +63,7 @@ def matched_poses(
     if not Path(path).is_file():
         raise FileNotFoundError(f"trajectory={path} does not exist: give a file with `timestamp tx ty tz qx qy qz qw`")
     times, poses = load_trajectory_tum(path)
+    times = in_seconds(times)  # ORB-SLAM3 and others write the nanoseconds of EuRoC's clock into this format
     what = f"{dataset.name} {dataset.sequence}"
     frames = (dataset[row] for row in range(len(dataset)))
     known = [(frame.timestamp, frame.T_world_camera) for frame in frames if frame.T_world_camera is not None]

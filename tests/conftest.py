@@ -1,6 +1,8 @@
 """Shared by all tests of the core: shapes and types checked at every call, one small config, one small camera."""
 
+import gc
 import os
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,14 +20,29 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 # Likewise: small arrays need no thorough compilation, and an oracle holds for any. Flags of the user come last and win.
 QUICK = ["--xla_backend_optimization_level=0"]
 if tuple(map(int, version("jaxlib").split(".")[:2])) <= (0, 10):  # XLA ends the process at a flag that it does not know
-    QUICK.append("--xla_cpu_use_fusion_emitters=false")
+    # And one thread for each executable: to split a small one costs a sixth more than it saves.
+    QUICK += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ["XLA_FLAGS"] = " ".join([*QUICK, os.environ.get("XLA_FLAGS", "")])
 
+# Programs are kept, thousands of objects each: to look through them again and again is a tenth of the time.
+gc.set_threshold(100_000, 20, 50)
+
 import jax  # noqa: E402
+import omegaconf._utils  # noqa: E402
 import pytest  # noqa: E402
+import yaml  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 from schedule import SLOW, TESTS, in_order, scheduler  # noqa: E402
 
+
+def loader_of_c(make=omegaconf._utils.get_yaml_loader):
+    """OmegaConf's loader on that of libyaml: a composition by Hydra reads some thirty files."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(yaml, "SafeLoader", getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        return make()
+
+
+omegaconf._utils.get_yaml_loader = cache(loader_of_c)
 MAX_MAPS = 30000  # and no file of tests makes as many again
 PACKAGE = Path(__file__).resolve().parents[1] / "emgs_jax"
 # Before anything imports the package: every file that declares shapes of JAX arrays has them checked at every call.
@@ -70,20 +87,26 @@ def camera():
 
 
 @pytest.fixture(scope="session")
-def exact_run(tmp_path_factory):
+def shared_folder(tmp_path_factory):
+    """One for all processes of this call of pytest."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+@pytest.fixture(scope="session")
+def exact_run(shared_folder):
     """Folder and metrics of a tiny run with the exact prior, made once for all processes: nobody writes into it."""
     from tiny_run import make_exact_run  # after the hook
 
-    base = tmp_path_factory.getbasetemp()
-    return make_exact_run(base.parent if "PYTEST_XDIST_WORKER" in os.environ else base)
+    return make_exact_run(shared_folder)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def drop_executables():
     """Every executable holds some 13 memory maps, of which Linux gives 65530: past that, compiling segfaults.
 
-    Until then they are kept, because other files need the same: a tiny run is 290 of them, and making them anew costs
-    10 CPU seconds. No memory is gained by dropping them.
+    Until then they are kept, because other files need the same: making anew what a tiny run takes costs 10 CPU
+    seconds. No memory is gained by dropping them.
     """
     yield
     if num_maps() > MAX_MAPS:

@@ -38,6 +38,13 @@ SMALL = (
     *("render.tile_size=8", "render.tile_capacity=192", "render.covariance_scale=2.0", "render.radius=3.0"),
     "slam.localization.icp.num_points=256",
 )
+# For whole steps. Every second row and column of the full images is kept; 32 of their pixels make 8 rows.
+FULL, ROOM = Camera([40.0, 46.0], [29.0, 24.5], 64, 48), 200  # rows of the map
+WHOLE = (
+    *("slam.submap.margin=100", "slam.observation.thin=2", "slam.fit.points_per_gaussian=2116"),
+    *(f"slam.submap.map_capacity={ROOM}", "slam.submap.submap_capacity=256"),  # the whole map
+    "slam.initialization=merged",
+)
 
 
 @cache

@@ -25,19 +25,25 @@ GROUPS = {
     ),
     "smoke": ("running/test_coming_back.py", "running/test_segments.py", "scripts/test_walk.py"),
     "browser": ("report/test_page_browser.py", "report/test_table_page.py", "report/test_viewer.py"),  # one Chromium
-    "small": ("test_slam.py", "running/test_growth.py", "running/test_stacked.py"),
+    "small": ("running/test_growth.py", "test_slam.py", "running/test_stacked.py"),  # the first counts, as above
 }
-# What the quick subset (-m "not slow") takes nothing of, beside the marked tests: six CPU seconds and more each.
+# What the quick subset (-m "not slow") takes nothing of, beside the marked tests: some five CPU seconds and more each.
 SLOW = {
     "data/test_apartment.py",
     "graph/test_graph_optimize.py",
     "loops/test_verification.py",
+    "ops/test_neighbours.py",
+    "prior/multiview/test_depth.py",
+    "prior/multiview/test_plane_sweep.py",
+    "prior/simulated/test_simulated_drift.py",
     "registration/test_pose_noise.py",
+    "registration/test_problem.py",
     *(f"report/{name}.py" for name in ("test_page", "test_page_browser", "test_query", "test_repeat")),
     *(f"running/{name}.py" for name in ("test_back_end", "test_compilation", "test_executables", "test_locating")),
     "running/test_values.py",
     *(f"scripts/{name}.py" for name in ("test_command_line", "test_evaluate", "test_score", "test_sweep_script")),
     "scripts/test_tune.py",
+    "test_existence.py",
     "test_front_door.py",
     "test_mutants.py",
     "test_splitting.py",

@@ -9,7 +9,7 @@ import scene as sc
 from emgs_jax.em import e_step, em_update, m_step, precision, support, widened_distance_sq
 from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import whitening
-from emgs_jax.registration.noise import confidence_levels, noise_of_levels
+from emgs_jax.registration.noise import level_edges, levels_of, noise_of_levels
 
 M, N, F = 60, 40, 3
 POINTS, GAUSSIANS = sc.random_observation(M, num_features=F), sc.random_gaussians(N, num_features=F)
@@ -353,8 +353,9 @@ def noisy_wall(seed: int):
 @sc.on_host
 def taken_in(gaussians, seen, error, confidence, config):
     """The means after points whose noise is estimated by their confidence, and how many points each has."""
-    levels = confidence_levels(confidence, seen.valid)
-    noise = noise_of_levels(error, seen.valid, levels)[levels][:, None] * seen.points
+    levels = levels_of(confidence, level_edges(confidence, seen.valid))
+    _, of_levels = noise_of_levels(error, seen.valid, levels)
+    noise = of_levels[levels][:, None] * seen.points
     step, _ = e_step(gaussians, seen, noise, config)
     new, total = m_step(gaussians, seen, precision(noise, config), step, config)
     return new.means, total

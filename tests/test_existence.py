@@ -143,6 +143,15 @@ def test_what_shows_nothing_is_confirmed_by_what_it_explains_and_by_nothing_else
     np.testing.assert_allclose(after.existence, [-1.0 + (settings.hit if use > 0 else 0.0)], atol=1e-6)
 
 
+def test_at_an_edge_of_depth_both_surfaces_are_seen_though_a_pixel_shows_one(settings):
+    """A pose that is wrong by a pixel shows the other; both explain nothing, which counts against what is seen."""
+    depth = np.where(np.arange(CAMERA.width) < CAMERA.width // 2, 2.0, 4.0)
+    map = map_of(discs([(0, 0, 2.0), (0, 0, 4.0)], std=0.2), existence=0.5)
+    after, is_seen = judged(map, -1, look(depth), HERE, CAMERA, NOISE, settings)
+    assert is_seen.all()
+    np.testing.assert_allclose(after.existence, np.float32(0.5) - settings.miss, atol=1e-6)
+
+
 def test_what_is_seen_through_is_not_confirmed_by_what_it_explains(settings):
     map = map_of(discs((0, 0, 2.0)))
     after, _ = judged(map, 1, look(3.0), HERE, CAMERA, NOISE, settings)

@@ -45,6 +45,18 @@ def test_importing_loads_nothing_else_and_changes_no_setting_of_jax():
     assert python(NO_MARK).splitlines() == ["[]", "unchanged", "[]"]
 
 
+def test_importing_keeps_jax_quiet_unless_the_user_says_otherwise():
+    """300 lines about executables from the cache that are sound; jaxlib reads the level as it is loaded."""
+    said = 'import emgs_jax, os; print(os.environ["TF_CPP_MIN_LOG_LEVEL"])'
+    assert python(said, TF_CPP_MIN_LOG_LEVEL="0").split() == ["0"]
+    without = "import os; os.environ.pop('TF_CPP_MIN_LOG_LEVEL', None); "
+    assert python(without + said).split() == ["3"] == python(without + "import experiments, os; " + said).split()
+
+
+def test_dir_lists_what_is_there_for_users_and_nothing_that_it_is_made_with():
+    assert {name for name in dir(emgs_jax) if not name.startswith("__")} == {*emgs_jax.__all__} - {"__version__"}
+
+
 def test_every_name_is_there_and_none_is_hidden_by_a_folder_of_the_package():
     for name in emgs_jax.__all__:
         assert getattr(emgs_jax, name) is not None

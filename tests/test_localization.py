@@ -343,16 +343,15 @@ def small_prediction(camera):
 def test_the_fine_step_is_icp_of_the_scaled_points_with_the_noise_of_the_coarse_pose(
     camera, submap, lenient, depth_noise, coarse_scale
 ):
-    """Metres for the pose, and the same over the depth for the points."""
+    """The noise of the points' depth, and what is known of the pose."""
     settings = sc.changed(lenient, **{"icp.prior_information": 30.0, "icp.scale_noise": 1.0})
     coarse = coarse_of(nudged(camera), camera, settings)
     coarse = sc.replace(coarse, depth_noise=np.float32(depth_noise), scale=np.float32(coarse_scale))
     current = small_prediction(camera).current
     T, aligned, info = fine_step(current, submap, coarse, settings)
     scaled = sc.replace(current, points=coarse_scale * np.asarray(current.points))
-    noise = sc.device(depth_noise * coarse.mean_depth), sc.device(depth_noise)
     known = sc.on_host(root_information)(coarse.belief.covariance)
-    expected, scale, found = solve(scaled, submap, coarse.T_world_camera, noise, settings.icp, None, known)
+    expected, scale, found = solve(scaled, submap, coarse.T_world_camera, known, sc.device(depth_noise), settings.icp)
     # Another program rounds in another order; the solver stops within its tolerance.
     assert max(sc.pose_error(T, expected)) < 1e-4
     np.testing.assert_allclose(info.scale, coarse_scale * scale, rtol=1e-4)
@@ -390,6 +389,15 @@ def test_each_check_alone_keeps_the_coarse_pose_and_says_why(camera, submap, len
     assert int(info.reason) == 2**bit and bit < len(REASONS)
     sc.assert_same(T, coarse.T_world_camera)
     assert aligned.valid.all()  # the next frame's coarse step still needs them
+
+
+def test_a_step_may_be_as_long_as_a_share_of_the_mean_depth(camera, submap, lenient):
+    coarse, _, _, info = fine_of(nudged(camera), submap, camera, lenient)
+    share = float(info.step_m / coarse.mean_depth)
+    assert abs(coarse.mean_depth - 1) > 0.1  # or a metre would do
+    for allowed in (0.99, 1.01):
+        _, _, limited = fine_step(nudged(camera).current, submap, coarse, sc.at(lenient, "max_step", allowed * share))
+        assert limited.is_tracked == (allowed > 1)
 
 
 def test_an_empty_submap_is_too_few_points_that_agree(camera, submap, lenient):

@@ -21,6 +21,7 @@ LINES = {  # each line, and all that a generator makes of it
     "x = a[1:, :n, 0]": ["x = a[(1) + 1:, :n, 0]", "x = a[1:, :(n) - 1, 0]", "x = a[1:, :n, 1]"],
     "x = jnp.minimum(a, b)": ["x = jnp.maximum(a, b)"],
     "x = jnp.where(a, b, c)": ["x = jnp.where(a, c, b)"],
+    "x = jnp.zeros_like(a[0])": ["x = jnp.ones_like(a[0])"],
     "x = jnp.stack(a, axis=-1)": ["x = jnp.stack(a, axis=0)"],
     "x = jnp.sum(a, where=valid)": ["x = jnp.sum(a)"],
     "x = T.inverse()": ["x = (T)"],
@@ -86,3 +87,9 @@ def test_a_file_meets_its_own_tests_first_and_then_those_that_import_it():
     assert found[0] == "tests/ops/test_linalg.py"
     assert "tests/registration/test_problem.py" in found
     assert set(found) < set(nearest_tests("emgs_jax/ops/linalg.py", reach=2))
+
+
+def test_a_class_of_which_an_option_of_conf_makes_something_meets_the_tests_that_choose_the_option():
+    found = nearest_tests("emgs_jax/prior/multiview/prior.py", reach=2)
+    assert "tests/prior/multiview/test_multiview_stereo.py" in found
+    assert "tests/data/test_replica.py" not in found

@@ -8,23 +8,21 @@ import numpy as np
 import pytest
 import reference
 import scene as sc
+from scene import FULL, ROOM, WHOLE
 
+from emgs_jax import slam
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.executable import calling
 from emgs_jax.running.convert import FirstWindow, opening
+from emgs_jax.running.executables import call
 from emgs_jax.running.growth import advance, start, with_room
-from emgs_jax.slam import Overflow, SlamState, StepInfo, init_state, step
+from emgs_jax.slam import Overflow, SlamState, StepInfo
 
 FRAME = 3
 pytestmark = pytest.mark.slow  # one compilation of the whole step is half a minute
-# Every second row and column of the full images is kept, which are those of `camera`; 32 of their pixels make 8 rows.
-FULL = Camera([40.0, 46.0], [29.0, 24.5], 64, 48)
-ROOM = 200  # rows of the map
-WHOLE = (
-    *("slam.submap.margin=100", "slam.observation.thin=2", "slam.fit.points_per_gaussian=2116"),
-    *(f"slam.submap.map_capacity={ROOM}", "slam.submap.submap_capacity=256"),  # the whole map
-    "slam.initialization=merged",
-)
+# With executables that are kept, as runs have them: those that test_growth.py compiled.
+init_state, step = (calling(call)(function) for function in (slam.init_state, slam.step))
 # An exact chain, lenient checks: the room is coarse at this resolution.
 LENIENT = {"localization.max_residual": 1.0, "localization.min_eigenvalue": 0.0}
 
@@ -496,7 +494,7 @@ def test_room_is_doubled_where_rows_did_not_fit(settings):
 
 
 def test_a_frame_is_repeated_from_the_same_state_until_it_fits(state, stepped, settings):
-    """With a step that says so for a map of less than four times the room; a full tile alone repeats nothing."""
+    """By a step that says so below four times the room; a splat without room alone repeats nothing."""
     calls, prediction = [], exact(FRAME)
 
     def crowded(given, _, __, chosen):

@@ -170,7 +170,7 @@ VERBS = {
         lambda s: (belief_of(s),),
     ),
     "icp": (
-        lambda o, g, T: icp.icp(o, g, T, (ONE * 0.02, ONE * 0.01), CONFIG.localization.icp),
+        lambda o, g, T: icp.icp(o, g, T, jnp.diag(50.0 * jnp.ones(7)), ONE * 0.01, CONFIG.localization.icp),
         lambda s: (
             sc.moved_points(sc.pose_of(np.linalg.inv(sc.matrix_of(sc.path_pose(s)))), close(s)),
             sc.random_gaussians(32, s, 2),
@@ -268,4 +268,5 @@ FORWARD = {"icp", "localize_fine"}
 # Medians: where rows move apart, another one takes the median's place at once.
 ROWS_TOGETHER = {"localize_coarse", "localize_fine"}
 # Each is the larger part of another verb, which is compiled in its place.
-INSIDE_ANOTHER = {"icp", "m_step", "fit_to_points", "cluster", "render", "project_gaussians", "residuals", "knn"}
+INSIDE_ANOTHER = {"icp", "m_step", "fit_to_points", "cluster", "kmeans", "render", "project_gaussians"}
+INSIDE_ANOTHER |= {"residuals", "knn"}

@@ -18,7 +18,7 @@ class Frame:
 
     Args:
         index: position among the images in use, from 0 (after `start`, `stop`, `stride`).
-        timestamp: seconds of the data set, or the number in the file name where it has none.
+        timestamp: seconds of the data set, or the number or the time in the file name where it has none.
         name: path of the image file, for messages.
         image: RGB, uint8 (h, w, 3).
         depth: camera-space z in metres, float32 (h, w), 0 = no value; None without ground truth.

@@ -15,6 +15,7 @@ import yaml
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.reading import Intrinsics, Size
+from emgs_jax.data.transforms_json import with_frames_camera
 
 KNOWN_FILES = (
     "COLMAP cameras.txt, nerfstudio transforms.json, OpenCV or ROS YAML (camera_matrix), ORB-SLAM YAML (Camera.fx), "
@@ -205,9 +206,7 @@ def _from_corner(fx: float, fy: float, values: Mapping[str, float]) -> Intrinsic
 def _transforms(values: Mapping[str, Any], path: Path) -> Calibration:
     """nerfstudio: one camera for all frames."""
     camera = {"fl_x", "fl_y", "cx", "cy", "w", "h", *DISTORTION, "k4"}
-    frames = values.get("frames")
-    if isinstance(frames, list) and any(isinstance(frame, dict) and camera & frame.keys() for frame in frames):
-        raise ValueError(f"{path} has a camera for each frame: take images of one camera and give its intrinsics")
+    values = with_frames_camera(values, camera | {"camera_model"}, path)
     _check_known(values, camera | TRANSFORMS_KEYS, path)
     model = values.get("camera_model", "OPENCV")
     if model not in TRANSFORMS_MODELS or values.get("is_fisheye"):

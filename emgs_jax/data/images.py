@@ -1,22 +1,20 @@
 """A folder of images or a video file; no ground truth, so no metrics."""
 
-import math
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from emgs_jax.data import reading
-from emgs_jax.data.base import BadFrameError, Frame
-from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens
+from emgs_jax.data.base import Frame
+from emgs_jax.data.file_names import IMAGE_SUFFIXES, natural_key, times_of
+from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens, with_notes
 from emgs_jax.data.reading import Size
+from emgs_jax.data.tones import Tones, read_shown, tones_of
+from emgs_jax.data.video import VIDEO_SUFFIXES, Video
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv")
-LAYOUT = "root[/sequence] = a folder of png, jpg, bmp or tiff images, or a video file (mp4, mov, avi, mkv)"
+LAYOUT = "root[/sequence] = a folder of png, jpg, bmp or tiff images, or a video file (mp4, mov, m4v, avi, mkv, webm)"
 
 
 class Images:
@@ -51,14 +49,15 @@ class Images:
                 f"dataset.intrinsics is not set for {path}: give {ALTERNATIVES}; where none of them is at hand, "
                 "fx = fy = .8 times the width and the centre of the image are a start"
             )
-        self._source = Video(path) if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file() else Folder(path)
+        is_video = path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+        self._source = Video(path, reading.limit(start, stop)) if is_video else Folder(path)
         self._chosen = reading.select(self._source.count, start, stop, stride, f"{path} ({LAYOUT})")
         raw_size = self._source.find_size(self._chosen)
         self._raw_size = raw_size
         self.sequence = path.name if sequence is None else str(sequence)
         self.size = reading.check_size(size)
         self._lens = find_lens(intrinsics, self._pictures())
-        self.calibration = self._lens.about
+        self.calibration = with_notes(self._lens.about, *self._source.notes)
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, raw_size, self.size)
 
     def _pictures(self) -> Pictures:
@@ -89,28 +88,33 @@ class Images:
             "size": self.size,
             "intrinsics": self.intrinsics,
             **({} if self._lens.maps is None else {"lens": self.calibration["distortion"]}),
+            **({} if self._source.tones is None else {"tones": self._source.tones}),
             "frames": (self._chosen.start, self._chosen.stop, self._chosen.step),
         }
         return reading.fingerprint(self._source.folder, reading.all_files(self), options)
 
 
 class Folder:
-    """Images of a folder in natural order; time is the number in the name where that ascends, else the position."""
+    """Images of a folder in natural order, at the times in their names (`times_of`)."""
 
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
             raise ValueError(f"{folder} is neither a folder nor a video file; expected {LAYOUT}")
         found = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
         self.folder = folder
-        self._paths = sorted(found, key=lambda p: (reading.natural_key(p), p.name))
+        self._paths = sorted(found, key=lambda p: (natural_key(p), p.name))
         self.count = len(self._paths)
-        self._times = times_of(self._paths)
+        self._times, note = times_of(self._paths)
+        self.notes: list[str | None] = [note]
+        self.tones: Tones | None = None  # of the images in use
 
     def find_size(self, rows: range) -> Size:
+        self.tones = tones_of([self._paths[row] for row in rows])
+        self.notes.append(self.tones and self.tones.note)
         return reading.first_size((self._paths[row] for row in rows), self.folder)
 
     def read(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        return reading.read_color(self._paths[row])
+        return read_shown(self._paths[row], None, self.tones)
 
     def timestamp(self, row: int) -> float:
         return self._times[row]
@@ -120,64 +124,3 @@ class Folder:
 
     def label(self, row: int) -> str:
         return str(self._paths[row])
-
-
-class Video:
-    """A video, read from its beginning: seeking lands on a key frame nearby with many codecs, counting never does."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self.folder = path, path.parent
-        self._capture = self._open()
-        self._next = 0  # number of the frame that the capture gives next
-        self.count = max(int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-        if self.count == 0:  # some containers do not say
-            while self._capture.grab():
-                self.count += 1
-            self._next = self.count
-        rate = self._capture.get(cv2.CAP_PROP_FPS)
-        self._seconds_per_frame = 1 / rate if math.isfinite(rate) and rate > 0 else 1.0
-
-    def _open(self) -> cv2.VideoCapture:
-        capture = cv2.VideoCapture(str(self._path))
-        if not capture.isOpened():
-            raise ValueError(f"{self._path} is no video that OpenCV can open: convert it to mp4 (h264) or to images")
-        return capture
-
-    def find_size(self, rows: range) -> Size:
-        return self.read(rows[0]).shape[1::-1]
-
-    def read(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        if row < self._next:
-            self._capture, self._next = self._open(), 0
-        while self._next < row and self._capture.grab():
-            self._next += 1
-        is_read, image = self._capture.read() if self._next == row else (False, None)
-        if not is_read or image is None:
-            raise BadFrameError(
-                f"{self.label(row)} cannot be read, the video ends or is damaged after frame {self._next - 1} although "
-                f"its header says {self.count} frames: set dataset.stop={self._next}"
-            )
-        self._next += 1
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-    def timestamp(self, row: int) -> float:
-        return row * self._seconds_per_frame
-
-    def file(self, row: int) -> Path:
-        return self._path
-
-    def label(self, row: int) -> str:
-        return f"{self._path}, frame {row}"
-
-
-def times_of(paths: Sequence[Path]) -> list[float]:
-    """The numbers in the names of files where they ascend, else their positions."""
-    numbers = [number for path in paths if (number := last_number(path.stem)) is not None and math.isfinite(number)]
-    is_time = len(numbers) == len(paths) and all(b > a for a, b in zip(numbers, numbers[1:], strict=False))
-    return numbers if is_time else [float(i) for i in range(len(paths))]
-
-
-def last_number(name: str) -> float | None:
-    """The last number in a file name without suffix: 'frame-000012.color' gives 12, '1341841.25' gives 1341841.25."""
-    found = re.findall(r"[0-9]+(?:\.[0-9]+)?", name)
-    return float(found[-1]) if found else None

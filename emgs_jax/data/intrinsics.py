@@ -16,7 +16,9 @@ from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.calibration_files import Calibration, read_calibration
 from emgs_jax.data.focal_length import describe, estimate_focal_length
+from emgs_jax.data.plausible_camera import is_impossible, oddities, other_reading
 from emgs_jax.data.reading import Intrinsics, Number, Size
+from emgs_jax.data.tones import Tones, read_shown
 
 Given = str | Sequence[Number]  # dataset.intrinsics
 DIAGONAL_35_MM = 43.27  # of 36 mm x 24 mm; cameras scale by the diagonal, whatever their aspect (COLMAP's rule)
@@ -71,9 +73,9 @@ class Lens:
         return depth if self.maps is None else cv2.remap(depth, *self.maps, cv2.INTER_NEAREST)
 
 
-def pictures_of(files: Sequence[Path], size: Size) -> Pictures:
-    """Image files of one size."""
-    return Pictures(size, len(files), lambda index: reading.read_color(files[index], size), files)
+def pictures_of(files: Sequence[Path], size: Size, tones: Tones | None = None) -> Pictures:
+    """Image files of one size; `tones` of those with more than 8 bits."""
+    return Pictures(size, len(files), lambda index: read_shown(files[index], size, tones), files)
 
 
 def find_lens(given: Given, pictures: Pictures) -> Lens:
@@ -89,14 +91,15 @@ def find_lens(given: Given, pictures: Pictures) -> Lens:
         what, camera = "dataset.intrinsics", from_numbers(given)
     elif given == "exif":
         what, camera = "dataset.intrinsics=exif", from_exif(pictures)
-        about = {"source": given, "note": f"from EXIF: focal length {camera.intrinsics[0]:.1f} px"}
+        about = {"source": given, "note": f"intrinsics from EXIF: focal length {camera.intrinsics[0]:.1f} px"}
     elif given == "estimate":
         what = "dataset.intrinsics=estimate"
         camera, about = from_images(pictures)
     else:
         path = Path(given).expanduser()
         what, camera = str(path), read_calibration(path)
-        about = {"source": path.name, "note": f"from {path.name}: {[round(v, 2) for v in camera.intrinsics]}"}
+        values = [round(value, 2) for value in camera.intrinsics]
+        about = {"source": path.name, "note": f"intrinsics from {path.name}: {values}"}
     return to_lens(camera, pictures.size, what, about, pictures.name)
 
 
@@ -111,15 +114,23 @@ def to_lens(camera: Calibration, size: Size, what: str, about: Mapping[str, Any]
         images: names them, likewise.
 
     Raises:
-        ValueError: it is for images of another size, or the distortion leaves nothing of the image.
+        ValueError: it is for images of another size, no lens has such a view, or the distortion leaves nothing of the
+            image.
     """
     check_image_size(camera, size, what)
     raw = reading.check_intrinsics(camera.intrinsics, size, what, images)
+    about = with_notes(about, check_plausible(camera, size, what, images))
     about = {**about, "size": [*size], "intrinsics": [*raw], "distortion": [*camera.distortion]}
     if not any(camera.distortion):
         return Lens(raw, None, about)
     straight, maps = undistortion(raw, camera.distortion, size, what)
     return Lens(straight, maps, about)
+
+
+def with_notes(about: Mapping[str, Any], *notes: str | None) -> Mapping[str, Any]:
+    """The description of a lens whose `note` also says what `notes` say of the images."""
+    said = [note for note in (about.get("note"), *notes) if note]
+    return {**about, "note": "; ".join(said)} if said else about
 
 
 def from_numbers(given: Sequence[Number]) -> Calibration:
@@ -194,7 +205,7 @@ def from_images(pictures: Pictures) -> tuple[Calibration, dict[str, Any]]:
     (w, h) = pictures.size
     about = {
         "source": "estimate",
-        "note": describe(found),
+        "note": f"intrinsics {describe(found)}",
         "focal_px": found.value,
         "focal_deviation_px": found.spread,
         "focal_quartiles_px": [*found.quartiles],
@@ -213,6 +224,25 @@ def check_image_size(camera: Calibration, size: Size, what: str) -> None:
     if (w, h) == (height, width):
         reason = "they are turned, maybe by their EXIF orientation; calibrate the images as they are shown"
     raise ValueError(f"{what} is for images of {w}x{h}, but the images are {width}x{height}: {reason}")
+
+
+def check_plausible(camera: Calibration, size: Size, what: str, images: str) -> str | None:
+    """What is odd about a camera for images of that size; None where nothing is.
+
+    Raises:
+        ValueError: no lens has such a view; or the numbers fit as another camera's, and no size stands beside them.
+    """
+    found = oddities(camera.intrinsics, size)
+    if not found:
+        return None
+    other = other_reading(camera.intrinsics, size)
+    odd = f"{what} {[*camera.intrinsics]} is odd for the {size[0]}x{size[1]} {images}: {', '.join(found)}"
+    if is_impossible(camera.intrinsics, size):
+        remedy = other or "give fx, fy, cx, cy in pixels of the images on disk"
+        raise ValueError(f"{odd}; {remedy}")
+    if other and camera.size is None:
+        raise ValueError(f"{odd}; {other}, or, where they are right, a calibration file with width and height")
+    return f"{odd}; {other or 'check it'}"
 
 
 def undistortion(

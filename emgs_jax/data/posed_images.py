@@ -15,8 +15,9 @@ from emgs_jax.data import reading
 from emgs_jax.data.base import Frame
 from emgs_jax.data.calibration_files import Calibration, colmap_camera, read_calibration
 from emgs_jax.data.colmap_model import BINARY, TEXT, load_colmap
-from emgs_jax.data.images import times_of
-from emgs_jax.data.intrinsics import to_lens
+from emgs_jax.data.file_names import find_image, natural_key, times_of
+from emgs_jax.data.intrinsics import to_lens, with_notes
+from emgs_jax.data.tones import read_shown, tones_of
 from emgs_jax.data.transforms_json import load_transforms
 
 Pose = Float[np.ndarray, "4 4"]
@@ -45,7 +46,7 @@ class Solved:
 
 
 class PosedImages:
-    """What the data sets of this file share (a `Dataset`); images in the natural order of their names."""
+    """What the data sets of this file share (a `Dataset`); images in the natural order of their folders and names."""
 
     name = ""
     classes: tuple[str, ...] = ()
@@ -54,8 +55,8 @@ class PosedImages:
     def __init__(
         self, folder: Path, solved: Solved, chosen: tuple[int, int | None, int], size: Sequence[int], sequence: str
     ) -> None:
-        order = sorted(range(len(solved.images)), key=lambda row: (reading.natural_key(solved.images[row]), row))
-        times = times_of([solved.images[row] for row in order])
+        order = sorted(range(len(solved.images)), key=lambda row: (natural_key(solved.images[row]), row))
+        times, note = times_of([solved.images[row] for row in order])
         picked = reading.select(len(order), *chosen, solved.source)
         self._folder, self._files, self._times = folder, solved.files, [times[place] for place in picked]
         rows = [order[place] for place in picked]
@@ -68,7 +69,8 @@ class PosedImages:
         self._raw_size = reading.first_size(self._images, self._images[0].parent)
         about = {"source": solved.source.name}
         self._lens = to_lens(solved.camera, self._raw_size, str(solved.source), about)
-        self.calibration = self._lens.about
+        self._tones = tones_of(self._images)
+        self.calibration = with_notes(self._lens.about, note, self._tones and self._tones.note)
         self.sequence = sequence
         self.size = reading.check_size(size)
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
@@ -79,7 +81,7 @@ class PosedImages:
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
         path = self._images[index]
-        image = self._lens.straighten(reading.read_color(path, self._raw_size))
+        image = self._lens.straighten(read_shown(path, self._raw_size, self._tones))
         image = reading.resize_color(image, self.size)
         return Frame(index, self._times[index], str(path), image, None, self.pose(index))
 
@@ -92,6 +94,7 @@ class PosedImages:
     def fingerprint(self) -> str:
         options = {"dataset": self.name, "size": self.size, "intrinsics": self.intrinsics}
         options |= {"lens": self.calibration["distortion"], "images": [path.name for path in self._images]}
+        options |= {} if self._tones is None else {"tones": self._tones}
         return reading.fingerprint(self._folder, reading.all_files(self), options)
 
 
@@ -182,14 +185,16 @@ def read_colmap(model: Path, folder: Path) -> Solved:
     camera = colmap_camera([*used.pop()], found.files[0])
     for name, pose in zip(found.names, found.T_world_camera, strict=True):
         reading.check_position(pose[:3, 3], f"{found.files[1]}, image {name},")
-    return Solved([folder / name for name in found.names], [*found.T_world_camera], camera, found.files[1], found.files)
+    return Solved(
+        [find_image(folder, name) for name in found.names], [*found.T_world_camera], camera, found.files[1], found.files
+    )
 
 
 def read_nerfstudio(path: Path) -> Solved:
     """The frames of a transforms.json; a pose of inf or nan is none.
 
     Raises:
-        ValueError: no frame, a camera for each frame or one that is not read, a damaged file.
+        ValueError: no frame, cameras that differ or one that is not read, a damaged file.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist; expected the layout {NERFSTUDIO_LAYOUT}")
@@ -199,4 +204,4 @@ def read_nerfstudio(path: Path) -> Solved:
         reading.as_pose(" ".join(map(repr, row)), f"{path}, frame {name}")
         for name, row in zip(names, rows, strict=True)
     ]
-    return Solved([path.parent / name for name in names], poses, camera, path, (path,))
+    return Solved([find_image(path.parent, name) for name in names], poses, camera, path, (path,))

@@ -1,5 +1,6 @@
 """A data set without the frames that cannot be read."""
 
+import contextlib
 import hashlib
 import itertools
 from collections.abc import Callable, Iterable, Sequence
@@ -10,12 +11,17 @@ import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
 from emgs_jax.data.checksums import find_checksums
+from emgs_jax.data.spool import Spool
 
+MAX_KEPT_BYTES = 2**30  # of frames that were read, uncompressed; the others are read anew
+ARRAYS = ("image", "depth", "labels")  # of a frame
 MAX_STEP_M = 100.0  # from one frame in use to the next: two that are farther apart show nothing in common
 
 
 class ReadableFrames:
     """The frames of a data set that a run uses (a `Dataset` itself); windows are made over these.
+
+    Each is read once: mapping, comparison and pictures take the same bits, in a temporary file as far as they fit.
 
     Args:
         dataset: all frames.
@@ -40,6 +46,7 @@ class ReadableFrames:
         if on_bad_frame not in ("error", "skip"):
             raise ValueError(f"on_bad_frame must be error or skip, got {on_bad_frame!r}")
         self._dataset, self._checksums = dataset, find_checksums(checksums, dataset)
+        self._spool, self._places = Spool(), {}  # of each frame that was read, the rest of it and where its arrays are
         self.name, self.sequence, self.size = dataset.name, dataset.sequence, dataset.size
         self.intrinsics, self.calibration, self.classes = dataset.intrinsics, dataset.calibration, dataset.classes
         self.has_ground_truth = dataset.has_ground_truth
@@ -59,10 +66,22 @@ class ReadableFrames:
         return replace(self._read(self.kept[index]), index=index)
 
     def _read(self, index: int) -> Frame:
+        if index in self._places:
+            frame, places = self._places[index]
+            return replace(frame, **{name: self._spool[place] for name, place in places.items()})
         if self._checksums is not None:
             for file in self._dataset.files(index):
                 self._checksums.check(file)
-        return self._dataset[index]
+        frame = self._dataset[index]
+        self._keep(index, frame)
+        return frame
+
+    def _keep(self, index: int, frame: Frame) -> None:
+        arrays = {name: getattr(frame, name) for name in ARRAYS if getattr(frame, name) is not None}
+        if self._spool.num_bytes + sum(array.nbytes for array in arrays.values()) <= MAX_KEPT_BYTES:
+            with contextlib.suppress(OSError):  # a full disk keeps nothing, and is no failure
+                places = {name: self._spool.append(array) for name, array in arrays.items()}
+                self._places[index] = replace(frame, **dict.fromkeys(ARRAYS)), places
 
     def pose(self, index: int) -> np.ndarray | None:
         return self._dataset.pose(self.kept[index])

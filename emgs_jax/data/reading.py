@@ -2,7 +2,6 @@
 
 import hashlib
 import math
-import re
 import struct
 import zlib
 from collections.abc import Iterable, Sequence
@@ -21,6 +20,7 @@ Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy; pixel centres 
 MAX_SIDE = 16384  # pixels; more is a slip of the hand, and would ask for gigabytes
 MAX_POSITION_M = 1000.0  # from the origin: steps of float32 are .06 mm there, and 6 cm at 1e6 m
 RIGID_TOLERANCE = 1e-2  # text files round; a flipped digit moves R^T R by more
+OWN_BITS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH  # BGR in 8 or 16 bits, or float
 REMEDY = "fetch the file again or set on_bad_frame=skip"
 
 
@@ -41,12 +41,6 @@ def find_sequence(root: str | None, sequence: str | None, layout: str, source: s
     return path
 
 
-def natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key under which frame2 comes before frame10."""
-    parts = re.split(r"([0-9]+)", path.name.casefold())
-    return [(1, int(p), p) if p and p[0] in "0123456789" else (0, 0, p) for p in parts]
-
-
 def select(count: int, start: int, stop: int | None, stride: int, where: object) -> range:
     """The images in use out of the `count` that are there, in order."""
     if count == 0:
@@ -63,6 +57,11 @@ def select(count: int, start: int, stop: int | None, stride: int, where: object)
             f"dataset.stop must be null (all) or in {start + 1}..{count}, {where} has {count} images; got {stop}"
         )
     return range(start, count if stop is None else stop, stride)
+
+
+def limit(start: int, stop: int | None) -> int | None:
+    """How many images have to be counted before `select`; None = all, also where `start` and `stop` make no sense."""
+    return stop if isinstance(start, int) and isinstance(stop, int) and 0 <= start < stop else None
 
 
 def check_index(index: int, count: int) -> None:

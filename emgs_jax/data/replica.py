@@ -10,7 +10,9 @@ from jaxtyping import Float
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
-from emgs_jax.data.intrinsics import Given, find_lens, pictures_of
+from emgs_jax.data.calibration_files import Calibration
+from emgs_jax.data.file_names import natural_key
+from emgs_jax.data.intrinsics import Given, find_lens, pictures_of, to_lens
 from emgs_jax.data.reading import Intrinsics, Number, Size
 
 LAYOUT = "root/{cam_params.json, SCENE/{traj.txt, results/{frame000000.jpg, depth000000.png}}}"
@@ -49,9 +51,13 @@ class Replica:
         chosen = reading.select(len(images), start, stop, stride, f"{self._folder / 'results'} (layout {LAYOUT})")
         self._images = [images[i] for i in chosen]
         self._poses = read_rows(self._folder / "traj.txt", self._images)
-        self._raw_size, calibration, scale = read_calibration(Path(str(root)).expanduser() / "cam_params.json")
-        given = calibration if intrinsics is None else intrinsics
-        self._lens = find_lens(given, pictures_of(self._images, self._raw_size))
+        path = Path(str(root)).expanduser() / "cam_params.json"
+        self._raw_size, calibration, scale = read_calibration(path)
+        if intrinsics is None:
+            camera = Calibration(calibration, (), self._raw_size)
+            self._lens = to_lens(camera, self._raw_size, str(path), {"source": path.name})
+        else:
+            self._lens = find_lens(intrinsics, pictures_of(self._images, self._raw_size))
         self.calibration = self._lens.about
         self.sequence = str(sequence)
         self.size = reading.check_size(size)
@@ -93,7 +99,7 @@ def find_images(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} does not exist; expected the layout {LAYOUT} ({SOURCE})")
     found = [p for p in folder.iterdir() if re.fullmatch(r"frame[0-9]+\.(jpe?g|png)", p.name, re.IGNORECASE)]
-    return sorted(found, key=reading.natural_key)
+    return sorted(found, key=natural_key)
 
 
 def number_of(path: Path) -> int:

@@ -13,13 +13,16 @@ from jaxtyping import UInt8
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
 from emgs_jax.data.calibration_files import Calibration
-from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens, to_lens
+from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens, to_lens, with_notes
+from emgs_jax.data.tones import ALL_16_BITS, find_tones
 
 LAYOUT = "root[/sequence] = a .bag of ROS 1, or the folder of a ROS 2 bag with metadata.yaml"
 RAW, COMPRESSED, INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
 TO_RGB = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "mono8": cv2.COLOR_GRAY2RGB}
-TO_RGB |= {"rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
-CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4}
+TO_RGB |= {"rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB, "mono16": cv2.COLOR_GRAY2RGB}
+# What OpenCV's programs publish where nobody says the encoding: its own order of colours.
+TO_RGB |= {"8UC1": cv2.COLOR_GRAY2RGB, "8UC3": cv2.COLOR_BGR2RGB, "8UC4": cv2.COLOR_BGRA2RGB}
+CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4, "mono16": 1, "8UC1": 1, "8UC3": 3, "8UC4": 4}
 STRAIGHT_MODELS = ("plumb_bob", "rational_polynomial", "")
 RECTIFIED = re.compile(r"(^|[/_])rect([/_]|$)")  # a topic, as image_proc and others name it
 
@@ -33,7 +36,7 @@ class RosBag:
         topic: of sensor_msgs/Image or CompressedImage; None = the only one.
         info_topic: of sensor_msgs/CameraInfo; None = camera_info beside the topic, or the only one.
         intrinsics: as `Images` takes them; None = those of the first CameraInfo.
-        start, stop, stride: which of the images, in the order of the bag.
+        start, stop, stride: which of the images, in the order in which they were taken.
         size: (width, height) of the frames given out.
     """
 
@@ -56,19 +59,23 @@ class RosBag:
         self._path = reading.find_sequence(root, "." if sequence is None else sequence, LAYOUT, "ros2 bag record")
         with _opened(self._path) as bag:
             self._topic = _topic_of(bag, (RAW, COMPRESSED), topic, self._path, "topic")
-            times = [time for _, time, _ in bag.messages(connections=_connections(bag, self._topic))]
+            received, stamps = _times(bag, self._topic)
             info = None if intrinsics is not None else _camera_info(bag, self._topic, info_topic, self._path)
         first: dict[int, int] = {}  # several may have one time
-        places = [(time, row - first.setdefault(time, row)) for row, time in enumerate(times)]
-        chosen = reading.select(len(times), start, stop, stride, f"{self._path}, topic {self._topic},")
-        self._places = [places[row] for row in chosen]
+        places = [(time, row - first.setdefault(time, row)) for row, time in enumerate(received)]
+        taken, note = when_taken(received, stamps)
+        order = sorted(range(len(taken)), key=lambda row: taken[row])
+        chosen = reading.select(len(order), start, stop, stride, f"{self._path}, topic {self._topic},")
+        self._places = [places[order[place]] for place in chosen]
+        self._taken = [taken[order[place]] for place in chosen]
+        self._tones = find_tones(self._picture, len(self))
         self._raw_size = self._first_size()
         if info is None:
             pictures = Pictures(self._raw_size, len(self), self._read)
             self._lens = find_lens(intrinsics, pictures)
         else:
             self._lens = to_lens(info, self._raw_size, f"CameraInfo of {self._path}", {"source": "CameraInfo"})
-        self.calibration = self._lens.about
+        self.calibration = with_notes(self._lens.about, note, self._tones and self._tones.note)
         self.sequence = self._path.resolve().name if sequence is None else str(sequence)
         self.size = reading.check_size(size)
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
@@ -81,7 +88,7 @@ class RosBag:
         image = self._read(index)
         reading.check_raw_size(image, self._raw_size, self._label(index))
         image = reading.resize_color(self._lens.straighten(image), self.size)
-        return Frame(index, self._places[index][0] / 1e9, self._label(index), image)
+        return Frame(index, self._taken[index] / 1e9, self._label(index), image)
 
     def pose(self, index: int) -> None:
         return None
@@ -92,10 +99,11 @@ class RosBag:
     def fingerprint(self) -> str:
         options = {"dataset": self.name, "size": self.size, "intrinsics": self.intrinsics, "topic": self._topic}
         options |= {"lens": self.calibration["distortion"], "frames": self._places}
+        options |= {} if self._tones is None else {"tones": self._tones}
         return reading.fingerprint(self._path.parent, self.files(0), options)
 
     def _label(self, index: int) -> str:
-        return f"{self._path}, {self._topic}, image at {self._places[index][0]} ns"
+        return f"{self._path}, {self._topic}, image at {self._taken[index]} ns"
 
     def _first_size(self) -> reading.Size:
         for index in range(len(self)):
@@ -106,6 +114,10 @@ class RosBag:
         raise ValueError(f"none of the images of {self._topic} can be read: {last}")
 
     def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        return (self._tones or ALL_16_BITS).shown(self._picture(index))
+
+    def _picture(self, index: int) -> np.ndarray:
+        """RGB (h, w, 3) in the message's own bits."""
         time, ordinal = self._places[index]
         with _opened(self._path) as bag:
             found = bag.messages(connections=_connections(bag, self._topic), start=time, stop=time + 1)
@@ -116,11 +128,41 @@ class RosBag:
         raise BadFrameError(f"{self._label(index)} is not there any more: record the bag again")
 
 
-def to_rgb(message: Any, is_compressed: bool, label: str) -> UInt8[np.ndarray, "_ _ 3"]:
-    """The picture of a message; raises BadFrameError where it is damaged or of an encoding that is not read."""
+def _times(bag: Any, topic: str) -> tuple[list[int], list[int]]:
+    """When each message of a topic was received and its header's stamp, in nanoseconds; 0 = it has none."""
+    received, stamps = [], []
+    for connection, time, raw in bag.messages(connections=_connections(bag, topic)):
+        received.append(time)
+        try:
+            stamp = bag.deserialize(raw, connection.msgtype).header.stamp
+            stamps.append(stamp.sec * 10**9 + stamp.nanosec)
+        except Exception:  # of a damaged message, which is a bad frame when it is read
+            stamps.append(0)
+    return received, stamps
+
+
+def when_taken(received: Sequence[int], stamps: Sequence[int]) -> tuple[list[int], str | None]:
+    """Nanoseconds at which images were taken: their headers' stamps, as messages arrive late and overtake each other.
+
+    Where a driver stamps nothing, or all alike, it is when they were received, and a note says so. One message without
+    a stamp was taken as long before it came as the others (median).
+    """
+    known = [row for row, stamp in enumerate(stamps) if stamp > 0]
+    if not known or (len(known) > 1 and len({stamps[row] for row in known}) == 1):
+        return [*received], "the headers have no times, so images have those of their recording" if received else None
+    delay = int(np.median([received[row] - stamps[row] for row in known]))
+    return [stamp if stamp > 0 else time - delay for time, stamp in zip(received, stamps, strict=True)], None
+
+
+def to_rgb(message: Any, is_compressed: bool, label: str) -> np.ndarray:
+    """The picture of a message, RGB (h, w, 3) in its own bits, 8 or 16.
+
+    Raises:
+        BadFrameError: it is damaged or of an encoding that is not read.
+    """
     if is_compressed:
         data = bytes(message.data)
-        image = None if reading.damage(data) else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        image = None if reading.damage(data) else cv2.imdecode(np.frombuffer(data, np.uint8), reading.OWN_BITS)
         if image is None:
             raise BadFrameError(f"{label} is damaged: record it again, or set on_bad_frame=skip")
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
@@ -129,11 +171,14 @@ def to_rgb(message: Any, is_compressed: bool, label: str) -> UInt8[np.ndarray, "
             f"{label} has the encoding {str(message.encoding)[:40]!r}, and read are {', '.join(CHANNELS)}: "
             "choose another dataset.topic, such as the rectified one"
         )
-    width = message.width * CHANNELS[message.encoding]
+    dtype = np.dtype(np.uint16 if message.encoding == "mono16" else np.uint8)
+    dtype = dtype.newbyteorder(">" if message.is_bigendian else "<")
+    width = message.width * CHANNELS[message.encoding] * dtype.itemsize
     if message.step < width or len(message.data) != message.step * message.height or not message.height * width:
         raise BadFrameError(f"{label} is not as large as it says: record it again, or set on_bad_frame=skip")
     rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)[:, :width]
-    image = np.ascontiguousarray(rows).reshape(message.height, message.width, -1)
+    image = np.ascontiguousarray(rows).view(dtype).astype(dtype.newbyteorder("="), copy=False)
+    image = image.reshape(message.height, message.width, -1)
     code = TO_RGB[message.encoding]
     return image if code is None else cv2.cvtColor(image, code)
 

@@ -1,7 +1,9 @@
 """nerfstudio's transforms.json as it is read: camera → world with OpenGL's axes, pixels from the image's corner."""
 
 import json
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,3 +31,18 @@ def load_transforms(path: Path) -> tuple[list[str], list[list[float]]]:
             raise ValueError(f"{path}: frame {name!r} must have a transform_matrix of 4 rows of 4: export it again")
     bottom = [[0.0, 0.0, 0.0, 1.0]]
     return names, [((m if len(m) == 4 else np.vstack([m, bottom])) * FLIP).ravel().tolist() for m in matrices]
+
+
+def with_frames_camera(values: Mapping[str, Any], keys: Collection[str], path: Path) -> Mapping[str, Any]:
+    """`values` with the camera that stands in every frame; ValueError where frames have different ones."""
+    frames = values.get("frames")
+    found = [{key: frame[key] for key in keys & frame.keys()} for frame in frames or () if isinstance(frame, dict)]
+    whole = [{**{key: values[key] for key in keys & values.keys()}, **own} for own in found]
+    for number, camera in enumerate(whole):
+        if camera != whole[0]:
+            key = next(key for key in sorted(keys) if camera.get(key) != whole[0].get(key))
+            raise ValueError(
+                f"{path} has different cameras: {key} is {whole[0].get(key)} in frame 0 and {camera.get(key)} in frame "
+                f"{number}: take images of one camera, with focus and zoom locked, or map them as dataset=images"
+            )
+    return {**values, **whole[0]} if whole else values

@@ -1,6 +1,7 @@
 """TUM RGB-D and every folder of its layout: rgb.txt, depth.txt, groundtruth.txt, associated by timestamp."""
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,9 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
-from emgs_jax.data.intrinsics import ALTERNATIVES, Given, find_lens, pictures_of
+from emgs_jax.data.file_names import find_image, is_file
+from emgs_jax.data.intrinsics import ALTERNATIVES, Given, find_lens, pictures_of, with_notes
 from emgs_jax.data.labels import LabelFolder, as_unknown
 from emgs_jax.data.reading import Intrinsics, Number
+from emgs_jax.data.timestamps import in_seconds, resolution
+from emgs_jax.data.tones import read_shown, tones_of
 
 LAYOUT = "root/SEQUENCE/{rgb.txt, depth.txt, groundtruth.txt, rgb/, depth/}"
 SOURCE = "TUM RGB-D benchmark, project page of the Computer Vision Group of TU Munich"
@@ -73,7 +77,7 @@ class Tum:
         self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
         times, names, _ = read_list(self._folder / "rgb.txt", 2)
         chosen = reading.select(len(times), start, stop, stride, f"{self._folder / 'rgb.txt'} (layout {LAYOUT})")
-        self._times, self._images = times[chosen], [self._folder / names[i][0] for i in chosen]
+        self._times, self._images = times[chosen], [find_image(self._folder, names[i][0]) for i in chosen]
         self.sequence = str(sequence)
         self.size = reading.check_size(size)
         self._depth_scale = reading.check_depth_scale(depth_scale)
@@ -84,8 +88,9 @@ class Tum:
         self.has_ground_truth = self._depths is not None and self._poses is not None
         given = find_calibration(self.sequence, intrinsics, distortion)
         self._raw_size = RAW_SIZE if intrinsics is None else reading.first_size(self._images, self._folder)
-        self._lens = find_lens(given, pictures_of(self._images, self._raw_size))
-        self.calibration = self._lens.about
+        self._tones = tones_of(self._images)
+        self._lens = find_lens(given, pictures_of(self._images, self._raw_size, self._tones))
+        self.calibration = with_notes(self._lens.about, self._tones and self._tones.note)
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
         self._labels = None
         if labels is not None:
@@ -99,7 +104,7 @@ class Tum:
         if (self._folder / "depth.txt").exists():
             times, names, _ = read_list(self._folder / "depth.txt", 2)
             rows = matched_rows(self._times, times, tolerance, ("depth", self._folder / "depth.txt"))
-            depths = [None if row < 0 else self._folder / names[row][0] for row in rows]
+            depths = [None if row < 0 else find_image(self._folder, names[row][0]) for row in rows]
         if (self._folder / "groundtruth.txt").exists():
             path = self._folder / "groundtruth.txt"
             times, words, lines = read_list(path, 8)
@@ -114,7 +119,7 @@ class Tum:
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
         path, (w, h) = self._images[index], self.size
-        image = reading.read_color(path, self._raw_size)
+        image = read_shown(path, self._raw_size, self._tones)
         depth = None
         if self._depths is not None:
             depth = np.zeros((h, w), np.float32)
@@ -156,13 +161,15 @@ class Tum:
             "depths": [p and p.name for p in self._depths or ()],
             "poses": self._poses,
         } | ({} if self._labels is None else {"classes": self.classes})
+        options |= {} if self._tones is None else {"tones": self._tones}
         return reading.fingerprint(self._folder, reading.all_files(self), options)
 
 
 def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[list[str]], list[int]]:
-    """Timestamps in ascending order, the words after them and the number of the line that each stands in.
+    """Seconds in ascending order, the words after them and the number of the line that each stands in.
 
-    Lines of a '#' comment and empty lines do not count.
+    Lines of a '#' comment and empty lines do not count. With two columns the second is the name of a file beside the
+    list, which may have spaces or stand in quotes.
     """
     try:
         lines = reading.read_text(path).splitlines()
@@ -180,10 +187,16 @@ def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[l
         if len(row) < columns or not math.isfinite(time):
             raise ValueError(f"{path}, line {number}: expected a timestamp and {columns - 1} more, got {line[:80]!r}")
         times.append(time)
-        words.append(row[1:columns])
+        words.append([_file_name(line, row[1], path.parent)] if columns == 2 else row[1:columns])
         numbers.append(number)
     order = np.argsort(times, kind="stable")
-    return np.array(times, np.float64)[order], [words[i] for i in order], [numbers[i] for i in order]
+    return in_seconds(np.array(times, np.float64)[order]), [words[i] for i in order], [numbers[i] for i in order]
+
+
+def _file_name(line: str, first_word: str, folder: Path) -> str:
+    """What stands behind the time, where that is a file; else its first word, as there may be more columns."""
+    whole = re.split(r"[,\s]+", line.strip(), maxsplit=1)[1].strip(" \t,\"'")
+    return whole if is_file(find_image(folder, whole)) else first_word.strip("\"'")
 
 
 def matched_rows(
@@ -206,7 +219,10 @@ def _span(times: Float[np.ndarray, " n"]) -> str:
 
 
 def nearest_rows(times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, " m"], tolerance: float) -> list[int]:
-    """Row of `candidates` (ascending) nearest to each time, -1 where none is within the tolerance in seconds."""
+    """Row of `candidates` (ascending) nearest to each time, -1 where none is within the tolerance in seconds.
+
+    Times that differ by the tolerance are within it, however float64 rounds them: seconds since 1970 by 2e-7.
+    """
     if len(candidates) == 0:
         return [-1] * len(times)
     after = np.clip(np.searchsorted(candidates, times), 1, max(len(candidates) - 1, 1))
@@ -214,7 +230,7 @@ def nearest_rows(times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, "
     gaps = np.abs(candidates[pair] - times)
     best = gaps.argmin(axis=0)
     rows = np.take_along_axis(pair, best[None], 0)[0]
-    return np.where(gaps.min(axis=0) <= tolerance, rows, -1).tolist()
+    return np.where(gaps.min(axis=0) <= tolerance + resolution(times, candidates), rows, -1).tolist()
 
 
 def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"] | None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.evaluation.clouds import PointCloud, VoxelGrid, transform_cloud
-from emgs_jax.evaluation.trajectory import Alignment
+from emgs_jax.evaluation.trajectory import Alignment, rotated
 from emgs_jax.ops.ranges import number
 
 Image = tuple[np.ndarray, np.ndarray]  # camera-space z (h, w), 0 where there is none, and RGB in [0, 1], (h, w, 3)
@@ -225,7 +225,7 @@ def draw_voxels(
         counts: (n,) points of each voxel.
     """
     fx, fy, cx, cy = pinhole.intrinsics
-    points = (cloud.points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    points = rotated(cloud.points - T_world_camera[:3, 3], T_world_camera[:3, :3].T)
     z = np.where(points[:, 2] > 0, points[:, 2], 1.0)
     u, v = fx * points[:, 0] / z + cx, fy * points[:, 1] / z + cy
     reach = np.ceil(np.clip(0.5 * config.voxel_m * max(fx, fy) / z, 0.0, config.max_footprint_px))

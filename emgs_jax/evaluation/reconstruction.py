@@ -9,7 +9,15 @@ from scipy.spatial import cKDTree
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
-from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, register, transform_cloud, voxel_downsample
+from emgs_jax.evaluation.clouds import (
+    PointCloud,
+    SpooledCloud,
+    fuse_clouds,
+    register,
+    transform_cloud,
+    tree_of,
+    voxel_downsample,
+)
 from emgs_jax.evaluation.trajectory import Alignment, align_poses
 from emgs_jax.ops.ranges import number
 
@@ -27,9 +35,9 @@ class EvaluationConfig:
     max_depth_m: float = number(low=1e-6, high=math.inf)  # true depth farther away is left out
     icp_distance_m: float = number(low=0)  # ICP after the alignment takes pairs within this distance; 0 = no ICP
     placement_icp_m: float = number(low=1e-6)  # likewise for reconstruction_icp/…, whatever the protocol does
-    icp_voxel_m: float = number(low=1e-6)
+    icp_voxel_m: float = number(low=1e-4)  # a grid has 2^20 cells to each side of the origin
     icp_max_steps: int = number(low=0, high=10000)
-    voxel_m: float = number(low=1e-6)
+    voxel_m: float = number(low=1e-4)
     max_points: int | None = number(low=1, high=1e9)  # compare a random choice of so many points of each cloud
     f1_thresholds_m: tuple[float, ...] = number(low=1e-9)
     max_normal_angle_deg: float = number(low=0, high=180)
@@ -125,26 +133,34 @@ class Reference:
 def reference(truth: PointCloud, config: EvaluationConfig) -> Reference:
     """Prepare a true cloud for comparisons under `config`, with either alignment and with or without ICP."""
     cloud = voxel_downsample(truth, config.voxel_m)
-    return Reference(cloud, _tree(cloud.points), cKDTree(voxel_downsample(truth, config.icp_voxel_m).points))
+    return Reference(cloud, tree_of(cloud.points), tree_of(voxel_downsample(truth, config.icp_voxel_m).points))
 
 
 def compare_clouds(
-    cloud: PointCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
+    cloud: PointCloud | SpooledCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
 ) -> dict[str, float | int | str | None]:
     """Bring the estimate's cloud into the frame of the truth, then measure how far they are apart."""
     aligned, note = align_cloud(cloud, truth, poses, config)
     return reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
 
 
+def own_voxel(alignment: Alignment, config: EvaluationConfig) -> float:
+    """Side of a voxel of `voxel_m` in the lengths of the estimate that is aligned."""
+    return config.voxel_m / alignment.scale if alignment.scale > 0 else config.voxel_m
+
+
 def align_cloud(
-    cloud: PointCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
+    cloud: PointCloud | SpooledCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
 ) -> tuple[PointCloud, str | None]:
     """Bring the estimate's cloud into the frame of the truth; what the poses left open is noted, see `align_poses`.
 
-    The alignment is that of the poses, estimated and true (n, 4, 4). ICP, where the protocol has it, then moves the
+    The alignment is that of the poses, estimated and true (n, 4, 4). A `SpooledCloud` is averaged by `voxel_m` of the
+    truth, so that its own unit does not matter. ICP, where the protocol has it, then moves the
     cloud rigidly: the scale stays that of the poses.
     """
     alignment, note = align_poses(*poses, with_scale=config.alignment == "sim3")
+    if isinstance(cloud, SpooledCloud):
+        cloud = cloud.averaged(own_voxel(alignment, config))
     aligned = transform_cloud(cloud, alignment)
     if config.icp_distance_m > 0:
         source = voxel_downsample(aligned, config.icp_voxel_m).points
@@ -173,9 +189,9 @@ def reconstruction_metrics(
         return metrics
     rng = np.random.default_rng(0)  # one for both: equally long clouds must not keep the same rows
     estimate, true = _chosen(estimate, config.max_points, rng), _chosen(true, config.max_points, rng)
-    tree = truth.tree if true is truth.cloud else _tree(true.points)
+    tree = truth.tree if true is truth.cloud else tree_of(true.points)
     to_truth, partner = tree.query(estimate.points, workers=-1)
-    to_estimate, back = _tree(estimate.points).query(true.points, workers=-1)
+    to_estimate, back = tree_of(estimate.points).query(true.points, workers=-1)
     values = [_average(distances, config) for distances in (to_truth, to_estimate)]
     for threshold in config.f1_thresholds_m:
         precision, recall = 100.0 * np.mean(to_truth <= threshold), 100.0 * np.mean(to_estimate <= threshold)
@@ -210,11 +226,6 @@ def _metric_names(config: EvaluationConfig) -> list[str]:
         names += [f"{kind}_{100 * threshold:g}cm_percent" for kind in ("f1", "precision", "recall")]
     names += ["normals_abs_cos_percent", f"normals_within_{config.max_normal_angle_deg:g}deg_percent"]
     return [f"reconstruction/{name}" for name in names]
-
-
-def _tree(points: np.ndarray) -> cKDTree:
-    # Without balancing and compacting the tree is built, and here even searched, in half the time.
-    return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def _abs_cosines(normals: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -5,13 +5,16 @@ columns predicted ones, and the last column counts points without an answer. Mat
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.data.spool import Spool
+from emgs_jax.evaluation.clouds import PointCloud, tree_of
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, Reference, align_cloud, own_voxel
+from emgs_jax.evaluation.trajectory import align_poses, rotated
 
 _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
 
@@ -37,7 +40,7 @@ def label_cells(frame: Frame, dataset: Dataset, voxel: float, max_depth: float) 
         return np.empty((0, 4), np.int64)
     known = (frame.labels >= 0) & (frame.depth > 0) & (frame.depth <= max_depth)
     points = backproject(frame.depth, dataset.intrinsics)[known]
-    index = np.floor((points @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]) / voxel)
+    index = np.floor((rotated(points, frame.T_world_camera[:3, :3]) + frame.T_world_camera[:3, 3]) / voxel)
     return _distinct(np.column_stack([index, frame.labels[known]]).astype(np.int64))
 
 
@@ -47,6 +50,21 @@ def true_labels(cells: Sequence[np.ndarray], dataset: Dataset, voxel: float) -> 
         return None
     rows = _distinct(np.concatenate(cells))
     return LabelledPoints((rows[:, :3] + 0.5) * voxel, rows[:, 3], tuple(dataset.classes))
+
+
+def align_labels(
+    labels: "LabelledPoints | SpooledLabels",
+    truth: Reference,
+    poses: tuple[np.ndarray, np.ndarray],
+    config: EvaluationConfig,
+) -> LabelledPoints:
+    """Bring points with classes into the frame of the truth, as `align_cloud` does with those of a cloud."""
+    if isinstance(labels, SpooledLabels):
+        alignment, _ = align_poses(*poses, with_scale=config.alignment == "sim3")
+        labels = labels.points(own_voxel(alignment, config))
+    nothing = np.zeros_like(labels.points)
+    aligned, _ = align_cloud(PointCloud(labels.points, nothing, nothing), truth, poses, config)
+    return replace(labels, points=aligned.points)
 
 
 def compare_labels(found: LabelledPoints, truth: LabelledPoints, num_neighbours: int) -> dict[str, float | int | None]:
@@ -105,6 +123,28 @@ class LabelGrid:
         return np.column_stack([rows[begins, :4], np.add.reduceat(rows[:, 4], begins)])
 
 
+class SpooledLabels:
+    """The points of many views with their classes, in a temporary file, counted once the side of a voxel is known.
+
+    See `clouds.SpooledCloud`. float32 (n, 4) a view: x, y, z and the class.
+    """
+
+    def __init__(self, classes: Sequence[str]) -> None:
+        self._parts, self._classes = Spool(), tuple(classes)
+
+    def append(self, points: np.ndarray, labels: np.ndarray) -> None:
+        """Add a view: points (n, 3) and their classes (n,)."""
+        self._parts.append(np.column_stack([points, labels]).astype(np.float32))
+
+    def points(self, voxel: float) -> LabelledPoints:
+        """As `LabelGrid.points`, for voxels of this side [lengths of the points]."""
+        grid = LabelGrid(voxel)
+        for row in range(len(self._parts)):
+            part = self._parts[row].astype(np.float64)
+            grid.add(part[:, :3], part[:, 3].astype(np.int64))
+        return grid.points(self._classes)
+
+
 def transfer_labels(points: np.ndarray, labels: np.ndarray, targets: np.ndarray, num_neighbours: int) -> np.ndarray:
     """Most frequent label among the nearest points of each target (m, 3); of equally frequent ones the smallest.
 
@@ -115,7 +155,7 @@ def transfer_labels(points: np.ndarray, labels: np.ndarray, targets: np.ndarray,
     if not len(points):
         return np.full(len(targets), -1)
     k = min(num_neighbours, len(points))
-    votes = labels[cKDTree(points).query(targets, k=[*range(1, k + 1)], workers=-1)[1]]
+    votes = labels[tree_of(points).query(targets, k=[*range(1, k + 1)], workers=-1)[1]]
     counts = (votes[:, :, None] == votes[:, None, :]).sum(-1)
     candidates = np.where(counts == counts.max(1, keepdims=True), votes, np.iinfo(np.int64).max)
     return candidates.min(1)

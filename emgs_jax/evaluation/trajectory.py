@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from emgs_jax.data.timestamps import resolution
+
 _MIN_SPREAD_M = 1e-6  # below this RMS distance from its centroid a path gives no direction and no scale
 
 
@@ -24,7 +26,7 @@ class Alignment:
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Map points (..., 3) into the reference's frame."""
-        return self.scale * points @ self.rotation.T + self.translation
+        return rotated(self.scale * points, self.rotation) + self.translation
 
     def apply_to_poses(self, poses: np.ndarray) -> np.ndarray:
         """Map camera poses (n, 4, 4); the result stays rigid, the scale acts on the positions only."""
@@ -39,8 +41,15 @@ class Alignment:
         return Alignment(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
 
+def rotated(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """R v of each vector (..., 3). Not by BLAS: its threads wait for each other longer than so thin a product takes."""
+    return np.einsum("ij,...j->...i", rotation, vectors)
+
+
 def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
     """Pair timestamps (n,) and (m,), in seconds, that are each other's nearest within `max_difference`.
+
+    Times that differ by it are within it, however float64 rounds them: seconds since 1970 by 2e-7.
 
     Returns indices into a and into b, int (k,), in the order of a; no index occurs twice.
     """
@@ -49,7 +58,7 @@ def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -
         return np.empty(0, np.int64), np.empty(0, np.int64)
     to_b, to_a = _nearest(times_a, times_b), _nearest(times_b, times_a)
     rows = np.arange(len(times_a))
-    keep = (to_a[to_b] == rows) & (np.abs(times_a - times_b[to_b]) <= max_difference)
+    keep = (to_a[to_b] == rows) & (np.abs(times_a - times_b[to_b]) <= max_difference + resolution(times_a, times_b))
     return rows[keep], to_b[keep]
 
 

@@ -92,7 +92,7 @@ def problem_of(graph: Graph, scale_std: float) -> Problem | str:
         return "no measurement leads to the first node"
 
     n, e = bucket(len(valid)), bucket(int(used.sum()))
-    still = np.tile([1.0, 0, 0, 0, 0, 0, 0], (n, 1))
+    still = np.array(jaxlie.SE3.identity((n,)).wxyz_xyz, poses.dtype)
     still[: len(valid)][joined] = poses[joined, :7]
     scales = np.where(joined, poses[:, 7], 0.0)
     padded = jax.tree.map(lambda leaf: jnp.asarray(_pad(np.asarray(leaf)[used], e)), edges)

@@ -42,7 +42,7 @@ def normal_equations(
     size = num_nodes * degrees
     entries = (transposed @ jacobians).ravel(), (rows.ravel(), rows.transpose(0, 2, 1).ravel())
     hessian = coo_array(entries, shape=(size, size)).tocsc() + diags_array(prior[:, 0])
-    gradient = prior[:, 1:].copy()
+    gradient = prior[:, 1:]
     np.add.at(gradient, unknowns, transposed @ residuals)
     measured = hessian.diagonal() > 0
     return NormalEquations((hessian + diags_array(1.0 - measured)).tocsc(), gradient, measured)

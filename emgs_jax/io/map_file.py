@@ -8,7 +8,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.gaussian_map import GaussianMap, empty_map
@@ -33,6 +32,7 @@ def load_map(path: str | os.PathLike) -> GaussianMap:
 
 def check_map(path: str | os.PathLike, map: GaussianMap) -> None:
     """Raise ValueError where a leaf has not a map's dtype and shape, or is not finite where there is a Gaussian."""
+    map = jax.device_get(map)
     valid, features = map.gaussians.valid, map.gaussians.features
     if valid.ndim != 1 or valid.dtype != bool or features.ndim != 2:
         raise ValueError(f"{path} is no map: gaussians.valid is {valid.dtype} {valid.shape}: map again")
@@ -42,7 +42,7 @@ def check_map(path: str | os.PathLike, map: GaussianMap) -> None:
         if (leaf.shape, leaf.dtype) != (like.shape, like.dtype):
             wanted = f"{like.dtype} {like.shape}"
             raise ValueError(f"{path}: {_name(key)} is {leaf.dtype} {leaf.shape}, expected {wanted}: map again")
-        if not bool(jnp.all(jnp.isfinite(leaf[valid]))):
+        if not np.isfinite(leaf[valid]).all():
             raise ValueError(f"{path}: {_name(key)} is not finite where there is a Gaussian: map again")
     covs, means = np.asarray(map.gaussians.covs[valid], np.float64), np.asarray(map.gaussians.means[valid])
     if np.abs(means).max(initial=0.0) > MAX_LENGTH_M or np.abs(covs).max(initial=0.0) > MAX_LENGTH_M**2:
@@ -128,7 +128,7 @@ def _build(cls: type, prefix: str, arrays: dict[str, np.ndarray], static: dict[s
             fields[field.name] = _build(hint, f"{name}.", arrays, static)
         else:
             given = arrays.pop(name)
-            fields[field.name] = jnp.asarray(given)
+            fields[field.name] = jax.device_put(given)
             if fields[field.name].dtype != given.dtype:
                 raise ValueError(f"{name} is {given.dtype}, which this code does not write")
     return cls(**fields)

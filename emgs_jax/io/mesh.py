@@ -25,12 +25,13 @@ def save_mesh_ply(
         reason = f"{len(points)} points with a normal, at least {min_points} are needed for a mesh"
     else:
         vertices, faces = poisson(*crop(points, normals), depth)
-        vertices, faces = trim(vertices, faces, points)
+        tree = cKDTree(points)
+        vertices, faces = trim(vertices, faces, tree)
         reason = None if len(faces) else "the surface reconstruction is empty"
     if reason is not None:
         Path(path).unlink(missing_ok=True)
         return reason
-    nearest = cKDTree(points).query(vertices)[1]
+    nearest = tree.query(vertices)[1]
     write_ply(path, with_colors(structured(vertices.astype(np.float32), ["x", "y", "z"]), colors[nearest]), faces)
     return None
 
@@ -56,10 +57,10 @@ def poisson(points: np.ndarray, normals: np.ndarray, depth: int) -> tuple[np.nda
     return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
 
 
-def trim(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def trim(vertices: np.ndarray, faces: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray]:
     """Drop the surface that Poisson invents: what is farther from all points than their own spacing explains."""
-    spacing = np.median(cKDTree(points).query(points, k=7)[0][:, -1])
-    near = cKDTree(points).query(vertices)[0] <= 2.0 * spacing if len(vertices) else np.empty(0, bool)
+    spacing = np.median(tree.query(tree.data, k=7)[0][:, -1])
+    near = tree.query(vertices)[0] <= 2.0 * spacing if len(vertices) else np.empty(0, bool)
     faces = faces[near[faces].all(1)] if len(faces) else faces
     used = np.unique(faces)
     return vertices[used], np.searchsorted(used, faces)

@@ -8,7 +8,7 @@ DESCRIPTOR_SIZE = 128
 
 
 def detect(
-    gray: np.ndarray, num_features: int, min_contrast: float
+    gray: np.ndarray, num_features: int, min_contrast: float, magnification: int = 1
 ) -> tuple[Float[np.ndarray, "n 2"], Float32[np.ndarray, "n 128"]]:
     """SIFT keypoints with the square roots of their normalised descriptors (Arandjelović and Zisserman, CVPR 2012).
 
@@ -16,16 +16,20 @@ def detect(
         gray: uint8 (h, w).
         num_features: at most, the strongest.
         min_contrast: of a keypoint.
+        magnification: of the image that is searched: more finds what is small or faint.
 
     Returns:
         pixels, centres at integers, and unit descriptors; none for a blank image.
     """
+    if magnification > 1:
+        gray = cv2.resize(gray, None, fx=magnification, fy=magnification, interpolation=cv2.INTER_LINEAR)
     detector = cv2.SIFT_create(nfeatures=num_features, contrastThreshold=min_contrast, enable_precise_upscale=True)
     keypoints, descriptors = detector.detectAndCompute(gray, None)
     if not keypoints:
         return np.zeros((0, 2)), np.zeros((0, DESCRIPTOR_SIZE), np.float32)
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
-    return np.array([point.pt for point in keypoints]), np.sqrt(descriptors / total)
+    pixels = (np.array([point.pt for point in keypoints]) + 0.5) / magnification - 0.5
+    return pixels, np.sqrt(descriptors / total)
 
 
 def mutual(
@@ -39,10 +43,11 @@ def mutual(
     if not len(a) or len(b) < 2:
         return np.zeros(0, int), np.zeros(0, int)
     similarity = a @ b.T
-    nearest = similarity.argmax(axis=1)
-    best, second = -np.partition(-similarity, 1, axis=1)[:, :2].T
+    row, nearest = np.arange(len(a)), similarity.argmax(axis=1)
+    best = similarity[row, nearest]
+    rows = np.flatnonzero(best == similarity.max(axis=0)[nearest])  # a tenth of the time of argmax along columns
+    rows = rows[np.sort(np.unique(nearest[rows], return_index=True)[1])]  # of equal ones the first
+    similarity[row, nearest] = -np.inf
     # Of unit vectors |d|² = 2 - 2 cos.
-    is_distinct = 1 - best < max_ratio**2 * (1 - second)
-    is_mutual = similarity.argmax(axis=0)[nearest] == np.arange(len(nearest))
-    rows = np.flatnonzero(is_distinct & is_mutual)
+    rows = rows[1 - best[rows] < max_ratio**2 * (1 - similarity[rows].max(axis=1))]
     return rows, nearest[rows]

@@ -16,6 +16,7 @@ from emgs_jax.ops.pytree import fill_rows, join_rows, split_rows
 GROUP = 16  # points per group: near each other
 NUM_GROUPS = 24  # groups that a block of queries looks into
 BLOCK = 8  # queries of a block of `knn`
+LEAST_LISTED = 32  # points near a block of queries, of which six times as many as are wanted
 RANKED = 12  # values that are compared with all others at once
 CURVE_BITS = 8  # per axis, of the cells of the Hilbert curve
 FAR = 1e18  # m; where what does not count stands: its squared distance is finite, and larger than any other
@@ -179,8 +180,8 @@ def nearest(
     Returns:
         Row numbers into `points`, and which of them exist.
     """
-    near, *found = _search(queries, asked, points, groups, k, size, count, order)
-    return _neighbours(near, *found, queries.shape[0])
+    near, distance_sq, rank = _ranked(queries, asked, points, groups, size, count or max(6 * k, LEAST_LISTED), order)
+    return _existing(_first(near, distance_sq, rank, k, queries.shape[0]))
 
 
 def knn(
@@ -207,52 +208,54 @@ def knn(
     """
     queries, points = jax.lax.stop_gradient((queries, points))  # a row number has no gradient
     asked = jnp.ones(queries.shape[0], bool) if asked is None else asked
-    near, *found = _search(queries, asked, points, group_points(points, valid), k, BLOCK, 0, None)
+    groups = group_points(points, valid)
+    near, distance_sq, rank = _ranked(queries, asked, points, groups, BLOCK, max(6 * k, LEAST_LISTED), None)
+    found = _first(near, distance_sq, rank, k, queries.shape[0])
     blocks = queries.at[near.queries].get(mode="clip")
     is_asked = asked.at[near.queries].get(mode="fill", fill_value=False)
-    is_open = jnp.any(is_asked & (found[1][..., -1] > near.beyond_sq[:, None]), axis=1)
+    farthest_sq = jnp.max(jnp.where(rank < k, distance_sq, 0.0), axis=-1)
+    is_open = jnp.any(is_asked & (farthest_sq > near.beyond_sq[:, None]), axis=1)
     open_blocks, _, _ = compact_rows(is_open, is_open.shape[0])
 
-    def look_at_all(number: Int[Array, ""], found: list[Array]) -> list[Array]:
+    def look_at_all(number: Int[Array, ""], found: Int[Array, "m k"]) -> Int[Array, "m k"]:
         block = open_blocks[number]
         distance_sq = jnp.sum((blocks[block][:, None] - points) ** 2, axis=-1)
-        negative, rows = jax.lax.top_k(-jnp.where(valid, distance_sq, 3.0 * FAR**2), k)
-        return [found[0].at[block].set(rows), found[1].at[block].set(-negative)]
+        negative, rows = jax.lax.top_k(-jnp.where(valid, distance_sq, jnp.inf), k)
+        return found.at[near.queries[block]].set(jnp.where(negative > -FAR, rows, -1), mode="drop")
 
-    return _neighbours(near, *jax.lax.fori_loop(0, jnp.sum(is_open), look_at_all, found), queries.shape[0])
-
-
-def _neighbours(
-    near: Nearby, rows: Int[Array, "b q k"], distance_sq: Float[Array, "b q k"], num_queries: int
-) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
-    """What was found for the queries of all blocks, in the order of the queries, and which of it exists; else row 0."""
-    rows, exists = (of_queries(near, values, num_queries) for values in (rows, distance_sq < FAR))
-    return jnp.where(exists, rows, 0), exists
+    return _existing(jax.lax.fori_loop(0, jnp.sum(is_open), look_at_all, found))
 
 
-def _search(
+def _ranked(
     queries: Float[Array, "m d"],
     asked: Bool[Array, "m"],
     points: Float[Array, "n d"],
     groups: Groups,
-    k: int,
     size: int,
     count: int,
     order: Int[Array, "m"] | None,
-) -> tuple[Nearby, Int[Array, "b q k"], Float[Array, "b q k"]]:
-    """What is near each block, and of every query the k nearest of these with their squared distances."""
+) -> tuple[Nearby, Float[Array, "b q c"], Int[Array, "b q c"]]:
+    """What is near each block, and the squared distance and rank of each of these for every query of the block."""
     queries, points = jax.lax.stop_gradient((queries, points))
-    near = nearby(queries, asked, groups, count or max(6 * k, 32), size, order)
+    near = nearby(queries, asked, groups, count, size, order)
     blocks = queries.at[near.queries].get(mode="clip")
     offsets = between(blocks, jnp.where(near.exists[..., None], points[near.rows], FAR))
     distance_sq = dot(offsets, offsets)
-    rank = ranks(distance_sq)
-    # To every rank its row; what comes after the k nearest falls off the end.
-    places = *jnp.indices(rank.shape, sparse=True)[:2], rank
-    beyond = jnp.zeros((*rank.shape[:2], k), jnp.int32), jnp.full((*rank.shape[:2], k), 3.0 * FAR**2)
-    found = jnp.broadcast_to(near.rows[:, None], rank.shape), distance_sq
-    rows, found_sq = (start.at[places].set(values, mode="drop") for start, values in zip(beyond, found, strict=True))
-    return near, rows, found_sq
+    return near, distance_sq, ranks(distance_sq)
+
+
+def _first(
+    near: Nearby, distance_sq: Float[Array, "b q c"], rank: Int[Array, "b q c"], k: int, num_queries: int
+) -> Int[Array, "m k"]:
+    """Rows of the k that rank first, in the order of the queries; -1 where there is none."""
+    rows = jnp.where(distance_sq < FAR, near.rows[:, None], -1)
+    # Each row goes to its query and rank; what comes after the k nearest falls off the end.
+    return jnp.full((num_queries, k), -1, rows.dtype).at[near.queries[..., None], rank].set(rows, mode="drop")
+
+
+def _existing(found: Int[Array, "m k"]) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
+    """Row numbers, and which of them exist; else row 0."""
+    return jnp.maximum(found, 0), found >= 0
 
 
 def ranks(values: Float[Array, "*b c"]) -> Int[Array, "*b c"]:

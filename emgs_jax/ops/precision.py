@@ -1,8 +1,8 @@
-"""How executables are called: as they are, and with matrix products in full float32 wherever they run."""
+"""Matrix products in full float32 wherever they run."""
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 import jax
 
@@ -23,8 +23,3 @@ def full_precision(function: Callable[Arguments, Result]) -> Callable[Arguments,
             return function(*args, **kwargs)
 
     return precise
-
-
-def directly(executable: Callable, *arguments: Any) -> Any:
-    """Call an executable; `running.executables.call` looks first whether it is kept."""
-    return executable(*arguments)

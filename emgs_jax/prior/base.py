@@ -11,13 +11,13 @@ from emgs_jax.data.base import Dataset, Frame
 
 @dataclass(frozen=True)
 class Window:
-    """One call of the prior (Method A): the anchor, the FIFO from oldest to newest, the current and the newest image.
+    """One call of the prior (Method A): the anchor, the FIFO from oldest to newest, the current and newer images.
 
     Args:
         inference: number of the call, from 0.
         views: frame indices in the order that the model sees them; `views[0]` is the anchor (frame 0).
-        dense: frame indices whose dense geometry the mapping needs: all views of the first window, then
-            (previous, current).
+        dense: frame indices whose dense geometry the mapping needs: all views of the first window up to the current
+            one, then (previous, current).
         current: the frame that this call integrates; in the first window the last of `dense`.
     """
 
@@ -88,6 +88,10 @@ class Prior(ABC):
         """Predict for views of two visits of a place, see `visits`; None where that is not known."""
         return None if self.is_sequential else self.predict(window, frames, intrinsics)
 
+    def num_newer(self, window_size: int) -> int:
+        """Images after the current one that its windows have, see `windows`: a camera's frames are mapped so late."""
+        return 1
+
     def check(self, dataset: Dataset, window_size: int) -> None:  # noqa: B027 (most can answer for any data set)
         """Raise ValueError where the prior cannot answer for the data set."""
 
@@ -96,19 +100,41 @@ class Prior(ABC):
         return {}
 
 
-def windows(num_frames: int, window_size: int) -> Iterator[Window]:
+MAX_MEDIAN_DEPTH = (
+    200.0  # rooms have some metres, scenes in a unit of a network's own about 1, in millimetres thousands
+)
+
+
+def check_unit(prediction: PriorPrediction) -> None:
+    """Raise ValueError where depths are so large that they can be no metres."""
+    depths = prediction.points[..., 2][prediction.mask & np.isfinite(prediction.points).all(-1)]
+    median = float(np.median(depths)) if len(depths) else 0.0
+    if median > MAX_MEDIAN_DEPTH:
+        raise ValueError(
+            f"the prior's points have a median depth of {median:.4g} in its inference "
+            f"{prediction.window.inference}, and a map's thresholds are for metres, or a unit in which a scene is some "
+            "units deep: are these millimetres? Divide points and the translations of T_anchor_view by 1000"
+        )
+
+
+def windows(num_frames: int, window_size: int, num_newer: int = 1) -> Iterator[Window]:
     """Yield the calls of a sequence: one that fills the FIFO, then one for each further frame.
 
-    A step sees the anchor, the `window_size` images before the current one, the current one and, except at the end
-    of the sequence, the next; an image is never listed twice.
+    A step sees the anchor, the current image, the `num_newer` after it, as far as the sequence has them, and those
+    before it, `window_size` + 2 in all; an image is never listed twice. So with more newer images the windows are the
+    same, and the current image is an older one of them; the last images of a sequence have fewer after them.
     """
     if not isinstance(window_size, int) or window_size < 1:
         raise ValueError(f"slam.window_size must be a whole number of images, 1 or more, got {window_size}")
+    if not 1 <= num_newer <= window_size:
+        raise ValueError(f"a window of {window_size} images cannot have {num_newer} after the current one")
     first = tuple(range(min(window_size, num_frames)))
+    dense = first[: max(len(first) - num_newer + 1, 1)]
     if first:
-        yield Window(0, first, first, first[-1])
-    for inference, current in enumerate(range(len(first), num_frames), start=1):
-        recent = range(max(current - window_size, 0), min(current + 2, num_frames))
+        yield Window(0, first, dense, dense[-1])
+    for inference, current in enumerate(range(len(dense), num_frames), start=1):
+        newest = current + num_newer
+        recent = range(max(newest - window_size - 1, 0), min(newest + 1, num_frames))
         yield Window(inference, tuple(dict.fromkeys((0, *recent))), (current - 1, current), current)
 
 
@@ -116,7 +142,7 @@ def visits(a: int, b: int, spacing: int, window_size: int) -> Window:
     """The call that shows two visits of a place together: frame a, which is the anchor, and b, which comes later.
 
     Beside them it has the frames `spacing` before and after a, and before b: none that is later than b. Its number is
-    that of the step that integrates b.
+    that of the step that integrates b, of a prior that sees one newer image.
     """
     views = [index for index in (a, a - spacing, a + spacing, b - spacing, b) if 0 <= index <= b]
     return Window(max(b - window_size + 1, 0), tuple(dict.fromkeys(views)), (a, b), b)

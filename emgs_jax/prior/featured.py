@@ -33,6 +33,10 @@ class Featured(Prior):
             geometry.is_simulated,
         )
 
+    def num_newer(self, window_size: int) -> int:
+        """Those that the prior asks for."""
+        return self._prior.num_newer(window_size)
+
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Raise ValueError where prior or model cannot answer for the data set."""
         self._prior.check(dataset, window_size)
@@ -83,6 +87,10 @@ class Requeried(Prior):
         self.feature_names, self.text_features = text.names, text.vectors
         settings = prior.provenance.settings | {"features": features | {"templates": [*text.templates]}}
         self.provenance = replace(prior.provenance, settings=settings)
+
+    def num_newer(self, window_size: int) -> int:
+        """Those that the prior asks for."""
+        return self._prior.num_newer(window_size)
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Raise ValueError where the prior cannot answer for the data set."""

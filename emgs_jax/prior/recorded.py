@@ -29,7 +29,7 @@ import numpy as np
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.io.files import atomic_write, remove_temporaries
 from emgs_jax.io.npz import read_npz
-from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows, with_frames
+from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, check_unit, windows, with_frames
 from emgs_jax.prior.recorded_checks import (
     FIELDS,
     REMEDY,
@@ -56,7 +56,7 @@ def record(
     the list of windows, e.g. tqdm.
     """
     folder = Path(folder)
-    calls = list(windows(len(dataset), window_size))
+    calls = list(windows(len(dataset), window_size, prior.num_newer(window_size)))
     header = _header(prior, dataset, window_size, len(calls))
     files = _resume(folder, header)
     folder.mkdir(parents=True, exist_ok=True)
@@ -67,6 +67,7 @@ def record(
     asked = range(max(missing, default=-1) + 1) if prior.is_sequential else missing
     for window, frames in with_frames((call for call in progress(calls) if call.inference in asked), dataset):
         prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
+        check_unit(prediction)
         if window.inference in missing:
             name = names[window.inference]
             files[name] = _write(folder / name, _npz(_arrays(prediction)))
@@ -105,6 +106,11 @@ class Recorded(Prior):
         self.feature_names = tuple(self._manifest["feature_names"])
         self.text_features = self._load("text_features.npz", ("text_features",))["text_features"]
         check_text(self.folder / "text_features.npz", self.text_features, self.feature_names)
+
+    def num_newer(self, window_size: int) -> int:
+        """Those that the prior asked for: in the first window they come after the dense ones but for the newest."""
+        first = self._load("000000.npz", ("views", "dense"))
+        return 1 + len(first["views"]) - len(first["dense"])
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Raise ValueError where the recording is not of this data set, calibration and window size."""

@@ -24,7 +24,8 @@ def places_seen_twice(
     other key frames (a saved map, frames that were lost at first, `slam.initialization=merged`), is not recorded.
     """
     database, pairs, seen = Database(), [], set()
-    for window, frames in with_frames(progress(list(windows(len(dataset), window_size))), dataset):
+    calls = list(windows(len(dataset), window_size, replay.num_newer(window_size)))
+    for window, frames in with_frames(progress(calls), dataset):
         prediction = replay.predict(window, list(frames.values()), dataset.intrinsics)
         for row, index in enumerate(window.dense):
             if index in seen:

@@ -17,12 +17,11 @@ from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import Whitening
 from emgs_jax.ops.neighbours import Groups
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.registration.matching import Matches, surface_of
-from emgs_jax.registration.noise import confidence_levels, noise_of_levels, num_independent, robust_std
+from emgs_jax.registration.matching import Candidates, Matches, surface_of
+from emgs_jax.registration.noise import level_edges, levels_of, noise_of_levels, num_independent
 from emgs_jax.registration.problem import (
     DISTRIBUTION,
     IcpConfig,
-    Noise,
     Problem,
     Uncertainty,
     candidates_at,
@@ -47,7 +46,8 @@ class IcpInfo(eqx.Module):
         residual: root mean square distance of the inliers to their Gaussians' planes, as a fraction of their depth.
         misfit: the same fraction of all points within `max_misfit`, as 1.4826 times the median, a robust standard
             deviation; 0 without any.
-        misfit_of_levels: likewise of the points in each of the `confidence_levels`.
+        misfit_of_levels: likewise of the points in each level of confidence.
+        level_edges: where these levels end.
         information: of the points alone, of (xi, log s).
         num_effective: how many independent measurements the points are worth, see `num_independent`.
         min_eigenvalue: smallest eigenvalue of what planes and colours say of the pose, per effective point (1/m² and
@@ -61,6 +61,7 @@ class IcpInfo(eqx.Module):
     residual: Float[Array, ""]
     misfit: Float[Array, ""]
     misfit_of_levels: Float[Array, "l"]
+    level_edges: Float[Array, "e"]
     information: Float[Array, "7 7"]
     num_effective: Float[Array, ""]
     min_eigenvalue: Float[Array, ""]
@@ -69,7 +70,12 @@ class IcpInfo(eqx.Module):
 
 
 def _observed(
-    y: Float[Array, "7"], matches: Matches, problem: Problem, noise: Noise, config: IcpConfig
+    y: Float[Array, "7"],
+    matches: Matches,
+    levels: Int[Array, "p"],
+    problem: Problem,
+    noise: Float[Array, ""],
+    config: IcpConfig,
 ) -> tuple[Uncertainty, Float[Array, "p"], tuple[Float[Array, ""], Float[Array, "l"]]]:
     """What the points' distances from their Gaussians say of the uncertainty, of which `noise` is the least.
 
@@ -78,12 +84,10 @@ def _observed(
     """
     source = problem.source
     distance, is_near = distances(y, matches, problem, config)
-    levels = confidence_levels(source.confidence, source.valid)
-    misfit, of_levels = robust_std(distance, is_near), noise_of_levels(distance, is_near, levels)
-    depth = jnp.maximum(of_levels, noise[1])[levels]
-    factor = jnp.maximum(misfit / noise[1], 1.0)
+    misfit, of_levels = noise_of_levels(distance, is_near, levels)
+    depth = jnp.maximum(of_levels, noise)[levels]
     uncertainty = Uncertainty(
-        pose=(noise[0] * factor, noise[1] * factor),
+        common=noise * jnp.maximum(misfit / noise, 1.0),
         depth=depth,
         num_effective=num_independent(distance / depth, source.points, is_near),
     )
@@ -94,27 +98,27 @@ def _search_and_solve(
     carry: _Carry,
     is_first: Bool[Array, ""],
     problem_of: Callable[[Uncertainty], Problem],
-    noise: Noise,
+    levels: Int[Array, "p"],
+    noise: Float[Array, ""],
     config: IcpConfig,
-) -> tuple[_Carry, tuple[Matches, Int[Array, ""], Bool[Array, ""]]]:
+) -> tuple[_Carry, tuple[Candidates, Int[Array, ""], Bool[Array, ""]]]:
     """Look up the Gaussians near every point, see how well the points fit them, and solve for y from there."""
     y, before = carry
     problem = problem_of(before)
     candidates = candidates_at(y, problem, config)
-    seen, _, _ = _observed(y, matches_at(y, candidates, problem, config), problem, noise, config)
+    seen, _, _ = _observed(y, matches_at(y, candidates, problem, config), levels, problem, noise, config)
     # y is the coarse pose at first, and only then do the distances say what that is worth.
-    pose = jax.tree.map(lambda now, then: jnp.where(is_first, now, then), seen.pose, before.pose)
-    uncertainty = Uncertainty(pose=pose, depth=seen.depth, num_effective=seen.num_effective)
+    common = jnp.where(is_first, seen.common, before.common)
+    uncertainty = Uncertainty(common=common, depth=seen.depth, num_effective=seen.num_effective)
     # Seven unknowns: on a CPU the normal equations take a fraction of a QR of all rows.
     solver = optx.LevenbergMarquardt(
         rtol=config.tolerance, atol=config.tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
     )
     args = candidates, problem_of(uncertainty), config
-    solution = optx.least_squares(residuals, solver, y, args, has_aux=True, max_steps=config.max_steps, throw=False)
+    solution = optx.least_squares(residuals, solver, y, args, max_steps=config.max_steps, throw=False)
     y = jnp.where(jnp.all(jnp.isfinite(solution.value)), solution.value, y)
     is_converged = solution.result == optx.RESULTS.successful
-    # Not `solution.aux`, which lags one accepted step behind.
-    return (y, uncertainty), (solution.state.aux, solution.stats["num_steps"], is_converged)
+    return (y, uncertainty), (candidates, solution.stats["num_steps"], is_converged)
 
 
 @full_precision
@@ -122,18 +126,18 @@ def icp(
     source: Observation,
     target: Gaussians,
     T_world_coarse: jaxlie.SE3,
-    noise: Noise,
+    known: Float[Array, "7 7"],
+    noise: Float[Array, ""],
     config: IcpConfig,
     white: Whitening | None = None,
-    known: Float[Array, "7 7"] | None = None,
     groups: Groups | None = None,
 ) -> tuple[jaxlie.SE3, Float[Array, ""], IcpInfo]:
     """Place camera-frame `source` on `target`: argmin over xi and s of data + prior, T = T_world_coarse exp(xi).
 
     The data term is a truncated least-squares sum over the points, scaled so that all of them together weigh as much
-    as `num_effective` independent ones. The prior holds xi at 0 with `prior_information`, and the scale s of the
-    points about the camera at 1 with `scale_noise`: the predictions of one call share an error of scale, and only the
-    map remembers the scale of the calls before.
+    as `num_effective` independent ones. The prior holds xi at 0 and the scale s of the points about the camera at 1 by
+    what is `known`: the predictions of one call share an error of scale, and only the map remembers the scale of the
+    calls before.
 
     `noise` is a lower bound. Where the points do not fit the map at the coarse pose as well as that, the coarse pose is
     worth no more than they fit there, and the depths no more than they fit where they are looked up: a prior may repeat
@@ -143,11 +147,10 @@ def icp(
         source: points to align, camera frame.
         target: Gaussians of the submap, world frame.
         T_world_coarse: where to start, and the mean of the prior.
-        noise: standard deviation of the coarse pose in metres, and of the points' depth as a fraction of it.
+        known: root of the information of the coarse pose and scale, (xi, log s), where there is a prior.
+        noise: standard deviation of the points' depth as a fraction of it.
         config: terms and gates.
         white: `whitening` of the target's covariances; None makes it here.
-        known: root of the information of the coarse pose and scale, (xi, log s), where there is a prior; None: that of
-            `noise`.
         groups: `group_points` of the valid Gaussians' means; None makes it here.
 
     Returns:
@@ -157,15 +160,18 @@ def icp(
     surface = surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, white, groups)
 
     def problem_of(uncertainty: Uncertainty) -> Problem:
-        return pose_problem(source, surface, T_world_coarse, noise[1], uncertainty, config, known)
+        return pose_problem(source, surface, T_world_coarse, noise, uncertainty, config, known)
 
-    step = partial(_search_and_solve, problem_of=problem_of, noise=noise, config=config)
-    given = Uncertainty(pose=noise, depth=jnp.full(source.valid.shape, noise[1]), num_effective=jnp.ones(()))
+    edges = level_edges(source.confidence, source.valid)
+    levels = levels_of(source.confidence, edges)
+    step = partial(_search_and_solve, problem_of=problem_of, levels=levels, noise=noise, config=config)
+    given = Uncertainty(common=noise, depth=jnp.full(source.valid.shape, noise), num_effective=jnp.ones(()))
     (y, uncertainty), rounds = jax.lax.scan(step, (jnp.zeros(7), given), jnp.arange(config.num_searches) == 0)
-    matches, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
+    candidates, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
     problem = problem_of(uncertainty)
+    matches = matches_at(y, candidates, problem, config)
     T, scale = pose_of(y, problem)
-    seen, distance, (misfit, misfit_of_levels) = _observed(y, matches, problem, noise, config)
+    seen, distance, (misfit, misfit_of_levels) = _observed(y, matches, levels, problem, noise, config)
     num_inliers = jnp.sum(matches.is_inlier)
     info = IcpInfo(
         num_inliers=num_inliers,
@@ -173,6 +179,7 @@ def icp(
         residual=jnp.sqrt(jnp.sum(jnp.where(matches.is_inlier, distance, 0.0) ** 2) / jnp.maximum(num_inliers, 1)),
         misfit=misfit,
         misfit_of_levels=misfit_of_levels,
+        level_edges=edges,
         information=data_information(y, matches, problem, config),
         num_effective=seen.num_effective,
         min_eigenvalue=jnp.linalg.eigvalsh(information(T, scale, matches, problem, config))[0],

@@ -12,14 +12,20 @@ NORMAL = 1.4826  # standard deviation of a normal distribution over its median a
 NUM_CELLS = 4  # along each side of the image, whose errors are compared; few, for errors may be alike over much of it
 
 
-def confidence_levels(confidence: Float[Array, "p"], valid: Bool[Array, "p"]) -> Int[Array, "p"]:
-    """The eighth of the valid points in which a point's confidence lies, 0 the lowest.
+def level_edges(confidence: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, "l"]:
+    """The confidences that part the valid points into eighths: the largest of each level but the last.
 
-    Only the order counts, since networks mean different things by their numbers. Equal confidences have equal levels:
-    a constant one says nothing, and all points have level 0.
+    Only the order counts, since networks mean different things by their numbers. NaN without a valid point.
     """
     share = jnp.arange(1, NUM_LEVELS) * jnp.sum(valid)
-    edges = kth_smallest(confidence, valid, -(-share // NUM_LEVELS) - 1)  # the last of each level's lower ones
+    return kth_smallest(confidence, valid, -(-share // NUM_LEVELS) - 1)
+
+
+def levels_of(confidence: Float[Array, "p"], edges: Float[Array, "l"]) -> Int[Array, "p"]:
+    """The level of confidence of every point, 0 the lowest.
+
+    Equal confidences have equal levels: a constant one says nothing, and all points have level 0.
+    """
     return jnp.sum(confidence[:, None] > edges, axis=-1)
 
 
@@ -28,14 +34,17 @@ def robust_std(errors: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Arra
     return jnp.where(jnp.any(valid), NORMAL * median(jnp.abs(errors), valid), 0.0)
 
 
-def noise_of_levels(errors: Float[Array, "p"], valid: Bool[Array, "p"], levels: Int[Array, "p"]) -> Float[Array, "l"]:
-    """Standard deviation of the errors in every level of confidence; that of all points where a level has too few.
+def noise_of_levels(
+    errors: Float[Array, "p"], valid: Bool[Array, "p"], levels: Int[Array, "p"]
+) -> tuple[Float[Array, ""], Float[Array, "l"]]:
+    """`robust_std` of all errors, and of those in every level; there that of all where a level has too few.
 
     So a confidence that is wrong about its points is found out by their errors.
     """
-    chosen = valid & (levels == jnp.arange(NUM_LEVELS)[:, None])
-    found = jax.vmap(robust_std, (None, 0))(errors, chosen)
-    return jnp.where(jnp.sum(chosen, axis=1) >= MIN_PAIRS, found, robust_std(errors, valid))
+    chosen = valid & jnp.append(levels == jnp.arange(NUM_LEVELS)[:, None], jnp.ones_like(valid)[None], axis=0)
+    *of_levels, of_all = jax.vmap(robust_std, (None, 0))(errors, chosen)
+    has_enough = jnp.sum(chosen[:-1], axis=1) >= MIN_PAIRS
+    return of_all, jnp.where(has_enough, jnp.stack(of_levels), of_all)
 
 
 def num_independent(

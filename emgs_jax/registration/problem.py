@@ -1,7 +1,6 @@
 """What ICP minimises: the distances of points from Gaussians, in standard deviations, and the prior of the pose."""
 
 import math
-from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -16,7 +15,6 @@ from emgs_jax.ops.neighbours import nearest
 from emgs_jax.ops.pytree import choice, static, traced
 from emgs_jax.registration.matching import Candidates, Matches, Surface, match
 
-Noise: TypeAlias = tuple[Float[Array, ""], Float[Array, ""]]  # standard deviations in m, and in rad or over the depth
 RESIDUALS = ("colored", "distribution", "colored+distribution", "colored+ray")
 COLORED, DISTRIBUTION, _, COLORED_RAY = range(len(RESIDUALS))
 LEAST_RATIO = 1e-3  # of a point's depth over that of a plane; less is behind the camera
@@ -45,7 +43,7 @@ class IcpConfig(eqx.Module):
         num_neighbours: Gaussians near a point, which every step of a solve compares.
         num_color_neighbours: Gaussians from which a Gaussian's intensity gradient is fitted.
         max_steps: of every solve.
-        tolerance: relative and absolute, of the solver.
+        tolerance: relative and absolute, of the solver; float32 tells no smaller differences apart than the least.
     """
 
     residual: Float[Array, "*b"] = choice(*RESIDUALS)
@@ -61,14 +59,14 @@ class IcpConfig(eqx.Module):
     num_neighbours: int = static(low=1, high=256)
     num_color_neighbours: int = static(low=1, high=256)
     max_steps: int = static(low=0, high=1000)
-    tolerance: float = static(low=0, high=1)
+    tolerance: float = static(low=1e-7, high=1)
 
 
 class Uncertainty(eqx.Module):
     """What the coarse pose, the points' depths and all points together are worth."""
 
-    pose: Noise
-    depth: Float[Array, "p"]  # as a fraction
+    common: Float[Array, ""]  # depth noise of all; the coarse pose is worth less by as much as it exceeds the given
+    depth: Float[Array, "p"]  # noise of each, as a fraction
     num_effective: Float[Array, ""]
 
 
@@ -91,21 +89,15 @@ def pose_problem(
     scale_unit: Float[Array, ""],
     uncertainty: Uncertainty,
     config: IcpConfig,
-    known: Float[Array, "7 7"] | None = None,
+    known: Float[Array, "7 7"],
 ) -> Problem:
     """What the uncertainty makes of points and map; `scale_unit` is the depth noise that the seventh unknown counts.
 
-    `known` is the root of the information of (xi, log s) where the points fit as well as they should; None: that of the
-    uncertainty alone.
+    `known` is the root of the information of (xi, log s) where the points fit as well as they should.
     """
-    if known is None:
-        pose = jnp.sqrt(config.prior_information) / jnp.repeat(jnp.stack(uncertainty.pose), 3)
-        # Everything of a call errs with its scale, so the scale is held by the depths' common noise.
-        prior = jnp.diag(jnp.append(pose, scale_unit / jnp.sqrt(jnp.mean(uncertainty.depth**2))))
-    else:
-        units = jnp.ones(7).at[6].set(config.scale_noise * scale_unit)
-        prior = (config.prior_information > 0) * known * units * (scale_unit / uncertainty.pose[1])
-        prior = prior.at[6, 6].set(jnp.where(units[6] * prior[6, 6] > 0, prior[6, 6], 1.0))  # a scale that stays
+    units = jnp.ones(7).at[6].set(config.scale_noise * scale_unit)
+    prior = (config.prior_information > 0) * known * units * (scale_unit / uncertainty.common)
+    prior = prior.at[6, 6].set(jnp.where(units[6] * prior[6, 6] > 0, prior[6, 6], 1.0))  # a scale that stays
     return Problem(
         source=source,
         surface=surface,
@@ -150,8 +142,8 @@ def distances(
 
 def residuals(
     y: Float[Array, "7"], args: tuple[Candidates, Problem, IcpConfig]
-) -> tuple[tuple[Float[Array, "p 5"], Float[Array, "7"]], Matches]:
-    """Rows of every point and of the prior, in standard deviations; beside them the matches.
+) -> tuple[Float[Array, "p 5"], Float[Array, "7"]]:
+    """Rows of every point and of the prior, in standard deviations.
 
     The matches carry no gradient. The derivative is made here, once, and the solver gets rows that are linear in y:
     otherwise each of its uses of the derivative would be compiled, and computed, anew.
@@ -161,7 +153,7 @@ def residuals(
     matches = jax.lax.stop_gradient(matches_at(fixed, candidates, problem, config))
     jacobian = jax.lax.stop_gradient(jax.jacfwd(rows_of)(fixed, matches, problem, config))
     rows = rows_of(fixed, matches, problem, config) + jacobian @ (y - fixed)
-    return (rows, problem.prior @ y), matches
+    return rows, problem.prior @ y
 
 
 def rows_of(y: Float[Array, "7"], matches: Matches, problem: Problem, config: IcpConfig) -> Float[Array, "p 5"]:

@@ -1,7 +1,7 @@
-"""Front-to-back compositing of one tile, and the image from all of them."""
+"""Front-to-back compositing of the tiles' splats, its gradient, and the image from all tiles."""
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,14 +12,14 @@ from jaxtyping import Array, Float, Int, PyTree
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import fill_rows, static, take_rows, traced
+from emgs_jax.ops.pytree import static, take_rows, traced
 from emgs_jax.render.project import Splats, project_gaussians
-from emgs_jax.render.tiles import assign_tiles, tile_corners
+from emgs_jax.render.tiles import CHUNK, Chunks, TileLists, list_splats, num_tiles, take_chunks, tile_corners
 
 OPAQUE = 0.99  # coverage of a pixel behind which nothing changes it by more than a hundredth
-NUM_SIZES = 3  # programs for tiles of the capacity, half and a quarter of it, which most tiles of a map do not exceed
-Tile: TypeAlias = tuple[Array, Array, Array]  # corner, rows of its splats, which of them exist
-Sums: TypeAlias = tuple[Float[Array, "q v"], Float[Array, "q"], Float[Array, "q"], Float[Array, "q"]]
+MAX_ALPHA = 0.999  # of its light that a splat takes from those behind it, so that a logarithm of the rest exists
+Sums: TypeAlias = tuple[Float[Array, "t v q"], Float[Array, "t q"], Float[Array, "t q"], Float[Array, "t q"]]
+State = TypeVar("State")
 
 
 class RenderConfig(eqx.Module):
@@ -27,8 +27,10 @@ class RenderConfig(eqx.Module):
 
     Args:
         tile_size: pixels along a tile's side.
-        tile_capacity: splats that one tile can hold, the nearest; `Rendering.overflow` counts those that are missed.
-        tile_batch: tiles that are drawn at once, which bounds the memory.
+        tile_capacity: splats of a tile for which there is room, on average over the tiles: one may hold more. A dozen
+            bytes for each. The nearest of the image come first; `Rendering.overflow` counts those that are missed.
+        tile_batch: times CHUNK splats of tiles are drawn at once, which bounds the memory: some six times as many
+            floats as they have pixels.
         opacity: of every Gaussian at its centre (the paper's constant opacity).
         covariance_scale: factor on the covariances, so that neighbouring Gaussians close the surface.
         blur: pixels²; low-pass filter.
@@ -54,8 +56,8 @@ class Rendering(eqx.Module):
         alpha: coverage in [0, 1].
         depth: expected camera-space z in metres; 0 where alpha is below `min_alpha`.
         depth_std: standard deviation in metres of the depth over the splats of a pixel: large where two surfaces mix.
-        overflow: splats that were not drawn because their tile was full, summed over the tiles in which something is
-            seen behind the nearest; where every pixel is opaque they are hidden.
+        overflow: splats for which there was no room, summed over the tiles in which something is seen behind those
+            that are drawn; where every pixel is opaque they are hidden.
     """
 
     values: Float[Array, "h w c"]
@@ -65,49 +67,163 @@ class Rendering(eqx.Module):
     overflow: Int[Array, ""]
 
 
-def splat_alpha(splats: Splats, pixels: Float[Array, "q 2"], config: RenderConfig) -> Float[Array, "c q"]:
+def splat_alpha(splats: Splats, pixels: Float[Array, "*p q 2"], config: RenderConfig) -> Float[Array, "*c q"]:
     """Opacity of every splat at every pixel: opacity · exp(-½ d²); 0 beyond `radius` standard deviations."""
-    offset = pixels[None] - splats.means[:, None]
-    precision = splats.precisions
-    distance_sq = (
-        precision[:, None, 0, 0] * offset[..., 0] ** 2
-        + 2.0 * precision[:, None, 0, 1] * offset[..., 0] * offset[..., 1]
-        + precision[:, None, 1, 1] * offset[..., 1] ** 2
-    )
-    alpha = config.opacity * jnp.exp(-0.5 * distance_sq)
-    return jnp.where((distance_sq <= config.radius**2) & splats.valid[:, None], alpha, 0.0)
+    dx, dy = _offsets(splats, pixels)
+    a, b, c = (splats.precisions[..., i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    distance_sq = a * dx**2 + 2.0 * b * dx * dy + c * dy**2
+    return jnp.where(distance_sq <= config.radius**2, config.opacity * jnp.exp(-0.5 * distance_sq), 0.0)
 
 
-def splat_depth(splats: Splats, pixels: Float[Array, "q 2"], config: RenderConfig) -> Float[Array, "c q"]:
+def splat_depth(splats: Splats, pixels: Float[Array, "*p q 2"], config: RenderConfig) -> Float[Array, "*c q"]:
     """Camera-space z of every splat's plane at every pixel, kept within the splat's own extent in depth."""
-    offset = pixels[None] - splats.means[:, None]
-    inverse = splats.inverse_depth[:, None] + jnp.sum(splats.depth_slope[:, None] * offset, axis=-1)
+    dx, dy = _offsets(splats, pixels)
+    slope = splats.depth_slope[..., None]
+    inverse = splats.inverse_depth[..., None] + slope[..., 0, :] * dx + slope[..., 1, :] * dy
     reach = config.radius * splats.depth_std
     nearest, farthest = splats.depth - reach, splats.depth + reach
     highest = 1.0 / jnp.maximum(nearest, 0.1 * splats.depth)
-    return 1.0 / jnp.clip(inverse, (1.0 / farthest)[:, None], highest[:, None])
+    return 1.0 / jnp.clip(inverse, (1.0 / farthest)[..., None], highest[..., None])
 
 
-def blend_weights(
-    splats: Splats, pixels: Float[Array, "q 2"], config: RenderConfig
-) -> tuple[Float[Array, "c q"], Float[Array, "c q"]]:
-    """Share of every splat of a tile, nearest first, in the light of every pixel, and its depth there (m)."""
-    alpha = splat_alpha(splats, pixels, config)
-    log_light = jnp.cumsum(jnp.log1p(-jnp.minimum(alpha, 0.999)), axis=0)
-    light_before = jnp.exp(jnp.concatenate([jnp.zeros_like(log_light[:1]), log_light[:-1]]))
-    weights = alpha * light_before
-    # An invalid row may hold any depth; its weight is 0, and 0 · inf would be NaN.
-    return weights, jnp.where(weights > 0, splat_depth(splats, pixels, config), 0.0)
+def _offsets(splats: Splats, pixels: Float[Array, "*p q 2"]) -> tuple[Float[Array, "*c q"], Float[Array, "*c q"]]:
+    """x and y of every pixel from every splat's mean."""
+    return pixels[..., 0] - splats.means[..., 0, None], pixels[..., 1] - splats.means[..., 1, None]
 
 
-def weighted_sums(weights: Float[Array, "c q"], depth: Float[Array, "c q"], values: Float[Array, "c v"]) -> Sums:
-    """Σ w v, Σ w, Σ w z and Σ w z² of every pixel."""
-    return weights.T @ values, weights.sum(0), (weights * depth).sum(0), (weights * depth**2).sum(0)
+def at_pixels(
+    splats: Splats, chunks: Chunks, pixels: Float[Array, "t q 2"], config: RenderConfig
+) -> tuple[Float[Array, "c k q"], Float[Array, "c k q"]]:
+    """Opacity of the chunks' splats at the pixels of their tiles, and depth, 0 where that is 0."""
+    near = take_rows(splats, chunks.rows)
+    seen = take_rows(pixels, chunks.tiles)[:, None]
+    alpha = jnp.where(chunks.exists[..., None], splat_alpha(near, seen, config), 0.0)
+    return alpha, jnp.where(alpha > 0, splat_depth(near, seen, config), 0.0)
 
 
-def composite(splats: Splats, values: Float[Array, "c v"], pixels: Float[Array, "q 2"], config: RenderConfig) -> Sums:
-    """Blend the splats of one tile, which come nearest first: values, alpha, Σ w z, Σ w z²."""
-    return weighted_sums(*blend_weights(splats, pixels, config), values)
+def _sum_before(
+    terms: Float[Array, "c k q"], chunks: Chunks, total: Float[Array, "t q"]
+) -> tuple[Float[Array, "c k q"], Float[Array, "t q"]]:
+    """Sum of the terms that come before each one in its tile's list, and of all so far.
+
+    Args:
+        terms: of the splats of some chunks.
+        chunks: of whose tiles.
+        total: sum of the chunks before these; likewise with these.
+    """
+    count, length, _ = terms.shape
+    # Products with triangles of ones: `cumsum` is several passes on every device, and twenty times slower on a CPU.
+    triangle = jnp.broadcast_to(jnp.tri(length, k=-1), (count, length, length))
+    within = jnp.einsum("ckl,clq->ckq", triangle, terms)
+    whole = within[:, -1] + terms[:, -1]
+    is_same = chunks.tiles[:, None] == chunks.tiles
+    earlier = jnp.where(is_same, jnp.tri(count, k=-1), 0.0) @ whole
+    before = within + (take_rows(total, chunks.tiles) + earlier)[:, None]
+    return before, total.at[chunks.tiles].add(whole, mode="drop")
+
+
+def light_before(
+    alpha: Float[Array, "c k q"], chunks: Chunks, log_light: Float[Array, "t q"]
+) -> tuple[Float[Array, "c k q"], Float[Array, "t q"]]:
+    """Light that reaches every splat of some chunks, and the logarithm of what is left behind them."""
+    before, log_light = _sum_before(jnp.log(1.0 - jnp.minimum(alpha, MAX_ALPHA)), chunks, log_light)
+    return jnp.exp(before), log_light
+
+
+def _add(sums: Sums, chunks: Chunks, weights: Float[Array, "c k q"], depth: Array, values: Array) -> Sums:
+    """The sums over the splats so far, with those of some chunks."""
+    moments = jnp.stack([weights, weights * depth, weights * depth**2], axis=-2).sum(axis=1)
+    more = jnp.einsum("ckv,ckq->cvq", values[chunks.rows], weights), *jnp.unstack(moments, axis=1)
+    return jax.tree.map(lambda x, y: x.at[chunks.tiles].add(y, mode="drop"), sums, more)
+
+
+def over_chunks(visit: Callable[[Chunks, State], State], start: State, lists: TileLists, config: RenderConfig) -> State:
+    """Visit all chunks of the lists, `tile_batch` at once, as many times as it takes."""
+    count = min(config.tile_batch, lists.rows.shape[0] // CHUNK + lists.overflow.shape[0])
+
+    def step(turn: Int[Array, ""], state: State) -> State:
+        return visit(take_chunks(lists, turn * count, count), state)
+
+    return jax.lax.fori_loop(0, -(-lists.chunks[-1] // count), step, start)
+
+
+@eqx.filter_custom_vjp
+def composite(
+    drawn: tuple[Splats, Float[Array, "n v"], RenderConfig],
+    lists: TileLists,
+    pixels: Float[Array, "t q 2"],
+    front: tuple[Float[Array, "t q"], Float[Array, "t q"]] | None,
+) -> Sums:
+    """Blend the splats of every tile, nearest first: Σ w v, Σ w, Σ w z and Σ w z² of every pixel.
+
+    The weight of a splat is its opacity times the light that those before it let through; or, with a `front`, the
+    opacity alone of those whose depth lies between its two (m).
+    """
+    splats, values, config = drawn
+
+    def visit(chunks: Chunks, state: tuple[Sums, Array]) -> tuple[Sums, Array]:
+        sums, log_light = state
+        alpha, depth = at_pixels(splats, chunks, pixels, config)
+        share, log_light = _share(alpha, depth, chunks, log_light, front)
+        return _add(sums, chunks, alpha * share, depth, values), log_light
+
+    dark = jnp.zeros(pixels.shape[:2])
+    start = (jnp.zeros((dark.shape[0], values.shape[1], dark.shape[1])), dark, dark, dark), dark
+    return over_chunks(visit, start, lists, config)[0]
+
+
+def _share(
+    alpha: Float[Array, "c k q"], depth: Float[Array, "c k q"], chunks: Chunks, log_light: Array, front: Any
+) -> tuple[Float[Array, "c k q"], Float[Array, "t q"]]:
+    """By what the opacity is multiplied to be a splat's weight, and the logarithm of the light behind these chunks."""
+    if front is None:
+        return light_before(alpha, chunks, log_light)
+    low, high = (take_rows(x, chunks.tiles)[:, None] for x in front)
+    return jnp.where((depth >= low) & (depth <= high), 1.0, 0.0), log_light
+
+
+@composite.def_fwd
+def _composite_forward(_, drawn: Any, lists: TileLists, pixels: Array, front: Any) -> tuple[Sums, Sums]:
+    sums = composite(drawn, lists, pixels, front)
+    return sums, sums
+
+
+@composite.def_bwd
+@full_precision
+def _composite_backward(
+    sums: Sums, slopes: Sums, _, drawn: Any, lists: TileLists, pixels: Array, front: Any
+) -> PyTree[Array]:
+    """Visit the chunks once more, so that nothing need be kept of them, as 3DGS does.
+
+    With the slope g of the result by a splat's weight w = α T, that by its opacity is T g less what it takes from those
+    behind it, Σ w g / (1 - α).
+    """
+    splats, values, config = drawn
+    slopes = jax.tree.map(lambda x, y: jnp.zeros_like(x) if y is None else y, sums, slopes)
+    by_value, *by_rest = slopes
+    whole = jnp.sum(by_value * sums[0], axis=1) + sum(x * y for x, y in zip(by_rest, sums[1:], strict=True))
+
+    def visit(chunks: Chunks, state: PyTree[Array]) -> PyTree[Array]:
+        gradient, log_light, so_far = state
+        (alpha, depth), pull = eqx.filter_vjp(lambda s, c: at_pixels(s, chunks, pixels, c), splats, config)
+        share, log_light = _share(alpha, depth, chunks, log_light, front)
+        weights = alpha * share
+        per_value = take_rows(by_value, chunks.tiles)
+        one, z, z_sq = (take_rows(x, chunks.tiles)[:, None] for x in by_rest)
+        slope = jnp.einsum("ckv,cvq->ckq", values[chunks.rows], per_value) + one + z * depth + z_sq * depth**2
+        by_alpha = share * slope
+        if front is None:
+            before, so_far = _sum_before(weights * slope, chunks, so_far)
+            behind = take_rows(whole, chunks.tiles)[:, None] - before - weights * slope
+            by_alpha -= jnp.where(alpha < MAX_ALPHA, behind / (1.0 - jnp.minimum(alpha, MAX_ALPHA)), 0.0)
+        by_splats, by_config = pull((by_alpha, weights * (z + 2.0 * z_sq * depth)))
+        by_values = jnp.where(chunks.exists[..., None], jnp.einsum("ckq,cvq->ckv", weights, per_value), 0.0)
+        more = by_splats, jnp.zeros_like(values).at[chunks.rows].add(by_values), by_config
+        return jax.tree.map(jnp.add, gradient, more), log_light, so_far
+
+    none = jax.tree.map(jnp.zeros_like, eqx.filter(drawn, eqx.is_inexact_array))
+    dark = jnp.zeros(pixels.shape[:2])
+    return over_chunks(visit, (none, dark, dark), lists, config)[0]
 
 
 @full_precision
@@ -130,78 +246,28 @@ def splats_of(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, 
 
 def render_splats(splats: Splats, values: Float[Array, "n v"], camera: Camera, config: RenderConfig) -> Rendering:
     """`render` for Gaussians that are projected already."""
-    sums, overflow = draw_tiles(splats, values, camera, config, composite)
-    return rendering_of(*sums, overflow, config)
+    lists, pixels = lists_of(splats, camera, config)
+    return rendering_of(composite((splats, values, config), lists, pixels, None), lists, camera, config)
 
 
-def draw_tiles(
-    splats: Splats,
-    values: Float[Array, "n v"],
-    camera: Camera,
-    config: RenderConfig,
-    blend: Callable[..., PyTree[Array]],
-) -> tuple[PyTree[Array], Int[Array, "t"]]:
-    """Images (h, w, ...) of what `blend`, a function like `composite`, gives for the splats of every tile.
-
-    Returns:
-        The images, and how many splats found each tile full.
-    """
-    corners = tile_corners(camera, config.tile_size)
-    rows, exists, overflow = assign_tiles(splats, corners, config.tile_size, config.tile_capacity, config.radius)
+def lists_of(splats: Splats, camera: Camera, config: RenderConfig) -> tuple[TileLists, Float[Array, "t q 2"]]:
+    """The splats of every tile, and its pixels, row-major."""
     step = jnp.arange(config.tile_size, dtype=jnp.float32)
     inside = jnp.stack(jnp.meshgrid(step, step, indexing="xy"), axis=-1).reshape(-1, 2)
-
-    def draw(tile: Tile) -> PyTree[Array]:
-        corner, tile_rows, tile_exists = tile
-        near, near_values = take_rows((splats, values), tile_rows)
-        near = eqx.tree_at(lambda s: s.valid, near, near.valid & tile_exists)
-        near_values = jnp.where(near.valid[:, None], near_values, 0.0)
-        return blend(near, near_values, corner + inside, config)
-
-    tiles = _map_by_fill(draw, (corners, rows, exists), min(config.tile_batch, corners.shape[0]))
-    return jax.tree.map(lambda x: _assemble(x, camera, config.tile_size), tiles), overflow
+    pixels = tile_corners(camera, config.tile_size)[:, None] + inside
+    splats, radius = jax.lax.stop_gradient((splats, config.radius))  # who is where has no slope
+    return list_splats(splats, camera, config.tile_size, config.tile_capacity, radius), pixels
 
 
-def _map_by_fill(draw: Callable[[Tile], PyTree[Array]], tiles: Tile, batch_size: int) -> PyTree[Array]:
-    """Draw all tiles, equally full ones together, each batch with as few of its rows as the fullest tile needs.
-
-    Args:
-        draw: what one tile becomes; the splats that exist are its first rows.
-        tiles: corners (t, 2), rows (t, c), which exist (t, c).
-        batch_size: tiles at once; at most t.
-    """
-    capacity = tiles[1].shape[1]
-    sizes = [-(-capacity // 2**power) for power in reversed(range(NUM_SIZES))]
-    order = jnp.argsort(jnp.sum(tiles[2], axis=1))
-    batches = jax.tree.map(lambda x: fill_rows(x[order], batch_size, 0).reshape(-1, batch_size, *x.shape[1:]), tiles)
-
-    def first_rows(size: int) -> Callable[[Tile], PyTree[Array]]:
-        return jax.vmap(lambda tile: draw((tile[0], tile[1][:size], tile[2][:size])))
-
-    def draw_batch(batch: Tile) -> PyTree[Array]:
-        fullest = jnp.max(jnp.sum(batch[2], axis=1))
-        return jax.lax.switch(jnp.sum(fullest > jnp.array(sizes[:-1])), [first_rows(size) for size in sizes], batch)
-
-    drawn = jax.lax.map(draw_batch, batches)
-    back = jnp.argsort(order)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[back], drawn)
-
-
-def rendering_of(
-    values_sum: Float[Array, "h w v"],
-    alpha: Float[Array, "h w"],
-    depth_sum: Float[Array, "h w"],
-    depth_sq_sum: Float[Array, "h w"],
-    overflow: Int[Array, "t"],
-    config: RenderConfig,
-) -> Rendering:
-    """The means behind the images of `composite`; `overflow` is of every tile."""
+def rendering_of(sums: Sums, lists: TileLists, camera: Camera, config: RenderConfig) -> Rendering:
+    """The means behind what `composite` gives for the tiles."""
+    values, alpha, depth_sum, depth_sq_sum = images_of(sums, camera, config)
     is_covered = alpha >= jnp.maximum(config.min_alpha, 1e-6)
     total = jnp.where(is_covered, alpha, 1.0)
     depth = jnp.where(is_covered, depth_sum / total, 0.0)
     variance = jnp.maximum(depth_sq_sum / total - depth**2, 1e-12)
     depth_std = jnp.where(is_covered, jnp.sqrt(variance), 0.0)
-    return Rendering(values_sum, alpha, depth, depth_std, _seen_overflow(overflow, alpha, config.tile_size))
+    return Rendering(values, alpha, depth, depth_std, _seen_overflow(lists.overflow, alpha, config.tile_size))
 
 
 def _seen_overflow(overflow: Int[Array, "t"], alpha: Float[Array, "h w"], tile_size: int) -> Int[Array, ""]:
@@ -213,9 +279,16 @@ def _seen_overflow(overflow: Int[Array, "t"], alpha: Float[Array, "h w"], tile_s
     return jnp.sum(jnp.where(jnp.min(pixels, axis=(1, 3)).reshape(-1) < OPAQUE, overflow, 0))
 
 
+def images_of(sums: Sums, camera: Camera, config: RenderConfig) -> tuple[Float[Array, "h w *v"], ...]:
+    """Values (h, w, v) and the three others (h, w), of all tiles."""
+    values, *others = sums
+    tiles = values.swapaxes(1, 2), *others
+    return tuple(_assemble(x, camera, config.tile_size) for x in tiles)
+
+
 def _assemble(tiles: Float[Array, "t q *c"], camera: Camera, tile_size: int) -> Float[Array, "h w *c"]:
     """Tiles in row-major order -> image, cut at the border."""
-    columns, rows = -(-camera.width // tile_size), -(-camera.height // tile_size)
+    columns, rows = num_tiles(camera, tile_size)
     channels = tiles.shape[2:]
     grid = tiles.reshape(rows, columns, tile_size, tile_size, *channels).swapaxes(1, 2)
     return grid.reshape(rows * tile_size, columns * tile_size, *channels)[: camera.height, : camera.width]

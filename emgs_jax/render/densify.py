@@ -1,27 +1,31 @@
 """Densification: a point with normal and colour for every pixel of a view, the paper's rule for a sparse map."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, unproject
 from emgs_jax.ops.linalg import outer, safe_normalize, tangent_basis
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import traced
+from emgs_jax.ops.pytree import take_rows, traced
 from emgs_jax.render.composite import (
     RenderConfig,
     Rendering,
-    Sums,
-    blend_weights,
-    draw_tiles,
+    at_pixels,
+    composite,
+    images_of,
+    light_before,
+    lists_of,
+    over_chunks,
     rendering_of,
-    splat_alpha,
+    splat_depth,
     splats_of,
-    weighted_sums,
 )
 from emgs_jax.render.project import Splats
+from emgs_jax.render.tiles import Chunks, TileLists
 
 
 class DensifyConfig(eqx.Module):
@@ -67,16 +71,14 @@ def densify(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, co
     values = jnp.concatenate([gaussians.colors, gaussians.normals], axis=-1)
     drawn = eqx.tree_at(lambda r: r.min_alpha, config.render, config.min_alpha)
 
-    def blend(splats: Splats, values: Array, pixels: Array, render: RenderConfig) -> tuple[Sums, Sums]:
-        weights, depth = blend_weights(splats, pixels, render)
-        nearness = splat_alpha(splats, pixels, render)
-        surface = jnp.where(in_front_surface(weights, depth, config.surface_depth), nearness, 0.0)
-        return weighted_sums(weights, depth, values), weighted_sums(surface, depth, values)
-
     splats = splats_of(without_floor(gaussians, config.min_std), T_world_camera, camera, drawn)
-    (whole, surface), overflow = draw_tiles(splats, values, camera, drawn, blend)
-    rendering = rendering_of(*whole, overflow, drawn)
-    values_sum, weight, depth_sum, _ = surface
+    lists, pixels = lists_of(splats, camera, drawn)
+    whole = composite((splats, values, drawn), lists, pixels, None)
+    middle = median_depth(*jax.lax.stop_gradient((splats, lists, pixels, whole[1], drawn)))
+    reach = jax.lax.stop_gradient(config.surface_depth) * middle
+    surface = composite((splats, values, drawn), lists, pixels, (middle - reach, middle + reach))
+    rendering = rendering_of(whole, lists, camera, drawn)
+    values_sum, weight, depth_sum, _ = images_of(surface, camera, drawn)
     covered = weight > 0
     weight = jnp.where(covered, weight, 1.0)
     depth = jnp.where(covered, depth_sum / weight, 0.0)
@@ -107,10 +109,22 @@ def without_floor(gaussians: Gaussians, min_std: Float[Array, ""]) -> Gaussians:
     return eqx.tree_at(lambda g: g.covs, gaussians, gaussians.covs - floor[:, None, None] * plane)
 
 
-def in_front_surface(
-    weights: Float[Array, "c q"], depth: Float[Array, "c q"], reach: Float[Array, ""]
-) -> Bool[Array, "c q"]:
-    """Which splats of every pixel, nearest first, lie within a fraction `reach` of their weighted median depth."""
-    below = jnp.cumsum(weights, axis=0) < 0.5 * weights.sum(0)
-    middle = jnp.take_along_axis(depth, jnp.sum(below, axis=0)[None], axis=0, mode="clip")
-    return jnp.abs(depth - middle) <= reach * middle
+def median_depth(
+    splats: Splats, lists: TileLists, pixels: Float[Array, "t q 2"], alpha: Float[Array, "t q"], config: RenderConfig
+) -> Float[Array, "t q"]:
+    """Depth of the first splat of every pixel behind which no more than half of its coverage `alpha` lies (m)."""
+    never = lists.rows.shape[0]
+
+    def visit(chunks: Chunks, state: tuple[Int[Array, "t q"], Array]) -> tuple[Int[Array, "t q"], Array]:
+        first, log_light = state
+        opacity, _ = at_pixels(splats, chunks, pixels, config)
+        light, log_light = light_before(opacity, chunks, log_light)
+        taken = 1.0 - light * (1.0 - opacity)
+        is_past = chunks.exists[..., None] & (taken >= 0.5 * take_rows(alpha, chunks.tiles)[:, None])
+        found = jnp.min(jnp.where(is_past, chunks.positions[..., None], never), axis=1)
+        return first.at[chunks.tiles].min(found, mode="drop"), log_light
+
+    start = jnp.full(alpha.shape, never), jnp.zeros(alpha.shape)
+    first, _ = over_chunks(visit, start, lists, config)
+    middle = take_rows(splats, take_rows(lists.rows, first))
+    return jnp.where(first < never, splat_depth(middle, pixels[..., None, :], config)[..., 0], 0.0)

@@ -1,36 +1,133 @@
-"""Which splats touch which tile of the image."""
+"""Which splats touch which tile of the image: one list for all tiles, sorted by tile and depth (3DGS)."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.ops.camera import Camera
-from emgs_jax.ops.neighbours import compact_rows
 from emgs_jax.render.project import Splats
+
+CHUNK = 32  # splats of a tile that are composited at once; the last of a tile may have fewer
+WORD = 2**31  # what an integer holds
+
+
+class TileLists(eqx.Module):
+    """The splats of every tile, nearest first, one tile after the other.
+
+    Args:
+        rows: of the splats; what is past the last tile's has no meaning.
+        bounds: where the tiles' lists begin, and where the last one ends.
+        chunks: likewise in chunks of CHUNK splats.
+        overflow: how many splats of every tile had no room.
+    """
+
+    rows: Int[Array, "e"]
+    bounds: Int[Array, "b"]
+    chunks: Int[Array, "b"]
+    overflow: Int[Array, "t"]
+
+
+class Chunks(eqx.Module):
+    """Some consecutive chunks of the lists.
+
+    Args:
+        tiles: to which they belong; past the last tile where there is none.
+        positions: in the lists.
+        rows: of the splats; those of the first in the lists where there is none.
+        exists: which there are.
+    """
+
+    tiles: Int[Array, "c"]
+    positions: Int[Array, "c k"]
+    rows: Int[Array, "c k"]
+    exists: Bool[Array, "c k"]
+
+
+def num_tiles(camera: Camera, tile_size: int) -> tuple[int, int]:
+    """Columns and rows of tiles; the last ones may reach over the border."""
+    return -(-camera.width // tile_size), -(-camera.height // tile_size)
 
 
 def tile_corners(camera: Camera, tile_size: int) -> Float[Array, "t 2"]:
-    """Pixel (x, y) of the upper left corner of every tile, row-major; the last tiles may reach over the border."""
-    x = jnp.arange(0, camera.width, tile_size, dtype=jnp.float32)
-    y = jnp.arange(0, camera.height, tile_size, dtype=jnp.float32)
+    """Pixel (x, y) of the upper left corner of every tile, row-major."""
+    x, y = (tile_size * jnp.arange(count, dtype=jnp.float32) for count in num_tiles(camera, tile_size))
     return jnp.stack(jnp.meshgrid(x, y, indexing="xy"), axis=-1).reshape(-1, 2)
 
 
-def assign_tiles(
-    splats: Splats, corners: Float[Array, "t 2"], tile_size: int, capacity: int, radius: Float[Array, ""]
-) -> tuple[Int[Array, "t c"], Bool[Array, "t c"], Int[Array, "t"]]:
-    """Splats whose bounding box of `radius` standard deviations meets the tile, nearest first.
+def list_splats(splats: Splats, camera: Camera, tile_size: int, capacity: int, radius: Float[Array, ""]) -> TileLists:
+    """List the splats whose bounding box of `radius` standard deviations meets a tile.
 
-    Returns:
-        Rows of the splats, which of them exist, and per tile how many did not fit and are therefore not drawn.
+    As in Kerbl et al., "3D Gaussian Splatting", 2023, section 6: every splat is copied for each tile that it touches,
+    the copies are sorted by tile and depth, and a tile's list is a range of them.
+
+    Args:
+        splats: on the image plane.
+        camera: of the image.
+        tile_size: pixels along a tile's side.
+        capacity: splats of a tile for which there is room, on average over the tiles; the nearest of all come first.
+        radius: standard deviations.
     """
-    order = jnp.argsort(jnp.where(splats.valid, splats.depth, jnp.inf), stable=True)
+    columns, lines = num_tiles(camera, tile_size)
+    num_splats, num_lists = splats.depth.shape[0], columns * lines
+    # Positive floats are ordered as their bits are.
+    depth = jax.lax.bitcast_convert_type(jnp.where(splats.valid, splats.depth, jnp.inf), jnp.int32)
+    order = jnp.argsort(depth, stable=True)
+    first, size = (x[order] for x in _touched(splats, jnp.array([columns, lines]), tile_size, radius))
+    counts = size[:, 0] * size[:, 1]
+    ends = jnp.cumsum(counts)
+
+    copies = jnp.arange(num_lists * capacity)
+    splat = jnp.cumsum(jnp.zeros(copies.shape, jnp.int32).at[ends].add(1, mode="drop"))  # how many end before
+    splat = jnp.minimum(splat, num_splats - 1)
+    number, width = copies - (ends - counts)[splat], jnp.maximum(size[splat, 0], 1)
+    tile = (first[splat, 1] + number // width) * columns + first[splat, 0] + number % width
+    tile, splat = _sorted(jnp.where(copies < ends[-1], tile, num_lists), splat, num_lists, num_splats)
+
+    bounds = jnp.searchsorted(tile, jnp.arange(num_lists + 1))
+    listed = jnp.diff(bounds)
+    chunks = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(-(-listed // CHUNK))])
+    return TileLists(order[splat], bounds, chunks, _num_touching(first, size, (lines, columns)) - listed)
+
+
+def _touched(
+    splats: Splats, num: Int[Array, "2"], tile_size: int, radius: Float[Array, ""]
+) -> tuple[Int[Array, "n 2"], Int[Array, "n 2"]]:
+    """Column and row of the first tile that every splat's box meets, and how many tiles wide and high that is."""
     half = radius * jnp.sqrt(jnp.stack([splats.covs[:, 0, 0], splats.covs[:, 1, 1]], axis=-1))
-    low, high, valid = ((x)[order] for x in (splats.means - half, splats.means + half, splats.valid))
+    low, high = splats.means - half, splats.means + half
+    first = jnp.clip(jnp.ceil((low - (tile_size - 1)) / tile_size), 0, num).astype(jnp.int32)
+    last = jnp.clip(jnp.floor(high / tile_size) + 1, 0, num).astype(jnp.int32)
+    is_drawn = splats.valid & jnp.all(high >= low, axis=-1)
+    return first, jnp.where(is_drawn[:, None], jnp.maximum(last - first, 0), 0)
 
-    def assign(corner: Float[Array, "2"]) -> tuple[Int[Array, "c"], Bool[Array, "c"], Int[Array, ""]]:
-        is_near = jnp.all((high >= corner) & (low <= corner + (tile_size - 1)), axis=-1) & valid
-        ranks, exists, overflow = compact_rows(is_near, capacity)
-        return jnp.take(order, ranks, mode="clip"), exists, overflow
 
-    return jax.vmap(assign)(corners)
+def _sorted(
+    tile: Int[Array, "e"], splat: Int[Array, "e"], num_lists: int, num_splats: int
+) -> tuple[Int[Array, "e"], Int[Array, "e"]]:
+    """Pairs by tile and then by splat. One word for both, where it holds them, is sorted several times faster."""
+    if (num_lists + 1) * num_splats < WORD:
+        return jnp.divmod(jax.lax.sort(tile * num_splats + splat, is_stable=False), num_splats)
+    tile, splat = jax.lax.sort((tile, splat), num_keys=2, is_stable=False)
+    return tile, splat
+
+
+def _num_touching(first: Int[Array, "n 2"], size: Int[Array, "n 2"], shape: tuple[int, int]) -> Int[Array, "t"]:
+    """Splats that touch every tile: what begins minus what has ended, summed along both axes."""
+    (x0, y0), (x1, y1) = first.T, (first + size).T
+    changes = jnp.zeros((shape[0] + 1, shape[1] + 1), jnp.int32)
+    changes = changes.at[y0, x0].add(1).at[y1, x1].add(1).at[y0, x1].add(-1).at[y1, x0].add(-1)
+    return jnp.cumsum(jnp.cumsum(changes, axis=0), axis=1)[:-1, :-1].reshape(-1)
+
+
+def take_chunks(lists: TileLists, begin: Int[Array, ""], count: int) -> Chunks:
+    """`count` chunks of the lists, from chunk `begin` on."""
+    last = lists.bounds.shape[0] - 2
+    numbers = begin + jnp.arange(count)
+    tiles = jnp.searchsorted(lists.chunks[1:], numbers, side="right")
+    of = jnp.minimum(tiles, last)
+    starts = lists.bounds[of] + (numbers - lists.chunks[of]) * CHUNK
+    positions = starts[:, None] + jnp.arange(CHUNK)
+    exists = (positions < lists.bounds[of + 1][:, None]) & (tiles <= last)[:, None]
+    # The first exists wherever anything does: what stands for nothing is finite.
+    return Chunks(tiles, positions, lists.rows[jnp.where(exists, positions, 0)], exists)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from emgs_jax.io.files import atomic_write
@@ -48,7 +47,6 @@ def draw_heat_maps(
     lines = -(-len(maps) // per_line)
     width, height = 1.6 + 0.75 * len(columns[1]), 1.3 + 0.45 * len(rows[1])
     figure = Figure(figsize=(per_line * width, lines * height + 0.5), facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
     figure.suptitle(title)
     panels = figure.subplots(lines, per_line, squeeze=False).ravel()
     for panel, heat_map in zip(panels, maps, strict=False):

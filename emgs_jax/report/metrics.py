@@ -11,7 +11,7 @@ import numpy as np
 
 from emgs_jax.data.base import Frame
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.evaluation.clouds import PointCloud, SpooledCloud
 from emgs_jax.evaluation.layers import double_wall_share
 from emgs_jax.evaluation.loops import loop_metrics
 from emgs_jax.evaluation.reconstruction import (
@@ -24,7 +24,15 @@ from emgs_jax.evaluation.reconstruction import (
     reference,
 )
 from emgs_jax.evaluation.rendering import Rendered
-from emgs_jax.evaluation.segmentation import LabelledPoints, compare_labels, label_cells, translate, true_labels
+from emgs_jax.evaluation.segmentation import (
+    LabelledPoints,
+    SpooledLabels,
+    align_labels,
+    compare_labels,
+    label_cells,
+    translate,
+    true_labels,
+)
 from emgs_jax.evaluation.trajectory import align_poses, trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
@@ -116,7 +124,7 @@ def score_map(
     return metrics | _score_labels(labels, poses, scorer)
 
 
-def score_cloud(cloud: PointCloud, poses: tuple[np.ndarray, np.ndarray], scorer: Scorer) -> Metrics:
+def score_cloud(cloud: PointCloud | SpooledCloud, poses: tuple[np.ndarray, np.ndarray], scorer: Scorer) -> Metrics:
     """Reconstruction metrics of a cloud as the protocol says, and placed by its points as `reconstruction_icp/…`.
 
     The second placement begins with the first and moves the cloud rigidly onto the truth (ICP): an almost straight path
@@ -145,13 +153,14 @@ def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
     return prefixed(metrics, RAW_PRIOR)
 
 
-def _score_labels(labels: LabelledPoints | None, poses: tuple[np.ndarray, np.ndarray], scorer: Scorer) -> Metrics:
+def _score_labels(
+    labels: LabelledPoints | SpooledLabels | None, poses: tuple[np.ndarray, np.ndarray], scorer: Scorer
+) -> Metrics:
     """Segmentation metrics of points with classes, aligned like the cloud; empty without classes."""
     if labels is None or scorer.labels is None:
         return {}
-    nothing = np.zeros_like(labels.points)
-    aligned, _ = align_cloud(PointCloud(labels.points, nothing, nothing), scorer.truth, poses, scorer.evaluation)
-    return compare_labels(replace(labels, points=aligned.points), scorer.labels, scorer.evaluation.label_neighbours)
+    aligned = align_labels(labels, scorer.truth, poses, scorer.evaluation)
+    return compare_labels(aligned, scorer.labels, scorer.evaluation.label_neighbours)
 
 
 def _own_classes(raw: RawPrior, row: int, scorer: Scorer) -> np.ndarray | None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -15,6 +14,7 @@ from matplotlib.patheffects import withStroke
 from PIL import Image, ImageDraw
 
 from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.evaluation.trajectory import rotated
 from emgs_jax.io.files import atomic_write
 
 _ESTIMATE, _TRUTH, _ONLINE, _LOOP, _INK = "#e4572e", "#1b998b", "#8d6a9f", "#2e86e4", "#333333"
@@ -31,6 +31,7 @@ class Paths:
         truth: where the estimate fits it best; NaN where unknown.
         online: as the frames were placed, before poses moved.
         loops: rows of the frames that loops join.
+        unit: of all lengths.
     """
 
     estimate: np.ndarray
@@ -38,6 +39,7 @@ class Paths:
     truth: np.ndarray | None = None
     online: np.ndarray | None = None
     loops: tuple[tuple[int, int], ...] = ()
+    unit: str = "m"
 
 
 def draw_overview(
@@ -62,7 +64,6 @@ def draw_overview(
         features: points in the colours of their features, drawn from above below the map; None without features.
     """
     figure = Figure(figsize=(16, max(6.0, 0.8 + 2.05 * len(frames))), facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=13, color=_INK)
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.05)) if frames else (figure, None)
     axes = left.subplots(1 if features is None else 2, squeeze=False)[:, 0]
@@ -183,7 +184,7 @@ def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
     rotation = view_from_above(paths.estimate)
     path = paths.estimate[:, :3, 3] @ rotation.T
     finite = np.isfinite(cloud.points).all(1)
-    points, colors = cloud.points[finite] @ rotation.T, cloud.colors[finite].clip(0.0, 1.0)
+    points, colors = rotated(cloud.points[finite], rotation), cloud.colors[finite].clip(0.0, 1.0)
     if len(points):
         image, extent = seen_from_above(points, colors, path[:, 2])
         axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=1)
@@ -199,14 +200,14 @@ def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
         axes.plot([], [], color=_LOOP, linewidth=1.6, label=f"{len(ends)} loops")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_facecolor(_PAPER)
-    axes.set_xlabel("metres", color=_INK)
+    axes.set_xlabel({"m": "metres"}.get(paths.unit, paths.unit), color=_INK)
     axes.tick_params(colors=_INK, labelsize=9)
     axes.grid(color="white", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[:].set_visible(False)
     axes.set_title(f"map from above, {len(points):,} points", fontsize=11, color=_INK)
     axes.legend(loc="upper right", fontsize=10, framealpha=0.9)
-    _draw_scale_bar(axes)
+    _draw_scale_bar(axes, paths.unit)
 
 
 def _draw_features(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
@@ -230,7 +231,7 @@ def _draw_path(axes: Axes, path: np.ndarray, color: str, label: str, width: floa
         axes.plot(*end[:, :2].T, marker=marker, markersize=7, color=color, markeredgecolor="white", linestyle="none")
 
 
-def _draw_scale_bar(axes: Axes) -> None:
+def _draw_scale_bar(axes: Axes, unit: str) -> None:
     left, right = axes.get_xlim()
     length = 10.0 ** np.floor(np.log10(max(right - left, 1e-6) / 4))
     length *= max(step for step in (1, 2, 5) if step * length <= (right - left) / 4)
@@ -239,7 +240,7 @@ def _draw_scale_bar(axes: Axes) -> None:
     axes.plot(
         [start, start + length], [0.04, 0.04], color=_INK, linewidth=4, transform=transform, solid_capstyle="butt"
     )
-    text = axes.text(start + length / 2, 0.055, f"{length:g} m", transform=transform, ha="center", color=_INK)
+    text = axes.text(start + length / 2, 0.055, f"{length:g} {unit}", transform=transform, ha="center", color=_INK)
     text.set_path_effects([withStroke(linewidth=3, foreground="white")])
 
 

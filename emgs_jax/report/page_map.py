@@ -6,19 +6,18 @@ import zlib
 from collections.abc import Mapping
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.gaussian_map import GaussianMap, confirmed
-from emgs_jax.gaussians import has_feature
+from emgs_jax.running.convert import on_device
+from emgs_jax.running.executables import stored
 from emgs_jax.semantics import principal_colors, similarities
 
 COV_UNIT = 1e-4  # m²; float16 then holds standard deviations from .1 mm to 2.5 m
 _LARGEST_HALF = 65504.0
-_similarities, _feature_colors = eqx.filter_jit(similarities), eqx.filter_jit(principal_colors)
+_similarities, feature_colors = stored(similarities), stored(principal_colors)
 _UPPER = np.triu_indices(3)
 
 
@@ -50,8 +49,8 @@ def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.nd
             f"text.npz has embeddings of width {text.vectors.shape[1]} and map.npz features of width "
             f"{gaussians.features.shape[1]}: they are of two runs, run again"
         )
-    cosines = np.asarray(_similarities(confirmed(map), jnp.asarray(text.vectors)))[rows]
-    is_known = np.asarray(has_feature(map.gaussians.features))[rows]
+    cosines = np.asarray(_similarities(confirmed(map), on_device(text.vectors)))[rows]
+    is_known = np.asarray(map.gaussians.features)[rows].any(-1)
     labels = np.where(is_known, cosines.argmax(1), -1).astype(np.int16)
     return layers | {"label": labels, "similarity": _bytes(cosines)}
 
@@ -65,7 +64,7 @@ def feature_layer(map: GaussianMap) -> dict[str, np.ndarray]:
     rows = np.flatnonzero(gaussians.valid)
     if not np.asarray(gaussians.features)[rows].any():
         return {}
-    return {"feature": _bytes(np.asarray(_feature_colors(gaussians))[rows])}
+    return {"feature": _bytes(np.asarray(feature_colors(gaussians))[rows])}
 
 
 def thinned(layers: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarray]:

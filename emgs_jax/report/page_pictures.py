@@ -5,7 +5,6 @@ import io
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jaxlie
 import matplotlib
@@ -18,6 +17,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
 from emgs_jax.running.convert import to_se3
+from emgs_jax.running.executables import stored
 
 WIDTH = 200  # pixels; a picture is not wider
 QUALITY = 80  # of JPEG
@@ -41,7 +41,7 @@ class Views(NamedTuple):
     far: float
 
 
-@eqx.filter_jit
+@stored
 def _drawn(gaussians: Gaussians, pose: jaxlie.SE3, camera: Camera, config: RenderConfig) -> tuple[jax.Array, jax.Array]:
     drawing = render(gaussians, gaussians.colors, pose, camera, config)
     return drawing.values, drawing.depth
@@ -110,7 +110,7 @@ def _seen(dataset: Dataset | None, row: int) -> str:
 def _painted(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     """Depth in colours, uint8 (h, w, 3); grey where there is none."""
     share = (depth - near) / max(far - near, 1e-9)
-    colors = np.rint(255 * matplotlib.colormaps["turbo"](share.clip(0.0, 1.0))[..., :3]).astype(np.uint8)
+    colors = np.rint(255 * matplotlib.colormaps["turbo"](share)[..., :3]).astype(np.uint8)
     return np.where((depth > 0)[..., None], colors, np.uint8(_NO_DEPTH))
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-from emgs_jax.io.files import flat
+from emgs_jax.report import provenance
 from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, cell
 from emgs_jax.report.page_strip import loop_why, loop_words
 from emgs_jax.report.provenance import RAW_PRIOR, ROWS
@@ -59,11 +59,16 @@ def verdict(run: RecordedRun) -> tuple[str, str]:
     if ours is None:
         level = "bad" if is_lost else "mixed" if is_degraded else "unknown"
         return level, f"{tracked}. There is no ground truth that errors could be told from."
-    words = f"The path is off by {100 * ours:.1f} cm (RMS, placed with its scale)"
+    has_metres = provenance.has_metric_truth(run.provenance)
+
+    def length(value: float) -> str:
+        return f"{100 * value:.1f} cm" if has_metres else f"{value:.3g} units of the reference"
+
+    words = f"The path is off by {length(ours)} (RMS, placed with its scale)"
     is_worse = raw is not None and ours > raw
     if raw:
         change = f"{100 * abs(1 - ours / raw):.0f} % {'more' if is_worse else 'less'}"
-        words += f", {change} than the prior alone ({100 * raw:.1f} cm)"
+        words += f", {change} than the prior alone ({length(raw)})"
     key = "rendering/depth_within_5_percent"
     met, met_raw = metrics.get(key), metrics.get(RAW_PRIOR + key)
     if met is not None and met_raw is not None:
@@ -75,9 +80,7 @@ def verdict(run: RecordedRun) -> tuple[str, str]:
 
 def is_metric(run: RecordedRun) -> bool:
     """Whether lengths of the map are meant to be metres."""
-    said = flat(run.provenance["prior"].get("settings", {}))  # of what a recording was made with, too
-    has_unit = not any(key.endswith("median_depth") for key in said)
-    return has_unit and all(value != "arbitrary" for key, value in said.items() if key.endswith("scale"))
+    return provenance.is_metric(run.provenance["prior"].get("settings", {}))
 
 
 def head(run: RecordedRun, again: Repeated) -> str:

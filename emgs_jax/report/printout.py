@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from emgs_jax.running.clock import Clock
 from emgs_jax.running.record import FrameRecord
 from emgs_jax.running.untracked import MANY_IN_A_ROW, REMEDIES, UNTRACKED, called, longest_row, main_reason
 
@@ -30,6 +31,13 @@ def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
         where = f" ({len(row)} in a row, from {called(records[row[0]])} {end})" if len(row) > 1 else ""
         lines.append(f"{len(bad)} frames were not tracked{where}, {count} of them because {reason}: {REMEDIES[reason]}")
     return lines
+
+
+def time_words(clock: Clock, num_frames: int) -> str:
+    """How long a run took, a frame too, of what phases that is the sum, and how much of it was compilation."""
+    whole, phases = sum(clock.phases.values()), ", ".join(f"{name} {s:.1f}" for name, s in clock.phases.items())
+    pace = f"{whole:.1f} s, {whole / max(num_frames, 1):.2f} s a frame"
+    return f"{pace}: {phases}; of all that compilation {clock.compile_seconds:.1f}"
 
 
 def last_words(metrics: Mapping[str, Any]) -> str:

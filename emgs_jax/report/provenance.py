@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 from emgs_jax.data.base import Dataset
-from emgs_jax.io.files import write_json
+from emgs_jax.io.files import flat, write_json
 from emgs_jax.prior.base import Provenance
 from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, cell
 
@@ -89,6 +89,18 @@ def write_metrics(path: str | os.PathLike, metrics: Mapping[str, Any]) -> None:
     write_json(path, {key: metrics[key] for key in sorted(metrics, key=_rank)})
 
 
+def is_metric(settings: Mapping[str, Any]) -> bool:
+    """Whether a prior with these settings means metres."""
+    said = flat(settings)  # of what a recording was made with, too
+    has_unit = not any(key.endswith("median_depth") for key in said)
+    return has_unit and all(value != "arbitrary" for key, value in said.items() if key.endswith("scale"))
+
+
+def has_metric_truth(block: Mapping[str, Any]) -> bool:
+    """Whether the true poses of a result's provenance are in metres: other programs have a unit of their own."""
+    return (block.get("data") or {}).get("name") not in ("colmap", "nerfstudio")
+
+
 def print_metrics_table(metrics: Mapping[str, Any]) -> str:
     """Lay out the main metrics, one row for the map, the raw prior and each baseline; `–` where there is no value.
 
@@ -104,7 +116,9 @@ def prefix_of(key: str) -> str:
 
 
 def _laid_out(metrics: Mapping[str, Any], columns: Sequence[Column]) -> str:
-    lines = [[_label(metrics.get("provenance", {})), *(column.title for column in columns)]]
+    block = metrics.get("provenance", {})
+    titles = (column.title if has_metric_truth(block) else _in_units(column.title) for column in columns)
+    lines = [[_label(block), *titles]]
     for prefix, name in ROWS.items():
         if any(prefix + column.key in metrics for column in columns):
             values = [(metrics.get(prefix + key), None, factor, digits) for key, _, factor, digits, _ in columns]
@@ -114,6 +128,10 @@ def _laid_out(metrics: Mapping[str, Any], columns: Sequence[Column]) -> str:
     widths = [max(map(len, texts)) for texts in zip(*lines, strict=True)]
     rows = ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines]
     return "\n".join([rows[0], "─" * max(map(len, rows)), *rows[1:]])
+
+
+def _in_units(title: str) -> str:
+    return title.replace("[cm]", "[.01 units]")
 
 
 def _label(block: Mapping[str, Any]) -> str:

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -178,7 +177,6 @@ def _save(
     keys = -(-len(handles) // KEYS_PER_LINE)  # lines of the legend
     size = 3.6 * columns, max(1.0, len(lines) * (3.6 * height / width + 0.35) + 0.25 * keys)
     figure = Figure(figsize=size, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
     if not lines:
         figure.suptitle("no answer is seen from these poses")
     for axes, (title, image) in zip(

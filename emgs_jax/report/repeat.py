@@ -40,8 +40,10 @@ def repeat(settings: Mapping[str, Any]) -> Repeated:
     settings, options = flat(jsonable(settings)), _options(settings)
     words = [f"{group}={option}" for group, option, _ in options]
     differences: list[tuple[str, Any, Any]] = list(options)
+    config, made = compose(*words), len(words)
     for follows_another in (False, True):  # what is taken from another key follows that one
-        config = compose(*words)
+        if len(words) > made:
+            config = compose(*words)
         composed, own = _values(config), flat(OmegaConf.to_container(config, resolve=False))
         for key, value in settings.items():
             default = composed.get(key, ...)

@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.evaluation.clouds import PointCloud
@@ -22,13 +21,13 @@ from emgs_jax.io.trajectory import from_tum, save_trajectory_tum
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import loop_list, metric_graph
+from emgs_jax.report.page_map import feature_colors
 from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, REPORT_FILE, TEXT_FILE
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.first_frame import seen_from
 from emgs_jax.running.places import save_places
 from emgs_jax.running.record import SEGMENT, UNJOINED, MappingRun, row_of_first_node, with_truth
-from emgs_jax.semantics import principal_colors
 
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (
@@ -112,15 +111,22 @@ def save_classes(folder: Path, prior: Prior) -> None:
 
 
 def save_outputs(
-    folder: Path, run: MappingRun, dense: DenseMap, config: DensifyConfig, title: str, with_scale: bool
+    folder: Path,
+    run: MappingRun,
+    dense: DenseMap,
+    config: DensifyConfig,
+    title: str,
+    with_scale: bool,
+    unit: str = "m",
 ) -> list[str]:
     """Write the files that show the map; returns what could not be made, and why.
 
     Args:
         title: of the picture.
         with_scale: the true path is drawn where it fits best by a similarity, not by a rigid motion, as it is scored.
+        unit: of the map's lengths, as the picture says it.
     """
-    gaussians = jax.device_get(confirmed(run.state.map))
+    gaussians = jax.device_get(shown := confirmed(run.state.map))
     valid = gaussians.valid
     # As drawn: the covariances are those that close the surface.
     covs = gaussians.covs[valid] * float(config.render.covariance_scale)
@@ -134,9 +140,9 @@ def save_outputs(
     centers = center_cloud(run)
     no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, centers.colors)
     is_placed = np.array([record.status != "lost" for record in run.records])
-    paths = Paths(np.stack(run.poses), is_placed, _placed_truth(run, with_scale), *_moved(run))
+    paths = Paths(np.stack(run.poses), is_placed, _placed_truth(run, with_scale), *_moved(run), unit=unit)
     classes = () if dense.labels is None else dense.labels.classes
-    draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes, feature_cloud(gaussians))
+    draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes, feature_cloud(shown))
     return [] if no_mesh is None else [f"no mesh.ply: {no_mesh}"]
 
 
@@ -145,7 +151,7 @@ def feature_cloud(gaussians: Gaussians) -> PointCloud | None:
     valid = np.asarray(gaussians.valid)
     if not np.asarray(gaussians.features)[valid].any():
         return None
-    colors = np.asarray(principal_colors(jax.tree.map(jnp.asarray, gaussians)))
+    colors = np.asarray(feature_colors(gaussians))
     return PointCloud(*(np.asarray(values)[valid] for values in (gaussians.means, gaussians.normals, colors)))
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import yaml
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from emgs_jax.io.files import atomic_write
@@ -150,7 +149,6 @@ def draw_trials(
     y = [shown[0].factor * row[shown[0].key] for row in known]
     x = [shown[1].factor * row[shown[1].key] for row in known] if len(shown) > 1 else [row["trial"] for row in known]
     figure = Figure(figsize=(6.4, 4.8), facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.scatter(x, y, c=["#e4572e" if row["trial"] in named else "#9aa5b1" for row in known], s=28)
     for row, across, up in zip(known, x, y, strict=True):

@@ -5,6 +5,7 @@ Nothing here needs JAX, because predictions are recorded where there may be none
 
 import copy
 import difflib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from tqdm import tqdm
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.featured import Featured, Requeried
+from emgs_jax.running.overrides import readable
 from emgs_jax.running.values import check_values
 
 if TYPE_CHECKING:
@@ -108,6 +110,7 @@ def graph_config(config: DictConfig) -> "BackEndConfig | None":
 
 def compose(*overrides: str, name: str = "config") -> DictConfig:
     """conf/`name`.yaml with overrides; raises ValueError where one names no key or option."""
+    overrides = tuple(readable(overrides))
     with _hydra():
         try:
             config = hydra.compose(name, list(overrides))
@@ -150,14 +153,17 @@ def _explained(error: Exception, name: str, overrides: Sequence[str]) -> str:
     """What is wrong with the overrides, and what might have been meant."""
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     options = groups()
+    if needed := re.match(r"You must specify '([\w/]+)'", str(error)):
+        return f"{needed[1]} is not given: choose {needed[1]}= one of {', '.join(options.get(needed[1], ()))}"
     choices = [override for override in parsed if override.key_or_group.split("@")[0] in options]
-    for override in choices:
+    paths = [override for override in parsed if override.key_or_group == "hydra.searchpath"]  # of options beside ours
+    for override in () if paths else choices:
         group = override.key_or_group
         if override.value() is not None and str(override.value()) not in options.get(group, [str(override.value())]):
             return f"{override.input_line} is no option of {group}: there are {', '.join(options[group])}"
     values = [override for override in parsed if override not in choices]
     try:
-        known = keys_of(hydra.compose(name, [override.input_line for override in choices]))
+        known = keys_of(hydra.compose(name, [override.input_line for override in [*choices, *paths]]))
     except (HydraException, *NO_WORD):
         return f"{' '.join(overrides)}: {error}"
     for override in values:
@@ -209,7 +215,7 @@ def build_dataset(config: DictConfig) -> ReadableFrames:
     """The data set of a config, without unreadable frames where it says so."""
     dataset = build(config, "dataset")
     if "note" in dataset.calibration:
-        tqdm.write(f"intrinsics {dataset.calibration['note']}")
+        tqdm.write(dataset.calibration["note"])
     progress = partial(tqdm, desc="checking", unit="frame")
     return ReadableFrames(dataset, config.on_bad_frame, config.checksums, progress)
 

@@ -1,6 +1,7 @@
 """From what a prior predicts on the host to the arrays of a step: every check of the input is here."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,12 +12,16 @@ import numpy as np
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.observation import Observation, ObservationConfig, Prediction, observe
 from emgs_jax.ops.camera import Camera
-from emgs_jax.ops.pytree import stack
 from emgs_jax.prior.base import PriorPrediction
 from emgs_jax.running.executables import stored
 from emgs_jax.slam import SlamConfig
 
 _observe = stored(observe)
+
+
+def on_device(tree: Any) -> Any:
+    """Leaves of NumPy as arrays of JAX; `jnp.asarray` would make an executable for each of their shapes."""
+    return jax.tree.map(jax.device_put, tree)
 
 
 class FirstWindow(eqx.Module):
@@ -53,22 +58,25 @@ def _check(prediction: PriorPrediction, frames: Mapping[int, Frame]) -> None:
 
 
 def _observation(prediction: PriorPrediction, view: int, frame: Frame, config: ObservationConfig) -> Observation:
-    return _observe(
-        jnp.asarray(prediction.points[view], jnp.float32),
-        jnp.asarray(frame.image, jnp.float32) / 255.0,
-        jnp.asarray(prediction.features[view], jnp.float32),
-        jnp.asarray(prediction.confidence[view], jnp.float32),
-        jnp.asarray(prediction.mask[view]),
-        config,
+    image, mask = frame.image * np.float32(1.0 / 255.0), np.asarray(prediction.mask[view])
+    points, features, confidence = (
+        np.asarray(values[view], np.float32)
+        for values in (prediction.points, prediction.features, prediction.confidence)
     )
+    return _observe(*on_device((points, image, features, confidence, mask)), config)
+
+
+@stored
+def _poses(matrices: jax.Array, is_finite: jax.Array) -> jaxlie.SE3:
+    return jaxlie.SE3(jnp.where(is_finite[..., None], jaxlie.SE3.from_matrix(matrices).wxyz_xyz, jnp.nan))
 
 
 def to_se3(matrices: np.ndarray) -> jaxlie.SE3:
     """(..., 4, 4) float64 -> poses; a matrix that is not finite gives a pose of NaN, which a step marks as lost."""
     matrices = np.asarray(matrices, np.float64)
-    is_finite = np.isfinite(matrices).all(axis=(-2, -1))
-    T = jaxlie.SE3.from_matrix(jnp.asarray(np.where(is_finite[..., None, None], matrices, np.eye(4)), jnp.float32))
-    return jaxlie.SE3(jnp.where(is_finite[..., None], T.wxyz_xyz, jnp.nan))
+    is_finite = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
+    filled = np.where(is_finite[..., None, None], matrices, np.eye(4)).astype(np.float32)
+    return _poses(*on_device((filled, is_finite)))
 
 
 def to_first_window(
@@ -99,11 +107,13 @@ def to_first_window(
     dense = [prediction.window.dense[row] for row in rows]
     views = [_observation(prediction, row, frames[index], config) for row, index in zip(rows, dense, strict=True)]
     poses = np.asarray(T_world_anchor) @ prediction.T_anchor_view[[prediction.window.views.index(i) for i in dense]]
-    usable = [bool(view.valid.any()) and np.isfinite(pose).all() for view, pose in zip(views, poses, strict=True)]
+    has_points = [np.asarray(view.valid).any() for view in views]
+    usable = [bool(known) and np.isfinite(pose).all() for known, pose in zip(has_points, poses, strict=True)]
     if not any(usable):
         return None, ()
     first = usable.index(True)
-    return FirstWindow(stack(views[first:]), to_se3(poses[first:])), tuple(dense[first:])
+    together = jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(views[first:]))
+    return FirstWindow(on_device(together), to_se3(poses[first:])), tuple(dense[first:])
 
 
 def to_prediction(
@@ -129,8 +139,8 @@ def to_prediction(
         previous=_observation(prediction, 0, frames[previous], config),
         T_world_views=to_se3(np.asarray(T_world_anchor) @ prediction.T_anchor_view[rows]),
         T_world_anchor=to_se3(T_world_anchor),
-        has_newest=jnp.asarray(has_newest),
-        is_repeat=jnp.asarray(True),
+        has_newest=on_device(np.bool_(has_newest)),
+        is_repeat=on_device(np.bool_(True)),
     )
 
 
@@ -145,24 +155,24 @@ def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[
         ValueError: `merged`, and a view has no pose.
     """
     if config.initialization == "merged":
-        if not bool(jnp.all(jnp.isfinite(window.T_world_views.wxyz_xyz))):
+        if not np.isfinite(np.asarray(window.T_world_views.wxyz_xyz)).all():
             raise ValueError(
                 "a view of the first window has no pose, so its points cannot be merged: use "
                 "slam.initialization=incremental, which leaves such a view out, or begin elsewhere (dataset.start=...)"
             )
         return window, []
-    num_views = window.views.valid.shape[0]
-    view = lambda i: jax.tree.map(lambda leaf: leaf[i], window.views)  # noqa: E731
-    poses = window.T_world_views.wxyz_xyz
+    found: FirstWindow = jax.device_get(window)
+    num_views, poses = len(found.views.valid), found.T_world_views.wxyz_xyz
+    views = [on_device(jax.tree.map(lambda leaf, row=row: leaf[row], found.views)) for row in range(num_views)]
     following = [
         Prediction(
-            current=view(i),
-            previous=view(i - 1),
-            T_world_views=jaxlie.SE3(poses[jnp.array([i - 1, i, min(i + 1, num_views - 1)])]),
-            T_world_anchor=jaxlie.SE3(poses[0]),
-            has_newest=jnp.asarray(i + 1 < num_views),
-            is_repeat=jnp.asarray(False),
+            current=views[i],
+            previous=views[i - 1],
+            T_world_views=jaxlie.SE3(on_device(poses[[i - 1, i, min(i + 1, num_views - 1)]])),
+            T_world_anchor=jaxlie.SE3(on_device(poses[0])),
+            has_newest=on_device(np.bool_(i + 1 < num_views)),
+            is_repeat=on_device(np.bool_(False)),
         )
         for i in range(1, num_views)
     ]
-    return jax.tree.map(lambda leaf: leaf[:1], window), following
+    return on_device(jax.tree.map(lambda leaf: leaf[:1], found)), following

@@ -6,14 +6,14 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jaxlie
 import numpy as np
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
-from emgs_jax.evaluation.reconstruction import EvaluationConfig
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, own_voxel
 from emgs_jax.evaluation.rendering import Rendered
 from emgs_jax.evaluation.segmentation import LabelledPoints, translate
+from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.running.convert import to_se3
@@ -55,7 +55,8 @@ def dense_map(
         run: finished.
         dataset: for the images in the pictures, and the truth.
         config: what becomes a point.
-        evaluation: points of one of its voxels are averaged, and views are compared with the truth under it.
+        evaluation: points of one of its voxels, of the truth where that is known, are averaged, and views are
+            compared with the truth under it.
         labelled: `labelled_map` of the run, which says the class of each point.
         num_pictures: frames that are shown, evenly spread.
     """
@@ -77,20 +78,25 @@ def dense_map(
                 *(rows[view.valid].astype(np.float64) for rows in (view.points, view.normals, view.colors))
             )
 
-    cloud = fuse_clouds(clouds(), evaluation.voxel_m)
+    cloud = fuse_clouds(clouds(), _voxel(with_truth(run, run.poses), evaluation))
     points = cloud.points
     labels = None if labelled is None else LabelledPoints(points, labelled.classes_of(points), labelled.classes)
     return DenseMap(cloud, labels, pictures, rendered.metrics())
 
 
+def _voxel(poses: tuple[np.ndarray, np.ndarray] | None, config: EvaluationConfig) -> float:
+    """Side of a voxel in the map's lengths: `voxel_m`, of the truth where the map's unit is larger than a metre."""
+    if poses is None:
+        return config.voxel_m
+    return min(config.voxel_m, own_voxel(align_poses(*poses, with_scale=True)[0], config))
+
+
 def _drawn_ahead(run: MappingRun, rows: list[int], config: DensifyConfig) -> Iterator[DenseView]:
     """The views of frames on the host; the next is being drawn while one is looked at."""
     pending: DenseView | None = None
-    poses = to_se3(np.reshape([run.poses[row] for row in rows], (-1, 4, 4)))
-    gaussians = confirmed(run.state.map)
-    for position in range(len(rows)):
-        pose = jaxlie.SE3(poses.wxyz_xyz[position])
-        view = _densify(gaussians, pose, run.camera, config)
+    gaussians, poses = confirmed(run.state.map), run.poses
+    for row in rows:
+        view = _densify(gaussians, to_se3(poses[row]), run.camera, config)
         drawing = eqx.tree_at(lambda view: view.rendering, view, None)  # nobody looks at it, so it is not fetched
         if pending is not None:
             yield jax.device_get(pending)

@@ -2,15 +2,16 @@
 
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from emgs_jax.localization import LocalizationConfig
-from emgs_jax.observation import depth_in
+from emgs_jax.observation import Observation, depth_in
+from emgs_jax.registration.belief import Belief
 from emgs_jax.registration.pose_noise import LEAST_NOISE, axis_std
-from emgs_jax.running.convert import to_se3
+from emgs_jax.running.executables import stored
 from emgs_jax.running.record import MappingRun
 from emgs_jax.slam import SlamState
 
@@ -26,12 +27,23 @@ def own_covariance(state: SlamState, config: LocalizationConfig) -> np.ndarray:
         config: of the steps.
     """
     belief, last = state.belief, state.previous
-    if not last.valid.any() or float(belief.repeats.counts[0]) == 0 or float(config.pose_shared) >= 1:
+    is_known = np.asarray(last.valid).any() and np.asarray(belief.repeats.counts)[0] > 0
+    if not is_known or float(config.pose_shared) >= 1:
         return np.zeros((6, 6))
-    mean_depth = jnp.mean(depth_in(state.T_world_previous, last), where=last.valid)
-    guess = jnp.maximum(belief.depth_noise, LEAST_NOISE), mean_depth, config.icp.prior_information
-    std = axis_std(belief.repeats, jnp.zeros((2, 2)), *guess, config.pose_shared)[0]
+    std = _own_std(belief, last, state.T_world_previous, (config.icp.prior_information, config.pose_shared))
     return np.diag(np.asarray(std, np.float64) ** 2)
+
+
+@stored
+def _own_std(
+    belief: Belief,
+    last: Observation,
+    T_world_last: jaxlie.SE3,
+    known: tuple[Float[Array, ""], Float[Array, ""]],
+) -> Float[Array, "6"]:
+    mean_depth = jnp.mean(depth_in(T_world_last, last), where=last.valid)
+    guess = jnp.maximum(belief.depth_noise, LEAST_NOISE), mean_depth
+    return axis_std(belief.repeats, jnp.zeros((2, 2)), *guess, *known)[0]
 
 
 def with_first_frame(run: MappingRun) -> None:
@@ -54,6 +66,7 @@ def seen_from(
     own: Float[np.ndarray, "6 6"], T_world_first: Float[np.ndarray, "4 4"], T_world_cameras: Float[np.ndarray, "n 4 4"]
 ) -> Float[np.ndarray, "n 6 6"]:
     """What the first frame's covariance makes other poses uncertain by: Ad own Adᵀ, each in its own axes."""
-    adjoints = jax.vmap(lambda T: T.adjoint())(to_se3(np.linalg.inv(T_world_cameras) @ T_world_first))
-    adjoints = np.asarray(adjoints, np.float64)
+    T = np.linalg.inv(T_world_cameras) @ T_world_first
+    rotations, across = T[:, :3, :3], np.cross(T[:, None, :3, 3], T[:, :3, :3], axisb=1, axisc=1)
+    adjoints = np.block([[rotations, across], [np.zeros_like(rotations), rotations]])
     return adjoints @ own @ adjoints.transpose(0, 2, 1)

@@ -1,6 +1,7 @@
 """What streams by while a sequence is mapped, gathered for comparison: what the prior alone says, and baselines."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -8,11 +9,12 @@ import numpy as np
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.data.reading import resize_nearest
+from emgs_jax.data.spool import Spool
 from emgs_jax.evaluation.baselines import BaselineConfig, Fusion, Pinhole, View
-from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
+from emgs_jax.evaluation.clouds import PointCloud, SpooledCloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, posed
-from emgs_jax.evaluation.segmentation import LabelGrid, LabelledPoints, nearest_classes
-from emgs_jax.io.spool import Spool
+from emgs_jax.evaluation.segmentation import SpooledLabels, nearest_classes
+from emgs_jax.evaluation.trajectory import rotated
 from emgs_jax.observation import known_surface
 from emgs_jax.running.inputs import RawView
 from emgs_jax.running.record import PLACED, MappingRun
@@ -27,16 +29,16 @@ class RawPrior:
     """What the prior alone says of a sequence.
 
     Args:
-        cloud: its points at its poses, averaged per voxel.
+        cloud: its points at its poses; a voxel's side in its lengths is known once the poses are aligned.
         depths: camera-space z of each frame (h, w), in the prior's own lengths; 0 where it says none.
         classes: of each frame's pixels (h, w), as positions in the prior's names, -1 = none; None without classes.
-        labels: its points, averaged likewise, with the class that most frames see there; None without classes.
+        labels: its points likewise, each with the class that its frame sees there; None without classes.
     """
 
-    cloud: PointCloud
+    cloud: SpooledCloud
     depths: Spool
     classes: Spool | None = None
-    labels: LabelledPoints | None = None
+    labels: SpooledLabels | None = None
 
 
 class Baselines:
@@ -79,32 +81,40 @@ def gather(
     baselines: Baselines | None = None,
     text: Text | None = None,
 ) -> RawPrior:
-    """Take all views of a sequence, one after the other.
+    """Take all views of a sequence, one after the other: each in another thread, while the next frame is mapped.
 
     Args:
         views: of all frames.
-        evaluation: points of one of its voxels are averaged.
+        evaluation: how normals are fitted.
         keeps_depths: the truth is known.
         baselines: that take the views, too.
         text: names of the classes that the views are asked for, and their embeddings; None: they are not.
     """
-    depths, classes, grid = Spool(), Spool(), LabelGrid(evaluation.voxel_m)
+    cloud, depths, classes = SpooledCloud(), Spool(), Spool()
+    labels = None if text is None else SpooledLabels(text[0])
 
-    def clouds() -> Iterator[PointCloud]:
-        for row, (points, mask, image, pose, features) in enumerate(views):
-            depth = np.where(mask & np.isfinite(points[..., 2]), points[..., 2], 0.0).astype(np.float32)
-            cloud = camera_cloud(points, mask, image, evaluation)
-            if keeps_depths:
-                depths.append(depth)
-            if text is not None:
-                labels = resize_nearest(nearest_classes(features, text[1]).astype(np.int32), depth.shape[::-1])
-                classes.append(labels)
-                seen = mask & (labels >= 0)
-                grid.add(points[seen] @ pose[:3, :3].T + pose[:3, 3], labels[seen])
-            if baselines is not None:
-                known = mask & np.isfinite(points).all(-1)
-                baselines.add(row, View(depth, image, cloud), points, known, pose)
-            yield posed(cloud, pose)
+    def take(row: int, view: RawView) -> None:
+        points, mask, image, pose, features = view
+        depth = np.where(mask & np.isfinite(points[..., 2]), points[..., 2], 0.0).astype(np.float32)
+        seen = camera_cloud(points, mask, image, evaluation)
+        if keeps_depths:
+            depths.append(depth)
+        if text is not None:
+            found = resize_nearest(nearest_classes(features, text[1]).astype(np.int32), depth.shape[::-1])
+            classes.append(found)
+            has_class = mask & (found >= 0)
+            labels.append(rotated(points[has_class], pose[:3, :3]) + pose[:3, 3], found[has_class])
+        if baselines is not None:
+            known = mask & np.isfinite(points).all(-1)
+            baselines.add(row, View(depth, image, seen), points, known, pose)
+        cloud.append(posed(seen, pose))
 
-    cloud = fuse_clouds(clouds(), evaluation.voxel_m)
-    return RawPrior(cloud, depths) if text is None else RawPrior(cloud, depths, classes, grid.points(text[0]))
+    with ThreadPoolExecutor(1, "raw prior") as thread:
+        taken: Future[None] | None = None
+        for row, view in enumerate(views):
+            if taken is not None:
+                taken.result()  # one at a time: no more of them are in memory, and an error ends the mapping
+            taken = thread.submit(take, row, view)
+        if taken is not None:
+            taken.result()
+    return RawPrior(cloud, depths) if text is None else RawPrior(cloud, depths, classes, labels)

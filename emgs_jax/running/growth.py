@@ -4,7 +4,6 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -16,14 +15,15 @@ import numpy as np
 from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert
 from emgs_jax.observation import Prediction, transform
 from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.executable import calling
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.belief import certain
-from emgs_jax.running.convert import FirstWindow
+from emgs_jax.running.convert import FirstWindow, on_device
 from emgs_jax.running.executables import call, outputs, ready
 from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
 
 _insert = eqx.filter_jit(insert)
-_init, _step = partial(init_state, call=call), partial(step, call=call)
+_init, _step = (calling(call)(function) for function in (init_state, step))  # by executables that are kept
 _prepared: set[tuple] = set()  # shapes whose step this process has compiled
 
 
@@ -92,17 +92,18 @@ def prepare(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
         return _zeros(outputs(executable, *arguments))
 
     view = _zeros(jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), first.views))
-    pose, poses = (jaxlie.SE3(jnp.asarray(np.eye(1, 7).repeat(n, 0).squeeze(), jnp.float32)) for n in (1, 3))
-    unknown = jnp.asarray(False)
+    pose, poses = (jaxlie.SE3(on_device(np.eye(1, 7, dtype=np.float32).repeat(n, 0).squeeze())) for n in (1, 3))
+    unknown = on_device(np.bool_(False))
     prediction = Prediction(
         current=view, previous=view, T_world_views=poses, T_world_anchor=pose, has_newest=unknown, is_repeat=unknown
     )
-    map = empty_map(config.submap.map_capacity, view.features.shape[-1])
+    map = _zeros(jax.eval_shape(lambda: empty_map(config.submap.map_capacity, view.features.shape[-1])))
     key = jax.tree.structure((map, view, config)), tuple(leaf.shape for leaf in jax.tree.leaves((map, view)))
     if key in _prepared:
         return
-    state = SlamState(map, view, pose, certain(), jnp.asarray(0, jnp.int32))
-    step(state, prediction, camera, config, note)
+    state = SlamState(map, view, pose, _zeros(jax.eval_shape(certain)), on_device(np.int32(0)))
+    with calling(note):
+        step(state, prediction, camera, config)
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         list(threads.map(lambda noted: _prepare(*noted), calls))
     _prepared.add(key)
@@ -123,7 +124,7 @@ def _of_map(overflow: jax.Array) -> Overflow:
 def _zeros(shapes: Any) -> Any:
     """Arrays of zeros from NumPy, which compiles nothing; what is no shape stays."""
     is_shape = lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct)  # noqa: E731
-    return jax.tree.map(lambda leaf: jnp.asarray(np.zeros(leaf.shape, leaf.dtype)) if is_shape(leaf) else leaf, shapes)
+    return jax.tree.map(lambda leaf: on_device(np.zeros(leaf.shape, leaf.dtype)) if is_shape(leaf) else leaf, shapes)
 
 
 def advance(
@@ -131,7 +132,7 @@ def advance(
 ) -> tuple[SlamState, StepInfo, SlamConfig]:
     """One step; a map or submap that is full is doubled and the frame repeated.
 
-    That gives the same map as starting with the larger capacity. Splats that find their tile full are only counted:
+    That gives the same map as starting with the larger capacity. Splats for which there is no room are only counted:
     they change what is drawn, not what is kept. `step` is `slam.step`, or what does the same for stacked states.
     """
     new, info = step(state, prediction, camera, config)

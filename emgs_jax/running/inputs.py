@@ -9,7 +9,7 @@ import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.observation import Prediction
-from emgs_jax.prior.base import Prior, PriorPrediction, windows, with_frames
+from emgs_jax.prior.base import Prior, PriorPrediction, check_unit, windows, with_frames
 from emgs_jax.running.clock import Clock, Timer
 from emgs_jax.running.convert import FirstWindow, opening, to_first_window, to_prediction
 from emgs_jax.slam import SlamConfig
@@ -101,9 +101,11 @@ def predictions(
     dataset: Dataset, prior: Prior, window_size: int, clock: Clock
 ) -> Iterator[tuple[PriorPrediction, dict[int, Frame]]]:
     """Ask the prior window by window; a frame is read when a window needs it and dropped when none does."""
-    for window, frames in clock.each("load", with_frames(windows(len(dataset), window_size), dataset)):
+    calls = windows(len(dataset), window_size, prior.num_newer(window_size))
+    for window, frames in clock.each("load", with_frames(calls, dataset)):
         with clock.phase("predict"):
             prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
+            check_unit(prediction)
         yield prediction, frames
 
 

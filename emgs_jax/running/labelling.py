@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
@@ -12,11 +11,14 @@ from scipy.spatial import cKDTree
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.prior.base import Prior
+from emgs_jax.running.convert import on_device
+from emgs_jax.running.executables import stored
 from emgs_jax.running.record import MappingRun
 from emgs_jax.semantics import classify, similarities
 
 NUM_NEIGHBOURS = 8  # Gaussians that may explain a point
 MAX_POINTS = 10_000  # at once; bounds the memory, does not change the result
+_classify, _similarities = stored(classify), stored(similarities)
 
 
 @dataclass(frozen=True)
@@ -88,9 +90,8 @@ def labelled_map(run: MappingRun, prior: Prior) -> LabelledMap | None:
     gaussians = confirmed(run.state.map)
     if not prior.feature_names or not gaussians.features.shape[-1]:
         return None
-    text = jnp.asarray(prior.text_features, jnp.float32)
-    labels, cosines = jax.device_get((classify(gaussians, text), similarities(gaussians, text)))
-    rows = jax.device_get(gaussians)
+    text = on_device(np.asarray(prior.text_features, np.float32))
+    rows, labels, cosines = jax.device_get((gaussians, _classify(gaussians, text), _similarities(gaussians, text)))
     known = labels >= 0
     factors = np.linalg.cholesky(rows.covs[known].astype(np.float64))
     return LabelledMap(

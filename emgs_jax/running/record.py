@@ -67,7 +67,7 @@ class FrameRecord:
         refined: of these, merged on the image plane.
         new: of these, added to the map.
         num_gaussians: in the map after this frame.
-        overflow: splats that found their tile full and would be seen.
+        overflow: splats for which there was no room and that would be seen.
         seconds: of mapping (conversion and step), compilation included.
         compile_seconds: of these.
     """

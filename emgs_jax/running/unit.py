@@ -6,9 +6,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jaxtyping import Array, Float
 
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.registration.belief import rescaled_belief
+from emgs_jax.running.convert import on_device
+from emgs_jax.running.executables import stored
 from emgs_jax.running.record import MappingRun
 from emgs_jax.slam import SlamState
 
@@ -66,8 +69,11 @@ def in_own_unit(run: MappingRun) -> None:
 
 def rescaled(state: SlamState, factor: float, origin: np.ndarray) -> SlamState:
     """All lengths of a state times `factor`, about `origin`; the scales of later predictions follow."""
-    center = jnp.asarray(origin, jnp.float32)
+    return _rescaled(state, *on_device((np.float32(factor), np.asarray(origin, np.float32))))
 
+
+@stored
+def _rescaled(state: SlamState, factor: Float[Array, ""], center: Float[Array, "3"]) -> SlamState:
     def placed(points: jnp.ndarray) -> jnp.ndarray:
         return center + factor * (points - center)
 
@@ -82,5 +88,5 @@ def rescaled(state: SlamState, factor: float, origin: np.ndarray) -> SlamState:
         map=grown(state.map),
         previous=eqx.tree_at(lambda o: o.points, state.previous, placed(state.previous.points)),
         T_world_previous=jaxlie.SE3.from_rotation_and_translation(T.rotation(), placed(T.translation())),
-        belief=rescaled_belief(state.belief, jnp.asarray(factor, jnp.float32)),
+        belief=rescaled_belief(state.belief, factor),
     )

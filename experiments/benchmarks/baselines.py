@@ -1,6 +1,6 @@
 """What a user would write or pick instead of the library, on the host: the same mathematics with array operations."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,28 +97,31 @@ def colored_icp(source: Arrays, target: Arrays, start: np.ndarray, reach: float,
     return registration.registration_colored_icp(*clouds, reach, start, estimation, criteria).transformation
 
 
-def render(splats: Arrays, values: np.ndarray, size: tuple[int, int], config: Any, xp: Any = np) -> np.ndarray:
-    """Front-to-back compositing of every splat at every pixel, without tiles; `values` (n, v) -> (h, w, v).
+def render(
+    splats: Arrays, values: np.ndarray, width: int, lines: Sequence[int], config: Any, xp: Any = np
+) -> np.ndarray:
+    """Front-to-back compositing of every splat at every pixel, without tiles; `values` (n, v) -> (lines, w, v).
 
     Args:
         splats: means (n, 2), precisions (n, 2, 2), depth (n,): those in front of the camera.
         values: of each splat.
-        size: width and height.
+        width: of the image.
+        lines: of the image that are drawn.
         config: RenderConfig.
         xp: numpy, or torch with tensors.
     """
     order = xp.argsort(splats["depth"])
     means, values = splats["means"][order], values[order]
     a, b, c = (splats["precisions"][order][:, i, j][:, None] for i, j in ((0, 0), (0, 1), (1, 1)))
-    columns, lines = xp.arange(size[0]), []
-    for row in range(size[1]):  # a line of the image at once bounds the memory
+    columns, drawn = xp.arange(width), []
+    for row in lines:  # a line of the image at once bounds the memory
         dx, dy = columns[None] - means[:, :1], row - means[:, 1:]
         distance_sq = a * dx**2 + 2.0 * b * dx * dy + c * dy**2
         alpha = float(config.opacity) * xp.exp(-0.5 * distance_sq) * (distance_sq <= float(config.radius) ** 2)
         light = xp.cumprod(1.0 - alpha, 0)
         light = xp.concatenate([xp.ones_like(light[:1]), light[:-1]])
-        lines.append((alpha * light).T @ values)
-    return xp.stack(lines)
+        drawn.append((alpha * light).T @ values)
+    return xp.stack(drawn)
 
 
 def render_gsplat(gaussians: Any, values: Any, T_camera_world: Any, intrinsics: Any, size: tuple[int, int]) -> Any:

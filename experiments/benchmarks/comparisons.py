@@ -2,6 +2,7 @@
 
 import importlib.util
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -23,6 +24,8 @@ from emgs_jax.render.project import project_gaussians
 from . import baselines
 from .data import Data, gaussians_of, view
 from .timing import Candidate, Timing, compare, executable, interleaved, spread
+
+MAX_PAIRS = 2**26  # of a splat and a pixel, without tiles: a second or two
 
 
 def _host(tree: eqx.Module, valid: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -79,7 +82,7 @@ def time_icp(data: Data, offset: tuple[float, float], repetitions: int) -> list[
     target = gaussians_of(data, 3 * count // 4)
     stride = max(reference.valid.shape[0] // config.num_points, 1)
     cases = [_icp_case(data, row, offset) for row in range(1, len(data.true_poses))]
-    arguments = [(points, target, start, (jnp.asarray(0.02), jnp.asarray(0.01)), config) for points, start, _ in cases]
+    arguments = [(points, target, start, jnp.eye(7), jnp.asarray(0.01), config) for points, start, _ in cases]
     ours = executable(icp, *arguments[0])
     clouds = [
         (_host(jax.tree.map(lambda leaf: leaf[::stride], points)), start.as_matrix()) for points, start, _ in cases
@@ -125,23 +128,38 @@ def _pose_errors(found: list[np.ndarray], truth: list[np.ndarray]) -> dict[str, 
 
 
 def time_render(data: Data, thin: int, num_gaussians: int, repetitions: int) -> list[Timing]:
-    """Drawing colours on every `thin`-th pixel against compositing without tiles, and gsplat where it can run."""
+    """Drawing colours on every `thin`-th pixel against compositing without tiles, and gsplat where it can run.
+
+    Without tiles no more than MAX_PAIRS of a splat and a pixel are looked at, on lines evenly spread over the image:
+    every line takes as long as every other, so the time of all is as many times as long.
+    """
     gaussians = gaussians_of(data, num_gaussians)
     T, camera = view(data, 0)[0], downscale(data.camera, thin)
     config = data.config.refinement.render
     ours = executable(render, gaussians, gaussians.colors, T, camera, config)
     splats = project_gaussians(gaussians, T, camera, config.covariance_scale, config.blur)
-    arrays, size = _host(splats), (camera.width, camera.height)
     colors = np.asarray(gaussians.colors)[np.asarray(splats.valid)]
-    image = baselines.render(arrays, colors, size, config)
+    num_lines = min(max(MAX_PAIRS // (num_gaussians * camera.width), 1), camera.height)
+    lines = np.linspace(0, camera.height - 1, num_lines).astype(int).tolist()
+    dense = (_host(splats), colors, camera.width, lines, config)
     drawn = ours.call()
-    ours.facts.update(gaussians=num_gaussians, pixels=size[0] * size[1], tile_overflow=int(drawn.overflow))
+    ours.facts.update(gaussians=num_gaussians, pixels=camera.width * camera.height, tile_overflow=int(drawn.overflow))
     # A pixel at the rim of a splat may be in or out.
-    ours.facts["color_error_999"] = float(np.quantile(np.abs(np.asarray(drawn.values) - image), 0.999))
+    apart = np.abs(np.asarray(drawn.values)[lines] - baselines.render(*dense))
+    ours.facts["color_error_999"] = float(np.quantile(apart, 0.999))
     candidates = {"emgs_jax": ours}
-    candidates["NumPy"] = Candidate(lambda: baselines.render(arrays, colors, size, config))
-    candidates |= _torch_candidates(gaussians, T, camera, (arrays, colors, size, config))
-    return compare(interleaved("render", candidates, repetitions), "NumPy")
+    candidates["NumPy"] = Candidate(lambda: baselines.render(*dense), None, {"drawn_lines": num_lines})
+    candidates |= _torch_candidates(gaussians, T, camera, dense)
+    if "gsplat" not in candidates:
+        ours.facts["gsplat"] = "no row: it needs the package, PyTorch and a CUDA GPU"
+    timings = interleaved("render", candidates, repetitions)
+    return compare([of_all_lines(timing, camera.height) for timing in timings], "NumPy")
+
+
+def of_all_lines(timing: Timing, height: int) -> Timing:
+    """With the time that all lines would take, where only some are drawn."""
+    share = timing.facts.get("drawn_lines", height) / height
+    return replace(timing, seconds=[seconds / share for seconds in timing.seconds])
 
 
 def _torch_candidates(gaussians: Gaussians, T: jaxlie.SE3, camera: Any, dense: tuple) -> Mapping[str, Candidate]:
@@ -153,15 +171,15 @@ def _torch_candidates(gaussians: Gaussians, T: jaxlie.SE3, camera: Any, dense: t
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     tensor = lambda value: torch.as_tensor(np.array(value), device=device)  # noqa: E731
     synchronize = torch.cuda.synchronize if device.type == "cuda" else lambda: None
-    arrays, colors, size, config = dense
+    arrays, colors, width, lines, config = dense
     tensors = {name: tensor(value) for name, value in arrays.items()}
 
     def dense_torch() -> None:
         with torch.device(device):
-            baselines.render(tensors, tensor(colors), size, config, torch)
+            baselines.render(tensors, tensor(colors), width, lines, config, torch)
         synchronize()
 
-    found = {f"PyTorch, {device.type}": Candidate(dense_torch)}
+    found = {f"PyTorch, {device.type}": Candidate(dense_torch, None, {"drawn_lines": len(lines)})}
     if device.type == "cuda" and importlib.util.find_spec("gsplat") is not None:
         variances, axes = np.linalg.eigh(np.asarray(gaussians.covs) * float(config.covariance_scale))
         axes *= np.sign(np.linalg.det(axes))[:, None, None]
@@ -173,7 +191,7 @@ def _torch_candidates(gaussians: Gaussians, T: jaxlie.SE3, camera: Any, dense: t
         pose, rgb = tensor(T.inverse().as_matrix()), tensor(gaussians.colors)
 
         def splat() -> None:
-            baselines.render_gsplat(model, rgb, pose, tensor(intrinsics), size)
+            baselines.render_gsplat(model, rgb, pose, tensor(intrinsics), (camera.width, camera.height))
             synchronize()
 
         found["gsplat"] = Candidate(splat)

@@ -121,7 +121,11 @@ WRONG = [
     ("transforms.json", json.dumps(TRANSFORMS | {"k4": 1}), "with k4 is not read"),
     ("transforms.json", json.dumps(TRANSFORMS | {"camera_model": "OPENCV_FISHEYE"}), "OPENCV_FISHEYE is not read"),
     ("transforms.json", json.dumps(TRANSFORMS | {"is_fisheye": True}), "FISHEYE is not read"),
-    ("transforms.json", json.dumps(TRANSFORMS | {"frames": [{"fl_x": 3}]}), "a camera for each frame"),
+    (
+        "transforms.json",
+        json.dumps(TRANSFORMS | {"frames": [{}, {}, {"cx": 3}]}),
+        "different cameras: cx is .* in frame 0 and 3 in frame 2",
+    ),
     ("transforms.json", json.dumps(TRANSFORMS | {"fl_x": True}), "fl_x must be a finite number"),
     ("info.yaml", ROS.replace("image_height: 480\n", ""), "has no image_height: add"),
     ("info.yaml", ROS.replace("plumb_bob", "equidistant"), "equidistant is not read"),

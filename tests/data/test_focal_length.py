@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.data.focal_length import Pair, choose_pairs, estimate_focal_length, fit_focal_length, sampson, two_views
+from emgs_jax.data.focal_length import (
+    Pair,
+    choose_pairs,
+    estimate_focal_length,
+    fit_focal_length,
+    match,
+    sampson,
+    two_views,
+)
 from emgs_jax.data.replica import Replica
 from emgs_jax.data.seven_scenes import SevenScenes
 from emgs_jax.data.tum import Tum
@@ -80,6 +88,20 @@ def test_the_epipolar_distance_is_the_length_of_the_least_correction():
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     moved = replace(pair, pixels=pixels + 0.1 * np.stack([normals[:, :2], normals[:, 2:]]))
     np.testing.assert_allclose(np.abs(sampson(moved, FOCAL, center)), 0.1, atol=1e-4)
+
+
+def test_keypoints_match_where_each_is_the_others_nearest_and_no_second_is_nearly_as_near():
+    """Of 20 the other image shows all in another order, but the fourth twice and the last two as something else."""
+    rng = np.random.default_rng(0)
+    unit = lambda rows: rows / np.linalg.norm(rows, axis=1, keepdims=True)  # noqa: E731
+    told, pixels = unit(rng.uniform(size=(20, 128))), rng.uniform(0, 640, (2, 21, 2))
+    order = np.append(rng.permutation(20), 3)
+    again = np.where(order[:, None] < 18, told[order], unit(rng.uniform(size=(21, 128))))
+    again = unit(again + 0.01 * rng.uniform(size=again.shape))
+    found = match((pixels[0, :20], told), (pixels[1], again))
+    rows = np.setdiff1d(np.arange(18), [3])
+    expected = pixels[0, rows], pixels[1, [list(order).index(row) for row in rows]]
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 17, 40, 1000])

@@ -1,5 +1,7 @@
 """Folders of images and videos."""
 
+from fractions import Fraction
+
 import cv2
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ from written_scene import color_image
 
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.images import Images
+from emgs_jax.data.video import _times
 
 INTRINSICS = (128.0, 128.0, 79.5, 59.5)
 SIZE = (160, 120)
@@ -112,11 +115,11 @@ def test_a_video_of_a_phone_that_was_held_upright_comes_upright(tmp_path):
     np.testing.assert_array_equal(upright[3].image, np.rot90(lying, -1))
 
 
-def test_a_video_that_ends_before_what_its_header_claims_says_where(tmp_path):
+def test_a_video_has_the_frames_that_can_be_read_whatever_its_header_announces(tmp_path):
     path = tmp_path / "clip.avi"
     write_video(path)
     content = path.read_bytes()
-    # Two more images than there are, in the main header and in that of the stream.
+    # Two more images than there are, in the main header and in that of the stream: as after a cut.
     count = (6).to_bytes(4, "little")
     at = [content.index(b"avih") + 8 + 16, content.index(b"strh") + 8 + 32]
     assert all(content[place : place + 4] == count for place in at)
@@ -124,7 +127,46 @@ def test_a_video_that_ends_before_what_its_header_claims_says_where(tmp_path):
         content = content[:place] + (8).to_bytes(4, "little") + content[place + 4 :]
     path.write_bytes(content)
     dataset = load(path)
-    assert len(dataset) == 8, "this OpenCV does not believe the header"
-    with pytest.raises(BadFrameError, match="dataset.stop=6"):
-        dataset[7]
-    assert number_of(dataset[1]) == 1
+    assert [number_of(frame) for frame in dataset] == [0, 1, 2, 3, 4, 5]
+    assert "clip.avi announces 8 frames, 6 can be read" in dataset.calibration["note"]
+    assert "note" not in load(path, stop=6).calibration and len(load(path, stop=4)) == 4
+    with pytest.raises(ValueError, match=r"dataset.stop must be null \(all\) or in 1..6"):
+        load(path, stop=7)
+    with pytest.raises(ValueError, match=r"dataset.start must be in 0..5"):
+        load(path, start=6, stop=3)
+
+
+def test_a_video_whose_rate_changes_has_all_its_frames_at_the_times_that_the_file_says(tmp_path):
+    """Matroska has no count in its header; OpenCV answers duration x nominal rate (here 6 of 9), and one mean rate."""
+    av = pytest.importorskip("av")
+    path, times = tmp_path / "clip.mkv", [0, 67, 134, 201, 221, 241, 261, 281, 301]
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("mpeg4", rate=15)
+        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        for i, time in enumerate(times):
+            frame = av.VideoFrame.from_ndarray(color_image(i % 6, SIZE), format="bgr24")
+            frame.pts, frame.time_base = time, Fraction(1, 1000)
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode())
+    assert cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT) < len(times)
+    dataset = load(path)
+    assert [number_of(frame) for frame in dataset] == [i % 6 for i in range(9)]
+    np.testing.assert_allclose([frame.timestamp for frame in dataset], np.array(times) / 1000, atol=1e-6)
+
+
+class StreamWithoutTimes:
+    """A capture of a bare h264 stream: three frames, all of them at 0."""
+
+    left = 3
+
+    def grab(self):
+        self.left -= 1
+        return self.left >= 0
+
+    def get(self, what):
+        return {cv2.CAP_PROP_POS_MSEC: 0.0, cv2.CAP_PROP_FPS: 25.0}[what]
+
+
+def test_a_stream_without_times_has_those_of_its_nominal_rate():
+    assert _times(StreamWithoutTimes(), None) == [0.0, 1 / 25, 2 / 25]

@@ -1,6 +1,7 @@
 """Projects of COLMAP and folders of nerfstudio; oracles: pycolmap, poses that are known, the lens of dataset=images."""
 
 import json
+import struct
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from written_scene import color_image, scene_pose
 
 from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.colmap_model import load_colmap
 from emgs_jax.data.images import Images
 from emgs_jax.data.posed_images import Colmap, Nerfstudio
 from emgs_jax.data.readable import ReadableFrames
@@ -55,6 +57,55 @@ def write_nerfstudio(folder, **changes) -> None:
         frames.append({"file_path": f"images/{name}", "transform_matrix": turned.tolist()})
     values = {"fl_x": 130, "fl_y": 128, "cx": 81, "cy": 59.5, "w": 160, "h": 120, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(values | changes))
+
+
+def test_clips_in_folders_follow_each_other(tmp_path):
+    """Images of one name in several folders; COLMAP sorts by the name with its folder."""
+    model = write_colmap(tmp_path)
+    names = [f"clip{clip}/{i:04d}.png" for clip in (2, 10) for i in range(3)]
+    for i, name in enumerate(names):
+        (tmp_path / "images" / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "images" / name), color_image(i, SIZE))
+    lines = [f"{i + 1} 1 0 0 0 {-0.1 * i} 0 0 7 {name}\n\n" for i, name in enumerate(names)]
+    (model / "images.txt").write_text("".join(reversed(lines)))
+    frames = [*Colmap(str(tmp_path), size=SIZE)]
+    assert [frame.name.split("images/")[1] for frame in frames] == names
+    np.testing.assert_allclose([frame.T_world_camera[0, 3] for frame in frames], np.arange(6) / 10)
+    assert [frame.timestamp for frame in frames] == [0, 1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda name: f"images\\{name}", lambda name: f"./images/{name[:-4]}", lambda name: f"images\\{name[:-4]}"],
+)
+@pytest.mark.parametrize("has_ending_in_capitals", [False, True])
+def test_names_with_backslashes_and_without_ending_are_found(change, has_ending_in_capitals, tmp_path):
+    write_nerfstudio(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    for frame, name in zip(values["frames"], NAMES, strict=True):
+        frame["file_path"] = change(name)
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    for path in [*(tmp_path / "images").iterdir()] if has_ending_in_capitals and "." not in change("a.png")[2:] else []:
+        path.rename(path.with_suffix(".PNG"))
+    dataset = Nerfstudio(str(tmp_path), size=SIZE)
+    for i, row in enumerate((1, 0, 2)):
+        np.testing.assert_array_equal(dataset[i].image[..., ::-1], color_image(row, SIZE))
+
+
+@pytest.mark.parametrize("above", [(), ("w", "h"), ("fl_x", "fl_y", "cx", "cy", "w", "h")])
+def test_equal_cameras_in_the_frames_are_one_and_different_ones_are_named(above, tmp_path):
+    write_nerfstudio(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    camera = {key: values.pop(key) for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
+    values |= {key: camera[key] for key in above}
+    values["frames"] = [frame | camera | {"k1": 0.02} for frame in values["frames"]]
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    dataset = Nerfstudio(str(tmp_path), size=SIZE)
+    assert dataset.calibration["intrinsics"] == [130, 128, 80.5, 59] and dataset.calibration["distortion"][0] == 0.02
+    values["frames"][2]["fl_x"] = 131
+    (tmp_path / "transforms.json").write_text(json.dumps(values))
+    with pytest.raises(ValueError, match="fl_x is 130 in frame 0 and 131 in frame 2.*dataset=images"):
+        Nerfstudio(str(tmp_path), size=SIZE)
 
 
 @pytest.mark.parametrize(("build", "write"), [(Colmap, write_colmap), (Nerfstudio, write_nerfstudio)])
@@ -112,6 +163,26 @@ def test_binary_and_text_of_pycolmap_are_read_alike(second, tmp_path):
     for image in found.images.values():
         row = sorted(NAMES, key=lambda name: int(name[3:-4])).index(image.name)
         np.testing.assert_allclose(text.pose(row)[:3, 3], image.projection_center(), atol=1e-9)
+
+
+PARAMETERS = (  # of the models in the order of their numbers, as COLMAP's documentation of its cameras lists them
+    *("f cx cy", "fx fy cx cy", "f cx cy k", "f cx cy k1 k2", "fx fy cx cy k1 k2 p1 p2", "fx fy cx cy k1 k2 k3 k4"),
+    *("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "fx fy cx cy omega", "f cx cy k", "f cx cy k1 k2"),
+    *("fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1", "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3"),
+)
+
+
+def test_a_binary_camera_of_each_model_has_its_parameters(tmp_path):
+    """One after the other, so that one that is read too short or too long moves all after it."""
+    counts = [len(names.split()) for names in PARAMETERS]
+    records = [struct.pack(f"<IiQQ{n}d", key, key, 160, 120, *range(n)) for key, n in enumerate(counts)]
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", len(counts)) + b"".join(records))
+    image = struct.pack("<I7dI", 1, 1, 0, 0, 0, 0, 0, 0, 3) + b"a.png\0" + struct.pack("<Q", 0)
+    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 1) + image)
+    cameras = load_colmap(tmp_path).cameras
+    assert [[float(word) for word in cameras[key][1:]] for key in range(len(counts))] == [
+        [160, 120, *range(n)] for n in counts
+    ]
 
 
 def replaced(path, old, new):

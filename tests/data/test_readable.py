@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from emgs_jax.data import readable
 from emgs_jax.data.base import BadFrameError, Frame
 from emgs_jax.data.readable import ReadableFrames
 
@@ -54,6 +55,28 @@ def test_without_skipping_nothing_is_read_before_its_turn_and_the_error_names_th
         ReadableFrames(Damaged(*range(5)), "skip")
     with pytest.raises(ValueError, match="on_bad_frame must be error or skip, got 'maybe'"):
         ReadableFrames(SimpleNamespace(), "maybe")
+
+
+class Noisy(Damaged):
+    """Frames of noise: 36 bytes of colours and 48 of depth each."""
+
+    def __getitem__(self, index: int) -> Frame:
+        self.reads.append(index)
+        rng = np.random.default_rng(index)
+        image, depth = rng.integers(0, 255, (3, 4, 3), np.uint8), rng.random((3, 4), np.float32)
+        return Frame(index, 0.5, f"{index}.png", image, depth, rng.random((4, 4)))
+
+
+@pytest.mark.parametrize(("room", "reads"), [(84, 1), (83, 3)])
+def test_a_frame_is_read_once_and_has_the_same_bits_again_and_anew_where_there_is_no_room(room, reads, monkeypatch):
+    monkeypatch.setattr(readable, "MAX_KEPT_BYTES", room)
+    dataset = Noisy()
+    frames = ReadableFrames(dataset)
+    frames[3].image[:] = 0  # whoever has a frame may change it
+    for frame in (frames[3], frames[3]):
+        np.testing.assert_equal(vars(frame), vars(Noisy()[3]))
+        assert frame.image.dtype == np.uint8 and frame.depth.dtype == np.float32
+    assert dataset.reads == [3] * reads
 
 
 class WithTruth(Damaged):

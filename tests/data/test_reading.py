@@ -8,6 +8,7 @@ import pytest
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.file_names import natural_key
 
 RAMP = np.stack([*np.meshgrid(np.arange(64), np.arange(48)), np.zeros((48, 64))], axis=-1).astype(np.uint8)
 
@@ -36,7 +37,7 @@ def test_nearest_takes_the_pixel_that_holds_the_new_centre(size):
 
 def test_files_sort_by_their_numbers(tmp_path):
     names = ["f10.png", "F2.png", "f1.png", "a.png", "f1b.png"]
-    ordered = sorted((tmp_path / n for n in names), key=reading.natural_key)
+    ordered = sorted((tmp_path / n for n in names), key=natural_key)
     assert [p.name for p in ordered] == ["a.png", "f1.png", "f1b.png", "F2.png", "f10.png"]
 
 

@@ -60,7 +60,11 @@ def test_missing_broken_or_foreign_calibration_names_the_file(replica_root):
         with pytest.raises(ValueError, match=f"cam_params.json {message}".replace(" :", ":")):
             load(replica_root)
     path.write_text(whole.replace('"w": 120', '"w": 1200'))
-    with pytest.raises(BadFrameError, match="frame000000.jpg is 120x68, but .* are 1200x68"):
+    with pytest.raises(ValueError, match="cam_params.json .* odd for the 1200x68 images: the view is 169 degrees wide"):
+        load(replica_root)
+    path.write_text(whole.replace('"w": 120', '"w": 160'))
+    assert "principal point is 12 % of the width from the middle" in load(replica_root).calibration["note"]
+    with pytest.raises(BadFrameError, match="frame000000.jpg is 120x68, but .* are 160x68"):
         load(replica_root)[0]
     path.unlink()
     with pytest.raises(FileNotFoundError, match="cam_params.json is missing"):

@@ -1,6 +1,7 @@
 """Bags of ROS 1 and 2, written by rosbags' own writers; oracles: the pictures that were written, dataset=images."""
 
 import sys
+from unittest.mock import ANY
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ from written_scene import color_image
 
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.images import Images
-from emgs_jax.data.rosbag import RECTIFIED, RosBag, to_rgb
+from emgs_jax.data.rosbag import RECTIFIED, RosBag, to_rgb, when_taken
 
 rosbags = pytest.importorskip("rosbags", reason="reads bags: pip install -e .[rosbag]")
 from tests.data.written_bag import SIZE, D, K, P, write_bag  # noqa: E402
@@ -31,6 +32,42 @@ def test_images_and_camera_are_those_that_were_recorded(version, kind, tmp_path)
         assert dataset[index].timestamp == pytest.approx(1 + index / 10)
     assert dataset.fingerprint() == RosBag(str(path), size=SIZE).fingerprint()
     assert dataset.fingerprint() != RosBag(str(path), size=SIZE, stride=2).fingerprint()
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("kind", ["Image", "CompressedImage"])
+def test_images_come_in_the_order_and_at_the_times_at_which_they_were_taken(version, kind, tmp_path):
+    """The second arrives last; the stamps of the bag are those of its recorder."""
+    path = write_bag(tmp_path, version, kind, late=(80_000_000, 310_000_000, 90_000_000))
+    dataset = RosBag(str(path), size=SIZE)
+    straight = RosBag(str(write(tmp_path / "straight", version=version, kind=kind)), size=SIZE)
+    for index in (0, 1, 2):
+        np.testing.assert_array_equal(dataset[index].image, straight[index].image)
+        assert dataset[index].timestamp == pytest.approx(1 + index / 10)
+    assert RosBag(str(path), size=SIZE, stride=2)[1].timestamp == pytest.approx(1.2)
+    assert "note" not in dataset.calibration
+
+
+def test_without_stamps_the_time_is_that_of_the_recording_and_a_note_says_so():
+    received = [10, 20, 30]
+    for stamps in ([0, 0, 0], [7, 7, 7]):
+        assert when_taken(received, stamps) == (received, ANY) and "no times" in when_taken(received, stamps)[1]
+    assert when_taken(received, [5, 0, 24]) == ([5, 20 - 5, 24], None)  # 5 and 6 late
+    assert when_taken([], []) == ([], None) and when_taken([10], [4]) == ([4], None)
+
+
+@pytest.mark.parametrize("encoding", ["8UC1", "8UC3", "mono16"])
+def test_encodings_without_an_order_of_colours_are_opencvs_own_and_16_bits_are_stretched(encoding, tmp_path):
+    dataset = RosBag(str(write_bag(tmp_path, encoding=encoding, bent=D[:0])), size=SIZE)
+    for index in range(3):
+        image, true = dataset[index].image[..., ::-1].astype(int), color_image(index, SIZE).astype(int)
+        if encoding == "8UC3":
+            np.testing.assert_array_equal(image, true)
+            continue
+        green = true[..., 1]
+        expected = green if encoding == "8UC1" else green * 255 / 119  # 119 is the brightest, 0 the darkest
+        np.testing.assert_allclose(image, np.repeat(expected[..., None], 3, -1), atol=3)
+    assert ("more than 8 bits" in dataset.calibration.get("note", "")) == (encoding == "mono16")
 
 
 def test_topics_and_the_camera_are_chosen_and_what_cannot_be_read_is_refused_with_the_key(tmp_path):
@@ -87,6 +124,7 @@ def test_a_damaged_bag_and_a_missing_library_are_clear(tmp_path, monkeypatch):
 
 
 def test_an_image_that_is_shorter_than_it_says_is_a_bad_frame(tmp_path):
-    message = type("Message", (), {"encoding": "rgb8", "width": 4, "height": 2, "step": 12, "data": np.zeros(23)})()
+    values = {"encoding": "rgb8", "is_bigendian": 0, "width": 4, "height": 2, "step": 12, "data": np.zeros(23)}
+    message = type("Message", (), values)()
     with pytest.raises(BadFrameError, match="is not as large as it says"):
         to_rgb(message, False, "here")

@@ -73,7 +73,8 @@ def test_unregistered_depth_keeps_the_files_pose_and_585_and_given_intrinsics_ar
 
 def test_png_and_jpg_are_read_and_the_png_wins(seven_scenes_root):
     folder = seven_scenes_root / "kitchen" / "seq-01"
-    cv2.imwrite(str(folder / "frame-000000.color.jpg"), color_image(5, (640, 480)))
+    for name in ("frame-000000.color.jpg", "frame-0000000.color.jpg"):  # before and after the png by name
+        cv2.imwrite(str(folder / name), color_image(5, (640, 480)))
     dataset = load(seven_scenes_root)
     assert [frame.name[-3:] for frame in dataset] == ["png", "jpg", "jpg"]
     assert [frame.timestamp for frame in dataset] == [0, 1, 2]

@@ -1,5 +1,7 @@
 """TUM layout: association by time, calibration, undistortion."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from written_scene import plane_depth, scene_pose
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.intrinsics import undistortion
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.data.tum import CALIBRATIONS, Tum, nearest_rows
+from emgs_jax.data.tum import CALIBRATIONS, Tum, nearest_rows, read_list
 
 SEQUENCE = "rgbd_dataset_freiburg3_plane"
 LISTS = ("rgb", "depth", "groundtruth")
@@ -147,3 +149,26 @@ def test_points_of_one_real_frame_lie_on_the_surfaces_of_the_next(shared_data, d
     dataset = Tum(shared_data("tum"), "rgbd_dataset_freiburg3_cabinet", stride=1)
     assert len(dataset) == 48
     assert np.median(np.abs(np.concatenate([depth_gaps(dataset, i, i + 1) for i in (3, 20, 40)]))) < 0.025
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "{time} rgb\\\\{name}",
+        "{time} rgb/my {name}",
+        "{time},rgb/my {name}",
+        '{time} "rgb/my {name}"',
+        "{time} rgb/{name} {time} depth/{name}",
+    ],
+)
+def test_lists_may_have_backslashes_spaces_quotes_and_more_columns(line, tum_root):
+    (folder,) = tum_root.iterdir()
+    times, names, _ = read_list(folder / "rgb.txt", 2)
+    if "my" in line:
+        for (name,) in names:
+            (folder / name).rename(folder / "rgb" / f"my {Path(name).name}")
+    lines = [line.format(time=time, name=Path(name).name) for time, (name,) in zip(times, names, strict=True)]
+    (folder / "rgb.txt").write_text("\n".join(lines))
+    dataset = Tum(str(tum_root), folder.name, stride=1)
+    assert [frame.timestamp for frame in dataset] == [100.0, 101.0, 102.0]
+    assert all(frame.image.mean() > 0 and (frame.depth > 0).any() for frame in dataset)

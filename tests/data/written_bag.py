@@ -9,17 +9,33 @@ from rosbags.typesys import Stores, get_typestore
 from tests.data.written_scene import color_image
 
 SIZE = (160, 120)
+TAKEN = (10**9, 1_100_000_000, 1_200_000_000)  # nanoseconds
 K = [130.0, 0, 80.5, 0, 128.0, 59.0, 0, 0, 1]
 P = [110.0, 0, 79.0, 0, 0, 112.0, 60.0, 0, 0, 0, 1, 0]  # of rectified images
 D = [0.02, -0.004, 0.001, -0.002, 0.0]
 
 
-def messages(store, version, kind, info=True, encoding="bgr8", model="plumb_bob", bent=D, P=P, name="raw"):
-    """(topic, type, message, nanoseconds) of three images and a camera_info."""
+def messages(
+    store,
+    version,
+    kind,
+    info=True,
+    encoding="bgr8",
+    model="plumb_bob",
+    bent=D,
+    P=P,
+    name="raw",
+    late=(0, 0, 0),
+):
+    """(topic, type, message, nanoseconds of its arrival) of three images and a camera_info; `late`: of the images."""
     types = store.types
-    time = types["builtin_interfaces/msg/Time"](1, 0)
     extra = {"seq": 0} if version == 1 else {}
-    header = types["std_msgs/msg/Header"](stamp=time, frame_id="cam", **extra)
+
+    def stamped(nanoseconds):
+        time = types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, 10**9))
+        return types["std_msgs/msg/Header"](stamp=time, frame_id="cam", **extra)
+
+    header = stamped(10**9)
     if info:
         letters = dict(zip("dkrp" if version == 2 else "DKRP", (bent, K, np.eye(3).ravel(), P), strict=True))
         roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
@@ -28,15 +44,27 @@ def messages(store, version, kind, info=True, encoding="bgr8", model="plumb_bob"
         found = info_type(header, SIZE[1], SIZE[0], model, **values, binning_x=0, binning_y=0, roi=roi)
         yield "/cam/camera_info", "sensor_msgs/msg/CameraInfo", found, 5
     for i in range(3):
-        image = color_image(i, SIZE)
+        image, arrival = color_image(i, SIZE), TAKEN[i] + late[i]
+        header = stamped(TAKEN[i])
         if kind == "Image":
-            padded = np.pad(image.reshape(SIZE[1], -1), ((0, 0), (0, 4)))  # rows may be longer than the picture
-            found = types["sensor_msgs/msg/Image"](header, *SIZE[::-1], encoding, 0, 3 * SIZE[0] + 4, padded.ravel())
-            yield f"/cam/image_{name}", "sensor_msgs/msg/Image", found, int((1 + i / 10) * 1e9)
+            rows = pixels(image, encoding)
+            padded = np.pad(rows, ((0, 0), (0, 4)))  # rows may be longer than the picture
+            is_big = int(encoding == "mono16")
+            found = types["sensor_msgs/msg/Image"](
+                header, *SIZE[::-1], encoding, is_big, padded.shape[1], padded.ravel()
+            )
+            yield f"/cam/image_{name}", "sensor_msgs/msg/Image", found, arrival
         else:
             data = cv2.imencode(".png", image)[1].ravel()
             found = types["sensor_msgs/msg/CompressedImage"](header, "png", data)
-            yield f"/cam/image_{name}/compressed", "sensor_msgs/msg/CompressedImage", found, int((1 + i / 10) * 1e9)
+            yield f"/cam/image_{name}/compressed", "sensor_msgs/msg/CompressedImage", found, arrival
+
+
+def pixels(image, encoding):
+    """The bytes of a BGR image (h, b); of mono16 its green in 12 bits, big-endian."""
+    if encoding == "mono16":
+        return (image[..., 1].astype(np.uint16) * 16).astype(">u2").view(np.uint8)
+    return (image[..., 1] if encoding.endswith("C1") else image).reshape(len(image), -1)
 
 
 def write_bag(folder, version=2, kind="Image", **options):

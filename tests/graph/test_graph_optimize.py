@@ -35,6 +35,8 @@ from scipy import stats
 
 from emgs_jax.graph.measurements import LOOP, ODOMETRY, Graph, Nodes
 from emgs_jax.graph.optimize import GraphConfig, marginal_covariances, optimize
+from emgs_jax.graph.problem import problem_of
+from emgs_jax.graph.start import spread
 from emgs_jax.io.g2o import load_graph_g2o
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -84,6 +86,16 @@ def test_exact_measurements_give_the_truth(start, scale_std):
     nodes, info = optimize(Graph(given, edges), config(scale_std=scale_std, start=start, kernel=np.inf))
     assert not info.reason and info.converged
     np.testing.assert_allclose(error(nodes, truth), 0.0, atol=1e-6)
+
+
+def test_where_the_solver_starts_exact_measurements_have_no_error_left():
+    """Rotations first, then positions, from any: two linear problems."""
+    truth = walk(30, laps=1.0)
+    edges = join(measure(truth, window_pairs(30)), measure(truth, [(0, 29), (2, 28)], LOOP))
+    given = disturb(truth, np.random.default_rng(1), np.array([0.3] * 6 + [0.0]))
+    problem = problem_of(Graph(given, edges), 0.0)
+    nodes = rows_of(spread(problem.graph, problem.free), np.arange(30))
+    np.testing.assert_allclose(error(nodes, truth), 0.0, atol=1e-9)
 
 
 def test_a_loop_of_scale_alone_spreads_linearly():

@@ -6,9 +6,9 @@ import pytest
 from scene import on_host
 from scipy.spatial import cKDTree
 
-from emgs_jax.ops.neighbours import compact_rows, knn
+from emgs_jax.ops.neighbours import compact_rows, curve_order, knn
 
-search, compacted = on_host(knn), on_host(compact_rows)
+search, compacted, along_curve = on_host(knn), on_host(compact_rows), on_host(curve_order)
 # Sizes of most tests, so that they share programs: a few blocks of queries among few and among many groups of points.
 NUM_QUERIES, NUM_POINTS, MANY_QUERIES, MANY_POINTS = 300, 1000, 1300, 2400
 
@@ -27,7 +27,7 @@ def check(queries, points, valid, k, asked=None):
     rows, found = search(queries, points, valid, k) if asked is None else search(queries, points, valid, k, asked)
     valid, is_answer = np.asarray(valid), np.ones(len(queries), bool) if asked is None else asked
     kept, num_found = points[valid].astype(float), min(k, int(valid.sum()))
-    assert (found[is_answer] == (np.arange(k) < num_found)).all()
+    assert (found[is_answer] == (np.arange(k) < num_found)).all() and not rows[~found].any()
     if num_found == 0:
         return
     expected, _ = cKDTree(kept).query(queries[is_answer].astype(float), np.arange(1, num_found + 1))
@@ -140,6 +140,17 @@ def test_the_order_of_points_and_queries_does_not_matter():
     assert (
         found.all() and (rows[turned] == expected[order]).mean() > 0.999
     )  # but for distances that are as good as equal
+
+
+def test_the_curve_goes_from_each_cube_to_one_that_touches_it_and_what_does_not_count_comes_last():
+    """By which a group is compact: any order gives the same neighbours, and takes longer."""
+    cubes = np.random.default_rng(17).permutation(np.stack(np.meshgrid(*[np.arange(8)] * 3), axis=-1).reshape(-1, 3))
+    beside = np.array([[3.0, np.nan, 1.0], [100.0, 0.0, 0.0]])
+    positions = np.concatenate([beside, 0.1 * cubes - 5.0]).astype(np.float32)
+    order = along_curve(positions, np.arange(len(positions)) >= len(beside))
+    steps = np.diff(cubes[order[: len(cubes)] - len(beside)], axis=0)
+    assert (np.abs(steps).sum(axis=1) == 1).all()
+    assert sorted(order[len(cubes) :]) == [0, 1]
 
 
 def test_compaction_lists_the_true_rows_in_order_and_counts_what_did_not_fit():

@@ -11,11 +11,11 @@ from emgs_jax.registration import belief
 from emgs_jax.registration.belief import certain
 from emgs_jax.registration.icp import IcpInfo
 
-measured, moved, next_belief, predict, root_information, update = (
+measured, moved, next_belief, predict, rescaled, root_information, update = (
     on_host(f)
     for f in (
-        *(belief.measured, belief.moved, belief.next_belief),
-        *(belief.predict, belief.root_information, belief.update),
+        *(belief.measured, belief.moved, belief.next_belief, belief.predict),
+        *(belief.rescaled_belief, belief.root_information, belief.update),
     )
 )
 MOTION = pose((0.2, -0.1, 0.3), (0.3, 0.05, -0.4))
@@ -52,6 +52,20 @@ def test_the_errors_of_the_next_pose_are_distributed_as_predicted():
 def test_a_motion_that_is_not_finite_only_adds_noise():
     P, lost = covariance(), jaxlie.SE3(device(np.full(7, np.nan)))
     np.testing.assert_allclose(predict(P, lost, np.full(7, 0.1, np.float32)), P + 0.01 * np.eye(7), rtol=1e-6)
+
+
+def test_in_another_unit_of_length_all_is_known_as_well_as_before():
+    """Of which a metre has three times as many: motion, noise and errors of the pose are three times as long."""
+    factor, units = np.float32(3.0), np.float32([3.0] * 3 + [1.0] * 4)
+    longer = jaxlie.SE3(MOTION.wxyz_xyz * np.float32([1.0] * 4 + [3.0] * 3))
+    found = moved(rescaled(both_known(), factor), longer, units * NOISE)
+    expected = rescaled(moved(both_known(), MOTION, NOISE), factor)
+    for name in ("covariance", "world_covariance"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-4, atol=1e-9)
+        np.testing.assert_array_equal(
+            getattr(rescaled(both_known(), factor), name)[3:, 3:], getattr(both_known(), name)[3:, 3:]
+        )
+    assert expected.log_scale == pytest.approx(np.log(3.0))
 
 
 def test_an_update_is_that_of_the_kalman_filter():
@@ -91,7 +105,7 @@ def test_a_frame_that_is_tracked_is_known_as_its_points_say_and_another_as_befor
     twice = jaxlie.SE3(device(np.tile(MOTION.wxyz_xyz, (2, 1))))
     before = jax.device_get(eqx.tree_at(lambda b: b.repeats.said, both_known(), twice))
     zero, one, information = device(0.0), device(np.int32(1)), 1e4 * np.eye(7)
-    numbers = zero, zero, device(0.04), device(np.zeros(8)), device(information), zero, zero
+    numbers = zero, zero, device(0.04), device(np.zeros(8)), device(np.zeros(7)), device(information), zero, zero
     found = IcpInfo(one, *numbers, one, device(True))
     arguments = before, found, np.float32(0.02), np.float32(1.1)
     after = next_belief(*arguments, np.array(True), np.float32(5.0))

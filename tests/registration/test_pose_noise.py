@@ -27,7 +27,7 @@ def repeat(prediction, before, scale):
     return in_unit(repeats, scale), repeats, latest
 
 
-pose_std = on_host(pose_noise.pose_std)
+axis_std, pose_std = on_host(pose_noise.axis_std), on_host(pose_noise.pose_std)
 
 
 def power(count: int) -> jaxlie.SE3:
@@ -174,6 +174,15 @@ def test_without_repeats_the_depths_say_it_and_one_guess_counts_like_one_repeat(
     # What is in common does not show: a quarter of the variance differs, and twice that is what two differ by.
     std = pose_std(known, nothing, guess, np.float32(0.75))
     np.testing.assert_allclose(std[0], (0.001 * 2**0.5) ** (3 / 4) * 0.02 ** (1 / 4), rtol=1e-4)
+
+
+def test_along_the_axes_lengths_are_in_mean_depths_and_what_is_informed_of_is_surer():
+    """Of the motion and of the pose itself: three lengths, then three angles; nine depths are worth a third of one."""
+    latest, shared = np.float32([[0.1**2, 0.2**2], [0.3**2, 0.4**2]]), np.float32(0.5)
+    lengths, angles = pose_std(none_yet(), latest, np.float32(0.01), shared).T
+    given = np.float32(0.03), np.float32(DEPTH), np.float32(9.0), shared
+    expected = np.stack([DEPTH * lengths] * 3 + [angles] * 3, axis=1)
+    np.testing.assert_allclose(axis_std(none_yet(), latest, *given), expected, rtol=1e-5)
 
 
 def test_a_pose_is_at_least_as_uncertain_as_its_own_repeat_differs():

@@ -75,13 +75,15 @@ def test_depths_that_err_by_a_factor_pull_the_pose_nowhere_along_their_rays(conf
     assert step(COLORED)[6] * float(problem.scale_unit) < -0.5 * DEPTH_NOISE**2
 
 
-def test_the_information_of_the_points_does_not_depend_on_the_unit_of_the_seventh_unknown(config):
+def test_the_information_of_the_points_is_that_of_their_rows_whatever_the_unit_of_the_seventh_unknown(config):
     settings = at(config("slam/localization=default").localization.icp, "residual", DISTRIBUTION)
     matches, problem = noisy_problem()
     found, small, still = (
         data_information(NOWHERE, matches, eqx.tree_at(lambda p: p.scale_unit, problem, device(unit)), settings)
         for unit in (1.0, 0.01, 0.0)
     )
+    jacobian = jacobian_of(NOWHERE, matches, problem, settings).astype(float).reshape(-1, 7)  # its unit is 1
+    np.testing.assert_allclose(found, jacobian.T @ jacobian, rtol=1e-3, atol=1e-3 * found.max())
     np.testing.assert_allclose(small, found, rtol=1e-3, atol=1e-3 * found.max())
     assert not np.any(still[6]) and np.all(np.isfinite(still))
 
@@ -94,7 +96,7 @@ def test_what_is_known_is_the_prior_of_the_unknowns_and_worth_less_where_the_poi
 
     @on_host
     def prior_of(noise, depth, known, settings: IcpConfig) -> jax.Array:
-        uncertainty = Uncertainty((jnp.asarray(0.05), noise), depth, jnp.ones(()))
+        uncertainty = Uncertainty(noise, depth, jnp.ones(()))
         given = problem.source, problem.surface, problem.T_world_coarse, jnp.asarray(0.02)
         return pose_problem(*given, uncertainty, settings, known).prior
 

@@ -8,8 +8,8 @@ from scene import on_host
 from emgs_jax.registration import noise
 from emgs_jax.registration.noise import NUM_CELLS, NUM_LEVELS
 
-confidence_levels, noise_of_levels, num_independent, robust_std = (
-    on_host(f) for f in (noise.confidence_levels, noise.noise_of_levels, noise.num_independent, noise.robust_std)
+noise_of_levels, num_independent, robust_std = (
+    on_host(f) for f in (noise.noise_of_levels, noise.num_independent, noise.robust_std)
 )
 COUNT = 4096
 ALL = np.ones(COUNT, bool)
@@ -23,9 +23,14 @@ LAWS = {  # any law that falls with the error has the same order
 }
 
 
+@on_host
+def confidence_levels(confidence, valid):
+    return noise.levels_of(confidence, noise.level_edges(confidence, valid))
+
+
 def noise_of(confidence, errors=ERRORS, valid=ALL):
     levels = confidence_levels(np.float32(confidence), valid)
-    return noise_of_levels(errors, valid, levels)[levels]
+    return noise_of_levels(errors, valid, levels)[1][levels]
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -49,7 +54,7 @@ def test_high_confidence_of_wrong_points_is_found_out():
 def test_a_level_with_few_points_takes_the_noise_of_all():
     is_best = np.arange(COUNT) < 10
     levels = confidence_levels(np.float32(np.where(is_best, 9.0, 1.0)), ALL)
-    found = noise_of_levels(np.where(is_best, np.float32(1e-6), ERRORS), ALL, levels)
+    _, found = noise_of_levels(np.where(is_best, np.float32(1e-6), ERRORS), ALL, levels)
     np.testing.assert_allclose(found[levels[0]], found[0], rtol=0.02)
 
 
@@ -60,9 +65,11 @@ def test_invalid_points_and_nan_neither_count_nor_spread():
     levels = confidence_levels(confidence, valid)
     alone = confidence_levels(confidence[valid], ALL[: valid.sum()])
     np.testing.assert_array_equal(levels[valid], alone)
-    expected = noise_of_levels(ERRORS[valid], ALL[: valid.sum()], alone)
-    np.testing.assert_allclose(noise_of_levels(spoilt, valid, levels), expected, rtol=1e-6)
-    assert robust_std(ERRORS, ~ALL) == 0 and (noise_of_levels(ERRORS, ~ALL, levels) == 0).all()
+    of_all, expected = noise_of_levels(ERRORS[valid], ALL[: valid.sum()], alone)
+    found = noise_of_levels(spoilt, valid, levels)
+    np.testing.assert_allclose(found[1], expected, rtol=1e-6)
+    np.testing.assert_allclose([found[0], of_all], robust_std(ERRORS[valid], ALL[: valid.sum()]), rtol=1e-6)
+    assert robust_std(ERRORS, ~ALL) == 0 and (noise_of_levels(ERRORS, ~ALL, levels)[1] == 0).all()
 
 
 @pytest.mark.parametrize("std", [0.01, 0.3])

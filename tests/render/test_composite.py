@@ -10,7 +10,8 @@ import scene as sc
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import pixel_grid, rays
-from emgs_jax.render.composite import render
+from emgs_jax.render.composite import render, splat_depth
+from emgs_jax.render.project import Splats
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 
@@ -92,6 +93,15 @@ def test_a_fronto_parallel_gaussian_has_its_own_depth_where_it_covers(camera, re
     assert 0.9 * float(render_config.opacity) < rendering.alpha.max() <= render_config.opacity
 
 
+def test_a_gaussian_is_drawn_once_also_where_the_map_has_no_free_row(camera, render_config):
+    """The farthest is the last of the order, where the rows of a tile that is not full point."""
+    seen, beside = ((0.1, 0.05, 2.0), (0, 0, -1), 0.15), ((9.0, 0.0, 1.0), (0, 0, -1), 0.15)
+    alone, among = discs(seen), discs(*[beside] * (COUNT - 1), seen)
+    assert among.valid.all()
+    images = (draw(gaussians, WHITE, sc.pose(), camera, render_config) for gaussians in (among, alone))
+    assert_images_equal(*images, atol=0)
+
+
 def test_the_depth_of_a_slanted_gaussian_is_that_of_its_plane(camera, render_config):
     normal, mean = np.array([0.5, 0.3, -1.0]), np.array([0.1, 0.05, 2.0])
     rendering = draw(discs((mean, normal, 0.15)), WHITE, sc.pose(), camera, render_config)
@@ -100,6 +110,22 @@ def test_the_depth_of_a_slanted_gaussian_is_that_of_its_plane(camera, render_con
     covered = np.asarray(rendering.depth) > 0
     assert covered.sum() >= 8 and np.ptp(plane[covered]) > 0.1
     np.testing.assert_allclose(np.asarray(rendering.depth)[covered], plane[covered], atol=1e-4)  # m; roundings
+
+
+def test_a_steep_plane_is_drawn_no_farther_and_no_nearer_than_its_gaussian_reaches_nor_at_the_camera(render_config):
+    """Three standard deviations; of the second, which reaches behind the camera, to a tenth of its depth."""
+    depth, std = np.float32([2.0, 4.0, 0.5]), np.float32([0.1, 1.9, 0.02])
+    inverse, slope = 1.0 / depth, np.float32([[0.1, 0.0], [0.5, 0.0], [0.0, -0.4]])
+    shape = np.zeros((3, 2)), *[np.tile(np.eye(2), (3, 1, 1))] * 2
+    pixels = np.stack(np.meshgrid(*[np.arange(-6, 7)] * 2), axis=-1).reshape(-1, 2).astype(np.float32)
+    splats = Splats(*(sc.device(x) for x in (*shape, depth, std, inverse, slope, depth > 0)))
+    found = sc.on_host(splat_depth)(splats, pixels, render_config)
+    inverse = inverse[:, None] + slope.astype(float) @ pixels.T
+    plane = 1.0 / np.where(inverse > 0, inverse, 1e-9)  # beyond its horizon it is infinitely far
+    nearest, farthest = np.maximum(depth - 3.0 * std, 0.1 * depth), depth + 3.0 * std
+    expected = np.clip(plane, nearest[:, None], farthest[:, None])
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert (expected.min(axis=1) == nearest).all() and (expected.max(axis=1) == farthest).all()
 
 
 @pytest.mark.parametrize("size", [5, 32])

@@ -8,10 +8,11 @@ import scene as sc
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import render
-from emgs_jax.render.densify import DensifyConfig, densify, in_front_surface, without_floor
+from emgs_jax.render.densify import DensifyConfig, densify, without_floor
+from emgs_jax.render.project import project_gaussians
 
 NUM_ROWS = 1080  # of every map, many of them free: one program for all
-drawn_dense, in_front = sc.on_host(densify), sc.on_host(in_front_surface)
+drawn_dense = sc.on_host(densify)
 
 
 def dense(gaussians: Gaussians, *arguments):
@@ -181,19 +182,36 @@ def test_points_move_with_map_and_camera(camera, densify_config):
     np.testing.assert_allclose(moved.points[both], expected[both], atol=2e-3)  # a splat more or less at its edge
 
 
-@pytest.mark.parametrize(
-    ("weights", "expected"),
-    [
-        ((0.2, 0.4, 0.3, 0.0), [False, True, True, False]),  # about 2 m, and what is within 20 cm of that
-        ((0.6, 0.2, 0.2, 0.1), [True, False, False, False]),
-        ((0.3, 0.1, 0.1, 0.6), [False, False, True, True]),
-    ],
-)
-def test_the_front_surface_is_a_part_of_the_depth_about_the_weighted_median(weights, expected):
-    weights, depth = np.float32(weights)[:, None], np.float32([[1.0], [2.0], [2.15], [2.25]])
-    np.testing.assert_array_equal(in_front(weights, depth, np.float32(0.1))[:, 0], expected)
-    nothing = in_front(0.0 * weights, depth, np.float32(0.1))  # no weight, no surface that matters
-    assert nothing.shape == (4, 1)
+def test_the_front_of_a_pixel_is_the_weighted_median_of_its_splats(camera, densify_config):
+    """Oracle: the splats of some pixels one after the other. Forty of a chunk and more before and behind each other."""
+    g = sc.random_gaussians(200, 4, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
+    g = sc.replace(g, normals=np.tile([0.0, 0.0, -1.0], (200, 1)))
+    config = sc.changed(densify_config, **{"render.opacity": 0.3, "surface_depth": 0.1})
+    view = dense(g, sc.pose(), camera, config)
+    render_config = config.render
+    splats = sc.on_host(project_gaussians)(g, sc.pose(), camera, render_config.covariance_scale, render_config.blur)
+    order, counts, found = np.argsort(splats.depth), [], []
+    for row, column in np.ndindex(24, 32):
+        weights, nearness, depths, light = [], [], [], 1.0
+        for k in order[splats.valid[order]]:
+            offset = np.array([column, row]) - splats.means[k]
+            distance_sq = offset @ splats.precisions[k] @ offset
+            if distance_sq <= 9.0:
+                nearness.append(0.3 * np.exp(-0.5 * distance_sq))
+                weights.append(light * nearness[-1])
+                light -= weights[-1]
+                reach = 3.0 * splats.depth_std[k]
+                inverse = splats.inverse_depth[k] + splats.depth_slope[k] @ offset
+                depths.append(1 / np.clip(inverse, 1 / (splats.depth[k] + reach), 1 / (splats.depth[k] - reach)))
+        counts.append(len(weights))
+        if weights:
+            weights, nearness, depths = map(np.array, (weights, nearness, depths))
+            middle = depths[np.searchsorted(np.cumsum(weights), 0.5 * weights.sum())]
+            surface = nearness * (np.abs(depths - middle) <= 0.1 * middle)
+            found.append(view.depth[row, column] - (surface @ depths) / surface.sum())
+    assert np.max(counts) > 40
+    # Where a rounding decides which one is the median, or whether one is within reach, or within 3 σ, it is another.
+    assert np.mean(np.abs(found) < 1e-3) > 0.98
 
 
 def test_pixels_without_depth_are_invalid_and_finite(camera, densify_config):

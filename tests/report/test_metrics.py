@@ -12,11 +12,11 @@ from scene import evaluation_config, random_gaussians
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import Frame
+from emgs_jax.data.spool import Spool
 from emgs_jax.evaluation.clouds import PointCloud, transform_cloud
 from emgs_jax.evaluation.reconstruction import compare_clouds, reference
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.evaluation.trajectory import trajectory_metrics
-from emgs_jax.io.spool import Spool
 from emgs_jax.report.metrics import (
     Scorer,
     describe,

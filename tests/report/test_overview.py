@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.report.overview import (
     Paths,
+    _draw_map,
     below_ceiling,
     class_colors,
     draw_overview,
@@ -126,6 +128,13 @@ def test_what_is_lost_or_unknown_is_a_gap_and_loops_are_lines_beside_the_path_be
     gaps = [[np.diff(columns).max() / np.ptp(columns) for columns in found[:2]] for found in (whole, broken)]
     assert max(gaps[0]) < 0.1 and 0.2 < min(gaps[1]) <= max(gaps[1]) < 0.3  # two of eight pieces
     assert min(map(len, moved)) > 200 and not any(map(len, whole[2:]))
+
+
+def test_lengths_are_metres_only_where_that_is_known():
+    for unit, shown in (("m", "metres"), ("units", "units")):
+        axes = Figure().subplots()
+        _draw_map(axes, a_cloud(), Paths(path_along([1.0, -0.5, 0.0]), np.ones(5, bool), unit=unit))
+        assert axes.get_xlabel() == shown and [text.get_text().split()[1] for text in axes.texts] == [unit]
 
 
 def test_features_are_drawn_from_above_below_the_map(tmp_path):

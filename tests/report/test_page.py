@@ -20,6 +20,7 @@ from emgs_jax.report.page import write_report
 from emgs_jax.report.page_map import COV_UNIT, fitted, packed, thinned
 from emgs_jax.report.page_strip import placed_paths
 from emgs_jax.report.page_words import DATA_LICENCES, verdict
+from emgs_jax.report.provenance import print_metrics_table
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.running.configure import groups
 from experiments.report import report
@@ -163,6 +164,17 @@ def test_the_verdict_compares_with_the_raw_prior(tmp_path, metrics, level):
     folder = written_run(tmp_path, **metrics)
     edited(folder / "frames.jsonl", lambda text: text.replace('"degraded"', '"tracked"').replace('"lost"', '"tracked"'))
     assert verdict(read_run(folder))[0] == level
+
+
+@pytest.mark.parametrize(("name", "unit"), [("colmap", "0.0123 units of the reference"), ("tum", "1.2 cm")])
+def test_errors_against_poses_of_another_program_are_in_its_unit(tmp_path, name, unit):
+    folder = written_run(tmp_path, **{"trajectory/ate_sim3_m": 0.0123, "raw_prior/trajectory/ate_sim3_m": 0.03})
+    run = read_run(folder)
+    block = run.provenance | {"data": run.provenance["data"] | {"name": name}}
+    run = replace(run, metrics=run.metrics | {"provenance": block})
+    table = print_metrics_table(run.metrics)
+    assert f"The path is off by {unit}" in verdict(run)[1]
+    assert ("[.01 units]" in table, "[cm]" in table) == ((True, False) if name == "colmap" else (False, True))
 
 
 def damage(name: str, before: str, after: str):

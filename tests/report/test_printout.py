@@ -3,7 +3,8 @@
 import pytest
 
 from emgs_jax.localization import REASONS
-from emgs_jax.report.printout import frame_lines, last_words
+from emgs_jax.report.printout import frame_lines, last_words, time_words
+from emgs_jax.running.clock import Clock
 from emgs_jax.running.record import FrameRecord
 from emgs_jax.running.untracked import MANY_IN_A_ROW, REMEDIES
 
@@ -44,6 +45,14 @@ def test_the_line_that_ends_a_run_says_how_many_frames_are_not_in_the_map_and_fr
     assert last_words(metrics) == f"{said}; "
     metrics["segments/unjoined_frames"] = 40
     assert last_words(metrics) == f"{said}, 40 of them because their part was never joined with the map; "
+
+
+def test_the_seconds_of_a_run_are_those_of_all_its_phases():
+    clock = Clock()
+    clock.phases |= {"predict": 160.0, "map": 29.6, "raw_prior": 0.4}
+    clock.compile_seconds = 12.34
+    said = "predict 160.0, map 29.6, raw_prior 0.4; of all that compilation 12.3"
+    assert time_words(clock, 40) == f"190.0 s, 4.75 s a frame: {said}"
 
 
 def test_a_remedy_names_keys_that_there_are():

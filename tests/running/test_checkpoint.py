@@ -29,7 +29,9 @@ from emgs_jax.running.checkpoint import (
 from emgs_jax.running.record import FrameRecord
 from tools.kills.folders import log_lines
 
-OVERRIDES = ("prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=256")
+# Strict gates, so that the map outgrows half the capacity of tiny_run, and has the shapes of its runs then.
+GATES = ("slam.em.max_mahalanobis_sq=1", "slam.refinement.max_mahalanobis_sq_2d=1")
+OVERRIDES = ("prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=512", *GATES)
 GRAPH = ("graph=default", "graph.every=1")
 SHOWS_TIMES = {"metrics.json", "frames.jsonl", "overview.png", "report.html"}
 
@@ -92,7 +94,7 @@ def goes_on(folder: Path, more: tuple[str, ...], num_steps: range, monkeypatch) 
         found = experiments.run.run(compose(*OVERRIDES, *more), folder)
     assert len(steps) in num_steps, "the steps before are not repeated"
     expected, metrics = whole(*more)
-    assert metrics["map/capacity"] > 256, "the map had to grow"
+    assert metrics["map/capacity"] == 1024, "the map had to grow"
     names = {path.name for path in expected.iterdir()}
     assert {path.name for path in folder.iterdir()} == names
     for name in names - SHOWS_TIMES:

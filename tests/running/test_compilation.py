@@ -17,7 +17,7 @@ compilation.MAX_BYTES = int(sys.argv[2])
 events = []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
 compilation.use_compilation_cache(None if sys.argv[1] == "None" else sys.argv[1])
-for size in range(2, 8):
+for size in range(2, 5):
     jax.jit(lambda x: jnp.linalg.qr(jnp.sin(x) @ x.T)[0])(jnp.ones((size, 5))).block_until_ready()
 print(events.count("/jax/compilation_cache/cache_hits"), events.count("/jax/compilation_cache/cache_misses"))
 print(jax.config.jax_compilation_cache_dir)
@@ -45,9 +45,9 @@ def finish(process: subprocess.Popen) -> tuple[int, int, str, str]:
 def test_two_processes_that_start_at_once_share_a_new_folder_and_the_next_one_compiles_nothing(tmp_path):
     both = [start(tmp_path / "new"), start(tmp_path / "new")]
     for hits, misses, folder, complaints in map(finish, both):
-        assert hits + misses >= 6 and folder == str(tmp_path / "new") and "rror" not in complaints
+        assert hits + misses >= 3 and folder == str(tmp_path / "new") and "rror" not in complaints
     hits, misses, _, complaints = finish(start(tmp_path / "new"))
-    assert hits >= 6 and misses == 0 and complaints == ""
+    assert hits >= 3 and misses == 0 and complaints == ""
 
 
 def test_the_folder_stays_within_its_bound(tmp_path):

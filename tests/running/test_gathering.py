@@ -10,8 +10,10 @@ from scene import evaluation_config, slam_config
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.baselines import TsdfConfig, VoxelConfig
-from emgs_jax.evaluation.reconstruction import ground_truth_cloud, reference
+from emgs_jax.evaluation.reconstruction import compare_clouds, ground_truth_cloud, reference
+from emgs_jax.evaluation.segmentation import align_labels
 from emgs_jax.report.metrics import Scorer, score_baselines
+from emgs_jax.running.dense import _voxel
 from emgs_jax.running.gathering import Baselines, gather
 from emgs_jax.running.inputs import RawView
 from emgs_jax.running.record import FrameRecord
@@ -94,14 +96,15 @@ def test_the_raw_priors_depths_are_zero_where_it_says_nothing_and_are_kept_where
 
 def test_the_classes_of_each_frame_are_kept_and_those_of_its_points_are_where_the_prior_puts_them(gathered):
     _, _, raw = gathered
+    found = raw.labels.points(evaluation_config().voxel_m)
     width = SHAPE[1] // 2
     assert len(raw.classes) == len(STATUSES)
     np.testing.assert_array_equal(raw.classes[0], np.tile(np.repeat([0, -1], [width, SHAPE[1] - width]), (SHAPE[0], 1)))
     np.testing.assert_array_equal(raw.classes[1], np.ones(SHAPE))
-    assert raw.labels.classes == ("wall", "cat") and (raw.labels.points[:, 1] > 1.0).all()
+    assert found.classes == ("wall", "cat") and (found.points[:, 1] > 1.0).all()
     for row in (1, 2, 3):
-        seen = np.abs(raw.labels.points[:, 0] - XS[row]) < 1.0
-        assert seen.sum() > 50 and (raw.labels.labels[seen] == row % 2).all()
+        seen = np.abs(found.points[:, 0] - XS[row]) < 1.0
+        assert seen.sum() > 50 and (found.labels[seen] == row % 2).all()
     plain = gather([], evaluation_config(), False)
     assert plain.classes is None and plain.labels is None
 
@@ -125,3 +128,53 @@ def test_baselines_are_compared_at_the_poses_that_they_were_built_at(gathered):
         assert metrics[f"baseline_{name}_ours/rendering/psnr_db"] > 40.0
     run.true_poses = [None] * len(STATUSES)
     assert score_baselines(run, baselines, raw, Scorer(Walls(), config, truth, None, None)) == {}
+
+
+@pytest.mark.parametrize("metres_per_unit", [0.001, 3.0, 30.0, 1000.0])
+def test_a_prior_scores_the_same_in_whatever_unit_it_answers(metres_per_unit):
+    """Points were averaged per centimetre of its own lengths: exact answers in units of 30 m had F1 27 %."""
+    evaluation, walls, text = evaluation_config(), Walls(), (("wall",), np.ones((1, 1), np.float32))
+    frames = [walls[row] for row in range(len(walls))]
+    truth = reference(ground_truth_cloud(frames, INTRINSICS, evaluation), evaluation)
+
+    def scored(unit):
+        views, poses = [], []
+        for frame in frames:
+            pose = frame.T_world_camera.copy()
+            pose[:3, 3] /= unit
+            points = (backproject(frame.depth, INTRINSICS) / unit).astype(np.float32)
+            views.append(RawView(points, frame.depth > 0, frame.image, pose, np.ones((1, 1, 1), np.float16)))
+            poses.append(pose)
+        both, raw = (np.stack(poses), poses_along(XS)), gather(views, evaluation, False, text=text)
+        labels = align_labels(raw.labels, truth, both, evaluation)
+        return compare_clouds(raw.cloud, truth, both, evaluation), len(labels.points), labels.points.max(0)
+
+    (metric, count, corner), (other, other_count, other_corner) = scored(1.0), scored(metres_per_unit)
+    assert metric["reconstruction/f1_5cm_percent"] > 99.9
+    for key, value in metric.items():
+        # Points at the border of a voxel fall to either side; a centimetre is what a voxel has.
+        assert other[key] == value if isinstance(value, str | None) else other[key] == pytest.approx(value, 0.02, 5e-4)
+    assert other_count == pytest.approx(count, rel=0.02)
+    np.testing.assert_allclose(other_corner, corner, atol=evaluation.voxel_m)
+
+
+def test_the_map_is_averaged_by_a_centimetre_of_the_truth_and_never_by_more_than_one_of_its_own():
+    config, true = evaluation_config(), poses_along(XS)
+    for unit, side in ((1.0, 1.0), (40.0, 1 / 40), (0.001, 1.0)):
+        own = true.copy()
+        own[:, :3, 3] /= unit
+        assert _voxel((own, true), config) == pytest.approx(side * config.voxel_m)
+    assert _voxel(None, config) == config.voxel_m
+
+
+def test_what_goes_wrong_in_gathering_ends_the_mapping_one_frame_later():
+    asked = []
+
+    def views():
+        for number in range(9):
+            asked.append(number)
+            yield RawView(np.zeros((2, 2)), np.ones((2, 2), bool), np.zeros((2, 2, 3)), np.eye(4), np.zeros((1, 1, 0)))
+
+    with pytest.raises(IndexError):
+        gather(views(), evaluation_config(), True)
+    assert asked == [0, 1]

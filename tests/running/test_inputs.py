@@ -69,3 +69,15 @@ def test_a_frame_that_is_lost_for_a_while_is_the_same():
         return replace(prediction, T_anchor_view=poses)
 
     assert {one.structure for one in taken(edit)} == {0}
+
+
+def test_predictions_in_millimetres_are_named_before_the_first_step():
+    """They ended frame by frame in advice about walls."""
+
+    def in_millimetres(prediction: PriorPrediction) -> PriorPrediction:
+        poses = prediction.T_anchor_view.copy()
+        poses[:, :3, 3] *= 1000
+        return replace(prediction, T_anchor_view=poses, points=1000 * prediction.points)
+
+    with pytest.raises(ValueError, match=r"median depth of \d+ in its inference 0, .* millimetres\? Divide points and"):
+        taken(in_millimetres)

@@ -1,8 +1,10 @@
 """Where a step begins once the camera is found; oracle: the pose and the unit that were found."""
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -11,7 +13,7 @@ import pytest
 from loop_scene import matrix
 from scene import assert_same, random_gaussians, random_observation
 
-from emgs_jax import load_config
+import emgs_jax
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.graph.measurements import ODOMETRY
 from emgs_jax.localization import localize_coarse
@@ -35,6 +37,8 @@ from emgs_jax.running.locating import (
 from emgs_jax.running.record import FOUND, FrameRecord, new_run
 from emgs_jax.slam import SlamState
 
+load_config = cache(emgs_jax.load_config)  # nobody changes what it gives
+localized = eqx.filter_jit(localize_coarse)
 PLACE = matrix((10, -70, 20), (3.0, -2.0, 1.0))
 FOUND_THERE = Location(PLACE, float(np.log(1.1)), 1e-4 * np.eye(7), 4)
 CAMERA = Camera((5.0, 5.0), (2.0, 1.5), 5, 4)  # of 20 rows
@@ -73,7 +77,7 @@ def test_the_coarse_pose_of_the_step_is_where_the_camera_was_found(coarse):
     config = load_config(f"slam.localization.coarse={coarse}").slam.localization
     state, again = found_at(run(lost_state()), prediction(), FOUND_THERE)
     last = state.previous, state.T_world_previous
-    pose = localize_coarse(again, *last, CAMERA, config, state.belief)
+    pose = localized(again, *last, CAMERA, config, state.belief)
     np.testing.assert_allclose(pose.T_world_camera.as_matrix(), PLACE, atol=1e-4)
     np.testing.assert_allclose(pose.scale, 1.1, rtol=2e-3)  # .1 from the mean so far, .01 against .1
     _, here, there = np.array(prediction().T_world_views.as_matrix())

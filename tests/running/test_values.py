@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from tiny_run import TINY, compose
 
@@ -14,11 +15,16 @@ from emgs_jax.running.configure import build, groups, load_config
 from emgs_jax.running.values import check_values, declared
 from experiments.grid import read_axes, variants
 
+GROUPS = groups()
 PARTS = ("slam", "densify", "evaluation", "graph", "dataset", "prior", "features", "baseline.voxel", "baseline.tsdf")
 
 
 def check_all(*overrides: str) -> None:
-    config = compose(*overrides)
+    """The groups are chosen by Hydra, and then the values are put where it would put them, as it reads them."""
+    words = [word for word in overrides if word.split("=")[0] in GROUPS]
+    config = compose(*words)
+    for word in OverridesParser.create().parse_overrides([word for word in overrides if word not in words]):
+        OmegaConf.update(config, word.key_or_group, word.value(), merge=False)
     for part in PARTS:
         check_values(config, part)
 
@@ -57,7 +63,9 @@ def test_every_value_of_a_protocol_is_in_its_range(option):
         ("slam.em.support=1", "slam.em.support must be one of printed, normalized; got 1"),
         ("slam.em.average.forgetting=2", "slam.em.average.forgetting must be a number from 0 to 1, got 2"),
         ("slam.em.num_neighbours=0", "slam.em.num_neighbours must be a whole number from 1 to 256, got 0"),
-        ("slam.localization.icp.tolerance=nan", "slam.localization.icp.tolerance must be a number from 0 to 1"),
+        ("slam.localization.icp.tolerance=1e-9", "slam.localization.icp.tolerance must be a number from 1e-07 to 1"),
+        ("evaluation.voxel_m=1e-6", "evaluation.voxel_m must be a number"),
+        ("slam.localization.icp.tolerance=nan", "slam.localization.icp.tolerance must be a number from 1e-07 to 1"),
         ("slam.submap.map_capacity=0", "slam.submap.map_capacity must be a whole number from 1 to 67108864, got 0"),
         ("slam.window_size=2.5", "slam.window_size must be a whole number from 1 to 1000, got 2.5"),
         ("render.tile_size=0", "^render.tile_size must be a whole number from 1 to 1024, got 0"),

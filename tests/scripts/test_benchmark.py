@@ -11,10 +11,10 @@ from tiny_run import compose
 
 import experiments.benchmark
 from emgs_jax.render.composite import RenderConfig
-from experiments.benchmarks import baselines
+from experiments.benchmarks import baselines, comparisons
 from experiments.benchmarks.comparisons import time_icp, time_render
 from experiments.benchmarks.data import enlarged, first_state, load
-from experiments.benchmarks.timing import Candidate, compare, interleaved, spread
+from experiments.benchmarks.timing import Candidate, Timing, compare, interleaved, spread
 
 TINY = ("benchmark.repetitions=2", "benchmark.num_gaussians=200")
 
@@ -72,8 +72,10 @@ def test_compositing_without_tiles_is_the_reference_pixel_by_pixel():
         "precisions": np.linalg.inv(np.stack([cov for _, cov in drawn])),
         "depth": g["means"][:, 2],
     }
-    image = baselines.render(splats, g["colors"], (24, 18), config)
+    image = baselines.render(splats, g["colors"], 24, range(18), config)
     np.testing.assert_allclose(image, expected, atol=1e-5)  # the config holds float32
+    some = baselines.render(splats, g["colors"], 24, [3, 11], config)
+    np.testing.assert_array_equal(some, image[[3, 11]])
     assert expected.max() > 0.3
 
 
@@ -85,6 +87,9 @@ def test_candidates_take_turns_and_a_ratio_compares_the_same_turn(monkeypatch):
     np.testing.assert_allclose(timings[0].seconds, [0.02, 0.04, 0.08])
     np.testing.assert_allclose(timings[1].facts["times_faster_than"]["a"], (8, 4, 16))
     assert spread([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
+    part = comparisons.of_all_lines(Timing("render", "a part", [0.1, 0.2], facts={"drawn_lines": 3}), 12)
+    np.testing.assert_allclose(part.seconds, [0.4, 0.8])
+    assert comparisons.of_all_lines(timings[0], 12) == timings[0]
 
 
 def written(folder, timings) -> str:
@@ -125,9 +130,11 @@ def test_both_registrations_find_the_pose_of_exact_views():
 
 
 @pytest.mark.long
-def test_drawing_agrees_with_compositing_without_tiles():
-    ours = time_render(load(benchmark_config("render.tile_capacity=256"), thin=1), 1, 200, 1)[0]
+def test_drawing_agrees_with_compositing_without_tiles(monkeypatch):
+    monkeypatch.setattr(comparisons, "MAX_PAIRS", 200 * 64 * 12)  # a line of four
+    ours, dense = time_render(load(benchmark_config("render.tile_capacity=256"), thin=1), 1, 200, 1)[:2]
     assert ours.facts["tile_overflow"] == 0 and ours.facts["color_error_999"] < 1e-3
+    assert dense.facts["drawn_lines"] == 12
 
 
 @pytest.mark.long

@@ -10,15 +10,18 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from hydra.types import RunMode
 from omegaconf import OmegaConf
 from own_process import run
 from tiny_run import CONF
+from tqdm import tqdm
 
 from emgs_jax.running.configure import compose, groups
 from experiments.cli import COMMANDS, main
-from experiments.command import check_arguments
+from experiments.command import check_arguments, check_missing, kept_words, nothing_left
 from experiments.evaluate import delegated
 from experiments.interrupt import clear_interrupt
 from experiments.report import positional
@@ -106,6 +109,23 @@ def test_the_help_of_a_command_names_its_keys_and_its_examples_are_ones(name, mo
         check_arguments(name, rewritten(words))
 
 
+@pytest.mark.parametrize("error", [SystemExit("error: no such file"), ZeroDivisionError("division by zero"), None])
+def test_the_log_of_a_job_has_the_consoles_words_and_how_it_failed(error, tmp_path, capsys):
+    logging = OmegaConf.create({"handlers": {"file": {"filename": str(tmp_path / "run.log")}}})
+    with pytest.raises(type(error)) if error else contextlib.nullcontext(), kept_words(logging):
+        print("Wände")
+        tqdm.write("a line")
+        if error:
+            raise error
+    assert capsys.readouterr().out == "Wände\na line\n"
+    first, second, *rest = (tmp_path / "run.log").read_text(encoding="utf-8").splitlines()
+    assert (first, second) == ("Wände", "a line") and bool(rest) == bool(error)
+    assert not error or str(error) in rest[-1]
+    with kept_words(OmegaConf.create({"handlers": {"console": {}}})):
+        print("nowhere")
+    assert capsys.readouterr().out == "nowhere\n" and {path.name for path in tmp_path.iterdir()} == {"run.log"}
+
+
 HELPS = """
 import contextlib, io, sys
 from experiments.cli import COMMANDS, main
@@ -129,6 +149,65 @@ def test_the_wrong_word_ends_a_command_with_one_line():
     done = run("experiments.run", "slam.em=paper")
     assert done.returncode == 1 and done.stderr.startswith("error: slam.em=paper would put a word")
     assert "Traceback" not in done.stderr
+
+
+def test_a_word_that_is_no_override_says_how_to_write_it():
+    for words in (["dataset.root=my", "folder"], ["dataset=images", "stop", "-m"]):
+        with pytest.raises(ValueError, match=r"is no KEY=VALUE: put a value with spaces into quotes.*emgs run --help"):
+            check_arguments("config", words)
+    check_arguments("config", ["--cfg", "job", "--package", "slam", "~hydra.run", "-m"])
+
+
+def test_what_has_to_be_given_is_named_with_the_command():
+    for name, key in (("view", "folder"), ("report", "folder"), ("export", "folder"), ("effects", "folder")):
+        with pytest.raises(ValueError, match=f"^{key} is not given .*: emgs {name} {key}=…$"):
+            check_missing(name, compose(name=name))
+    check_missing("view", compose("folder=x", name="view"))
+
+
+def test_a_choice_that_has_to_be_made_is_named_with_its_options():
+    with pytest.raises(ValueError, match="^features is not given: choose features= one of dinov2_text, dinov3_text"):
+        compose(name="embed")
+
+
+def test_options_of_a_folder_of_ones_own_are_options(tmp_path):
+    """`--config-dir` is in Hydra's help, and what stood in that folder was refused."""
+    (tmp_path / "dataset").mkdir()
+    (tmp_path / "dataset" / "mine.yaml").write_text("_target_: emgs_jax.data.images.Images\nroot: walk\n")
+    for option in (["--config-dir", str(tmp_path)], [f"--config-dir={tmp_path}"], ["-cd", str(tmp_path)]):
+        check_arguments("config", [*option, "dataset=mine", "dataset.root=other"])
+        with pytest.raises(ValueError, match="is no key of the config"):
+            check_arguments("config", [*option, "dataset=mine", "dataset.nothing=other"])
+    with pytest.raises(ValueError, match="--config-dir nowhere is no folder"):
+        check_arguments("config", ["--config-dir", "nowhere"])
+
+
+def test_a_command_that_comes_to_nothing_leaves_nothing(tmp_path, monkeypatch):
+    """Neither the folder that Hydra made nor those above it, up to where the user is."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "outputs" / "synthetic" / "now"
+    monkeypatch.setattr("experiments.command.HydraConfig", SimpleNamespace(get=lambda: hydra_of(folder)))
+    for kept in (None, "frames.jsonl"):
+        (folder / ".hydra").mkdir(parents=True)
+        (folder / "run.log").touch()
+        if kept:
+            (folder / kept).touch()
+        with pytest.raises(ValueError, match="wrong"), nothing_left():
+            raise ValueError("wrong")
+        assert tmp_path.exists() and folder.exists() == (kept is not None)
+        assert [path.name for path in tmp_path.iterdir()] == (["outputs"] if kept else [])
+
+
+def hydra_of(folder: Path) -> SimpleNamespace:
+    """What Hydra says of a run."""
+    return SimpleNamespace(runtime=SimpleNamespace(output_dir=str(folder)), mode=RunMode.RUN)
+
+
+def test_a_name_with_any_signs_is_read_and_a_run_of_nothing_leaves_nothing(tmp_path):
+    folder = tmp_path / "my runs" / "first"
+    done = run("experiments.run", "dataset=images", "dataset.root=Küche (1)", f"hydra.run.dir={folder}")
+    assert done.returncode == 1 and done.stderr.startswith("error: dataset.root=Küche (1) does not exist")
+    assert not folder.exists()
 
 
 @pytest.mark.parametrize("word", ["terminated", "interrupted"])

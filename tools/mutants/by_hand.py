@@ -2,10 +2,16 @@
 
 BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there instead, the bug
     (
-        "registration/problem",
-        "jnp.stack(uncertainty.pose), 3)",
-        "jnp.stack(uncertainty.pose[::-1]), 3)",
+        "registration/pose_noise",
+        "jnp.append(mean_depth, 1.0), 3,",
+        "jnp.append(1.0, mean_depth), 3,",
         "metres for radians",
+    ),
+    (
+        "registration/problem",
+        "scale_unit / uncertainty.common",
+        "uncertainty.common / scale_unit",
+        "worse is worth more",
     ),
     ("registration/problem", "rays @ T.rotation().as_matrix().T", "rays", "rays stay in the camera's frame"),
     (
@@ -19,12 +25,6 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
         "scale_translation(raw_current.inverse() @ raw_newest, scale)",
         "raw_current.inverse() @ raw_newest",
         "the newest pose without its scale",
-    ),
-    (
-        "localization",
-        "coarse.depth_noise * coarse.mean_depth, coarse.depth_noise",
-        "coarse.depth_noise, coarse.depth_noise",
-        "a fraction of the depth for metres",
     ),
     (
         "registration/pose_noise",

@@ -106,14 +106,18 @@ def compiles(mutant: Mutant) -> bool:
 
 @cache
 def importers() -> dict[str, set[str]]:
-    """For every file those that import it; tests also where they mention it."""
+    """For every file those that import it; tests also where they mention it or an option of conf/ that names it."""
     files = [*sources(), *(str(path.relative_to(ROOT)) for path in (ROOT / "tests").rglob("*.py"))]
     names = {file.removesuffix(".py").replace("/", "."): file for file in files}
     names |= {Path(file).stem: file for file in files if file.startswith("tests/")}
     found: dict[str, set[str]] = {file: set() for file in files}
+    options = targets()
     for file in files:
         source = (ROOT / file).read_text()
-        said = set(re.findall(r"\b(?:emgs_jax|experiments)(?:\.\w+)+", source)) if file.startswith("tests/") else set()
+        said = set()
+        if file.startswith("tests/"):
+            said |= set(re.findall(r"\b(?:emgs_jax|experiments)(?:\.\w+)+", source))
+            said |= {name for option in re.findall(r"[\w/]+=\w+", source) for name in options.get(option, ())}
         for node in ast.walk(ast.parse(source)):
             if isinstance(node, ast.Import):
                 said |= {alias.name for alias in node.names}
@@ -124,10 +128,23 @@ def importers() -> dict[str, set[str]]:
     return found
 
 
+def targets() -> dict[str, list[str]]:
+    """The modules of which an option of conf/ makes something, by its name (`prior=recorded`)."""
+    found = {}
+    for path in (ROOT / "conf").rglob("*.yaml"):
+        option = f"{path.parent.relative_to(ROOT / 'conf').as_posix()}={path.stem}"
+        found[option] = re.findall(r"_target_: (\w+(?:\.\w+)+)\.\w+", path.read_text())
+    return found
+
+
+def home(file: str) -> Path:
+    """Where the tests of a file stand."""
+    return Path("tests", *(Path(file).parent.parts[1:] if file.startswith("emgs_jax/") else ["scripts"]))
+
+
 def nearest_tests(file: str, reach: int) -> list[str]:
     """A file's own tests, then those that import it, directly or through `reach` - 1 others, the nearest first."""
-    folder = "/".join(Path(file).parent.parts[1:]) if file.startswith("emgs_jax/") else "scripts"
-    own = (ROOT / "tests" / folder).glob(f"test_{Path(file).stem}*.py")
+    own = (ROOT / home(file)).glob(f"test_{Path(file).stem}*.py")
     found = dict.fromkeys(sorted(str(path.relative_to(ROOT)) for path in own))
     seen = newest = {file}
     for _ in range(reach):

@@ -36,7 +36,7 @@ LIBRARIES = {"jnp", "np", "jax", "lax", "cv2", "sorted", "min", "max", "sum", "r
 WORDS = re.compile(r"print|(logging|log|logger|warnings|tqdm)\.\w+|\w+\.(set_description|set_postfix)")
 KEPT = {"dtype", "strict", "encoding", "precision", "length", "check", "text", "indent", "preferred_element_type"}
 SIZES = "__all__ GROUP CURVE_BITS BLOCK NUM_NEAR MIN_RUN MAX_POINTS _MERGE_ROWS _BAND_ROWS COLUMNS_AT_ONCE MAX_BYTES"
-SIZES = {*SIZES.split(), *("NUM_SIZES", "WORDS_AT_ONCE")}
+SIZES = {*SIZES.split(), *("NUM_SIZES", "WORDS_AT_ONCE", "LEAST_LISTED")}
 SCENERY = re.compile(r"emgs_jax/data/(plan|furniture|furnishing|walks|looks|room)\.py")
 GUARD = (ast.Raise, ast.Return, ast.Continue)
 STATEMENTS = {ast.Expr: "pass", ast.AugAssign: "pass", ast.Break: "continue", ast.Continue: "break"}
@@ -200,10 +200,17 @@ def inside(node: ast.AST) -> Iterator[ast.AST]:
             pass
         case ast.AnnAssign(value=value):
             parts = [value] if value else []
-        case ast.Raise() | ast.Assert() | ast.JoinedStr() | ast.keyword(arg="axis" | "strict" | "exist_ok" | "high"):
+        case (
+            ast.Raise()
+            | ast.Assert()
+            | ast.JoinedStr()
+            | ast.keyword(arg="axis" | "strict" | "exist_ok" | "high" | "disable")
+        ):
             parts = []
         case ast.Assign(targets=[ast.Name(id=name)]) if name in SIZES:
             parts = []
+        case ast.Call(func=ast.Attribute(attr=name), args=[ast.Subscript(), *parts]) if name.endswith("s_like"):
+            pass  # whose shape is taken, and which row hardly ever has another
         case ast.Subscript(value=value, slice=index):  # its numbers have changes of their own
             parts = [value, *(index.elts if isinstance(index, ast.Tuple) else [index])]
             parts = [part for part in parts if not re.fullmatch(r"-?\d+", ast.unparse(part))]

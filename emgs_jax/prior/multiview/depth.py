@@ -25,7 +25,7 @@ class DepthConfig(eqx.Module):
         min_margin: by which the aggregated cost of any plane that is not next to the best must exceed the best's.
         temperature: aggregated cost above the best's at which a plane is 1/e as plausible.
         median_radius: half the side of the window whose median replaces a depth: removes speckle, keeps edges.
-        max_depth_step: two views agree where their depths differ by at most this fraction.
+        depth_step: of the depths of two views, as a fraction: where they differ by so much they agree by 1/e.
     """
 
     sweep: SweepConfig
@@ -34,7 +34,7 @@ class DepthConfig(eqx.Module):
     min_margin: Float[Array, "*b"] = traced(low=0)
     temperature: Float[Array, "*b"] = traced(low=1e-6)
     median_radius: int = static(low=0, high=32)
-    max_depth_step: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    depth_step: Float[Array, "*b"] = traced(low=1e-6)
 
 
 def _between_planes(total: Float[Array, "h w d"], best: Array) -> Float[Array, "h w"]:
@@ -104,14 +104,14 @@ def estimate_depth(
 
 
 @full_precision
-def count_agreeing(
+def agreement(
     depth: Float[Array, "h w"],
     others: Float[Array, "s h w"],
     T_other_reference: jaxlie.SE3,
     camera: Camera,
     config: DepthConfig,
 ) -> Float[Array, "h w"]:
-    """How many other views' depth maps confirm each depth; 0 where there is none.
+    """How many other views' depth maps confirm each depth, each by exp(-difference / `depth_step`); 0 without a depth.
 
     Args:
         depth: of the view, m; 0 = none.
@@ -127,6 +127,8 @@ def count_agreeing(
         pixels, seen_depth = project(camera, points @ T.rotation().as_matrix().T + T.translation())
         index, inside = nearest_pixel(pixels, other.shape)
         there = other.reshape(-1)[index]
-        return inside & (depth > 0) & (there > 0) & (jnp.abs(seen_depth - there) <= config.max_depth_step * there)
+        is_seen = inside & (depth > 0) & (there > 0)
+        difference = jnp.abs(seen_depth / jnp.where(is_seen, there, 1.0) - 1.0)
+        return jnp.where(is_seen, jnp.exp(-difference / config.depth_step), 0.0)
 
-    return jnp.sum(jax.vmap(agrees)(T_other_reference.wxyz_xyz, others).astype(jnp.float32), axis=0)
+    return jnp.sum(jax.vmap(agrees)(T_other_reference.wxyz_xyz, others), axis=0)

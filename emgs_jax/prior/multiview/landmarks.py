@@ -22,6 +22,7 @@ class MatchingConfig:
     Args:
         num_features: at most, in one image.
         min_contrast: of a keypoint (SIFT).
+        magnification: of the image before its keypoints are looked for.
         max_ratio: distance to the best descriptor over that to the second (Lowe, IJCV 2004).
         max_epipolar_error: of a match that fits the essential matrix.
         max_reprojection_error: of an observation that fits its landmark.
@@ -34,6 +35,7 @@ class MatchingConfig:
 
     num_features: int = number(low=1)
     min_contrast: float = number(low=0, high=1)
+    magnification: int = number(low=1, high=8)
     max_ratio: float = number(low=0, high=1)
     max_epipolar_error: float = number(low=0, high=1000)
     max_reprojection_error: float = number(low=0, high=1000)
@@ -97,7 +99,7 @@ class Structure:
 
 def detect(gray: np.ndarray, config: MatchingConfig) -> View:
     """The keypoints of an image (h, w) uint8, without landmarks and not placed."""
-    pixels, descriptors = sift.detect(gray, config.num_features, config.min_contrast)
+    pixels, descriptors = sift.detect(gray, config.num_features, config.min_contrast, config.magnification)
     return View(pixels, descriptors, np.full(len(pixels), NONE))
 
 

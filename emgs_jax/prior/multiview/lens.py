@@ -54,10 +54,12 @@ def grid(height: int, width: int) -> Float[np.ndarray, "h w 2"]:
     return np.stack(np.meshgrid(np.arange(float(width)), np.arange(float(height))), axis=-1)
 
 
-def rectify(image: Float[np.ndarray, "h w"], lens: Lens) -> Float[np.ndarray, "h w"]:
-    """The image as a pinhole camera sees it; its border goes on where the lens shows nothing."""
-    x, y = np.moveaxis(np.float32(distort(grid(*image.shape), lens)), -1, 0)
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+def rectify(images: Float[np.ndarray, "*b h w"], lens: Lens) -> Float[np.ndarray, "*b h w"]:
+    """Images as a pinhole camera sees them; their border goes on where the lens shows nothing."""
+    x, y = np.moveaxis(np.float32(distort(grid(*images.shape[-2:]), lens)), -1, 0)
+    single = images.reshape(-1, *x.shape)
+    found = [cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for image in single]
+    return np.stack(found).reshape(images.shape)
 
 
 def as_shown(values: Float[np.ndarray, "h w"], lens: Lens) -> Float[np.ndarray, "h w"]:

@@ -74,7 +74,7 @@ def fit_plane(
     on_plane = np.abs(planes @ pixels.T - inverse) <= config.tolerance
     chosen = on_plane[on_plane.sum(axis=1).argmax()]
     for _ in range(2):  # least squares of those that support it, then of those that support that
-        plane = np.linalg.lstsq(pixels[chosen], inverse[chosen], rcond=None)[0]
+        plane = np.linalg.lstsq(pixels[chosen], inverse[chosen])[0]
         chosen = np.abs(pixels @ plane - inverse) <= config.tolerance
     return plane, chosen
 

@@ -2,13 +2,9 @@
 
 Structure from motion of the window gives the poses, a plane sweep against some of the other views the depth, and the
 matches on a blank region its plane (`planar.py`). What was found for an image (keypoints, matches, depth) is kept while
-the image is in the window, so the windows of a sequence must be asked for in order. The confidence of a depth is
-
-    1 + n exp(-spread / tolerated_spread),
-
-n the views whose own depth confirms it, `spread` how far plausible planes of its cost curve lie from the best (see
-`estimate_depth`), or by how much the plane of a blank region is uncertain (see `fill_planes`): 1 where nothing is
-known, more the smaller the expected error is.
+the image is in the window, so the windows of a sequence must be asked for in order. The current image is in the middle
+of its window, so its depth is matched, and compared with that of other views, on both sides. The confidence of a depth
+is 1 + the probability that it is right (`confidence.py`): 1 where nothing is known.
 
 The frame is that of the first image that could be placed (image 0, unless the camera rests at first), and the scale
 that of its window, which is fixed by `median_depth`; images alone do not tell it. The radial distortion of the lens is
@@ -18,7 +14,6 @@ Where the camera has lost all that the structure knows, the newest views begin a
 its own. What is known of the views before is of no use then: they have no pose any more, the anchor included.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
@@ -35,7 +30,8 @@ from emgs_jax.keypoints.poses import calibration
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
-from emgs_jax.prior.multiview.depth import DepthConfig, count_agreeing, estimate_depth
+from emgs_jax.prior.multiview.confidence import ConfidenceConfig, probability
+from emgs_jax.prior.multiview.depth import DepthConfig, agreement, estimate_depth
 from emgs_jax.prior.multiview.incremental import StructureConfig, extend
 from emgs_jax.prior.multiview.initialization import begin_again, initialize
 from emgs_jax.prior.multiview.keys import kept, key_views
@@ -45,7 +41,7 @@ from emgs_jax.prior.multiview.planar import PlanarConfig, fill_planes
 from emgs_jax.prior.multiview.sources import choose, parallax
 
 jitted_depth = eqx.filter_jit(estimate_depth)
-jitted_agreeing = eqx.filter_jit(count_agreeing)
+jitted_agreement = eqx.filter_jit(agreement)
 
 
 @dataclass(frozen=True)
@@ -55,21 +51,21 @@ class DenseConfig:
     Args:
         depth: matching and acceptance.
         planar: blank regions that become planes.
+        confidence: how probable a depth is.
         num_sources: views that it is matched against.
         best_parallax_rad: between the rays of a landmark, beyond which more is no better.
         num_checks: views whose depth is compared with it.
-        tolerated_spread: planes, see `estimate_depth`; more discounts what the other views confirm by e.
-        min_support: number of other views, discounted so, that must confirm a depth: it is the confidence above 1.
+        min_probability: of a depth that is given.
         depth_margin: the range of depths that is tried goes beyond the landmarks' by this factor.
     """
 
     depth: DepthConfig
     planar: PlanarConfig
+    confidence: ConfidenceConfig
     num_sources: int = number(low=1, high=64)
     best_parallax_rad: float = number(low=1e-6, high=4)
     num_checks: int = number(low=0, high=64)
-    tolerated_spread: float = number(low=1e-6)
-    min_support: float = number(low=0)
+    min_probability: float = number(low=0, high=1)
     depth_margin: float = number(low=1, high=1000)
 
 
@@ -77,6 +73,16 @@ def _values(config: StructureConfig | DenseConfig) -> dict:
     """What a config was given, as JSON holds it: a device's .1 is .1 again, and infinity is null."""
     given = jax.tree.map(lambda v: float(str(np.float32(v))) if isinstance(v, jax.Array) else v, asdict(config))
     return jsonable(given)
+
+
+def tried_depths(z: np.ndarray, margin: float) -> np.ndarray:
+    """The nearest and the farthest depth that is tried: of all landmarks but a hundredth at either end, and a margin.
+
+    Args:
+        z: depths of those that a view shows, m.
+        margin: factor by which the range goes beyond theirs.
+    """
+    return np.float32([np.percentile(z, 1) / margin, np.percentile(z, 99) * margin])
 
 
 class MultiviewStereo(Prior):
@@ -92,13 +98,19 @@ class MultiviewStereo(Prior):
     def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:
         self._structure_config, self._dense_config = structure, dense
         settings = {"structure": _values(structure), "dense": _values(dense)}
-        self.provenance = Provenance("multiview_stereo", {"version": 6} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 7} | settings)
         self._next = 0
         self._structure = Structure(np.eye(3))
 
+    def num_newer(self, window_size: int) -> int:
+        """Half of the window, so that a depth is matched with views on both sides: a third of it and what checks it."""
+        return max(window_size // 2, 1)
+
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Raise ValueError where a window has too few images to confirm a depth."""
-        least = 1 + max(math.ceil(self._dense_config.min_support), 1)
+        confidence = self._dense_config.confidence
+        best = max(confidence.photo) * np.array(confidence.geo)
+        least = 1 + max(int(np.sum(best < self._dense_config.min_probability)), 1)
         if window_size < least:
             raise ValueError(f"multiview_stereo compares at least {least} images, got slam.window_size={window_size}")
 
@@ -147,8 +159,8 @@ class MultiviewStereo(Prior):
         elif initialize(self._structure, *given):
             self._has_begun = True
         if self._structure.distortion != distortion:
-            lens = self._structure.lens()
-            self._grays = {frame: rectify(shown, lens) for frame, shown in self._shown.items()}
+            grays = rectify(np.stack([*self._shown.values()]), self._structure.lens())
+            self._grays = dict(zip(self._shown, grays, strict=True))
 
     def _forget(self, window: Window) -> None:
         config = self._structure_config.keys
@@ -177,13 +189,14 @@ class MultiviewStereo(Prior):
 
     def _answer(self, window: Window) -> PriorPrediction:
         placed, lens = self._structure.placed(), self._structure.lens()
-        for frame in window.dense:
+        ahead = range(window.current + 1, (window.current + window.views[-1]) // 2 + 1)  # which confirm it
+        for frame in (*window.dense, *ahead):
             if frame not in self._depths or not self._depths[frame].any():  # it may have been placed since
                 self._depths[frame], self._spreads[frame] = self._depth(frame)
         confidence = np.stack([as_shown(self._confidence(frame), lens) for frame in window.dense])
         confidence = np.maximum(confidence, 1.0)
         depth = np.stack([as_shown(self._depths[frame], lens) for frame in window.dense])
-        mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_support)
+        mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_probability)
         points = points_shown(np.where(mask, depth, 0.0), lens).astype(np.float32)
         features = np.zeros((*mask.shape, 0), np.float16)
         T_anchor_view = np.full((len(window.views), 4, 4), np.nan)
@@ -206,8 +219,7 @@ class MultiviewStereo(Prior):
         z = z[z > 0]
         if not len(z):
             return nothing, nothing
-        margin = self._dense_config.depth_margin
-        depth_range = np.float32([np.percentile(z, 1) / margin, np.percentile(z, 99) * margin])
+        depth_range = tried_depths(z, self._dense_config.depth_margin)
         count = self._dense_config.num_sources
         is_used = np.arange(count) < len(sources)
         sources = (sources * count)[:count]
@@ -241,7 +253,7 @@ class MultiviewStereo(Prior):
         return choose(worth, self._dense_config.num_sources)
 
     def _confidence(self, frame: int) -> np.ndarray:
-        """One more than the views that confirm each depth, discounted by its spread."""
+        """One more than the probability that each depth is right."""
         placed, count = self._structure.placed(), self._dense_config.num_checks
         others = sorted((o for o in self._depths if o in placed and o != frame), key=lambda o: abs(o - frame))[:count]
         if frame not in placed or not others:
@@ -249,16 +261,14 @@ class MultiviewStereo(Prior):
         maps = np.zeros((count, *self._depths[frame].shape), np.float32)
         maps[: len(others)] = [self._depths[other] for other in others]
         others = (others * count)[:count]
-        agreeing = jitted_agreeing(
+        agreed = jitted_agreement(
             jnp.asarray(self._depths[frame]),
             jnp.asarray(maps),
             self._relative(others, frame),
             self._camera,
             self._dense_config.depth,
         )
-        return 1.0 + np.asarray(agreeing) * np.exp(
-            -self._spreads[frame] / np.float32(self._dense_config.tolerated_spread)
-        )
+        return 1.0 + probability(self._spreads[frame], np.asarray(agreed), self._dense_config.confidence)
 
     def _relative(self, others: Sequence[int], frame: int) -> jaxlie.SE3:
         """T_other_frame of several views."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from stereo_scene import arc, calibration, cloud, projected, structure_config, structure_of, views_of, whose
 
+from emgs_jax.keypoints.sift import mutual
 from emgs_jax.prior.multiview.landmarks import (
     NONE,
     View,
@@ -47,23 +48,37 @@ def tracks(structure):
     return found
 
 
-def test_blobs_are_detected_at_their_centres_with_unit_descriptors_and_a_blank_image_has_none(views):
+@pytest.mark.parametrize("magnification", [1, 2, 3])
+def test_blobs_are_detected_at_their_centres_with_unit_descriptors_and_a_blank_image_has_none(views, magnification):
     """Pixel centres are at integers, and the product of descriptors is a cosine."""
+    config = structure_config(f"prior.structure.matching.magnification={magnification}").matching
     y, x = np.mgrid[:48, :64]
     gray = np.zeros((48, 64))
     for u, v in ((20.0, 15.0), (40.25, 30.5)):
         gray += 200 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 2.5**2))
-    found = detect(np.uint8(gray), CONFIG).pixels
+    found = detect(np.uint8(gray), config).pixels
     for center in ((20.0, 15.0), (40.25, 30.5)):
         assert np.linalg.norm(found - center, axis=1).min() < 0.06
-    found = detect(np.uint8(np.random.default_rng(0).uniform(0, 255, (96, 128))), CONFIG)
+    found = detect(np.uint8(np.random.default_rng(0).uniform(0, 255, (96, 128))), config)
     assert len(found.descriptors) > 5 and found.descriptors.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1.0, rtol=1e-5)
-    blank = detect(np.full((48, 64), 128, np.uint8), CONFIG)
+    blank = detect(np.full((48, 64), 128, np.uint8), config)
     assert blank.pixels.shape == (0, 2) and blank.descriptors.shape == (0, 128) and blank.landmark.shape == (0,)
     few = views_of(cloud(CONFIG.min_matches - 1), arc(2))
     for pair in ((blank, views[0]), (views[0], blank), few):
         assert not len(match(*pair, calibration(), CONFIG)[0])
+
+
+def test_the_distinct_and_mutual_neighbours_are_those_of_a_sort():
+    rng = np.random.default_rng(0)
+    a, b = (np.float32(rows / np.linalg.norm(rows, axis=1, keepdims=True)) for rows in rng.uniform(size=(2, 40, 8)))
+    cosine, order = a @ b.T, np.argsort(-(a @ b.T), axis=1)
+    best, second = (np.take_along_axis(cosine, order[:, rank : rank + 1], axis=1)[:, 0] for rank in (0, 1))
+    is_match = (1 - best < 0.81 * (1 - second)) & (np.argsort(-cosine, axis=0)[0][order[:, 0]] == np.arange(40))
+    rows, nearest = mutual(a, b, max_ratio=0.9)
+    assert 3 < len(rows) < 40
+    np.testing.assert_array_equal(rows, np.flatnonzero(is_match))
+    np.testing.assert_array_equal(nearest, order[is_match, 0])
 
 
 def test_matches_are_right_and_the_same_from_either_side(views):

@@ -27,6 +27,9 @@ def test_distorting_and_straightening_undo_each_other_and_a_pinhole_changes_noth
         np.testing.assert_allclose(straight(distort(pixels, lens), lens), pixels, atol=0.01)
     gray, depth = plane_image(np.eye(4), 0.4)
     np.testing.assert_array_equal(rectify(gray, small_lens(0.0)), gray)
+    both = np.stack([gray, gray[::-1]])
+    one_by_one = [rectify(image, small_lens(0.1)) for image in both]
+    np.testing.assert_array_equal(rectify(both, small_lens(0.1)), one_by_one)
     np.testing.assert_array_equal(as_shown(depth, small_lens(0.0)), depth)
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from emgs_jax.io.spool import Spool
+from emgs_jax.data.spool import Spool
 
 
 def test_arrays_come_back_in_any_order_as_they_were_and_more_can_follow():

@@ -1,0 +1,70 @@
+"""Whether intrinsics can be those of the images, else what they may be: of other images, in another order or unit."""
+
+import math
+
+import numpy as np
+
+from emgs_jax.data.reading import Intrinsics, Size, resize_intrinsics
+
+USUAL_VIEW_DEG = 10.0, 150.0  # of lenses that a pinhole camera describes
+NARROWEST_VIEW_DEG = 2.0  # of a telescope
+MAX_OFFSET = 0.1  # of the principal point from the middle, of the side; lenses and mounts are off by some per cent
+MAX_ALIKE, ALIKE = 0.04, 0.012  # likewise where it is off by the same share of both sides, as in another resolution
+MAX_SQUEEZE = 0.1  # of fx / fy from 1: pixels are square, but images may have been squeezed
+FIT = 0.03  # another reading of the numbers fits where it comes so near to the middle and to square pixels
+
+
+def view_deg(intrinsics: Intrinsics, size: Size) -> tuple[float, float]:
+    """Horizontal and vertical angle of view in degrees, for a principal point in the middle."""
+    return tuple(math.degrees(2 * math.atan(size[i] / (2 * intrinsics[i]))) for i in (0, 1))
+
+
+def oddities(intrinsics: Intrinsics, size: Size) -> list[str]:
+    """What is unusual about a camera for images of that (width, height); empty where nothing is."""
+    found, views = [], view_deg(intrinsics, size)
+    for angle, side in zip(views, ("wide", "high"), strict=True):
+        if not USUAL_VIEW_DEG[0] <= angle <= USUAL_VIEW_DEG[1]:
+            found.append(f"the view is {angle:.3g} degrees {side}")
+    offsets = _offsets(intrinsics, size)
+    limit = MAX_ALIKE if abs(offsets[0] - offsets[1]) < ALIKE else MAX_OFFSET
+    for offset, side in zip(offsets, ("width", "height"), strict=True):
+        if abs(offset) > limit:
+            found.append(f"the principal point is {100 * abs(offset):.0f} % of the {side} from the middle")
+    if abs(math.log(intrinsics[0] / intrinsics[1])) > math.log1p(MAX_SQUEEZE):
+        found.append(f"pixels would not be square (fx / fy = {intrinsics[0] / intrinsics[1]:.3g})")
+    return found
+
+
+def is_impossible(intrinsics: Intrinsics, size: Size) -> bool:
+    """Whether no lens has such a view."""
+    views = view_deg(intrinsics, size)
+    return not (min(views) >= NARROWEST_VIEW_DEG and max(views) <= USUAL_VIEW_DEG[1])
+
+
+def other_reading(numbers: Intrinsics, size: Size) -> str | None:
+    """What four numbers would fit as, with the intrinsics that they then are; None where no other reading fits."""
+    (a, b, c, d), (w, h) = numbers, size
+    scaled = w / (2 * (c + 0.5))
+    readings = {
+        "normalised by width and height": (a * w, b * h, c * w - 0.5, d * h - 0.5),
+        "normalised by the width": (a * w, b * w, c * w - 0.5, d * w - 0.5),
+        "in the order fx, cx, fy, cy": (a, c, b, d),
+        "in the order cx, cy, fx, fy": (c, d, a, b),
+        "with cx and cy exchanged (of images that are turned)": (a, b, d, c),
+        f"of images of {w / scaled:.0f}x{h / scaled:.0f}": resize_intrinsics(numbers, (1, 1), (scaled, scaled)),
+    }
+    for reading, values in readings.items():
+        if min(values[:2]) > 0 and not np.allclose(values, numbers, rtol=FIT) and _fits(values, size):
+            return f"they fit as those {reading}: give [{', '.join(f'{value:.6g}' for value in values)}]"
+    return None
+
+
+def _offsets(intrinsics: Intrinsics, size: Size) -> tuple[float, float]:
+    """Of the principal point from the middle, as shares of width and height."""
+    return tuple((intrinsics[2 + i] + 0.5) / size[i] - 0.5 for i in (0, 1))
+
+
+def _fits(intrinsics: Intrinsics, size: Size) -> bool:
+    squeeze = abs(math.log(intrinsics[0] / intrinsics[1]))
+    is_central = np.abs(_offsets(intrinsics, size)).max() <= FIT
+    return bool(is_central and squeeze <= FIT and not is_impossible(intrinsics, size))

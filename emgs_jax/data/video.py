@@ -1,0 +1,86 @@
+"""The frames of a video file, as they can be read: what its header says of their number and rate is often wrong."""
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.reading import Size
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+
+
+class Video:
+    """A video, read from its beginning: seeking lands on a key frame nearby with many codecs, counting never does.
+
+    Args:
+        path: of the file.
+        stop: frames from there on are not wanted, and not counted; None = all.
+
+    Attributes:
+        count: frames that can be read, up to `stop`.
+        notes: where the header announces more frames than there are.
+    """
+
+    tones = None  # a decoder gives 8 bits
+
+    def __init__(self, path: Path, stop: int | None = None) -> None:
+        self._path, self.folder = path, path.parent
+        self._capture = self._open()
+        announced = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        self._times = _times(self._capture, stop)
+        self.count = self._next = len(self._times)  # _next: number of the frame that the capture gives next
+        is_short = math.isfinite(announced) and self.count < (announced if stop is None else min(announced, stop))
+        self.notes = [f"{path} announces {announced:.0f} frames, {self.count} can be read"] if is_short else []
+
+    def _open(self) -> cv2.VideoCapture:
+        capture = cv2.VideoCapture(str(self._path))
+        if not capture.isOpened():
+            raise ValueError(f"{self._path} is no video that OpenCV can open: convert it to mp4 (h264) or to images")
+        return capture
+
+    def find_size(self, rows: range) -> Size:
+        return self.read(rows[0]).shape[1::-1]
+
+    def read(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        if row < self._next:
+            self._capture, self._next = self._open(), 0
+        while self._next < row and self._capture.grab():
+            self._next += 1
+        is_read, image = self._capture.read() if self._next == row else (False, None)
+        if not is_read or image is None:
+            raise BadFrameError(
+                f"{self.label(row)} cannot be read, the video ends or is damaged after frame {self._next - 1}: "
+                f"set dataset.stop={self._next}"
+            )
+        self._next += 1
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+    def timestamp(self, row: int) -> float:
+        """Seconds since the beginning, at which the file shows the frame."""
+        return self._times[row]
+
+    def file(self, row: int) -> Path:
+        return self._path
+
+    def label(self, row: int) -> str:
+        return f"{self._path}, frame {row}"
+
+
+def _times(capture: cv2.VideoCapture, stop: int | None) -> list[float]:
+    """Seconds at which each frame is shown, read to the end or to `stop`.
+
+    The rate may change within a video, so a frame's number says nothing about its time. Where the file has no times
+    that ascend (a bare stream of h264) they are numbers of frames / its nominal rate, or numbers where it has none.
+    """
+    times = []
+    while (stop is None or len(times) < stop) and capture.grab():
+        times.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+    is_time = np.isfinite(times).all() and (np.diff(times) >= 0).all() and (len(times) < 2 or times[-1] > times[0])
+    if is_time:
+        return times
+    rate = capture.get(cv2.CAP_PROP_FPS)
+    return [row / (rate if math.isfinite(rate) and rate > 0 else 1.0) for row in range(len(times))]

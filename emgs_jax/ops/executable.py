@@ -1,0 +1,39 @@
+"""Functions that are compiled each by itself, and the one place that says how their executables are called."""
+
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import equinox as eqx
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+Call = Callable[..., Any]  # of a function made by `eqx.filter_jit`, and its arguments
+
+_call: ContextVar[Call] = ContextVar("_call", default=lambda jitted, *arguments: jitted(*arguments))
+
+
+def executable(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Decorate: `eqx.filter_jit` for positional arguments, called as `calling` says."""
+    jitted = eqx.filter_jit(function)
+
+    @wraps(function)
+    def run(*arguments: Arguments.args, **_: Arguments.kwargs) -> Result:
+        return _call.get()(jitted, *arguments)
+
+    return run
+
+
+@contextmanager
+def calling(call: Call) -> Generator[None]:
+    """Inside, and in this thread, `call(jitted, *arguments)` stands for `jitted(*arguments)` of every executable.
+
+    The host keeps executables from one process to the next by it, and lists what a step compiles before the first one.
+    """
+    before = _call.set(call)
+    try:
+        yield
+    finally:
+        _call.reset(before)

@@ -1,0 +1,84 @@
+"""Words of the command line for Hydra's grammar: what it cannot read as anything else is text, as it stands."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+
+KEY = re.compile(r"(?:\+{1,2}|~)?[A-Za-z_][\w./@:-]*=")
+NAMES = ("root", "sequence", "folder", "map", "out")  # keys whose values are names, though they may look like numbers
+OPENS = {"[": "]", "{": "}"}
+
+
+def readable(arguments: Sequence[str]) -> list[str]:
+    """The words with every `key=value` quoted that means something else to Hydra, or nothing.
+
+    A value is text where there is such a file or folder, and where the grammar has no place for its signs: spaces with
+    brackets, `=`, letters beyond ASCII. A list that a shell has cut at its spaces is put together.
+    """
+    return [_readable(word) if KEY.match(word) else word for word in joined(arguments)]
+
+
+def joined(arguments: Sequence[str]) -> list[str]:
+    """`key=[1, 2]` as one word where it came as two; what is never closed stays as it is."""
+    words: list[str] = []
+    rest = [*arguments]
+    while rest:
+        word, rest = rest[0], rest[1:]
+        if _is_open(word):
+            ends = [n for n in range(1, len(rest) + 1) if not _is_open(" ".join([word, *rest[:n]]))]
+            count = ends[0] if ends else 0
+            word, rest = " ".join([word, *rest[:count]]), rest[count:]
+        words.append(word)
+    return words
+
+
+def _is_open(word: str) -> bool:
+    """Whether the value of an override is a list or mapping without its end."""
+    value = word[found.end() :] if (found := KEY.match(word)) else ""
+    closing = OPENS.get(value[:1])
+    return closing is not None and value.count(value[0]) > value.count(closing)
+
+
+def parsed(word: str) -> Override | None:
+    """What Hydra reads; None where it reads nothing."""
+    try:
+        return OverridesParser.create().parse_override(word)
+    except HydraException:
+        return None
+
+
+def _readable(word: str) -> str:
+    key = KEY.match(word)[0]
+    value, found = word[len(key) :], parsed(word)
+    if found is None:
+        items = value.split(",")
+        if len(items) > 1 and not _is_there(value) and all(map(_is_there, items)):  # of a multirun
+            return f"{key}{','.join(map(quoted, items))}"
+        whole = f"{key}{_quoted_items(value)}" if value[:1] + value[-1:] == "[]" and not _is_there(value) else ""
+        return whole if whole and parsed(whole) is not None else f"{key}{quoted(value)}"
+    is_number = key[:-1].rpartition(".")[2] in NAMES and isinstance(found.value(), int | float | bool)
+    return f"{key}{quoted(value)}" if is_number or (_is_there(value) and found.value() != value) else word
+
+
+def _is_there(value: str) -> bool:
+    """Whether there is a file or folder of that name."""
+    try:
+        return value != "" and value == value.strip("\"'") and Path(value).expanduser().exists()
+    except (OSError, ValueError):  # too long, or with a zero byte
+        return False
+
+
+def _quoted_items(value: str) -> str:
+    """A list whose items are quoted where Hydra does not read them."""
+    items = (item.strip() for item in value[1:-1].split(","))
+    return f"[{','.join(item if parsed(f'x=[{item}]') is not None else quoted(item) for item in items)}]"
+
+
+def quoted(value: str) -> str:
+    """Text as Hydra's grammar takes it literally: only quotes, and backslashes before them, need a backslash."""
+    escaped = re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), value)
+    return f"'{escaped}'"
