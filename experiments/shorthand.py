@@ -57,11 +57,12 @@ def frame_size(width: int, height: int) -> tuple[int, int]:
 
 def _look(path: Path) -> tuple[tuple[int, int], str]:
     """The size of frames, and `exif` where the first image says its focal length, else `estimate`."""
-    from emgs_jax.data.images import VIDEO_SUFFIXES, Folder, Video
+    from emgs_jax.data.images import Folder
     from emgs_jax.data.intrinsics import exif_focal_length
+    from emgs_jax.data.video import VIDEO_SUFFIXES, Video
 
     if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
-        return frame_size(*Video(path).find_size(range(1))), "estimate"
+        return frame_size(*Video(path, 1).find_size(range(1))), "estimate"
     images = Folder(path)
     if images.count == 0:
         raise ValueError(f"{path} has no images, and is no video")

@@ -32,6 +32,7 @@ from jax.experimental import serialize_executable
 from emgs_jax.running.executable_files import described, read, rebuilt, remove, write
 
 PACKAGES = ("jax", "jaxlib", "equinox", "jaxlie", "optimistix", "lineax", "numpy")
+FORMAT = 2  # of entries; 1 had executables of arguments of other shapes
 ROOT = Path(__file__).parents[1]
 COMPILED = "/jax/core/compile/backend_compile_duration"
 # Defaults, but executables that are asked for with one of them are others to JAX's cache: what was taken from there
@@ -112,7 +113,8 @@ def _compile(function: Callable, arguments: tuple, digest: str) -> Callable:
     """The executable of a new entry: that of the same program in another entry, or compiled and kept."""
     lowered = function.lower(*arguments)
     outputs, text = eqx.filter_eval_shape(function, *arguments), lowered.as_text()
-    program = _hash(*_machine(), text, *_used(lowered, digest))
+    shapes = [_about(leaf) for leaf in _arrays(arguments)]  # of those it does not take, too: each call checks them
+    program = _hash(*_machine(), text, *_used(lowered, digest), shapes)
     found = _runnable(program, arguments, outputs)
     if found is None:
         found, is_new = _compiled(lowered)
@@ -195,7 +197,7 @@ def _digest(function: Callable, tree: Any, about: tuple) -> str:
     named = function.__wrapped__
     inside = {name: getattr(jax.config, name, value) for name, value in jax.config.values.items()}  # of `with`
     settings = [f"{name}={inside[name]}" for name in sorted(inside) if "cache" not in name]
-    return _hash(*_machine(), *settings, *_source(named.__module__), named.__qualname__, tree, about)
+    return _hash(FORMAT, *_machine(), *settings, *_source(named.__module__), named.__qualname__, tree, about)
 
 
 def _hash(*parts: object) -> str:

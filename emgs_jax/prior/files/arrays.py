@@ -8,7 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from emgs_jax.data.reading import decode, is_rigid, natural_key
+from emgs_jax.data.file_names import natural_key
+from emgs_jax.data.reading import decode, is_rigid
 from emgs_jax.io.npz import npz_names, read_npz
 from emgs_jax.prior.files.view import Intrinsics, View, usable
 

@@ -4,12 +4,11 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import jax
 import numpy as np
 import pytest
 import tiny_run
-from written_predictions import KEYS, Named, asked, by_frame, truth, write_npz
+from written_predictions import KEYS, NAMES, Named, asked, by_frame, truth, write_depths, write_npz
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.io.trajectory import save_trajectory_tum
@@ -19,7 +18,6 @@ from emgs_jax.prior.files.view import Camera, View, at_frame, whole_image
 from emgs_jax.running import configure
 from experiments.command import check_arguments
 
-NAMES = Named().names
 SIZE = (48, 64)
 
 
@@ -61,21 +59,6 @@ def test_every_window_says_the_same_of_a_frame_and_poses_are_relative_to_the_anc
         np.testing.assert_array_equal(prediction.points, expected[list(prediction.window.dense)].astype(np.float32))
         assert prediction.features.shape == (len(prediction.window.dense), *SIZE, 0)
         assert prediction.confidence.dtype == np.float32 and np.all(prediction.confidence == 1)
-
-
-def write_depths(folder: Path, suffix: str) -> None:
-    folder.mkdir()
-    for name, frame in zip(NAMES, truth(), strict=True):
-        path = folder / f"{name}{suffix}"
-        if suffix == ".png":
-            cv2.imwrite(str(path), np.rint(frame.depth * 1000).astype(np.uint16))
-        elif suffix == ".npy":
-            np.save(path, frame.depth)
-        else:
-            openexr = pytest.importorskip("OpenEXR")
-            header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-            with openexr.File(header, {"Z": frame.depth}) as file:
-                file.write(str(path))
 
 
 def write_poses(folder: Path, suffix: str, **more) -> None:
@@ -206,97 +189,6 @@ def test_what_was_found_is_one_line_and_says_by_how_much_focal_lengths_differ(tm
         asked(write_npz(tmp_path / "no", NAMES, intrinsics=lambda f: [fx, fy, cx]))
     asked(far)
     assert "dataset.intrinsics times 1.100 would agree" in capsys.readouterr().out
-
-
-def matrix(frame, **scaled):
-    pose = frame.T_world_camera.copy()
-    pose[:3, 3] *= scaled.get("unit", 1)
-    pose[:3, :3] *= scaled.get("turn", 1)
-    return pose
-
-
-FAULTS = {
-    "no poses": ({"T_world_camera": None}, r"IMG_8.npz lacks T_world_camera; it has depth.*multiview_stereo"),
-    "neither": ({"depth": None}, r"IMG_8.npz must have depth or points, one of them; it has T_world_camera"),
-    "a row": ({"depth": lambda f: f.depth.ravel()}, r"IMG_8.npz: depth must be \(h, w\), got \(3072,\)"),
-    "cropped": ({"depth": lambda f: f.depth[:, :30]}, r"IMG_8.npz: depth is 30x48 .* must show the whole image"),
-    "mm": ({"depth": lambda f: f.depth * 1000}, r"IMG_8.npz: depth has a median of \d+, which is no depth in metres"),
-    "no rotation": ({"T_world_camera": lambda f: matrix(f, turn=2)}, r"IMG_8.npz: T_world_camera is no rigid motion"),
-    "poses in mm": (
-        {"T_world_camera": lambda f: matrix(f, unit=1000)},
-        r"T_world_camera of .*own/\*\.npz: the depths of two views .* are taken as in mill",
-    ),
-    "inverse": (
-        {"T_world_camera": lambda f: np.linalg.inv(f.T_world_camera)},
-        "are taken as world -> camera: expected are camera -> world",
-    ),
-    "OpenGL": (
-        {"T_world_camera": lambda f: f.T_world_camera * [1, -1, -1, 1]},
-        "are taken as camera -> world of OpenGL's axes",
-    ),
-    "probabilities": (
-        {"confidence": lambda f: np.full(SIZE, 0.3)},
-        r"IMG_8.npz: depth: confidence must be at least 1 .* is 0.3: .* give 1 \+ confidence",
-    ),
-    "confidence of another size": (
-        {"confidence": lambda f: np.ones((4, 5))},
-        r"confidence must be numbers \(48, 64\)",
-    ),
-    "intrinsics of the image": ({"intrinsics": lambda f: [999, 999, 320, 240]}, r"own size \(64x48\)"),
-    "nothing to see": ({"depth": lambda f: f.depth * np.nan}, "none of its 6 files has a depth above 0"),
-    "never known": ({"T_world_camera": lambda f: np.full((4, 4), np.nan)}, "none of 6 is known"),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_what_is_wrong_is_named_with_file_and_key(fault, tmp_path):
-    changes, message = FAULTS[fault]
-    with pytest.raises(ValueError, match=message):
-        asked(write_npz(tmp_path / "own", NAMES, **changes))
-
-
-def test_a_file_that_is_missing_too_many_or_no_file_at_all_is_named(own, tmp_path):
-    with pytest.raises(ValueError, match=r"does not exist: give the folder"):
-        asked(tmp_path / "nowhere")
-    with pytest.raises(ValueError, match=r"has no file \*.npz, \*.exr"):
-        asked(tmp_path)
-    with pytest.raises(ValueError, match=r"has 6 predictions \(IMG_8 ...\) and the data set 5 frames \(a ...\)"):
-        asked(own, Named(names=["a", "b", "c", "d", "e"]))
-    (own / "IMG_9.npz").unlink()
-    with pytest.raises(ValueError, match=r"has no file for 1 of 6 frames, the first is IMG_9"):
-        asked(own)
-    (own / "IMG_9.npz").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"IMG_9.npz: .*; it has nothing"):
-        asked(own)
-
-
-def test_a_list_of_poses_of_another_length_or_without_a_name_is_named(tmp_path):
-    folder = tmp_path / "images"
-    write_depths(folder, ".npy")
-    with pytest.raises(
-        ValueError, match=r"has 6 files \*.npy and neither of poses.txt, poses.json: .*multiview_stereo"
-    ):
-        asked(folder)
-    save_trajectory_tum(folder / "poses.txt", range(5), [np.eye(4)] * 5)
-    with pytest.raises(ValueError, match=r"poses.txt has 5 poses for 6 files"):
-        asked(folder)
-    (folder / "poses.txt").unlink()
-    (folder / "poses.json").write_text('{"T_world_camera": {"IMG_8": null}}')
-    with pytest.raises(ValueError, match=r"poses.json lacks T_world_camera of 5 of 6 files, first IMG_9"):
-        asked(folder)
-
-
-@pytest.mark.parametrize(
-    ("keys", "message"),
-    [
-        ({"scale": "relative"}, "prior.scale must be one of auto, metric, arbitrary"),
-        ({"median_depth": 0.0}, "prior.median_depth must be above 0 m"),
-        ({"depth_scale": 0.0}, "prior.depth_scale must be raw units per metre"),
-    ],
-)
-def test_a_key_without_sense_is_named(keys, message, own):
-    with pytest.raises(ValueError, match=message):
-        Files(own, **(KEYS | keys))
 
 
 def test_the_script_of_the_documentation_writes_what_the_prior_reads(tmp_path, monkeypatch):

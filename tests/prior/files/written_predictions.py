@@ -3,7 +3,9 @@
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
+import pytest
 import tiny_run
 
 from emgs_jax.data.base import Frame
@@ -39,6 +41,9 @@ class Named:
         return " ".join(self.names)
 
 
+NAMES = Named().names
+
+
 @cache
 def truth() -> list[Frame]:
     return [tiny_run.dataset()[index] for index in range(tiny_run.NUM_FRAMES)]
@@ -69,3 +74,18 @@ def by_frame(predictions: list[PriorPrediction]) -> dict[int, tuple[np.ndarray, 
         for prediction in predictions
         for row, index in enumerate(prediction.window.dense)
     }
+
+
+def write_depths(folder: Path, suffix: str) -> None:
+    folder.mkdir()
+    for name, frame in zip(NAMES, truth(), strict=True):
+        path = folder / f"{name}{suffix}"
+        if suffix == ".png":
+            cv2.imwrite(str(path), np.rint(frame.depth * 1000).astype(np.uint16))
+        elif suffix == ".npy":
+            np.save(path, frame.depth)
+        else:
+            openexr = pytest.importorskip("OpenEXR")
+            header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+            with openexr.File(header, {"Z": frame.depth}) as file:
+                file.write(str(path))
