@@ -47,6 +47,8 @@ class Session:
         for test in tests:
             begin = time.monotonic()
             killer = self._failure(tree, test, mutant, source)
+            if killer is None:
+                continue
             self._keep(found, test, killer, round(time.monotonic() - begin, 1))
             if killer:
                 break
@@ -69,8 +71,8 @@ class Session:
             seconds = {test: took for one in self._known.values() for test, (_, took) in one["passed"].items()}
         return sorted(tests, key=lambda test: (Path(test).parent != home(mutant.file), seconds.get(test, UNKNOWN_S)))
 
-    def _failure(self, tree: Tree, test: str, mutant: Mutant, source: str) -> str:
-        """The first test of a file that fails with the change and passes without it; empty where there is none."""
+    def _failure(self, tree: Tree, test: str, mutant: Mutant, source: str) -> str | None:
+        """The first test of a file that fails with the change; empty where all pass, None where it fails without."""
         tree.write(mutant.file, changed(source, mutant.edit))
         failure = tree.failure(test)
         tree.write(mutant.file, source)
@@ -79,7 +81,7 @@ class Session:
             return failure
         if tree.failure(failure if "::" in failure else test):
             print(f"left out, as it fails without a change: {failure}", flush=True)
-            return ""
+            return None
         self._sound.add(failure)
         return failure
 
