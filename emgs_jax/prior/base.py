@@ -122,7 +122,8 @@ def windows(num_frames: int, window_size: int, num_newer: int = 1) -> Iterator[W
 
     A step sees the anchor, the current image, the `num_newer` after it, as far as the sequence has them, and those
     before it, `window_size` + 2 in all; an image is never listed twice. So with more newer images the windows are the
-    same, and the current image is an older one of them; the last images of a sequence have fewer after them.
+    same, and the current image is an older one of them; the last images of a sequence have fewer after them, and one
+    less in all.
     """
     if not isinstance(window_size, int) or window_size < 1:
         raise ValueError(f"slam.window_size must be a whole number of images, 1 or more, got {window_size}")
@@ -133,7 +134,7 @@ def windows(num_frames: int, window_size: int, num_newer: int = 1) -> Iterator[W
     if first:
         yield Window(0, first, dense, dense[-1])
     for inference, current in enumerate(range(len(dense), num_frames), start=1):
-        newest = current + num_newer
+        newest = min(current + num_newer, num_frames)
         recent = range(max(newest - window_size - 1, 0), min(newest + 1, num_frames))
         yield Window(inference, tuple(dict.fromkeys((0, *recent))), (current - 1, current), current)
 

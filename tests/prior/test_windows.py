@@ -30,7 +30,7 @@ def test_with_more_newer_images_the_windows_are_the_same_and_the_current_one_is_
     later = num_newer - 1
     assert [call.current + later for call in more[: len(one) - 1]] == [call.current for call in one[:-1]]
     assert more[0].dense == tuple(range(4 - later))
-    assert more[-1].views == (0, *range(12 - 5 + num_newer - 1, 12)), "the last ones have fewer after them"
+    assert all(call.views == one[-1].views for call in more[len(one) - 1 :]), "the last ones have fewer after them"
     with pytest.raises(ValueError, match="a window of 4 images cannot have 5 after the current one"):
         list(windows(12, 4, 5))
 
