@@ -191,7 +191,7 @@ def _composite_forward(_, drawn: Any, lists: TileLists, pixels: Array, front: An
 @composite.def_bwd
 @full_precision
 def _composite_backward(
-    sums: Sums, slopes: Sums, _, drawn: Any, lists: TileLists, pixels: Array, front: Any
+    sums: Sums, slopes: Any, _, drawn: Any, lists: TileLists, pixels: Array, front: Any
 ) -> PyTree[Array]:
     """Visit the chunks once more, so that nothing need be kept of them, as 3DGS does.
 
