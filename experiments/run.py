@@ -66,16 +66,17 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             session = new_run(dataset, slam, clock, graph=graph, saved=saved)
             watched = build(config, "view") if config.view else None
             live = stack.enter_context(live_view(watched, session, densify.render, prior, dataset.kept))
-        baselines = Baselines(fused, session, dataset)
-        settings = OmegaConf.to_container(config, resolve=True)
-        origin = provenance(settings, dataset, prior.provenance)
-        if saved is not None:
-            origin["map"] = saved.checksum
-        keeper = Keeper(folder / CHECKPOINT_FILE, build(config, "checkpoint"), signature(origin))
+            baselines = Baselines(fused, session, dataset)
+            settings = OmegaConf.to_container(config, resolve=True)
+            origin = provenance(settings, dataset, prior.provenance)
+            if saved is not None:
+                origin["map"] = saved.checksum
+            keeper = Keeper(folder / CHECKPOINT_FILE, build(config, "checkpoint"), signature(origin))
         for note in [*filter(None, [keeper.note]), *claim_folder(folder, keeper.found is not None)]:
             tqdm.write(note)
         raw = _map(session, dataset, prior, (baselines, evaluation), folder, keeper, live)
-        save_progress(folder, session)
+        with clock.phase("export"):
+            save_progress(folder, session)
         with _said(clock, "densify", "drawing the map from the pose of every frame"):
             labelled = labelled_map(session, prior)
             dense = dense_map(session, dataset, densify, evaluation, labelled)
