@@ -20,7 +20,9 @@ def executable(function: Callable[Arguments, Result]) -> Callable[Arguments, Res
     jitted = eqx.filter_jit(function)
 
     @wraps(function)
-    def run(*arguments: Arguments.args, **_: Arguments.kwargs) -> Result:
+    def run(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+        if named:
+            raise TypeError(f"{jitted} takes its arguments by position, not {', '.join(named)}")
         return _call.get()(jitted, *arguments)
 
     return run
