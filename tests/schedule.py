@@ -30,6 +30,8 @@ GROUPS = {
 # What the quick subset (-m "not slow") takes nothing of, beside the marked tests: some five CPU seconds and more each.
 SLOW = {
     "data/test_apartment.py",
+    "features/test_dino.py",
+    "features/test_dinotxt.py",
     "graph/test_graph_optimize.py",
     "loops/test_verification.py",
     "ops/test_neighbours.py",

@@ -133,6 +133,7 @@ def test_baselines_are_not_compared_with_poses_that_move(tmp_path):
         experiments.run.run(compose("graph=default", "baseline=voxel"), tmp_path)
 
 
+@pytest.mark.slow
 def test_the_phases_account_for_the_time(exact_run):
     metrics = exact_run[1]
     parts = sum(metrics[f"time/{name}_seconds"] for name in PHASES if name not in ("compile", "total"))

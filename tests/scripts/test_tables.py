@@ -117,6 +117,7 @@ def settings(tmp_path):
         yield config
 
 
+@pytest.mark.slow
 def test_what_is_finished_is_not_run_again_and_the_page_is_written_when_all_is_there(settings, monkeypatch):
     runs, page = [], Path(settings["page"])
 
