@@ -1,6 +1,7 @@
 """Point clouds: reading and moving them, and averaging them per voxel without holding all points at once."""
 
 import os
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -129,6 +130,7 @@ class SpooledCloud:
     def __init__(self) -> None:
         self._parts, self._count = Spool(), 0
         self._averaged: tuple[float, PointCloud] | None = None  # the last answer: one alignment serves several numbers
+        self._averaging = threading.Lock()  # threads that place the cloud differently ask for the same average
 
     def append(self, cloud: PointCloud) -> None:
         """Add the points of a cloud."""
@@ -140,10 +142,11 @@ class SpooledCloud:
 
     def averaged(self, voxel: float) -> PointCloud:
         """The points, averaged per voxel [lengths of the clouds]."""
-        if self._averaged is None or self._averaged[0] != voxel:
-            parts = (self._parts[row].astype(np.float64) for row in range(len(self._parts)))
-            self._averaged = voxel, fuse_clouds((PointCloud(p[:, :3], p[:, 3:6], p[:, 6:]) for p in parts), voxel)
-        return self._averaged[1]
+        with self._averaging:
+            if self._averaged is None or self._averaged[0] != voxel:
+                parts = (self._parts[row].astype(np.float64) for row in range(len(self._parts)))
+                self._averaged = voxel, fuse_clouds((PointCloud(p[:, :3], p[:, 3:6], p[:, 6:]) for p in parts), voxel)
+            return self._averaged[1]
 
 
 def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:

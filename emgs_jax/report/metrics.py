@@ -132,8 +132,10 @@ def score_cloud(cloud: PointCloud | SpooledCloud, poses: tuple[np.ndarray, np.nd
     """
     config = scorer.evaluation
     by_points = replace(config, icp_distance_m=config.placement_icp_m)
-    placed = _renamed(compare_clouds(cloud, scorer.truth, poses, by_points), "reconstruction_icp/")
-    return compare_clouds(cloud, scorer.truth, poses, config) | placed
+    with ThreadPoolExecutor(1, "placed by its points") as thread:
+        placed = thread.submit(compare_clouds, cloud, scorer.truth, poses, by_points)
+        found = compare_clouds(cloud, scorer.truth, poses, config)
+        return found | _renamed(placed.result(), "reconstruction_icp/")
 
 
 def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
@@ -148,9 +150,10 @@ def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
     rendered = Rendered(scorer.dataset, poses, scorer.evaluation, has_classes=raw.classes is not None)
     for row in range(len(raw.depths)):
         rendered.add(row, raw.depths[row], None, _own_classes(raw, row, scorer))
-    metrics = trajectory_metrics(*poses) | score_cloud(raw.cloud, poses, scorer) | rendered.metrics()
-    metrics |= _score_labels(raw.labels, poses, scorer)
-    return prefixed(metrics, RAW_PRIOR)
+    with ThreadPoolExecutor(1, "classes of the raw prior") as thread:
+        of_labels = thread.submit(_score_labels, raw.labels, poses, scorer)
+        metrics = trajectory_metrics(*poses) | score_cloud(raw.cloud, poses, scorer) | rendered.metrics()
+        return prefixed(metrics | of_labels.result(), RAW_PRIOR)
 
 
 def _score_labels(
