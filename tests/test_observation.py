@@ -9,6 +9,7 @@ import reference
 from scene import assert_same, at, moved_points, observe_room, on_host, path_pose, pose
 
 from emgs_jax import observation
+from emgs_jax.running.values import check_value, declared
 
 normals_from_pointmap, observe, transform = (
     on_host(f) for f in (observation.normals_from_pointmap, observation.observe, observation.transform)
@@ -48,6 +49,16 @@ def test_the_normals_of_a_plane_are_exact_and_face_the_camera(camera, config, no
     assert degrees(normals, truth).max() < 0.05
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-5)
     assert (np.sum(normals * points, axis=-1) < 0).all()
+
+
+def test_the_smallest_window_is_of_three_pixels(camera, config):
+    points, truth = plane_points(camera, (0, 0, -1), 1.5)
+    smallest = config("slam.observation.normal_radius=1", "slam.observation.normal_spacing=1").observation
+    assert degrees(normals_from_pointmap(points, EVERY, smallest), truth).max() < 0.05
+    fields = declared(observation.ObservationConfig)
+    check_value("normal_radius", 1, fields["normal_radius"])
+    with pytest.raises(ValueError, match="normal_radius"):
+        check_value("normal_radius", 0, fields["normal_radius"])
 
 
 def test_the_normals_of_a_sphere_point_away_from_its_centre(camera, config):

@@ -1,5 +1,6 @@
 """Choosing, resizing and checking of files on disk."""
 
+import math
 import struct
 
 import cv2
@@ -76,6 +77,13 @@ def test_a_truncated_jpeg_is_found_behind_a_whole_thumbnail(tmp_path):
     path.write_bytes(data[:-200])
     with pytest.raises(BadFrameError, match="truncated"):
         reading.read_color(path)
+
+
+def test_a_depth_scale_is_a_positive_number():
+    assert reading.check_depth_scale(5000) == 5000.0
+    for wrong in (0, -1, math.nan, math.inf):
+        with pytest.raises(ValueError, match="dataset.depth_scale must be raw units per metre"):
+            reading.check_depth_scale(wrong)
 
 
 def test_depth_is_metres_with_both_marks_of_the_sensor_zero_and_what_is_no_depth_image_is_refused(tmp_path):

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, read_cloud, register, transform_cloud, voxel_downsample
 from emgs_jax.evaluation.trajectory import Alignment
 from emgs_jax.io.ply import save_points_ply
+from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 
 def test_points_of_a_voxel_become_their_means_and_twice_is_once():
@@ -113,4 +114,8 @@ def test_a_file_without_usable_points_is_named(tmp_path):
     points[1:3, 0] = np.nan, np.inf
     o3d.io.write_point_cloud(str(tmp_path / "a.ply"), o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
     with pytest.raises(ValueError, match=r"a\.ply: 2 of 5 points are not finite in x, y, z"):
+        read_cloud(tmp_path / "a.ply", 12)
+    points[1:3, 0] = 1.0, 2.0 * MAX_LENGTH_M
+    o3d.io.write_point_cloud(str(tmp_path / "a.ply"), o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
+    with pytest.raises(ValueError, match=r"a\.ply has a point 2e\+\d+ m away"):
         read_cloud(tmp_path / "a.ply", 12)

@@ -119,6 +119,12 @@ def test_the_scale_prior_pulls_to_the_map_s_scale():
     assert float(found.log_scale[0]) == 0.0
 
 
+def test_scales_that_may_not_move_cost_nothing_wherever_they_are():
+    nodes = put(walk(5), log_scale=np.full(5, 0.3))
+    _, info = optimize(Graph(nodes, measure(nodes, window_pairs(5, (1,)))), config(scale_std=0.0))
+    assert info.cost_before == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_tight_scale_prior_is_the_solution_without_scales():
     truth = walk(24)
     edges = join(
@@ -429,6 +435,8 @@ def test_the_solver_of_conf_is_a_config_and_without_iterations_nothing_moves():
     on, off = (hydra.utils.instantiate(default, **changes) for changes in ({}, {"max_iterations": 0}))
     assert isinstance(on, GraphConfig) and rmse(optimize(graph, on)[0], graph.nodes) > 0.01
     assert same(optimize(graph, off)[0], graph.nodes)
+    (_, end), (_, stopped) = optimize(graph, on), optimize(graph, hydra.utils.instantiate(default, max_iterations=1))
+    assert end.converged is True and stopped.converged is False and stopped.num_iterations == 1 < end.num_iterations
     with pytest.raises(hydra.errors.InstantiationException, match="one of given, spread"):
         hydra.utils.instantiate(default, start="chordal")
 

@@ -56,6 +56,11 @@ def test_a_mesh_has_points_and_the_big_end_may_come_first(tmp_path, points):
     (tmp_path / "big.ply").write_bytes(header.encode() + b"end_header\n" + points.astype(">f8").tobytes())
     found = read_vertices(tmp_path / "big.ply")
     np.testing.assert_array_equal(np.stack([found[name] for name in "xyz"], 1), points)
+    camera = "element camera 3\nproperty float f\nproperty uchar id\n"  # 15 bytes before the vertices
+    header = header.replace("element vertex", f"{camera}element vertex")
+    (tmp_path / "big.ply").write_bytes(header.encode() + b"end_header\n" + bytes(15) + points.astype(">f8").tobytes())
+    found = read_vertices(tmp_path / "big.ply")
+    np.testing.assert_array_equal(np.stack([found[name] for name in "xyz"], 1), points)
 
 
 def test_every_cut_of_a_file_and_every_byte_too_many_is_noticed(written):

@@ -4,13 +4,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from compiled_rows import random_problem
 from scene import at, device, matrix_of, on_host
 
 from emgs_jax.ops.linalg import whitening
 from emgs_jax.registration import problem as problems
 from emgs_jax.registration.belief import root_information
-from emgs_jax.registration.problem import COLORED, COLORED_RAY, IcpConfig, Uncertainty, pose_problem
+from emgs_jax.registration.problem import COLORED, COLORED_RAY, IcpConfig, Problem, Uncertainty, pose_problem
 
 data_information, rows_of = on_host(problems.data_information), on_host(problems.rows_of)
 jacobian_of = on_host(jax.jacfwd(problems.rows_of))
@@ -95,16 +96,19 @@ def test_what_is_known_is_the_prior_of_the_unknowns_and_worth_less_where_the_poi
     known = on_host(root_information)(np.float32(factor @ factor.T + 1e-4 * np.eye(7)))
 
     @on_host
-    def prior_of(noise, depth, known, settings: IcpConfig) -> jax.Array:
+    def problem_of(noise, depth, known, settings: IcpConfig) -> Problem:
         uncertainty = Uncertainty(noise, depth, jnp.ones(()))
         given = problem.source, problem.surface, problem.T_world_coarse, jnp.asarray(0.02)
-        return pose_problem(*given, uncertainty, settings, known).prior
+        return pose_problem(*given, uncertainty, settings, known)
 
     y, depth = np.linspace(-1.0, 1.0, 7), np.full(problem.source.valid.shape, 0.02, np.float32)
-    prior = lambda worse, chosen: prior_of(np.float32(0.02 * worse), depth, known, chosen)  # noqa: E731
+    prior = lambda worse, chosen: problem_of(np.float32(0.02 * worse), depth, known, chosen).prior  # noqa: E731
     scaled = y * ([1.0] * 6 + [0.5 * 0.02])  # the seventh counts `scale_noise` of the depth noise
     expected = np.linalg.norm(known @ scaled)
     for worse in (1.0, 3.0):
         np.testing.assert_allclose(np.linalg.norm(prior(worse, settings) @ y), expected / worse, rtol=1e-4)
+    made = problem_of(np.float32(0.02), depth, known, settings)
+    assert float(made.scale_unit) == pytest.approx(0.5 * 0.02)
+    np.testing.assert_allclose(made.depth_noise, settings.noise * depth, rtol=1e-6)
     nothing = prior(1.0, at(settings, "prior_information", 0.0))
     assert not np.any(nothing[:6]) and nothing[6, 6] == 1  # as printed; a scale that no point moves stays

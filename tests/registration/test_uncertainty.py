@@ -102,7 +102,7 @@ def test_their_number_does_not_depend_on_the_unit_or_on_invalid_points_and_has_b
     found = num_independent(errors, POINTS, ALL)
     np.testing.assert_allclose(num_independent(np.float32(1e-3) * errors, POINTS, ALL), found, rtol=1e-4)
     wild = np.where(half, errors, np.float32(1e3)), np.where(half[:, None], POINTS, np.float32(0.0))
-    assert num_independent(*wild, half) <= COUNT / 2
+    np.testing.assert_allclose(num_independent(*wild, half), found, rtol=0.3)  # half of each square of 4 x 4 errors
     assert num_independent(np.ones(COUNT, np.float32), POINTS, ALL) == NUM_CELLS**2
     assert num_independent(errors, POINTS, ~ALL) == NUM_CELLS**2
     slope = on_host(jax.grad(noise.num_independent))(np.zeros(COUNT, np.float32), POINTS, ALL)

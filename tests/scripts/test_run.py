@@ -133,6 +133,11 @@ def test_baselines_are_not_compared_with_poses_that_move(tmp_path):
         experiments.run.run(compose("graph=default", "baseline=voxel"), tmp_path)
 
 
+def test_a_run_does_not_write_over_the_map_that_it_begins_with(tmp_path):
+    with pytest.raises(ValueError, match="is the folder of this run, too"):
+        experiments.run.run(compose(f"map={tmp_path}/../{tmp_path.name}"), tmp_path)
+
+
 @pytest.mark.slow
 def test_the_phases_account_for_the_time(exact_run):
     metrics = exact_run[1]
