@@ -37,6 +37,9 @@ DATA_LICENCES = {
     "apartment": _OWN,
     "tum": "TUM RGB-D: CC BY 4.0; another folder of this layout: see its publisher",
     "seven_scenes": "7-Scenes: see the data set's page at Microsoft Research",
+    "bonn": "Bonn RGB-D Dynamic: see the data set's page at the University of Bonn",
+    "euroc": "EuRoC MAV: see the data set's page at ETH Zurich; another folder of this layout: see its publisher",
+    "kitti": "KITTI: CC BY-NC-SA 3.0",
     "replica": "Replica: Replica Dataset Research Terms, for research and education that is not commercial",
     **dict.fromkeys(("images", "colmap", "nerfstudio", "rosbag"), "your own images, your own licence"),
 }
