@@ -23,7 +23,7 @@ class Kitti(PosedImages):
 
     Args:
         root: folder that holds sequences/ and poses/.
-        sequence: "00"; a number is taken as its two digits.
+        sequence: "00"; of 7 the two digits 07.
         camera: 0 and 1 are grey, 2 and 3 in colour, left and right.
         start, stop, stride: which of the images, in order of their names.
         size: (width, height) of the frames given out.
@@ -41,7 +41,7 @@ class Kitti(PosedImages):
         stride: int = 1,
         size: Sequence[int] = (480, 144),
     ) -> None:
-        name = f"{sequence:02d}" if isinstance(sequence, int) else sequence
+        name = None if sequence is None else str(sequence).zfill(2)
         place = None if name is None else f"sequences/{name}"
         folder = reading.find_sequence(root, place, LAYOUT, SOURCE)
         solved = read_kitti(folder, folder.parents[1] / "poses" / f"{name}.txt", camera)

@@ -28,7 +28,7 @@ def test_poses_are_those_of_the_camera_that_took_the_images(kitti_root):
         np.testing.assert_allclose(frame.T_world_camera[:3, 3], truth[:3, :3] @ CENTER + truth[:3, 3], atol=1e-9)
         np.testing.assert_allclose(frame.T_world_camera[:3, :3], truth[:3, :3], atol=1e-9)
     np.testing.assert_allclose([frame.timestamp for frame in dataset], [0, 0.1037, 0.2074])
-    for same in (7, "07"):  # YAML and the command line may take 07 for a number
+    for same in (7, "7"):  # YAML and the command line may take 07 for a number
         assert load(kitti_root, same).fingerprint() == dataset.fingerprint() and load(kitti_root, same).sequence == "07"
 
 
