@@ -7,7 +7,7 @@ import pytest
 
 from tools.fuzz.cases import ERROR, FAULT, SAME, Case, run_case, run_cases
 from tools.fuzz.damage import BYTES, TEXT
-from tools.fuzz.targets import Target, targets
+from tools.fuzz.targets import TESTS, Target, targets
 
 NUM_CASES = 60  # of each target about three
 
@@ -20,6 +20,11 @@ def test_no_damaged_input_is_a_fault(tmp_path):
     assert {case.target for case in found} == {target.name for target in kinds}
     refused = sum(case.verdict == ERROR for case in found)
     assert NUM_CASES / 2 < refused < NUM_CASES, "most damages are seen; some are none"
+
+
+def test_a_finished_run_is_written_without_pytest_too():
+    """`python -m tools.fuzz` ended with "No module named 'hand_run'", which only pytest looked for where it is."""
+    assert (TESTS / "hand_run.py").is_file() and (TESTS / "report" / "written_run.py").is_file()
 
 
 def verdict(tmp_path, read, damages=TEXT, number=0) -> Case:

@@ -82,7 +82,7 @@ def read_calibration(path: Path) -> Calibration:
         raise FileNotFoundError(f"dataset.intrinsics: {path} cannot be read; it may be {KNOWN_FILES}") from error
     if suffix == ".txt":
         return _colmap(text, path)
-    values = _parse(text, path)
+    values = parse_keys(text, path)
     if "fl_x" in values or "frames" in values:
         return _transforms(values, path)
     if "camera_matrix" in values:
@@ -105,7 +105,7 @@ _Loader.add_constructor(
 )
 
 
-def _parse(text: str, path: Path) -> dict[str, Any]:
+def parse_keys(text: str, path: Path) -> dict[str, Any]:
     """The keys and values of a JSON or YAML file."""
     try:
         if path.suffix.lower() == ".json":
@@ -131,7 +131,7 @@ def _number(value: Any, key: str, path: Path) -> float:
     return number
 
 
-def _needed(values: Mapping[str, Any], keys: Collection[str], path: Path) -> list[float]:
+def needed(values: Mapping[str, Any], keys: Collection[str], path: Path) -> list[float]:
     """The numbers at `keys`, which must be there."""
     missing = [key for key in keys if key not in values]
     if missing:
@@ -149,13 +149,13 @@ def _check_known(values: Mapping[str, Any], known: Collection[str], path: Path) 
         )
 
 
-def _size(width: float, height: float, path: Path) -> Size:
+def size_of(width: float, height: float, path: Path) -> Size:
     if min(width, height) < 1 or width != int(width) or height != int(height):
         raise ValueError(f"{path}: width and height must be pixels, got {width:g} and {height:g}: correct them")
     return int(width), int(height)
 
 
-def _lens(coefficients: list[float], path: Path) -> tuple[float, ...]:
+def lens_of(coefficients: list[float], path: Path) -> tuple[float, ...]:
     """k1, k2, p1, p2 and maybe k3; empty where all are 0. What OpenCV's longer models add must be 0."""
     if len(coefficients) not in (0, 4, 5, 8, 12, 14) or any(coefficients[5:]):
         raise ValueError(
@@ -164,7 +164,7 @@ def _lens(coefficients: list[float], path: Path) -> tuple[float, ...]:
     return tuple(coefficients[:5]) if any(coefficients) else ()
 
 
-def _refuse_model(model: object, known: Collection[str], path: Path) -> None:
+def refuse_model(model: object, known: Collection[str], path: Path) -> None:
     raise ValueError(
         f"{path}: the camera model {model} is not read, only {', '.join(known)}: undistort the images with the program "
         "that calibrated them (colmap image_undistorter) and give the new calibration"
@@ -185,7 +185,7 @@ def colmap_camera(words: list[str], path: Path) -> Calibration:
     """The camera of the words MODEL WIDTH HEIGHT PARAMS; raises ValueError where they are of another model."""
     model, *words = words
     if model not in COLMAP_MODELS:
-        _refuse_model(model, COLMAP_MODELS, path)
+        refuse_model(model, COLMAP_MODELS, path)
     names = COLMAP_MODELS[model]
     if len(words) != 2 + len(names):
         raise ValueError(f"{path}: {model} has the parameters {', '.join(names)}, got {len(words) - 2}: correct them")
@@ -195,7 +195,7 @@ def colmap_camera(words: list[str], path: Path) -> Calibration:
     values = dict(zip(names, numbers, strict=True))
     intrinsics = _from_corner(values.get("fx", values.get("f")), values.get("fy", values.get("f")), values)
     bent = [values.get(key, 0.0) for key in DISTORTION[:4]]
-    return Calibration(intrinsics, _lens(bent, path), _size(width, height, path))
+    return Calibration(intrinsics, lens_of(bent, path), size_of(width, height, path))
 
 
 def _from_corner(fx: float, fy: float, values: Mapping[str, float]) -> Intrinsics:
@@ -210,13 +210,13 @@ def _transforms(values: Mapping[str, Any], path: Path) -> Calibration:
     _check_known(values, camera | TRANSFORMS_KEYS, path)
     model = values.get("camera_model", "OPENCV")
     if model not in TRANSFORMS_MODELS or values.get("is_fisheye"):
-        _refuse_model("OPENCV_FISHEYE" if values.get("is_fisheye") else model, TRANSFORMS_MODELS, path)
-    fx, fy, cx, cy, width, height = _needed(values, ("fl_x", "fl_y", "cx", "cy", "w", "h"), path)
+        refuse_model("OPENCV_FISHEYE" if values.get("is_fisheye") else model, TRANSFORMS_MODELS, path)
+    fx, fy, cx, cy, width, height = needed(values, ("fl_x", "fl_y", "cx", "cy", "w", "h"), path)
     bent = [_number(values.get(key, 0), key, path) for key in DISTORTION]
     if _number(values.get("k4", 0), "k4", path) != 0:
-        _refuse_model("with k4", TRANSFORMS_MODELS, path)
+        refuse_model("with k4", TRANSFORMS_MODELS, path)
     return Calibration(
-        _from_corner(fx, fy, {"cx": cx, "cy": cy}), _lens(_short(bent), path), _size(width, height, path)
+        _from_corner(fx, fy, {"cx": cx, "cy": cy}), lens_of(_short(bent), path), size_of(width, height, path)
     )
 
 
@@ -231,18 +231,18 @@ def _opencv(values: Mapping[str, Any], path: Path) -> Calibration:
     _check_known(values, known | OPENCV_KEYS, path)
     model = str(values.get("distortion_model", "plumb_bob"))
     if model not in ("plumb_bob", "radtan") or values.get("fisheye_model"):
-        _refuse_model("fisheye" if values.get("fisheye_model") else model, ("plumb_bob", "radtan"), path)
-    width, height = _needed(values, ("image_width", "image_height"), path)
-    K = _matrix(values["camera_matrix"], "camera_matrix", path)
+        refuse_model("fisheye" if values.get("fisheye_model") else model, ("plumb_bob", "radtan"), path)
+    width, height = needed(values, ("image_width", "image_height"), path)
+    K = numbers_of(values["camera_matrix"], "camera_matrix", path)
     if len(K) != 9 or any(K[i] != 0 for i in (1, 3, 6, 7)) or K[8] != 1:
         raise ValueError(f"{path}: camera_matrix must be fx 0 cx, 0 fy cy, 0 0 1, got {K}: correct it")
     if "distortion_coefficients" not in values:
         raise ValueError(f"{path} has no distortion_coefficients: add them, data: [0, 0, 0, 0] for straight images")
-    bent = _matrix(values["distortion_coefficients"], "distortion_coefficients", path)
-    return Calibration((K[0], K[4], K[2], K[5]), _lens(bent, path), _size(width, height, path))
+    bent = numbers_of(values["distortion_coefficients"], "distortion_coefficients", path)
+    return Calibration((K[0], K[4], K[2], K[5]), lens_of(bent, path), size_of(width, height, path))
 
 
-def _matrix(value: Any, key: str, path: Path) -> list[float]:
+def numbers_of(value: Any, key: str, path: Path) -> list[float]:
     """The numbers of a matrix, {rows, cols, data} or nested lists, row by row."""
     data = value.get("data") if isinstance(value, dict) else value
     if not isinstance(data, list):
@@ -254,14 +254,14 @@ def _matrix(value: Any, key: str, path: Path) -> list[float]:
 def _mast3r_slam(values: Mapping[str, Any], path: Path) -> Calibration:
     """width, height, calibration: [fx, fy, cx, cy(, k1, k2, p1, p2(, k3))]."""
     _check_known(values, {"width", "height", "calibration"}, path)
-    width, height = _needed(values, ("width", "height"), path)
-    numbers = _matrix(values["calibration"], "calibration", path)
+    width, height = needed(values, ("width", "height"), path)
+    numbers = numbers_of(values["calibration"], "calibration", path)
     if len(numbers) not in (4, 8, 9):
         raise ValueError(
             f"{path}: calibration must be fx, fy, cx, cy(, k1, k2, p1, p2(, k3)), got {len(numbers)}: correct it"
         )
     fx, fy, cx, cy, *bent = numbers
-    return Calibration((fx, fy, cx, cy), _lens(bent, path), _size(width, height, path))
+    return Calibration((fx, fy, cx, cy), lens_of(bent, path), size_of(width, height, path))
 
 
 def _orb_slam(values: Mapping[str, Any], path: Path) -> Calibration:
@@ -273,17 +273,17 @@ def _orb_slam(values: Mapping[str, Any], path: Path) -> Calibration:
         raise ValueError(f"{path} has more than one camera's keys: {found}; remove them")
     model = values.get("Camera.type", "PinHole")
     if model != "PinHole":
-        _refuse_model(model, ("PinHole",), path)
+        refuse_model(model, ("PinHole",), path)
     names = [f"{section}.{key}" for key in ("fx", "fy", "cx", "cy")]
-    fx, fy, cx, cy, width, height = _needed(values, [*names, "Camera.width", "Camera.height"], path)
+    fx, fy, cx, cy, width, height = needed(values, [*names, "Camera.width", "Camera.height"], path)
     bent = [_number(values.get(f"{section}.{key}", 0), f"{section}.{key}", path) for key in DISTORTION]
-    return Calibration((fx, fy, cx, cy), _lens(_short(bent), path), _size(width, height, path))
+    return Calibration((fx, fy, cx, cy), lens_of(_short(bent), path), size_of(width, height, path))
 
 
 def _plain(values: Mapping[str, Any], path: Path) -> Calibration:
     """width, height, fx, fy, cx, cy as ViPE takes them, and maybe the distortion."""
     names = ("width", "height", "fx", "fy", "cx", "cy")
     _check_known(values, {*names, *DISTORTION}, path)
-    width, height, fx, fy, cx, cy = _needed(values, names, path)
+    width, height, fx, fy, cx, cy = needed(values, names, path)
     bent = [_number(values.get(key, 0), key, path) for key in DISTORTION]
-    return Calibration((fx, fy, cx, cy), _lens(_short(bent), path), _size(width, height, path))
+    return Calibration((fx, fy, cx, cy), lens_of(_short(bent), path), size_of(width, height, path))

@@ -1,7 +1,7 @@
-"""Images whose cameras another program has found: a project of COLMAP, a folder of nerfstudio.
+"""Images whose cameras are known: a project of COLMAP, a folder of nerfstudio, and benchmarks without depth.
 
-Their poses are a reference for the path, in a unit of their own: only what is aligned with a scale says something
-(`trajectory/ate_sim3_m`). Without depth there is no reference for the map.
+Their poses are a reference for the path. Those that a program has found are in a unit of their own: only what is
+aligned with a scale says something (`trajectory/ate_sim3_m`). Without depth there is no reference for the map.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ MODEL_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0")
 
 @dataclass(frozen=True)
 class Solved:
-    """What a program has found of one camera's images.
+    """What is known of one camera's images.
 
     Args:
         images: files.
@@ -36,6 +36,7 @@ class Solved:
         camera: of all of them.
         source: the file that says so.
         files: all that were read.
+        times: seconds of each, where the images stand in order of time; None = what their names say.
     """
 
     images: list[Path]
@@ -43,6 +44,7 @@ class Solved:
     camera: Calibration
     source: Path
     files: tuple[Path, ...]
+    times: list[float] | None = None
 
 
 class PosedImages:
@@ -55,12 +57,14 @@ class PosedImages:
     def __init__(
         self, folder: Path, solved: Solved, chosen: tuple[int, int | None, int], size: Sequence[int], sequence: str
     ) -> None:
-        order = sorted(range(len(solved.images)), key=lambda row: (natural_key(solved.images[row]), row))
-        times, note = times_of([solved.images[row] for row in order])
+        order, times, note = in_order(solved)
         picked = reading.select(len(order), *chosen, solved.source)
         self._folder, self._files, self._times = folder, solved.files, [times[place] for place in picked]
         rows = [order[place] for place in picked]
         self._images, self._poses = [solved.images[row] for row in rows], [solved.poses[row] for row in rows]
+        for path, pose in zip(self._images, self._poses, strict=True):
+            if pose is not None:
+                reading.check_position(pose[:3, 3], f"{solved.source}, image {path.name},")
         if not any(path.is_file() for path in self._images):
             raise FileNotFoundError(
                 f"{solved.source} names {self._images[0].name} and {len(rows) - 1} others, and none of them is in "
@@ -96,6 +100,14 @@ class PosedImages:
         options |= {"lens": self.calibration["distortion"], "images": [path.name for path in self._images]}
         options |= {} if self._tones is None else {"tones": self._tones}
         return reading.fingerprint(self._folder, reading.all_files(self), options)
+
+
+def in_order(solved: Solved) -> tuple[list[int], list[float], str | None]:
+    """Rows of the images in their order, the seconds of these, and a note on where those come from."""
+    if solved.times is not None:
+        return [*range(len(solved.images))], solved.times, None
+    order = sorted(range(len(solved.images)), key=lambda row: (natural_key(solved.images[row]), row))
+    return order, *times_of([solved.images[row] for row in order])
 
 
 class Colmap(PosedImages):
@@ -183,8 +195,6 @@ def read_colmap(model: Path, folder: Path) -> Solved:
             "--ImageReader.single_camera 1 where they were taken by one"
         )
     camera = colmap_camera([*used.pop()], found.files[0])
-    for name, pose in zip(found.names, found.T_world_camera, strict=True):
-        reading.check_position(pose[:3, 3], f"{found.files[1]}, image {name},")
     return Solved(
         [find_image(folder, name) for name in found.names], [*found.T_world_camera], camera, found.files[1], found.files
     )

@@ -230,11 +230,18 @@ def first_size(paths: Iterable[Path], where: object) -> Size:
 
 
 def as_pose(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
+    """`as_motion`; ValueError where it is farther away than positions can be held."""
+    pose = as_motion(text, where)
+    if pose is not None:
+        check_position(pose[:3, 3], where)
+    return pose
+
+
+def as_motion(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
     """A rigid 4x4 transform from 16 numbers, row by row; None where they are inf or nan, which means lost tracking.
 
     Raises:
         BadFrameError: they are no pose.
-        ValueError: it is farther away than positions can be held.
     """
     try:
         pose = np.array([float(token) for token in text.split()], np.float64).reshape(4, 4)
@@ -244,7 +251,6 @@ def as_pose(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
         return None
     if not is_rigid(pose):
         raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
-    check_position(pose[:3, 3], where)
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded
     return pose

@@ -1,6 +1,9 @@
-"""Times as programs write them: seconds, or clocks that count milliseconds, microseconds or nanoseconds."""
+"""Times as programs write them (seconds, or clocks that count smaller units), and what is nearest to them in time."""
+
+from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 UNITS = {"seconds": 1, "milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}  # how many are a second
 EPOCH = 1e9, 4.2e9  # seconds since 1970, from 2001 to 2103
@@ -28,3 +31,44 @@ def in_seconds(times: np.ndarray) -> np.ndarray:
 def resolution(*times: np.ndarray) -> float:
     """Seconds by which float64 may miss times so large: no two of them are told apart by less."""
     return float(np.spacing(max((np.abs(values).max(initial=0.0) for values in times), default=0.0)))
+
+
+def matched_rows(
+    times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, " m"], tolerance: float, of: tuple[str, Path]
+) -> list[int]:
+    """`nearest_rows`, which some image must have; `of` says what of and where it is listed."""
+    rows = nearest_rows(times, candidates, tolerance)
+    if max(rows) < 0:
+        what, path = of
+        raise ValueError(
+            f"{path}: 0 of {len(rows)} images have a {what} (max difference {tolerance:g} s): the images are at "
+            f"{_span(times)} s, the lines of this file at {_span(candidates)} s. Correct the times, choose other "
+            "images (dataset.start, stop), raise dataset.max_time_difference, or move the file away"
+        )
+    return rows
+
+
+def _span(times: Float[np.ndarray, " n"]) -> str:
+    return f"{times.min():.3f} to {times.max():.3f}" if len(times) else "no"
+
+
+def nearest_rows(times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, " m"], tolerance: float) -> list[int]:
+    """Row of `candidates` (ascending) nearest to each time, -1 where none is within the tolerance in seconds.
+
+    Times that differ by the tolerance are within it, however float64 rounds them: seconds since 1970 by 2e-7.
+    """
+    if len(candidates) == 0:
+        return [-1] * len(times)
+    after = np.clip(np.searchsorted(candidates, times), 1, max(len(candidates) - 1, 1))
+    pair = np.stack([after - 1, np.minimum(after, len(candidates) - 1)])
+    gaps = np.abs(candidates[pair] - times)
+    best = gaps.argmin(axis=0)
+    rows = np.take_along_axis(pair, best[None], 0)[0]
+    return np.where(gaps.min(axis=0) <= tolerance + resolution(times, candidates), rows, -1).tolist()
+
+
+def check_tolerance(seconds: float) -> float:
+    """`dataset.max_time_difference` as finite seconds, 0 or more."""
+    if not (np.isfinite(seconds) and seconds >= 0):
+        raise ValueError(f"dataset.max_time_difference must be seconds, 0 or more, got {seconds}")
+    return float(seconds)

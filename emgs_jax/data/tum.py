@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +15,15 @@ from emgs_jax.data.file_names import find_image, is_file
 from emgs_jax.data.intrinsics import ALTERNATIVES, Given, find_lens, pictures_of, with_notes
 from emgs_jax.data.labels import LabelFolder, as_unknown
 from emgs_jax.data.reading import Intrinsics, Number
-from emgs_jax.data.timestamps import in_seconds, resolution
+from emgs_jax.data.timestamps import check_tolerance, in_seconds, matched_rows
 from emgs_jax.data.tones import read_shown, tones_of
 
 LAYOUT = "root/SEQUENCE/{rgb.txt, depth.txt, groundtruth.txt, rgb/, depth/}"
-SOURCE = "TUM RGB-D benchmark, project page of the Computer Vision Group of TU Munich"
 RAW_SIZE = (640, 480)
+Calibrations = Mapping[str, tuple[Intrinsics, tuple[float, ...] | None]]  # by what stands in a sequence's name
 REMEDY = "correct the line or take it out (its image then has no true pose), or set on_bad_frame=skip"
 # Calibration by the benchmark (digits of ORB-SLAM2); fr3 comes undistorted. Distortion is k1, k2, p1, p2, k3.
-CALIBRATIONS: dict[str, tuple[Intrinsics, tuple[float, ...] | None]] = {
+CALIBRATIONS: Calibrations = {
     "freiburg1": (
         (517.306408, 516.469215, 318.643040, 255.313989),
         (0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
@@ -57,6 +57,8 @@ class Tum:
     """
 
     name = "tum"
+    source = "TUM RGB-D benchmark, project page of the Computer Vision Group of TU Munich"
+    calibrations = CALIBRATIONS
 
     def __init__(
         self,
@@ -74,19 +76,17 @@ class Tum:
         classes: str = "classes.txt",
         unknown: Sequence[int] | None = None,
     ) -> None:
-        self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
+        self._folder = reading.find_sequence(root, sequence, LAYOUT, self.source)
         times, names, _ = read_list(self._folder / "rgb.txt", 2)
         chosen = reading.select(len(times), start, stop, stride, f"{self._folder / 'rgb.txt'} (layout {LAYOUT})")
         self._times, self._images = times[chosen], [find_image(self._folder, names[i][0]) for i in chosen]
         self.sequence = str(sequence)
         self.size = reading.check_size(size)
         self._depth_scale = reading.check_depth_scale(depth_scale)
-        if not (math.isfinite(max_time_difference) and max_time_difference >= 0):
-            raise ValueError(f"dataset.max_time_difference must be seconds, 0 or more, got {max_time_difference}")
         self._pose_lines: list[int] = []
-        self._depths, self._poses = self._associate(float(max_time_difference))
+        self._depths, self._poses = self._associate(check_tolerance(max_time_difference))
         self.has_ground_truth = self._depths is not None and self._poses is not None
-        given = find_calibration(self.sequence, intrinsics, distortion)
+        given = find_calibration(self.sequence, intrinsics, distortion, self.calibrations)
         self._raw_size = RAW_SIZE if intrinsics is None else reading.first_size(self._images, self._folder)
         self._tones = tones_of(self._images)
         self._lens = find_lens(given, pictures_of(self._images, self._raw_size, self._tones))
@@ -174,7 +174,7 @@ def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[l
     try:
         lines = reading.read_text(path).splitlines()
     except BadFrameError as error:
-        raise FileNotFoundError(f"{error}; expected the layout {LAYOUT} ({SOURCE})") from error
+        raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
     times, words, numbers = [], [], []
     for number, line in enumerate(lines, 1):
         row = line.replace(",", " ").split()
@@ -199,40 +199,6 @@ def _file_name(line: str, first_word: str, folder: Path) -> str:
     return whole if is_file(find_image(folder, whole)) else first_word.strip("\"'")
 
 
-def matched_rows(
-    times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, " m"], tolerance: float, of: tuple[str, Path]
-) -> list[int]:
-    """`nearest_rows`, which some image must have; `of` says what of and where it is listed."""
-    rows = nearest_rows(times, candidates, tolerance)
-    if max(rows) < 0:
-        what, path = of
-        raise ValueError(
-            f"{path}: 0 of {len(rows)} images have a {what} (max difference {tolerance:g} s): the images are at "
-            f"{_span(times)} s, the lines of this file at {_span(candidates)} s. Correct the times, choose other "
-            "images (dataset.start, stop), raise dataset.max_time_difference, or move the file away"
-        )
-    return rows
-
-
-def _span(times: Float[np.ndarray, " n"]) -> str:
-    return f"{times.min():.3f} to {times.max():.3f}" if len(times) else "no"
-
-
-def nearest_rows(times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, " m"], tolerance: float) -> list[int]:
-    """Row of `candidates` (ascending) nearest to each time, -1 where none is within the tolerance in seconds.
-
-    Times that differ by the tolerance are within it, however float64 rounds them: seconds since 1970 by 2e-7.
-    """
-    if len(candidates) == 0:
-        return [-1] * len(times)
-    after = np.clip(np.searchsorted(candidates, times), 1, max(len(candidates) - 1, 1))
-    pair = np.stack([after - 1, np.minimum(after, len(candidates) - 1)])
-    gaps = np.abs(candidates[pair] - times)
-    best = gaps.argmin(axis=0)
-    rows = np.take_along_axis(pair, best[None], 0)[0]
-    return np.where(gaps.min(axis=0) <= tolerance + resolution(times, candidates), rows, -1).tolist()
-
-
 def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"] | None:
     """T_world_camera from tx ty tz qx qy qz qw; None where they are inf or nan, which means lost tracking.
 
@@ -254,15 +220,17 @@ def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"] | 
     return pose
 
 
-def find_calibration(sequence: str, intrinsics: Given | None, distortion: Sequence[Number] | None) -> Given:
+def find_calibration(
+    sequence: str, intrinsics: Given | None, distortion: Sequence[Number] | None, calibrations: Calibrations
+) -> Given:
     """What is known of the images on disk: as given, else the benchmark's by the sequence's name."""
     if intrinsics is None:
         if distortion is not None:
             raise ValueError("dataset.distortion needs the dataset.intrinsics that it was calibrated with")
-        for key, (calibration, bent) in CALIBRATIONS.items():
+        for key, (calibration, bent) in calibrations.items():
             if key in sequence.lower():
                 return (*calibration, *(bent or ()))
-        raise ValueError(f"{sequence} names no calibration (freiburg1, freiburg2 or freiburg3): give {ALTERNATIVES}")
+        raise ValueError(f"{sequence} names no calibration ({', '.join(calibrations)}): give {ALTERNATIVES}")
     if distortion is None:
         return intrinsics
     bent = tuple(float(v) for v in distortion)

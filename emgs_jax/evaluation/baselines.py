@@ -1,12 +1,11 @@
 """What one would do with predictions instead of mapping: average their points per voxel, or fuse their depth (TSDF).
 
 Both take views as they come, hold no view afterwards, and are compared like the map: their cloud, and what is rendered
-of it. Lengths are those of the poses, so a voxel or a truncation of 2 cm is one only where these are metric: with a
-prior whose scale is .5 it is 4 cm of the world.
+of it. Lengths are those of the poses; sizes in metres become such lengths by the unit that a fusion starts with.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -65,7 +64,7 @@ class VoxelConfig:
     """The mean of all points of each voxel.
 
     Args:
-        voxel_m: its side, in the lengths of the poses.
+        voxel_m: its side.
         max_footprint_px: a point is drawn as the square that its voxel covers, but at most so far to each side: what
             lies just before the camera would fill the image.
         surface_depth: see `draw_voxels`.
@@ -80,9 +79,9 @@ class VoxelConfig:
     def __post_init__(self) -> None:
         _require_positive("voxel", voxel_m=self.voxel_m, max_footprint_px=self.max_footprint_px)
 
-    def start(self, pinhole: Pinhole) -> Fusion:
-        """Without any view."""
-        return _Voxels(self, pinhole)
+    def start(self, pinhole: Pinhole, unit: float) -> Fusion:
+        """Without any view; a length of the poses is `unit` metres."""
+        return _Voxels(replace(self, voxel_m=self.voxel_m / unit), pinhole)
 
 
 @dataclass(frozen=True)
@@ -93,8 +92,8 @@ class TsdfConfig:
     surfaces nearer to each other than that disturb each other.
 
     Args:
-        voxel_m: side of a voxel, in the lengths of the poses.
-        truncation_m: distance at which the field ends, likewise; a few voxels, and more than the noise of the depth.
+        voxel_m: side of a voxel.
+        truncation_m: distance at which the field ends; a few voxels, and more than the noise of the depth.
         min_views: that must have seen a place.
     """
 
@@ -110,9 +109,10 @@ class TsdfConfig:
                 "would be found; take some voxels"
             )
 
-    def start(self, pinhole: Pinhole) -> Fusion:
-        """Without any view."""
-        return _Tsdf(self, pinhole)
+    def start(self, pinhole: Pinhole, unit: float) -> Fusion:
+        """Without any view; a length of the poses is `unit` metres."""
+        lengths = replace(self, voxel_m=self.voxel_m / unit, truncation_m=self.truncation_m / unit)
+        return _Tsdf(lengths, pinhole)
 
 
 BaselineConfig = VoxelConfig | TsdfConfig

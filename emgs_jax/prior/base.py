@@ -100,20 +100,25 @@ class Prior(ABC):
         return {}
 
 
-MAX_MEDIAN_DEPTH = (
-    200.0  # rooms have some metres, scenes in a unit of a network's own about 1, in millimetres thousands
-)
+MEDIAN_DEPTHS = 0.01, 200.0  # rooms have some metres, scenes in a unit of a network's own about 1
+USUAL_DEPTH = 2.0
 
 
 def check_unit(prediction: PriorPrediction) -> None:
-    """Raise ValueError where depths are so large that they can be no metres."""
+    """Raise ValueError where depths are so large or small that they can be no metres; says a factor that helps.
+
+    A map's thresholds are lengths, so a prior has to have metres or a scene of some units. One that knows no unit
+    normalises its lengths, as `prior=files` does with `scale=arbitrary`: then its own does not matter.
+    """
     depths = prediction.points[..., 2][prediction.mask & np.isfinite(prediction.points).all(-1)]
-    median = float(np.median(depths)) if len(depths) else 0.0
-    if median > MAX_MEDIAN_DEPTH:
+    median = float(np.median(depths)) if len(depths) else USUAL_DEPTH
+    if median > 0 and not MEDIAN_DEPTHS[0] <= median <= MEDIAN_DEPTHS[1]:
+        factor = 10.0 ** round(np.log10(USUAL_DEPTH) - np.log10(median))
         raise ValueError(
             f"the prior's points have a median depth of {median:.4g} in its inference "
             f"{prediction.window.inference}, and a map's thresholds are for metres, or a unit in which a scene is some "
-            "units deep: are these millimetres? Divide points and the translations of T_anchor_view by 1000"
+            f"units deep: multiply points and the translations of T_anchor_view by {factor:g} (.001 makes metres of "
+            "millimetres, .01 of centimetres); prior=files prior.scale=arbitrary does so by itself"
         )
 
 

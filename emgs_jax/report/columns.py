@@ -32,6 +32,7 @@ PLACED = (  # by their points
     Column("reconstruction_icp/f1_5cm_percent", "ICP: F1@.05 [%]", 1.0, 1, False),
     Column("reconstruction_icp/normals_abs_cos_percent", "ICP: normals [%]", 1.0, 1, False),
 )
+BY_PATH = tuple(column._replace(title=f"path: {column.title}") for column in MAIN[1:])  # beside those by points
 RENDERED = (  # at their own poses
     Column("rendering/coverage_percent", "coverage [%]", 1.0, 1, False),
     Column("rendering/worst_coverage_percent", "at worst [%]", 1.0, 1, False),

@@ -6,7 +6,7 @@ from html import escape
 from typing import Any
 
 from emgs_jax.report import provenance
-from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, cell
+from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Column, cell
 from emgs_jax.report.page_strip import loop_why, loop_words
 from emgs_jax.report.provenance import RAW_PRIOR, ROWS
 from emgs_jax.report.recorded_run import RecordedRun
@@ -14,7 +14,7 @@ from emgs_jax.report.repeat import Repeated
 
 MANY_LOST = 0.1  # share of the frames
 _SE3 = Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True)
-_COLUMNS = (MAIN[0]._replace(title="ATE Sim(3) [cm]"), _SE3, *MAIN[1:], *PLACED[:1], *PLACED[3:4], *RENDERED)
+_COLUMNS = (MAIN[0]._replace(title="ATE Sim(3) [cm]"), _SE3, *PLACED[:1], *PLACED[3:4], *BY_PATH, *RENDERED)
 FILES = {
     "report.html": "this page; any browser of 2023 or later",
     "overview.png": "the map from above with both paths, some frames; any viewer of images",
@@ -37,6 +37,9 @@ DATA_LICENCES = {
     "apartment": _OWN,
     "tum": "TUM RGB-D: CC BY 4.0; another folder of this layout: see its publisher",
     "seven_scenes": "7-Scenes: see the data set's page at Microsoft Research",
+    "bonn": "Bonn RGB-D Dynamic: see the data set's page at the University of Bonn",
+    "euroc": "EuRoC MAV: see the data set's page at ETH Zurich; another folder of this layout: see its publisher",
+    "kitti": "KITTI: CC BY-NC-SA 3.0",
     "replica": "Replica: Replica Dataset Research Terms, for research and education that is not commercial",
     **dict.fromkeys(("images", "colmap", "nerfstudio", "rosbag"), "your own images, your own licence"),
 }
@@ -136,8 +139,8 @@ def errors(run: RecordedRun) -> str:
         lines.append(f"<tr><td>{escape(column.title)}</td>{''.join(cells)}</tr>")
     titles = "".join(f"<th>{escape(name)}</th>" for name, _ in rows)
     how = (
-        f"Protocol {run.provenance['protocol']}: {config.get('statistic', 'mean')} distances, clouds placed by the "
-        f"path ({config.get('alignment')}), ICP: by the points; rendered at each one's own poses. "
+        f"Protocol {run.provenance['protocol']}: {config.get('statistic', 'mean')} distances, clouds placed by their "
+        f"points (ICP) or by the path ({config.get('alignment')}); rendered at each one's own poses. "
         f"{metrics.get('trajectory/num_frames')} frames with truth. Raw prior: the same predictions without mapping."
     )
     return section("Errors", f"<table><tr><th></th>{titles}</tr>{''.join(lines)}</table>{quiet(how)}")

@@ -13,7 +13,7 @@ import jax
 from emgs_jax.data.base import Dataset
 from emgs_jax.io.files import flat, write_json
 from emgs_jax.prior.base import Provenance
-from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, cell
+from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Column, cell
 
 RESULT_FORMAT = 1  # of metrics.json; another one is refused where results are read
 RAW_PRIOR = "raw_prior/"  # prefix of the same metrics for the prior without any mapping
@@ -104,9 +104,10 @@ def has_metric_truth(block: Mapping[str, Any]) -> bool:
 def print_metrics_table(metrics: Mapping[str, Any]) -> str:
     """Lay out the main metrics, one row for the map, the raw prior and each baseline; `–` where there is no value.
 
-    Below are the same rows placed by their points (ICP), and what is rendered of them at their own poses.
+    First come clouds placed by their points (ICP), as in the README, below the same rows placed by the path, and what
+    is rendered of them at their own poses.
     """
-    tables = [_laid_out(metrics, columns) for columns in (MAIN, (*PLACED, *RENDERED))]
+    tables = [_laid_out(metrics, columns) for columns in ((MAIN[0], *PLACED), (*BY_PATH, *RENDERED))]
     return "\n\n".join(table for table in tables if table)
 
 

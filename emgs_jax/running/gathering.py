@@ -47,31 +47,46 @@ class Baselines:
     At ours it takes what the map took: frames that are tracked or that the map was made from, of each the points with a
     normal, in the size that the prediction was given there. So what is different is the fusion alone.
 
+    Sizes in metres become lengths of the poses by the first view: a unit is what its true depths are of those that it
+    is fused with (median), so that the prior's own unit does not matter; 1 m where it shows no true depth.
+
     Args:
         configs: by name.
         run: that is growing.
-        dataset: for the camera.
+        dataset: for the camera and the truth.
     """
 
     def __init__(self, configs: Mapping[str, BaselineConfig], run: MappingRun, dataset: Dataset) -> None:
-        pinhole = Pinhole(dataset.intrinsics, *dataset.size)
-        self.raw: dict[str, Fusion] = {name: config.start(pinhole) for name, config in configs.items()}
-        self.ours: dict[str, Fusion] = {name: config.start(pinhole) for name, config in configs.items()}
+        self.raw: dict[str, Fusion] = {}
+        self.ours: dict[str, Fusion] = {}
         self.poses: list[np.ndarray] = []  # ours, as they were: the finished run has another unit
-        self._run = run
+        self._configs, self._run, self._dataset = configs, run, dataset
 
     def add(self, row: int, view: View, points: np.ndarray, mask: np.ndarray, T_world_camera: np.ndarray) -> None:
         """Add the frame of a record, with its points (h, w, 3), which are known, and its pose as the prior says it."""
         record = self._run.records[row]
         self.poses.append(record.pose)
-        for fusion in self.raw.values():
-            fusion.add(view, T_world_camera, 1.0)
-        if record.status in PLACED and self.ours:
+        if self._configs:
+            self._fuse(self.raw, row, view, T_world_camera, 1.0)
+        if record.status in PLACED and self._configs:
             taken = np.asarray(has_normal(points, mask, self._run.config.observation))
             cloud = PointCloud(*(values[taken[mask]] for values in vars(view.cloud).values()))
             view = View(np.where(taken, view.depth, np.float32(0.0)), view.image, cloud)
-            for fusion in self.ours.values():
-                fusion.add(view, record.pose, 1.0 if record.scale is None else record.scale)
+            self._fuse(self.ours, row, view, record.pose, 1.0 if record.scale is None else record.scale)
+
+    def _fuse(self, into: dict[str, Fusion], row: int, view: View, T_world_camera: np.ndarray, scale: float) -> None:
+        if not into:
+            pinhole, truth = Pinhole(self._dataset.intrinsics, *self._dataset.size), self._dataset[row].depth
+            unit = 1.0 if truth is None else unit_of(truth, scale * view.depth)
+            into |= {name: config.start(pinhole, unit) for name, config in self._configs.items()}
+        for fusion in into.values():
+            fusion.add(view, T_world_camera, scale)
+
+
+def unit_of(truth: np.ndarray, depth: np.ndarray) -> float:
+    """Metres of one length of a depth (h, w), by the median of what is known of both; 1 where nothing is."""
+    known = (truth > 0) & (depth > 0)
+    return float(np.median(truth[known] / depth[known])) if known.any() else 1.0
 
 
 def gather(

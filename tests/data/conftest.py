@@ -98,6 +98,7 @@ def copy_of(write):
 seven_scenes_root, tum_root, replica_root, images_root = map(
     copy_of, (write_seven_scenes, write_tum, write_replica, write_images)
 )
+bonn_root = tum_root  # the same layout
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from emgs_jax.data.file_names import times_of
-from emgs_jax.data.timestamps import in_seconds, resolution, unit_of
-from emgs_jax.data.tum import nearest_rows, read_list
+from emgs_jax.data.timestamps import in_seconds, nearest_rows, resolution, unit_of
+from emgs_jax.data.tum import read_list
 from emgs_jax.evaluation.trajectory import associate
 from emgs_jax.io.trajectory import load_trajectory_tum
 

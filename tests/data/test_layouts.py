@@ -9,6 +9,7 @@ from hydra.utils import get_class
 from omegaconf import OmegaConf
 
 from emgs_jax.data.base import Frame
+from emgs_jax.data.bonn import Bonn
 from emgs_jax.data.images import Images
 from emgs_jax.data.replica import Replica
 from emgs_jax.data.seven_scenes import SevenScenes
@@ -18,6 +19,7 @@ CONF = Path(__file__).resolve().parents[2] / "conf" / "dataset"
 ON_DISK = {
     "seven_scenes": (SevenScenes, "kitchen/seq-01", {"register_depth": False}),
     "tum": (Tum, "rgbd_dataset_freiburg3_plane", {}),
+    "bonn": (Bonn, "rgbd_dataset_freiburg3_plane", {}),
     "replica": (Replica, "office9", {}),
     "images": (Images, ".", {"intrinsics": (128, 128, 79.5, 59.5)}),
 }

@@ -40,7 +40,7 @@ def a_view(depth, color=(51, 102, 204)):
 
 def fused(config, *views):
     """Of (view, pose, scale)."""
-    fusion = config.start(PINHOLE)
+    fusion = config.start(PINHOLE, 1.0)
     for view in views:
         fusion.add(*view)
     return fusion

@@ -72,13 +72,18 @@ def test_the_revision_is_that_of_git_and_none_outside_of_its_checkout(tmp_path):
     assert git_revision(Path("/")) is None
 
 
-def test_baselines_have_rows_of_their_own_and_a_second_table_what_is_placed_by_its_points_and_rendered():
-    metrics = METRICS | {"reconstruction_icp/accuracy_m": 0.04, "rendering/coverage_percent": 97.25}
-    metrics |= prefixed({"reconstruction_icp/accuracy_m": 0.05, "rendering/psnr_db": 20.0}, "baseline_tsdf_ours/")
+def test_the_first_table_is_placed_by_points_as_the_readme_the_second_by_the_path_and_rendered():
+    """The run ended with F1 by the path, and the README begins with the other one; neither said which it was."""
+    placed = {"reconstruction_icp/accuracy_m": 0.04, "reconstruction_icp/f1_5cm_percent": 71.0}
+    metrics = METRICS | placed | {"rendering/coverage_percent": 97.25}
+    metrics |= prefixed({"reconstruction/accuracy_m": 0.05, "rendering/psnr_db": 20.0}, "baseline_tsdf_ours/")
     first, second = metrics_table(metrics | {"provenance": a_provenance(True)}).split("\n\n")
     assert first.splitlines()[2].startswith("ours") and "TSDF" not in first
     _, _, ours, tsdf = second.splitlines()
-    assert ours.split() == ["ours", "4.00", *["–"] * 4, "97.2", *["–"] * 4]
+    assert "ICP: F1@.05 [%]" in first and "path: F1@.05 [%]" in second
+    assert "F1" not in first.replace("ICP: F1", "") and "F1" not in second.replace("path: F1", "")
+    assert first.splitlines()[2].split() == ["ours", "4.12", "4.00", "–", "–", "71.0", "–"]
+    assert ours.split() == ["ours", "5.00", "–", "98.8", "–", "88.0", "97.2", *["–"] * 4]
     assert tsdf.split() == ["TSDF,", "our", "poses", "5.00", *["–"] * 8, "20.0"]
 
 
@@ -98,13 +103,14 @@ def test_metrics_are_strict_json_ours_first_then_the_raw_prior_then_provenance(t
 
 
 def test_the_table_shows_both_rows_and_says_what_is_simulated():
-    metrics = METRICS | prefixed(METRICS, RAW_PRIOR) | {"raw_prior/trajectory/ate_sim3_m": 1.5}
+    by_points = {key.replace("reconstruction/", "reconstruction_icp/"): value for key, value in METRICS.items()}
+    metrics = by_points | prefixed(by_points, RAW_PRIOR) | {"raw_prior/trajectory/ate_sim3_m": 1.5}
     table = metrics_table(metrics | {"provenance": a_provenance(True)}).splitlines()
     assert table[0].split()[:3] == ["simulated", "ATE", "[cm]"]
     assert table[2].split() == ["ours", "4.12", "5.00", "–", "98.8", "–", "88.0"]
     assert table[3].split() == ["raw", "prior", "150.00", "5.00", "–", "98.8", "–", "88.0"]
     assert len({len(line) for line in table}) == 1
-    assert len(table) == 4, "nothing is placed by its points or rendered"
+    assert len(table) == 4, "nothing is placed by the path or rendered"
     alone = metrics_table(METRICS | {"provenance": a_provenance(False)})
     assert "simulated" not in alone
     assert "raw prior" not in alone

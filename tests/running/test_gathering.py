@@ -39,11 +39,15 @@ class Walls:
         return Frame(row, 0.0, "f", image, np.full(SHAPE, WALL, np.float32), poses_along(XS)[row])
 
 
-@pytest.fixture(scope="module")
-def gathered():
-    """The prior's depths are what the map's scales make of the truth, its poses two metres above ours."""
+def gather_all(unit: float = 1.0):
+    """The prior's depths are what the map's scales make of the truth, its poses two metres above ours.
+
+    Lengths of the prior and of the map are in units of so many metres.
+    """
     ours, raw = poses_along(XS), poses_along(XS)
     raw[:, 1, 3] += 2.0
+    ours[:, :3, 3] /= unit
+    raw[:, :3, 3] /= unit
     records = [
         FrameRecord(row, "f", 0.0, status, pose=ours[row], scale=scale)
         for row, (status, scale) in enumerate(zip(STATUSES, SCALES, strict=True))
@@ -54,7 +58,7 @@ def gathered():
     def views():
         for row, record in enumerate(records):
             run.records.append(record)  # as `map_frames` does: a frame's record is there before its view
-            points = backproject(np.full(SHAPE, WALL / (SCALES[row] or 1.0)), INTRINSICS)
+            points = backproject(np.full(SHAPE, WALL / (SCALES[row] or 1.0) / unit), INTRINSICS)
             features = np.zeros((1, 2, 2), np.float16)  # left half, right half of the image
             features[0, :, row % 2] = 1.0 if row else [1.0, 0.0]
             mask = np.full(SHAPE, row != 4)
@@ -63,6 +67,20 @@ def gathered():
 
     text = ("wall", "cat"), np.eye(2, dtype=np.float32)
     return run, baselines, gather(views(), evaluation_config(), True, baselines, text)
+
+
+@pytest.fixture(scope="module")
+def gathered():
+    return gather_all()
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_in_another_unit_baselines_are_the_same_clouds_in_that_unit(gathered, name):
+    """Voxels and truncation were lengths of the prior: with a unit of 4 m a voxel was 8 cm."""
+    other = gather_all(unit=4.0)[1]  # a power of two, so that nothing is rounded
+    for kind in ("raw", "ours"):
+        expected, found = (getattr(baselines, kind)[name].cloud() for baselines in (gathered[1], other))
+        np.testing.assert_allclose(4.0 * found.points, expected.points, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", CONFIGS)

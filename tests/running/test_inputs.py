@@ -71,13 +71,17 @@ def test_a_frame_that_is_lost_for_a_while_is_the_same():
     assert {one.structure for one in taken(edit)} == {0}
 
 
-def test_predictions_in_millimetres_are_named_before_the_first_step():
-    """They ended frame by frame in advice about walls."""
+def in_unit(prediction: PriorPrediction, metres: float) -> PriorPrediction:
+    poses = prediction.T_anchor_view.copy()
+    poses[:, :3, 3] /= metres
+    return replace(prediction, T_anchor_view=poses, points=prediction.points / np.float32(metres))
 
-    def in_millimetres(prediction: PriorPrediction) -> PriorPrediction:
-        poses = prediction.T_anchor_view.copy()
-        poses[:, :3, 3] *= 1000
-        return replace(prediction, T_anchor_view=poses, points=1000 * prediction.points)
 
-    with pytest.raises(ValueError, match=r"median depth of \d+ in its inference 0, .* millimetres\? Divide points and"):
-        taken(in_millimetres)
+@pytest.mark.parametrize("metres", [1e-3, 1e-2, 1e3])
+def test_predictions_in_another_unit_are_named_before_the_first_step_with_a_factor_that_mends_them(metres):
+    """Millimetres ended frame by frame in advice about walls; of centimetres it said to divide by 1000."""
+    with pytest.raises(ValueError, match=r"median depth of .* in its inference 0, .* multiply points and") as caught:
+        taken(lambda prediction: in_unit(prediction, metres))
+    factor = float(str(caught.value).split("T_anchor_view by ")[1].split(" ")[0])
+    assert 0.1 < factor / metres < 10, "a scene of some units"
+    assert len(taken(lambda prediction: in_unit(in_unit(prediction, metres), 1 / factor))) > 1

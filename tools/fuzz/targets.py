@@ -20,9 +20,12 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax import load_config
 from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.data.bonn import Bonn
 from emgs_jax.data.checksums import SUMS_FILE
 from emgs_jax.data.class_file import read_classes
+from emgs_jax.data.euroc import Euroc
 from emgs_jax.data.images import Images
+from emgs_jax.data.kitti import Kitti
 from emgs_jax.data.posed_images import Colmap, Nerfstudio
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.reading import is_rigid
@@ -57,6 +60,7 @@ from emgs_jax.running.measuring import Look
 from emgs_jax.running.places import load_places, save_places
 from emgs_jax.running.record import FrameRecord
 from emgs_jax.running.values import check_values
+from tests.data.written_benchmarks import write_euroc, write_kitti
 from tests.data.written_scene import color_image, plane_depth, scene_pose, write_depth
 
 from .damage import BYTES, TEXT, WORDS, Damage
@@ -64,6 +68,7 @@ from .damage import BYTES, TEXT, WORDS, Damage
 NUM_FRAMES = 3
 SIZE = (48, 36)
 KITCHEN = (640, 480)
+TESTS = Path(__file__).resolve().parents[2] / "tests"  # where pytest looks for what tests share
 
 
 class Target(NamedTuple):
@@ -417,9 +422,8 @@ def read_checkpoint(folder: Path) -> None:
 
 
 def write_finished_run(folder: Path) -> None:
-    beside = str(Path(__file__).resolve().parents[1])
-    if beside not in sys.path:  # where pytest looks for what tests share
-        sys.path.append(beside)
+    if str(TESTS) not in sys.path:
+        sys.path.append(str(TESTS))
     from tests.report.written_run import written_run
 
     written_run(folder / "room")
@@ -481,6 +485,21 @@ def targets() -> Iterator[Target]:
         ),
         image | {".txt": TEXT},
     )
+    yield Target(
+        "bonn",
+        write_tum,
+        lambda f: check_frames(
+            Bonn(f, "rgbd_dataset_freiburg3_plane", size=SIZE, stride=1, intrinsics=(60, 60, 23.5, 17.5))
+        ),
+        image | {".txt": TEXT},
+    )
+    yield Target(
+        "euroc",
+        write_euroc,
+        lambda f: check_frames(Euroc(f, "MH_01_easy", size=SIZE)),
+        image | {".csv": TEXT, ".yaml": TEXT},
+    )
+    yield Target("kitti", write_kitti, lambda f: check_frames(Kitti(f, "07", size=SIZE)), image | {".txt": TEXT})
     yield Target(
         "replica",
         write_replica,

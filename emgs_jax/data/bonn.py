@@ -1,0 +1,72 @@
+"""Bonn RGB-D Dynamic: TUM's layout, with a motion capture that follows markers on the sensor in axes of its own."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from emgs_jax.data.intrinsics import Given
+from emgs_jax.data.reading import Number
+from emgs_jax.data.tum import Calibrations, Tum
+
+# The authors' transforms: what they call T_g, their world from a point of the camera, is T_ROS^-1 T T_ROS T_M with the
+# markers' pose T of groundtruth.txt. T_M is no rigid motion but has a scale of 1.0593, by which depths fall short of
+# the motion capture's metres; here it stands in `depth_scale`, so that poses stay rigid.
+T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])  # is its own inverse
+T_M = np.array(
+    [
+        [1.0157, 0.1828, -0.2389, 0.0113],
+        [0.0009, -0.8431, -0.6413, -0.0098],
+        [-0.3009, 0.6147, -0.8085, 0.0111],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+CALIBRATION = (542.822841, 542.576870, 315.593520, 237.756098), (0.039903, -0.099343, -0.000730, -0.000144, 0.0)
+
+
+class Bonn(Tum):
+    """One sequence of Bonn RGB-D Dynamic; what a list lacks is treated as in `Tum`.
+
+    Args:
+        root: folder that holds the sequences.
+        sequence: "rgbd_bonn_balloon".
+        start, stop, stride: which of the images in rgb.txt, in order of time.
+        size: (width, height) of the frames given out.
+        intrinsics: of the images on disk, as `Images` takes them; None = the benchmark's calibration.
+        depth_scale: raw units per metre of the motion capture.
+        max_time_difference: seconds between a colour image and its depth image or pose.
+    """
+
+    name = "bonn"
+    source = "Bonn RGB-D Dynamic Dataset, project page of the Photogrammetry and Robotics Lab of the University of Bonn"
+    calibrations: Calibrations = {"": CALIBRATION}  # of one sensor, whatever the sequence is called
+
+    def __init__(
+        self,
+        root: str | None = None,
+        sequence: str | None = None,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 10,
+        size: Sequence[int] = (320, 240),
+        intrinsics: Given | None = None,
+        depth_scale: Number = 4720.1,
+        max_time_difference: Number = 0.02,
+    ) -> None:
+        super().__init__(
+            *(root, sequence, start, stop, stride, size, intrinsics),
+            depth_scale=depth_scale,
+            max_time_difference=max_time_difference,
+        )
+
+    def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
+        T_capture_markers = super().pose(index)
+        return None if T_capture_markers is None else T_ROS @ T_capture_markers @ T_ROS @ markers_camera()
+
+
+def markers_camera() -> Float[np.ndarray, "4 4"]:
+    """T_M without its scale: the rigid motion from the camera to the markers."""
+    left, _, right = np.linalg.svd(T_M[:3, :3])
+    motion = T_M.copy()
+    motion[:3, :3] = left @ right
+    return motion

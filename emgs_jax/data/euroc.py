@@ -1,0 +1,108 @@
+"""EuRoC MAV, and what has its layout (ASL): images of one camera on a rig, whose motion is known; no depth."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from emgs_jax.data import reading
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.calibration_files import Calibration, lens_of, needed, numbers_of, parse_keys, refuse_model, size_of
+from emgs_jax.data.posed_images import Pose, PosedImages, Solved
+from emgs_jax.data.reading import Number
+from emgs_jax.data.timestamps import check_tolerance, matched_rows
+from emgs_jax.data.tum import as_transform, read_list
+
+LAYOUT = "root/SEQUENCE/mav0/{cam0/{data.csv, sensor.yaml, data/}, state_groundtruth_estimate0/data.csv}"
+SOURCE = "EuRoC MAV dataset of the ASL at ETH Zurich, the zip of a sequence in ASL format"
+MODELS = ("radial-tangential", "radtan")
+ORDER = (0, 1, 2, 4, 5, 6, 3)  # from x y z qw qx qy qz to TUM's order
+
+
+class Euroc(PosedImages):
+    """One camera of one sequence of EuRoC, straightened; without state_groundtruth_estimate0 there are no poses.
+
+    Args:
+        root: folder that holds the sequences.
+        sequence: "MH_01_easy".
+        camera: "cam0" (left) or "cam1".
+        start, stop, stride: which of the images in data.csv, in order of time.
+        size: (width, height) of the frames given out.
+        max_time_difference: seconds between an image and its pose.
+    """
+
+    name = "euroc"
+
+    def __init__(
+        self,
+        root: str | None = None,
+        sequence: str | None = None,
+        camera: str = "cam0",
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        size: Sequence[int] = (376, 240),
+        max_time_difference: Number = 0.02,
+    ) -> None:
+        folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
+        solved = read_euroc(folder / "mav0", camera, check_tolerance(max_time_difference))
+        super().__init__(folder, solved, (start, stop, stride), size, str(sequence))
+
+
+def read_euroc(folder: Path, camera: str, tolerance: float) -> Solved:
+    """The images of a camera and its poses in the world of the ground truth.
+
+    Raises:
+        FileNotFoundError: a file of the layout is missing.
+        ValueError: it is damaged, the lens has another model, or no pose is near any image in time.
+    """
+    images, sensor = folder / camera / "data.csv", folder / camera / "sensor.yaml"
+    for path in (images, sensor):
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} is missing; expected the layout {LAYOUT} ({SOURCE})")
+    times, names, _ = read_list(images, 2)
+    found, T_body_camera = read_sensor(sensor)
+    truth, poses = folder / "state_groundtruth_estimate0" / "data.csv", [None] * len(times)
+    if truth.is_file() and len(times):
+        poses = body_poses(truth, times, tolerance)
+    return Solved(
+        [folder / camera / "data" / name for (name,) in names],
+        [None if pose is None else pose @ T_body_camera for pose in poses],
+        found,
+        images,
+        (images, sensor, *([truth] if truth.is_file() else [])),
+        times.tolist(),
+    )
+
+
+def body_poses(path: Path, times: np.ndarray, tolerance: float) -> list[Pose | None]:
+    """T_world_body nearest to each time, from lines of time, position, quaternion (w first) and more."""
+    known, words, lines = read_list(path, 8)
+    rows = matched_rows(times, known, tolerance, ("pose", path))
+
+    def pose(row: int) -> Pose | None:
+        return as_transform([words[row][i] for i in ORDER], f"{path}, line {lines[row]}:")
+
+    return [None if row < 0 else pose(row) for row in rows]
+
+
+def read_sensor(path: Path) -> tuple[Calibration, Pose]:
+    """The camera of a sensor.yaml and T_body_camera, which it calls T_BS."""
+    try:
+        values = parse_keys(reading.read_text(path), path)
+    except BadFrameError as error:
+        raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
+    for key in ("T_BS", "resolution", "intrinsics", "distortion_model", "distortion_coefficients"):
+        if key not in values:
+            raise ValueError(f"{path} has no {key}, which a camera of EuRoC has: fetch it again")
+    model = values["distortion_model"]
+    if model not in MODELS:
+        refuse_model(model, MODELS, path)
+    intrinsics, size = numbers_of(values["intrinsics"], "intrinsics", path), values["resolution"]
+    bent = numbers_of(values["distortion_coefficients"], "distortion_coefficients", path)
+    mounted = numbers_of(values["T_BS"], "T_BS", path)
+    if len(intrinsics) != 4 or not isinstance(size, list) or len(size) != 2:
+        raise ValueError(f"{path}: intrinsics must be fx, fy, cx, cy and resolution width, height: fetch it again")
+    width, height = needed(dict(zip(("width", "height"), size, strict=True)), ("width", "height"), path)
+    T_body_camera = reading.as_pose(" ".join(map(repr, mounted)), f"{path}: T_BS")
+    return Calibration(tuple(intrinsics), lens_of(bent, path), size_of(width, height, path)), T_body_camera

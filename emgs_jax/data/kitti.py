@@ -1,0 +1,128 @@
+"""KITTI odometry: rectified images of a car, and the motion of its left grey camera; no depth."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from emgs_jax.data import reading
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.calibration_files import Calibration
+from emgs_jax.data.file_names import IMAGE_SUFFIXES, natural_key
+from emgs_jax.data.posed_images import Pose, PosedImages, Solved
+
+LAYOUT = "root/{sequences/00/{image_2/, calib.txt, times.txt}, poses/00.txt}"
+SOURCE = "KITTI odometry benchmark: colour images, calibration files and ground truth poses, project page at KIT"
+
+
+class Kitti(PosedImages):
+    """One camera of one sequence of KITTI odometry; 11 to 21 have no poses.
+
+    The world is that of poses/00.txt: the left grey camera at the first image of the sequence.
+
+    Args:
+        root: folder that holds sequences/ and poses/.
+        sequence: "00"; of 7 the two digits 07.
+        camera: 0 and 1 are grey, 2 and 3 in colour, left and right.
+        start, stop, stride: which of the images, in order of their names.
+        size: (width, height) of the frames given out.
+    """
+
+    name = "kitti"
+
+    def __init__(
+        self,
+        root: str | None = None,
+        sequence: str | int | None = None,
+        camera: int = 2,
+        start: int = 0,
+        stop: int | None = None,
+        stride: int = 1,
+        size: Sequence[int] = (480, 144),
+    ) -> None:
+        name = None if sequence is None else str(sequence).zfill(2)
+        place = None if name is None else f"sequences/{name}"
+        folder = reading.find_sequence(root, place, LAYOUT, SOURCE)
+        solved = read_kitti(folder, folder.parents[1] / "poses" / f"{name}.txt", camera)
+        super().__init__(folder, solved, (start, stop, stride), size, str(name))
+
+
+def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:
+    """The images of a camera and its poses.
+
+    Args:
+        folder: of the sequence.
+        truth: poses of camera 0; a poses.txt in `folder` does as well, and without either there is none.
+        camera: 0 to 3.
+
+    Raises:
+        FileNotFoundError: a file of the layout is missing.
+        ValueError: it is damaged, or lists do not have a row for every image.
+    """
+    images = folder / f"image_{camera}"
+    if not images.is_dir():
+        raise FileNotFoundError(f"{images} is no folder; expected the layout {LAYOUT} ({SOURCE})")
+    found = (path for path in images.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    paths = sorted(found, key=natural_key)
+    calibration, clock = folder / "calib.txt", folder / "times.txt"
+    intrinsics, T_first_camera = read_projection(calibration, f"P{camera}")
+    truth = next((path for path in (truth, folder / "poses.txt") if path.is_file()), None)
+    poses: list[Pose | None] = [None] * len(paths)
+    if truth is not None:
+        rows = read_rows(truth, len(paths))
+        poses = [pose_of(row, f"{truth}, line {line}:", T_first_camera) for line, row in enumerate(rows, 1)]
+    times = [number_of(row, f"{clock}, line {line}:") for line, row in enumerate(read_rows(clock, len(paths)), 1)]
+    files = calibration, clock, *([] if truth is None else [truth])
+    return Solved(paths, poses, intrinsics, truth or calibration, files, times)
+
+
+def read_rows(path: Path, count: int) -> list[str]:
+    """The lines of a list that has one for every image."""
+    rows = _text(path).rstrip().splitlines()
+    if len(rows) != count:
+        raise ValueError(f"{path} has {len(rows)} lines for {count} images: fetch the sequence and this file again")
+    return rows
+
+
+def read_projection(path: Path, key: str) -> tuple[Calibration, Float[np.ndarray, "4 4"]]:
+    """The camera with the projection K [I | t] of calib.txt, and its pose T_first_camera beside the left grey one."""
+    lines = dict(line.split(":", 1) for line in _text(path).splitlines() if ":" in line)
+    if key not in lines:
+        raise ValueError(f"{path} has no {key}: fetch the calibration files of the odometry benchmark")
+    P = _numbers(lines[key], 12, f"{path}: {key}").reshape(3, 4)
+    K, pose = P[:, :3], np.eye(4)
+    if K[0, 1] or K[1, 0] or K[2].tolist() != [0, 0, 1] or not min(K[0, 0], K[1, 1]) > 0:
+        raise ValueError(f"{path}: {key} must be that of a rectified camera, fx 0 cx, 0 fy cy, 0 0 1: fetch it again")
+    pose[:3, 3] = -np.linalg.solve(K, P[:, 3])
+    return Calibration((K[0, 0], K[1, 1], K[0, 2], K[1, 2])), pose
+
+
+def pose_of(row: str, where: str, T_first_camera: Pose) -> Pose | None:
+    """T_world_camera of a row of twelve numbers, the upper part of that of camera 0; None where it is inf or nan."""
+    if len(row.split()) != 12:
+        raise BadFrameError(f"{where} {row[:80]!r} must be 12 numbers, the upper part of a pose: fetch the file again")
+    pose = reading.as_motion(f"{row} 0 0 0 1", where)
+    return None if pose is None else pose @ T_first_camera
+
+
+def number_of(text: str, where: str) -> float:
+    """A finite number."""
+    return float(_numbers(text, 1, where)[0])
+
+
+def _numbers(text: str, count: int, where: str) -> Float[np.ndarray, " n"]:
+    try:
+        values = np.array([float(word) for word in text.split()], np.float64)
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count or not np.isfinite(values).all():
+        raise ValueError(f"{where} must be {count} finite numbers, got {text.strip()[:80]!r}: fetch it again")
+    return values
+
+
+def _text(path: Path) -> str:
+    try:
+        return reading.read_text(path)
+    except BadFrameError as error:
+        raise FileNotFoundError(f"{error}; expected the layout {LAYOUT} ({SOURCE})") from error

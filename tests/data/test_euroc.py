@@ -1,0 +1,70 @@
+"""EuRoC's folders; oracles: poses from which the files were written, the lens of dataset=images."""
+
+import numpy as np
+import pytest
+from written_scene import scene_pose
+
+from emgs_jax.data.euroc import Euroc
+from emgs_jax.data.images import Images
+from tests.data.written_benchmarks import LENS, START, write_euroc
+
+
+@pytest.fixture
+def euroc_root(tmp_path):
+    write_euroc(tmp_path)
+    return tmp_path
+
+
+def load(root, **options):
+    return Euroc(str(root), "MH_01_easy", **{"stride": 1, "size": (160, 120), **options})
+
+
+def test_poses_are_the_cameras_and_not_the_bodys_and_times_are_seconds(euroc_root):
+    dataset = load(euroc_root)
+    assert dataset.pose(0) is None and not dataset.has_ground_truth
+    for row in (1, 2):
+        np.testing.assert_allclose(dataset[row].T_world_camera, scene_pose(row), atol=1e-7)
+    np.testing.assert_allclose([dataset[row].timestamp - START / 1e9 for row in range(3)], [0, 0.05, 0.1], atol=5e-7)
+
+
+def test_images_are_straightened_as_those_of_a_folder_with_these_numbers(euroc_root):
+    folder = euroc_root / "MH_01_easy" / "mav0" / "cam0" / "data"
+    same, dataset = Images(str(folder), size=(160, 120), intrinsics=LENS), load(euroc_root)
+    assert dataset.intrinsics == same.intrinsics
+    np.testing.assert_array_equal(dataset[1].image, same[1].image)
+
+
+def test_without_the_truths_folder_there_are_no_poses(euroc_root):
+    truth = euroc_root / "MH_01_easy" / "mav0" / "state_groundtruth_estimate0"
+    whole = load(euroc_root).fingerprint()
+    (truth / "data.csv").unlink()
+    assert load(euroc_root).pose(1) is None and load(euroc_root).fingerprint() != whole
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("radial-tangential", "equidistant", "sensor.yaml: the camera model equidistant is not read, only radial-tan"),
+        ("[160, 120]", "[752, 480]", r"data.csv is for images of 752x480, but the images are 160x120"),
+        ("[160, 120]", "752", "sensor.yaml: .* resolution width, height: fetch it again"),
+        ("T_BS:", "T_SB:", "sensor.yaml has no T_BS, which a camera of EuRoC has"),
+        ("[130.0", "[x", "sensor.yaml: intrinsics must be a finite number, got 'x'"),
+        ("cols: 4", "cols: [", "sensor.yaml is damaged or no yaml"),
+    ],
+)
+def test_a_camera_that_is_not_read_is_refused_with_its_file(euroc_root, old, new, said):
+    path = euroc_root / "MH_01_easy" / "mav0" / "cam0" / "sensor.yaml"
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(ValueError, match=said):
+        load(euroc_root)
+
+
+def test_what_is_missing_or_far_in_time_is_named(euroc_root):
+    with pytest.raises(FileNotFoundError, match=r"cam1/data.csv is missing; expected the layout root/SEQUENCE/mav0"):
+        load(euroc_root, camera="cam1")
+    with pytest.raises(ValueError, match=r"data.csv: 0 of 3 images have a pose \(max difference 0.0001 s\)"):
+        load(euroc_root, max_time_difference=1e-4)
+    path = euroc_root / "MH_01_easy" / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    path.write_text(path.read_text().replace(",0.", ",7.", 4))
+    with pytest.raises(ValueError, match=r"estimate0/data.csv, line 2: .* is no pose, as its quaternion has not"):
+        load(euroc_root)
