@@ -8,6 +8,7 @@ in which the map is better than each other estimate.
 
 import re
 import shlex
+import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -75,9 +76,13 @@ def block(paths: Sequence[Path], titles: Mapping[str, str]) -> str:
 
 
 def short_block(paths: Sequence[Path], titles: Mapping[str, str], short: Mapping[str, Sequence[str]]) -> str:
-    """Likewise with the columns of `SHORT`, and of the rows those of the `settings` and `kinds` that `short` names."""
+    """Likewise with the columns of `SHORT`, and of the rows those of the `data`, `settings` and `kinds` of `short`."""
     estimates = [item for path in paths for item in estimates_of(path)]
-    shown = [item for item in estimates if item.variant in short["settings"] and item.kind in short["kinds"]]
+    shown = [
+        item
+        for item in estimates
+        if item.dataset in short["data"] and item.variant in short["settings"] and item.kind in short["kinds"]
+    ]
     return f"\n{_about(paths)}\n\n{_table(shown, titles, SHORT, is_best_bold=True)}\n"
 
 
@@ -98,7 +103,7 @@ def _about(paths: Sequence[Path]) -> str:
         "device": _distinct(f"{one['kind']}, {one['cpu_count']} CPU cores" for one in (o["device"] for o in origins)),
         "commit": f"`{revision_of(origin['git'] for origin in origins)}`",
     }
-    return "; ".join(f"{name} {value}" for name, value in facts.items()) + "."
+    return textwrap.fill("; ".join(f"{name} {value}" for name, value in facts.items()) + ".", 130)
 
 
 def _distinct(values: Iterable[Any]) -> str:

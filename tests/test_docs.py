@@ -64,8 +64,8 @@ def test_keys_of_the_stages_are_keys_of_the_config(page):
             node = node[name]
 
 
-def test_the_readme_lists_every_room_of_the_package():
-    text = next(block for block in BLOCK.findall((ROOT / "README.md").read_text()) if "\nops/" in block)
+def test_the_documentation_lists_every_room_of_the_package():
+    text = next(block for block in BLOCK.findall((ROOT / "docs" / "how_it_works.md").read_text()) if "\nops/" in block)
     listed = {line.split()[0] for line in text.splitlines() if re.match(r"[a-z_]+/? ", line)}
     found = [path for path in (ROOT / "emgs_jax").iterdir() if not path.name.startswith(("_", "."))]
     files = {path.stem for path in found if path.suffix == ".py"}

@@ -101,10 +101,10 @@ def test_a_config_holds_what_the_command_line_gives():
 
 
 @pytest.mark.slow
-def test_the_snippet_of_the_readme_maps_a_sequence_in_two_ways_with_the_same_bits(tmp_path, monkeypatch, capsys):
+def test_the_snippet_of_the_documentation_maps_a_sequence_in_two_ways_with_the_same_bits(tmp_path, monkeypatch, capsys):
     """Oracles: the truth, since the prior is exact; one way for the other."""
     monkeypatch.chdir(tmp_path)
-    text = (PACKAGE.parent / "README.md").read_text(encoding="utf-8")
+    text = (PACKAGE.parent / "docs" / "how_it_works.md").read_text(encoding="utf-8")
     (snippet,) = [part.split("```")[0] for part in text.split("```python\n")[1:] if "map_sequence" in part]
     tiny = ", ".join(repr(word) for word in (*TINY, "prior.level=0", "compilation_cache=off"))
     assert snippet.count('"dataset=synthetic", "experiment=smoke"') == 2

@@ -1,6 +1,7 @@
 """The tables of the pages from made-up runs: numbers worked out by hand, and nothing else on a page changes."""
 
 import json
+import re
 from pathlib import Path
 
 import hydra
@@ -54,7 +55,9 @@ def test_rows_are_mean_and_deviation_over_the_seeds_and_the_map_is_counted_again
 def test_the_short_table_has_what_is_named_and_the_best_of_each_column_in_bold(tmp_path):
     """Lengths of ours are the smaller ones, and so are its shares, which is worse."""
     paths = [written(tmp_path / "default", 3, ours=0.02, raw=0.03), written(tmp_path / "level 2", 3, ours=0.01)]
-    text = short_block(paths, {"synthetic": "room"}, {"settings": ["default"], "kinds": ["ours", "raw prior"]})
+    text = short_block(
+        paths, {"synthetic": "room"}, {"data": ["synthetic"], "settings": ["default"], "kinds": ["ours", "raw prior"]}
+    )
     rows = [cells(line) for line in text.splitlines() if line.startswith("| room")]
     lower = [column.is_lower_better for column in SHORT]
     assert any(lower) and not all(lower)
@@ -62,7 +65,9 @@ def test_the_short_table_has_what_is_named_and_the_best_of_each_column_in_bold(t
         ["room", "ours", "1", *["**2.0**" if is_lower else "2.0" for is_lower in lower]],
         ["room", "raw prior", "1", *["3.0" if is_lower else "**3.0**" for is_lower in lower]],
     ]
-    alone = short_block(paths, {"synthetic": "room"}, {"settings": ["level 2"], "kinds": ["ours"]})
+    alone = short_block(
+        paths, {"synthetic": "room"}, {"data": ["synthetic"], "settings": ["level 2"], "kinds": ["ours"]}
+    )
     assert [cells(line)[0] for line in alone.splitlines() if "ours" in line] == ["room, level 2"]
 
 
@@ -71,7 +76,7 @@ def test_the_line_above_a_table_says_where_it_comes_from_and_names_every_device(
     metrics = json.loads(paths[1].read_text())
     metrics["provenance"]["device"] = {"kind": "gpu", "cpu_count": 16}
     paths[1].write_text(json.dumps(metrics))
-    about = block(paths, {"synthetic": "room"}).strip().splitlines()[0]
+    about = " ".join(block(paths, {"synthetic": "room"}).strip().split("\n\n")[0].splitlines())
     facts = "simulated", "synthetic room0 (40 frames)", "3, 4", "paper/sim3", "`0123456789ab`"
     assert all(fact in about for fact in (*facts, "device cpu, 2 CPU cores, gpu, 16 CPU cores;")), about
 
@@ -111,6 +116,7 @@ def settings(tmp_path):
         config = hydra.compose("tables", ["root=nowhere", f"out={tmp_path / 'out'}", *pages])
         config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
         settings = {"default": {}, "level 2": {"prior.level": 2}}
+        config["short"]["data"] = ["synthetic"]
         config["tables"] = {"some": [{"data": ["synthetic"], "seeds": [3, 4], "settings": settings}]}
         for name in ("page.md", "full.md"):
             (tmp_path / name).write_text(PAGE)
@@ -156,6 +162,6 @@ def test_both_pages_have_the_places_of_all_tables_every_row_has_a_title_and_both
         text = (CONF.parent / config[key]).read_text()
         assert all(text.count(f"<!-- table: {name} -->") == 1 for name in config.tables)
         assert text.count("<!-- end -->") == len(config.tables)
-        about.append([line for line in text.splitlines() if line.startswith("Prior ") and "commit `" in line])
+        about.append(re.findall(r"^Prior [^|]*?; commit `\w+`\.$", text, re.MULTILINE))
     assert {data for rows in config.tables.values() for row in rows for data in row.data} <= set(config.titles)
     assert about[0] == about[1] and len(about[0]) == len(config.tables)
