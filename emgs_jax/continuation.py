@@ -13,13 +13,14 @@ from emgs_jax.ops.pytree import traced
 
 
 class ContinuationConfig(eqx.Module):
-    """How far the errors of a frame are alike.
+    """Extrapolation of a frame's depth errors from observed surfaces to the new surface beside them.
 
     Args:
-        width: of the Gaussian window over which they are averaged, its standard deviation as a fraction of the image's
-            width; 0: new points stay where the frame puts them, as printed.
+        width: of the Gaussian window over which errors are averaged, its standard deviation as a fraction of the
+            image's width; 0: new points stay where the frame puts them, as printed.
         max_error: of a logarithm of depth; a larger one is no error but another surface.
-        min_cos: between a Gaussian's normal and the ray; a flatter look does not show where along it the plane lies.
+        min_cos: between a Gaussian's normal and the ray; a more grazing view does not show where along it the plane
+            lies.
     """
 
     width: Float[Array, "*b"] = traced(low=0, high=10)

@@ -42,7 +42,7 @@ def empty_gaussians(capacity: int, num_features: int) -> Gaussians:
 
 
 class FitConfig(eqx.Module):
-    """How points become Gaussians.
+    """Conversion of points into Gaussians: number of clusters, clustering and covariances.
 
     Args:
         points_per_gaussian: λ, in pixels of an image of 518 × 392, the paper's; a new Gaussian stands for so many. An

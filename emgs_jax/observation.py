@@ -48,7 +48,7 @@ class Prediction(eqx.Module):
 
 
 class ObservationConfig(eqx.Module):
-    """How a point map becomes an observation.
+    """Conversion of a point map into an observation: thinning, normals and masking.
 
     Args:
         thin: every `thin`-th row and column is kept; 1 = the paper, every pixel.
@@ -137,7 +137,7 @@ def sample_features(grid: Float[Array, "y x f"], size: tuple[int, int], thin: in
 def known_surface(
     points: Float[Array, "h w 3"], mask: Bool[Array, "h w"], config: ObservationConfig
 ) -> Bool[Array, "h w"]:
-    """Which points of an image `observe` takes: of those in the mask the ones with a normal."""
+    """Return the mask of the points that `observe` takes: inside `mask`, before the camera and with a normal."""
     valid = mask & (points[..., 2] > 0)
     return valid & _is_surface(normals_from_pointmap(jnp.where(valid[..., None], points, 0.0), valid, config))
 

@@ -82,7 +82,7 @@ def match_on_image(
 def within_margins(
     depth: Float[Array, "*g"], surface: Float[Array, "*g"], config: RefinementConfig
 ) -> Bool[Array, "*g"]:
-    """Whether a depth is the surface's, or in front of it or behind it by no more than the margins."""
+    """Test whether a depth is within the margins in front of and behind a surface, fractions of its depth."""
     relative = depth / surface - 1.0
     return (relative >= -config.front_margin) & (relative <= config.back_margin)
 

@@ -1,4 +1,4 @@
-"""What a data set gives: frames in order, their calibration and, where it is known, the truth."""
+"""Interface of a data set: frames in order, their calibration and, where it is known, the ground truth."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -58,7 +58,7 @@ class Dataset(Protocol):
     def pose(self, index: int) -> np.ndarray | None: ...
 
     def files(self, index: int) -> Sequence[Path]:
-        """What frame `index` is read from, its image first, lists and poses too; empty where frames are made."""
+        """Return the files of frame `index`: its image first, then lists and poses; empty where frames are made."""
         ...
 
     def fingerprint(self) -> str:

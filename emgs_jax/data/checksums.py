@@ -106,7 +106,7 @@ def read_sums(path: Path) -> dict[Path, tuple[int, str]]:
 
 
 def _place(file: Path) -> Path:
-    """Where a file lies, by whatever links it is named; itself where that is no name."""
+    """Return the path of a file with all links resolved; the path itself if no file can have that name."""
     try:
         return Path(os.path.realpath(file))
     except ValueError:  # a zero byte in a name from a damaged list

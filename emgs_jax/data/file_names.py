@@ -1,4 +1,4 @@
-"""What the names of image files say: which file is meant, their order, and their times."""
+"""Information in the names of image files: the file that a list means, the order of the files, and their times."""
 
 import math
 import re
@@ -35,7 +35,7 @@ def find_image(folder: Path, name: str) -> Path:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; not where no file can have that name (too long, or with a zero byte)."""
+    """Test whether a file exists; False also for a name that no file can have (too long, or with a zero byte)."""
     try:
         return path.is_file()
     except (OSError, ValueError):

@@ -53,13 +53,13 @@ class Pair:
 
 @dataclass(frozen=True)
 class FocalLength:
-    """What images say of their focal length, in pixels.
+    """Focal length estimated from images, in pixels.
 
     Args:
-        value: of all pairs together.
-        spread: its standard deviation, from how much single pairs pull.
-        quartiles: of what every pair alone says; they scatter far more than the value.
-        num_pairs, num_images: that it rests on.
+        value: estimate from all pairs of images together.
+        spread: its standard deviation, from the scatter of the pairs' gradients.
+        quartiles: of the estimates from single pairs; they scatter far more than the value.
+        num_pairs, num_images: that the estimate rests on.
     """
 
     value: float
@@ -241,7 +241,7 @@ def normal_equations(
 
 
 def eliminate(A: Float[np.ndarray, "6 6"], b: Float[np.ndarray, " 6"], damping: float):
-    """What a pair says of log f alone, curvature and gradient, and the step of its motion for a step of log f."""
+    """Eliminate a pair's motion: return curvature and gradient by log f, and the motion's step as a function of log f's."""
     block = A[1:, 1:] + np.diag(damping * A[1:, 1:].diagonal() + 1e-9 * max(A[1:, 1:].trace(), 1e-30))
     solved = np.linalg.solve(block, np.stack([A[1:, 0], b[1:]], axis=-1))
     curvature, gradient = A[0, 0] - A[0, 1:] @ solved[:, 0], b[0] - A[0, 1:] @ solved[:, 1]

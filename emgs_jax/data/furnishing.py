@@ -1,4 +1,4 @@
-"""Where furniture stands: at random places along the walls, clear of doorways, of each other and of who walks by."""
+"""Placement of furniture: at random along the walls, clear of doorways, of other pieces and of the camera's routes."""
 
 from collections.abc import Callable, Iterable
 
@@ -20,12 +20,12 @@ Bounds = Float[np.ndarray, "2 3"]  # lowest and highest corner in the world
 def furnish(
     area: Area, pieces: Iterable[Piece], middle: list[Part], lanes: Float[np.ndarray, "p 2"], rng: np.random.Generator
 ) -> list[Part]:
-    """What stands in the middle, and around it the pieces, each at a place of its own at a wall.
+    """Place pieces of furniture at random along the walls, around what stands in the middle; return all parts.
 
     Args:
         area: the room.
-        pieces: those that find a place are built; the first choose first.
-        middle: in the world.
+        pieces: placed in this order; one without a free place after TRIES draws is left out.
+        middle: parts in the world, which stay.
         lanes: points (x, y) of the routes through the room.
         rng: draws the pieces and the places.
     """
@@ -56,7 +56,7 @@ def bounds(parts: list[Part]) -> Bounds:
 
 
 def _with_back(parts: list[Part]) -> list[Part]:
-    """What was built around the origin is moved until it stands 5 cm before y = 0."""
+    """Move parts built around the origin until they begin at y = 0.05 m; parts that lie at y ≥ 0 stay."""
     back = bounds(parts)[0, 1]
     return parts if back > -1e-6 else moved(parts, np.array([0.0, 0.05 - back, 0.0]))
 
@@ -77,7 +77,7 @@ def _is_inside(box: Bounds, area: Area) -> bool:
 
 
 def _meets(box: Bounds, others: list[Bounds], gap: float) -> Bool[np.ndarray, " n"]:
-    """Which of the others are nearer than the gap along every axis: a picture may hang above a sofa."""
+    """Test which of the other boxes are nearer than `gap` along every axis: a picture may hang above a sofa."""
     low, high = np.array([other[0] for other in others]), np.array([other[1] for other in others])
     return ((box[0] - gap < high) & (low < box[1] + gap)).all(axis=-1) if others else np.zeros(0, bool)
 

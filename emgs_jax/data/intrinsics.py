@@ -1,4 +1,4 @@
-"""What `dataset.intrinsics` may be (numbers, a calibration file, exif, estimate), and images made straight by it."""
+"""Intrinsics by `dataset.intrinsics` (numbers, a calibration file, exif, estimate), and undistortion of the images."""
 
 import math
 import struct
@@ -52,7 +52,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Lens:
-    """How images become those of a pinhole camera.
+    """Undistortion of images: they become those of a pinhole camera.
 
     Args:
         intrinsics: fx, fy, cx, cy of the straight images, which have the size of those on disk.
@@ -227,7 +227,7 @@ def check_image_size(camera: Calibration, size: Size, what: str) -> None:
 
 
 def check_plausible(camera: Calibration, size: Size, what: str, images: str) -> str | None:
-    """What is odd about a camera for images of that size; None where nothing is.
+    """Describe what is implausible in a camera for images of that size; return None if nothing is.
 
     Raises:
         ValueError: no lens has such a view; or the numbers fit as another camera's, and no size stands beside them.

@@ -1,4 +1,4 @@
-"""Whether intrinsics can be those of the images, else what they may be: of other images, in another order or unit."""
+"""Plausibility of intrinsics for the images, and likely mistakes: those of other images, in another order or unit."""
 
 import math
 
@@ -20,7 +20,7 @@ def view_deg(intrinsics: Intrinsics, size: Size) -> tuple[float, float]:
 
 
 def oddities(intrinsics: Intrinsics, size: Size) -> list[str]:
-    """What is unusual about a camera for images of that (width, height); empty where nothing is."""
+    """List what is unusual about a camera for images of that (width, height); empty if nothing is."""
     found, views = [], view_deg(intrinsics, size)
     for angle, side in zip(views, ("wide", "high"), strict=True):
         if not USUAL_VIEW_DEG[0] <= angle <= USUAL_VIEW_DEG[1]:
@@ -36,13 +36,13 @@ def oddities(intrinsics: Intrinsics, size: Size) -> list[str]:
 
 
 def is_impossible(intrinsics: Intrinsics, size: Size) -> bool:
-    """Whether no lens has such a view."""
+    """Test whether no lens has such an angle of view: too narrow in one direction, or too wide."""
     views = view_deg(intrinsics, size)
     return not (min(views) >= NARROWEST_VIEW_DEG and max(views) <= USUAL_VIEW_DEG[1])
 
 
 def other_reading(numbers: Intrinsics, size: Size) -> str | None:
-    """What four numbers would fit as, with the intrinsics that they then are; None where no other reading fits."""
+    """Find another order, unit or image size in which the four numbers fit; return it with the intrinsics, or None."""
     (a, b, c, d), (w, h) = numbers, size
     scaled = w / (2 * (c + 0.5))
     readings = {

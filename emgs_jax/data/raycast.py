@@ -1,4 +1,4 @@
-"""What the built-in scenes share: from meshes, looks and poses to frames with exact depth, labels and normals."""
+"""Common part of the built-in scenes: frames with exact depth, labels and normals, cast from meshes at given poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

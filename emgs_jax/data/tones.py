@@ -39,11 +39,14 @@ ALL_16_BITS = Tones(0.0, 65535.0)
 
 
 def find_tones(read: Callable[[int], np.ndarray], count: int) -> Tones | None:
-    """What `count` images need to be shown in 8 bits; None where they have 8 already, or use all of 16.
+    """Find the range of grey values that is shown in 8 bits, from a sample of `count` images.
 
     Args:
         read: image 0..count-1 in its own bits; raises BadFrameError.
-        count: how many.
+        count: number of images.
+
+    Returns:
+        None for images of 8 bits, for 16 bits of which more than MIN_SPAN is used, and where no image can be read.
     """
     ends, dtype = [], None
     for row in dict.fromkeys(np.linspace(0, count - 1, min(count, MAX_LOOKED_AT)).astype(int).tolist()):

@@ -1,4 +1,4 @@
-"""What a feature model gives: unit vectors of the cells of an image, in the space of its text embeddings."""
+"""Interface of a feature model: unit vectors of the cells of an image, in the space of its text embeddings."""
 
 from typing import Protocol, runtime_checkable
 

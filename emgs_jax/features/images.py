@@ -11,7 +11,7 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class ImageConfig:
-    """How images are given to the network.
+    """Preprocessing of images for the network: resizing and normalization.
 
     Args:
         long_side: pixels to which the longer side is resized, a multiple of the patch.

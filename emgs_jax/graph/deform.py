@@ -27,7 +27,7 @@ class DeformConfig(eqx.Module):
 
 
 class _Motions(eqx.Module):
-    """What takes a world from where nodes were to where they are: x' = s ΔR (x - t) + t'."""
+    """Similarities that move the surroundings of nodes from their old to their new poses: x' = s ΔR (x - t) + t'."""
 
     turn: jaxlie.SO3
     scale: Float[Array, "*n"]

@@ -1,4 +1,4 @@
-"""What is known of the poses: nodes, the measurements between them, and their residuals with derivatives."""
+"""The pose graph: nodes, the measurements (factors) between them, and their residuals with derivatives."""
 
 import equinox as eqx
 import jax

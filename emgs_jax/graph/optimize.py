@@ -23,18 +23,17 @@ COLUMNS_AT_ONCE = 224  # of the inverse: some MB for thousands of nodes
 
 
 class GraphConfig(eqx.Module):
-    """What counts, and when to stop.
+    """Settings of the pose-graph optimization: scale prior, robust kernel, start, convergence and acceptance.
 
     Args:
         scale_std: s_p: standard deviation of every σ about 0; 0: scales stay as they are (SE(3)); inf: no prior.
-        kernel: φ of dynamic covariance scaling on loops, in χ²; inf: quadratic.
-        start: `given`, or `spread` (errors spread over the paths, where that costs less; and, where a loop would be
-            left out, what all loops in full make of them).
+        kernel: φ of dynamic covariance scaling on loop factors, in χ²; inf: quadratic.
+        start: `given` (the current poses), or `spread` (errors spread over the paths, where that costs less; and, where
+            a loop would be rejected, the solution with all loops at full weight).
         max_iterations: of Levenberg and Marquardt; 0: nothing moves.
         damping: λ at the start, times the Hessian's diagonal.
         min_decrease: relative, of the cost; less has converged.
-        max_misfit: χ² per measured row of the odometry: a result that bends it more, and more than it was,
-            is refused.
+        max_misfit: χ² per measured row of the odometry: a result that bends it more, and more than it was, is refused.
     """
 
     scale_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
@@ -48,10 +47,10 @@ class GraphConfig(eqx.Module):
 
 @dataclass(frozen=True)
 class GraphInfo:
-    """What an optimisation found, also where that is refused and the nodes stay.
+    """Result of a pose-graph optimization, reported also where it is refused and the nodes stay.
 
     Args:
-        reason: why the nodes are those that were given; empty: they moved, or there is nothing to gain.
+        reason: why the nodes stay where they were; empty: they moved, or there is nothing to gain.
         cost_before: Σρ over edges, and half the squared scale prior.
         cost: likewise, at the end.
         num_iterations: tried steps.

@@ -71,7 +71,7 @@ def _parts(graph: Graph, used: np.ndarray) -> np.ndarray:
 
 
 def problem_of(graph: Graph, scale_std: float) -> Problem | str:
-    """What is to be solved, or why it cannot be."""
+    """Build the least-squares problem of a pose graph, or return the reason why it has no solution."""
     nodes, edges = graph.nodes, graph.edges
     used, valid = np.asarray(edges_in_use(graph)), np.asarray(nodes.valid)
     numbers = np.concatenate(

@@ -1,4 +1,4 @@
-"""Where the solver starts: the error of every loop spread over its path, rotations first (chordal)."""
+"""Initial poses for the solver: the error of every loop closure spread over its path, rotations first (chordal)."""
 
 import jaxlie
 import numpy as np

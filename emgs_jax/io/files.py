@@ -99,7 +99,7 @@ def remove_temporaries(folder: Path) -> list[str]:
 
 
 def _is_running(process: int) -> bool:
-    """Whether a process of this number runs; where the system cannot be asked, it is taken to."""
+    """Test whether a process with this number is running; True where the system cannot be asked."""
     if os.name != "posix":
         return True
     try:

@@ -18,7 +18,7 @@ _MAX_HEADER_BYTES = 1 << 20
 
 
 class Element(NamedTuple):
-    """What stands `count` times in the body: its properties by name, a type or None for a list."""
+    """Element of a PLY header, with `count` rows in the body: its properties by name, a type or None for a list."""
 
     name: str
     count: int
@@ -98,12 +98,12 @@ def _header(content: bytes, path: object) -> tuple[str, list[Element], int]:
 
 
 def _is_count(word: str) -> bool:
-    """Whether a word is a number of rows that a file can have."""
+    """Test whether a word is a number of rows that a file can have."""
     return word.isdecimal() and len(word) < 19
 
 
 def _is_type(words: list[str]) -> bool:
-    """Whether words of a header are a type, or list and the types of its length and elements."""
+    """Test whether words of a header are a type, or `list` and the types of its length and elements."""
     is_list = len(words) == 3 and words[0] == "list"
     return {*words[1:]} <= _TYPES.keys() if is_list else len(words) == 1 and words[0] in _TYPES
 

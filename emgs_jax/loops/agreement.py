@@ -1,9 +1,9 @@
-"""Do loops fit each other, and what the graph knows already?
+"""Spatial consistency of loops: with each other, and with the poses that the pose graph knows already.
 
-By appearance two rooms that are furnished alike are one place, and all loops between them agree on one correction. If
-there are keyframes that it brings together and that see through each other's surfaces, as at the end of the hall before
-the rooms, it is wrong as a whole, also between keyframes that see nothing of that. Without such a view only the path is
-left: that the camera cannot have come back, as far as that is known.
+Two rooms that are furnished alike look like one place, and all loops between them imply the same correction. The
+correction is wrong as a whole, also between keyframes without a free-space violation, if it brings any keyframes
+together that see through each other's surfaces, as at the end of the hall before the rooms. Without such a view only
+the path is left: that the camera cannot have come back, as far as the path is known.
 """
 
 import math
@@ -23,14 +23,14 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class AgreementConfig:
-    """When two loops say the same; gaps count frames, lengths are the map's.
+    """Thresholds by which loops are spatially consistent; gaps count frames, lengths are the map's.
 
     Args:
         max_query_gap, max_candidate_gap: between the queries and between the candidates of two loops.
-        max_distance: between where they put one query.
+        max_distance: between the positions that they imply for one query.
         max_turn_deg: likewise.
         min_others: loops, each of another query, that a loop needs.
-        max_contradicted: queries of contradicted loops, among all that agree one after the other.
+        max_contradicted: queries of loops with a free-space violation, in a chain of consistent loops.
     """
 
     max_query_gap: int = number(low=0)
@@ -42,7 +42,7 @@ class AgreementConfig:
 
 
 def is_consistent(innovation: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], num_std: float) -> bool:
-    """Is a loop within what the graph leaves open (innovationᵀ covariance⁻¹ innovation, a χ² of d)?
+    """Test a loop against the pose graph's uncertainty: innovationᵀ covariance⁻¹ innovation, a χ² of d.
 
     The threshold has the probability of `num_std` standard deviations of one number: 3 refuses .27 % of true loops.
 
@@ -70,18 +70,21 @@ def agreeing(
     log_scales: Mapping[int, float],
     config: AgreementConfig,
 ) -> Bool[np.ndarray, " n"]:
-    """Which loops have enough others, of nearby queries to nearby candidates, that imply the same correction.
+    """Test which loops (n,) are spatially consistent: enough others imply the same correction.
 
-    The correction of one, T_implied T_now⁻¹, must fit the query of the other.
+    Only loops of nearby queries to nearby candidates are compared: the correction of one, T_implied T_now⁻¹, must fit
+    the query of the other.
 
-    A false match of repeating texture is alone, or one of many that all say something else. Loops that agree one after
-    the other are one statement, however far the path drifts in the meantime, and fall together if it is contradicted:
+    A false match of repeating texture is alone, or one of many that each imply another correction. Consistent loops
+    form chains, however far the path drifts in the meantime; a chain with too many free-space violations is rejected:
     see the top of this file.
 
     Args:
-        contradicted: `VerifyInfo.contradicted` of those that were refused.
-        poses: T_world_camera of every frame of a loop, as they are now.
+        loops: verified ones.
+        contradicted: `VerifyInfo.contradicted` of loops that were rejected for a free-space violation.
+        poses: current T_world_camera of every frame of a loop.
         log_scales: σ of these: a length of the inference times e^σ is one of the map.
+        config: thresholds.
     """
     every = [*loops, *contradicted]
     if not every:
@@ -121,5 +124,5 @@ def pairs_within(frames: Int[np.ndarray, " n"], max_gap: int) -> tuple[Int[np.nd
 
 
 def _num_different(rows: Int[np.ndarray, " n"], values: Int[np.ndarray, " n"], num_rows: int) -> Int[np.ndarray, " r"]:
-    """How many different values stand in each row."""
+    """Count the different values in each row 0..num_rows-1."""
     return np.bincount(np.unique(np.stack([rows, values]), axis=1)[0], minlength=num_rows)

@@ -1,4 +1,4 @@
-"""Where one keyframe's camera is from another's, if they show the same: gates that ask these two, cheap ones first."""
+"""Relative pose of two keyframes that show the same place, with gates on the pair itself, cheap ones first."""
 
 import math
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ MIN_POSE = 6  # points that a pose needs
 
 
 class Gate(StrEnum):
-    """What refuses a candidate, in the order in which it is asked."""
+    """Reasons to reject a loop candidate, in the order in which the gates are tested."""
 
     MATCHES = "matches"  # too few that fit an essential matrix
     MATCH_SHARE = "match_share"  # too many that do not

@@ -1,4 +1,4 @@
-"""Where the camera may have been before, by what its images look like: keyframes and their nearest in appearance.
+"""Place recognition: keyframes, and candidates for a revisit among them by the appearance of their images.
 
 RootSIFT (Arandjelović and Zisserman, CVPR 2012) summed up as VLAD (Jégou et al., CVPR 2010), words of the sequence's
 own descriptors. How alike two images of one place are depends on the scene, so a candidate is compared with the
@@ -64,12 +64,12 @@ class AppearanceConfig:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """What is kept of an image to know its place again; some 85 kB with 500 keypoints and 80 by 60 depths.
+    """Description of an image for place recognition; some 85 kB with 500 keypoints and 80 by 60 depths.
 
     Args:
         frame: its number.
         pixels: of the keypoints, centres at integers.
-        descriptors: RootSIFT as bytes; `unit_descriptors` gives them back.
+        descriptors: RootSIFT as bytes; `unit_descriptors` decodes them.
         points: of the keypoints in the camera's own frame, units of its own inference; NaN without depth.
         intrinsics: fx, fy, cx, cy in pixels.
         size: width and height of the image.

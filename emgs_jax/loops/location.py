@@ -1,7 +1,7 @@
-"""Where is the camera, among keyframes that know their place? For one that is lost, or new in a saved map.
+"""Relocalization: the pose of a camera among keyframes with known poses, for one that is lost or new in a saved map.
 
-Nothing is known of the pose, so a keyframe that looks alike is no better than any other that does: all candidates are
-asked by themselves, and the camera is where the best of them says only if none says something else.
+Nothing is known of the pose, so every keyframe of similar appearance is a candidate. Each is verified by itself; the
+best one gives the pose, unless another verified candidate implies a different one.
 """
 
 import math
@@ -22,17 +22,18 @@ NO_CANDIDATE, AMBIGUOUS = "no_candidate", "ambiguous"  # what refuses beside the
 
 @dataclass(frozen=True)
 class LocationConfig:
-    """When the camera is looked for, and when what is found counts.
+    """Settings of relocalization: when it is attempted, and when its result is accepted.
 
     Args:
-        patience: frames in a row that are not tracked, from which on it is looked for.
-        max_patience: likewise, from which on the map begins anew where the prior puts the camera, if it is found
-            nowhere. inf: never.
-        num_candidates: keyframes that are asked, each of another time span.
-        max_distance: between where two of them put the camera, times the distance of the points that it sees.
-        max_turn_deg: likewise.
-        min_inliers: points that agree with the best.
-        min_inlier_fraction: of the points, that agree with the map at last.
+        patience: frames in a row that are not tracked, from which on relocalization is attempted.
+        max_patience: likewise, from which on the map restarts at the pose that the prior predicts, if relocalization
+            still fails. inf: never.
+        num_candidates: keyframes that are verified, each of another time span.
+        max_distance: between the positions that two candidates imply, times the distance of the points that the camera
+            sees.
+        max_turn_deg: likewise between orientations.
+        min_inliers: of the best candidate.
+        min_inlier_fraction: of the points that fit the map when the pose is refined in it.
         max_step: between the pose by the keyframe and that by the map, times the mean depth.
         max_step_deg: likewise.
     """
@@ -67,13 +68,13 @@ class Places:
 
 @dataclass(frozen=True)
 class Location:
-    """Where a camera is found.
+    """Pose of a camera as found by relocalization.
 
     Args:
         T_world_camera: camera -> world.
         log_scale: σ of its inference.
         covariance: of (translation, rotation, σ) where the truth is T Exp(·), lengths of the map.
-        by: number of the keyframe that says so.
+        by: number of the keyframe that it was found by.
     """
 
     T_world_camera: Float[np.ndarray, "4 4"]
@@ -134,7 +135,7 @@ def locate(
 
 
 def _located(loop: LoopMeasurement, places: Places) -> Location:
-    """Where the query of a loop is, by its candidate's place."""
+    """Return the pose of a loop's query in the world, by the pose and scale of its candidate."""
     scale = np.exp(places.log_scales[loop.a])
     units = np.array([scale] * 3 + [1.0] * 4)
     covariance = np.linalg.inv(loop.sqrt_info.T @ loop.sqrt_info) * units[:, None] * units

@@ -21,12 +21,12 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class RevisitConfig:
-    """Whether the prior is asked once more, for which views, and what its answer is worth.
+    """Second measurement of loops by the prior: whether it is made, on which views, and its standard deviations.
 
     Args:
-        is_asked: measure loops that are to move the poses in this way, too, where the prior can be asked.
-        num_asked: loops of a closure that are, each of another query, those with most inliers.
-        spacing: frames between the two visits' frames and those beside them that it is shown as well.
+        is_asked: measure loops that are to move the poses in this way, too, where the prior can predict both visits.
+        num_asked: loops of a closure that are measured, each of another query, those with most inliers.
+        spacing: frames between the two visits' frames and the neighbouring ones that the prior sees as well.
         std, std_share: of each axis of the pose between the two visits: in units of the earlier one, and of its length.
         std_deg: of its rotation, about each axis.
         log_ratio_std: of the ratio of the units of the two inferences that the loop is between.
@@ -47,10 +47,10 @@ class RevisitConfig:
 
 @dataclass(frozen=True)
 class Revisit:
-    """What one inference says of both visits, in its own unit.
+    """Prediction of one inference that shows both visits of a place, in its own unit.
 
     Args:
-        T_a_b: camera b -> camera a; not finite where it does not know.
+        T_a_b: camera b -> camera a; not finite where the prior does not know.
         points: of a and of b, each in its own camera's frame.
         masks: of these.
     """
@@ -64,7 +64,7 @@ Ask = Callable[[int, int], Revisit | None]  # of two frames, the earlier first; 
 
 
 def measured_again(told: Revisit, a: Keyframe, b: Keyframe, config: RevisitConfig) -> Similarity | None:
-    """What an inference with both visits says of the similarity between the inferences of two keyframes.
+    """Measure the similarity between two keyframes' inferences by an inference that shows both visits.
 
     Its unit is neither's: the depths of a and b stand in both, e^{ρ_x} = median z'_x / z_x. So t = e^{-ρ_a} t', and the
     ratio of a's unit to b's is ρ_b - ρ_a.

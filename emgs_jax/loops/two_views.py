@@ -21,7 +21,7 @@ HUBER = 1.345  # standard deviations: 95 % efficient where all is normal
 
 @dataclass(frozen=True)
 class RefineConfig:
-    """What a residual is expected to be, and how sure of the result one may be.
+    """Noise model of the two-view refinement: least residuals, their correlation, and least errors of the result.
 
     Args:
         min_pixel_std, min_depth_std: of residuals in pixels and log depth, at least.

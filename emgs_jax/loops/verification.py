@@ -121,7 +121,7 @@ def neighbours_of(
     poses: Sequence[Float[np.ndarray, "4 4"]],
     log_scales: Sequence[float],
 ) -> list[Neighbour]:
-    """Where other keyframes are from a candidate, by the poses and σ of all, under the keyframes' numbers."""
+    """Return other keyframes with their poses and log-scales relative to a candidate; inputs are indexed by frame."""
     inverse, scale = np.linalg.inv(poses[candidate.frame]), log_scales[candidate.frame]
     return [
         Neighbour(one, rescaled(inverse @ poses[one.frame], np.exp(-scale)), log_scales[one.frame] - scale)
@@ -130,7 +130,7 @@ def neighbours_of(
 
 
 def tally(infos: Iterable[VerifyInfo]) -> dict[str, int]:
-    """How many candidates each gate refused, in the gates' order, and how many were `accepted`."""
+    """Count the candidates that each gate rejected, in the gates' order, and those that were `accepted`."""
     counts = Counter(info.refused_by for info in infos)
     return {gate.value: counts[gate] for gate in Gate} | {"accepted": counts[None]}
 

@@ -1,1 +1,1 @@
-"""What everything stands on: pytrees, small algebra, the camera, clustering and nearest neighbours."""
+"""Foundations of all other modules: pytrees, small algebra, the camera, clustering and nearest neighbours."""

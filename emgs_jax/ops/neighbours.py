@@ -39,12 +39,12 @@ class Groups(eqx.Module):
 
 
 class Nearby(eqx.Module):
-    """What is near each block of queries.
+    """Nearest points of each block of queries.
 
     Args:
-        queries: rows of the queries of a block; one past the last where a block has room left.
+        queries: rows of the queries of a block; one past the last for unused slots of a block.
         rows: of the points that are nearest to any query of the block, nearest first.
-        exists: which of them there are.
+        exists: False for slots without a point.
         beyond_sq: no other point is nearer to a query of the block than that, m².
     """
 
@@ -149,7 +149,7 @@ def of_queries(near: Nearby, values: Shaped[Array, "b q *v"], num_queries: int) 
 
 
 def among_nearest(distance_sq: Float[Array, "*b c"], exists: Bool[Array, "*#b c"], k: int) -> Bool[Array, "*b c"]:
-    """Which of c points are the k nearest of those that exist."""
+    """Mark the k nearest of those of c points that exist."""
     return exists & (ranks(jnp.where(exists, distance_sq, jnp.inf)) < k)
 
 
@@ -235,7 +235,7 @@ def _ranked(
     count: int,
     order: Int[Array, "m"] | None,
 ) -> tuple[Nearby, Float[Array, "b q c"], Int[Array, "b q c"]]:
-    """What is near each block, and the squared distance and rank of each of these for every query of the block."""
+    """Find the points near each block, with squared distance and rank of each of them for every query of the block."""
     queries, points = jax.lax.stop_gradient((queries, points))
     near = nearby(queries, asked, groups, count, size, order)
     blocks = queries.at[near.queries].get(mode="clip")
@@ -259,11 +259,11 @@ def _existing(found: Int[Array, "m k"]) -> tuple[Int[Array, "m k"], Bool[Array, 
 
 
 def ranks(values: Float[Array, "*b c"]) -> Int[Array, "*b c"]:
-    """How many of the c values, which are not negative, are smaller than each of them; each has another rank.
+    """Rank c values that are not negative: 0 for the smallest; no two have the same rank.
 
-    Some values after the others are compared with all: operations on whole vectors instead of a sort of each row, in a
-    loop, or XLA would do them anew for everything that looks at the ranks. Values that differ by less than c · 2⁻²³ of
-    themselves count as equal; of these the first comes first.
+    A few values at a time are compared with all: operations on whole vectors instead of a sort of each row, in a loop,
+    or XLA would repeat them for every consumer of the ranks. Values that differ by less than c · 2⁻²³ of themselves
+    count as equal; of these the first comes first.
     """
     num = values.shape[-1]
     # Not negative floats are ordered as their bits are, the last of which carry the place.

@@ -1,4 +1,4 @@
-"""What values a config field may have, declared with the field. Needs no JAX: recording a prior does not, either."""
+"""Ranges of values of config fields, declared with the field. Free of JAX, as recording a prior needs none either."""
 
 import dataclasses
 from collections.abc import Mapping

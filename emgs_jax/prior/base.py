@@ -1,4 +1,4 @@
-"""What a prior gives: for a window of images, the pose of every view and dense geometry of some of them."""
+"""Interface of a prior: for a window of images, the pose of every view and dense geometry of some of them."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
@@ -56,7 +56,7 @@ class PriorPrediction:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where predictions come from; goes into every result and every recorded file."""
+    """Origin of predictions; it is written into every result and every recorded file."""
 
     name: str
     settings: dict = field(default_factory=dict)
@@ -96,7 +96,7 @@ class Prior(ABC):
         """Raise ValueError where the prior cannot answer for the data set."""
 
     def report(self) -> dict[str, float]:
-        """What the prior measured of itself while it predicted, as keys `prior/…`."""
+        """Return the prior's own statistics of its predictions so far, as keys `prior/…`."""
         return {}
 
 

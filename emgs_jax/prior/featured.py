@@ -43,7 +43,7 @@ class Featured(Prior):
         self._model.check(dataset)
 
     def report(self) -> dict[str, float]:
-        """What the prior measured of itself, if it does."""
+        """Return the statistics of the wrapped prior."""
         return self._prior.report()
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
@@ -55,7 +55,7 @@ class Featured(Prior):
         return replace(prediction, features=np.stack([features for _, features in known]))
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
-        """What the prior says of two visits, with features of its own: geometry is all that is asked for."""
+        """Return the wrapped prior's prediction of two visits, with its own features: only geometry is needed."""
         return self._prior.revisit(window, frames, intrinsics)
 
     def _features(self, frame: Frame) -> np.ndarray:
@@ -97,13 +97,13 @@ class Requeried(Prior):
         self._prior.check(dataset, window_size)
 
     def report(self) -> dict[str, float]:
-        """What the prior measured of itself, if it does."""
+        """Return the statistics of the wrapped prior."""
         return self._prior.report()
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """What the prior predicts."""
+        """Return the wrapped prior's prediction."""
         return self._prior.predict(window, frames, intrinsics)
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
-        """What the prior says of two visits."""
+        """Return the wrapped prior's prediction of two visits."""
         return self._prior.revisit(window, frames, intrinsics)

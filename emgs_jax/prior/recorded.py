@@ -133,7 +133,7 @@ class Recorded(Prior):
         return self._answer(name, window, frames, intrinsics) if name in self._manifest["files"] else None
 
     def has_whole(self, name: str) -> bool:
-        """Whether a file is there as it was written."""
+        """Test by its checksum whether a file is there as it was written."""
         return _digest_of(self.folder / name) == self._manifest["files"].get(name, "")
 
     def _answer(

@@ -1,4 +1,4 @@
-"""What a recording has to hold: a file that fits its checksum may still be forged, or be of a prior with a fault."""
+"""Checks of a recording's contents: a file that fits its checksum may still be forged, or come from a faulty prior."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -75,7 +75,7 @@ def load_exr(path: Path) -> np.ndarray:
 
 
 def load_json(path: Path) -> Any:
-    """What a JSON file holds."""
+    """Load a JSON file; raises ValueError that names the file where it cannot be read."""
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, OSError, RecursionError) as error:

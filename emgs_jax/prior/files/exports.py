@@ -1,4 +1,4 @@
-"""What the demos of feed-forward networks write; names of arrays and conventions are those of their code."""
+"""Readers of what the demos of feed-forward networks write; names of arrays and conventions are those of their code."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -127,7 +127,7 @@ def read_export(path: Path) -> Predictions:
 
 
 def read_cut3r(folder: Path) -> Predictions:
-    """What CUT3R's demo writes: depth/N.npy, conf/N.npy and camera/N.npz with pose and intrinsics."""
+    """Read the output of CUT3R's demo: depth/N.npy, conf/N.npy and camera/N.npz with pose and intrinsics."""
     cameras = files_of(folder / "camera", ".npz")
     poses = [as_poses(load_npz(path, ("pose",))["pose"][None], f"{path}: pose") for path in cameras]
 

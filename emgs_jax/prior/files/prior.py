@@ -85,7 +85,7 @@ class Files(Prior):
         check_conventions(self._pairs(known, camera), dataset.intrinsics, found.pose_source)
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """What the files say of the views; `check` comes first, as it finds whose file is whose."""
+        """Predict a window from the files of its views; `check` comes first, as it matches files with frames."""
         if not self._rows:
             raise ValueError("Files.check(dataset, window_size) finds which file is of which frame: call it first")
         size = frames[0].image.shape[1::-1]
@@ -138,7 +138,7 @@ class Files(Prior):
 
 
 def read_predictions(folder: Path, units_per_metre: float) -> Predictions:
-    """What a folder holds, whose layout is told by the files that are there."""
+    """Read the predictions in a folder; the layout follows from the files that are there."""
     if not folder.exists():
         raise ValueError(f"prior.folder={folder} does not exist: give the folder of the predictions (docs/priors.md)")
     export = find_export(folder)

@@ -20,7 +20,7 @@ LEAST_DEPTH = 1e-6  # below: no value
 
 @dataclass(frozen=True)
 class View:
-    """What a file says of one frame, on a grid (gh, gw) of its own.
+    """Prediction of one frame as its file holds it, on a grid (gh, gw) of its own.
 
     Args:
         source: the file, for messages.
@@ -54,7 +54,7 @@ class Camera(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Which part of the image a grid shows: the whole image in the grid's pixels, and where the grid begins in it."""
+    """Part of the image that a grid shows: size of the image in the grid's pixels, and the grid's corner in it."""
 
     scaled: tuple[float, float]
     corner: tuple[float, float]
@@ -65,7 +65,7 @@ Place = Callable[[Camera, View], Part]
 
 @dataclass(frozen=True)
 class Predictions:
-    """What a folder holds.
+    """Predictions that a folder holds.
 
     Args:
         layout: its name, for people.
@@ -135,7 +135,7 @@ def at_frame(
 
 
 def usable(geometry: Float[np.ndarray, "gh gw *c"]) -> Bool[np.ndarray, "gh gw"]:
-    """Where a view has a depth or a point."""
+    """Mark the pixels with a depth or a point: finite, and at least LEAST_DEPTH before the camera."""
     depth = geometry if geometry.ndim == 2 else geometry[..., 2]
     with np.errstate(invalid="ignore"):
         is_before = depth > LEAST_DEPTH

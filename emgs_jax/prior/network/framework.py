@@ -32,7 +32,7 @@ class NoAnswerError(ValueError):
 
 @dataclass(frozen=True)
 class FrameworkModel:
-    """What is known of a network.
+    """Properties of a network that runs through the framework's wrappers.
 
     Args:
         norm: key of `NORMALIZATIONS`.
@@ -45,7 +45,7 @@ class FrameworkModel:
         extra: of the framework's package, which installs what the network needs beside it.
         precision: attribute of the framework's wrapper that holds its precision, `infer` where it is an argument; the
             others run in float32, because their wrappers optimise geometry as well.
-        fields: what its wrapper reads in every view though it ignores it; keys of `_fields`.
+        fields: that its wrapper reads in every view but ignores; keys of `_fields`.
     """
 
     norm: str
@@ -88,7 +88,7 @@ MODELS = {
 
 
 def _fields(row: int, height: int, width: int) -> dict[str, Any]:
-    """What a wrapper reads in a view though the network is told images only: names, and geometry that it ignores."""
+    """Return placeholders for fields of a view that a wrapper reads although the network sees images only."""
     return {
         "label": ["window"],
         "instance": [f"{row:06d}"],
@@ -101,7 +101,7 @@ def _fields(row: int, height: int, width: int) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class ComputeConfig:
-    """How a network runs.
+    """Settings for running a network: device, precision and memory.
 
     Args:
         device: `cuda` or `cpu`; None = cuda where there is one.
@@ -119,7 +119,7 @@ class ComputeConfig:
 
 @dataclass(frozen=True)
 class NetworkSettings:
-    """Which network is loaded: key of `MODELS`, folder of the checkpoint (`mapanything` only), and how it runs."""
+    """Choice of a network: key of `MODELS`, folder of the checkpoint (`mapanything` only), and how it runs."""
 
     model: str
     checkpoint: Path | None
@@ -139,7 +139,7 @@ class Network(Protocol):
 
 @dataclass(frozen=True)
 class ViewOutput:
-    """What the prior uses of a network's output for one view.
+    """Part of a network's output for one view that the prior uses.
 
     Args:
         points: camera frame, metres or the network's unit, float32 (h, w, 3) on its grid.

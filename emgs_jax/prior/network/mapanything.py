@@ -106,7 +106,7 @@ class MapAnything(Prior):
         }
 
     def report(self) -> dict[str, float]:
-        """What was measured so far: seconds of an inference (median), peak of the GPU's memory (0 without one)."""
+        """Return seconds of an inference (median, first), peak GPU memory (0 without one) and their number, if any."""
         if not self._seconds:
             return {}
         return {
@@ -235,7 +235,7 @@ def check_frames(window: Window, frames: Sequence[Frame]) -> Size:
 
 
 def no_prediction(window: Window, size: Size) -> PriorPrediction:
-    """What is given out where there is no answer: nothing is valid, and only the anchor has a pose."""
+    """Build the prediction of a failed inference: no pixel is valid, and only the anchor has a pose."""
     width, height = size
     shape, poses = (len(window.dense), height, width), np.full((len(window.views), 4, 4), np.nan)
     poses[0] = np.eye(4)

@@ -1,4 +1,4 @@
-"""Which of a network's pixels can be used: MapAnything's masks as pure functions on its own grid.
+"""Masks of the usable pixels of a network's output: MapAnything's masks as pure functions on its own grid.
 
 A pixel is left out where the network calls it ambiguous, where its confidence is among the lowest of its view, on
 edges, and where other views of the window contradict its depth. Every part has a neutral value that turns it off.
@@ -17,7 +17,7 @@ from emgs_jax.ops.pytree import traced
 
 
 class MaskConfig(eqx.Module):
-    """What makes a pixel unusable. Upstream's defaults are in conf/prior/mapanything.yaml.
+    """Criteria by which a pixel is left out. Upstream's defaults are in conf/prior/mapanything.yaml.
 
     Args:
         drop_ambiguous: 1 leaves out what the network itself calls ambiguous (sky, mirrors), 0 keeps it.
@@ -25,7 +25,7 @@ class MaskConfig(eqx.Module):
         max_edge_step: depth range over 3 × 3 pixels, relative to the depth, above which there is a depth edge.
         max_edge_degrees: angle between neighbouring normals above which there is a normal edge. A pixel is left out
             where both edges are; inf in either keeps all.
-        min_consistent_share: of the views that see the point and have its depth; 0 = not asked.
+        min_consistent_share: of the views that see the point, share that must have its depth; 0 = not tested.
         consistent_depth_m: two depths agree within this and
         consistent_depth_share: this fraction of the depth.
     """
@@ -74,7 +74,7 @@ def grid_normals(
 def normal_edges(
     normals: Float[Array, "h w 3"], has_normal: Bool[Array, "h w"], max_degrees: Float[Array, ""]
 ) -> Bool[Array, "h w"]:
-    """Whether in the 3 × 3 pixels around there is one whose normal differs from a neighbour's by more than the angle.
+    """Mark pixels with a normal edge in their 3 × 3 surroundings: an angle above `max_degrees` to a neighbour's normal.
 
     A pixel without a normal differs from any neighbour that has one.
     """
@@ -89,14 +89,14 @@ def normal_edges(
 def depth_edges(
     depth: Float[Array, "h w"], valid: Bool[Array, "h w"], max_step: Float[Array, ""]
 ) -> Bool[Array, "h w"]:
-    """Whether the valid depths of the 3 × 3 pixels around range over more than `max_step` of the pixel's own."""
+    """Mark valid pixels whose valid 3 × 3 neighbours range in depth over more than `max_step` of the pixel's own."""
     highest = jnp.max(jnp.stack(_around(jnp.where(valid, depth, -jnp.inf), -jnp.inf)), axis=0)
     lowest = jnp.min(jnp.stack(_around(jnp.where(valid, depth, jnp.inf), jnp.inf)), axis=0)
     return valid & ((highest - lowest) / jnp.where(valid, depth, 1.0) > max_step)
 
 
 def above_percentile(confidence: Float[Array, "h w"], percentile: Float[Array, ""]) -> Bool[Array, "h w"]:
-    """Whether a pixel's confidence is above a percentile of its view's, or the highest: a constant one is never low.
+    """Mark pixels with a confidence above a percentile of their view, or the highest: a constant one is never low.
 
     All pixels for percentile 0.
     """
@@ -135,10 +135,10 @@ def consistent_share(
     T_anchor_view: Float[Array, "v 4 4"],
     config: MaskConfig,
 ) -> tuple[Float[Array, "h w"], Int[Array, "h w"]]:
-    """How many of the other views that see the points of view `row` have their depth there, at the nearest pixel.
+    """Compute the share of the other views seeing a point of view `row` that have its depth at the nearest pixel.
 
     Args:
-        row: the view that is asked about.
+        row: the view whose points are tested.
         depths: camera-space z in metres of all views; 0 where there is none.
         intrinsics: of all views, pixel centres at integers.
         T_anchor_view: camera -> any common frame.
@@ -176,6 +176,6 @@ def consistent(
     T_anchor_view: Float[Array, "v 4 4"],
     config: MaskConfig,
 ) -> Bool[Array, "h w"]:
-    """Whether enough views agree with a pixel of view `row`; one that no other view sees is not contradicted."""
+    """Mark the pixels of view `row` that enough views agree with; one that no other view sees is not contradicted."""
     share, num_seen = consistent_share(row, depths, intrinsics, T_anchor_view, config)
     return (num_seen == 0) | (share >= config.min_consistent_share)

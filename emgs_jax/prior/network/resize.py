@@ -58,7 +58,7 @@ GRIDS: dict[int, dict[float, Size]] = {  # resolution set -> aspect -> grid, ups
 
 @dataclass(frozen=True)
 class Resize:
-    """How frames of one size come onto a grid.
+    """Mapping of frames of one size onto a network's grid: scaling, then a crop.
 
     Args:
         frame: size of the frames.

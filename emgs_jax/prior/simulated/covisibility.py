@@ -1,4 +1,4 @@
-"""How much two views with true depth and poses see of the same."""
+"""Covisibility of two views with true depth and poses: the share of their points that both see."""
 
 from collections.abc import Sequence
 

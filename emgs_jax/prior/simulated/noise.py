@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 
 class Stream(IntEnum):
-    """What a random stream is for; part of its seed."""
+    """Purposes of random streams; each is part of its stream's seed."""
 
     DRIFT = 1
     PAIR = 2

@@ -164,7 +164,7 @@ class Simulated(Prior):
         return PriorPrediction(window, T_anchor_view, points, confidence, mask, features)
 
     def _is_held(self, anchor: Frame, middle: Frame, intrinsics: Sequence[float]) -> bool:
-        """Whether the anchor and the window's middle view share enough for the anchor to hold the window."""
+        """Test whether the anchor shares enough surface with the window's middle view to constrain the window."""
         noise = self.standard
         shared = shared_points(anchor, middle, intrinsics, noise.shared_tolerance, noise.shared_columns)
         return shared >= noise.min_shared
