@@ -12,13 +12,13 @@ MIN_SPREAD = 1e-3  # of a direction of unit features; along a smaller one they d
 
 
 class Relevance(eqx.Module):
-    """What a map says to c words.
+    """Similarity of a map's Gaussians to c words.
 
     Args:
         cosines: of every Gaussian's feature with each word; 0 without a feature.
         leads: cosine minus the largest one with any other word or rival; plus 1 where there is no other. Positive for
             the closest word only.
-        labels: the word that a Gaussian is an answer to, -1 for none of these.
+        labels: the word that a Gaussian answers, -1 for none of them.
     """
 
     cosines: Float[Array, "n c"]
@@ -101,10 +101,10 @@ def answers(
 
 @full_precision
 def principal_colors(gaussians: Gaussians) -> Float[Array, "n 3"]:
-    """Where features lie along the three directions in which they differ most, as RGB in [0, 1].
+    """Colour features by their coordinates along the three directions in which they differ most, as RGB in [0, 1].
 
-    Each direction's sign makes its largest entry positive; from 0 to 1 go 98 % of the Gaussians. Grey (.5) is a
-    direction in which features do not differ, an invalid row, and a Gaussian without a feature.
+    Each direction's sign makes its largest entry positive; 98 % of the Gaussians span 0 to 1. Grey (.5) is a direction
+    in which features do not differ, an invalid row, and a Gaussian without a feature.
     """
     is_known = _is_known(gaussians)
     count = jnp.maximum(jnp.sum(is_known), 1)

@@ -69,13 +69,13 @@ class SlamConfig(eqx.Module):
 
 
 class SlamState(eqx.Module):
-    """What the next step needs.
+    """State between two steps.
 
     Args:
         map: all Gaussians.
         previous: the last frame as it was aligned, world frame.
         T_world_previous: its pose.
-        belief: how well that is known.
+        belief: uncertainty of its pose and scale.
         time: frames so far, those that could not be placed included.
     """
 
@@ -87,7 +87,7 @@ class SlamState(eqx.Module):
 
 
 class Overflow(eqx.Module):
-    """How many rows did not fit: a step with any of the first two is to be repeated with more room."""
+    """Rows beyond a capacity: if either of the first two is not 0, the step must be repeated with more capacity."""
 
     map: Int[Array, ""]
     submap: Int[Array, ""]
@@ -95,7 +95,7 @@ class Overflow(eqx.Module):
 
 
 class StepInfo(eqx.Module):
-    """What one step did; `origin` is the median birth of the Gaussians that explain its points, its own if none do."""
+    """Diagnostics of one step; `origin`: median birth of the Gaussians that explain its points, its own if none do."""
 
     T_world_camera: jaxlie.SE3
     T_world_newest: jaxlie.SE3
@@ -148,13 +148,13 @@ class Frame(eqx.Module):
 
 
 class Fused(eqx.Module):
-    """What a frame's points make of the submap.
+    """Submap after a frame's points are fused into it.
 
     Args:
         map: the submap's Gaussians after EM and splitting.
         halves: the second halves of what was split.
-        rest: the points that no Gaussian explains; they continue the map's surfaces.
-        origin: median birth of what explains the others; the frame's own time where nothing does.
+        rest: the points that no Gaussian explains; their depth errors are extrapolated from the map's surfaces.
+        origin: median birth of the Gaussians that explain the others; the frame's own time where none does.
         em: counts.
     """
 

@@ -1,4 +1,4 @@
-"""How long the stages take, beside what one would pick instead: `python -m experiments.benchmark [parts=[em,icp]]`.
+"""Run times of the stages, beside alternatives that one would pick: `python -m experiments.benchmark [parts=[em,icp]]`.
 
 Compilation and run time apart, everything in turns on the same data; the tables are printed and written to benchmark.md
 and benchmark.json in Hydra's folder. The parts: stages, em, icp, render, sweep, growth.
@@ -28,7 +28,7 @@ from .command import command
 
 
 def parts(config: DictConfig) -> dict[str, Callable[[], Iterable[Timing]]]:
-    """What can be timed, by name."""
+    """Return the benchmarks that can be chosen, by name."""
     chosen = config.benchmark
     count, turns = chosen.num_gaussians, chosen.repetitions
     return {

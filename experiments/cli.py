@@ -35,7 +35,7 @@ def usage() -> str:
 
 
 def explained(name: str) -> Callable[[], None]:
-    """What shows the help of a command without its imports."""
+    """Return a program that shows the help of a command without its imports."""
     from .command import RUN, command
 
     return command(RUN if name == "run" else name)(lambda config: None)

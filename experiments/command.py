@@ -1,4 +1,4 @@
-"""What the commands share: Hydra, the compilation cache, and an error that is one clear line."""
+"""Shared parts of the commands: Hydra, the compilation cache, and an error that is one clear line."""
 
 import contextlib
 import logging
@@ -105,7 +105,7 @@ def kept_words(logging: DictConfig) -> Iterator[None]:
 
 
 def help_of(name: str) -> str:
-    """What conf/`name`.yaml says of itself: its first comment, and its own keys and choices as they stand there."""
+    """Return the help in conf/`name`.yaml: its first comment, and its own keys and choices as they stand there."""
     lines = (CONF / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
     blocks: dict[str, list[str]] = {}  # key at the left margin -> its lines; "" -> the comment above all of them
     key = ""

@@ -1,4 +1,4 @@
-"""What each value of a sweep changes: `python -m experiments.effects folder=multirun/sweep`.
+"""Effect of each value of a sweep: `python -m experiments.effects folder=multirun/sweep`.
 
 Every setting that differs in one key from the sweep's own config is compared with that config, on the same predictions.
 The differences are averaged over the repetitions (seeds) that are found below the folder.

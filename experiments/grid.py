@@ -111,7 +111,7 @@ def plain_setting(setting: Mapping[str, Value]) -> dict[str, Value]:
 
 
 def notes(config: DictConfig, axes: Axes) -> list[str]:
-    """What to know of axes whose values do not share a program."""
+    """List axes whose values do not share a compiled program, or need predictions of their own, in a sentence each."""
     found = []
     for key, values in axes.items():
         configs = [variant.slam for variant in variants(config, {key: values})]

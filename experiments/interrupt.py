@@ -32,7 +32,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _is_lost(frame: FrameType | None) -> bool:
-    """Whether a frame is inside a callback of the garbage collector (JAX has one) or of an object that goes."""
+    """Test whether a frame is inside a callback of the garbage collector (JAX has one) or a finalizer."""
     callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
     callbacks.add(weakref.finalize.__call__.__code__)
     while frame is not None:

@@ -10,7 +10,7 @@ from emgs_jax.running.configure import CONF
 
 
 class Kind(NamedTuple):
-    """What a value must be, in words and as a check."""
+    """Kind of a value, in words and as a check."""
 
     words: str
     fits: Callable[[Any], bool]

@@ -43,7 +43,7 @@ def predict(config: DictConfig) -> Path:
 
 
 def _record_visits(prior: Prior, dataset: Dataset, config: DictConfig, folder: Path) -> None:
-    """What the back end of a run will ask for beside the windows of the sequence."""
+    """Record the predictions of both visits of a loop that a run's back end will need beside the sequence's windows."""
     end, size = graph_config(config), config.slam.window_size
     if not end.revisit.is_asked or prior.is_sequential:
         return

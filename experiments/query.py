@@ -92,7 +92,7 @@ def asked(config: DictConfig) -> tuple[str, ...]:
 
 
 def rivals(config: DictConfig, words: tuple[str, ...], texts: Vocabulary) -> TextEmbeddings:
-    """What is not asked for: the words of `against`, else all others of a fixed vocabulary, else what anything is."""
+    """Return a query's rivals: the words of `against`, else all others of a fixed vocabulary, else generic words."""
     if config.against is not None:
         names = words_of(config.against, "against")
         both = sorted({*names} & {*words})

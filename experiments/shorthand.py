@@ -75,7 +75,7 @@ def _look(path: Path) -> tuple[tuple[int, int], str]:
 
 
 def _is_path(word: str, before: Sequence[str]) -> bool:
-    """Whether a word is no override (~key deletes one), no option and no value of one."""
+    """Test whether a word is neither an override (~key deletes one) nor an option or the value of one."""
     is_other = "=" in word or word.startswith("-") or (word.startswith("~") and not word.startswith("~/"))
     return not is_other and (not before or before[-1] not in VALUED)
 

@@ -70,7 +70,7 @@ def sweep(config: DictConfig, folder: Path, command_line: str = "") -> list[dict
 
 
 def _left(chunks: Sequence[Sequence[Variant]], results: SweepResults) -> list[list[Variant]]:
-    """What is not done of chunks of the whole grid: a sweep that goes on has the chunks of one that nobody stopped."""
+    """Return the settings that are not done, by chunks of the whole grid, which a resumed sweep has to keep."""
     left = ([variant for variant in chunk if variant.setting not in results] for chunk in chunks)
     return [chunk for chunk in left if chunk]
 

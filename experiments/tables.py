@@ -128,7 +128,7 @@ def _table(
 
 
 def _is_best(row: Row, rivals: Sequence[Row], column: Column) -> bool:
-    """Whether no rival, of which the row is one, is better; False where it has no value."""
+    """Test whether no rival, of which the row is one, is better; False where the row has no value."""
     values = [rival.values.get(column.key) for rival in rivals]
     best = (min if column.is_lower_better else max)((value for value in values if value is not None), default=None)
     return best is not None and row.values.get(column.key) == best

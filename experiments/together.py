@@ -35,7 +35,7 @@ NOT_OF_RESULTS = (  # keys that change no number of a setting
 
 @dataclass(frozen=True)
 class Work:
-    """What all settings share; `at_once` and `num_threads` as in `map_together`, `folder` for a picture of each map."""
+    """Common inputs of all settings; `at_once`, `num_threads` as in `map_together`; `folder`: for pictures of maps."""
 
     dataset: ReadableFrames
     prior: Prior

@@ -170,7 +170,7 @@ def _check_apart(tuned: Mapping[str, DictConfig], held_out: Mapping[str, DictCon
 
 
 def _source(config: DictConfig) -> tuple[Any, Any]:
-    """What a sequence is mapped from."""
+    """Return the identity of a sequence's input: the data set's fingerprint and the prior's settings."""
     return build_dataset(config).fingerprint(), OmegaConf.to_container(config.prior, resolve=True)
 
 

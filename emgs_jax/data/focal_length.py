@@ -241,7 +241,7 @@ def normal_equations(
 
 
 def eliminate(A: Float[np.ndarray, "6 6"], b: Float[np.ndarray, " 6"], damping: float):
-    """Eliminate a pair's motion: return curvature and gradient by log f, and the motion's step as a function of log f's."""
+    """Eliminate a pair's motion: return curvature and gradient by log f, and the motion's step for a step of log f."""
     block = A[1:, 1:] + np.diag(damping * A[1:, 1:].diagonal() + 1e-9 * max(A[1:, 1:].trace(), 1e-30))
     solved = np.linalg.solve(block, np.stack([A[1:, 0], b[1:]], axis=-1))
     curvature, gradient = A[0, 0] - A[0, 1:] @ solved[:, 0], b[0] - A[0, 1:] @ solved[:, 1]

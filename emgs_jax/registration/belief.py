@@ -1,8 +1,9 @@
-"""What is known of a frame's pose and scale: one step of a Kalman filter from frame to frame.
+"""Estimate of a frame's pose and scale: prediction and correction of a Kalman filter from frame to frame.
 
 The error of a pose T and a scale s is T Exp(ξ) and s e^σ with (ξ, σ) ~ N(0, P), in the order translation (m), rotation
 (rad), logarithm of the scale. There are two P. One is relative to the map, into which a frame is fitted. The other is
-relative to the first frame, and has the errors of the map in it: it is what a user may rely on, and moves nothing.
+relative to the first frame, and includes the errors of the map: it is what a user may rely on, and no result depends on
+it.
 """
 
 import equinox as eqx
@@ -19,15 +20,15 @@ DEGREES = 7
 
 
 class Belief(eqx.Module):
-    """What the next step needs to know of the last frame, beside its pose.
+    """Estimate from the last frame that the next step starts from, beside the pose itself.
 
     Args:
         covariance: P of its pose and scale, relative to the map.
         world_covariance: P relative to the first frame.
         depth_noise: how much its points differ from the map, as a fraction of their depth.
         log_scale: mean logarithm of the scales of the tracked frames: the prior's own unit, in that of the map.
-        num_scales: how many these are.
-        repeats: what two answers of the prior differed by about one pose.
+        num_scales: number of these scales.
+        repeats: differences between repeated predictions of one pose.
     """
 
     covariance: Float[Array, "*b 7 7"]
@@ -126,16 +127,17 @@ def next_belief(
     is_tracked: Bool[Array, ""],
     num_alike: Float[Array, ""],
 ) -> Belief:
-    """What the points of a frame make of it; nothing where it is not tracked.
+    """Correct the estimate by the points of a frame; it stays as it is where the frame is not tracked.
 
     Args:
-        belief: of its coarse pose.
-        found: by ICP. Where the points fit worse than `depth_noise`, the coarse pose was worth as much less.
-        depth_noise: as a fraction of the depth.
+        belief: estimate at the frame's coarse pose.
+        found: result of ICP. Where the points fit worse than `depth_noise`, the coarse pose is less certain by the same
+            factor.
+        depth_noise: expected, as a fraction of the depth.
         scale: of its prediction.
         is_tracked: the fine pose was accepted.
-        num_alike: frames that see one part of the map, which is wrong for all of them in the same way: what the points
-            of one say of the scale, and of the place in the world, is worth so much less.
+        num_alike: frames that see one part of the map, which is wrong for all of them in the same way: the information
+            of one frame's points about the scale, and about the pose in the world, is divided by it.
     """
     worth, nothing = jnp.maximum(found.misfit / depth_noise, 1.0) ** 2, jnp.zeros(DEGREES)
     units = jnp.ones(DEGREES).at[-1].set(num_alike**-0.5)

@@ -38,7 +38,7 @@ _Carry: TypeAlias = tuple[Float[Array, "7"], Uncertainty]
 
 
 class IcpInfo(eqx.Module):
-    """What the solve found.
+    """Result of the ICP solve: inliers, residuals, information and convergence.
 
     Args:
         num_inliers: points with a Gaussian that passes the gates.
@@ -50,7 +50,7 @@ class IcpInfo(eqx.Module):
         level_edges: where these levels end.
         information: of the points alone, of (xi, log s).
         num_effective: how many independent measurements the points are worth, see `num_independent`.
-        min_eigenvalue: smallest eigenvalue of what planes and colours say of the pose, per effective point (1/m² and
+        min_eigenvalue: smallest eigenvalue of the pose's information by planes and colours, per effective point (1/m² and
             1/rad²). Offsets from means do not count: the mean of a Gaussian is no landmark of its surface.
         num_steps: of all solves.
         is_converged: False where the last solve reached `max_steps` or failed.
@@ -77,7 +77,7 @@ def _observed(
     noise: Float[Array, ""],
     config: IcpConfig,
 ) -> tuple[Uncertainty, Float[Array, "p"], tuple[Float[Array, ""], Float[Array, "l"]]]:
-    """What the points' distances from their Gaussians say of the uncertainty, of which `noise` is the least.
+    """Estimate the uncertainty from the points' distances to their Gaussians; `noise` is its lower bound.
 
     Returns:
         The uncertainty, the distances as fractions of the depth, and their spread: of all points, and of each level.

@@ -1,4 +1,4 @@
-"""How wrong points are, from the points themselves: by what their prior says of them, and how many say the same."""
+"""Noise of points, estimated from themselves: by level of the prior's confidence, and how many are independent."""
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +50,7 @@ def noise_of_levels(
 def num_independent(
     errors: Float[Array, "p"], points: Float[Array, "p 3"], valid: Bool[Array, "p"]
 ) -> Float[Array, ""]:
-    """How many independent measurements the points are worth, whose errors are alike where they are near each other.
+    """Estimate how many independent measurements the points are worth, as errors of neighbouring points correlate.
 
     The image is cut into cells. The variance of the cells' mean errors is that of all errors where the points of a cell
     err alike, and falls with their number where they do not: cells · var(errors) / var(means), between the number of

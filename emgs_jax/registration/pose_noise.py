@@ -1,10 +1,10 @@
-"""How wrong the prior's poses are: by how much two of its answers differ about the same one.
+"""Noise of the prior's poses, estimated from how much two of its predictions of the same pose differ.
 
-The answer before the current one has the current frame as its newest, and the previous one as its current: it has said
-how the camera moved from there to here, and where it was then relative to the anchor. The current one says both again.
-Depths tell less: a prior may keep those of an image, and one that solves for poses knows them better than any depth.
-Two answers that are the same to rounding are one answer, of a prior that has one pose for a frame: that it does not
-contradict itself says nothing about how wrong it is, and the pose is as uncertain as without a repeat.
+In the prediction before the current one, the current frame was the newest and the previous frame the current one: it
+has the motion of the camera between the two, and the previous pose relative to the anchor. The current prediction has
+both again. Depths tell less: a prior may keep those of an image, and one that solves for poses knows them better than
+any depth. Two predictions that are equal up to rounding are one prediction, of a prior that has one pose for a frame:
+its consistency says nothing about its error, and the pose is as uncertain as without a repeated prediction.
 """
 
 import equinox as eqx
@@ -25,13 +25,13 @@ SAME_SQUARE = 1e-10  # of what one answer differs by from itself: rounding, of l
 
 
 class Repeats(eqx.Module):
-    """What two answers of the prior differed by so far; rows: motion to the next frame, pose relative to the anchor.
+    """Differences between repeated predictions so far; rows: motion to the next frame, pose relative to the anchor.
 
     Args:
-        said: both as the last answer has them, m of the map.
-        is_said: False where it has none; `said` is the identity then.
+        said: both as last predicted, m of the map.
+        is_said: False where they were not predicted; `said` is the identity then.
         log_squares: mean logarithm of the mean square, per axis, of the differences: of lengths in mean depths, angles.
-        counts: differences in that mean; an answer that is the same again is none.
+        counts: differences in that mean; a prediction that is the same again is not counted.
     """
 
     said: jaxlie.SE3

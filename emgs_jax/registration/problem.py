@@ -1,4 +1,4 @@
-"""What ICP minimises: the distances of points from Gaussians, in standard deviations, and the prior of the pose."""
+"""Cost function of ICP: the distances of points from Gaussians, in standard deviations, and the prior of the pose."""
 
 import math
 
@@ -63,22 +63,22 @@ class IcpConfig(eqx.Module):
 
 
 class Uncertainty(eqx.Module):
-    """What the coarse pose, the points' depths and all points together are worth."""
+    """Uncertainty of the coarse pose and of the points' depths, and the effective number of points."""
 
-    common: Float[Array, ""]  # depth noise of all; the coarse pose is worth less by as much as it exceeds the given
+    common: Float[Array, ""]  # depth noise of all; the coarse pose is less certain by its ratio to the expected one
     depth: Float[Array, "p"]  # noise of each, as a fraction
     num_effective: Float[Array, ""]
 
 
 class Problem(eqx.Module):
-    """What stays the same while the pose moves; lengths in metres."""
+    """Constants of the ICP problem while the pose moves; lengths in metres."""
 
     source: Observation  # camera frame
     surface: Surface
     T_world_coarse: jaxlie.SE3
     depth_noise: Float[Array, "p"]  # of every point along its viewing ray, as a fraction
     scale_unit: Float[Array, ""]  # of the scale's logarithm, which is the seventh unknown
-    prior: Float[Array, "7 7"]  # root of the information that is there before
+    prior: Float[Array, "7 7"]  # root of the information of the coarse pose and scale
     weight: Float[Array, ""]  # of a point
 
 
@@ -91,7 +91,7 @@ def pose_problem(
     config: IcpConfig,
     known: Float[Array, "7 7"],
 ) -> Problem:
-    """What the uncertainty makes of points and map; `scale_unit` is the depth noise that the seventh unknown counts.
+    """Build the ICP problem of points and map; `scale_unit` is the depth noise in which the seventh unknown counts.
 
     `known` is the root of the information of (xi, log s) where the points fit as well as they should.
     """
@@ -213,7 +213,7 @@ def data_information(
 def information(
     T: jaxlie.SE3, scale: Float[Array, ""], matches: Matches, problem: Problem, config: IcpConfig
 ) -> Float[Array, "6 6"]:
-    """What planes and colours of the inliers say of the pose, per point: Σ j j' / p with j = (a, x × a) / std.
+    """Compute the inliers' information about the pose, per point: Σ j j' / p with j = (a, x × a) / std.
 
     a is the normal, or the gradient of the intensity, and x the point, both in the camera's axes.
     """

@@ -1,4 +1,4 @@
-"""What the image that was predicted twice says: the scale, how far to trust the prior, and poses through it."""
+"""Scale, trust in the prior and poses from a repeated prediction: two windows predict the same image."""
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +55,7 @@ def repeat_error(
     scale: Float[Array, ""],
     max_pair_distance: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """How far the two predictions of one image are apart, a robust standard deviation, and its mean depth, m.
+    """Return the robust standard deviation between two predictions of one image, and the median of its depth, m.
 
     Without a pair nothing is known, and `max_pair_distance` (fraction of the depth) stands in.
     """

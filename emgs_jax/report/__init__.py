@@ -1,1 +1,1 @@
-"""What people look at: metrics, tables, pictures, gates, and where they come from."""
+"""Reports for people: metrics, tables, pictures, gates, and the provenance of all of them."""

@@ -1,4 +1,4 @@
-"""What a back end has measured, and what became of the candidates of loops: for graph.g2o, loops.json, metrics.json."""
+"""Report of the back end: its pose graph, and outcomes of loop candidates for graph.g2o, loops.json, metrics.json."""
 
 import math
 from collections import Counter
@@ -30,11 +30,11 @@ def metric_graph(end: BackEnd) -> Graph:
 
 
 def loop_list(end: BackEnd) -> list[dict[str, Any]]:
-    """What became of every candidate, for loops.json, in the order of the frames.
+    """List the outcome of every loop candidate, for loops.json, in the order of the frames.
 
-    `frame` and `other` are places among the frames in use, the later first; `outcome` is accepted, known (the poses
-    said so already), unconfirmed (others do not agree), unsolved (no better poses were found with it, and `reason` says
-    why) or refused, and then `gate` and `measured` say by what.
+    `frame` and `other` are positions among the frames in use, the later first; `outcome` is accepted, known (the poses
+    agreed with it already), unconfirmed (not spatially consistent with other loops), unsolved (no better poses were
+    found with it; `reason` says why) or refused; then `gate` names the gate and `measured` is the value that it tested.
     """
     unsolved, outcomes, lines = _unsolved(end), _outcomes(end), []
     found = [Refusal(loop.a, loop.b, "", math.nan) for loop in end.verified]
@@ -84,7 +84,7 @@ def revisit_note(end: BackEnd | None, is_sequential: bool) -> list[str]:
 
 
 def counts(end: BackEnd) -> dict[str, Any]:
-    """What became of the candidates of this run, for metrics.json; what its map was saved with does not count."""
+    """Count the outcomes of this run's loop candidates, for metrics.json, without those of a loaded map."""
     gates = Counter(refusal.gate for refusal in end.refusals)
     refused = {f"loops/refused_{gate}": count for gate, count in sorted(gates.items())}
     solved = [closure for closure in end.closures if closure.loops]

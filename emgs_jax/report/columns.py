@@ -1,4 +1,4 @@
-"""What tables show: the main metrics with their units, numbers as text, Markdown."""
+"""Columns of tables: the main metrics with their units, numbers as text, Markdown."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple

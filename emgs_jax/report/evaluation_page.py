@@ -39,14 +39,14 @@ class JobLine(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What an evaluation came to.
+    """Outcome of an evaluation.
 
     Args:
         jobs: all of its runs.
         rows: for the table of errors.
         estimates: that the rows are made from.
         gate: the file that was compared with; None without one.
-        regressions: what is worse than it allows, a line each.
+        regressions: metrics that are worse than the gate allows, a line each.
     """
 
     jobs: Sequence[JobLine]
@@ -111,7 +111,7 @@ def _jobs(out: Path, jobs: Sequence[JobLine]) -> str:
 
 
 def _comparable(row: Row) -> tuple:
-    """What two rows must share to be set beside each other."""
+    """Return the values that two rows must share to be compared with each other."""
     return row.dataset, row.sequences, row.protocol, row.is_simulated
 
 

@@ -27,7 +27,7 @@ IMAGE_FORMATS = {"colmap", "nerfstudio"}
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """What is written of a run.
+    """Settings of an export of a run: formats, size and scale.
 
     Args:
         formats: names of FORMATS.
@@ -74,7 +74,7 @@ def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: Readab
 
 
 def find_factor(run: RecordedRun, config: ExportConfig) -> float | None:
-    """What the lengths of a run are multiplied by; None where nothing is known."""
+    """Return the factor on all lengths of a run, from `scale` or `length`; None if neither is given."""
     if config.length is None:
         return config.scale
     if config.scale is not None:

@@ -30,7 +30,7 @@ IMAGE_WIDTH = 320  # pixels
 
 @dataclass(frozen=True)
 class LiveConfig:
-    """How a run is shown while it maps.
+    """Settings of the live view of a run that maps.
 
     Args:
         port: on 127.0.0.1.
@@ -86,7 +86,7 @@ class LiveView:
         self.viewer.stop()
 
     def _is_idle(self) -> bool:
-        """Whether the thread can draw; where it has failed it is said, once, and the run goes on without it."""
+        """Test whether the thread can draw; a failure is printed, once, and the run continues without the live view."""
         if self._failure is None and self._drawing is not None and self._drawing.done():
             self._failure = self._drawing.exception()
             if self._failure is not None:

@@ -54,7 +54,7 @@ STATUSES = ("tracked", "degraded", "lost", "initialization")
 
 @dataclass(frozen=True)
 class Scorer:
-    """What the maps of one data set are compared with, made once.
+    """References that all maps of one data set are compared with, made once.
 
     Args:
         dataset: in use.
@@ -167,7 +167,7 @@ def _score_labels(
 
 
 def _own_classes(raw: RawPrior, row: int, scorer: Scorer) -> np.ndarray | None:
-    """What the prior itself says of the pixels of a frame, as positions in the data set's classes."""
+    """Return the prior's own classes of a frame's pixels, as positions in the data set's; None without any."""
     if raw.classes is None:
         return None
     return translate(raw.classes[row], scorer.prior.feature_names, scorer.dataset.classes)
@@ -262,7 +262,7 @@ def double_walls(gaussians: Gaussians, scale: float) -> float | None:
 
 
 def score_back_end(run: MappingRun) -> Metrics:
-    """What became of loops, and the errors of the poses as they were when the frames were placed; empty without one."""
+    """Score loop closures, relocalization, and the online poses (as first estimated); empty without a back end."""
     if run.back_end is None:
         return {}
     end, online = run.back_end, run.back_end.online[run.back_end.first :]

@@ -23,14 +23,14 @@ _PAPER = "#e3e6ea"
 
 @dataclass(frozen=True)
 class Paths:
-    """Where the camera was, (n, 4, 4) T_world_camera each, all in one frame; None where there is no such path.
+    """Camera trajectories, (n, 4, 4) T_world_camera each, all in one frame; None where there is no such path.
 
     Args:
         estimate: of every frame.
         is_placed: (n,), False where the camera was lost and a pose stands in for its own.
-        truth: where the estimate fits it best; NaN where unknown.
-        online: as the frames were placed, before poses moved.
-        loops: rows of the frames that loops join.
+        truth: aligned with the estimate; NaN where unknown.
+        online: as first estimated, before the back end moved poses.
+        loops: rows of the frames that loop closures join.
         unit: of all lengths.
     """
 

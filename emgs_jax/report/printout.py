@@ -1,4 +1,4 @@
-"""What a run says at its end: how many frames came to what, and what to do where many were not tracked."""
+"""Messages at the end of a run: how many frames have which status, and remedies where many were not tracked."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
 
 
 def time_words(clock: Clock, num_frames: int) -> str:
-    """How long a run took, a frame too, of what phases that is the sum, and how much of it was compilation."""
+    """Describe how long a run took, per frame, by phase, and how much of it was compilation."""
     whole, phases = sum(clock.phases.values()), ", ".join(f"{name} {s:.1f}" for name, s in clock.phases.items())
     pace = f"{whole:.1f} s, {whole / max(num_frames, 1):.2f} s a frame"
     return f"{pace}: {phases}; of all that compilation {clock.compile_seconds:.1f}"

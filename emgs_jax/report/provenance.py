@@ -1,4 +1,4 @@
-"""What a run writes and prints about itself: provenance, metrics.json, the table on the terminal."""
+"""Provenance of a run, its metrics.json, and the table of its metrics on the terminal."""
 
 import importlib.metadata
 import os
@@ -63,7 +63,7 @@ def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -
 
 
 def signature(block: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a provenance decides the bits of a result: all but where things are, when to write and who watches."""
+    """Return the part of a provenance that determines the bits of a result: no caches, checkpoints or views."""
     ignored = ("compilation_cache", "checkpoint", "checksums", "view")
     return {**block, "config": {key: value for key, value in block["config"].items() if key not in ignored}}
 
@@ -90,14 +90,14 @@ def write_metrics(path: str | os.PathLike, metrics: Mapping[str, Any]) -> None:
 
 
 def is_metric(settings: Mapping[str, Any]) -> bool:
-    """Whether a prior with these settings means metres."""
+    """Test whether a prior with these settings predicts in metres."""
     said = flat(settings)  # of what a recording was made with, too
     has_unit = not any(key.endswith("median_depth") for key in said)
     return has_unit and all(value != "arbitrary" for key, value in said.items() if key.endswith("scale"))
 
 
 def has_metric_truth(block: Mapping[str, Any]) -> bool:
-    """Whether the true poses of a result's provenance are in metres: other programs have a unit of their own."""
+    """Test whether the true poses of a result are in metres: COLMAP and nerfstudio have units of their own."""
     return (block.get("data") or {}).get("name") not in ("colmap", "nerfstudio")
 
 
@@ -136,7 +136,7 @@ def _in_units(title: str) -> str:
 
 
 def _label(block: Mapping[str, Any]) -> str:
-    """What a table says first: nothing of measured numbers, of simulated ones that they are and in which version."""
+    """Return the label above a table: empty for measured numbers; `simulated`, with any version, for others."""
     if not block.get("simulated", False):
         return ""
     name = (block.get("prior") or {}).get("name", "")

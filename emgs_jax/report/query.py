@@ -40,14 +40,14 @@ _relevance = eqx.filter_jit(relevance)
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked.
+    """Query to a map: words, rivals and thresholds.
 
     Args:
         words: with their vectors.
-        against: what is not asked for, in the same space; perhaps none.
+        against: rivals, which are not asked for, in the same space; may be empty.
         margin: the lead that an answer needs.
         min_cosine: the cosine that an answer needs.
-        instances: which answers are one object.
+        instances: clustering of answers into objects.
     """
 
     words: TextEmbeddings
@@ -59,15 +59,15 @@ class Question:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a map says.
+    """Result of a query to a map.
 
     Args:
-        question: what was asked.
+        question: the query.
         gaussians: the confirmed ones are valid; on the device.
         relevance: of all rows of the map, on the host.
         rows: of the confirmed Gaussians.
         instances: objects of each word, rows of the map.
-        reach: within which answers are one object, in the unit of the map.
+        reach: distance within which answers are one object, in the unit of the map.
     """
 
     question: Question

@@ -46,7 +46,7 @@ _OUTCOMES = ("accepted", "known", "unconfirmed", "unsolved", "refused")
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """What a run has written.
+    """Outputs of a finished run, as read from its folder.
 
     Args:
         folder: of the run.
@@ -54,8 +54,8 @@ class RecordedRun:
         frames: lines of frames.jsonl that have a pose, in order.
         skipped: the other lines.
         poses: T_world_camera of `frames`, (n, 4, 4) float64: the final ones.
-        online: the same as they were when the frames were placed; nan before the back end begins, None without one.
-        raw: as the prior alone says.
+        online: the same as first estimated, before the back end moved them; nan before it begins, None without one.
+        raw: the raw predictions' poses.
         truth: (n, 4, 4), nan where unknown.
         map: all Gaussians.
         camera: of the frames.
@@ -78,7 +78,7 @@ class RecordedRun:
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """Where the result comes from."""
+        """Provenance of the result, as in metrics.json."""
         return self.metrics["provenance"]
 
     @property

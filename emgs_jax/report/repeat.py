@@ -19,7 +19,7 @@ _WORDS = {"null", "none", "true", "false", "nan", "inf", "on", "off", "yes", "no
 
 
 class Repeated(NamedTuple):
-    """How a run is done again.
+    """Overrides of `emgs run` that repeat a run.
 
     Args:
         words: overrides of `emgs run` that compose its config, groups first; a key that conf/ no longer has has a +.
@@ -36,7 +36,7 @@ class Repeated(NamedTuple):
 
 
 def repeat(settings: Mapping[str, Any]) -> Repeated:
-    """How to repeat the run with these settings, the `config` of a provenance."""
+    """Find the overrides that repeat the run with these settings, the `config` of a provenance."""
     settings, options = flat(jsonable(settings)), _options(settings)
     words = [f"{group}={option}" for group, option, _ in options]
     differences: list[tuple[str, Any, Any]] = list(options)

@@ -1,4 +1,4 @@
-"""Where results lie: OUT/data set/sequence/variant/seed/metrics.json, and what may be read back from there."""
+"""Folders of results: OUT/data set/sequence/variant/seed/metrics.json, and reading them back."""
 
 import json
 import re
@@ -16,7 +16,7 @@ _PLACES = ("dataset.root", "compilation_cache", "checksums")  # say where things
 
 @dataclass(frozen=True)
 class Estimate:
-    """What was compared with the truth in one run: the map, what the prior alone says, or a baseline.
+    """Estimate of one run that was compared with the truth: the map, the raw predictions, or a baseline.
 
     Args:
         folder: of the result.
@@ -72,7 +72,7 @@ def read_metrics(path: Path) -> dict[str, Any]:
 
 
 def is_finished(folder: Path, config: Mapping[str, Any]) -> bool:
-    """Whether the result is there; raises ValueError if it was made with another config."""
+    """Test whether the result is there; raises ValueError if it was made with another config."""
     path = folder / METRICS_FILE
     if not path.exists():
         return False
@@ -98,7 +98,7 @@ def read_estimates(out: Path) -> list[Estimate]:
 
 
 def estimates_of(path: Path) -> list[Estimate]:
-    """What one result holds: ours, the raw prior and baselines, or another system."""
+    """Read the estimates of one result: ours, the raw prior and baselines, or another system."""
     metrics = read_metrics(path)
     kinds = ROWS | {"": "ours" if metrics["provenance"]["prior"] else "scored"}
     there = {"", *map(prefix_of, metrics)}

@@ -38,7 +38,7 @@ says nothing about a network and must not be compared with quoted rows; neither 
 
 @dataclass(frozen=True)
 class Placement:
-    """How a map is brought into the frame of the truth.
+    """Alignment of a map with the truth.
 
     Args:
         by: `trajectory`, the alignment of the poses; or `points`, from there a rigid ICP of the centres onto the truth.
@@ -133,7 +133,7 @@ def score_scene(
 def summary(
     results: Sequence[SceneResult], classes: Sequence[str], protocol: SegmentationProtocol, how: Placement
 ) -> dict[str, Any]:
-    """What the file says: metrics of all scenes and of each, IoU of each class, and the matrices."""
+    """Build the contents of the file: metrics of all scenes and of each, IoU of each class, and the matrices."""
     ignored = ignored_positions(classes, protocol)
     total = np.sum([result.confusion for result in results], axis=0)
     right, true = np.diagonal(total), total.sum(1)

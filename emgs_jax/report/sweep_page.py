@@ -57,7 +57,7 @@ def _best(rows: Rows, column: Column) -> Mapping[str, Any]:
 
 
 def _best_words(rows: Rows, axes: Sequence[str], columns: Sequence[Column]) -> str:
-    """How many settings there are, and which is the best of the first metric and of the finest F1."""
+    """Describe in a sentence how many settings there are, and the best by the first metric and by the finest F1."""
     words = [f"{len(rows)} settings"]
     for column in columns:
         if column.key in (MAIN[0].key, "reconstruction/f1_5cm_percent"):

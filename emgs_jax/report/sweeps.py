@@ -75,7 +75,7 @@ def _key(setting: Mapping[str, Any]) -> str:
 
 
 def picture_path(folder: Path, setting: Mapping[str, Any]) -> Path:
-    """Where the picture of a setting lies; its name follows from the values."""
+    """Return the path of a setting's picture; its name follows from the values."""
     return folder / "pictures" / f"{hashlib.sha256(_key(setting).encode()).hexdigest()[:16]}.jpg"
 
 

@@ -142,7 +142,7 @@ def _row(what: tuple, members: list[Estimate]) -> Row:
 
 
 def source_of(row: Row) -> str:
-    """What the numbers are made from; simulated ones say so in every table, in Markdown."""
+    """Describe the source of the numbers in Markdown: measured or (in bold) simulated, and the prior."""
     label = "**simulated**" if row.is_simulated else "measured"
     return label if row.prior in (None, "simulated") else f"{label}, {row.prior}"
 

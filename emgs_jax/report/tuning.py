@@ -1,4 +1,4 @@
-"""What a search leaves: a table of the default and the best on every sequence, a picture, settings that `run` takes."""
+"""Results of a search: a table of the default and the best on every sequence, a picture, settings that `run` takes."""
 
 import os
 import statistics
@@ -18,11 +18,11 @@ DEFAULT, RAW = "default", "raw prior"
 
 @dataclass(frozen=True)
 class SequenceResults:
-    """What settings came to on one sequence.
+    """Metrics of the settings of a search on one sequence.
 
     Args:
         name: of the sequence.
-        is_held_out: it decided nothing.
+        is_held_out: the search did not use it.
         is_simulated: the prior is made from the ground truth.
         metrics: of DEFAULT and of trials, by name.
     """

@@ -25,7 +25,7 @@ HOST = "127.0.0.1"
 
 
 def _alone(method: Callable) -> Callable:
-    """What browsers ask for and what a run that maps brings come from several threads: one after the other."""
+    """Make a method hold the viewer's lock: browsers and a run that maps call from several threads."""
 
     @wraps(method)
     def locked(self: "Viewer", *arguments: Any) -> Any:

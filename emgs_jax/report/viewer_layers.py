@@ -1,4 +1,4 @@
-"""What the viewer shows of a map: colours of its Gaussians, answers to words, the Gaussian under a ray."""
+"""Layers of a map in the viewer: colours of its Gaussians, answers to queries, the Gaussian under a ray."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -23,11 +23,11 @@ Layers = Mapping[str, np.ndarray]  # as `page_map.map_layers` makes them, perhap
 
 
 class Answer(NamedTuple):
-    """What a map says to words.
+    """Result of a query for words in a map.
 
     Args:
         cosines: of each Gaussian with the closest word that is asked for, (n,) in [0, 1].
-        is_found: closer to it than to everything that is not asked for, and close enough.
+        is_found: (n,) closer to it than to all rivals, and close enough.
     """
 
     cosines: np.ndarray

@@ -1,4 +1,4 @@
-"""What the viewer shows of a run, whether it is finished or still maps."""
+"""Data of a run for the viewer, whether it is finished or still maps."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

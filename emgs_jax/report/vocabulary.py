@@ -17,7 +17,7 @@ from emgs_jax.running.configure import build
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """What can be said to a map.
+    """Texts that a map can be queried for, with their embeddings.
 
     Args:
         source: where vectors come from, for people.
@@ -66,7 +66,7 @@ def feature_space(run: RecordedRun) -> dict[str, Any]:
 
 
 def vocabulary(run: RecordedRun, file: str | None, model: FeatureModel | None) -> Vocabulary:
-    """What can be said to the map of a run: what the file has, else what the model embeds, else the run's classes.
+    """Choose the vocabulary for a run's map: of the file if given, else of the model, else the run's classes.
 
     Args:
         run: finished.

@@ -32,21 +32,21 @@ from emgs_jax.slam import SlamState
 
 @dataclass(frozen=True)
 class BackEndConfig:
-    """What is measured, how loops are found, and how all is solved.
+    """Settings of the back end: noise of factors, place recognition, loop closures, optimization and relocalization.
 
     Args:
-        noise: of where frames are placed.
+        noise: of the factors that a frame's pose becomes.
         appearance: keyframes and candidates.
         verification: of a candidate.
-        agreement: of verified loops with each other.
-        revisit: how they are measured once more.
+        agreement: spatial consistency of verified loops.
+        revisit: second measurement of loops by the prior.
         every: frames between keyframes.
-        max_known: χ² of a loop at the poses as they are, up to which it says what is so already: it closes nothing by
-            itself, and the prior is not asked for it.
+        max_known: χ² of a loop at the current poses, up to which they agree with it: it starts no closure by itself,
+            and the prior is not asked for it.
         min_frames: between two closures.
-        solver: of the graph.
-        deform: how the map follows what was solved.
-        location: of a camera that is lost.
+        solver: of the pose graph.
+        deform: of the map, to follow the optimized poses.
+        location: relocalization of a lost camera.
     """
 
     noise: NoiseConfig
@@ -154,7 +154,7 @@ class BackEnd:
             self.edges.append(map_edge(look, self.poses, self.log_scales, origin, self.config.noise))
 
     def _has_place(self, row: int) -> bool:
-        """Whether a node is related to those before, or the map holds it; none from before the camera was found."""
+        """Test whether a node is in the map or has an odometry factor; False for nodes before the camera was found."""
         is_led = self.is_placed[row] or any(edge.a == row and edge.kind == ODOMETRY for edge in self.edges)
         return row >= self.since and is_led
 
@@ -179,11 +179,11 @@ class BackEnd:
         return describe(time, look.image, look.points, look.mask, self.intrinsics, self.config.appearance)
 
     def locate(self, look: Look, elsewhere: bool = False) -> tuple[Location | None, str | None]:
-        """Where a frame was taken, by the keyframes of its segment that the map holds; else why that is open.
+        """Relocalize a frame among its segment's keyframes that are in the map; else return why that fails.
 
         Args:
             look: of a frame that is no node yet, or is no keyframe.
-            elsewhere: by those of the other segment that has the one most alike, whatever the ratio of the units.
+            elsewhere: search the other segment that has the most similar keyframe, whatever the ratio of the units.
         """
         query = self._described(len(self.poses), look)
         segment = self._most_alike(query) if elsewhere else self.segment
@@ -214,19 +214,19 @@ class BackEnd:
         return replace(config, alignment=replace(config.alignment, scale_std=math.inf))
 
     def agreed(self, since: int = 0) -> list[LoopMeasurement]:
-        """Loops of queries from `since` on that others agree with."""
+        """Return the verified loops of queries from `since` on that are spatially consistent with others."""
         recent = [loop for loop in self.verified if loop.b >= since]
         poses, log_scales = (dict(enumerate(values)) for values in (self.poses, self.log_scales))
         yes = agreeing(recent, self.contradicted, poses, log_scales, self.config.agreement)
         return [loop for loop, ok in zip(recent, yes, strict=True) if ok]
 
     def new(self, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
-        """Those that are no edges yet."""
+        """Select the loops that are not in the pose graph yet."""
         known = {(loop.a, loop.b) for loop in self.accepted}
         return [loop for loop in loops if (loop.a, loop.b) not in known]
 
     def retract(self, agreed: Sequence[LoopMeasurement]) -> int:
-        """Take back the edges of loops that are not among all that are `agreed` now; returns how many."""
+        """Remove the factors of accepted loops that are not among `agreed`, all consistent ones; return their number."""
         good = {(loop.a, loop.b) for loop in agreed}
         before = len(self.accepted)
         self.accepted = [loop for loop in self.accepted if (loop.a, loop.b) in good]
@@ -250,13 +250,13 @@ class BackEnd:
             self.verified.append(loop)
 
     def wants_to_close(self, loops: Sequence[LoopMeasurement]) -> bool:
-        """Whether some loop says what is not so, and the last closure is long enough ago."""
+        """Test whether a closure is due: a loop violates the current poses, and the last closure is long enough ago."""
         last = self.closures[-1].time if self.closures else -self.config.min_frames
         is_due = len(self.poses) - 1 - last >= self.config.min_frames
         return is_due and bool(self.news(loops))
 
     def news(self, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
-        """Those that say what is not so at the poses as they are."""
+        """Select the loops that the current poses violate: χ² above `max_known`."""
         return [loop for loop in loops if self.misfit(loop) > self.config.max_known]
 
     def misfit(self, loop: LoopMeasurement) -> float:

@@ -131,12 +131,12 @@ def difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> str | None:
 
 
 class Keeper:
-    """Who keeps the checkpoint of a run: `found` is what it goes on from, None where it begins.
+    """Owner of a run's checkpoint file: `found` is the checkpoint to resume from, None where there is none.
 
     Args:
         path: of the file.
         config: when it is written; None = never.
-        signature: what tells this run from others.
+        signature: settings that must match those of the checkpoint.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Where the time of a run goes: phases, and what of them was tracing, lowering and compiling."""
+"""Wall-clock time of a run: by phase, and the part that was tracing, lowering and compiling."""
 
 import contextlib
 import sys

@@ -8,7 +8,7 @@ MAX_BYTES = 2 * 2**30  # what was not used for longest goes first
 
 
 def cache_folder() -> Path:
-    """Where executables are kept unless something else is said: below XDG_CACHE_HOME or ~/.cache."""
+    """Return the default folder of compiled executables: below XDG_CACHE_HOME or ~/.cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "emgs_jax" / "jax"
 
 

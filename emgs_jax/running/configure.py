@@ -65,7 +65,7 @@ class RunConfig:
 
 
 def load_config(*overrides: str, name: str = "config") -> RunConfig:
-    """What the command line makes of the same words: `load_config("dataset=images", "dataset.root=video.mp4")`.
+    """Build the config of the same words on a command line: `load_config("dataset=images", "dataset.root=video.mp4")`.
 
     Args:
         overrides: as for `emgs run`; `emgs run --help` lists them.
@@ -87,7 +87,7 @@ def load_config(*overrides: str, name: str = "config") -> RunConfig:
 
 
 def build(config: DictConfig, key: str, **more: Any) -> Any:
-    """What the node at `key` describes, made after all of its values are checked.
+    """Instantiate the node at `key`, after all of its values are checked.
 
     Args:
         config: composed.
@@ -150,7 +150,7 @@ def groups() -> dict[str, list[str]]:
 
 
 def _explained(error: Exception, name: str, overrides: Sequence[str]) -> str:
-    """What is wrong with the overrides, and what might have been meant."""
+    """Explain the error in the overrides, and name the keys or options that might have been meant."""
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     options = groups()
     if needed := re.match(r"You must specify '([\w/]+)'", str(error)):
@@ -250,6 +250,6 @@ def attach_features(config: DictConfig, dataset: ReadableFrames, prior: Prior) -
 
 
 def message_of(error: Exception) -> str:
-    """What is wrong, without Hydra's wrapping."""
+    """Return the message of the original error, without Hydra's wrapping."""
     cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
     return str(cause) or type(cause).__name__

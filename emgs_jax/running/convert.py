@@ -86,7 +86,7 @@ def to_first_window(
     config: ObservationConfig,
     since: int = 0,
 ) -> tuple[FirstWindow | None, tuple[int, ...]]:
-    """What a map can start from: the dense views from the first on that has a pose and a valid point.
+    """Select the views that a map can start from: the dense ones, from the first with a pose and a valid point on.
 
     Args:
         prediction: of a window.
@@ -145,7 +145,7 @@ def to_prediction(
 
 
 def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[Prediction]]:
-    """What the map is initialised from, and the steps that follow from the same window.
+    """Split the first window into the views that initialize the map and the steps that follow from the same window.
 
     These are the whole window and none, or (incremental initialisation) the first view alone and each further view as
     if it were a step's current frame. Consecutive views come from one inference, so the previous image's two

@@ -43,7 +43,7 @@ _thread = threading.local()  # `hits`: executables that JAX took from its cache
 
 
 def call(function: Callable, *arguments: Any) -> Any:
-    """What `function(*arguments)` is, by an executable that is kept.
+    """Compute `function(*arguments)` by an executable that is kept on disk.
 
     Args:
         function: made by `eqx.filter_jit` from a function of this package.
@@ -206,7 +206,7 @@ def _hash(*parts: object) -> str:
 
 @cache
 def _machine() -> tuple[str, ...]:
-    """What an executable is compiled for, and by what; the number of threads decides how sums are cut."""
+    """Describe the machine and versions that an executable is for; the number of threads decides how sums are split."""
     device = jax.devices()[0]
     cpu = Path("/proc/cpuinfo")
     features = sorted(set(re.findall(r"^(?:flags|Features)\s*:.*", cpu.read_text(), re.M))) if cpu.exists() else []

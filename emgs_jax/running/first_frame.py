@@ -1,4 +1,4 @@
-"""What the first frame itself is off by: the covariances of a run's poses are relative to it."""
+"""Covariance of the first frame's own pose; the covariances of a run's poses are relative to that frame."""
 
 from dataclasses import replace
 
@@ -65,7 +65,7 @@ def with_first_frame(run: MappingRun) -> None:
 def seen_from(
     own: Float[np.ndarray, "6 6"], T_world_first: Float[np.ndarray, "4 4"], T_world_cameras: Float[np.ndarray, "n 4 4"]
 ) -> Float[np.ndarray, "n 6 6"]:
-    """What the first frame's covariance makes other poses uncertain by: Ad own Adᵀ, each in its own axes."""
+    """Compute what the first frame's covariance adds to that of other poses: Ad own Adᵀ, each in its own axes."""
     T = np.linalg.inv(T_world_cameras) @ T_world_first
     rotations, across = T[:, :3, :3], np.cross(T[:, None, :3, 3], T[:, :3, :3], axisb=1, axisc=1)
     adjoints = np.block([[rotations, across], [np.zeros_like(rotations), rotations]])

@@ -1,4 +1,4 @@
-"""What streams by while a sequence is mapped, gathered for comparison: what the prior alone says, and baselines."""
+"""Data gathered for comparison while a sequence is mapped: the raw predictions, and baselines."""
 
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -26,11 +26,11 @@ Text = tuple[tuple[str, ...], np.ndarray]  # names of classes and their embeddin
 
 @dataclass(frozen=True)
 class RawPrior:
-    """What the prior alone says of a sequence.
+    """Raw predictions of a sequence, without any mapping.
 
     Args:
         cloud: its points at its poses; a voxel's side in its lengths is known once the poses are aligned.
-        depths: camera-space z of each frame (h, w), in the prior's own lengths; 0 where it says none.
+        depths: camera-space z of each frame (h, w), in the prior's own lengths; 0 without a value.
         classes: of each frame's pixels (h, w), as positions in the prior's names, -1 = none; None without classes.
         labels: its points likewise, each with the class that its frame sees there; None without classes.
     """

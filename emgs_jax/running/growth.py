@@ -1,4 +1,4 @@
-"""What a map needs from the host: executables before it starts, and twice the room where it or its submap is full."""
+"""Host side of a map: executables before it starts, and doubled capacity where it or its submap is full."""
 
 import os
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What a run takes, one input after the other: frames are read, predicted and converted when their turn comes."""
+"""Inputs of a run, one after the other: frames are read, predicted and converted when they are needed."""
 
 from collections import ChainMap
 from collections.abc import Iterator, Mapping
@@ -16,7 +16,7 @@ from emgs_jax.slam import SlamConfig
 
 
 class RawView(NamedTuple):
-    """What the prior alone says of a frame: points (h, w, 3) of its camera, and which have the least confidence.
+    """Raw prediction of a frame: points (h, w, 3), camera frame, and the mask of those that are confident enough.
 
     The mapping leaves out points without a normal as well.
     """
@@ -24,23 +24,23 @@ class RawView(NamedTuple):
     points: np.ndarray
     mask: np.ndarray
     image: np.ndarray
-    T_world_camera: np.ndarray  # the frame's before where the prior says none
+    T_world_camera: np.ndarray  # of the frame before where the prior has none
     features: np.ndarray  # (y, x, f), a grid that covers the image
 
 
 @dataclass(frozen=True)
 class Input:
-    """What a run takes at once.
+    """One input of a run: a frame or several, with their prediction.
 
     Args:
         frames: one; several where the map is made from all of them.
-        raw: what the prior alone says of each.
-        taken: what the map starts from, or the prediction of a step; None where there is nothing to start from yet.
+        raw: raw prediction of each.
+        taken: views that the map starts from, or the prediction of a step; None where no map can start yet.
         T_world_anchor: known pose of the first frame; NaN where the inference is not related to it.
-        T_anchor_views: what the inference says of every view of its window, by frame index.
+        T_anchor_views: predicted pose of every view of the window, by frame index.
         spent: seconds of the conversion.
         structure: number of the frame that `T_anchor_views` are in, see `PriorPrediction`; 0: that of the first frame.
-            Where it is another one `taken` has no pose: nothing says where the camera is in the world.
+            For any other, `taken` has no pose: the camera's pose in the world is not known.
     """
 
     frames: tuple[Frame, ...]
@@ -54,12 +54,12 @@ class Input:
 
 @dataclass(frozen=True)
 class PlacedStructure:
-    """Where a frame of the prior's own is in the world of the part that was begun in it.
+    """Pose of a frame of the prior's own in the world of the disconnected submap that was started in it.
 
     Args:
         number: `Input.structure`.
         T_world_structure: (4, 4).
-        T_world_anchor: (4, 4), of the frame by which the part began.
+        T_world_anchor: (4, 4), of the frame with which the submap started.
     """
 
     number: int

@@ -1,4 +1,4 @@
-"""A camera that is lost, or new in a saved map: it is looked for among the keyframes, and goes on where it is found."""
+"""Relocalization of a camera that is lost, or new in a saved map: from its keyframe's pose the run goes on."""
 
 from collections import Counter
 from dataclasses import replace
@@ -25,17 +25,17 @@ FINE_POSE = "fine_pose"  # what refuses a place by which the frame does not fit 
 
 
 def is_missing(run: MappingRun, info: StepInfo | None) -> bool:
-    """Whether the camera is to be looked for: no place is known, or no frame has been tracked for a while."""
+    """Test whether relocalization is due: no pose is known yet, or no frame has been tracked for a while."""
     if run.back_end is None or (run.state is None and run.saved is None):
         return False
     return info is None or _num_untracked(run, info) >= run.back_end.config.location.patience
 
 
 def is_to_begin_anew(run: MappingRun, given: Input, state: SlamState, info: StepInfo) -> bool:
-    """Whether the map is to go on from a frame that is found nowhere, where the prior puts it.
+    """Test whether the map restarts from a frame that was not relocalized, at the pose that the prior predicts.
 
-    Not before there is little hope, and only where the prior leads from a frame that was placed to this one and knows
-    what it sees: there are points, and its two predictions of the image before are one thing.
+    Only after many untracked frames, and where the prior connects a frame in the map with this one and knows what it
+    sees: there are points, and its two predictions of the previous image agree.
 
     Args:
         run: before this frame.
@@ -53,10 +53,10 @@ def is_to_begin_anew(run: MappingRun, given: Input, state: SlamState, info: Step
 
 
 def _leads_here(end: BackEnd, given: Input) -> bool:
-    """Whether the given frame is predicted together with the one before, and so on back to one that was placed.
+    """Test whether a chain of predictions, each of two consecutive frames, leads from the map to the given frame.
 
-    What the prior itself has lost on the way is passed over, where a later answer shows frames of both sides. The
-    anchor is none of them: a prior that is somewhere else says a pose of it, too.
+    Frames that the prior itself has lost are skipped, where a later prediction shows frames of both sides. The anchor
+    does not count as a link: a prior that has lost the connection predicts a pose of the anchor, too.
     """
     here, before = (given.T_anchor_views.get(given.frames[0].index - offset) for offset in (0, 1))
     if here is None or before is None or not np.isfinite([here, before]).all():
@@ -77,12 +77,12 @@ def _num_untracked(run: MappingRun, info: StepInfo) -> int:
 
 
 def look_for(run: MappingRun, given: Input) -> tuple[Location | None, str | None]:
-    """Where the first frame of `given` was taken, or what refuses every place; see `loops.location`."""
+    """Relocalize the first frame of `given`: return its pose, or the reason why there is none; see `loops.location`."""
     return run.back_end.locate(looks_of(given)[0])
 
 
 def looks_of(given: Input) -> list[Look]:
-    """What the back end takes of each frame."""
+    """Collect what the back end needs of each frame."""
     return [
         Look(frame.index, frame.image, raw.points, raw.mask, given.T_anchor_views)
         for frame, raw in zip(given.frames, given.raw, strict=True)
@@ -145,7 +145,7 @@ def found_at(
 
 
 def anchor_motion(prediction: Prediction, T_world_camera: jaxlie.SE3, scale: jnp.ndarray) -> jaxlie.SE3:
-    """What moves the prior's world so that its own pose of the current frame, scaled about the anchor, is this one."""
+    """Return the motion of the prior's world that brings its own current pose, scaled about the anchor, to this one."""
     anchor, current = prediction.T_world_anchor, pose_row(prediction.T_world_views, 1)
     return T_world_camera @ scale_translation(anchor.inverse() @ current, scale).inverse() @ anchor.inverse()
 
@@ -165,7 +165,7 @@ def moved(prediction: Prediction, motion: jaxlie.SE3 | None) -> Prediction:
 
 
 def refusal(info: StepInfo, prediction: Prediction, location: Location, config: LocationConfig) -> str | None:
-    """What the map says against a place: too few points agree with it, or they move the pose too far; None: nothing."""
+    """Return why the map rejects a relocalized pose (too few inliers, or they move it too far); None if it does not."""
     found, current = info.localization, prediction.current
     depth = np.median(np.asarray(current.points[:, 2])[np.asarray(current.valid)]) * np.exp(location.log_scale)
     agrees = bool(found.is_tracked) and float(found.icp.inlier_fraction) >= config.min_inlier_fraction

@@ -1,4 +1,4 @@
-"""What a frame measures, as edges of the graph: where it was placed, relative to the frame before and to the map."""
+"""Factors of the pose graph that a frame adds: its pose relative to an earlier frame, and to the map."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -38,16 +38,16 @@ class NoiseConfig:
 
 @dataclass(frozen=True)
 class Look:
-    """What the back end takes of a frame, beside its pose.
+    """Frame as the back end needs it, beside its pose.
 
     Args:
         frame: index in the data set.
         image: RGB, uint8 (h, w, 3).
         points: camera frame, m of its inference, (h, w, 3).
         mask: of these, (h, w).
-        T_anchor_views: by frame index, the poses (4, 4) that its inference says; some may not be finite.
-        depth_noise: ν of the points, as they differ from the map; None where the frame was not placed in it: the few
-            that are near the map by chance say nothing.
+        T_anchor_views: by frame index, the poses (4, 4) that its inference predicts; some may not be finite.
+        depth_noise: ν of the points, as they differ from the map; None where the frame was not tracked: the few points
+            that are near the map by chance do not count.
     """
 
     frame: int
@@ -87,16 +87,17 @@ def chain_edge(
     has_place: Callable[[int], bool],
     noise: NoiseConfig,
 ) -> Edge | None:
-    """Where the last frame was placed, relative to the nearest one before it that its window shows; None without one.
+    """Build the last frame's sequential factor to the nearest earlier frame in its window; None without one.
 
-    It is measured as placed, not as predicted. The map was made at these poses: a prediction that differs from them by
-    its noise would move every frame by that, each with the Gaussians of its birth, and roughen all surfaces.
+    The measurement is the estimated pose, not the predicted one. The map was made at these poses: a prediction that
+    differs from them by its noise would move every frame by that, each with the Gaussians of its birth, and roughen all
+    surfaces.
 
     Args:
         look: of the frame.
         poses: T_world_camera (4, 4) of all nodes, the last one its own; that of a frame k before it is k before.
         log_scales: σ of all nodes, likewise.
-        has_place: whether it may be measured to a node: not to one whose pose only stands in.
+        has_place: whether a factor may join a node: not if its pose only stands in.
         noise: of the measurements.
     """
     time = len(poses) - 1
@@ -113,7 +114,7 @@ def chain_edge(
 def map_edge(
     look: Look, poses: Sequence[np.ndarray], log_scales: Sequence[float], origin: int, noise: NoiseConfig
 ) -> Edge:
-    """Where the last frame was placed, relative to the frame `origin` of whose Gaussians it was placed by."""
+    """Build the map factor: the last frame's pose relative to the frame `origin` whose Gaussians it was fitted to."""
     measured = _as_placed(poses, log_scales, origin)
     return Edge(len(poses) - 1, origin, measured, 0.0, _weights(look, noise, noise.map), ODOMETRY)
 

@@ -37,14 +37,14 @@ def joined(arguments: Sequence[str]) -> list[str]:
 
 
 def _is_open(word: str) -> bool:
-    """Whether the value of an override is a list or mapping without its end."""
+    """Test whether the value of an override is a list or mapping without its end."""
     value = word[found.end() :] if (found := KEY.match(word)) else ""
     closing = OPENS.get(value[:1])
     return closing is not None and value.count(value[0]) > value.count(closing)
 
 
 def parsed(word: str) -> Override | None:
-    """What Hydra reads; None where it reads nothing."""
+    """Parse a word as Hydra does; None where it is no override."""
     try:
         return OverridesParser.create().parse_override(word)
     except HydraException:
@@ -65,7 +65,7 @@ def _readable(word: str) -> str:
 
 
 def _is_there(value: str) -> bool:
-    """Whether there is a file or folder of that name."""
+    """Test whether there is a file or folder of that name."""
     try:
         return value != "" and value == value.strip("\"'") and Path(value).expanduser().exists()
     except (OSError, ValueError):  # too long, or with a zero byte

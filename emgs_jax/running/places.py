@@ -186,7 +186,7 @@ def _table(name: str, records: Sequence[Any], fields: Iterable[str]) -> dict[str
 
 
 def _rows(name: str, arrays: Mapping[str, np.ndarray], fields: Iterable[str], count: int) -> list[dict[str, Any]]:
-    """What `_table` was made of; a and b must be among `count` nodes."""
+    """Return the records that `_table` was made of, a dict each; a and b must be among `count` nodes."""
     columns = {field: arrays[f"{name}.{field}"] for field in fields}
     for field in ("a", "b"):
         if len(columns[field]) and not 0 <= columns[field].min() <= columns[field].max() < count:

@@ -33,7 +33,7 @@ UNJOINED = "its part was never joined with the map (unjoined)"
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """What became of one frame: a line of frames.jsonl. None where a frame was not a step.
+    """Outcome of one frame: a line of frames.jsonl. None where a frame was not a step.
 
     Args:
         index: position in the data set.
@@ -42,24 +42,25 @@ class FrameRecord:
         status: tracked, degraded (the coarse pose stays, nothing is fused), lost (not even that is known),
             initialization (the map was made from it) or skipped (it cannot be read).
         reason: why it is not tracked.
-        location: where the camera was looked for: `found`, and the run goes on from there; `anew`, and the map does so
-            from its coarse pose; or what refused every place. `segment`: a part begins whose relation to the others is
-            not known; `joined`: it is known by this frame.
+        location: outcome of relocalization: `found`, and the run continues from there; `anew`, and the map restarts
+            from its coarse pose; or the reason of the failure. `segment`: a disconnected submap starts; `joined`: this
+            frame connects it.
         pose: T_world_camera; of a lost frame what stands in for it.
-        raw_pose: the same as the prior alone says; the one before where it says none.
+        raw_pose: the same by the raw prediction; that of the frame before where it has none.
         true_pose: None where unknown.
         newest_pose: temporary pose of the next frame.
-        covariance: (6, 6) of ξ where the true pose is T Exp(ξ), translation (m), rotation (rad); of the pose as it was
-            placed, relative to the first frame.
+        covariance: (6, 6) of ξ where the true pose is T Exp(ξ), translation (m), rotation (rad); of the pose as first
+            estimated, relative to the first frame.
         inliers: points that agree with the map.
         residual: of these to the map's planes, as a fraction of their depth.
-        scale: by which the prediction was multiplied.
+        scale: factor on the prediction's lengths.
         depth_noise: how much the points differ from the map, as a fraction of their depth; None where none agrees.
         step_m: between the coarse and the fine pose.
         step_rad: likewise.
-        similarity: where it is `joined`, what takes its part to the other: (4, 4) with e^σ R in the place of R.
-        origin: the frame by whose Gaussians it was placed (median of their births), counted from the map's first one.
-        repeat_rms: how far the two predictions of the previous image are apart, m.
+        similarity: where it is `joined`, the motion of its submap into the other: (4, 4) with e^σ R in the place of R.
+        origin: the frame whose Gaussians it was registered to (median of their births), counted from the map's first
+            one.
+        repeat_rms: distance of the two predictions of the previous image, m.
         fused: points that moved Gaussians.
         updated: Gaussians that they moved.
         mean_log_joint: of the fused points with their best Gaussians.
@@ -67,7 +68,7 @@ class FrameRecord:
         refined: of these, merged on the image plane.
         new: of these, added to the map.
         num_gaussians: in the map after this frame.
-        overflow: splats for which there was no room and that would be seen.
+        overflow: splats beyond the capacity that would be seen.
         seconds: of mapping (conversion and step), compilation included.
         compile_seconds: of these.
     """
@@ -155,12 +156,12 @@ class MappingRun:
 
     @property
     def raw_poses(self) -> np.ndarray:
-        """What the prior alone says, likewise."""
+        """Raw predictions of the poses, likewise."""
         return _stacked([record.raw_pose for record in self.records])
 
     @property
     def true_poses(self) -> list[np.ndarray | None]:
-        """What the data set says, likewise; None where unknown."""
+        """True poses of the data set, likewise; None where unknown."""
         return [record.true_pose for record in self.records]
 
 

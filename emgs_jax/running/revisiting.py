@@ -15,7 +15,7 @@ MEASURED, SILENT, UNUSABLE = "measured", "silent", "unusable"
 
 
 def asking(prior: Prior, dataset: Dataset, spacing: int, window_size: int, clock: Clock) -> Ask:
-    """How a run asks its prior for both visits of a loop; the frames are read again."""
+    """Return a function by which a run's prior predicts both visits of a loop; the frames are read again."""
 
     def ask(a: int, b: int) -> Revisit | None:
         window = visits(a, b, spacing, window_size)

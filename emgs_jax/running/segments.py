@@ -31,7 +31,7 @@ UNKNOWN = np.full((4, 4), np.nan)  # pose
 
 
 def predicted(run: MappingRun, given: Input) -> Prediction:
-    """What is given as a step's input, in the world of the map; without poses where that is not related to it."""
+    """Return a step's prediction in the world of the map; without poses where they are not related to it."""
     prediction = as_prediction(given.taken)
     if run.structure is None or not is_related(run, given):
         return prediction
@@ -47,12 +47,12 @@ def in_structure(prediction: Prediction, given: Input, placed: PlacedStructure) 
 
 
 def is_related(run: MappingRun, given: Input) -> bool:
-    """Whether the poses that are given are in a frame of which it is known where it is in the map."""
+    """Test whether the given poses are in a frame whose pose in the map is known."""
     return given.structure == (0 if run.structure is None else run.structure.number)
 
 
 def placed_by(given: Input, pose: np.ndarray) -> PlacedStructure:
-    """Where the prior's own frame is, by the pose of the given frame in the world; lengths are scaled about that."""
+    """Place the prior's own frame by the pose of the given frame in the world; lengths are scaled about that frame."""
     own = given.T_anchor_views.get(given.frames[0].index, UNKNOWN)
     return PlacedStructure(given.structure, pose @ np.linalg.inv(own), pose)
 
@@ -164,9 +164,9 @@ def join(run: MappingRun, given: Input) -> None:
 
 
 def edge_to_place(end: BackEnd, place: Location, unit: float) -> Edge:
-    """What holds two segments together: the last node relative to the keyframe by which it was found, as it is now.
+    """Build the join factor of two segments: the last node relative to the keyframe that relocalized it, as now.
 
-    `unit` is a length of that keyframe's inference in the map in which the place was found.
+    `unit` is a length of that keyframe's inference in the map in which the pose was found.
     """
     a, b = place.by, len(end.poses) - 1
     scale = np.exp(end.log_scales[a])

@@ -31,7 +31,7 @@ REMEDIES = dict(
 
 
 def alarm(records: Sequence[FrameRecord]) -> str | None:
-    """What to say after the last record of a run: many frames in a row are not tracked, one is again, or a new part."""
+    """Return the message after a run's last record, if any: frames in a row untracked, tracked again, or new submap."""
     if not records:
         return None
     if records[-1].location == ANEW:
@@ -79,7 +79,7 @@ def main_reason(records: Sequence[FrameRecord]) -> tuple[str, int]:
 
 
 def called(record: FrameRecord) -> str:
-    """What to call a frame: the name of its file."""
+    """Name a frame in messages: its file's name, or its number."""
     return f"frame {record.index}" if record.name is None else Path(record.name).name
 
 

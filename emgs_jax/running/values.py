@@ -24,7 +24,7 @@ _NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: 
 
 @dataclasses.dataclass(frozen=True)
 class Declared:
-    """What a field says of its values: plain kinds, the kinds of a list's elements, the ends, the names.
+    """Values that a field allows: plain kinds, the kinds of a list's elements, the range, the names.
 
     A field with `is_node` has fields of its own.
     """
@@ -121,13 +121,13 @@ def _advice(value: Any) -> str:
 
 
 def field_of(config: DictConfig, key: str) -> Declared:
-    """What the field at a dotted key of a composed config declares; its parent has a `_target_`."""
+    """Return the declaration of the field at a dotted key of a composed config; its parent has a `_target_`."""
     parent, _, name = key.rpartition(".")
     return declared(get_class(OmegaConf.select(config, parent)["_target_"]))[name]
 
 
 def declared(cls: type) -> dict[str, Declared]:
-    """What the fields of a dataclass, or the parameters of another class, declare, by name."""
+    """Return the declarations of the fields of a dataclass, or of the parameters of another class, by name."""
     return dict(_declarations(cls))
 
 

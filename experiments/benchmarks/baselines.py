@@ -1,4 +1,4 @@
-"""What a user would write or pick instead of the library, on the host: the same mathematics with array operations."""
+"""Host-side alternatives that a user would write or pick instead of the library: the same mathematics on arrays."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What the benchmark runs on: the first frames of a data set, as a prior predicts them."""
+"""Data of the benchmark: the first frames of a data set, as a prior predicts them."""
 
 import itertools
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""What a step costs with the size of the map, and with the number of settings that share it."""
+"""Cost of a step by the size of the map, and by the number of settings that share it."""
 
 import os
 from collections.abc import Iterator, Sequence

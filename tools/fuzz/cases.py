@@ -22,7 +22,7 @@ SAME, ERROR, FAULT = "read", "clear error", "fault"
 
 @dataclass(frozen=True)
 class Case:
-    """What was damaged and what came of it.
+    """Damage to an input and its outcome.
 
     Args:
         number: with the seed it repeats the case.

@@ -99,7 +99,7 @@ def drop_word(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def change_value(data: bytes, rng: np.random.Generator) -> bytes:
-    """What stands after a colon or an equals sign, as in JSON and YAML."""
+    """Replace what stands after a colon or an equals sign, as in JSON and YAML, by a word; else change any word."""
     places = [place for place in range(len(data)) if data[place : place + 1] in (b":", b"=")][:2000]
     if not places:
         return change_word(data, rng)

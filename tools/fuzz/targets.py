@@ -1,4 +1,4 @@
-"""What is read from outside: how a sound input is written, how it is read, and what must be true of what comes back."""
+"""Inputs from outside: how a sound one is written, how it is read, and what must be true of the result."""
 
 import hashlib
 import json
@@ -430,7 +430,7 @@ def write_finished_run(folder: Path) -> None:
 
 
 def read_finished_run(folder: Path) -> None:
-    """What is accepted as a run has a page, and poses and frames that belong together."""
+    """Check that a run that can be read has a page, and poses and frames that belong together."""
     run = read_run(folder / "room")
     assert is_rigid(run.poses) and len(run.poses) == len(run.frames) == len(run.raw) == len(run.truth)
     text = write_report(run, None).read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""How many kernels an optimised program launches, read from its text."""
+"""Count of the kernels that an optimised program launches, read from its text."""
 
 import re
 from collections import Counter

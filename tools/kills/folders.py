@@ -1,4 +1,4 @@
-"""What is in the folder of a run: whether each file is whole, and a digest of what must not depend on kills."""
+"""Checks of a run's folder: whether each file is whole, and a digest of what must not depend on kills."""
 
 import hashlib
 import json
@@ -88,7 +88,7 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 def faults(folder: Path, may_hold_temporaries: bool) -> list[str]:
-    """What is wrong with the outputs that are there.
+    """List what is wrong with the outputs that are there.
 
     Args:
         folder: of a run that was stopped.

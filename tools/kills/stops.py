@@ -58,7 +58,7 @@ class Whole:
 
 @dataclass(frozen=True)
 class Case:
-    """What was done to a run and what came of it.
+    """Interruptions of a run and their outcome.
 
     Args:
         number: with the seed it repeats the choices; the moments themselves depend on the machine.
@@ -80,7 +80,7 @@ def begin(folder: Path, program: Program, log: Path) -> subprocess.Popen:
 
 
 def event(folder: Path) -> str:
-    """How far a run is: its newest output, of the log the number of lines."""
+    """Describe the progress of a run: its newest output, with the number of lines of the log."""
     files = [(path.stat().st_mtime_ns, path.name) for path in outputs(folder)] if folder.exists() else []
     name = max(files, default=(0, "start"))[1]
     is_log = name == "frames.jsonl"
@@ -88,7 +88,7 @@ def event(folder: Path) -> str:
 
 
 def watch(process: subprocess.Popen, folder: Path, until: str | None = None) -> list[tuple[str, float]]:
-    """What is new in a folder and when, until the process ends or `until` is there."""
+    """Record new outputs in a folder with their seconds, until the process ends or `until` is there."""
     start, seen = time.monotonic(), [("start", 0.0)]
     while process.poll() is None and seen[-1][0] != until:
         if time.monotonic() - start > SECONDS:

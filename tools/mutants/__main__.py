@@ -1,4 +1,4 @@
-"""Which plausible bugs do the tests notice? `python -m tools.mutants --sample 200 --seed 0 --jobs 2`.
+"""Plausible bugs, and whether the tests notice them: `python -m tools.mutants --sample 200 --seed 0 --jobs 2`.
 
 Each mutant is one change of one file: of a sample that a generator draws, and of the few in `by_hand.py`. It is made
 in a copy of the repository, where one file of tests after the other is run until a test fails: the file's own tests,
@@ -38,7 +38,7 @@ class Session:
         self._trees.put(tree)
 
     def result(self, mutant: Mutant, reach: int) -> dict:
-        """What became of a mutant with the tests at most so far away; its line is printed where there were new ones."""
+        """Test a mutant by the tests at most `reach` imports away; a line is printed where there were new ones."""
         source = (ROOT / mutant.file).read_text()
         new = {"mutant": str(mutant), "is_core": is_core(mutant.file), "killer": "", "seconds": 0.0, "passed": {}}
         with self._lock:

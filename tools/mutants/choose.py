@@ -1,4 +1,4 @@
-"""Which mutants are tried, and which tests may notice each: read from the source alone, so that all get the same."""
+"""Choice of mutants, and of the tests that may notice each: read from the source alone, so that all get the same."""
 
 import ast
 import hashlib
@@ -138,7 +138,7 @@ def targets() -> dict[str, list[str]]:
 
 
 def home(file: str) -> Path:
-    """Where the tests of a file stand."""
+    """Return the folder of a file's tests."""
     return Path("tests", *(Path(file).parent.parts[1:] if file.startswith("emgs_jax/") else ["scripts"]))
 
 

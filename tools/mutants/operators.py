@@ -1,4 +1,4 @@
-"""What a generator changes: one place of a file's source, the rest of which keeps its bytes."""
+"""Changes that a generator makes: one place of a file's source, the rest of which keeps its bytes."""
 
 import ast
 import re
@@ -173,7 +173,7 @@ class Finder:
                 yield from self._of_assignments(node)
 
     def _of_assignments(self, function: ast.FunctionDef) -> Iterator[Change]:
-        """What is assigned anew, to a name or inside a value, stays as it was."""
+        """Yield changes that leave out an assignment: to a name that has a value already, or inside an object."""
         known = {argument.arg for argument in ast.walk(function.args) if isinstance(argument, ast.arg)}
         statements = [child for child in ast.walk(function) if isinstance(child, ast.Assign)]
         for statement in sorted(statements, key=self._start):
@@ -192,7 +192,7 @@ def is_no_number(node: ast.expr) -> bool:
 
 
 def inside(node: ast.AST) -> Iterator[ast.AST]:
-    """What may change of a node's parts: no annotation, decorator, text, message or size of what is compiled."""
+    """Yield the parts of a node that may change: no annotation, decorator, text, message or compiled size."""
     match node:
         case ast.FunctionDef(args=args, body=parts):
             parts = [*args.defaults, *filter(None, args.kw_defaults), *parts]

@@ -22,7 +22,7 @@ PAGE_BYTES = 4096
 
 @dataclass
 class Curves:
-    """What was measured at each frame: MiB of this process, seconds of the step, Gaussians, and the status."""
+    """Measurements at each frame: MiB of this process, seconds of the step, Gaussians, and the status."""
 
     memory_mb: list[float] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
@@ -53,7 +53,7 @@ def soak(dataset: Dataset, overrides: Sequence[str] = (), seconds: float = np.in
 
 
 def faults(run: MappingRun, num_frames: int) -> list[str]:
-    """What is wrong with a run over so many frames; empty where nothing is."""
+    """List what is wrong with a run over so many frames; empty if nothing is."""
     gaussians = jax.device_get(run.map.gaussians)
     valid = gaussians.valid
     found = [
@@ -82,5 +82,5 @@ def ratio(values: Sequence[float]) -> float:
 
 
 def grown(ratios: Mapping[str, float], most: float) -> list[str]:
-    """What became more than it may: a name and its `ratio` each."""
+    """List the names, each with its `ratio`, of what has grown by more than `most`."""
     return [f"{name} grew to {value:.3f} times, {most:g} is allowed" for name, value in ratios.items() if value > most]
