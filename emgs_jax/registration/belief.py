@@ -2,8 +2,7 @@
 
 The error of a pose T and a scale s is T Exp(ξ) and s e^σ with (ξ, σ) ~ N(0, P), in the order translation (m), rotation
 (rad), logarithm of the scale. There are two P. One is relative to the map, into which a frame is fitted. The other is
-relative to the first frame, and includes the errors of the map: it is what a user may rely on, and no result depends on
-it.
+relative to the first frame, and includes the errors of the map: it is for the user, and no pose depends on it.
 """
 
 import equinox as eqx

@@ -50,7 +50,7 @@ class IcpInfo(eqx.Module):
         level_edges: where these levels end.
         information: of the points alone, of (xi, log s).
         num_effective: how many independent measurements the points are worth, see `num_independent`.
-        min_eigenvalue: smallest eigenvalue of the pose's information by planes and colours, per effective point (1/m² and
+        min_eigenvalue: smallest eigenvalue of the pose's information by planes and colours, per effective point (1/m²,
             1/rad²). Offsets from means do not count: the mean of a Gaussian is no landmark of its surface.
         num_steps: of all solves.
         is_converged: False where the last solve reached `max_steps` or failed.

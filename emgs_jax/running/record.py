@@ -58,9 +58,8 @@ class FrameRecord:
         step_m: between the coarse and the fine pose.
         step_rad: likewise.
         similarity: where it is `joined`, the motion of its submap into the other: (4, 4) with e^σ R in the place of R.
-        origin: the frame whose Gaussians it was registered to (median of their births), counted from the map's first
-            one.
-        repeat_rms: distance of the two predictions of the previous image, m.
+        origin: frame whose Gaussians it was registered to (median of their births), counted from the map's first one.
+        repeat_rms: robust standard deviation between the two predictions of the previous image, m.
         fused: points that moved Gaussians.
         updated: Gaussians that they moved.
         mean_log_joint: of the fused points with their best Gaussians.
