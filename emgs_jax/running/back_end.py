@@ -226,7 +226,7 @@ class BackEnd:
         return [loop for loop in loops if (loop.a, loop.b) not in known]
 
     def retract(self, agreed: Sequence[LoopMeasurement]) -> int:
-        """Remove the factors of accepted loops not among `agreed`, which are all consistent ones; return their number."""
+        """Remove the factors of accepted loops not among `agreed`, all consistent ones; return their number."""
         good = {(loop.a, loop.b) for loop in agreed}
         before = len(self.accepted)
         self.accepted = [loop for loop in self.accepted if (loop.a, loop.b) in good]
