@@ -32,7 +32,8 @@ REASONS = (
     "the geometry does not determine the pose",
 )
 
-ANCHORED, FUSED = 2, 3  # readings of `LocalizationConfig.coarse`
+COARSE = ("via_previous", "same_image", "anchored", "fused")  # readings of `LocalizationConfig.coarse`
+ANCHORED, FUSED = map(COARSE.index, ("anchored", "fused"))
 
 
 class LocalizationConfig(eqx.Module):
@@ -59,7 +60,7 @@ class LocalizationConfig(eqx.Module):
         min_eigenvalue: of the Hessian, see `IcpInfo`.
     """
 
-    coarse: Float[Array, "*b"] = choice("via_previous", "same_image", "anchored", "fused")
+    coarse: Float[Array, "*b"] = choice(*COARSE)
     coarse_scale: Float[Array, "*b"] = choice("none", "ratio", "estimated")
     scale_std: Float[Array, "*b"] = traced(low=1e-4, high=math.inf)
     max_pair_distance: Float[Array, "*b"] = traced(low=0, high=math.inf)

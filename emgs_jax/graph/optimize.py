@@ -12,14 +12,13 @@ from jaxtyping import Array, Float
 
 from emgs_jax.graph.measurements import DEGREES, LOOP, ODOMETRY, Graph, Nodes
 from emgs_jax.graph.problem import Linear, Problem, linear, moved, num_rows, problem_of
-from emgs_jax.graph.sparse import columns_of_inverse, damped_step
+from emgs_jax.graph.sparse import damped_step
 from emgs_jax.graph.start import spread
 from emgs_jax.ops.pytree import static, static_choice, traced
 
 # χ² of a measured row that nothing is to be gained from: errors of a thousandth of their standard deviation.
 NOTHING_TO_GAIN = 1e-6
 MAX_DAMPING = 1e8
-COLUMNS_AT_ONCE = 224  # of the inverse: some MB for thousands of nodes
 
 
 class GraphConfig(eqx.Module):
@@ -208,38 +207,3 @@ def optimize(graph: Graph, config: GraphConfig) -> tuple[Nodes, GraphInfo]:
         info = _info(problem, given.cost, end, (num_iterations, converged), num_edges, reason)
         keeps = bool(reason) or end is given
         return graph.nodes if keeps else _put_back(graph.nodes, problem, end.nodes), info
-
-
-def marginal_covariances(graph: Graph, rows: np.ndarray, config: GraphConfig) -> np.ndarray:
-    """Covariance of nodes given all measurements, by the steps of `move` (translation, rotation, log-scale).
-
-    Of the quadratic model at the graph's nodes: solve first. Only the asked columns of the inverse are computed.
-
-    Args:
-        graph: solved.
-        rows: (k,) of nodes.
-        config: of the solution.
-
-    Returns:
-        (k, 7, 7), float64; 0 in rows and columns of what is held, inf on the diagonal of what nothing determines.
-
-    Raises:
-        ValueError: the graph cannot be solved.
-    """
-    rows = np.asarray(rows)
-    with jax.enable_x64(True):
-        problem = problem_of(graph, float(config.scale_std))
-        if isinstance(problem, str):
-            raise ValueError(f"no covariances: {problem}")
-        equations = linear(problem, problem.graph.nodes, float(config.kernel)).equations
-    columns = rows[:, None] * DEGREES + np.arange(DEGREES)
-    blocks = columns_of_inverse(equations, columns, COLUMNS_AT_ONCE)
-    if blocks is None:
-        raise ValueError("no covariances: the measurements do not determine the poses; look at num_disconnected")
-    measured = equations.measured.reshape(-1, DEGREES)[rows]
-    blocks *= measured[:, :, None] & measured[:, None, :]
-    is_gauge = rows == np.argmax(np.asarray(problem.graph.nodes.valid))
-    unknown = ~measured & ~is_gauge[:, None]
-    unknown[:, 6] &= float(config.scale_std) > 0
-    blocks[:, np.arange(DEGREES), np.arange(DEGREES)] += np.where(unknown, np.inf, 0.0)
-    return blocks

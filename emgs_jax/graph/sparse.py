@@ -61,20 +61,3 @@ def damped_step(equations: NormalEquations, damping: float) -> np.ndarray | None
     """The step −(H + λ diag H)⁻¹ g, (n·d, c), of Levenberg and Marquardt; None where the matrix is singular."""
     factors = factorize((equations.hessian + diags_array(damping * equations.hessian.diagonal())).tocsc())
     return None if factors is None else factors.solve(-equations.gradient)
-
-
-def columns_of_inverse(equations: NormalEquations, columns: np.ndarray, at_once: int) -> np.ndarray | None:
-    """H⁻¹[b, b] of blocks b of unknowns, (k, d) to (k, d, d), `at_once` right-hand sides in memory; None: singular."""
-    factors, size = factorize(equations.hessian), equations.hessian.shape[0]
-    # The ratio of the factor's diagonal bounds the condition number from below.
-    if factors is None or np.ptp(np.log10(np.abs(factors.U.diagonal()) + 1e-300)) > 15:
-        return None
-    blocks = []
-    step = max(at_once // columns.shape[1], 1)
-    for start in range(0, len(columns), step):
-        part = columns[start : start + step]
-        sides = np.zeros((size, part.size))
-        sides[part.ravel(), np.arange(part.size)] = 1.0
-        solved = factors.solve(sides).reshape(size, *part.shape)
-        blocks += [solved[rows, i] for i, rows in enumerate(part)]
-    return np.array(blocks).reshape(-1, columns.shape[1], columns.shape[1])

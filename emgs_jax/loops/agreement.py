@@ -1,4 +1,4 @@
-"""Spatial consistency of loops: with each other, and with the poses that the pose graph knows already.
+"""Spatial consistency of loops: which of them imply the same correction of the poses.
 
 Two rooms that are furnished alike look like one place, and all loops between them imply the same correction. The
 correction is wrong as a whole, also between keyframes without a free-space violation, if it brings any keyframes
@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.stats import chi2, norm
 
 from emgs_jax.loops.two_views import gap_between, rescaled
 from emgs_jax.loops.verification import LoopMeasurement
@@ -39,28 +38,6 @@ class AgreementConfig:
     max_turn_deg: float = number(low=0, high=math.inf)
     min_others: int = number(low=0)
     max_contradicted: int = number(low=0)
-
-
-def is_consistent(innovation: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], num_std: float) -> bool:
-    """Test a loop against the pose graph's uncertainty: innovationᵀ covariance⁻¹ innovation, a χ² of d.
-
-    The threshold has the probability of `num_std` standard deviations of one number: 3 refuses .27 % of true loops.
-
-    Args:
-        innovation: Log(Z_a_b⁻¹ T_a_b) in the order translation, rotation; with the difference of the log-ratios, seven.
-        covariance: of the graph's own T_a_b, marginal, without this loop, plus that of the measurement. Too small a
-            covariance refuses true loops after a drift; with metres of it no loop can be refused here.
-
-    Raises:
-        ValueError: shapes differ, or the covariance is not positive definite.
-    """
-    if covariance.shape != (len(innovation), len(innovation)):
-        raise ValueError(f"covariance must be {(len(innovation),) * 2}, got {covariance.shape}")
-    try:
-        whitened = np.linalg.solve(np.linalg.cholesky(covariance), innovation)
-    except np.linalg.LinAlgError as error:
-        raise ValueError("covariance must be positive definite") from error
-    return bool(whitened @ whitened <= chi2.isf(2 * norm.sf(num_std), len(innovation)))
 
 
 def agreeing(

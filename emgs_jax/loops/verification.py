@@ -5,8 +5,7 @@ them apart is in `agreement`.
 """
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,12 +126,6 @@ def neighbours_of(
         Neighbour(one, rescaled(inverse @ poses[one.frame], np.exp(-scale)), log_scales[one.frame] - scale)
         for one in others
     ]
-
-
-def tally(infos: Iterable[VerifyInfo]) -> dict[str, int]:
-    """Count the candidates that each gate rejected, in the gates' order, and those that were `accepted`."""
-    counts = Counter(info.refused_by for info in infos)
-    return {gate.value: counts[gate] for gate in Gate} | {"accepted": counts[None]}
 
 
 def _check_neighbours(

@@ -22,11 +22,6 @@ def scale_translation(T: jaxlie.SE3, scale: Float[Array, ""]) -> jaxlie.SE3:
     return jaxlie.SE3.from_rotation_and_translation(T.rotation(), scale * T.translation())
 
 
-def interpolate(start: jaxlie.SE3, end: jaxlie.SE3, share: Float[Array, ""]) -> jaxlie.SE3:
-    """The pose `share` of the way along the screw motion from `start` to `end`."""
-    return start @ jaxlie.SE3.exp(share * (start.inverse() @ end).log())
-
-
 def median(values: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
     """Lower median of the valid values; 1 without any."""
     count = jnp.sum(valid)

@@ -13,7 +13,6 @@ import numpy as np
 from emgs_jax.io.files import atomic_write, jsonable, write_json
 from emgs_jax.report.columns import MAIN, Column, cell, markdown
 from emgs_jax.report.heat_map import HeatMap, draw_heat_maps
-from emgs_jax.report.metrics import Metrics
 
 FORMAT, VERSION = "emgs_jax.running.stacked", 1
 _REMEDY = "make it again in another folder (hydra.run.dir=…), or move this one away"
@@ -31,7 +30,7 @@ def read_sweep(path: Path) -> dict[str, Any]:
 
 
 class SweepResults:
-    """Metrics by setting, on disk after each `add`; a folder that holds some of the same sweep is continued.
+    """Mapping[str, Any] by setting, on disk after each `add`; a folder that holds some of the same sweep is continued.
 
     Args:
         folder: of the results.
@@ -58,7 +57,7 @@ class SweepResults:
     def __contains__(self, setting: Mapping[str, Any]) -> bool:
         return _key(setting) in self._rows
 
-    def add(self, settings: Sequence[Mapping[str, Any]], metrics: Sequence[Metrics]) -> None:
+    def add(self, settings: Sequence[Mapping[str, Any]], metrics: Sequence[Mapping[str, Any]]) -> None:
         """Keep the metrics of some settings and write all of them."""
         for setting, values in zip(settings, metrics, strict=True):
             self._rows[_key(setting)] = jsonable({"setting": setting, "metrics": values})

@@ -34,7 +34,7 @@ from rings import (
 from scipy import stats
 
 from emgs_jax.graph.measurements import LOOP, ODOMETRY, Graph, Nodes
-from emgs_jax.graph.optimize import GraphConfig, marginal_covariances, optimize
+from emgs_jax.graph.optimize import GraphConfig, optimize
 from emgs_jax.graph.problem import problem_of
 from emgs_jax.graph.start import spread
 from emgs_jax.io.g2o import load_graph_g2o
@@ -259,33 +259,6 @@ def test_chi2_of_noisy_measurements_has_its_distribution():
     assert info.odometry_chi2 + info.loop_chi2 == pytest.approx(np.sum(info.edge_chi2))
 
 
-def test_marginal_covariances_are_those_of_the_errors():
-    """NEES of a node half way, summed over seeds: χ² with 6 degrees of freedom each, 95 % band."""
-    total, seeds = 0.0, 20
-    for seed in range(seeds):
-        truth, graph = noisy_laps(24, 4, seed)
-        nodes, _ = optimize(graph, config(kernel=np.inf))
-        covariance = marginal_covariances(Graph(nodes, graph.edges), np.array([11]), config(kernel=np.inf))[0]
-        off = error(nodes, truth)[11, :6]
-        total += off @ np.linalg.solve(covariance[:6, :6], off)
-    low, high = stats.chi2.interval(0.95, 6 * seeds)
-    assert low < total < high
-
-
-def test_marginal_covariances_are_blocks_of_the_dense_inverse(laps):
-    from emgs_jax.graph.problem import linear, problem_of
-
-    _, graph, found, _ = laps
-    solved, rows = Graph(found, graph.edges), np.arange(40)[::-1]
-    blocks = marginal_covariances(solved, rows, config(scale_std=0.05))  # more columns than fit at once
-    problem = problem_of(solved, 0.05)
-    dense = np.linalg.inv(linear(problem, problem.graph.nodes, 16.8).equations.hessian.toarray())
-    for row in (39, 20, 1):
-        part = slice(7 * row, 7 * row + 7)
-        np.testing.assert_allclose(blocks[39 - row], dense[part, part], rtol=1e-6, atol=1e-12)
-    np.testing.assert_array_equal(blocks[-1], 0.0)  # the gauge
-
-
 @pytest.fixture(scope="module")
 def closures():
     """RMSE of four closures of two laps with 20 true loops, without and with 10 false ones, and the loops' weights."""
@@ -378,8 +351,6 @@ def test_parts_without_a_path_to_the_first_node_stay():
     assert info.num_disconnected == 24
     np.testing.assert_allclose(poses(nodes)[:24], poses(alone), atol=1e-9)
     np.testing.assert_array_equal(poses(nodes)[24:], poses(given))
-    covariance = marginal_covariances(Graph(nodes, join(graph.edges, there)), np.array([30, 5]), config())
-    assert np.isinf(covariance[0].diagonal()[:6]).all() and np.isfinite(covariance[1]).all()
 
 
 def refused(graph: Graph, reason: str, **changes) -> None:
@@ -419,14 +390,6 @@ def test_loops_that_contradict_the_window_are_refused_or_given_no_weight():
     for given in (one, graph):
         _, info = optimize(given, config(max_misfit=25.0))
         assert not info.reason and (info.edge_weights[-2:] < 0.2)[np.asarray(given.edges.valid)[-2:]].all()
-
-
-def test_a_singular_graph_has_no_covariances():
-    nodes = walk(3)
-    edges = join(measure(nodes, [(0, 1)]), measure(nodes, [(1, 2)]))
-    edges = put(edges, sqrt_info=lambda roots: np.stack([roots[0], np.ones((7, 7))]))
-    with pytest.raises(ValueError, match="do not determine"):
-        marginal_covariances(Graph(nodes, edges), np.array([2]), config())
 
 
 def test_the_solver_of_conf_is_a_config_and_without_iterations_nothing_moves():

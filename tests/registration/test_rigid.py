@@ -8,9 +8,8 @@ from scene import assert_same, matrix_of, on_host, path_pose, pose, pose_error, 
 from emgs_jax.registration import rigid
 from emgs_jax.registration.rigid import pose_row
 
-fit_rigid, fit_rigid_robust, interpolate, median, scale_translation = (
-    on_host(f)
-    for f in (rigid.fit_rigid, rigid.fit_rigid_robust, rigid.interpolate, rigid.median, rigid.scale_translation)
+fit_rigid, fit_rigid_robust, median, scale_translation = (
+    on_host(f) for f in (rigid.fit_rigid, rigid.fit_rigid_robust, rigid.median, rigid.scale_translation)
 )
 NUM_PAIRS = 200
 RNG = np.random.default_rng(0)
@@ -26,16 +25,6 @@ def test_scaling_a_translation_keeps_the_rotation():
     T, given = scale_translation(path_pose(2), np.float32(3.0)).wxyz_xyz, np.asarray(path_pose(2).wxyz_xyz)
     np.testing.assert_allclose(T[4:], 3 * given[4:], rtol=1e-6)
     np.testing.assert_array_equal(T[:4], given[:4])
-
-
-def test_a_pose_on_the_way_shares_the_screw_motion_and_its_ends_are_the_ends():
-    start, end = pose((0.4, -0.9, 0.3), (0.5, 1.0, -0.7)), pose((-0.2, 0.5, 1.1), (-1.0, 0.2, 0.4))
-    # Logarithms in float32 of motions of 2 m and 2 rad.
-    for share, expected in ((0.0, start), (1.0, end)):
-        assert max(pose_error(interpolate(start, end, np.float32(share)), expected)) < 1e-5
-    step = on_host(lambda a, b: (a.inverse() @ b).log())
-    whole, part = step(start, end), step(start, interpolate(start, end, np.float32(0.3)))
-    np.testing.assert_allclose(part, 0.3 * whole, atol=1e-5)
 
 
 def test_a_rigid_fit_equals_umeyama_and_recovers_scale():

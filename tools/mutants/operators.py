@@ -35,7 +35,7 @@ LIBRARIES = {"jnp", "np", "jax", "lax", "cv2", "sorted", "min", "max", "sum", "r
 # What only says something, what decides how a result is computed and not which, and the numbers of invented scenery.
 WORDS = re.compile(r"print|(logging|log|logger|warnings|tqdm)\.\w+|\w+\.(set_description|set_postfix)")
 KEPT = {"dtype", "strict", "encoding", "precision", "length", "check", "text", "indent", "preferred_element_type"}
-SIZES = "__all__ GROUP CURVE_BITS BLOCK NUM_NEAR MIN_RUN MAX_POINTS _MERGE_ROWS _BAND_ROWS COLUMNS_AT_ONCE MAX_BYTES"
+SIZES = "__all__ GROUP CURVE_BITS BLOCK NUM_NEAR MIN_RUN MAX_POINTS _MERGE_ROWS _BAND_ROWS MAX_BYTES"
 SIZES = {*SIZES.split(), *("NUM_SIZES", "WORDS_AT_ONCE", "LEAST_LISTED")}
 SCENERY = re.compile(r"emgs_jax/data/(plan|furniture|furnishing|walks|looks|room)\.py")
 GUARD = (ast.Raise, ast.Return, ast.Continue)
