@@ -1,4 +1,4 @@
-"""Continuation: a surface that a frame shows for the first time goes on where the map's ends, not beside it."""
+"""Surface extrapolation: new surface continues the depth error of the map's surface beside it, so that both join."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -64,16 +64,17 @@ def continued(
     camera: Camera,
     config: ContinuationConfig,
 ) -> Observation:
-    """The frame with the points that no Gaussian explains moved along their rays by what their neighbours err.
+    """Extrapolate depth errors: move points that no Gaussian explains along their rays by their neighbours' error.
 
-    The depth of a prediction errs alike over much of an image. So the points that the map does explain tell what those
-    beside them err, with ρ of `depth_error`, the precision v = (σ_min / σ)² of each point, and g the window:
+    The depth errors of a prediction are similar over much of an image. So the points that the map does explain predict
+    the errors of those beside them, with ρ of `depth_error`, the precision v = (σ_min / σ)² of each point, and g the
+    window:
 
         ρ̂ = b Σ g v ρ W / (W + 1) / (1 + Σ g v),   x <- c + (x - c) exp(-ρ̂)
 
     W frames made the Gaussian, so its own error has 1 / W of one frame's variance, and only W / (W + 1) of the
-    difference is the frame's. b in [0, 1] is how much of a point's error its neighbours told in this frame: the slope
-    of ρ over its own prediction from all others. Where errors are not alike b is 0, and nothing moves.
+    difference is the frame's. b in [0, 1] is how well neighbours predict a point's error in this frame: the slope of ρ
+    over its own prediction from all others. Where errors are not similar b is 0, and nothing moves.
 
     Args:
         aligned: the frame, world frame, one row a pixel of `camera`.
@@ -82,7 +83,7 @@ def continued(
         noise: of each point, as a fraction of its depth.
         T_world_camera: of the frame.
         camera: of the rows.
-        config: how far errors are alike.
+        config: window and gates.
     """
     center = T_world_camera.translation()
     error, is_known = depth_error(aligned.points, explained_by, is_fused, center, config)

@@ -49,7 +49,7 @@ class LocalizationConfig(eqx.Module):
             longer errors last, the larger. inf: map and repeats alone hold the scale (printed).
         max_pair_distance: fraction of the depth; farther points are no pair.
         pose_shared: part of the variance of the prior's poses that two of its answers about one have in common, see
-            `pose_std`; 1: what they differ by says nothing, what depths differ by does (printed).
+            `pose_std`; 1: their differences are ignored, those of depths are used (printed).
         num_alike, num_shared: frames that see one part of the map, and whose windows share images: they err alike, see
             `next_belief` and `measured`.
         icp: the fine step.
@@ -184,13 +184,13 @@ def _measured(
     """Pose, scale and belief after the prior's own pose (`fused` only) and the prior's own unit.
 
     A prior that has lost its anchor is wrong altogether, and for long: its pose counts by a Cauchy weight of its
-    distance from what is known, w = 1 / (1 + χ² / 6).
+    distance from the estimate, w = 1 / (1 + χ² / 6).
 
     Args:
-        T_world_camera: what is known.
+        T_world_camera: estimate before the measurement.
         scale: likewise.
         anchored: the prior's own pose, and its standard deviations.
-        belief: of what is known.
+        belief: uncertainty of the estimate.
         config: readings.
     """
     pose, std = anchored

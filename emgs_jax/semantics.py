@@ -81,8 +81,8 @@ def answers(
 
     Args:
         words: cosine of every Gaussian with each word that is asked for, at least one.
-        rivals: likewise with what is not asked for; perhaps none.
-        is_known: what is False answers to nothing.
+        rivals: likewise with each rival; may be empty.
+        is_known: False for Gaussians that cannot be an answer.
         margin: the lead that an answer needs.
         min_cosine: the cosine that an answer needs.
     """

@@ -49,10 +49,10 @@ class SlamConfig(eqx.Module):
         submap: what a step works on, and capacities.
         localization: coarse and fine.
         em: E- and M-step.
-        continuation: where points that no Gaussian explains go on from the map.
+        continuation: depth-error extrapolation to points that no Gaussian explains.
         splitting: of Gaussians that are too coarse for a nearer view.
         refinement: on the image plane.
-        existence: what later frames say of a Gaussian.
+        existence: evidence of later frames for and against a Gaussian.
     """
 
     window_size: int = static(low=1, high=1000)
@@ -313,7 +313,7 @@ def _store(
     view: Camera,
     config: SlamConfig,
 ) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
-    """The map with the submap written back, judged by this look; fresh Gaussians and second halves in free rows.
+    """Write the submap back, existence updated and duplicates merged; put new Gaussians and halves into free rows.
 
     Returns:
         The map, the number of its Gaussians, how many did not fit, and the time of the next frame.

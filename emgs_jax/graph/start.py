@@ -66,7 +66,7 @@ def _solve(
     offsets: np.ndarray,
     free: np.ndarray,
 ) -> np.ndarray | None:
-    """Least squares of weights · (carry x_a + offset − x_b) over x (n, d, c), begun at `values`."""
+    """Least squares of weights · (carry x_a + offset − x_b) over x (n, d, c), from the initial `values`."""
     a, b = ends.T
     errors = weights * (carry @ values[a] + offsets - values[b])
     degrees = values.shape[1]

@@ -219,7 +219,7 @@ def _unit(vectors: Float32[np.ndarray, "*b d"]) -> Float32[np.ndarray, "*b d"]:
 
 
 def propose(database: Database, row: int, config: AppearanceConfig) -> list[Candidate]:
-    """Earlier keyframes that look as much like this one as its own last neighbours do, the most alike first.
+    """Propose loop candidates: earlier keyframes at least as similar as the query's own last neighbours, best first.
 
     At least `min_gap` frames older, the best only within `suppressed_gap` frames, `num_candidates` at most; none for
     the first keyframe. The threshold is a quantile of the similarity to neighbours (LoopSplat, ViSTA-SLAM).
@@ -238,9 +238,9 @@ def propose(database: Database, row: int, config: AppearanceConfig) -> list[Cand
 def nearest(
     database: Database, query: Keyframe, rows: Sequence[int], count: int, config: AppearanceConfig
 ) -> list[Candidate]:
-    """The rows that look most like a keyframe of no known time, the best only within `suppressed_gap` frames.
+    """Find the keyframes (rows) most similar to one without a known time, the best only within `suppressed_gap` frames.
 
-    Nothing says how alike they must be: `propose` asks the query's neighbours, and this one has none.
+    There is no threshold of the similarity: that of `propose` comes from the query's neighbours, and this one has none.
     """
     similarity = database.vectors @ summarize(unit_descriptors(query), database.words)
     frames = np.array([keyframe.frame for keyframe in database.keyframes])

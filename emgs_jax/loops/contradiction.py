@@ -1,7 +1,7 @@
-"""Does one camera see through what the other sees? Then they are not where they are thought to be.
+"""Free-space violations: does one camera see through a surface that the other sees? Then their relative pose is wrong.
 
-Matches say what is alike; these say what is not, which no matching notices: of two halls that look alike the one ends
-earlier. What is hidden from a camera says nothing; what stands where it looks through does.
+Matches show what two images have in common, and miss what they have not: of two halls that look alike one ends earlier.
+What is occluded from a camera is no evidence; a surface in its free space is.
 """
 
 import numpy as np

@@ -90,14 +90,14 @@ def locate(
     verification: VerificationConfig,
     config: LocationConfig,
 ) -> tuple[Location | None, str | None]:
-    """The place of a keyframe that is none of the others; None with what refuses it where it is not sure.
+    """Relocalize a keyframe among others: return its pose, or None and the gate or reason that rejected it.
 
     Args:
         query: described like the others.
-        places: where it is looked for.
+        places: keyframes with their poses.
         appearance: of the keyframes.
         verification: of query and candidate.
-        config: what a place needs.
+        config: acceptance.
     """
     keyframes = places.database.keyframes
     rows = [row for row, one in enumerate(keyframes) if places.is_placed[one.frame]]

@@ -1,7 +1,7 @@
-"""Is a candidate the query's place? Two keyframes that show the same, others that say so too, and none that objects.
+"""Verification of loop candidates: the two keyframes show the same, neighbours confirm it, no view contradicts it.
 
-What passes all gates may still be wrong: by appearance two rooms that are furnished alike are one place. What tells
-them apart is in `agreement`.
+A loop that passes all gates may still be wrong: two rooms that are furnished alike look like one place. Spatial
+consistency tells them apart, see `agreement`.
 """
 
 import math

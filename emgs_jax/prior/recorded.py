@@ -52,7 +52,7 @@ def record(
 ) -> None:
     """Write what `prior` predicts for every window of `dataset`; inferences that are there already are kept.
 
-    A prior with `is_sequential = True` is asked for them again, because later ones depend on them. `progress` wraps
+    A prior with `is_sequential = True` predicts them again, because later ones depend on them. `progress` wraps
     the list of windows, e.g. tqdm.
     """
     folder = Path(folder)
@@ -81,7 +81,7 @@ def visits_file(window: Window) -> str:
 
 
 def add_visits(folder: Path, prediction: PriorPrediction) -> None:
-    """Write what a prior says of two visits into a recording that is complete."""
+    """Write a prior's prediction of two visits into a recording that is complete."""
     manifest, name = _read_manifest(folder), visits_file(prediction.window)
     files = manifest.pop("files")
     files[name] = _write(folder / name, _npz(_arrays(prediction)))

@@ -18,10 +18,11 @@ def places_seen_twice(
     alignment: AlignmentConfig,
     progress: Callable[[Sequence[Window]], Iterable[Window]] = iter,
 ) -> list[tuple[int, int]]:
-    """Pairs of frames, the earlier first, that look alike and whose keypoints fit one motion of the camera.
+    """Find pairs of frames, the earlier first, of similar appearance whose keypoints fit one motion of the camera.
 
-    A run looks for its loops in the same way, and asks more of them. What it finds beside these, because it began with
-    other key frames (a saved map, frames that were lost at first, `slam.initialization=merged`), is not recorded.
+    A run detects its loop candidates in the same way, and verifies more. Candidates that it finds beside these, because
+    it began with other keyframes (a saved map, frames that were lost at first, `slam.initialization=merged`), are not
+    recorded.
     """
     database, pairs, seen = Database(), [], set()
     calls = list(windows(len(dataset), window_size, replay.num_newer(window_size)))
@@ -52,9 +53,9 @@ def record_visits(
     spacing: int,
     progress: Callable[[Sequence[tuple[int, int]]], Iterable[tuple[int, int]]] = iter,
 ) -> int:
-    """Add what `prior` says of both visits of each pair to a recording that is complete; returns how many it holds.
+    """Add the predictions of both visits of each pair to a recording that is complete; return how many it holds.
 
-    Those that are there already are kept; a prior that cannot be asked out of order leaves none.
+    Those that are there already are kept; a prior that cannot predict out of order leaves none.
     """
     replay, known = Recorded(folder), 0
     for a, b in progress(pairs):

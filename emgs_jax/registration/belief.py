@@ -39,7 +39,7 @@ class Belief(eqx.Module):
 
 
 def certain() -> Belief:
-    """Of the frame that the map is made of: its pose is exact, and its scale is the unit."""
+    """Return the estimate of the frame that the map is made of: its pose is exact, and its scale is the unit."""
     exact = jnp.zeros((DEGREES, DEGREES))
     return Belief(exact, exact, jnp.zeros(()), jnp.zeros(()), jnp.ones(()), none_yet())
 
@@ -63,11 +63,11 @@ def predict(
 def update(
     covariance: Float[Array, "7 7"], difference: Float[Array, "7"], information: Float[Array, "7 7"]
 ) -> tuple[Float[Array, "7"], Float[Array, "7 7"]]:
-    """The step (ξ, σ) to the mean of what is known and what is measured, and its P: (P⁻¹ + W)⁻¹ W d and (P⁻¹ + W)⁻¹.
+    """Correct an estimate by a measurement: step (ξ, σ) of the mean, and P: (P⁻¹ + W)⁻¹ W d and (P⁻¹ + W)⁻¹.
 
     Args:
         covariance: P, which may be singular.
-        difference: d, of the measurement from what is known.
+        difference: d, the innovation: the measurement relative to the estimate.
         information: W of the measurement; zero where nothing is measured.
     """
     posterior = jnp.linalg.solve(jnp.eye(DEGREES) + covariance @ information, covariance)
@@ -76,7 +76,7 @@ def update(
 
 
 def rescaled_belief(belief: Belief, factor: Float[Array, ""]) -> Belief:
-    """The belief where all lengths of the map are multiplied by `factor`."""
+    """Return the estimate after all lengths of the map are multiplied by `factor`."""
     units = jnp.ones(DEGREES).at[:3].set(factor)
     return eqx.tree_at(
         lambda b: (b.covariance, b.world_covariance, b.log_scale, b.repeats),
@@ -91,7 +91,7 @@ def rescaled_belief(belief: Belief, factor: Float[Array, ""]) -> Belief:
 
 
 def moved(belief: Belief, T_previous_current: jaxlie.SE3, noise: Float[Array, "7"]) -> Belief:
-    """Of the current frame, before anything is measured of it; see `predict`."""
+    """Propagate the estimate to the current frame, before any measurement; see `predict`."""
     found = (predict(P, T_previous_current, noise) for P in (belief.covariance, belief.world_covariance))
     return eqx.tree_at(lambda b: (b.covariance, b.world_covariance), belief, tuple(found))
 
@@ -99,10 +99,10 @@ def moved(belief: Belief, T_previous_current: jaxlie.SE3, noise: Float[Array, "7
 def measured(
     belief: Belief, difference: Float[Array, "7"], information: Float[Array, "7 7"], num_shared: Float[Array, ""]
 ) -> tuple[Float[Array, "7"], Belief]:
-    """The step to the mean of what is known relative to the map and what is measured, and the belief; see `update`.
+    """Correct the pose estimate by a measurement: return the step of the mean, and the new estimate; see `update`.
 
-    What a prior says of its own pose is wrong alike in all frames whose windows share images: of the place in the world
-    each of these `num_shared` says so much less.
+    The errors of a prior's own poses are alike in all frames whose windows share images: about the pose in the world
+    each of these `num_shared` frames has only that part of the information.
     """
     step, covariance = update(belief.covariance, difference, information)
     _, world = update(belief.world_covariance, difference, information / num_shared)

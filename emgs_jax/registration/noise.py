@@ -24,7 +24,7 @@ def level_edges(confidence: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float
 def levels_of(confidence: Float[Array, "p"], edges: Float[Array, "l"]) -> Int[Array, "p"]:
     """The level of confidence of every point, 0 the lowest.
 
-    Equal confidences have equal levels: a constant one says nothing, and all points have level 0.
+    Equal confidences have equal levels: with a constant one all points have level 0.
     """
     return jnp.sum(confidence[:, None] > edges, axis=-1)
 

@@ -41,12 +41,12 @@ class Repeats(eqx.Module):
 
 
 def none_yet() -> Repeats:
-    """Of the frame that the map is made of."""
+    """Return the repeats of the frame that the map is made of: none so far."""
     return Repeats(jaxlie.SE3.identity((2,)), jnp.zeros(2, bool), jnp.zeros((2, 2)), jnp.zeros(2))
 
 
 def in_unit(repeats: Repeats, factor: Float[Array, ""]) -> Repeats:
-    """The repeats where all lengths of the map are multiplied by `factor`."""
+    """Return the repeats after all lengths of the map are multiplied by `factor`."""
     return eqx.tree_at(lambda r: r.said, repeats, scale_translation(repeats.said, factor))
 
 
@@ -58,12 +58,12 @@ def repeat_poses(
     mean_depth: Float[Array, ""],
     max_count: Float[Array, ""],
 ) -> tuple[Repeats, Float[Array, "2 2"]]:
-    """The repeats with those of this answer, and the mean squares of these alone: 0 where it says nothing new again.
+    """Add the differences of this repeated prediction; return also their mean squares, 0 without new ones.
 
     Args:
-        prediction: the answer.
-        before: of the last frame.
-        scale: of this answer. The poses returned are in its own unit: `in_unit` when the scale is final.
+        prediction: the current one.
+        before: differences until the last frame.
+        scale: of this prediction. The poses returned are in its own unit: `in_unit` when the scale is final.
         mean_depth: of the previous frame, m of the map.
         max_count: from this number of differences on older ones are forgotten.
     """

@@ -21,16 +21,16 @@ def repeat_scale(
     otherwise: Float[Array, ""],
     reading: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Scale of a prediction relative to the map, from the image that was predicted twice (R8), and how sure it is.
+    """Estimate a prediction's scale relative to the map, and its error, from an image's repeated prediction (R8).
 
-    The second is the standard deviation of its logarithm: that of the pixels' ratios over the root of how many of them
-    say something of their own, times √(π/2) for a median. 0 where an image is predicted the same to the bit.
+    The second value is the standard deviation of the scale's logarithm: that of the pixels' ratios over the root of
+    their number of independent ones, times √(π/2) for a median. 0 where an image is predicted the same to the bit.
 
     Args:
         now: its prediction of this call, camera frame.
         before: that of the call before as it was aligned with the map, world frame.
         T_world_previous: its pose.
-        otherwise: where there are too few pairs.
+        otherwise: scale where there are too few pairs.
         reading: row of `LocalizationConfig.coarse_scale`: 0 (1, as printed), 1 (median ratio of depths) or 2 (of the
             similarity that fits best).
     """

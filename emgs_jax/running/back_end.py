@@ -64,7 +64,7 @@ class BackEndConfig:
 
 @dataclass(frozen=True)
 class Closure:
-    """One solution: at which node, the loops that were new, and what the solver says of it."""
+    """One pose-graph optimization: its node, the new loops, and the solver's result."""
 
     time: int
     loops: tuple[LoopMeasurement, ...]
@@ -82,30 +82,30 @@ class Refusal(NamedTuple):
 
 @dataclass
 class BackEnd:
-    """Measurements as far as a run is.
+    """State of the back end: nodes, factors and loops of the pose graph so far.
 
     Args:
-        config: all of it.
+        config: all settings.
         intrinsics: of the images.
         min_std: floor of the map's covariances.
-        poses: T_world_camera (4, 4) of the nodes, as they are now.
+        poses: current T_world_camera (4, 4) of the nodes.
         log_scales: σ of their inferences, likewise.
-        online: poses as they were when the frames were placed, in the unit of `poses`.
+        online: poses as first estimated, in the unit of `poses`.
         frames: index in the data set of every node.
         is_placed: whether the map holds each of them: those that are neither degraded nor lost.
-        segments: of each of them; how those of two are to each other is not known.
-        edges: what was measured.
+        segments: of each of them; the relative pose of two segments is not known.
+        edges: factors.
         database: keyframes; their `frame` is the node.
         verified: loops that passed every gate of two keyframes.
-        contradicted: loops that something speaks against.
-        accepted: loops that are edges.
-        refusals: why candidates were no loops.
-        asked: loops, by their nodes, for which the prior was asked once more, and what came of it, see `revisiting`.
-        closures: what was solved.
+        contradicted: loops with a free-space violation.
+        accepted: loops that are factors.
+        refusals: candidates that were rejected, and why.
+        asked: loops, by their nodes, that the prior was to measure once more, and the outcome, see `revisiting`.
+        closures: optimizations so far.
         first: node of this run's first frame; those before are of the run that its map was saved by.
-        since: node since which one frame leads to the next; before it the camera was lost.
+        since: node since which consecutive frames are connected; before it the camera was lost.
         segment: of the next node.
-        has_one_unit: what the inferences of all nodes give has one unit, as far as the prior has.
+        has_one_unit: the inferences of all nodes have one unit, as far as the prior has.
     """
 
     config: BackEndConfig
@@ -131,14 +131,14 @@ class BackEnd:
     has_one_unit: bool = True
 
     def add(self, look: Look, pose: np.ndarray, scale: float, origin: int | None, is_placed: bool = True) -> None:
-        """One node more, and where it was placed.
+        """Add a node with the pose of its frame.
 
         Args:
             look: of the frame.
             pose: T_world_camera.
             scale: of its inference.
-            origin: node of whose Gaussians it was placed by; None where it was not placed in the map.
-            is_placed: the map holds it: it was placed in it, or the map was made from it.
+            origin: node whose Gaussians it was registered to; None where it was not registered to the map.
+            is_placed: the map holds it: it was registered to it, or the map was made from it.
         """
         time = len(self.poses)
         self.poses.append(np.asarray(pose, np.float64))

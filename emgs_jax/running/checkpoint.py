@@ -1,8 +1,8 @@
-"""A run that was stopped goes on: what its map is made of after some input, in one file, and the way back.
+"""Checkpoints: a run that was stopped resumes from its map and records after some input, saved in one file.
 
-Frames are read and the prior is asked from the start again, because what they carry along (landmarks of a window, the
-raw prior's points, keyframes of loops) follows from that alone, the same every time. The steps are not repeated: state
-and records come from the file, so that the result has the same bits as that of a run which nobody stopped.
+Frames are read and predicted from the start again, because what they carry along (landmarks of a window, the raw
+predictions' points, keyframes) follows from that alone, the same every time. The steps are not replayed: state and
+records come from the file, so that the result has the same bits as that of an uninterrupted run.
 """
 
 import json
@@ -29,10 +29,10 @@ MATRICES = dict.fromkeys(POSES, 4) | {"covariance": 6, "similarity": 4}  # of a 
 
 @dataclass(frozen=True)
 class CheckpointConfig:
-    """When a run writes what it has.
+    """Interval between checkpoints of a run.
 
     Args:
-        every: frames; 0 = never, and a run that is stopped begins anew.
+        every: frames; 0 = never, and a run that is stopped starts again at its first frame.
     """
 
     every: int = number(low=0, high=1_000_000_000)

@@ -56,7 +56,7 @@ class Clock:
 
     @contextlib.contextmanager
     def watching(self) -> Iterator["Clock"]:
-        """Listen to what JAX says of its compilations."""
+        """Record the compilations that JAX reports."""
         jax.monitoring.register_event_duration_secs_listener(self._hear)
         try:
             yield self

@@ -40,10 +40,10 @@ def correct(run: MappingRun, given: Input) -> None:
 
 
 def finish(run: MappingRun) -> None:
-    """The best poses for all that was measured by the back end of a run, and the map that conforms to them.
+    """Optimize the poses of a run once more, with all factors, and deform the map accordingly.
 
-    Nothing where no loop says what is not so: among themselves frames and map fit better as they were placed. Else the
-    layers are merged that came to lie on each other and that nobody saw again.
+    Nothing changes where no loop violates, or has violated, the poses: frames and map fit each other better as first
+    estimated. Else duplicate surfaces are merged that came to lie on each other and that nobody saw again.
     """
     end = run.back_end
     ask_again(end, end.news(end.new(end.agreed())), run.ask)

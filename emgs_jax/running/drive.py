@@ -101,13 +101,13 @@ def show_records(bar: tqdm, records: Sequence[FrameRecord]) -> None:
 
 
 def map_frames(run: MappingRun, dataset: Dataset, prior: Prior, keeper: Keeper | None = None) -> Iterator[RawView]:
-    """Map a sequence into `run`; yields on the way what the prior alone says of each frame, for comparison.
+    """Map a sequence into `run`; yields the raw predictions of each frame on the way, for comparison.
 
     Args:
         run: before its first frame.
         dataset: of the frames.
         prior: of the predictions.
-        keeper: of the run's checkpoint, from which it goes on where there is one.
+        keeper: of the run's checkpoint, from which it resumes where there is one.
 
     Raises:
         ValueError: no frame has a point and a pose from which a map can start.
@@ -183,12 +183,12 @@ def go_on(run: MappingRun, given: Input, timer: Timer) -> bool:
 
 
 def integrate(run: MappingRun, given: Input, prediction: Prediction) -> tuple[StepInfo | None, str | None]:
-    """One step; a camera that is missing is looked for, and then the step begins where it is found.
+    """Integrate one input by a step; a lost camera is relocalized first, and the step starts at the pose found.
 
-    Where it is found nowhere for long the map goes on from where the step has put it.
+    Where relocalization fails for long the map restarts at the pose that the step has estimated.
 
     Returns:
-        What the step did, None where the camera has no place yet; and what became of the search, None without one.
+        Result of the step, None where the camera has no pose yet; and the outcome of relocalization, None without one.
     """
     state, config, info, location = run.state, run.config, None, None
     if state is not None:

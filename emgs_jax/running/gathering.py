@@ -84,7 +84,7 @@ class Baselines:
 
 
 def unit_of(truth: np.ndarray, depth: np.ndarray) -> float:
-    """Metres of one length of a depth (h, w), by the median of what is known of both; 1 where nothing is."""
+    """Return the metres of one length of a depth (h, w), by the median over pixels known in both; 1 without any."""
     known = (truth > 0) & (depth > 0)
     return float(np.median(truth[known] / depth[known])) if known.any() else 1.0
 
@@ -103,7 +103,7 @@ def gather(
         evaluation: how normals are fitted.
         keeps_depths: the truth is known.
         baselines: that take the views, too.
-        text: names of the classes that the views are asked for, and their embeddings; None: they are not.
+        text: names of the classes that pixels are labelled with, and their embeddings; None: no labels.
     """
     cloud, depths, classes = SpooledCloud(), Spool(), Spool()
     labels = None if text is None else SpooledLabels(text[0])

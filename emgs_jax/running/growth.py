@@ -46,15 +46,15 @@ def start(
 
 
 def begin_anew(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[SlamState, SlamConfig]:
-    """The state whose map goes on from its last frame, where that is, as from a first window of this one view.
+    """Restart the map from its last frame, at that frame's pose, as from a first window of this one view.
 
-    For a camera that no longer fits the map and is found nowhere in it. All that the map has stays. Relative to what is
-    new the frame is exact, relative to the first frame it is as uncertain as it was.
+    For a camera that no longer fits the map and cannot be relocalized in it. All Gaussians of the map stay. Relative to
+    the new ones the frame's pose is exact, relative to the first frame it is as uncertain as it was.
 
     Args:
         state: after the step of that frame, which has points.
         camera: of the full images.
-        config: all stages; returned with more room where the map needs it.
+        config: all stages; returned with more capacity where the map needs it.
     """
     T = state.T_world_previous
     view = transform(T.inverse(), state.previous, jnp.ones(()))

@@ -1,4 +1,4 @@
-"""Classes of points of the surface: each Gaussian that explains a point says what it knows, by its responsibility."""
+"""Classes of points of the surface: the Gaussians that explain a point vote by their responsibilities."""
 
 from dataclasses import dataclass
 from functools import cached_property

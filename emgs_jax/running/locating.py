@@ -113,9 +113,9 @@ def begun(run: MappingRun, prediction: Prediction) -> SlamState:
 def found_at(
     run: MappingRun, prediction: Prediction, location: Location, has_other_unit: bool = False
 ) -> tuple[SlamState, Prediction]:
-    """State and prediction whose step begins where the camera is found: this frame is its own previous one.
+    """Return a state and prediction whose step starts at the relocalized pose: this frame is its own previous one.
 
-    With `has_other_unit` the prior's lengths are no longer those of the steps before: this frame says what they are.
+    With `has_other_unit` the prior's lengths are no longer those of the steps before: this frame determines the unit.
 
     Raises:
         ValueError: the features of a saved map are not as wide as those of this run.

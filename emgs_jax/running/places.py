@@ -1,6 +1,6 @@
-"""places.npz: what a run's back end knows, beside map.npz, so that another run can go on in the map.
+"""places.npz: a run's back end, beside map.npz, so that another run can continue in the map.
 
-Keyframes, poses and measurements. The other run's frames are further nodes of the same graph.
+Keyframes, poses and factors. The other run's frames are further nodes of the same pose graph.
 """
 
 import json

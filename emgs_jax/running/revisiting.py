@@ -1,4 +1,4 @@
-"""Loops that are to move the poses: the prior is asked once more, for views of both visits."""
+"""Second measurement of loops that are to move the poses: the prior predicts views of both visits together."""
 
 from collections.abc import Sequence
 

@@ -1,8 +1,8 @@
-"""Segments: parts of a run of which nobody knows how they are to each other, until the camera sees both.
+"""Segments: disconnected submaps of a run, whose relative poses are not known until the camera sees both.
 
-A prior that has lost the first view may go on in a frame of its own. There a new map begins, and the one before is set
-aside. Where a frame fits a map that is set aside, the similarity between its two places makes one segment of both: the
-newer one moves, poses, scales and Gaussians. What never met is left out at the end.
+A prior that has lost the first view may continue in a frame of its own. There a new map starts, and the one before is
+set aside. Where a frame fits a map that is set aside, the similarity between its two poses joins both segments: the
+newer one moves, poses, scales and Gaussians. Segments that are never joined are left out at the end.
 """
 
 from collections import Counter
@@ -58,9 +58,9 @@ def placed_by(given: Input, pose: np.ndarray) -> PlacedStructure:
 
 
 def begun_segment(run: MappingRun, given: Input) -> tuple[SlamState, SlamConfig] | None:
-    """A map of this frame alone, where the one before stands in; None where nothing new begins.
+    """Start a map of this frame alone, at the pose of the frame before; None where no segment starts.
 
-    Its unit is the prior's own: another one says nothing of it.
+    Its unit is the prior's own: that of another map does not apply.
     """
     pose = given.T_anchor_views.get(given.frames[0].index)
     is_new = run.back_end is not None and run.state is not None and not run.is_fixed and not is_related(run, given)
@@ -76,7 +76,7 @@ def begun_segment(run: MappingRun, given: Input) -> tuple[SlamState, SlamConfig]
 
 
 def enter(run: MappingRun, given: Input, before: SlamState) -> None:
-    """Go on in the segment that the last frame has begun; the state `before` it is set aside."""
+    """Switch to the segment that the last frame has started; the state `before` it is set aside."""
     run.aside = run.aside | {run.back_end.segment: before}
     run.back_end.segment = given.structure
     run.structure, run.prior_motion = placed_by(given, run.records[-1].pose), None
@@ -109,7 +109,7 @@ def meeting(run: MappingRun, given: Input, info: StepInfo) -> np.ndarray | None:
 
 
 def similarity_between(here: StepInfo, there: StepInfo) -> np.ndarray:
-    """(4, 4) with e^σ R in the place of R: what takes a frame and its lengths from one of its places to the other."""
+    """Return the similarity between a frame's two poses, lengths included: (4, 4) with e^σ R in the place of R."""
     before, after = (to_matrix(np.asarray(info.T_world_camera.wxyz_xyz)) for info in (here, there))
     before[:3, :3] *= float(here.localization.scale)
     after[:3, :3] *= float(there.localization.scale)

@@ -45,7 +45,7 @@ def programs(configs: Sequence[SlamConfig]) -> list[list[int]]:
 def map_together(
     runs: Sequence[MappingRun], dataset: Dataset, prior: Prior, at_once: int = 1, num_threads: int = 1
 ) -> Iterator[RawView]:
-    """`map_frames` of several runs; yields on the way what the prior alone says of each frame.
+    """Map several runs as `map_frames` does; yields the raw predictions of each frame on the way.
 
     Args:
         runs: before their first frame, with one clock; their configs share a program.
