@@ -40,11 +40,11 @@ OPENCV_KEYS = {
     *("calibration_time", "nframes", "nr_of_frames", "board_width", "board_height", "square_size", "marker_size"),
     *("flags", "aspectRatio", "fix_aspect_ratio", "avg_reprojection_error", "per_view_reprojection_errors"),
     *("extrinsic_parameters", "image_points", "grid_points", "fisheye_model", "camera_name", "distortion_model"),
-    *("rectification_matrix", "projection_matrix"),
+    *("rectification_matrix", "projection_matrix", "local_transform"),
 }
 ORB_SECTIONS = (
     *("Camera", "ORBextractor", "Viewer", "File", "System", "IMU", "Stereo", "RGBD", "loopClosing"),
-    *("DepthMapFactor", "ThDepth"),
+    *("DepthMapFactor", "ThDepth", "Feature", "Mapping", "PangolinViewer", "Tracking"),
 )
 TRANSFORMS_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 
@@ -265,15 +265,17 @@ def _mast3r_slam(values: Mapping[str, Any], path: Path) -> Calibration:
 
 
 def _orb_slam(values: Mapping[str, Any], path: Path) -> Calibration:
-    """Camera.fx … of ORB-SLAM2 or Camera1.fx … of ORB-SLAM3."""
+    """Camera.fx … of ORB-SLAM2, Camera1.fx … of ORB-SLAM3; OpenVSLAM has Camera.model, cols and rows."""
     section = "Camera1" if "Camera1.fx" in values else "Camera"
     strange = {key for key in values if str(key).split(".")[0] not in (*ORB_SECTIONS, "Camera1")}
     if "Camera2.fx" in values or strange:
         found = ", ".join(sorted(map(str, strange))) or "a second camera"
-        raise ValueError(f"{path} has more than one camera's keys: {found}; remove them")
-    model = values.get("Camera.type", "PinHole")
-    if model != "PinHole":
-        refuse_model(model, ("PinHole",), path)
+        raise ValueError(f"{path} has more than one camera's keys: {found}; remove what says nothing about the lens")
+    for model in (values.get("Camera.type", "PinHole"), values.get("Camera.model", "perspective")):
+        if str(model).lower() not in ("pinhole", "perspective"):
+            refuse_model(model, ("PinHole", "perspective"), path)
+    values = {"Camera.width": values.get("Camera.cols"), "Camera.height": values.get("Camera.rows")} | dict(values)
+    values = {key: value for key, value in values.items() if value is not None}
     names = [f"{section}.{key}" for key in ("fx", "fy", "cx", "cy")]
     fx, fy, cx, cy, width, height = needed(values, [*names, "Camera.width", "Camera.height"], path)
     bent = [_number(values.get(f"{section}.{key}", 0), f"{section}.{key}", path) for key in DISTORTION]

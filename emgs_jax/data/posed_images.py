@@ -2,6 +2,8 @@
 
 Their poses are a reference for the path. Those that a program has found are in a unit of their own: only what is
 aligned with a scale says something (`trajectory/ate_sim3_m`). Without depth there is no reference for the map.
+
+Pixels are those that are stored: these programs do not turn images by their EXIF orientation, and poses are of them.
 """
 
 from collections.abc import Sequence
@@ -70,7 +72,7 @@ class PosedImages:
                 f"{solved.source} names {self._images[0].name} and {len(rows) - 1} others, and none of them is in "
                 f"{self._images[0].parent}: put the images there"
             )
-        self._raw_size = reading.first_size(self._images, self._images[0].parent)
+        self._raw_size = reading.first_size(self._images, self._images[0].parent, reading.AS_STORED)
         about = {"source": solved.source.name}
         self._lens = to_lens(solved.camera, self._raw_size, str(solved.source), about)
         self._tones = tones_of(self._images)
@@ -85,7 +87,7 @@ class PosedImages:
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
         path = self._images[index]
-        image = self._lens.straighten(read_shown(path, self._raw_size, self._tones))
+        image = self._lens.straighten(read_shown(path, self._raw_size, self._tones, reading.AS_STORED))
         image = reading.resize_color(image, self.size)
         return Frame(index, self._times[index], str(path), image, None, self.pose(index))
 

@@ -20,6 +20,7 @@ Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy; pixel centres 
 MAX_SIDE = 16384  # pixels; more is a slip of the hand, and would ask for gigabytes
 MAX_POSITION_M = 1000.0  # from the origin: steps of float32 are .06 mm there, and 6 cm at 1e6 m
 RIGID_TOLERANCE = 1e-2  # text files round; a flipped digit moves R^T R by more
+AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION  # not turned by EXIF: other programs solve for the pixels of the file
 OWN_BITS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH  # BGR in 8 or 16 bits, or float
 REMEDY = "fetch the file again or set on_bad_frame=skip"
 
@@ -193,9 +194,9 @@ def decode(path: Path, flags: int) -> np.ndarray:
     return image
 
 
-def read_color(path: Path, raw_size: Size | None = None) -> UInt8[np.ndarray, "_ _ 3"]:
-    """RGB image; BadFrameError where its size is not raw_size."""
-    image = decode(path, cv2.IMREAD_COLOR)
+def read_color(path: Path, raw_size: Size | None = None, flags: int = 0) -> UInt8[np.ndarray, "_ _ 3"]:
+    """RGB image, turned as its EXIF says unless `flags` has AS_STORED; BadFrameError where its size is not raw_size."""
+    image = decode(path, cv2.IMREAD_COLOR | flags)
     check_raw_size(image, raw_size, path)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
@@ -219,11 +220,11 @@ def check_raw_size(image: np.ndarray, raw_size: Size | None, path: object) -> No
         )
 
 
-def first_size(paths: Iterable[Path], where: object) -> Size:
-    """(width, height) of the first image that can be read."""
+def first_size(paths: Iterable[Path], where: object, flags: int = 0) -> Size:
+    """(width, height) of the first image that can be read, as `read_color` does."""
     for path in paths:
         try:
-            return decode(path, cv2.IMREAD_COLOR).shape[1::-1]
+            return decode(path, cv2.IMREAD_COLOR | flags).shape[1::-1]
         except BadFrameError:
             continue
     raise ValueError(f"{where}: none of its images can be read; fetch them again")

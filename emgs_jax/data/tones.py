@@ -72,10 +72,12 @@ def tones_of(files: Sequence[Path]) -> Tones | None:
     return find_tones(lambda row: reading.decode(files[row], reading.OWN_BITS), len(files))
 
 
-def read_shown(path: Path, raw_size: reading.Size | None, tones: Tones | None) -> UInt8[np.ndarray, "_ _ 3"]:
+def read_shown(
+    path: Path, raw_size: reading.Size | None, tones: Tones | None, flags: int = 0
+) -> UInt8[np.ndarray, "_ _ 3"]:
     """`reading.read_color` of an image that may have more than 8 bits."""
     if tones is None:
-        return reading.read_color(path, raw_size)
-    image = reading.decode(path, reading.OWN_BITS)
+        return reading.read_color(path, raw_size, flags)
+    image = reading.decode(path, reading.OWN_BITS | flags)
     reading.check_raw_size(image, raw_size, path)
     return np.ascontiguousarray(tones.shown(image)[..., ::-1])

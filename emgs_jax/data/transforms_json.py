@@ -62,7 +62,7 @@ def with_angle_of_view(values: Mapping[str, Any], path: Path) -> Mapping[str, An
     if not all(map(_is_number, size)):
         names = [frame.get("file_path") for frame in _frames(values)]
         files = (find_image(path.parent, name) for name in names if isinstance(name, str))
-        size = [*reading.first_size(files, path)]
+        size = [*reading.first_size(files, path, reading.AS_STORED)]
     width, height = size
     focal = width / (2 * math.tan(angle / 2))
     return {"fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2, "w": width, "h": height} | dict(values)

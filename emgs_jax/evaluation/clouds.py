@@ -38,7 +38,10 @@ class PointCloud:
 
 
 def read_cloud(path: str | os.PathLike, normal_neighbours: int) -> PointCloud:
-    """Read a PLY; a cloud without normals gets those of planes through so many nearest points, sign unknown."""
+    """Read a PLY; a cloud without normals gets those of planes through so many nearest points, sign unknown.
+
+    Normals that are 0, as 3DGS writes them, are none; the others get length 1.
+    """
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path} does not exist: give a PLY file with the points in the trajectory's frame")
     vertices = read_vertices(path)
@@ -49,7 +52,11 @@ def read_cloud(path: str | os.PathLike, normal_neighbours: int) -> PointCloud:
     if not len(points):
         raise ValueError(f"{path} has no points: write the points of the map as PLY")
     has_normals, has_colors = ({*names} <= vertices.keys() for names in (_NORMALS, _COLORS))
-    normals = _columns(vertices, _NORMALS, path) if has_normals else _fitted_normals(points, normal_neighbours)
+    normals = _columns(vertices, _NORMALS, path) if has_normals else np.zeros_like(points)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    if not lengths.all():
+        normals = np.where(lengths > 0, normals, _fitted_normals(points, normal_neighbours))
+    normals = normals / np.where(lengths > 0, lengths, 1.0)
     return PointCloud(points, normals, _columns(vertices, _COLORS, path) if has_colors else np.zeros_like(points))
 
 

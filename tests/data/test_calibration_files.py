@@ -140,6 +140,7 @@ WRONG = [
     ("orb.yaml", ORB.replace("PinHole", "KannalaBrandt8"), "KannalaBrandt8 is not read"),
     ("orb.yaml", ORB.replace("Camera.width: 640\n", ""), "has no Camera.width: add"),
     ("orb.yaml", ORB + "Camera2.fx: 3\n", "more than one camera"),
+    ("orb.yaml", ORB + "Camera.model: fisheye\n", "the camera model fisheye is not read"),  # k1 and k2 are others there
     ("intrinsics.yaml", MAST3R.replace("width", "widht"), "unknown keys: widht"),
     ("intrinsics.yaml", MAST3R.split("calib")[0] + "calibration: [1, 2, 3]\n", "must be fx, fy, cx, cy.*got 3"),
     ("intrinsics.yaml", MAST3R.split("calib")[0] + "calibration: pinhole\n", r"must have data: \[numbers\]"),
@@ -154,3 +155,11 @@ def test_what_cannot_be_read_names_the_file_the_key_and_the_remedy(name, text, m
         read_calibration(write(tmp_path, name, text))
     with pytest.raises(FileNotFoundError, match=r"none\.json cannot be read; it may be COLMAP"):
         read_calibration(tmp_path / "none.json")
+
+
+def test_openvslams_yaml_is_read_as_orb_slams_with_its_own_names_of_size_and_model(tmp_path):
+    plain, other = tmp_path / "orb.yaml", tmp_path / "openvslam.yaml"
+    plain.write_text(ORB)
+    text = ORB.replace("Camera.width", "Camera.cols").replace("Camera.height", "Camera.rows")
+    other.write_text(text + "Camera.setup: monocular\nCamera.model: perspective\nFeature.max_num_keypoints: 2000\n")
+    assert read_calibration(other) == read_calibration(plain)

@@ -6,6 +6,7 @@ import struct
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 from written_scene import color_image, scene_pose
 
@@ -46,6 +47,14 @@ def write_colmap(folder, camera: str = "PINHOLE", second: str = ""):
     (model / "images.txt").write_text("\n".join(lines) + "\n")
     (model / "points3D.txt").write_text("1 0 0 1 255 0 0 -1\n")
     return model
+
+
+def turned_by_exif(path, orientation: int) -> None:
+    """A picture of another program's, with the same pixels and an EXIF orientation."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    with Image.open(path) as image:
+        image.save(path, exif=exif)
 
 
 def write_nerfstudio(folder, **changes) -> None:
@@ -281,3 +290,16 @@ def test_a_damaged_transforms_json_is_named_and_a_pose_that_is_not_finite_is_non
     path.write_text(json.dumps(values))
     dataset = Nerfstudio(str(path.parent), size=SIZE)
     assert dataset.pose(0) is None and dataset.pose(1) is not None
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_images_are_those_that_are_stored_whatever_their_exif_orientation(orientation, tmp_path):
+    """3 is upside down, which came silently with the poses of the pixels in the file; 6 was refused for its size."""
+    write_colmap(tmp_path)
+    plain = Colmap(str(tmp_path), size=SIZE)[0].image
+    for name in NAMES:
+        turned_by_exif(tmp_path / "images" / name, orientation)
+    assert cv2.imread(str(tmp_path / "images" / NAMES[1])).shape == (
+        (120, 160, 3) if orientation == 3 else (160, 120, 3)
+    )
+    np.testing.assert_array_equal(Colmap(str(tmp_path), size=SIZE)[0].image, plain)

@@ -102,6 +102,17 @@ def test_a_cloud_without_normals_gets_those_of_planes_through_its_points(tmp_pat
     assert not found.colors.any()
 
 
+def test_normals_of_length_0_are_none_and_others_get_length_1(tmp_path):
+    """3DGS writes zeros, which scored as 0 % of normals; and cosines of normals of length 2 were above 1."""
+    rng = np.random.default_rng(11)
+    points = rng.uniform(-1, 1, (300, 3)) * [1, 1, 0]
+    normals = np.where(np.arange(300)[:, None] < 150, 0.0, [0.0, 0.0, -2.0])
+    save_points_ply(tmp_path / "a.ply", points, normals, np.zeros((300, 3)))
+    found = read_cloud(tmp_path / "a.ply", 12)
+    np.testing.assert_allclose(np.abs(found.normals[:, 2]), 1.0, atol=1e-6)
+    assert (found.normals[150:, 2] < 0).all()
+
+
 def test_a_file_without_usable_points_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.ply does not exist"):
         read_cloud(tmp_path / "none.ply", 12)
