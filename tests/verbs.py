@@ -27,6 +27,7 @@ from emgs_jax.render import composite, densify, project
 
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
 CONFIG = sc.slam_config("slam.submap.map_capacity=48", "slam.submap.submap_capacity=32", "render.tile_capacity=32")
+DENSIFY = densify.DensifyConfig(0.05, 0.3, 0.0, CONFIG.refinement.render, "map")
 ONE, TENTH, FEW = sc.device(1.0), sc.device(0.1), sc.device(0.01)
 ROWS = np.arange(192)
 
@@ -213,7 +214,7 @@ VERBS = {
         lambda s: (sc.random_gaussians(32, s, 2), looking(s)),
     ),
     "densify": (
-        lambda g, T: densify.densify(g, T, CAMERA, densify.DensifyConfig(0.05, 0.3, 0.0, CONFIG.refinement.render)),
+        lambda g, T: densify.densify(g, T, CAMERA, DENSIFY),
         lambda s: (sc.random_gaussians(32, s, 2), looking(s)),
     ),
     "continued": (

@@ -10,7 +10,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, unproject
 from emgs_jax.ops.linalg import outer, safe_normalize, tangent_basis
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import take_rows, traced
+from emgs_jax.ops.pytree import static_choice, take_rows, traced
 from emgs_jax.render.composite import (
     RenderConfig,
     Rendering,
@@ -36,12 +36,15 @@ class DensifyConfig(eqx.Module):
         min_alpha: a pixel with less coverage has no depth.
         min_std: m; the floor of the covariances, which is not drawn along the surface, see `without_floor`.
         render: how the front is found.
+        points: at the depth of the `map` (the paper's rule), or at a frame's `own` where the map confirms it, see
+            `emgs_jax.running.dense.at_own_depth`.
     """
 
     surface_depth: Float[Array, "*b"] = traced(low=0)
     min_alpha: Float[Array, "*b"] = traced(low=0, high=1)
     min_std: Float[Array, "*b"] = traced(low=0, high=1000)
     render: RenderConfig
+    points: str = static_choice("map", "own")
 
 
 class DenseView(eqx.Module):

@@ -218,7 +218,7 @@ def score_settings(
         if all(pose is None for pose in run.true_poses):
             return counts
         labelled = labelled_map(run, scorer.prior)
-        dense = dense_map(run, scorer.dataset, config, scorer.evaluation, labelled, num_pictures=0)
+        dense = dense_map(run, scorer.dataset, config, scorer.evaluation, labelled, 0, raw.depths)
         labels = None if labelled is None else labelled.centers
         return score_map(run, dense.cloud, center_cloud(run), labels, scorer) | dense.rendering | counts
 

@@ -1,6 +1,6 @@
 """The map as points: what is rendered of it from the poses of its frames, its centres, and their classes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -48,6 +48,7 @@ def dense_map(
     evaluation: EvaluationConfig,
     labelled: LabelledMap | None = None,
     num_pictures: int = 4,
+    depths: Sequence[np.ndarray] | None = None,
 ) -> DenseMap:
     """Render the map from the pose of every frame that is not lost.
 
@@ -59,7 +60,11 @@ def dense_map(
             compared with the truth under it.
         labelled: `labelled_map` of the run, which says the class of each point.
         num_pictures: frames that are shown, evenly spread.
+        depths: what the prior says of every frame, camera-space z (h, w) in its own lengths, 0 where it says none; for
+            `densify.points=own` only.
     """
+    if config.points == "own" and depths is None:
+        raise ValueError("densify.points=own puts points at the depths of the frames: give depths=")
     known = [row for row, record in enumerate(run.records) if record.status != "lost"]
     shown = {known[int(i)] for i in np.linspace(0, len(known) - 1, num_pictures)} if known else set()
     pictures: list[dict[str, Any]] = []
@@ -74,14 +79,43 @@ def dense_map(
                 pictures.append(_picture(run, dataset, row, view) | ({} if labels is None else {"labels": labels}))
             found = translate(labels, labelled.classes, dataset.classes) if compares_classes else None
             rendered.add(row, np.where(view.valid, view.depth, 0.0), view.colors, found)
-            yield PointCloud(
-                *(rows[view.valid].astype(np.float64) for rows in (view.points, view.normals, view.colors))
-            )
+            points, valid = view.points, view.valid
+            if config.points == "own":
+                scale = run.records[row].scale  # the map's unit is that of the first frames
+                own = depths[row] * (1.0 if scale is None else scale)
+                points, valid = at_own_depth(view, own, run.poses[row][:3, 3], float(config.surface_depth))
+            yield PointCloud(*(rows[valid].astype(np.float64) for rows in (points, view.normals, view.colors)))
 
     cloud = fuse_clouds(clouds(), _voxel(with_truth(run, run.poses), evaluation))
     points = cloud.points
     labels = None if labelled is None else LabelledPoints(points, labelled.classes_of(points), labelled.classes)
     return DenseMap(cloud, labels, pictures, rendered.metrics())
+
+
+def at_own_depth(
+    view: DenseView, own: np.ndarray, center: np.ndarray, surface_depth: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The points of a view at the depth of its own frame, valid where map and frame show one surface.
+
+    The mean of W depths of variance σ² whose errors have the correlation ρ has the variance σ² (ρ + (1 - ρ) / W). Where
+    frames err alike, as those of multi-view stereo do, which are matched with the same images, ρ is near 1: the mean is
+    no more precise than any of them, and what is smaller than a Gaussian is missing in it. There the map says which
+    depths are right, and the frame where: x = c + (z / z_map) (x_map - c) where |z - z_map| <= `surface_depth` z_map,
+    and no point where the frame says something else, or nothing (two gates, as in the geometric and photometric
+    consistency of COLMAP, Schönberger et al. 2016).
+
+    Args:
+        view: drawn, on the host.
+        own: camera-space z (h, w) of the frame in the map's lengths; 0 where there is none.
+        center: of the camera, world frame.
+        surface_depth: fraction of the depth, as of `DensifyConfig`.
+
+    Returns:
+        Points (h, w, 3), world frame, and which are valid; the map's where they are not.
+    """
+    valid = view.valid & (own > 0) & (np.abs(own - view.depth) <= surface_depth * view.depth)
+    ratio = np.where(valid, own, 1.0) / np.where(valid, view.depth, 1.0)
+    return center + ratio[..., None] * (view.points - center), valid
 
 
 def _voxel(poses: tuple[np.ndarray, np.ndarray] | None, config: EvaluationConfig) -> float:

@@ -101,7 +101,7 @@ def gather(
     Args:
         views: of all frames.
         evaluation: how normals are fitted.
-        keeps_depths: the truth is known.
+        keeps_depths: the truth is known, or points are to lie at them.
         baselines: that take the views, too.
         text: names of the classes that pixels are labelled with, and their embeddings; None: no labels.
     """

@@ -1,5 +1,6 @@
 """The map as points; oracle: a coloured wall of which every camera sees a part that no other sees."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -115,6 +116,30 @@ def test_the_classes_of_rendered_pixels_are_compared_with_those_of_the_frames_by
     compared = hand_run(run.poses, run.raw_poses, larger, gaussians=run.state.map.gaussians)
     metrics = dense_map(compared, Truth(), densify_config(), evaluation_config(), labels, num_pictures=0).rendering
     np.testing.assert_allclose(metrics["rendering/label_accuracy_percent"], 100.0 * 5 / 6, atol=0.5)  # one is lost
+
+
+def test_a_point_lies_where_its_frame_puts_it_if_the_map_shows_that_surface_there_and_nowhere_else(run):
+    """The wall is at 2: left of the camera the frames say 2.05, right of it 3, and in the upper row nothing."""
+    said = np.full((len(STATUSES), 16, 24), 1.025, np.float32)
+    said[:, :, 12:], said[:, 0] = 1.5, 0.0
+    scaled = hand_run(run.poses, run.raw_poses, run.true_poses, gaussians=run.state.map.gaussians)
+    scaled.records = [replace(record, scale=2.0) for record in scaled.records]
+    found = dense_map(scaled, Pictures(), densify_config("densify.points=own"), evaluation_config(), depths=said).cloud
+    np.testing.assert_allclose(found.points[:, 2], 2.05, atol=1e-5)  # float32
+    np.testing.assert_allclose(found.normals, np.broadcast_to([0.0, 0.0, -1.0], found.normals.shape), atol=1e-5)
+    offsets = found.points[:, None, 0] - XS[[status != "lost" for status in STATUSES]]
+    left = np.array([offset for offset in (np.arange(12) - 11.5) * 2.05 / 24])
+    assert (np.abs(offsets[..., None] - left).min((1, 2)) < 0.01).all() and len(found) > 5 * 12 * 15 / 2
+    assert found.points[:, 1].min() > (0.4 - 7.5) * 2.05 / 24, "the upper row has no depth"
+
+
+def test_depths_of_frames_change_nothing_unless_points_are_to_lie_there_and_are_asked_for_then(run, dense, labels):
+    poison = np.full((len(STATUSES), 16, 24), np.nan, np.float32)
+    config = densify_config()
+    found = dense_map(run, Pictures(), config, evaluation_config(), labels, num_pictures=3, depths=poison)
+    np.testing.assert_array_equal(found.cloud.points, dense.cloud.points)
+    with pytest.raises(ValueError, match="depths="):
+        dense_map(run, Pictures(), densify_config("densify.points=own"), evaluation_config())
 
 
 def test_points_and_pictures_have_the_class_of_the_gaussians_there(dense, labels):
