@@ -39,7 +39,7 @@ from experiments.report import positional
         (["slam.em=papre"], r"one of its options \(default, paper\) with slam/em=default$"),
         (["render=bright"], "render=bright is no option of render: there are default"),
         (["slam=paper"], r"slam is chosen by its parts: slam/continuation=…, slam/em=…, slam/existence=…"),
-        (["dataset=kitti"], "dataset=kitti is no option of dataset: there are apartment, colmap, images"),
+        (["dataset=scannetpp"], "dataset=scannetpp is no option of dataset: there are apartment, bonn, colmap"),
         (["dataset=1.5"], "^dataset=1.5 is no option of dataset: there are apartment"),
         (["dataset=null"], "^dataset=null: Config group override must be a string"),
         (["graph=3"], "^graph=3 is no option of graph: there are default, none"),
