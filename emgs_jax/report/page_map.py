@@ -26,9 +26,9 @@ def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.nd
 
     Returns:
         `mean` float32 (n, 3) in metres; `cov` float16 (n, 6), the upper triangle in `COV_UNIT`; `color` uint8 (n, 3);
-        `normal` int8 (n, 3), 127 = 1; `existence` uint8, the probability that the Gaussian exists, 255 = 1;
+        `normal` int8 (n, 3), 127 = 1; `existence` uint8, the probability that it stands for something, 255 = 1;
         `updates` uint16; `birth` int32, the node of its first frame. With text, `label` int16, -1 = none, and
-        `similarity` uint8 (n, c): the cosine with each class, 255 = 1, 0 for negative ones.
+        `similarity` uint8 (n, c): the cosine with each class, 255 = 1, what is negative is 0.
     """
     gaussians = jax.device_get(confirmed(map))
     rows = np.flatnonzero(gaussians.valid)
