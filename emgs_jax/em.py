@@ -37,7 +37,7 @@ class EmConfig(eqx.Module):
 
     Args:
         num_neighbours: K, nearest Gaussians per point.
-        num_candidates: Gaussians near a block of points, among which the K of each point are looked for.
+        num_candidates: Gaussians near a block of points, among which the K of each point are searched.
         min_normal_cos: τ_n, on the mean over the neighbours of n_k · n_i.
         max_mahalanobis_sq: τ_Σ, on the smallest squared Mahalanobis distance (R1).
         max_log_gap: τ_π, on the gap between the best explanation and the best possible one; `inf` as printed (R3).
@@ -70,7 +70,7 @@ class EmConfig(eqx.Module):
 
 
 class EStep(eqx.Module):
-    """Which Gaussians explain which points, by blocks of points that are near each other.
+    """Data association of points with Gaussians, by blocks of points that are near each other.
 
     Args:
         near: the Gaussians near each block of points.
@@ -203,7 +203,7 @@ def support(gaussians: Gaussians, points: Observation, step: EStep, config: EmCo
 
 
 def precision(noise: Float[Array, "m 3"], config: EmConfig) -> Float[Array, "m"]:
-    """What a point is worth beside an exact one: min_std² / (min_std² + |ν|²) in (0, 1], 1 for all where ν = 0."""
+    """Weigh points by their noise: min_std² / (min_std² + (`config.noise` |ν|)²) in (0, 1], 1 for an exact point."""
     return config.min_std**2 / (config.min_std**2 + config.noise**2 * jnp.sum(noise**2, axis=-1))
 
 

@@ -1,4 +1,4 @@
-"""Existence: what later frames say of a Gaussian. It is confirmed or seen through, and two layers become one."""
+"""Existence: evidence of later frames for and against a Gaussian, and merging of duplicate surfaces."""
 
 import math
 
@@ -21,23 +21,26 @@ MIN_GAP = 2.0  # standard deviations along the normal; what is nearer is one she
 
 
 class ExistenceConfig(eqx.Module):
-    """How much a look says, and when two Gaussians say the same.
+    """Evidence of frames for and against the existence of Gaussians, and merging of duplicate surfaces.
 
     Args:
         birth: log-odds of a new Gaussian. At 0 it is tentative until it explains points of another frame; above, as
             printed, it is not.
-        hit: log-odds that a look adds some of whose points the Gaussian explains.
-        miss: log-odds that a look takes away which sees through the Gaussian, or to which it is of no use.
-        max_log_odds: which no number of looks exceeds, so that a change of mind takes a bounded number of them.
+        hit: log-odds that a frame adds if the Gaussian explains some of its points.
+        miss: log-odds that a frame takes away that sees through the Gaussian (free-space violation), or whose points it
+            does not explain.
+        max_log_odds: upper limit, so that a bounded number of frames can outweigh any number of earlier ones.
         refuted: log-odds below which a Gaussian is removed; `-inf` never, as printed.
-        num_std: standard deviations of the depth between a Gaussian and what is seen that say nothing.
-        min_cos: between its normal and the ray; a flatter look says nothing.
-        num_neighbours: nearest seen Gaussians among which another layer of the same surface is looked for.
-        max_mahalanobis_sq: between two that are one, the look's noise along the normal included; 0 joins none, as
-            printed.
+        num_std: k, standard deviations of the depth between a Gaussian and the surface that a frame sees, within which
+            it counts as seen.
+        min_cos: between its normal and the ray; in a more grazing view it is neither seen nor seen through.
+        num_neighbours: nearest seen Gaussians among which a duplicate surface is searched.
+        max_mahalanobis_sq: between two Gaussians that are one, the frame's noise along the normal included; 0 merges
+            none, as printed.
         max_layer_sq: likewise between two of which one stands behind the other, see `nearest_layers`.
         min_normal_cos: between their normals.
-        feature: of what two become: that of the heavier (`medoid`), or the sum of both (`accumulated`), see `EmConfig`.
+        feature: of the merged Gaussian: that of the heavier (`medoid`), or the sum of both (`accumulated`), see
+            `EmConfig`.
     """
 
     birth: Float[Array, "*b"] = traced(low=-1e6)
@@ -69,8 +72,7 @@ def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -
 
 
 def usefulness(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> Int[Array, "n"]:
-    """What every Gaussian was to a frame: 1 where points of it were fused into the Gaussian, -1 where none were, and 0
-    where the Gaussian was not in the submap.
+    """Return a frame's evidence for every Gaussian: 1 with points fused into it, -1 without, 0 outside the submap.
 
     Args:
         map: before the frame.
@@ -90,25 +92,26 @@ def judge(
     depth_noise: Float[Array, ""],
     config: ExistenceConfig,
 ) -> tuple[GaussianMap, Bool[Array, "n"]]:
-    """Log-odds of every Gaussian after one more look at it; what is refuted becomes a free row.
+    """Update the existence (log-odds) of every Gaussian by one more frame; refuted Gaussians become free rows.
 
-    With d the depths that the frame shows round the Gaussian's pixel, z its own and
-    σ² = (depth_noise · z)² + n'Σn, it is seen where |z - min d| <= kσ or |z - max d| <= kσ, and seen through where
-    z < min d - kσ. What is behind is occluded, and what is between, at an edge, may be either: that says nothing.
-    What is not seen through is confirmed by points that it explains, however flat the look and however near an edge:
-    there the depth round its pixel shows nothing, and a floor behind a table would never be confirmed. One that is seen
-    while others explain all points there only repeats what the map knows, as the second layer of a wall does: that
-    speaks against it, or a map would grow for as long as one looks. What is confirmed must be as wide as a pixel for
-    that: a view from afar has no point for each.
+    With d the depths that the frame shows round the Gaussian's pixel, z its own and σ² = (depth_noise · z)² + n'Σn, it
+    is seen where |z - min d| <= kσ or |z - max d| <= kσ, and seen through (free-space violation) where z < min d - kσ.
+    A Gaussian behind is occluded, and one between, at an edge, may be either: that is no evidence.
+
+    Unless it is seen through, points that it explains confirm it, however grazing the view and however near an edge:
+    the depth round its pixel shows nothing there, and a floor behind a table would never be confirmed. A Gaussian that
+    is seen while others explain all points there is redundant, like the second layer of a wall: that is evidence
+    against it, or a map would grow for as long as a camera looks at it. A confirmed one counts as redundant only if it
+    is as wide as a pixel: a view from afar has no point for each.
 
     Args:
         map: all Gaussians, world frame.
-        use: of each to this frame, see `usefulness`.
+        use: evidence of this frame's points for each, see `usefulness`.
         view: the frame as it was aligned, world frame; a frame that is not tracked has no valid row.
         T_world_camera: its pose.
         camera: of its rows.
         depth_noise: of its points, as a fraction of their depth.
-        config: how much a look says.
+        config: weights of the evidence.
 
     Returns:
         The map, and which Gaussians were seen.
@@ -143,7 +146,7 @@ def join_layers(
     depth_noise: Float[Array, ""],
     config: ExistenceConfig,
 ) -> GaussianMap:
-    """Make one of every two Gaussians of a surface that a look cannot tell apart and that are each other's nearest.
+    """Merge duplicate surfaces: every two Gaussians that a frame cannot tell apart and that are each other's nearest.
 
     Means, covariances, colours and normals are averaged by the Gaussians' weights. The covariance grows by the spread
     of the means along the surface only: a wall does not become thicker by being two layers.
@@ -151,7 +154,7 @@ def join_layers(
     Args:
         map: of which the submap is enough.
         is_seen: Gaussians that may be joined.
-        origins: of the camera of the look, world frame; one for all, or one for each.
+        origins: of the camera of the frame, world frame; one for all, or one for each.
         depth_noise: as a fraction of the depth.
         config: gates.
     """
@@ -210,8 +213,8 @@ def nearest_layers(
 ) -> tuple[Int[Array, "n"], Bool[Array, "n"]]:
     """The nearest other layer of every Gaussian, and whether it is that one's nearest, too.
 
-    The squared distance of the means is taken under Σ_a + Σ_b + ν²nn', where ν is the noise of the look along the
-    normal n of the Gaussian that asks: a look cannot tell the two apart. Where one stands behind the other, by more
+    The squared distance of the means is taken under Σ_a + Σ_b + ν²nn', where ν is the noise of the frame along the
+    normal n of the Gaussian itself: a frame cannot tell the two apart. Where one stands behind the other, by more
     than `MIN_GAP` standard deviations of either, they may be two sheets of one surface that different frames made, each
     with its own error. Then it is taken under ν² (1 / W_a + 1 / W_b), what the means of so many frames differ by.
     """

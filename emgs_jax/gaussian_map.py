@@ -34,14 +34,14 @@ class GaussianMap(eqx.Module):
 
 
 class AverageConfig(eqx.Module):
-    """How a Gaussian takes up what a frame says of it (eq. 4 and 6).
+    """Average over frames in the update of a Gaussian (eq. 4 and 6).
 
     Args:
-        gain: `ema_printed`, α_t = δ / (α_{t-1} + δ), an exponential average; or `count`, W += δ, α = δ / W, which
-            tends to the mean of all frames (R4; West 1979).
+        gain: `ema_printed`, α_t = δ / (α_{t-1} + δ), an exponential average; or `count`, W += δ, α = δ / W, which tends
+            to the mean of all frames (R4; West 1979).
         forgetting: factor on the kept α or W before each update; 1 = the printed form.
-        max_weight: which what is kept never exceeds, so that a camera that stands still does not become certain: what
-            its predictions have in common does not average out. `inf` as printed.
+        max_weight: upper limit of the kept α or W, so that a camera that stands still does not become certain: errors
+            that its predictions have in common do not average out. `inf` as printed.
         blend: of covariances: `linear` (printed) or `moment_matched` (R13).
     """
 
@@ -52,7 +52,7 @@ class AverageConfig(eqx.Module):
 
 
 class SubmapConfig(eqx.Module):
-    """Which part of the map a step works on, and how much room there is.
+    """Settings of the submap, the part of the map that a step works on, and initial capacities.
 
     Args:
         voxel_size: m; Gaussians are looked up by the voxel of their mean.
@@ -88,7 +88,7 @@ def confirmed(map: GaussianMap) -> Gaussians:
 
 
 def without(map: GaussianMap, is_gone: Bool[Array, "n"]) -> GaussianMap:
-    """The map with free rows in the place of some."""
+    """Return the map with some rows freed."""
     return where_rows(is_gone, empty_map(is_gone.shape[0], map.gaussians.features.shape[-1]), map)
 
 

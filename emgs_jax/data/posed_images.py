@@ -30,15 +30,15 @@ MODEL_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0")
 
 @dataclass(frozen=True)
 class Solved:
-    """What is known of one camera's images.
+    """Images of one camera with the poses and the calibration that another program solved for.
 
     Args:
         images: files.
         poses: T_world_camera of each, in the program's unit; None where there is none.
         camera: of all of them.
-        source: the file that says so.
+        source: the file that poses and camera come from.
         files: all that were read.
-        times: seconds of each, where the images stand in order of time; None = what their names say.
+        times: seconds of each, where the images stand in order of time; None = from their names.
     """
 
     images: list[Path]
@@ -50,7 +50,7 @@ class Solved:
 
 
 class PosedImages:
-    """What the data sets of this file share (a `Dataset`); images in the natural order of their folders and names."""
+    """Base of the data sets in this file (a `Dataset`); images in the natural order of their folders and names."""
 
     name = ""
     classes: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""What the data sets on disk share: finding, choosing, reading, checking and resizing; every failure names its file."""
+"""Common parts of the data sets on disk: finding, choosing, reading, checking, resizing; failures name their file."""
 
 import hashlib
 import math
@@ -61,7 +61,7 @@ def select(count: int, start: int, stop: int | None, stride: int, where: object)
 
 
 def limit(start: int, stop: int | None) -> int | None:
-    """How many images have to be counted before `select`; None = all, also where `start` and `stop` make no sense."""
+    """Return how many images must be counted before `select`; None = all, also where `start` and `stop` are invalid."""
     return stop if isinstance(start, int) and isinstance(stop, int) and 0 <= start < stop else None
 
 
@@ -139,7 +139,7 @@ def read_text(path: Path) -> str:
 
 
 def damage(data: bytes) -> str | None:
-    """What is wrong with an encoded image, where its format can tell; decoders fill what is missing with grey."""
+    """Describe the damage of an encoded image; None if its format shows none. Decoders fill missing parts with grey."""
     if data.startswith(b"\x89PNG\r\n\x1a\n"):
         return _png_damage(data)
     if data.startswith(b"\xff\xd8"):
@@ -258,7 +258,7 @@ def as_motion(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
 
 
 def is_rigid(poses: Float[np.ndarray, "*b 4 4"]) -> bool:
-    """Whether all are rigid motions, up to `RIGID_TOLERANCE`."""
+    """Test whether all poses are rigid motions, up to `RIGID_TOLERANCE`."""
     turns = poses[..., :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(turns @ turns.mT - np.eye(3))
@@ -277,7 +277,7 @@ def check_position(position: Float[np.ndarray, " 3"], where: object) -> None:
 
 
 def all_files(dataset: Dataset) -> set[Path]:
-    """What the frames in use are read from."""
+    """Return all files that the frames in use are read from."""
     return {file for index in range(len(dataset)) for file in dataset.files(index)}
 
 

@@ -194,7 +194,7 @@ def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[l
 
 
 def _file_name(line: str, first_word: str, folder: Path) -> str:
-    """What stands behind the time, where that is a file; else its first word, as there may be more columns."""
+    """Return the rest of the line behind the time if it names a file, else its first word: more columns may follow."""
     whole = re.split(r"[,\s]+", line.strip(), maxsplit=1)[1].strip(" \t,\"'")
     return whole if is_file(find_image(folder, whole)) else first_word.strip("\"'")
 
@@ -223,7 +223,7 @@ def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"] | 
 def find_calibration(
     sequence: str, intrinsics: Given | None, distortion: Sequence[Number] | None, calibrations: Calibrations
 ) -> Given:
-    """What is known of the images on disk: as given, else the benchmark's by the sequence's name."""
+    """Return the calibration of the images on disk: the given one, else the benchmark's by the sequence's name."""
     if intrinsics is None:
         if distortion is not None:
             raise ValueError("dataset.distortion needs the dataset.intrinsics that it was calibrated with")

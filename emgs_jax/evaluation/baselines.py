@@ -1,7 +1,7 @@
-"""What one would do with predictions instead of mapping: average their points per voxel, or fuse their depth (TSDF).
+"""Baselines without mapping: predictions averaged per voxel, or their depth fused (TSDF).
 
-Both take views as they come, hold no view afterwards, and are compared like the map: their cloud, and what is rendered
-of it. Lengths are those of the poses; sizes in metres become such lengths by the unit that a fusion starts with.
+Both take views one by one, hold no view afterwards, and are compared like the map: their cloud, and renderings of it.
+Lengths are those of the poses; sizes in metres become such lengths by the unit that a fusion starts with.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ Draw = Callable[[np.ndarray], Image]  # from the pose T_world_camera (4, 4)
 
 @dataclass(frozen=True)
 class View:
-    """What a prior predicts of one frame, in the frame of its camera and its own lengths.
+    """Prediction of one frame, in the frame of its camera and the prior's own lengths.
 
     Args:
         depth: camera-space z (h, w), 0 where there is none.
@@ -51,7 +51,7 @@ class Fusion(Protocol):
         ...
 
     def cloud(self) -> PointCloud:
-        """What there is so far, with normals towards the cameras."""
+        """Return the cloud that is fused so far, with normals towards the cameras."""
         ...
 
     def renderer(self) -> Draw:

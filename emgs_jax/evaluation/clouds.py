@@ -110,7 +110,7 @@ class VoxelGrid:
         return PointCloud(means[:, :3], normals, means[:, 6:9])
 
     def counts(self) -> np.ndarray:
-        """How many points were averaged for each row of `cloud`."""
+        """Count the points that were averaged for each row of `cloud`."""
         return self._sums()[:, 9]
 
     def _sums(self) -> np.ndarray:

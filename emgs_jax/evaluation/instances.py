@@ -10,7 +10,7 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class InstanceConfig:
-    """Which answers belong together.
+    """Clustering of a query's answers into objects (DBSCAN).
 
     Args:
         reach: in median distances between nearest Gaussians of the map; answers within it of each other are one object.

@@ -1,4 +1,4 @@
-"""How much of a map stands twice: one surface as two layers, what drift leaves behind where a camera comes back."""
+"""Share of a map with double walls: one surface in two layers, as drift leaves behind at a revisit."""
 
 import numpy as np
 from scipy.spatial import cKDTree

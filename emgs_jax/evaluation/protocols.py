@@ -17,7 +17,7 @@ NAMES = ("miou", "fmiou", "acc")
 
 @dataclass(frozen=True)
 class SegmentationProtocol:
-    """How labels of a map are compared with the truth. Values: conf/protocol.
+    """Protocol by which labels of a map are compared with the truth. Values: conf/protocol.
 
     Args:
         name: of the protocol.
@@ -65,7 +65,7 @@ class SegmentationProtocol:
 
 
 def ignored_positions(classes: Sequence[str], protocol: SegmentationProtocol) -> list[int]:
-    """Where the protocol's ignored names stand among the classes; a name that is not there ignores nothing."""
+    """Return the positions of the protocol's ignored names among the classes; names that are no classes are skipped."""
     return [position for position, name in enumerate(classes) if name in protocol.ignored]
 
 

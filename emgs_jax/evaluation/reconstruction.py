@@ -1,4 +1,4 @@
-"""How far a reconstructed cloud is from the true one: building both clouds, accuracy, completion, F1, normals."""
+"""Distance of a reconstructed cloud from the true one: building both clouds, accuracy, completion, F1, normals."""
 
 import math
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""How well depth, colours and classes that are rendered from the poses of a run agree with its frames."""
+"""Errors of depth, colours and classes that are rendered from the poses of a run, against its frames."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ _TOLERANCE = 0.05  # of the true depth; it is in the name of the metric
 
 @dataclass(frozen=True)
 class ViewScore:
-    """What was rendered of one frame, against the frame. Shares are of the pixels whose true depth is known.
+    """Errors of one rendered view against its frame. Shares are of the pixels whose true depth is known.
 
     Args:
         coverage: share with a rendered depth.

@@ -1,4 +1,4 @@
-"""How well points are classified: labels carried to the true points, one confusion matrix, the metrics of OVO.
+"""Semantic segmentation of points: labels carried to the true points, one confusion matrix, the metrics of OVO.
 
 Classes are 0 … c - 1; any other number is no class. A confusion matrix is int64 (c, c + 1): rows are true classes,
 columns predicted ones, and the last column counts points without an answer. Matrices of several scenes are added.

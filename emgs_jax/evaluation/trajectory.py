@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the true one: association, alignment, absolute and relative errors.
+"""Errors of an estimated trajectory against the true one: association, alignment, absolute and relative errors.
 
 All errors are root mean squares. Poses are `T_world_camera`, float (n, 4, 4), in metres.
 """

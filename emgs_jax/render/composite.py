@@ -23,12 +23,12 @@ State = TypeVar("State")
 
 
 class RenderConfig(eqx.Module):
-    """How the map is drawn.
+    """Settings of the renderer: tiles, splats and coverage.
 
     Args:
         tile_size: pixels along a tile's side.
-        tile_capacity: splats of a tile for which there is room, on average over the tiles: one may hold more. A dozen
-            bytes for each. The nearest of the image come first; `Rendering.overflow` counts those that are missed.
+        tile_capacity: splats of a tile, on average over the tiles: one may hold more. A dozen bytes for each. The
+            nearest of the image come first; `Rendering.overflow` counts those that are missed.
         tile_batch: times CHUNK splats of tiles are drawn at once, which bounds the memory: some six times as many
             floats as they have pixels.
         opacity: of every Gaussian at its centre (the paper's constant opacity).

@@ -29,7 +29,7 @@ from emgs_jax.render.tiles import Chunks, TileLists
 
 
 class DensifyConfig(eqx.Module):
-    """Which pixels become points.
+    """Choice of the rendered pixels that become points of the densified cloud.
 
     Args:
         surface_depth: fraction of the depth; splats within it of the front belong to one surface.

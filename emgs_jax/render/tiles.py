@@ -1,4 +1,4 @@
-"""Which splats touch which tile of the image: one list for all tiles, sorted by tile and depth (3DGS)."""
+"""Splats of each tile of the image: one list for all tiles, sorted by tile and depth (3DGS)."""
 
 import equinox as eqx
 import jax

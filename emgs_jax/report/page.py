@@ -108,7 +108,7 @@ def _path_arrays(run: RecordedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
 
 
 def _about(run: RecordedRun, layers: dict[str, np.ndarray], paths: PlacedPaths) -> dict[str, Any]:
-    """What the page's program needs beside numbers of Gaussians."""
+    """Return the data that the page's program needs, beside the attributes of Gaussians."""
     means = layers["mean"].astype(np.float64) if len(layers["mean"]) else run.poses[:, :3, 3]
     low, high = np.percentile(np.concatenate([means, run.poses[:, :3, 3]]), [1, 99], axis=0)
     rotation = view_from_above(run.poses)

@@ -22,7 +22,7 @@ _UPPER = np.triu_indices(3)
 
 
 def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.ndarray]:
-    """What is shown of each confirmed Gaussian, in the order of the map.
+    """Return the attributes of each confirmed Gaussian that the page shows, in the order of the map.
 
     Returns:
         `mean` float32 (n, 3) in metres; `cov` float16 (n, 6), the upper triangle in `COV_UNIT`; `color` uint8 (n, 3);

@@ -88,7 +88,7 @@ def strip(run: RecordedRun, errors: dict[str, np.ndarray]) -> str:
 
 
 def key_of(run: RecordedRun, errors: dict[str, np.ndarray]) -> str:
-    """What the colours mean."""
+    """Return the legend of the colours, in HTML."""
     found = {line["status"] for line in run.frames}
     parts = [(STATUS_COLORS[name], name) for name in STATUS_COLORS if name in found]
     if errors:

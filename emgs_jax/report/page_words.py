@@ -1,4 +1,4 @@
-"""What the page says in words and tables: the verdict, errors, loops, settings, files, licences. All of it escaped."""
+"""Words and tables of the page: verdict, errors, loops, settings, files, licences. All of it escaped."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -82,12 +82,12 @@ def verdict(run: RecordedRun) -> tuple[str, str]:
 
 
 def is_metric(run: RecordedRun) -> bool:
-    """Whether lengths of the map are meant to be metres."""
+    """Test whether lengths of the map are meant to be metres."""
     return provenance.is_metric(run.provenance["prior"].get("settings", {}))
 
 
 def head(run: RecordedRun, again: Repeated) -> str:
-    """What was mapped, by what, how well, and how it is done again."""
+    """Return the head of the page: data and prior, verdict, versions, and the command that repeats the run."""
     block, (level, words) = run.provenance, verdict(run)
     data, prior = block["data"], block["prior"]
     title = f"{data['name']} {data['sequence']}"
@@ -111,7 +111,7 @@ def first_words(title: str, more: str, level: str, words: str, is_simulated: boo
 
 
 def command_line(command: str) -> str:
-    """What is typed to do it again."""
+    """Return the command that repeats the run, in HTML."""
     return f"<p><code>{escape(command)}</code></p>"
 
 
@@ -162,14 +162,14 @@ def loops(run: RecordedRun) -> str:
 
 
 def settings(again: Repeated) -> str:
-    """What differs from the defaults."""
+    """Return the section of the settings that differ from the defaults."""
     rows = [(key, _plain(value), _plain(default)) for key, value, default in again.differences]
     body = table(("setting", "here", "default"), rows) if rows else "<p>None: all settings are the defaults.</p>"
     return section("Settings that differ from the defaults", body)
 
 
 def files(run: RecordedRun, note: str) -> str:
-    """What lies beside the page, and what opens it."""
+    """Return the section of the files beside the page, with the programs that open them."""
     there = [(name, words) for name, words in FILES.items() if name == "report.html" or (run.folder / name).is_file()]
     return section("Files of the run", table(("file", "what it is; what opens it"), there) + quiet(note))
 

@@ -80,7 +80,7 @@ def save_progress(folder: Path, run: MappingRun) -> None:
 
 
 def _complete_lines(path: Path, run: MappingRun) -> None:
-    """What was not known yet as frames.jsonl was written, frame by frame: the first one's error, what is left out."""
+    """Complete frames.jsonl at the end of a run: add the first frame's covariance, mark frames that are left out."""
     if not path.exists() or (run.first_covariance is None and all(r.reason != UNJOINED for r in run.records)):
         return
     lines, records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()], iter(run.records)

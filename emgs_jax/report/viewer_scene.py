@@ -1,4 +1,4 @@
-"""What stands in the viewer's scene: the map, both paths, the cameras; and how it changes as a run goes on."""
+"""Scene of the viewer: the map, both paths, the cameras; and its updates while a run maps."""
 
 from typing import Any
 
@@ -53,7 +53,7 @@ class Scene:
             self.points.colors = colors
 
     def show(self, kind: str, cameras: bool, paths: bool) -> None:
-        """What of it is seen: the map as `Gaussians` or as `points`, cameras, paths."""
+        """Choose what is visible: the map as `Gaussians` or as `points`, cameras, paths."""
         if self.splats is not None:
             self.splats.visible, self.points.visible = kind == "Gaussians", kind == "points"
         for path in filter(None, self.paths):

@@ -43,7 +43,7 @@ class BundleConfig(eqx.Module):
 
 
 class Tracks(eqx.Module):
-    """Where landmarks were seen.
+    """Observations of landmarks in views.
 
     Args:
         pixels: (x, y) of landmark l in view v.
@@ -55,12 +55,12 @@ class Tracks(eqx.Module):
 
 
 class Unknowns(eqx.Module):
-    """What is solved for, beside the points.
+    """Unknowns of the bundle adjustment, beside the points.
 
     Args:
-        free: rows of the views whose pose is not held; v where there are fewer.
-        distortion: of the lens, to begin with, see `undistort`.
-        distortion_std: what it is expected to be; 0 = the tracks are of a pinhole camera.
+        free: rows of the views whose pose is not fixed; v where there are fewer.
+        distortion: of the lens, initial value, see `undistort`.
+        distortion_std: standard deviation of its prior; 0 = the tracks are of a pinhole camera.
     """
 
     free: Int[Array, "f"]
@@ -77,7 +77,7 @@ class Estimate(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What was seen and what is solved for."""
+    """Problem of the bundle adjustment: observations, unknowns, camera and settings."""
 
     tracks: Tracks
     unknowns: Unknowns
@@ -114,7 +114,7 @@ def _loss(estimate: Estimate, problem: Problem) -> Float[Array, ""]:
 
 
 def _columns(unknowns: Unknowns, num_views: int) -> Float[Array, "v 7 u"]:
-    """Where a view's ξ and the lens, which is the last, stand among the unknowns; nowhere where the pose is held."""
+    """Map each view's ξ, and the lens as the last row, to columns of the unknowns; rows of a fixed pose are 0."""
     of_view = (unknowns.free == jnp.arange(num_views)[:, None]).astype(jnp.float32)
     of_poses = jnp.einsum("vf,ab->vafb", of_view, jnp.eye(6)).reshape(num_views, 6, -1)
     return jnp.pad(of_poses, ((0, 0), (0, 1), (0, 1))).at[:, -1, -1].set(1.0)

@@ -1,4 +1,4 @@
-"""How probable it is that a depth is right: its cost curve stands out, and other views say the same.
+"""Probability that a depth is right: the minimum of its cost curve is distinct, and other views confirm it.
 
     p = p_photo(spread) p_geo(agreement)
 

@@ -38,7 +38,7 @@ class DepthConfig(eqx.Module):
 
 
 def _between_planes(total: Float[Array, "h w d"], best: Array) -> Float[Array, "h w"]:
-    """Where between its neighbours the minimum lies, in planes from `best`, by the parabola through the three costs."""
+    """Locate the minimum between planes, as an offset from `best` in planes, by the parabola through three costs."""
     last = total.shape[-1] - 1
     before, at, after = (
         jnp.take_along_axis(total, jnp.clip(best + step, 0, last)[..., None], axis=-1)[..., 0] for step in (-1, 0, 1)
@@ -111,7 +111,7 @@ def agreement(
     camera: Camera,
     config: DepthConfig,
 ) -> Float[Array, "h w"]:
-    """How many other views' depth maps confirm each depth, each by exp(-difference / `depth_step`); 0 without a depth.
+    """Count the other depth maps that confirm each depth, each by exp(-difference / `depth_step`); 0 without a depth.
 
     Args:
         depth: of the view, m; 0 = none.

@@ -34,21 +34,21 @@ jitted_adjust = eqx.filter_jit(adjust)
 
 @dataclass(frozen=True)
 class StructureConfig:
-    """How the structure grows.
+    """Settings of incremental structure from motion.
 
     Args:
         matching: detection, matching and acceptance.
         keys: views that stay when they leave the window.
         bundle: the refinement.
         max_landmarks: that take part in the refinement; those that most views see.
-        num_fixed: at most, the oldest views of a window, which hold the frame and scale of the ones before.
+        num_fixed: at most, the oldest views of a window, which fix the frame and scale of the ones before.
         num_rounds: of refinement; observations that do not fit are dropped after each.
         min_first_parallax_rad: between the rays of the median landmark of the pair of views that a structure begins
             with; with less its depths are noise.
-        distortion_std: what the radial distortion of the lens is expected to be, as k of x (1 + k |x|²) with x on the
-            plane z = 1; it is measured until the first key view goes. 0 = the images have none.
+        distortion_std: prior standard deviation of the lens' radial distortion, as k of x (1 + k |x|²) with x on the
+            plane z = 1; it is measured until the first keyframe goes. 0 = the images have none.
         min_lens_parallax_rad: likewise, between the newest view and the farthest, for the lens to be measured.
-        median_depth: m; what the median landmark of the first view is taken for: images alone do not tell the scale.
+        median_depth: m; assumed depth of the median landmark of the first view: images alone do not tell the scale.
         max_lost: newest views of a window, one after the other, that cannot be placed, from which on they begin a
             structure of their own; what is forgotten then is not found again. inf: never.
     """

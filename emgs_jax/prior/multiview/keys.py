@@ -15,12 +15,12 @@ from emgs_jax.prior.multiview.landmarks import Structure, View, known_common
 
 @dataclass(frozen=True)
 class KeyConfig:
-    """Which views stay.
+    """Selection of keyframes: views that stay when they leave the window.
 
     Args:
         max_keys: beside those of the window; those go first that share least with its newest view. 0: none stays.
-        min_shift: median distance between the images of a landmark in a view and in the key before it, from which on
-            the view is a key, too; as a fraction of the image's width.
+        min_shift: median distance between the images of a landmark in a view and in the keyframe before it, from which
+            on the view is a keyframe, too; as a fraction of the image's width.
     """
 
     max_keys: int = number(low=0, high=1000)

@@ -51,7 +51,7 @@ class MatchingConfig:
 
 @dataclass
 class View:
-    """What is known of one image.
+    """Keypoints of one image and its pose.
 
     Args:
         pixels: (n, 2) float64 of the keypoints, where a pinhole camera sees them.
@@ -83,7 +83,7 @@ class Structure:
     is_lens_known: bool = False
 
     def lens(self) -> Lens:
-        """What the images were taken with."""
+        """Return the lens that the images were taken with."""
         return Lens(self.K.diagonal()[:2], self.K[:2, 2], self.distortion)
 
     def placed(self) -> dict[int, View]:
@@ -91,7 +91,7 @@ class Structure:
         return {frame: view for frame, view in self.views.items() if view.T_ref_view is not None}
 
     def known(self, view: View) -> np.ndarray:
-        """Which keypoints (n,) of a view have a landmark with a position."""
+        """Mark the keypoints (n,) of a view that have a landmark with a position."""
         has = view.landmark >= 0
         has[has] = np.isfinite(self.points[view.landmark[has], 0])
         return has

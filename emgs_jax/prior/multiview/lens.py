@@ -31,7 +31,7 @@ class Lens:
 
 
 def undistort(pixels: Pixels, distortion: float | jax.Array, focal: Pixels, center: Pixels) -> Pixels:
-    """Where a pinhole camera sees what the lens shows at pixels (…, 2), of NumPy or JAX."""
+    """Map pixels (…, 2) of the lens to those of a pinhole camera that sees the same; NumPy or JAX."""
     away = pixels - center
     return pixels + distortion * ((away / focal) ** 2).sum(-1)[..., None] * away
 
@@ -42,7 +42,7 @@ def straight(pixels: Float[np.ndarray, "*b 2"], lens: Lens) -> Float[np.ndarray,
 
 
 def distort(pixels: Float[np.ndarray, "*b 2"], lens: Lens) -> Float[np.ndarray, "*b 2"]:
-    """Where the lens shows what a pinhole camera sees at these pixels: the inverse of `straight`."""
+    """Map pixels of a pinhole camera to those of the lens that show the same: the inverse of `straight`."""
     shown = pixels
     for _ in range(NUM_STEPS):
         shown = shown - (straight(shown, lens) - pixels)
@@ -63,7 +63,7 @@ def rectify(images: Float[np.ndarray, "*b h w"], lens: Lens) -> Float[np.ndarray
 
 
 def as_shown(values: Float[np.ndarray, "h w"], lens: Lens) -> Float[np.ndarray, "h w"]:
-    """What a pinhole camera has at its pixels, at those of the lens: the nearest, 0 where there is none."""
+    """Resample an image of a pinhole camera at the pixels of the lens: the nearest value, 0 where there is none."""
     x, y = np.moveaxis(np.float32(straight(grid(*values.shape), lens)), -1, 0)
     return cv2.remap(values, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
 

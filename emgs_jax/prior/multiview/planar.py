@@ -20,7 +20,7 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class PlanarConfig:
-    """Which regions become planes.
+    """Detection of blank regions of an image that become planes.
 
     Args:
         max_contrast: grey value range, image in [0, 1], of the surroundings of a pixel that is blank.

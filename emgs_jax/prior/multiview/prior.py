@@ -46,16 +46,16 @@ jitted_agreement = eqx.filter_jit(agreement)
 
 @dataclass(frozen=True)
 class DenseConfig:
-    """Which views the depth of a view comes from.
+    """Settings of a view's dense depth: its source views, matching and acceptance.
 
     Args:
         depth: matching and acceptance.
         planar: blank regions that become planes.
-        confidence: how probable a depth is.
+        confidence: probability that a depth is right.
         num_sources: views that it is matched against.
         best_parallax_rad: between the rays of a landmark, beyond which more is no better.
         num_checks: views whose depth is compared with it.
-        min_probability: of a depth that is given.
+        min_probability: of a depth that is predicted.
         depth_margin: the range of depths that is tried goes beyond the landmarks' by this factor.
     """
 
@@ -70,7 +70,7 @@ class DenseConfig:
 
 
 def _values(config: StructureConfig | DenseConfig) -> dict:
-    """What a config was given, as JSON holds it: a device's .1 is .1 again, and infinity is null."""
+    """Return the values of a config as JSON holds them: a device's .1 is .1 again, and infinity is null."""
     given = jax.tree.map(lambda v: float(str(np.float32(v))) if isinstance(v, jax.Array) else v, asdict(config))
     return jsonable(given)
 

@@ -1,4 +1,4 @@
-"""Which other views a view is matched against."""
+"""Choice of the other views that a view is matched against."""
 
 import numpy as np
 from jaxtyping import Float
