@@ -93,8 +93,7 @@ def render_config(run: RecordedRun) -> RenderConfig:
 
 
 def _for_shader(config: RenderConfig) -> dict[str, float]:
-    values = {"blur": config.blur, "radius": config.radius, "opacity": config.opacity}
-    return {name: float(value) for name, value in (values | {"covarianceScale": config.covariance_scale}).items()}
+    return {name: float(getattr(config, name)) for name in ("blur", "radius", "opacity")}
 
 
 def _path_arrays(run: RecordedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:

@@ -21,6 +21,7 @@ from emgs_jax.io.trajectory import from_tum, save_trajectory_tum
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import loop_list, metric_graph
+from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.page_map import feature_colors
 from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, REPORT_FILE, TEXT_FILE
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
@@ -128,10 +129,9 @@ def save_outputs(
     """
     gaussians = jax.device_get(shown := confirmed(run.state.map))
     valid = gaussians.valid
-    # As drawn: the covariances are those that close the surface.
-    covs = gaussians.covs[valid] * float(config.render.covariance_scale)
-    rest = gaussians.colors[valid], float(config.render.opacity), gaussians.normals[valid]
-    save_gaussians_ply(folder / "map.ply", gaussians.means[valid], covs, *rest)
+    means, covs, normals = (values[valid] for values in (gaussians.means, gaussians.covs, gaussians.normals))
+    rest = gaussians.colors[valid], float(config.render.opacity), normals
+    save_gaussians_ply(folder / "map.ply", means, closing_covariances(means, covs, normals), *rest)
     labels = () if dense.labels is None else (dense.labels.labels, dense.labels.classes)
     save_points_ply(folder / "points.ply", dense.cloud.points, dense.cloud.normals, dense.cloud.colors, *labels)
     # matplotlib is slow to import, and the map does not wait for it
