@@ -138,7 +138,8 @@ def save_outputs(
     from emgs_jax.report.overview import Paths, draw_overview
 
     centers = center_cloud(run)
-    no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, centers.colors)
+    colored = dense.cloud.points, dense.cloud.colors
+    no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, colored)
     is_placed = np.array([record.status != "lost" for record in run.records])
     paths = Paths(np.stack(run.poses), is_placed, _placed_truth(run, with_scale), *_moved(run), unit=unit)
     classes = () if dense.labels is None else dense.labels.classes
