@@ -6,6 +6,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.polish.run import SPLATS_FILE, polish
+from emgs_jax.report.page import write_report
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.running.configure import build
 
@@ -20,7 +21,9 @@ def polish_run(config: DictConfig) -> dict[str, Any]:
     if dataset is None:
         raise ValueError(f"{note} They are what splats are fitted to.")
     settings = OmegaConf.create(dict(run.provenance["config"]))
-    return polish(run, dataset, fitting, build(settings, "densify"))
+    found = polish(run, dataset, fitting, build(settings, "densify"))
+    write_report(run, dataset)
+    return found
 
 
 @command("polish", positional)

@@ -24,6 +24,17 @@ STEEPEST = 0.3  # cosine; surfaces seen at a more grazing angle begin with splat
 
 
 @dataclass(frozen=True)
+class Rates:
+    """Adam's learning rate of each part of `Appearance`."""
+
+    colors: float = number(low=0, high=10)
+    logit: float = number(low=0, high=10)
+    log_std: float = number(low=0, high=10)
+    turn: float = number(low=0, high=10)
+    shift: float = number(low=0, high=10)
+
+
+@dataclass(frozen=True)
 class PolishConfig:
     """How splats are made and fitted.
 
@@ -40,9 +51,9 @@ class PolishConfig:
         loss: its weights.
     """
 
-    rates: Appearance
+    rates: Rates
     loss: LossConfig
-    pixels_per_splat: float = number(low=0.25, high=10_000)
+    pixels_per_splat: int = number(low=1, high=10_000)
     held_out_every: int = number(low=2, high=1_000_000)
     steps: int = number(low=0, high=10_000_000)
     final_rate: float = number(low=1e-6, high=1)
@@ -144,8 +155,11 @@ def fit(
     def step(fitted: Appearance, moments, anchors: Anchors, target: Float[Array, "h w 4"], T: jaxlie.SE3, decay: Array):
         (_, error), slope = jax.value_and_grad(loss, has_aux=True)(fitted, anchors, target, T, camera, config.loss)
         change, moments = adam.update(slope, moments)
-        fitted = jax.tree.map(lambda x, d, rate: x - decay * rate * d, fitted, change, config.rates)
-        return fitted, moments, error
+        parts = {
+            name: getattr(fitted, name) - decay * rate * getattr(change, name)
+            for name, rate in vars(config.rates).items()
+        }
+        return Appearance(**parts), moments, error
 
     first, (fitted, moments) = _read(path, (fitted, moments))
     for number_ in range(first, config.steps):

@@ -22,10 +22,10 @@ from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.polish.fit import PolishConfig, Seeds, fit, is_held_out, without_transparent
 from emgs_jax.polish.splats import draw, gaussians_of, ssim
 from emgs_jax.render.densify import DensifyConfig, densify
-from emgs_jax.report.recorded_run import RecordedRun
+from emgs_jax.report.recorded_run import POLISH, RecordedRun
 from emgs_jax.running.convert import to_se3
 
-SPLATS_FILE, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE = "splats.ply", "polish.json", "polish.png", "polish.npz"
+SPLATS_FILE, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE = POLISH
 MAX_PICTURES = 4
 _densify, _ssim = jax.jit(densify), jax.jit(ssim)
 

@@ -32,7 +32,7 @@ class Anchors(eqx.Module):
 
 
 class Appearance(eqx.Module):
-    """What is fitted of every splat; also the learning rates, one number each.
+    """What is fitted of every splat.
 
     Args:
         colors: RGB.
@@ -42,11 +42,11 @@ class Appearance(eqx.Module):
         shift: along the normal, `noise` · tanh of it.
     """
 
-    colors: Float[Array, "*n c"]
-    logit: Float[Array, "*n"]
-    log_std: Float[Array, "*n s"]
-    turn: Float[Array, "*n t"]
-    shift: Float[Array, "*n"]
+    colors: Float[Array, "n 3"]
+    logit: Float[Array, "n"]
+    log_std: Float[Array, "n 2"]
+    turn: Float[Array, "n 3"]
+    shift: Float[Array, "n"]
 
 
 class LossConfig(eqx.Module):

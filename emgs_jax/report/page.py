@@ -159,6 +159,7 @@ def _page(run: RecordedRun, paths: PlacedPaths, views: Views, about: dict[str, A
         "strip": strip(run, paths.errors),
         "key": key_of(run, paths.errors),
         "sections": page_words.errors(run)
+        + page_words.polished(run)
         + page_words.loops(run)
         + page_words.settings(again)
         + page_words.files(run, note),

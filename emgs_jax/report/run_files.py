@@ -23,7 +23,7 @@ from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import loop_list, metric_graph
 from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.page_map import feature_colors
-from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, REPORT_FILE, TEXT_FILE
+from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, POLISH, REPORT_FILE, TEXT_FILE
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.first_frame import seen_from
@@ -36,6 +36,7 @@ OUTPUTS = (
     *("map.npz", "places.npz", "map.ply", "points.ply", "mesh.ply", "overview.png", TEXT_FILE, REPORT_FILE),
     *(CHECKPOINT_FILE, "query.json", "query.png", "semantic.npz", "semantic.ply", "features.png", "labels"),
     *EXPORTS,
+    *POLISH,
 )
 
 
