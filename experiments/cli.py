@@ -14,6 +14,10 @@ COMMANDS = {  # name: (what it does, an example)
     "tune": ("a search for better settings", "emgs tune tune=gates experiment=smoke 'held_out={other:{prior.seed:3}}'"),
     "effects": ("what each value of sweeps changes", "emgs effects folder=multirun/sweep"),
     "report": ("write the page of a finished run anew", "emgs report outputs/synthetic/2026-01-31_12-00-00"),
+    "polish": (
+        "sharp splats fitted to the images of a finished run",
+        "emgs polish outputs/synthetic/2026-01-31_12-00-00",
+    ),
     "view": ("look at a finished run in the browser", "emgs view outputs/synthetic/2026-01-31_12-00-00"),
     "export": ("a run for COLMAP, nerfstudio and others", "emgs export outputs/… 'formats=[colmap,frustums]'"),
     "predict": ("record what a prior says of a sequence", "emgs predict dataset=… prior=mapanything out=predictions"),

@@ -11,15 +11,19 @@ from emgs_jax.io.ply import structured, with_colors, write_ply
 
 
 def save_mesh_ply(
-    path: str | os.PathLike, points: Any, normals: Any, colors: Any, depth: int = 8, min_points: int = 50
+    path: str | os.PathLike, points: Any, normals: Any, colored: tuple[Any, Any], depth: int = 8, min_points: int = 50
 ) -> str | None:
     """Mesh oriented points (Poisson, trimmed where points are far) and write it; deterministic.
 
+    Args:
+        points: (n, 3), with `normals` (n, 3) that are unit.
+        colored: points (m, 3) and their RGB in [0, 1], (m, 3): a vertex has the colour of the nearest one.
+
     Returns None, or the reason why there is no mesh; then no file is written and an older one is removed.
     """
-    points, normals, colors = (np.asarray(value, np.float64) for value in (points, normals, colors))
+    points, normals = (np.asarray(value, np.float64) for value in (points, normals))
     keep = np.isfinite(points).all(1) & np.isfinite(normals).all(1) & (np.linalg.norm(normals, axis=1) > 0.5)
-    points, normals, colors = points[keep], normals[keep], colors[keep]
+    points, normals = points[keep], normals[keep]
     reason = None
     if len(points) < min_points:
         reason = f"{len(points)} points with a normal, at least {min_points} are needed for a mesh"
@@ -31,8 +35,8 @@ def save_mesh_ply(
     if reason is not None:
         Path(path).unlink(missing_ok=True)
         return reason
-    nearest = tree.query(vertices)[1]
-    write_ply(path, with_colors(structured(vertices.astype(np.float32), ["x", "y", "z"]), colors[nearest]), faces)
+    colors = np.asarray(colored[1])[cKDTree(colored[0]).query(vertices)[1]]
+    write_ply(path, with_colors(structured(vertices.astype(np.float32), ["x", "y", "z"]), colors), faces)
     return None
 
 

@@ -72,7 +72,8 @@ def splat_alpha(splats: Splats, pixels: Float[Array, "*p q 2"], config: RenderCo
     dx, dy = _offsets(splats, pixels)
     a, b, c = (splats.precisions[..., i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     distance_sq = a * dx**2 + 2.0 * b * dx * dy + c * dy**2
-    return jnp.where(distance_sq <= config.radius**2, config.opacity * jnp.exp(-0.5 * distance_sq), 0.0)
+    opacity = config.opacity * splats.opacity[..., None]
+    return jnp.where(distance_sq <= config.radius**2, opacity * jnp.exp(-0.5 * distance_sq), 0.0)
 
 
 def splat_depth(splats: Splats, pixels: Float[Array, "*p q 2"], config: RenderConfig) -> Float[Array, "*c q"]:

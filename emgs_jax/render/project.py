@@ -34,6 +34,7 @@ class Splats(eqx.Module):
     inverse_depth: Float[Array, "n"]  # 1/m
     depth_slope: Float[Array, "n 2"]  # 1/m per pixel
     valid: Bool[Array, "n"]  # in front of the camera, and seen from the side to which the normal points
+    opacity: Float[Array, "n"]  # times that of the drawing, at its centre
 
 
 @full_precision
@@ -86,4 +87,5 @@ def project_gaussians(
         inverse_depth=1.0 / z,
         depth_slope=jnp.where((is_flat & is_in_front)[:, None], slope, 0.0),
         valid=is_in_front & (z > NEAREST_STD * depth_std) & (facing <= limit),
+        opacity=jnp.ones_like(z),
     )

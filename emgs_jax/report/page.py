@@ -93,8 +93,7 @@ def render_config(run: RecordedRun) -> RenderConfig:
 
 
 def _for_shader(config: RenderConfig) -> dict[str, float]:
-    values = {"blur": config.blur, "radius": config.radius, "opacity": config.opacity}
-    return {name: float(value) for name, value in (values | {"covarianceScale": config.covariance_scale}).items()}
+    return {name: float(getattr(config, name)) for name in ("blur", "radius", "opacity")}
 
 
 def _path_arrays(run: RecordedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
@@ -160,6 +159,7 @@ def _page(run: RecordedRun, paths: PlacedPaths, views: Views, about: dict[str, A
         "strip": strip(run, paths.errors),
         "key": key_of(run, paths.errors),
         "sections": page_words.errors(run)
+        + page_words.polished(run)
         + page_words.loops(run)
         + page_words.settings(again)
         + page_words.files(run, note),

@@ -11,6 +11,7 @@ import numpy as np
 
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.gaussian_map import GaussianMap, confirmed
+from emgs_jax.report.display import closing_covariances
 from emgs_jax.running.convert import on_device
 from emgs_jax.running.executables import stored
 from emgs_jax.semantics import principal_colors, similarities
@@ -25,19 +26,20 @@ def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.nd
     """Return the attributes of each confirmed Gaussian that the page shows, in the order of the map.
 
     Returns:
-        `mean` float32 (n, 3) in metres; `cov` float16 (n, 6), the upper triangle in `COV_UNIT`; `color` uint8 (n, 3);
-        `normal` int8 (n, 3), 127 = 1; `existence` uint8, the probability that it stands for something, 255 = 1;
-        `updates` uint16; `birth` int32, the node of its first frame. With text, `label` int16, -1 = none, and
-        `similarity` uint8 (n, c): the cosine with each class, 255 = 1, what is negative is 0.
+        `mean` float32 (n, 3) in metres; `cov` float16 (n, 6), the upper triangle of `closing_covariances` in
+        `COV_UNIT`; `color` uint8 (n, 3); `normal` int8 (n, 3), 127 = 1; `existence` uint8, the probability that it
+        stands for something, 255 = 1; `updates` uint16; `birth` int32, the node of its first frame. With text, `label`
+        int16, -1 = none, and `similarity` uint8 (n, c): the cosine with each class, 255 = 1, what is negative is 0.
     """
     gaussians = jax.device_get(confirmed(map))
     rows = np.flatnonzero(gaussians.valid)
-    covs = np.asarray(gaussians.covs)[rows][:, _UPPER[0], _UPPER[1]] / COV_UNIT
+    means, covs, normals = (np.asarray(x)[rows] for x in (gaussians.means, gaussians.covs, gaussians.normals))
+    covs = closing_covariances(means, covs, normals)[:, _UPPER[0], _UPPER[1]] / COV_UNIT
     layers = {
-        "mean": np.asarray(gaussians.means, np.float32)[rows],
+        "mean": means.astype(np.float32),
         "cov": np.clip(covs, -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16),
         "color": _bytes(np.asarray(gaussians.colors)[rows]),
-        "normal": np.rint(127 * np.asarray(gaussians.normals)[rows]).astype(np.int8),
+        "normal": np.rint(127 * normals).astype(np.int8),
         "existence": _bytes(1.0 / (1.0 + np.exp(-np.asarray(map.existence, np.float64)[rows]))),
         "updates": np.minimum(np.asarray(map.num_updates)[rows], 65535).astype(np.uint16),
         "birth": np.asarray(map.birth)[rows].astype(np.int32),

@@ -1,5 +1,6 @@
 """Words and tables of the page: verdict, errors, loops, settings, files, licences. All of it escaped."""
 
+import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
@@ -9,7 +10,7 @@ from emgs_jax.report import provenance
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Column, cell
 from emgs_jax.report.page_strip import loop_why, loop_words
 from emgs_jax.report.provenance import RAW_PRIOR, ROWS
-from emgs_jax.report.recorded_run import RecordedRun
+from emgs_jax.report.recorded_run import POLISH, RecordedRun
 from emgs_jax.report.repeat import Repeated
 
 MANY_LOST = 0.1  # share of the frames
@@ -29,8 +30,17 @@ FILES = {
     "map.ply": "the Gaussians as 3D Gaussian splatting has them; splat-transform, rerun",
     "points.ply": "a dense cloud with normals, colours and labels; MeshLab, CloudCompare, Open3D",
     "mesh.ply": "a mesh from centres and normals; MeshLab, CloudCompare, Open3D",
+    "splats.ply": "splats fitted to the images (emgs polish), standard 3DGS; SuperSplat, gsplat, nerfstudio",
+    "polish.png": "frames that were held out: image, map, splats; any viewer of images",
+    "polish.json": "PSNR, SSIM and depth errors of those before and after; any editor",
     "cameras.ply": "every camera in the colour of its status, and the path, as a mesh; MeshLab, CloudCompare",
 }
+POLISHED = (  # key of polish.json, words, digits
+    ("psnr_db", "PSNR, dB", 2),
+    ("ssim", "SSIM", 3),
+    ("depth_within_5_percent", "depth within 5 %, %", 1),
+    ("depth_l1_m", "depth L1, m", 3),
+)
 _OWN = "made by this program, Apache-2.0"
 DATA_LICENCES = {
     "synthetic": _OWN,
@@ -166,6 +176,25 @@ def settings(again: Repeated) -> str:
     rows = [(key, _plain(value), _plain(default)) for key, value, default in again.differences]
     body = table(("setting", "here", "default"), rows) if rows else "<p>None: all settings are the defaults.</p>"
     return section("Settings that differ from the defaults", body)
+
+
+def polished(run: RecordedRun) -> str:
+    """What `emgs polish` has changed on the frames that it held out; nothing where it was not run."""
+    path = run.folder / POLISH[1]
+    if not path.is_file():
+        return ""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        count, held = (int(found[f"polish/{name}"]) for name in ("num_splats", "num_held_out"))
+        rows = [
+            (words, *(f"{float(found[f'polish/{when}_{name}']):.{digits}f}" for when in ("before", "after")))
+            for name, words, digits in POLISHED
+            if found.get(f"polish/before_{name}") is not None
+        ]
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path} is not what emgs polish writes ({error!r}): polish again") from error
+    words = f"{count:,} splats; the {held} frames that are compared were not fitted."
+    return section("Polished", table(("held-out frames", "map", "splats"), rows) + quiet(words))
 
 
 def files(run: RecordedRun, note: str) -> str:

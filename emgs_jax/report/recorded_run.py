@@ -20,6 +20,7 @@ TEXT_FILE = "text.npz"  # classes of a map with features, in the format of `expe
 LOOPS_FILE = "loops.json"
 REPORT_FILE = "report.html"
 FRAMES_FILE = "frames.jsonl"
+POLISH = ("splats.ply", "polish.json", "polish.png", "polish.npz")  # of `experiments.polish`
 EXPORTS = ("colmap", "nerfstudio", "cameras.ply", "scaled")  # what `experiments.export` writes beside them
 _POSES = ("raw_pose", "true_pose")
 _PROVENANCE = {  # what of `provenance.provenance` is read again, by dotted key

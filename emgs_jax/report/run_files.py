@@ -21,8 +21,9 @@ from emgs_jax.io.trajectory import from_tum, save_trajectory_tum
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import loop_list, metric_graph
+from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.page_map import feature_colors
-from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, REPORT_FILE, TEXT_FILE
+from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, POLISH, REPORT_FILE, TEXT_FILE
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.first_frame import seen_from
@@ -35,6 +36,7 @@ OUTPUTS = (
     *("map.npz", "places.npz", "map.ply", "points.ply", "mesh.ply", "overview.png", TEXT_FILE, REPORT_FILE),
     *(CHECKPOINT_FILE, "query.json", "query.png", "semantic.npz", "semantic.ply", "features.png", "labels"),
     *EXPORTS,
+    *POLISH,
 )
 
 
@@ -128,17 +130,17 @@ def save_outputs(
     """
     gaussians = jax.device_get(shown := confirmed(run.state.map))
     valid = gaussians.valid
-    # As drawn: the covariances are those that close the surface.
-    covs = gaussians.covs[valid] * float(config.render.covariance_scale)
-    rest = gaussians.colors[valid], float(config.render.opacity), gaussians.normals[valid]
-    save_gaussians_ply(folder / "map.ply", gaussians.means[valid], covs, *rest)
+    means, covs, normals = (values[valid] for values in (gaussians.means, gaussians.covs, gaussians.normals))
+    rest = gaussians.colors[valid], float(config.render.opacity), normals
+    save_gaussians_ply(folder / "map.ply", means, closing_covariances(means, covs, normals), *rest)
     labels = () if dense.labels is None else (dense.labels.labels, dense.labels.classes)
     save_points_ply(folder / "points.ply", dense.cloud.points, dense.cloud.normals, dense.cloud.colors, *labels)
     # matplotlib is slow to import, and the map does not wait for it
     from emgs_jax.report.overview import Paths, draw_overview
 
     centers = center_cloud(run)
-    no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, centers.colors)
+    colored = dense.cloud.points, dense.cloud.colors
+    no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, colored)
     is_placed = np.array([record.status != "lost" for record in run.records])
     paths = Paths(np.stack(run.poses), is_placed, _placed_truth(run, with_scale), *_moved(run), unit=unit)
     classes = () if dense.labels is None else dense.labels.classes

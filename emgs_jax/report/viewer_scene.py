@@ -34,7 +34,7 @@ class Scene:
 
     def draw(self, run: Shown, colors: np.ndarray) -> None:
         """Show a run that has frames, in the place of what stands there, with colours (n, 3) of its Gaussians."""
-        self.covs = covariances(run.layers) * float(run.render.covariance_scale)
+        self.covs = covariances(run.layers)
         self._draw_map(run, colors)
         self.paths = [
             self._path("/our path", run.poses[:, :3, 3], run.is_placed, OURS),

@@ -29,7 +29,7 @@ class DenseMap:
     """The map as points.
 
     Args:
-        cloud: a point per pixel of every frame whose pose is known, averaged per voxel.
+        cloud: a point per pixel of every frame whose pose is known, averaged per voxel, in the colours of the images.
         labels: class of each of its points; None without classes.
         pictures: what the overview shows of some frames.
         rendering: `rendering_metrics` of the views that the cloud is made from; empty without truth.
@@ -54,7 +54,7 @@ def dense_map(
 
     Args:
         run: finished.
-        dataset: for the images in the pictures, and the truth.
+        dataset: for the images, and the truth.
         config: what becomes a point.
         evaluation: points of one of its voxels, of the truth where that is known, are averaged, and views are
             compared with the truth under it.
@@ -84,7 +84,9 @@ def dense_map(
                 scale = run.records[row].scale  # the map's unit is that of the first frames
                 own = depths[row] * (1.0 if scale is None else scale)
                 points, valid = at_own_depth(view, own, run.poses[row][:3, 3], float(config.surface_depth))
-            yield PointCloud(*(rows[valid].astype(np.float64) for rows in (points, view.normals, view.colors)))
+            # A voxel's colour is the mean of all pixels that see it: those of near and frontal views are most of them.
+            seen = dataset[row].image[valid] / 255.0
+            yield PointCloud(*(rows[valid].astype(np.float64) for rows in (points, view.normals)), seen)
 
     cloud = fuse_clouds(clouds(), _voxel(with_truth(run, run.poses), evaluation))
     points = cloud.points

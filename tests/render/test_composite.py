@@ -118,7 +118,7 @@ def test_a_steep_plane_is_drawn_no_farther_and_no_nearer_than_its_gaussian_reach
     inverse, slope = 1.0 / depth, np.float32([[0.1, 0.0], [0.5, 0.0], [0.0, -0.4]])
     shape = np.zeros((3, 2)), *[np.tile(np.eye(2), (3, 1, 1))] * 2
     pixels = np.stack(np.meshgrid(*[np.arange(-6, 7)] * 2), axis=-1).reshape(-1, 2).astype(np.float32)
-    splats = Splats(*(sc.device(x) for x in (*shape, depth, std, inverse, slope, depth > 0)))
+    splats = Splats(*(sc.device(x) for x in (*shape, depth, std, inverse, slope, depth > 0, np.ones_like(depth))))
     found = sc.on_host(splat_depth)(splats, pixels, render_config)
     inverse = inverse[:, None] + slope.astype(float) @ pixels.T
     plane = 1.0 / np.where(inverse > 0, inverse, 1e-9)  # beyond its horizon it is infinitely far

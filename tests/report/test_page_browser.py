@@ -3,6 +3,7 @@
 import base64
 import io
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from written_run import INTRINSICS, SIZE, written_run
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import render
+from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.page import render_config, write_report
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.running.convert import to_se3
@@ -76,6 +78,8 @@ def drawn_by_the_page(page, row: int, size, intrinsics) -> np.ndarray:
 
 def drawn_by_us(run, row: int, size, intrinsics) -> np.ndarray:
     gaussians, camera = confirmed(run.map), Camera(intrinsics[:2], intrinsics[2:], *size)
+    closed = closing_covariances(gaussians.means, gaussians.covs, gaussians.normals)  # all rows of this map are in use
+    gaussians = eqx.tree_at(lambda g: g.covs, gaussians, closed.astype(np.float32))
     drawing = jax.device_get(render(gaussians, gaussians.colors, to_se3(run.poses[row]), camera, render_config(run)))
     return np.asarray(drawing.values) + (1 - np.asarray(drawing.alpha)[..., None]) * BACKGROUND
 

@@ -12,6 +12,7 @@ from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.io.map_file import load_map_npz
 from emgs_jax.io.trajectory import load_trajectory_tum
+from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.run_files import OUTPUTS, claim_folder, save_outputs, save_progress
 from emgs_jax.running.dense import DenseMap
 
@@ -41,7 +42,7 @@ def written(tmp_path_factory):
     """A run whose outputs and progress are written, and their folder; the first frame's true pose is unknown."""
     folder, truth = tmp_path_factory.mktemp("run"), poses_along(np.linspace(0.0, 1.0, NUM_FRAMES) + 0.3)
     run = finished([None, *truth[1:]])
-    config = densify_config("render.covariance_scale=2.25", "render.opacity=0.75")
+    config = densify_config("render.opacity=0.75")
     assert save_outputs(folder, run, dense_map(), config, "a wall", True) == []
     save_progress(folder, run)
     return run, folder
@@ -67,7 +68,7 @@ def test_before_there_is_a_map_nothing_is_written(tmp_path):
 
 
 def test_map_ply_holds_the_gaussians_in_use_as_they_are_drawn(written):
-    """The covariances are those that close the surface, the opacity is the drawing's."""
+    """The covariances are those that close the surface and stay as thick, the opacity is the drawing's."""
     run, folder = written
     gaussians = run.state.map.gaussians
     valid = np.asarray(gaussians.valid)
@@ -76,8 +77,9 @@ def test_map_ply_holds_the_gaussians_in_use_as_they_are_drawn(written):
     found = np.stack([np.ravel(rows[axis]) for axis in "xyz"], axis=1)
     np.testing.assert_array_equal(found, np.asarray(gaussians.means)[valid])
     scales = np.sort(np.stack([np.ravel(rows[f"scale_{i}"]) for i in range(3)], axis=1))
-    std = 1.5 * np.sqrt([1e-4, 4e-3, 4e-3])
-    np.testing.assert_allclose(np.exp(scales), np.broadcast_to(std, scales.shape), rtol=1e-5)
+    covs = closing_covariances(*(np.asarray(x)[valid] for x in (gaussians.means, gaussians.covs, gaussians.normals)))
+    np.testing.assert_allclose(np.exp(scales), np.sqrt(np.linalg.eigvalsh(covs)), rtol=1e-5)
+    np.testing.assert_allclose(np.exp(scales[:, 0]), 1e-2, rtol=1e-5)
     np.testing.assert_allclose(1 / (1 + np.exp(-np.ravel(rows["opacity"]))), 0.75, rtol=1e-6)
     np.testing.assert_array_equal(np.ravel(rows["nz"]), -1.0)
     red = 0.5 + 0.28209479177387814 * np.ravel(rows["f_dc_0"])

@@ -86,7 +86,9 @@ def test_a_ply_keeps_labels_comments_and_triangles(run, tmp_path):
     head = before.read_bytes().split(b"end_header")[0]
     assert b"comment label 1 sofa" in head and target.read_bytes().split(b"end_header")[0] == head
     grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3) / 20
-    assert save_mesh_ply(tmp_path / "m.ply", grid, np.tile([0.0, 0, 1], (400, 1)), np.full((400, 3), 0.5)) is None
+    assert (
+        save_mesh_ply(tmp_path / "m.ply", grid, np.tile([0.0, 0, 1], (400, 1)), (grid, np.full((400, 3), 0.5))) is None
+    )
     scale_ply(tmp_path / "m.ply", tmp_path / "m2.ply", 2.0)
     faces = [path.read_bytes()[-130:] for path in (tmp_path / "m.ply", tmp_path / "m2.ply")]
     assert faces[0] == faces[1]

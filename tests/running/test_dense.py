@@ -56,12 +56,13 @@ def test_every_frame_that_is_not_lost_adds_what_its_own_pose_sees_of_the_map(den
     assert seen["lost"] == 0
 
 
-def test_the_points_are_the_walls_with_its_normals_and_colours(dense):
+def test_the_points_are_the_walls_with_its_normals_and_the_images_colours(dense):
+    """An image has the number of its frame as its colour, and no point is seen by two of them."""
     points, normals, colors = dense.cloud.points, dense.cloud.normals, dense.cloud.colors
     np.testing.assert_allclose(points[:, 2], 2.0, atol=2e-3)  # a pixel's mean depth, of float32 at 2 m
     np.testing.assert_allclose(normals, np.broadcast_to([0.0, 0.0, -1.0], normals.shape), atol=1e-5)
-    np.testing.assert_allclose(20.0 * colors[:, 0], points[:, 0], atol=0.1)  # the spacing of the Gaussians
-    np.testing.assert_allclose(colors[:, 1:], np.broadcast_to([0.25, 0.5], (len(colors), 2)), atol=1e-5)
+    number = np.abs(points[:, :1] - XS).argmin(axis=1)
+    np.testing.assert_allclose(255.0 * colors, np.broadcast_to(number[:, None], colors.shape), atol=1e-9)
 
 
 def test_pictures_are_of_frames_spread_evenly_over_those_that_are_not_lost(dense):

@@ -131,7 +131,7 @@ class SplatRenderer {
     gl.uniform2fv(this.place("focal"), lens.focal);
     gl.uniform2fv(this.place("center"), lens.center);
     gl.uniform2f(this.place("size"), width, height);
-    gl.uniform1f(this.place("covScale"), covUnit * render.covarianceScale * step);
+    gl.uniform1f(this.place("covScale"), covUnit * step);
     for (const name of ["blur", "radius", "opacity"]) gl.uniform1f(this.place(name), render[name]);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, number);
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits, so that time can be taken

@@ -1,0 +1,136 @@
+"""Flat splats on the map's surface, what of them is fitted, and by which loss."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Float
+
+from emgs_jax.gaussians import Gaussians
+from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.precision import full_precision
+from emgs_jax.ops.pytree import traced
+from emgs_jax.render.composite import RenderConfig, Rendering, render_splats, splats_of
+
+FLATNESS = 0.1  # thickness of a splat as a share of its smaller width where it begins
+
+
+class Anchors(eqx.Module):
+    """Where splats begin, which is not fitted.
+
+    Args:
+        means: m, world.
+        axes: columns are the two directions along the surface and the normal.
+        std: m, along the first two.
+        noise: m; a mean may leave the surface by so much, the map's own standard deviation along the normal.
+    """
+
+    means: Float[Array, "n 3"]
+    axes: Float[Array, "n 3 3"]
+    std: Float[Array, "n 2"]
+    noise: Float[Array, "n"]
+
+
+class Appearance(eqx.Module):
+    """What is fitted of every splat.
+
+    Args:
+        colors: RGB.
+        logit: of the opacity.
+        log_std: logarithm of the factor on the anchor's widths.
+        turn: of the anchor's axes, in those axes, a rotation vector (rad).
+        shift: along the normal, `noise` · tanh of it.
+    """
+
+    colors: Float[Array, "n 3"]
+    logit: Float[Array, "n"]
+    log_std: Float[Array, "n 2"]
+    turn: Float[Array, "n 3"]
+    shift: Float[Array, "n"]
+
+
+class LossConfig(eqx.Module):
+    """Weights of the loss, and how splats are drawn.
+
+    Args:
+        dssim: share of D-SSIM in the photometric term, the rest is L1 (Kerbl et al. 2023: .2).
+        depth: of the relative difference to the map's depth.
+        normal: of 1 - cos between normals of splats and those of the map.
+        render: how splats are drawn; its opacity is that of a splat with opacity 1.
+    """
+
+    dssim: Float[Array, "*b"] = traced(low=0, high=1)
+    depth: Float[Array, "*b"] = traced(low=0)
+    normal: Float[Array, "*b"] = traced(low=0)
+    render: RenderConfig
+
+
+def initial(colors: Float[Array, "n 3"], opacity: Float[Array, ""]) -> Appearance:
+    """Splats as their anchors are, in these colours."""
+    count = colors.shape[0]
+    logit = jnp.full(count, jnp.log(opacity / (1.0 - opacity)))
+    return Appearance(colors, logit, jnp.zeros((count, 2)), jnp.zeros((count, 3)), jnp.zeros(count))
+
+
+def gaussians_of(anchors: Anchors, fitted: Appearance) -> tuple[Gaussians, Float[Array, "n"]]:
+    """Flat Gaussians of the world, without features, and their opacities in (0, 1)."""
+    axes = anchors.axes @ jaxlie.SO3.exp(fitted.turn).as_matrix()
+    thickness = FLATNESS * jnp.min(anchors.std, axis=-1, keepdims=True)
+    std = jnp.concatenate([anchors.std * jnp.exp(fitted.log_std), thickness], axis=-1)
+    scaled = axes * std[:, None]
+    means = anchors.means + (anchors.noise * jnp.tanh(fitted.shift))[:, None] * anchors.axes[..., 2]
+    count = means.shape[0]
+    covs, features = jnp.einsum("nik,njk->nij", scaled, scaled), jnp.zeros((count, 0))
+    gaussians = Gaussians(means, covs, fitted.colors, axes[..., 2], features, jnp.ones(count, bool))
+    return gaussians, jax.nn.sigmoid(fitted.logit)
+
+
+@full_precision
+def draw(
+    gaussians: Gaussians, opacity: Float[Array, "n"], T: jaxlie.SE3, camera: Camera, config: RenderConfig
+) -> Rendering:
+    """Colours of Gaussians with an opacity each, over black, from T_world_camera."""
+    splats = splats_of(gaussians, T, camera, config)
+    splats = eqx.tree_at(lambda s: s.opacity, splats, opacity)
+    return render_splats(splats, gaussians.colors, camera, config)
+
+
+def loss(
+    fitted: Appearance, anchors: Anchors, target: Float[Array, "h w 4"], T: jaxlie.SE3, camera: Camera, c: LossConfig
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Photometric loss of 3DGS with depth and normals of the map as terms; and the mean squared error of the colours.
+
+    Args:
+        target: RGB of the image and the map's depth (m), 0 where it has none: such pixels count in no term.
+    """
+    gaussians, opacity = gaussians_of(anchors, fitted)
+    drawn = draw(gaussians, opacity, T, camera, c.render)
+    image, depth = target[..., :3], target[..., 3]
+    is_seen = depth > 0
+    count = jnp.maximum(jnp.sum(is_seen), 1)
+    found = jnp.where(is_seen[..., None], drawn.values, image)
+    photometric = (1.0 - c.dssim) * jnp.sum(jnp.abs(found - image)) / (3 * count)
+    photometric += c.dssim * 0.5 * (1.0 - ssim(found, image))
+    has_both = is_seen & (drawn.depth > 0)
+    off = jnp.where(has_both, jnp.abs(drawn.depth - depth) / jnp.where(is_seen, depth, 1.0), 0.0)
+    tilt = 1.0 - jnp.sum(gaussians.normals * anchors.axes[..., 2], axis=-1)
+    total = photometric + c.depth * jnp.sum(off) / count + c.normal * jnp.mean(tilt)
+    return total, jnp.sum((found - image) ** 2) / (3 * count)
+
+
+def ssim(a: Float[Array, "h w c"], b: Float[Array, "h w c"]) -> Float[Array, ""]:
+    """Mean structural similarity, window of 11 pixels with σ = 1.5, zero outside (Wang et al. 2004; as 3DGS)."""
+    rows, columns = (_window(side) for side in a.shape[:2])
+    planes = jnp.concatenate([a, b, a * a, b * b, a * b], axis=-1)
+    blurred = jnp.einsum("yi,xj,ijc->yxc", rows, columns, planes)
+    mean_a, mean_b, aa, bb, ab = jnp.split(blurred, 5, axis=-1)
+    luminance = (2.0 * mean_a * mean_b + 0.01**2) / (mean_a**2 + mean_b**2 + 0.01**2)
+    variances = (aa - mean_a**2) + (bb - mean_b**2)
+    return jnp.mean(luminance * (2.0 * (ab - mean_a * mean_b) + 0.03**2) / (variances + 0.03**2))
+
+
+def _window(side: int) -> Float[Array, "s s"]:
+    """The blur along one axis as a matrix: two products instead of a convolution."""
+    offsets = jnp.arange(side)[:, None] - jnp.arange(side)
+    weights = jnp.exp(-0.5 * jnp.arange(-5.0, 6.0) ** 2 / 1.5**2)
+    return jnp.where(jnp.abs(offsets) <= 5, jnp.exp(-0.5 * offsets**2 / 1.5**2) / jnp.sum(weights), 0.0)

@@ -1,0 +1,41 @@
+"""Sharp splats for a finished run: `python -m experiments.polish FOLDER`; splats.ply, polish.json and polish.png."""
+
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from emgs_jax.polish.run import SPLATS_FILE, polish
+from emgs_jax.report.page import write_report
+from emgs_jax.report.recorded_run import read_run
+from emgs_jax.running.configure import build
+
+from .command import command
+from .report import images_of, positional
+
+
+def polish_run(config: DictConfig) -> dict[str, Any]:
+    """Fit splats to the images of `config.folder`; returns what polish.json says."""
+    fitting, run = build(config, "polish"), read_run(Path(str(config.folder)))
+    dataset, note = images_of(run)
+    if dataset is None:
+        raise ValueError(f"{note} They are what splats are fitted to.")
+    settings = OmegaConf.create(dict(run.provenance["config"]))
+    found = polish(run, dataset, fitting, build(settings, "densify"))
+    write_report(run, dataset)
+    return found
+
+
+@command("polish", positional)
+def main(config: DictConfig) -> None:
+    """Polish, and say what it has changed on the frames that were held out."""
+    found = polish_run(config)
+    for name in ("psnr_db", "ssim", "depth_within_5_percent", "depth_l1_m"):
+        before, after = (found.get(f"polish/{when}_{name}") for when in ("before", "after"))
+        if before is not None and after is not None:
+            print(f"{name:24} {before:8.4g} → {after:.4g}")
+    print(f"{found['polish/num_splats']:,} splats are in {config.folder}/{SPLATS_FILE}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,193 @@
+"""Polishing; oracles: finite differences, known splats, images that must not count, a fit that nobody stopped."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+import scene as sc
+from omegaconf import OmegaConf
+
+from emgs_jax.data.spool import Spool
+from emgs_jax.ops.camera import Camera
+from emgs_jax.polish.fit import Rates, fit, is_held_out
+from emgs_jax.polish.run import polish
+from emgs_jax.polish.splats import Anchors, Appearance, draw, gaussians_of, initial, loss, ssim
+from emgs_jax.report.recorded_run import read_run
+from emgs_jax.running import configure
+from emgs_jax.running.configure import build
+from experiments.polish import polish_run
+
+pytest.importorskip("optax", reason="the extra of emgs polish: pip install -e .[polish]")
+CAMERA = Camera([20.0, 23.0], [14.5, 12.25], 32, 24)
+POSES = np.stack([np.eye(4)] * 2)
+POSES[1, 0, 3] = 0.05
+
+
+def config(*overrides: str, folder="x"):
+    return configure.compose(f"folder='{folder}'", *overrides, name="polish")
+
+
+def fitting(*overrides: str):
+    return build(config("polish.loss.render.tile_size=16", *overrides), "polish")
+
+
+def wall() -> Anchors:
+    """Flat splats on a wall 2 m away, a sixth of it wide, which fill the image."""
+    x, y = np.meshgrid(np.linspace(-1.6, 1.6, 9), np.linspace(-1.2, 1.2, 7), indexing="ij")
+    means = np.stack([x.ravel(), y.ravel(), np.full(x.size, 2.0)], axis=1)
+    axes = np.broadcast_to(np.diag([1.0, -1.0, -1.0]), (len(means), 3, 3))
+    std = np.full((len(means), 2), 0.16)
+    return Anchors(*(jnp.asarray(v, jnp.float32) for v in (means, axes, std, np.full(len(means), 0.02))))
+
+
+ANCHORS = wall()
+COLORS = np.random.default_rng(0).uniform(0.1, 0.9, (len(ANCHORS.means), 3)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """What the wall looks like from two poses, in the splats' true colours."""
+    settings, spool = fitting(), Spool()
+    gaussians, opacity = gaussians_of(ANCHORS, initial(jnp.asarray(COLORS), jnp.float32(settings.opacity)))
+    for pose in POSES:
+        T = jaxlie.SE3.from_matrix(jnp.asarray(pose, jnp.float32))
+        drawn = jax.jit(draw)(gaussians, opacity, T, CAMERA, settings.loss.render)
+        spool.append(np.concatenate([drawn.values, drawn.depth[..., None]], axis=-1).astype(np.float32))
+    return spool, POSES
+
+
+def test_the_gradient_is_that_of_finite_differences(frames):
+    """Away from where they begin, so that no term is at its minimum; the largest component of each parameter."""
+    rng, settings = np.random.default_rng(1), fitting()
+    begin = initial(jnp.asarray(COLORS), jnp.float32(settings.opacity))
+    # A wall that is tilted: which splat is in front of which, where the loss jumps, stays as it is.
+    means = ANCHORS.means.at[:, 2].add(0.2 * ANCHORS.means[:, 0] + 0.13 * ANCHORS.means[:, 1])
+    anchors = eqx.tree_at(lambda a: a.means, ANCHORS, means)
+    at = jax.tree.map(lambda x: x + jnp.asarray(rng.uniform(-0.2, 0.2, x.shape), jnp.float32), begin)
+    target, T = jnp.asarray(frames[0][0]), sc.pose()
+    value = jax.jit(lambda fitted: loss(fitted, anchors, target, T, CAMERA, settings.loss)[0])
+    slope = jax.jit(jax.grad(value))(at)
+    for name in ("colors", "logit", "log_std", "turn", "shift"):
+        leaf = np.asarray(getattr(slope, name))
+        row = np.unravel_index(np.abs(leaf).argmax(), leaf.shape)
+
+        def moved(step, name=name, row=row):
+            changed = {key: getattr(at, key) for key in vars(at)}
+            changed[name] = changed[name].at[row].add(step)
+            return float(value(Appearance(**changed)))
+
+        step = 2e-2 if name == "shift" else 4e-3
+        found = (moved(step) - moved(-step)) / (2 * step)
+        np.testing.assert_allclose(leaf[row], found, rtol=0.1, err_msg=name)  # float32, and a curved loss
+
+
+def test_the_colours_of_a_map_that_was_drawn_are_recovered_and_its_shape_stays(frames, tmp_path):
+    settings = fitting("polish.steps=300", "polish.rates.colors=0.05", "polish.final_rate=0.01", "polish.loss.dssim=0")
+    settings = replace(settings, rates=Rates(settings.rates.colors, 0.0, 0.0, 0.0, 0.0))
+    fitted = fit(ANCHORS, np.full_like(COLORS, 0.5), frames, CAMERA, settings, tmp_path / "state.npz")
+    gaussians, _ = gaussians_of(ANCHORS, fitted)
+    pixels = np.asarray(ANCHORS.means)[:, :2] / 2.0 * [20.0, 23.0] + [14.5, 12.25]
+    inside = ((pixels > 1) & (pixels < [30, 22])).all(1)
+    assert inside.sum() > 30
+    np.testing.assert_allclose(np.asarray(gaussians.colors)[inside], COLORS[inside], atol=0.01)
+    np.testing.assert_array_equal(gaussians.means, ANCHORS.means)
+
+
+def test_a_fit_that_was_stopped_goes_on_to_the_same_bits(frames, tmp_path):
+    settings = fitting("polish.steps=6", "polish.every=2")
+    whole = fit(ANCHORS, COLORS, frames, CAMERA, settings, tmp_path / "whole.npz")
+    steps = []
+
+    def stop(step, _):
+        steps.append(step)
+        if step == 3 and steps.count(3) == 1:
+            raise KeyboardInterrupt
+
+    for _ in range(2):
+        try:
+            parts = fit(ANCHORS, COLORS, frames, CAMERA, settings, tmp_path / "parts.npz", stop)
+        except KeyboardInterrupt:
+            continue
+    assert steps == [0, 1, 2, 3, 2, 3, 4, 5] and not (tmp_path / "parts.npz").exists()
+    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_ssim_is_one_of_equal_images_and_that_of_the_formula_in_a_slow_loop():
+    rng = np.random.default_rng(2)
+    a, b = jnp.asarray(rng.uniform(size=(2, 13, 15, 1)), jnp.float32)
+    np.testing.assert_allclose(ssim(a, a), 1.0, atol=1e-6)
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * 1.5**2))
+    window /= window.sum()
+    x, y = (np.pad(image[..., 0].astype(float), 5) for image in (a, b))
+    values = []
+    for i in range(13):
+        for j in range(15):
+            p, q = x[i : i + 11, j : j + 11], y[i : i + 11, j : j + 11]
+            mp, mq = (window * p).sum(), (window * q).sum()
+            vp, vq, c = ((window * u * v).sum() - m for u, v, m in ((p, p, mp**2), (q, q, mq**2), (p, q, mp * mq)))
+            values.append((2 * mp * mq + 1e-4) * (2 * c + 9e-4) / ((mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4)))
+    np.testing.assert_allclose(ssim(a, b), np.mean(values), atol=1e-5)
+
+
+SHORT = ("polish.steps=2", "polish.held_out_every=3", "polish.loss.render.tile_capacity=256")
+
+
+@pytest.fixture
+def folder(exact_run, tmp_path):
+    return shutil.copytree(exact_run[0], tmp_path / "run")
+
+
+class Edited:
+    """A data set in which the images of the held-out frames are noise."""
+
+    def __init__(self, dataset, settings) -> None:
+        self._dataset, self._settings = dataset, settings
+
+    def __getattr__(self, name):
+        return getattr(self._dataset, name)
+
+    def __len__(self):
+        return len(self._dataset)
+
+    def __getitem__(self, row):
+        frame = self._dataset[row]
+        if not is_held_out(row, self._settings):
+            return frame
+        return replace(frame, image=np.random.default_rng(row).integers(0, 255, frame.image.shape).astype(np.uint8))
+
+
+def test_what_is_held_out_never_enters_the_fit_and_the_files_say_what_came_out(folder):
+    from experiments.report import images_of
+
+    found = polish_run(config(*SHORT, folder=folder))
+    splats = (folder / "splats.ply").read_bytes()
+    assert json.loads((folder / "polish.json").read_text()) == found and (folder / "polish.png").is_file()
+    assert found["polish/num_held_out"] == 2 and found["polish/num_fitted"] == 4
+    assert 0 < found["polish/after_ssim"] < 1 and found["polish/after_depth_within_5_percent"] > 80
+    assert f"{found['polish/num_splats']:,} splats" in (folder / "report.html").read_text()
+    run, settings = read_run(folder), build(config(*SHORT), "polish")
+    densify = build(OmegaConf.create(dict(run.provenance["config"])), "densify")
+    other = polish(run, Edited(images_of(run)[0], settings), settings, densify)
+    assert (folder / "splats.ply").read_bytes() == splats
+    assert other["polish/before_psnr_db"] < found["polish/before_psnr_db"] - 3, "they are what is compared"
+
+
+def test_a_run_without_its_images_or_without_a_map_is_one_clear_error(folder, tmp_path):
+    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics["provenance"]["data"]["fingerprint"] = "of others"
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    with pytest.raises(ValueError, match="not those that were mapped"):
+        polish_run(config(*SHORT, folder=folder))
+    (folder / "map.npz").unlink()
+    with pytest.raises(ValueError, match=r"lacks map\.npz"):
+        polish_run(config(*SHORT, folder=folder))
+    with pytest.raises(ValueError, match="is no folder"):
+        polish_run(config(*SHORT, folder=tmp_path / "nowhere"))
