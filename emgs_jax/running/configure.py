@@ -28,6 +28,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.featured import Featured, Requeried
 from emgs_jax.running.overrides import readable
+from emgs_jax.running.truth import check_depth_unit
 from emgs_jax.running.values import check_values
 
 if TYPE_CHECKING:
@@ -217,7 +218,10 @@ def build_dataset(config: DictConfig) -> ReadableFrames:
     if "note" in dataset.calibration:
         tqdm.write(dataset.calibration["note"])
     progress = partial(tqdm, desc="checking", unit="frame")
-    return ReadableFrames(dataset, config.on_bad_frame, config.checksums, progress)
+    frames = ReadableFrames(dataset, config.on_bad_frame, config.checksums, progress)
+    if config.dataset.get("depth_scale") is not None:  # else the data set knows
+        check_depth_unit(frames, float(config.dataset.depth_scale))
+    return frames
 
 
 def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
