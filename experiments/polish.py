@@ -5,8 +5,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from emgs_jax.polish.run import SPLATS_FILE, polish
 from emgs_jax.report.page import write_report
+from emgs_jax.report.polish import SPLATS_FILE, polish
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.running.configure import build
 

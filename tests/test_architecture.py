@@ -21,7 +21,7 @@ CORE_ROOMS = (
 )
 # What is solved between frames, by SciPy; the core does not import it.
 HOST_FILES = {"graph.sparse", "graph.start", "graph.problem", "graph.optimize"}
-HOST = ("data", "io", "features", "keypoints", "loops", "prior", "evaluation", "running", "report", "polish")
+HOST = ("data", "io", "features", "keypoints", "loops", "prior", "evaluation", "running", "polish", "report")
 STAGES = {"initialization", "localization", "em", "continuation", "splitting", "refinement", "existence", "semantics"}
 HOST_PACKAGES = {"numpy", "cv2", "open3d", "trimesh", "matplotlib", "scipy", "torch", "tqdm", "hydra", "omegaconf"}
 

@@ -33,6 +33,12 @@ def test_the_angle_of_view_is_that_of_the_ray_through_the_border():
     assert width == pytest.approx(90) and height == pytest.approx(60)
 
 
+def test_one_direction_that_no_lens_has_is_enough():
+    assert not is_impossible(TRUE, SIZE)
+    for odd in (20.0, 1e6):  # a view of half a turn, and of a hundredth of a degree
+        assert is_impossible((odd, *TRUE[1:]), SIZE) and is_impossible((TRUE[0], odd, *TRUE[2:]), SIZE)
+
+
 def slips(fx, fy, cx, cy):
     """The same camera, as people give it by mistake."""
     (w, h), (u, v) = SIZE, (cx + 0.5, cy + 0.5)

@@ -32,6 +32,8 @@ def test_what_numpy_writes_is_read_bit_for_bit_and_may_be_changed():
         assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
         assert found[name].tobytes() == array.tobytes() and found[name].flags.writeable
     assert list(read_npz(saved(**ARRAYS), ("b",))) == ["b"]
+    packed = saved(np.savez_compressed, a=np.arange(1000.0))
+    np.testing.assert_array_equal(read_npz(packed, may_be_compressed=True)["a"], np.arange(1000.0))
     with pytest.raises(ValueError, match="it lacks c, d"):
         read_npz(saved(**ARRAYS), ("a", "c", "d"))
 

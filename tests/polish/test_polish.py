@@ -16,8 +16,8 @@ from omegaconf import OmegaConf
 from emgs_jax.data.spool import Spool
 from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.fit import Rates, fit, is_held_out
-from emgs_jax.polish.run import polish
 from emgs_jax.polish.splats import Anchors, Appearance, draw, gaussians_of, initial, loss, ssim
+from emgs_jax.report.polish import polish
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.running import configure
 from emgs_jax.running.configure import build
