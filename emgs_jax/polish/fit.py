@@ -17,7 +17,6 @@ from emgs_jax.io.npz import read_npz
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
 from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, initial, loss
-from emgs_jax.running.convert import to_se3
 
 SAME_SURFACE = 0.05  # of the depth; a splat so near the map's surface stands for it
 STEEPEST = 0.3  # cosine; surfaces seen at a more grazing angle begin with splats that are no longer than at it
@@ -166,8 +165,9 @@ def fit(
         epoch, place = divmod(number_, len(poses))
         row = np.random.default_rng((config.seed, epoch)).permutation(len(poses))[place]
         target = jnp.asarray(targets[row], jnp.float32)
+        pose = jaxlie.SE3.from_matrix(jnp.asarray(poses[row], jnp.float32))
         decay = jnp.float32(config.final_rate ** (number_ / max(config.steps - 1, 1)))
-        fitted, moments, error = step(fitted, moments, anchors, target, to_se3(poses[row]), decay)
+        fitted, moments, error = step(fitted, moments, anchors, target, pose, decay)
         on_step(number_, -10.0 * float(np.log10(max(float(error), 1e-12))))
         if (number_ + 1) % config.every == 0:
             _write(path, number_ + 1, (fitted, moments))

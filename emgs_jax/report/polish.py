@@ -67,6 +67,9 @@ def polish(
         seeds.add(view, image, run.poses[row])
         depth = np.where(view.valid, view.depth, 0.0)
         targets.append(np.concatenate([image, depth[..., None]], axis=-1).astype(np.float16))
+    for row in held:  # what only these see is as the map has it: their images stay out
+        _, view = seen(row)
+        seeds.add(view, view.colors, run.poses[row])
     anchors, colors = seeds.anchors(_map_noise(gaussians))
     with tqdm(total=config.steps, desc="polishing", unit="step") as bar:
         recent: list[float] = []
