@@ -153,7 +153,8 @@ def test_the_prior_of_true_points_is_the_ground_truth_and_moves_with_the_poses()
     move[:3, :3], move[:3, 3] = Rotation.random(rng=rng).as_matrix(), [1.0, 2.0, 3.0]
     frame = a_frame(plane_depth((0.3, 0.2, 0.9), 2.0).clip(0.0, 5.0), move)
     no_truth = Frame(1, 1.0, "g", frame.image)
-    truth = ground_truth_cloud([frame, no_truth], INTRINSICS, CONFIG)
+    nowhere = Frame(2, 2.0, "h", frame.image, frame.depth)  # where it was taken nobody knows
+    truth = ground_truth_cloud([frame, no_truth, nowhere], INTRINSICS, CONFIG)
     view = (backproject(frame.depth, INTRINSICS), frame.depth > 0, frame.image, frame.T_world_camera)
     raw = fuse_clouds([posed_cloud(*view, CONFIG)], CONFIG.voxel_m)
     np.testing.assert_array_equal(raw.points, truth.points)
