@@ -117,6 +117,29 @@ def test_the_page_draws_what_our_renderer_draws(page, run):
     assert psnr(np.roll(theirs, 1, axis=1), ours) < psnr(theirs, ours) - 3  # half a pixel would be seen
 
 
+WHOLE = """
+const { state, arrays, splats } = report, { canvas } = splats, lens = report.lens(canvas.width, canvas.height);
+const { position, right, down, ahead } = state.view, count = arrays.mean.length / 3;
+let inside = 0;
+for (let row = 0; row < count; row++) {
+  const from = sub(Array.from(arrays.mean.slice(3 * row, 3 * row + 3)), position), z = dot(ahead, from);
+  const x = (lens.focal[0] * dot(right, from)) / z + lens.center[0];
+  const y = (lens.focal[1] * dot(down, from)) / z + lens.center[1];
+  inside += z > 0 && x > 0 && y > 0 && x < canvas.width && y < canvas.height;
+}
+return inside / count;
+"""
+
+
+def test_the_whole_map_is_in_the_window(page):
+    """Also after a frame was left, whose lens the view keeps; a hundredth at each end does not count."""
+    assert page.run(WHOLE) > 0.98
+    page.run("report.state.focal = 3; report.draw(1)")
+    assert page.run(WHOLE) < 0.98
+    page.run("report.home()")
+    assert page.run(WHOLE) > 0.98
+
+
 def test_a_near_wall_hides_a_far_one(page):
     """It is the first in the map: without sorting the green one would be drawn over it."""
     left = drawn_by_the_page(page, 0, SIZE, INTRINSICS)[5:-5, 3:15].reshape(-1, 3)

@@ -5,11 +5,12 @@ const $ = (id) => document.getElementById(id);
 const BACKGROUND = [0.086, 0.098, 0.118];
 const SLOW = 60; // ms; a drawing that takes longer is drawn coarsely while the view moves
 const FEW = 20000; // Gaussians that are drawn coarsely
+const FOCAL = 0.9; // heights of the window, unless a frame is chosen
 const REST = 200; // ms without a move until it is drawn in full
 
 async function start() {
   const arrays = await readArrays();
-  const state = { frame: 0, view: null, pivot: ABOUT.pivot, size: ABOUT.size, focal: 0.9, flies: false, atFrame: false,
+  const state = { frame: 0, view: null, pivot: ABOUT.pivot, size: ABOUT.size, focal: FOCAL, flies: false, atFrame: false,
                   ruler: [], measures: false, paths: {}, seesThrough: true };
   const report = { state, arrays, frameTime: 0 };
   window.report = report; // for the tests, and whoever is curious
@@ -84,8 +85,11 @@ function wireDrawing(report) {
   report.home = () => {
     state.atFrame = false;
     state.pivot = ABOUT.pivot;
+    state.focal = FOCAL;
+    // As far away as it takes until a ball round the map fits into the narrower side of the window.
+    const half = Math.atan((0.5 * Math.min(1, box.clientWidth / box.clientHeight)) / FOCAL);
     const away = add(mul(ABOUT.up, 0.95), mul(ABOUT.front, -0.6));
-    state.view = lookAt(add(state.pivot, mul(unit(away), 0.8 * state.size)), state.pivot, ABOUT.up);
+    state.view = lookAt(add(state.pivot, mul(unit(away), (0.5 * state.size) / Math.sin(half))), state.pivot, ABOUT.up);
     report.moved();
   };
   report.showFrame = (row, goesThere = true) => {
