@@ -2,6 +2,7 @@
 
 import gc
 import os
+import sys
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -27,12 +28,17 @@ os.environ["XLA_FLAGS"] = " ".join([*QUICK, os.environ.get("XLA_FLAGS", "")])
 # Programs are kept, thousands of objects each: to look through them again and again is a tenth of the time.
 gc.set_threshold(100_000, 20, 50)
 
+import absl.logging  # noqa: E402
 import jax  # noqa: E402
 import omegaconf._utils  # noqa: E402
 import pytest  # noqa: E402
 import yaml  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 from schedule import SLOW, TESTS, in_order, scheduler  # noqa: E402
+
+
+# optax brings absl, whose handler closes the stream that it was made with, pytest's own, when Hydra sets up logging.
+absl.logging.get_absl_handler().python_handler.stream = sys.__stderr__
 
 
 def loader_of_c(make=omegaconf._utils.get_yaml_loader):
