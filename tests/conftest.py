@@ -36,7 +36,6 @@ import yaml  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 from schedule import SLOW, TESTS, in_order, scheduler  # noqa: E402
 
-
 # optax brings absl, whose handler closes the stream that it was made with, pytest's own, when Hydra sets up logging.
 absl.logging.get_absl_handler().python_handler.stream = sys.__stderr__
 
