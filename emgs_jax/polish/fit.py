@@ -1,5 +1,6 @@
 """Where splats begin, and their fit to the frames: Adam, one frame a step, in an order that the seed says."""
 
+import hashlib
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -160,7 +161,8 @@ def fit(
         }
         return Appearance(**parts), moments, error
 
-    first, (fitted, moments) = _read(path, (fitted, moments))
+    signature = _signature(anchors, colors, config)
+    first, (fitted, moments) = _read(path, (fitted, moments), signature)
     for number_ in range(first, config.steps):
         epoch, place = divmod(number_, len(poses))
         row = np.random.default_rng((config.seed, epoch)).permutation(len(poses))[place]
@@ -170,29 +172,38 @@ def fit(
         fitted, moments, error = step(fitted, moments, anchors, target, pose, decay)
         on_step(number_, -10.0 * float(np.log10(max(float(error), 1e-12))))
         if (number_ + 1) % config.every == 0:
-            _write(path, number_ + 1, (fitted, moments))
+            _write(path, number_ + 1, (fitted, moments), signature)
     path.unlink(missing_ok=True)
     return fitted
 
 
-def _write(path: Path, step: int, state) -> None:
+def _signature(anchors: Anchors, colors: np.ndarray, config: PolishConfig) -> str:
+    """Return a digest of where the splats begin and of all settings."""
+    rates, render = (repr(jax.tree.map(float, part)) for part in (config.rates, config.loss))
+    numbers = {name: value for name, value in vars(config).items() if name not in ("rates", "loss")}
+    digest = hashlib.sha256(f"{numbers} {rates} {render}".encode())
+    for values in (*jax.tree.leaves(anchors), colors):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+def _write(path: Path, step: int, state, signature: str) -> None:
     buffer = io.BytesIO()
     leaves = {f"leaf{number}": np.asarray(leaf) for number, leaf in enumerate(jax.tree.leaves(state))}
-    np.savez(buffer, step=step, **leaves)
+    np.savez(buffer, step=step, signature=signature, **leaves)
     with atomic_write(path) as handle:
         handle.write(buffer.getvalue())
 
 
-def _read(path: Path, state):
-    """The step to go on from and the state there; from the beginning where there is none, or one of other splats."""
+def _read(path: Path, state, signature: str):
+    """Return the step to go on from and the state there; the beginning where there is none, or one of another fit."""
     if not path.is_file():
         return 0, state
     leaves, tree = jax.tree.flatten(state)
     found = read_npz(path.read_bytes())
-    kept = [found.get(f"leaf{number}") for number in range(len(leaves))]
-    if any(value is None or value.shape != leaf.shape for value, leaf in zip(kept, leaves, strict=True)):
+    if str(found.get("signature")) != signature:
         return 0, state
-    leaves = [jnp.asarray(value, leaf.dtype) for value, leaf in zip(kept, leaves, strict=True)]
+    leaves = [jnp.asarray(found[f"leaf{number}"], leaf.dtype) for number, leaf in enumerate(leaves)]
     return int(found["step"]), jax.tree.unflatten(tree, leaves)
 
 

@@ -115,6 +115,11 @@ def test_a_fit_that_was_stopped_goes_on_to_the_same_bits(frames, tmp_path):
         except KeyboardInterrupt:
             continue
     assert steps == [0, 1, 2, 3, 2, 3, 4, 5] and not (tmp_path / "parts.npz").exists()
+    steps.clear()
+    with pytest.raises(KeyboardInterrupt):
+        fit(ANCHORS, COLORS, frames, CAMERA, settings, tmp_path / "parts.npz", stop)
+    fit(ANCHORS, COLORS, frames, CAMERA, replace(settings, seed=1), tmp_path / "parts.npz", stop)
+    assert steps == [0, 1, 2, 3, 0, 1, 2, 3, 4, 5], "other settings begin anew"
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
         np.testing.assert_array_equal(a, b)
 
