@@ -15,6 +15,7 @@ from emgs_jax.data.synthetic import Synthetic
 CHANGED = {
     "seven_scenes": "kitchen/seq-01/frame-000001.color.jpg",
     "tum": "rgbd_dataset_freiburg3_plane/groundtruth.txt",
+    "bonn": "rgbd_dataset_freiburg3_plane/groundtruth.txt",
     "replica": "office9/results/frame000001.jpg",
     "images": "img10.JPG",
 }

@@ -182,10 +182,10 @@ class Room:
 
 
 class Dark(Room):
-    """The same frames without depth."""
+    """The same frames without depth, as large as the views that are drawn."""
 
     def __getitem__(self, index):
-        return dataclasses.replace(super().__getitem__(index), depth=None)
+        return dataclasses.replace(super().__getitem__(index), depth=None, image=np.full((16, 24, 3), 128, np.uint8))
 
 
 def test_the_truth_is_that_of_every_frame_and_its_labels_where_the_prior_has_classes():

@@ -10,8 +10,8 @@ const REST = 200; // ms without a move until it is drawn in full
 
 async function start() {
   const arrays = await readArrays();
-  const state = { frame: 0, view: null, pivot: ABOUT.pivot, size: ABOUT.size, focal: FOCAL, flies: false, atFrame: false,
-                  ruler: [], measures: false, paths: {}, seesThrough: true };
+  const state = { frame: 0, view: null, pivot: ABOUT.pivot, size: ABOUT.size, focal: FOCAL, flies: false,
+                  atFrame: false, ruler: [], measures: false, paths: {}, seesThrough: true };
   const report = { state, arrays, frameTime: 0 };
   window.report = report; // for the tests, and whoever is curious
   wireStrip(report);
