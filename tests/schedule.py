@@ -22,6 +22,7 @@ GROUPS = {
         "test_front_door.py",
         "test_notebooks.py",
         "report/test_live_browser.py",
+        "polish/test_polish.py",
     ),
     "smoke": ("running/test_coming_back.py", "running/test_segments.py", "scripts/test_walk.py"),
     "browser": ("report/test_page_browser.py", "report/test_table_page.py", "report/test_viewer.py"),  # one Chromium
@@ -35,6 +36,7 @@ SLOW = {
     "graph/test_graph_optimize.py",
     "loops/test_verification.py",
     "ops/test_neighbours.py",
+    "polish/test_polish.py",
     "prior/multiview/test_depth.py",
     "prior/multiview/test_plane_sweep.py",
     "prior/simulated/test_simulated_drift.py",

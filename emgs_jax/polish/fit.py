@@ -3,7 +3,7 @@
 import hashlib
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
@@ -179,9 +179,8 @@ def fit(
 
 def _signature(anchors: Anchors, colors: np.ndarray, config: PolishConfig) -> str:
     """Return a digest of where the splats begin and of all settings."""
-    rates, render = (repr(jax.tree.map(float, part)) for part in (config.rates, config.loss))
-    numbers = {name: value for name, value in vars(config).items() if name not in ("rates", "loss")}
-    digest = hashlib.sha256(f"{numbers} {rates} {render}".encode())
+    settings = replace(config, loss=jax.tree.map(float, config.loss))  # whose arrays would be shown by their shapes
+    digest = hashlib.sha256(repr(settings).encode())
     for values in (*jax.tree.leaves(anchors), colors):
         digest.update(np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()
