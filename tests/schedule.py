@@ -31,12 +31,15 @@ GROUPS = {
 # What the quick subset (-m "not slow") takes nothing of, beside the marked tests: some five CPU seconds and more each.
 SLOW = {
     "data/test_apartment.py",
+    "data/test_focal_length.py",
+    "data/test_rosbag.py",
     "features/test_dino.py",
     "features/test_dinotxt.py",
     "graph/test_graph_optimize.py",
     "loops/test_verification.py",
     "ops/test_neighbours.py",
     "polish/test_polish.py",
+    "prior/files/test_prior_files.py",
     "prior/multiview/test_depth.py",
     "prior/multiview/test_plane_sweep.py",
     "prior/simulated/test_simulated_drift.py",
