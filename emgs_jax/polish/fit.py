@@ -1,4 +1,4 @@
-"""Where splats begin, and their fit to the frames: Adam, one frame a step, in an order that the seed says."""
+"""Initial splats, and their fit to the frames: Adam, one frame a step, in an order that the seed says."""
 
 import hashlib
 import io
@@ -64,7 +64,7 @@ class PolishConfig:
 
 
 def is_held_out(row: int, config: PolishConfig) -> bool:
-    """Whether the frame of this row is kept from the fit, for the comparison."""
+    """Test whether the frame of this row is kept from the fit, for the comparison."""
     return row % config.held_out_every == 0
 
 
@@ -104,7 +104,7 @@ class Seeds:
         self._rows.append((points, image[y, x], axes, std))
 
     def _held(self, view, pose: np.ndarray, counts: Sequence[int]) -> np.ndarray:
-        """Which cells of the frame hold a splat on the surface that the map shows there."""
+        """Mark the cells of the frame that hold a splat on the surface that the map shows there."""
         held, (height, width) = np.zeros(counts, bool), view.depth.shape
         for means, *_ in self._rows:
             local = (means - pose[:3, 3]) @ pose[:3, :3]

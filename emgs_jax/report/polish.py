@@ -24,10 +24,11 @@ from emgs_jax.polish.splats import draw, gaussians_of, ssim
 from emgs_jax.render.densify import DensifyConfig, densify
 from emgs_jax.report.recorded_run import POLISH, RecordedRun
 from emgs_jax.running.convert import to_se3
+from emgs_jax.running.executables import stored
 
 SPLATS_FILE, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE = POLISH
 MAX_PICTURES = 4
-_densify, _ssim = jax.jit(densify), jax.jit(ssim)
+_densify, _ssim = stored(densify), jax.jit(ssim)
 
 
 def polish(
