@@ -100,13 +100,9 @@ def _about(leaf: Any) -> Any:
 
 def _made(function: Callable, arguments: tuple, digest: str) -> Callable:
     """The executable of an entry, or of a new one where it is missing, damaged or refused."""
-    begin, entry = time.perf_counter(), _entry(digest)
-    found = None if entry is None else _runnable(entry["program"], arguments, rebuilt(entry["outputs"]))
-    if found is None:
-        return _compile(function, arguments, digest)
-    name = function.__wrapped__.__name__  # as JAX says it of what it takes from its cache
-    jax.monitoring.record_event_duration_secs(COMPILED, time.perf_counter() - begin, fun_name=name)
-    return found
+    entry = _entry(digest)
+    found = None if entry is None else _runnable(entry["program"], function, arguments, rebuilt(entry["outputs"]))
+    return _compile(function, arguments, digest) if found is None else found
 
 
 def _compile(function: Callable, arguments: tuple, digest: str) -> Callable:
@@ -115,7 +111,7 @@ def _compile(function: Callable, arguments: tuple, digest: str) -> Callable:
     outputs, text = eqx.filter_eval_shape(function, *arguments), lowered.as_text()
     shapes = [_about(leaf) for leaf in _arrays(arguments)]  # of those it does not take, too: each call checks them
     program = _hash(*_machine(), text, *_used(lowered, digest), shapes)
-    found = _runnable(program, arguments, outputs)
+    found = _runnable(program, function, arguments, outputs)
     if found is None:
         found, is_new = _compiled(lowered)
         if not is_new or "callback" in text:  # which knows where it is in this process
@@ -145,9 +141,9 @@ def _compiled(lowered: Any) -> tuple[Callable, bool]:
     return found, not _thread.hits
 
 
-def _runnable(program: str, arguments: tuple, outputs: Any) -> Callable | None:
-    """The kept executable of a program, as a function of such arguments."""
-    payload = read(_folder(), program)
+def _runnable(program: str, function: Callable, arguments: tuple, outputs: Any) -> Callable | None:
+    """The kept executable of a program, as that function of such arguments; told as JAX tells what its cache gives."""
+    begin, payload = time.perf_counter(), read(_folder(), program)
     if payload is None:
         return None
     leaves, structure = jax.tree.flatten(outputs)
@@ -162,6 +158,8 @@ def _runnable(program: str, arguments: tuple, outputs: Any) -> Callable | None:
     except Exception as error:  # whatever XLA dislikes
         remove(_folder(), program, error)
         return None
+    name = function.__wrapped__.__name__
+    jax.monitoring.record_event_duration_secs(COMPILED, time.perf_counter() - begin, fun_name=name)
 
     def run(*arguments: Any) -> Any:
         _, *found = executable(*_arrays(arguments))

@@ -12,6 +12,7 @@ import jaxlie
 import numpy as np
 import pytest
 from jax._src.lru_cache import LRUCache
+from listening import compiled
 from scene import observe_room, path_pose, predict_room, slam_config, stack_poses
 
 from emgs_jax.ops.camera import Camera
@@ -107,7 +108,9 @@ def test_another_source_of_the_same_program_compiles_nothing_again(folder, monke
     as_a_new_process()
     (folder / "test_executables.py").write_text("# another source")
     monkeypatch.setattr(executables, "ROOT", folder / "package")
-    assert_same(call(function, *arguments()), expected)
+    with compiled() as names:  # a run tells of it as of one that was compiled
+        assert_same(call(function, *arguments()), expected)
+    assert names[-1] == "looked_at"
     programs = [path for path in entries(folder) if path.stat().st_size > 1000]
     assert TRACES and len(programs) == 1 and len(entries(folder)) == 3
 

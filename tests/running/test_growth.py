@@ -3,11 +3,9 @@
 The first of a group: what is compiled here test_slam.py finds in memory.
 """
 
-import contextlib
-
 import jax
-import jax.monitoring
 import pytest
+from listening import compiled
 from scene import FULL, WHOLE, observe_room, path_pose, predict_room, slam_config, stack_poses
 
 from emgs_jax.gaussian_map import grow
@@ -17,22 +15,6 @@ from emgs_jax.running.executables import forget
 from emgs_jax.running.growth import advance, prepare, start
 
 pytestmark = pytest.mark.slow  # the whole step is compiled
-
-
-@contextlib.contextmanager
-def compiled():
-    """Names of the functions that XLA makes executables of inside the block."""
-    names = []
-
-    def hear(event, _, **about):
-        if event.endswith("backend_compile_duration"):
-            names.append(about["fun_name"].removeprefix("jit_").removeprefix("jit(").removesuffix(")"))
-
-    jax.monitoring.register_event_duration_secs_listener(hear)
-    try:
-        yield names
-    finally:
-        jax.monitoring.unregister_event_duration_listener(hear)
 
 
 @pytest.fixture(scope="module")
