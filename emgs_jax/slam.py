@@ -6,9 +6,8 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
-from emgs_jax.continuation import ContinuationConfig, continued
 from emgs_jax.em import EmConfig, EmInfo, em_update, owners
-from emgs_jax.existence import ExistenceConfig, join_layers, judge, usefulness
+from emgs_jax.existence import ExistenceConfig, fusion_evidence, merge_duplicates, update_existence
 from emgs_jax.gaussian_map import (
     AverageConfig,
     GaussianMap,
@@ -32,9 +31,10 @@ from emgs_jax.ops.neighbours import Groups, group_points, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, static_choice, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
-from emgs_jax.registration.belief import Belief, certain
+from emgs_jax.registration.pose_estimate import PoseEstimate, exact_estimate
 from emgs_jax.registration.rigid import median, pose_row
 from emgs_jax.splitting import SplittingConfig, split
+from emgs_jax.surface_extrapolation import ExtrapolationConfig, extrapolate
 
 
 class SlamConfig(eqx.Module):
@@ -62,7 +62,7 @@ class SlamConfig(eqx.Module):
     submap: SubmapConfig
     localization: LocalizationConfig
     em: EmConfig
-    continuation: ContinuationConfig
+    extrapolation: ExtrapolationConfig
     splitting: SplittingConfig
     refinement: RefinementConfig
     existence: ExistenceConfig
@@ -75,14 +75,14 @@ class SlamState(eqx.Module):
         map: all Gaussians.
         previous: the last frame as it was aligned, world frame.
         T_world_previous: its pose.
-        belief: uncertainty of its pose and scale.
+        estimate: uncertainty of its pose and scale.
         time: frames so far, those that could not be placed included.
     """
 
     map: GaussianMap
     previous: Observation
     T_world_previous: jaxlie.SE3
-    belief: Belief
+    estimate: PoseEstimate
     time: Int[Array, ""]
 
 
@@ -198,7 +198,9 @@ def _first_state(
     time = jnp.asarray(world.valid.shape[0], jnp.int32)
     new = new_map(gaussians, _first_weight(weight, config.em.average), existence, time - 1)
     map, _, overflow = insert(empty_map(config.submap.map_capacity, world.features.shape[-1]), new)
-    state = SlamState(map, jax.tree.map(lambda leaf: leaf[-1], world), pose_row(T_world_views, -1), certain(), time)
+    state = SlamState(
+        map, jax.tree.map(lambda leaf: leaf[-1], world), pose_row(T_world_views, -1), exact_estimate(), time
+    )
     return state, overflow
 
 
@@ -217,12 +219,12 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
     """
     view = downscale(camera, config.observation.thin)  # its pixels are an observation's rows
     num_rows = spacing(camera, config.observation.thin, config.fit)
-    last = state.previous, state.T_world_previous, state.belief
+    last = state.previous, state.T_world_previous, state.estimate
 
     coarse, guess = _localize_coarse(prediction, *last, view, config.localization)
     submap = _select(state.map, state.previous, guess, config.submap)
     frame = _localize_fine(prediction.current, submap, coarse, state.time, config.localization)
-    fused = _fuse(submap, frame, view, num_rows, (config.em, config.continuation, config.splitting))
+    fused = _fuse(submap, frame, view, num_rows, (config.em, config.extrapolation, config.splitting))
     candidates, weight = cluster(fused.rest, _order(view), num_rows, config.fit)
     refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config.refinement)
     new = fresh, weight, fused.halves
@@ -238,7 +240,7 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
         num_gaussians=num_gaussians,
         overflow=Overflow(overflow, submap.overflow, refinement.overflow),
     )
-    return SlamState(map, frame.points, frame.T_world_camera, frame.localization.belief, time), info
+    return SlamState(map, frame.points, frame.T_world_camera, frame.localization.estimate, time), info
 
 
 @executable
@@ -246,12 +248,12 @@ def _localize_coarse(
     prediction: Prediction,
     previous: Observation,
     T_world_previous: jaxlie.SE3,
-    belief: Belief,
+    estimate: PoseEstimate,
     view: Camera,
     config: LocalizationConfig,
 ) -> tuple[CoarsePose, Observation]:
     """The coarse pose, and the current frame placed by it."""
-    coarse = localize_coarse(prediction, previous, T_world_previous, view, config, belief)
+    coarse = localize_coarse(prediction, previous, T_world_previous, view, config, estimate)
     return coarse, transform(coarse.T_world_camera, prediction.current, coarse.scale)
 
 
@@ -280,7 +282,7 @@ def _fuse(
     frame: Frame,
     view: Camera,
     num_rows: int,
-    configs: tuple[EmConfig, ContinuationConfig, SplittingConfig],
+    configs: tuple[EmConfig, ExtrapolationConfig, SplittingConfig],
 ) -> Fused:
     """Fuse the points of a frame that is tracked, and split what they show to be too coarse."""
     (em, continuation, splitting), T, trusted = configs, frame.T_world_camera, frame.trusted
@@ -291,7 +293,7 @@ def _fuse(
     origin = jnp.where(info.num_fused > 0, median(births, explained.is_fused), frame.time).astype(jnp.int32)
     map, halves = split(map, trusted, noise, owned, num_rows, splitting)
     explained_by = take_rows(submap.map, owned)
-    rest = continued(trusted, explained_by, explained.is_fused, frame.localization.noise, T, view, continuation)
+    rest = extrapolate(trusted, explained_by, explained.is_fused, frame.localization.noise, T, view, continuation)
     rest = eqx.tree_at(lambda o: o.valid, rest, trusted.valid & ~explained.is_fused)
     return Fused(map, halves, rest, origin, info)
 
@@ -320,10 +322,12 @@ def _store(
     """
     (gaussians, rows), (fresh, weight, halves) = submap, new
     T, noise = frame.T_world_camera, frame.localization.depth_noise
-    use = usefulness(map, gaussians, rows)
-    map, is_seen = judge(write_back(map, gaussians, rows), use, frame.trusted, T, view, noise, config.existence)
+    use = fusion_evidence(map, gaussians, rows)
+    map, is_seen = update_existence(
+        write_back(map, gaussians, rows), use, frame.trusted, T, view, noise, config.existence
+    )
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
-    joined = join_layers(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
+    joined = merge_duplicates(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
     born = new_map(fresh, _first_weight(weight, config.em.average), config.existence.birth, frame.time)
     born = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), born, halves)
     map, _, overflow = insert(write_back(map, joined, rows), born)

@@ -22,7 +22,7 @@ def recorded(tmp_path_factory):
     record(Simulated(), dataset, WINDOW_SIZE, folder)
     config = loops_config("appearance.min_gap=5", "appearance.suppressed_gap=1", "appearance.num_neighbours=2")
     pairs = places_seen_twice(
-        Recorded(folder), dataset, WINDOW_SIZE, config["appearance"], config["verification"].alignment
+        Recorded(folder), dataset, WINDOW_SIZE, config["place_recognition"], config["verification"].alignment
     )
     return dataset, folder, pairs
 
