@@ -405,7 +405,7 @@ def test_the_solver_of_conf_is_a_config_and_without_iterations_nothing_moves():
     (_, end), (_, stopped) = optimize(graph, on), optimize(graph, hydra.utils.instantiate(default, max_iterations=1))
     assert end.converged is True and stopped.converged is False and stopped.num_iterations == 1 < end.num_iterations
     with pytest.raises(hydra.errors.InstantiationException, match="one of current, chordal"):
-        hydra.utils.instantiate(default, start="chordal")
+        hydra.utils.instantiate(default, start="spread")
 
 
 @pytest.mark.long  # for a quiet machine

@@ -491,7 +491,7 @@ def test_a_map_whose_visits_were_joined_is_settled_at_the_end_with_the_noise_of_
         asked.append((noise, gates))
         return replace(state, time=jnp.asarray(-1))
 
-    monkeypatch.setattr(back_end_update, "settle", settled)
+    monkeypatch.setattr(back_end_update, "merge_duplicates_of_state", settled)
     finish_back_end(run)
     assert asked == ([(0.01, "gates")] if has_loop else []) and (run.state.time == -1) == has_loop
 

@@ -34,7 +34,7 @@ def end(graph) -> BackEnd:
         one = keyframe(room(), matrix((0, frame / 10, 0)), frame)
         found.database = add_keyframe(found.database, one, graph.place_recognition)
     found.is_placed[7] = False
-    found.verified, found.contradicted, found.accepted = [loop(poses), loop(poses, 2)], [loop(poses, 3)], [loop(poses)]
+    found.verified, found.violating, found.accepted = [loop(poses), loop(poses, 2)], [loop(poses, 3)], [loop(poses)]
     return found
 
 
@@ -71,7 +71,7 @@ def test_what_is_read_is_what_was_written(end, graph, folder):
         np.testing.assert_array_equal(getattr(read, name), getattr(end, name))
     for name in ("factors", "verified", "violating", "accepted"):
         _same(getattr(read, name), getattr(end, name))
-    assert (read.first, read.since) == (len(end.poses), len(end.poses))
+    assert (read.first_node, read.connected_since) == (len(end.poses), len(end.poses))
     np.testing.assert_array_equal(read.database.words, end.database.words)
     np.testing.assert_array_equal(read.database.vectors, end.database.vectors)
     assert read.database.num_trained == end.database.num_trained
@@ -102,18 +102,18 @@ def test_what_was_left_out_of_the_map_is_no_part_of_it_when_it_is_loaded_either(
     """Symptom: the kept part was not the first, all its measurements were held by a node that nothing joined with it,
     and no loop ever moved anything again."""
     parted = walked(graph, ring())
-    parted.segments, parted.segment = [0] * 3 + [4] * (len(parted.poses) - 3), 4
+    parted.submap_ids, parted.submap_id = [0] * 3 + [4] * (len(parted.poses) - 3), 4
     parted.database = add_keyframe(parted.database, end.database.keyframes[1], graph.place_recognition)
     save_places(tmp_path / "places.npz", parted, 0.0)
     read = BackEnd(graph, CAMERA, 0.01)
     load_places(tmp_path / "places.npz", read)
-    np.testing.assert_array_equal(read.nodes(read.segment).valid, parted.nodes(parted.segment).valid)
+    np.testing.assert_array_equal(read.nodes(read.submap_id).valid, parted.nodes(parted.submap_id).valid)
     with np.load(tmp_path / "places.npz") as file:
         arrays = {name: array for name, array in file.items() if name != "is_kept"}  # as of a version before
     np.savez(tmp_path / "places.npz", **arrays)
     before = BackEnd(graph, CAMERA, 0.01)
     load_places(tmp_path / "places.npz", before)
-    assert before.segments == [0] * len(before.poses)
+    assert before.submap_ids == [0] * len(before.poses)
 
 
 def test_a_map_with_depths_on_another_grid_is_refused_before_a_frame_is_mapped(folder):
@@ -167,7 +167,7 @@ def test_a_damaged_file_is_refused(graph, folder):
 def test_a_folder_that_is_no_finished_run_is_refused(graph, folder, end, tmp_path):
     with pytest.raises(ValueError, match="add graph=default"):
         load(folder, None)
-    with pytest.raises(ValueError, match="map_mode must be one of extend, locate"):
+    with pytest.raises(ValueError, match="map_mode must be one of extend, localize"):
         load(folder, graph, "track")
     with pytest.raises(ValueError, match="is no folder"):
         load(folder / "nowhere", graph)
