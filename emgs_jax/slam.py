@@ -1,5 +1,7 @@
 """The pipeline: `init_state` makes the map of the first window, `step` integrates one frame. Both are pure."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -49,7 +51,7 @@ class SlamConfig(eqx.Module):
         submap: what a step works on, and capacities.
         localization: coarse and fine.
         em: E- and M-step.
-        continuation: depth-error extrapolation to points that no Gaussian explains.
+        extrapolation: of depth errors to points that no Gaussian explains.
         splitting: of Gaussians that are too coarse for a nearer view.
         refinement: on the image plane.
         existence: evidence of later frames for and against a Gaussian.
@@ -66,6 +68,19 @@ class SlamConfig(eqx.Module):
     splitting: SplittingConfig
     refinement: RefinementConfig
     existence: ExistenceConfig
+
+    @property
+    def fusion(self) -> "FusionConfig":
+        """Settings of the fusion alone: other ones compile it no second time."""
+        return FusionConfig(self.em, self.extrapolation, self.splitting)
+
+
+class FusionConfig(eqx.Module):
+    """Settings of the fusion of a frame's points, see `SlamConfig`."""
+
+    em: EmConfig
+    extrapolation: ExtrapolationConfig
+    splitting: SplittingConfig
 
 
 class SlamState(eqx.Module):
@@ -153,16 +168,24 @@ class Fused(eqx.Module):
     Args:
         map: the submap's Gaussians after EM and splitting.
         halves: the second halves of what was split.
-        rest: the points that no Gaussian explains; their depth errors are extrapolated from the map's surfaces.
+        unexplained: points that no Gaussian explains; their depth errors are extrapolated from the map's surfaces.
         origin: median birth of the Gaussians that explain the others; the frame's own time where none does.
         em: counts.
     """
 
     map: GaussianMap
     halves: GaussianMap
-    rest: Observation
+    unexplained: Observation
     origin: Int[Array, ""]
     em: EmInfo
+
+
+class NewGaussians(eqx.Module):
+    """What a frame adds to the map: Gaussians of its points with their number of images, and halves of split ones."""
+
+    gaussians: Gaussians
+    weight: Float[Array, "g"]
+    halves: GaussianMap
 
 
 def _first_weight(weight: Float[Array, "g"], config: AverageConfig) -> Float[Array, "g"]:
@@ -219,16 +242,17 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
     """
     view = downscale(camera, config.observation.thin)  # its pixels are an observation's rows
     num_rows = spacing(camera, config.observation.thin, config.fit)
-    last = state.previous, state.T_world_previous, state.estimate
 
-    coarse, guess = _localize_coarse(prediction, *last, view, config.localization)
+    coarse, guess = _localize_coarse(
+        prediction, state.previous, state.T_world_previous, state.estimate, view, config.localization
+    )
     submap = _select(state.map, state.previous, guess, config.submap)
     frame = _localize_fine(prediction.current, submap, coarse, state.time, config.localization)
-    fused = _fuse(submap, frame, view, num_rows, (config.em, config.extrapolation, config.splitting))
-    candidates, weight = cluster(fused.rest, _order(view), num_rows, config.fit)
+    fused = _fuse(submap, frame, view, num_rows, config.fusion)
+    candidates, weight = cluster(fused.unexplained, _order(view), num_rows, config.fit)
     refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config.refinement)
-    new = fresh, weight, fused.halves
-    map, num_gaussians, overflow, time = _store(state.map, (refined, submap.rows), new, frame, view, config)
+    new = NewGaussians(fresh, weight, fused.halves)
+    map, num_gaussians, overflow, time = _store(state.map, replace(submap, map=refined), new, frame, view, config)
 
     info = StepInfo(
         T_world_camera=frame.T_world_camera,
@@ -282,20 +306,20 @@ def _fuse(
     frame: Frame,
     view: Camera,
     num_rows: int,
-    configs: tuple[EmConfig, ExtrapolationConfig, SplittingConfig],
+    config: FusionConfig,
 ) -> Fused:
     """Fuse the points of a frame that is tracked, and split what they show to be too coarse."""
-    (em, continuation, splitting), T, trusted = configs, frame.T_world_camera, frame.trusted
+    T, trusted = frame.T_world_camera, frame.trusted
     noise = frame.localization.noise[:, None] * (trusted.points - T.translation())
-    map, explained, info = em_update(submap.map, trusted, noise, em, submap.white, submap.groups)
+    map, explained, info = em_update(submap.map, trusted, noise, config.em, submap.white, submap.groups)
     owned = owners(explained, map.birth.shape[0])
     births = take_rows(map.birth, owned).astype(jnp.float32)
     origin = jnp.where(info.num_fused > 0, median(births, explained.is_fused), frame.time).astype(jnp.int32)
-    map, halves = split(map, trusted, noise, owned, num_rows, splitting)
-    explained_by = take_rows(submap.map, owned)
-    rest = extrapolate(trusted, explained_by, explained.is_fused, frame.localization.noise, T, view, continuation)
-    rest = eqx.tree_at(lambda o: o.valid, rest, trusted.valid & ~explained.is_fused)
-    return Fused(map, halves, rest, origin, info)
+    map, halves = split(map, trusted, noise, owned, num_rows, config.splitting)
+    explained_by, noise = take_rows(submap.map, owned), frame.localization.noise
+    moved = extrapolate(trusted, explained_by, explained.is_fused, noise, T, view, config.extrapolation)
+    unexplained = eqx.tree_at(lambda o: o.valid, moved, trusted.valid & ~explained.is_fused)
+    return Fused(map, halves, unexplained, origin, info)
 
 
 @executable
@@ -309,8 +333,8 @@ _refine = executable(refine)
 @executable
 def _store(
     map: GaussianMap,
-    submap: tuple[GaussianMap, Int[Array, "s"]],
-    new: tuple[Gaussians, Float[Array, "g"], GaussianMap],
+    submap: Submap,
+    new: NewGaussians,
     frame: Frame,
     view: Camera,
     config: SlamConfig,
@@ -320,15 +344,12 @@ def _store(
     Returns:
         The map, the number of its Gaussians, how many did not fit, and the time of the next frame.
     """
-    (gaussians, rows), (fresh, weight, halves) = submap, new
-    T, noise = frame.T_world_camera, frame.localization.depth_noise
-    use = fusion_evidence(map, gaussians, rows)
-    map, is_seen = update_existence(
-        write_back(map, gaussians, rows), use, frame.trusted, T, view, noise, config.existence
-    )
+    rows, T, noise = submap.rows, frame.T_world_camera, frame.localization.depth_noise
+    evidence, map = fusion_evidence(map, submap.map, rows), write_back(map, submap.map, rows)
+    map, is_seen = update_existence(map, evidence, frame.trusted, T, view, noise, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
-    joined = merge_duplicates(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
-    born = new_map(fresh, _first_weight(weight, config.em.average), config.existence.birth, frame.time)
-    born = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), born, halves)
-    map, _, overflow = insert(write_back(map, joined, rows), born)
+    merged = merge_duplicates(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
+    born = new_map(new.gaussians, _first_weight(new.weight, config.em.average), config.existence.birth, frame.time)
+    born = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), born, new.halves)
+    map, _, overflow = insert(write_back(map, merged, rows), born)
     return map, jnp.sum(map.gaussians.valid), overflow, frame.time + 1
