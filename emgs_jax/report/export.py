@@ -6,7 +6,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.colors import to_rgb
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.io.colmap import save_colmap
@@ -16,7 +15,7 @@ from emgs_jax.io.nerfstudio import save_transforms
 from emgs_jax.io.ply import with_colors, write_ply
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.ops.ranges import number
-from emgs_jax.report.page_strip import OURS, STATUS_COLORS
+from emgs_jax.report.colors import OURS, STATUS_COLORS, rgb
 from emgs_jax.report.recorded_run import RecordedRun
 from emgs_jax.report.scaling import factor_of
 
@@ -104,9 +103,9 @@ def _nerfstudio(run: RecordedRun, folder: Path, dataset: ReadableFrames, max_poi
 
 def _frustums(run: RecordedRun, path: Path) -> None:
     """A pyramid for every frame in the colour of its status; the path is not drawn where the camera was lost."""
-    colors = np.array([to_rgb(STATUS_COLORS.get(frame["status"], OURS)) for frame in run.frames])
+    colors = np.array([rgb(STATUS_COLORS.get(frame["status"], OURS)) for frame in run.frames])
     is_joined = run.is_placed[1:] & run.is_placed[:-1]
-    save_frustums(path, run.camera, run.poses, colors, is_joined, np.array(to_rgb(OURS)))
+    save_frustums(path, run.camera, run.poses, colors, is_joined, rgb(OURS))
 
 
 def _write_images(folder: Path, run: RecordedRun, dataset: ReadableFrames) -> list[str]:

@@ -27,7 +27,7 @@ from emgs_jax.io.files import atomic_write, write_json
 from emgs_jax.io.npz import read_npz
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.ops.linalg import safe_normalize
-from emgs_jax.report.overview import class_colors
+from emgs_jax.report.colors import class_colors
 from emgs_jax.report.recorded_run import RecordedRun
 from emgs_jax.semantics import Relevance, relevance
 

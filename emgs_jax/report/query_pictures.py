@@ -18,10 +18,9 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import atomic_write
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
-from emgs_jax.report.overview import class_colors
-from emgs_jax.report.page import render_config
+from emgs_jax.report.colors import class_colors
 from emgs_jax.report.query import GREY, Answer, heat, hot, painted
-from emgs_jax.report.recorded_run import RecordedRun
+from emgs_jax.report.recorded_run import RecordedRun, render_config
 from emgs_jax.running.convert import to_se3
 from emgs_jax.semantics import principal_colors
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from emgs_jax.report.columns import DASH, MAIN, PLACED, RENDERED, Column, cell, markdown
+from emgs_jax.report.columns import DASH, MAIN, PLACED, RENDERED, Column, Line, Table, cell, markdown, metric_table
 from emgs_jax.report.results import Estimate
 
 _PAPER_DATASETS = {"seven_scenes": "7-Scenes", "tum": "TUM"}
@@ -108,21 +108,22 @@ def paper_table(rows: Sequence[Row], published: Sequence[Mapping[str, Any]]) -> 
     for row in published:
         cells = [DASH if value is None else f"{value:g}" for key in _PAPER_DATASETS for value in row[key]]
         lines.append([row["method"], f"quoted: {row['source']}", row["protocol"], DASH, *cells])
-    return markdown(["method", "source", "protocol", "sequences × seeds", *titles], lines) + _NOTES
+    return markdown(Table(["method", "source", "protocol", "sequences × seeds", *titles], lines)) + _NOTES
 
 
 def full_table(rows: Sequence[Row]) -> str:
-    """Markdown: a line per row with the main metrics."""
+    """Write a line per row with the main metrics, in Markdown."""
     lines = []
     for row in rows:
-        sequences = row.sequences[0] if len(row.sequences) == 1 else f"mean of {len(row.sequences)}"
-        cells = [
-            cell(row.values.get(key), row.spreads.get(key), factor, digits) for key, _, factor, digits, _ in COLUMNS
-        ]
-        what = [row.dataset, sequences, f"{row.kind}, {row.variant}", source_of(row), row.protocol]
-        lines.append([*what, str(len(row.seeds)), *cells])
-    titles = ["data set", "sequence", "method", "source", "protocol", "seeds", *(column.title for column in COLUMNS)]
-    return markdown(titles, lines)
+        method = f"{row.kind}, {row.variant}"
+        labels = [row.dataset, over(row.sequences), method, source_of(row), row.protocol, str(len(row.seeds))]
+        lines.append(Line(labels, row.values, row.spreads, rivals=None))
+    return markdown(metric_table(["data set", "sequence", "method", "source", "protocol", "seeds"], COLUMNS, lines))
+
+
+def over(sequences: Sequence[str]) -> str:
+    """Name the sequence of a row, or say of how many it is the mean."""
+    return sequences[0] if len(sequences) == 1 else f"mean of {len(sequences)}"
 
 
 def _row(what: tuple, members: list[Estimate]) -> Row:

@@ -7,11 +7,11 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.report.colors import PATHS, class_colors, rgb
 from emgs_jax.report.overview import (
     Paths,
     _draw_map,
     below_ceiling,
-    class_colors,
     draw_overview,
     fill_holes,
     paint_from_above,
@@ -19,7 +19,7 @@ from emgs_jax.report.overview import (
     view_from_above,
 )
 
-OURS, TRUTH, MOVED = (228, 87, 46), (27, 153, 139), ((141, 106, 159), (46, 134, 228))  # and loops, as placed
+OURS, TRUTH, *MOVED = (255 * rgb(PATHS[name].paper) for name in ("poses", "truth", "online", "loops"))
 
 
 def path_along(direction, n=5):

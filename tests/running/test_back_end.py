@@ -22,7 +22,7 @@ from emgs_jax.loops.two_views import rescaled
 from emgs_jax.loops.verification import LoopMeasurement
 from emgs_jax.registration.belief import certain
 from emgs_jax.report.back_end import counts, found_loops, loop_list, metric_graph, revisit_note
-from emgs_jax.report.page_strip import loop_why
+from emgs_jax.report.page_words import loop_why
 from emgs_jax.running import correction
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.correction import correct, finish
