@@ -54,7 +54,6 @@ class RecordedRun:
     """Outputs of a finished run, as read from its folder.
 
     Args:
-        folder: of the run.
         metrics: of metrics.json.
         frames: lines of frames.jsonl that have a pose, in order.
         skipped: the other lines.
@@ -62,8 +61,6 @@ class RecordedRun:
         online: the same as first estimated, before the back end moved them; nan before it begins, None without one.
         raw: the raw predictions' poses.
         truth: (n, 4, 4), nan where unknown.
-        map: all Gaussians.
-        camera: of the frames.
         text: classes that the map's features are compared with; None without.
         loops: lines of loops.json; empty without a back end.
     """

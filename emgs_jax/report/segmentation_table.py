@@ -58,8 +58,6 @@ class SceneResult:
     """One map against the truth of its scene.
 
     Args:
-        scene: its name.
-        folder: of the run.
         is_simulated: the prior is made from the truth.
         confusion: see `scene_confusion`.
         about: how the map was placed, and counts.

@@ -4,6 +4,7 @@ import os
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import yaml
@@ -21,9 +22,7 @@ class SequenceResults:
     """Metrics of the settings of a search on one sequence.
 
     Args:
-        name: of the sequence.
         is_held_out: the search did not use it.
-        is_simulated: the prior is made from the ground truth.
         metrics: of DEFAULT and of trials, by name.
     """
 
@@ -102,11 +101,8 @@ def settings_yaml(setting: Mapping[str, Any], lines: Sequence[str]) -> str:
     """A setting as an option of Hydra that changes keys wherever they stand, below comments."""
     tree: dict[str, Any] = {}
     for key, value in setting.items():
-        node = tree
         *parents, name = key.split(".")
-        for parent in parents:
-            node = node.setdefault(parent, {})
-        node[name] = value
+        reduce(lambda node, parent: node.setdefault(parent, {}), parents, tree)[name] = value
     comments = "".join(f"# {line}\n" for line in ("@package _global_", *lines))
     return comments + yaml.safe_dump(tree, sort_keys=False)
 
@@ -124,7 +120,7 @@ def draw_trials(
         path: of the picture.
         rows: of trials: `trial`, its number, and the objectives, which may be None.
         objectives: metric -> direction.
-        named: number -> words, of the trials that are marked.
+        named: words of the trials that are marked, by their number.
         title: of the picture.
 
     Returns:
@@ -134,15 +130,14 @@ def draw_trials(
     known = [row for row in rows if all(row.get(column.key) is not None for column in shown)]
     if not known:
         return "no trial has all objectives"
-    y = [shown[0].factor * row[shown[0].key] for row in known]
-    x = [shown[1].factor * row[shown[1].key] for row in known] if len(shown) > 1 else [row["trial"] for row in known]
+    y, *others = [[column.factor * row[column.key] for row in known] for column in shown]
+    x = others[0] if others else [row["trial"] for row in known]
     figure = Figure(figsize=(6.4, 4.8), facecolor="white", layout="constrained")
     axes = figure.subplots()
     axes.scatter(x, y, c=["#e4572e" if row["trial"] in named else "#9aa5b1" for row in known], s=28)
     for row, across, up in zip(known, x, y, strict=True):
-        if row["trial"] in named:
-            words = named[row["trial"]]
-            axes.annotate(words, (across, up), textcoords="offset points", xytext=(5, 4), fontsize=8)
+        words = named.get(row["trial"], "")
+        axes.annotate(words, (across, up), textcoords="offset points", xytext=(5, 4), fontsize=8)
     axes.set_ylabel(shown[0].title)
     axes.set_xlabel(shown[1].title if len(shown) > 1 else "trial")
     axes.set_title(title, fontsize=10)

@@ -142,16 +142,15 @@ class Viewer:
         """Of all Gaussians, (n, 3), and what there is to say about the words."""
         name = next(name for name, layer in layers_of(self.layers).items() if layer.title == self.layer.value)
         colors, message = painted(self.layers, name), self._known()
-        if "label" in self.layers and self.words.value.strip():
-            wanted, num_unknown = find_words(self.words.value, self._names)
-            against, more = find_words(self.against.value, self._names)
-            if wanted:
-                found = ask(self.layers, wanted, against, self.threshold.value)
-                colors = highlighted(colors, found)
-                count = int(found.is_found.sum())
-                message = f"{count:,} of {len(colors):,} Gaussians: {escape(', '.join(self._names[r] for r in wanted))}"
-            if num_unknown + more:
-                message += f"<br>{num_unknown + more} of the words are none of this run's. {self._known()}"
+        if "label" not in self.layers or not self.words.value.strip():
+            return colors, message
+        (wanted, unknown), (against, more) = (find_words(box.value, self._names) for box in (self.words, self.against))
+        if wanted:
+            found = ask(self.layers, wanted, against, self.threshold.value)
+            colors, words = highlighted(colors, found), escape(", ".join(self._names[row] for row in wanted))
+            message = f"{int(found.is_found.sum()):,} of {len(colors):,} Gaussians: {words}"
+        if unknown + more:
+            message += f"<br>{unknown + more} of the words are none of this run's. {self._known()}"
         return colors, message
 
     @_alone

@@ -83,10 +83,11 @@ def picked(means: np.ndarray, covs: np.ndarray, origin: Sequence[float], directi
     ray, offsets = np.asarray(direction, np.float64), np.asarray(means, np.float64) - np.asarray(origin, np.float64)
     if not len(means):
         return None
-    weighted = np.linalg.solve(np.asarray(covs, np.float64), np.broadcast_to(ray, offsets.shape)[..., None])[..., 0]
+    precisions = np.linalg.inv(np.asarray(covs, np.float64))
+    weighted = precisions @ ray
     along = np.einsum("ni,ni->n", weighted, offsets) / (weighted @ ray)  # where the ray is nearest, by the covariance
     rest = offsets - along[:, None] * ray
-    distances_sq = np.einsum("ni,ni->n", rest, np.linalg.solve(np.asarray(covs, np.float64), rest[..., None])[..., 0])
+    distances_sq = np.einsum("ni,nij,nj->n", rest, precisions, rest)
     is_met = (along > 0) & (distances_sq <= REACH**2)
     if not is_met.any():
         return None
