@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -21,7 +22,7 @@ from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.io.map_file import load_map, save_map
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.report.colors import class_colors
-from emgs_jax.report.query import Question, ask
+from emgs_jax.report.query import Question, ask, heat
 from emgs_jax.report.query_pictures import MAX_LEGEND, drawn, frame_view, legend, save_labels
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.vocabulary import vocabulary
@@ -112,6 +113,15 @@ def test_negative_words_a_margin_and_a_least_cosine_say_none_of_these(folder, tm
     assert count("a", features__text=path) == count("a", features__text=path, margin=0.19) == both[:1]
     assert count("a", features__text=path, margin=0.21) == [0]
     assert count("a", features__text=path, against="b", margin=0.21) == [0]
+
+
+def test_heat_runs_from_the_first_to_the_last_hundredth_of_the_leads_that_are_known(folder):
+    run = read_run(folder)
+    texts, leads = vocabulary(run, None, None), np.random.default_rng(0).normal(0.3, 2.0, (len(run.map.birth), 1))
+    answer = ask(run, Question(texts.embed(["sofa"]), texts.embed(["wall"]), 0.0, 0.0, InstanceConfig(2.0, 3)))
+    answer = replace(answer, relevance=eqx.tree_at(lambda r: r.leads, answer.relevance, leads), rows=answer.rows[50:])
+    expected = np.interp(leads[50:, 0], np.percentile(leads[50:], [1, 99]), [0.0, 1.0])
+    np.testing.assert_allclose(heat(answer, 0), [*[np.nan] * 50, *expected], atol=1e-9)
 
 
 def test_class_images_show_each_word_where_it_is_and_are_read_as_labels(folder, answered, tmp_path):

@@ -13,12 +13,13 @@ from omegaconf import OmegaConf
 from PIL import Image
 from written_run import CLASSES, two_walls, written_run
 
+from emgs_jax.ops.camera import Camera
 from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.layers import covariances, map_layers, painted
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.viewer import HOST, Viewer
 from emgs_jax.report.viewer_answers import ask, find_words, highlighted, picked
-from emgs_jax.report.viewer_scene import shown
+from emgs_jax.report.viewer_scene import field_of_view, shown
 from emgs_jax.running import configure
 from experiments.view import view
 
@@ -103,6 +104,10 @@ def viewer(run):
     viewer = Viewer(shown(run), free_port())
     yield viewer
     viewer.stop()
+
+
+def test_the_field_of_view_is_the_angle_between_the_upper_and_the_lower_edge_of_the_image():
+    assert np.isclose(field_of_view(Camera((1.0, 50.0), (0.0, 0.0), 30, 100)), np.pi / 2)
 
 
 def test_it_listens_on_this_machine_only(viewer):
