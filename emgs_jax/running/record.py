@@ -53,7 +53,7 @@ class FrameRecord:
             estimated, relative to the first frame.
         inliers: points that agree with the map.
         residual: of these to the map's planes, as a fraction of their depth.
-        scale: factor on the prediction's lengths.
+        scale: factor on the prediction's lengths; the frames that a map is made from give it its unit.
         depth_noise: how much the points differ from the map, as a fraction of their depth; None where none agrees.
         step_m: between the coarse and the fine pose.
         step_rad: likewise.
@@ -206,14 +206,14 @@ def record_start(run: MappingRun, given: Input, spent: Seconds) -> None:
         )
     share = {key: value / len(poses) for key, value in spent.items()}
     for row, pose in enumerate(poses):
-        _add(run, given, row, status="initialization", pose=to_matrix(pose), num_gaussians=count, **share)
+        _add(run, given, row, status="initialization", pose=to_matrix(pose), scale=1.0, num_gaussians=count, **share)
 
 
 def record_segment(run: MappingRun, given: Input, spent: Seconds) -> None:
     """Add the frame that a part of `run` begins with; it stands in where the one before is."""
     count = int(np.asarray(run.map.gaussians.valid).sum())
     kept = {"status": "initialization", "pose": run.records[-1].pose, "new": count, "num_gaussians": count}
-    _add(run, given, 0, **kept, location=SEGMENT, **spent)
+    _add(run, given, 0, **kept, scale=1.0, location=SEGMENT, **spent)
 
 
 def record_step(run: MappingRun, given: Input, info: StepInfo, spent: Seconds, location=None, similarity=None) -> None:
