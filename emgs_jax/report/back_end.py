@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.loop_closure.two_view_refinement import rescaled
+from emgs_jax.geometry import scale_pose
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.pose_graph.factors import PoseGraph
 from emgs_jax.running.back_end import BackEnd, Refusal
@@ -23,7 +23,7 @@ def metric_graph(end: BackEnd) -> PoseGraph:
     def scaled(edge: Factor) -> Factor:
         scale = np.exp(end.log_scales[edge.a])
         sqrt_info = edge.sqrt_info / np.array([scale] * 3 + [1.0] * 4)
-        return edge._replace(Z_a_b=rescaled(edge.Z_a_b, scale), log_ratio=0.0, sqrt_info=sqrt_info)
+        return edge._replace(Z_a_b=scale_pose(edge.Z_a_b, scale), log_ratio=0.0, sqrt_info=sqrt_info)
 
     nodes = end.nodes(end.submap_id)
     return PoseGraph(

@@ -14,7 +14,7 @@ from matplotlib.patheffects import withStroke
 from PIL import Image, ImageDraw
 
 from emgs_jax.evaluation.clouds import PointCloud
-from emgs_jax.evaluation.trajectory import rotated
+from emgs_jax.geometry import rotated
 from emgs_jax.io.files import atomic_write
 
 _ESTIMATE, _TRUTH, _ONLINE, _LOOP, _INK = "#e4572e", "#1b998b", "#8d6a9f", "#2e86e4", "#333333"

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from emgs_jax.evaluation.trajectory import Alignment, align_poses
+from emgs_jax.evaluation.trajectory import align_poses
+from emgs_jax.geometry import Sim3
 from emgs_jax.report.recorded_run import RecordedRun
 
 STATUS_COLORS = {
@@ -96,7 +97,7 @@ def key_of(run: RecordedRun, errors: dict[str, np.ndarray]) -> str:
     return "".join(f'<i style="background:{color}"></i>{name}' for color, name in parts)
 
 
-def _errors(poses: np.ndarray, truth: np.ndarray, alignment: Alignment) -> np.ndarray:
+def _errors(poses: np.ndarray, truth: np.ndarray, alignment: Sim3) -> np.ndarray:
     return np.linalg.norm(alignment.apply(poses[:, :3, 3]) - truth[:, :3, 3], axis=1)
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.geometry import Sim3, scale_pose
 from emgs_jax.loop_closure.consistency import ConsistencyConfig, spatially_consistent
 from emgs_jax.loop_closure.place_recognition import (
     Database,
@@ -30,7 +31,6 @@ from emgs_jax.loop_closure.relocalization import (
     RelocalizedPose,
     relocalize,
 )
-from emgs_jax.loop_closure.two_view_refinement import rescaled
 from emgs_jax.loop_closure.verification import LoopMeasurement, VerificationConfig, VerifyInfo, neighbours_of, verify
 from emgs_jax.ops.ranges import number
 from emgs_jax.pose_graph.deform import DeformConfig
@@ -292,7 +292,7 @@ class BackEnd:
     def chi2_of(self, loop: LoopMeasurement) -> float:
         """Compute χ² of a loop at the current poses and scales."""
         scale, other = self.log_scales[loop.a], self.log_scales[loop.b]
-        now = rescaled(np.linalg.inv(self.poses[loop.a]) @ self.poses[loop.b], np.exp(-scale))
+        now = scale_pose(np.linalg.inv(self.poses[loop.a]) @ self.poses[loop.b], np.exp(-scale))
         error = np.linalg.inv(loop.Z_a_b) @ now
         turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
         return float(np.sum((loop.sqrt_info @ [*error[:3, 3], *turn, other - scale - loop.log_ratio]) ** 2))
@@ -315,6 +315,13 @@ class BackEnd:
         change = jnp.mean(after.log_scale - before.log_scale, where=before.valid)
         state = replace(state, estimate=rescale_estimate(state.estimate, jnp.exp(change)))
         return deform_state(state, before, after, self.min_std, self.config.deform)
+
+    def transform(self, rows: Sequence[int], similarity: Sim3) -> None:
+        """Map the poses and scales of some nodes to another world."""
+        for row in rows:
+            self.poses[row] = similarity.apply_to_poses(self.poses[row])
+            self.online[row] = similarity.apply_to_poses(self.online[row])
+            self.log_scales[row] += float(np.log(similarity.scale))
 
     def nodes(self, submap_id: int | None = None) -> Nodes:
         """Stack all nodes, or mark those of a submap as valid; padded to a power of two, so that it compiles rarely."""

@@ -13,10 +13,10 @@ from scene import assert_same, random_gaussians, random_observation
 
 from emgs_jax import load_config
 from emgs_jax.gaussian_map import new_map
+from emgs_jax.geometry import scale_pose
 from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe
 from emgs_jax.loop_closure.prior_query import JointPrediction
-from emgs_jax.loop_closure.two_view_refinement import rescaled
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.pose_graph.deform import DeformConfig
 from emgs_jax.pose_graph.factors import Nodes, PoseGraph, residuals
@@ -119,7 +119,7 @@ def test_the_mean_of_the_scales_that_the_unit_of_a_run_is_made_of_follows_a_clos
     records = [FrameRecord(row, None, None, "tracked", pose=pose, scale=1.05) for row, pose in enumerate(poses)]
     records[0] = FrameRecord(0, None, None, "initialization", pose=poses[0])
     run = MappingRun(None, None, state=state, records=records, back_end=end)
-    smaller = np.stack([rescaled(pose, 0.9) for pose in poses])
+    smaller = np.stack([scale_pose(pose, 0.9) for pose in poses])
     end.verified = [loop(smaller, row) for row in range(1, 9)]
     finish_back_end(run)
     assert end.accepted and log_scale - np.mean(end.log_scales) > 1e-3  # `scale_std` asks for scales of one

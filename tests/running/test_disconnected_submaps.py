@@ -10,13 +10,13 @@ from scipy.spatial import cKDTree
 from walks import NEVER_FOUND, Apart, config, mapped, prior_of, same_run, walk
 
 from emgs_jax.data.base import Frame
+from emgs_jax.geometry import Sim3, pose_difference
 from emgs_jax.loop_closure.relocalization import RelocalizedPose
-from emgs_jax.loop_closure.two_view_refinement import pose_difference
 from emgs_jax.report.metrics import score_back_end
 from emgs_jax.report.run_files import save_progress
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.checkpoint import CheckpointConfig, Keeper
-from emgs_jax.running.disconnected_submaps import join_factor, scale_of
+from emgs_jax.running.disconnected_submaps import join_factor
 from emgs_jax.running.record import UNJOINED, MappingRun
 from emgs_jax.running.saved_map import load_saved_map
 
@@ -50,8 +50,8 @@ def test_parts_of_other_frames_and_units_are_joined_where_they_meet_the_map():
             distance, turn = pose_difference(found, record.true_pose)
             assert distance < 0.03 and turn < 1.0, record.index
     np.testing.assert_allclose(np.exp(end.log_scales), 1 / np.array(UNITS)[PART], rtol=0.02)
-    np.testing.assert_allclose(scale_of(run.records[one].similarity), 1 / UNITS[2], rtol=0.02)
-    np.testing.assert_allclose(scale_of(run.records[other].similarity), UNITS[1], rtol=0.02)
+    np.testing.assert_allclose(Sim3.from_matrix(run.records[one].similarity).scale, 1 / UNITS[2], rtol=0.02)
+    np.testing.assert_allclose(Sim3.from_matrix(run.records[other].similarity).scale, UNITS[1], rtol=0.02)
     assert not run.inactive and set(end.submap_ids) == {0}
     anew, noise = said.index("anew"), config().graph.noise
     (chain,) = (edge for edge in end.factors if edge.a == anew and edge.a == edge.b + 1 and edge.sqrt_info[6, 6])
