@@ -17,7 +17,7 @@ from emgs_jax.loop_closure.relocalization import RelocalizedPose
 from emgs_jax.observation import Prediction
 from emgs_jax.pose_graph.factors import ODOMETRY
 from emgs_jax.registration.pose_estimate import rescale_estimate
-from emgs_jax.running.back_end import BackEnd
+from emgs_jax.running.back_end import BackEnd, nodes_of, relocalize_frame, transform_nodes
 from emgs_jax.running.capacity import add_map, advance, start
 from emgs_jax.running.convert import FirstWindow, to_se3
 from emgs_jax.running.deformation import deform_state, move_map
@@ -86,7 +86,7 @@ def start_submap(run: MappingRun, window_input: WindowInput) -> tuple[SlamState,
 def enter_submap(run: MappingRun, window_input: WindowInput, before: SlamState) -> None:
     """Switch to the submap that the last frame has started; the state `before` it becomes inactive."""
     run.inactive = run.inactive | {run.back_end.submap_id: before}
-    run.back_end.submap_id = window_input.structure
+    run.back_end = replace(run.back_end, submap_id=window_input.structure)
     run.structure, run.prior_motion = place_structure(window_input, run.records[-1].pose), None
 
 
@@ -102,7 +102,7 @@ def match_submap(run: MappingRun, window_input: WindowInput, info: StepInfo) -> 
     """
     if not run.inactive or not bool(info.localization.is_tracked):
         return None
-    place, _ = run.back_end.relocalize(frame_data(window_input)[0], in_other_submap=True)
+    place, _ = relocalize_frame(run.back_end, frame_data(window_input)[0], in_other_submap=True)
     if place is None:
         return None
     other = run.inactive[run.back_end.submap_ids[place.keyframe]]
@@ -128,20 +128,21 @@ def join_submaps(run: MappingRun, window_input: WindowInput) -> None:
     The newer one moves, by the similarity of the record or its inverse.
     """
     end, similarity = run.back_end, Sim3.from_matrix(run.records[-1].similarity)
-    place, _ = end.relocalize(frame_data(window_input)[-1], in_other_submap=True)  # where `match_submap` has found it
+    frame = frame_data(window_input)[-1]
+    place, _ = relocalize_frame(end, frame, in_other_submap=True)  # where `match_submap` has found it
     here, there = end.submap_id, end.submap_ids[place.keyframe]
     if here < there:
         similarity = similarity.inverse()
-    newer, older, before = max(here, there), min(here, there), end.nodes()
+    newer, older, before = max(here, there), min(here, there), nodes_of(end)
     unit = np.exp(end.log_scales[place.keyframe])  # of the place's covariance: its map may be the one that moves
     rows = [row for row, one in enumerate(end.submap_ids) if one == newer]
-    end.transform(rows, similarity)
-    after, first = end.nodes(), row_of_first_node(run) - end.first_node
+    end = transform_nodes(end, rows, similarity)
+    after, first = nodes_of(end), row_of_first_node(run) - end.first_node
     for row in rows:
         run.records[first + row] = transform_record(run.records[first + row], similarity)
-    end.submap_ids = [older if one == newer else one for one in end.submap_ids]
-    end.submap_id, end.has_one_unit = older, False
-    end.factors.append(join_factor(end, place, unit))
+    submap_ids = [older if one == newer else one for one in end.submap_ids]
+    factors = [*end.factors, join_factor(end, place, unit)]
+    run.back_end = replace(end, submap_ids=submap_ids, submap_id=older, has_one_unit=False, factors=factors)
     other = run.inactive[there]
     run.inactive = {one: state for one, state in run.inactive.items() if one != there}
     state = deform_state(run.state, before, after, end.min_std, end.config.deform)
@@ -179,13 +180,19 @@ def drop_unjoined_submaps(run: MappingRun) -> None:
     kept = 0 if run.saved is not None else max(sorted(counts), key=lambda one: counts[one])
     run.state, run.inactive = ({end.submap_id: run.state} | run.inactive)[kept], {}
     is_kept = [one == kept for one in end.submap_ids]
-    end.is_placed = [placed and here for placed, here in zip(end.is_placed, is_kept, strict=True)]
-    end.submap_id = kept
-    for name in ("factors", "verified", "violating", "accepted"):
-        setattr(end, name, [one for one in getattr(end, name) if is_kept[one.a] and is_kept[one.b]])
+    between = {
+        name: [one for one in getattr(end, name) if is_kept[one.a] and is_kept[one.b]]
+        for name in ("factors", "verified", "violating", "accepted")
+    }
     known = end.database
     rows = [row for row, one in enumerate(known.keyframes) if is_kept[one.frame]]
-    end.database = replace(known, keyframes=tuple(known.keyframes[row] for row in rows), vectors=known.vectors[rows])
+    run.back_end = replace(
+        end,
+        is_placed=[placed and here for placed, here in zip(end.is_placed, is_kept, strict=True)],
+        submap_id=kept,
+        database=replace(known, keyframes=tuple(known.keyframes[row] for row in rows), vectors=known.vectors[rows]),
+        **between,
+    )
     first = row_of_first_node(run) - end.first_node
     for row in range(end.first_node, len(is_kept)):
         if not is_kept[row]:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.geometry import Sim3
 from emgs_jax.registration.pose_estimate import rescale_estimate
+from emgs_jax.running.back_end import transform_nodes
 from emgs_jax.running.convert import on_device
 from emgs_jax.running.executables import stored
 from emgs_jax.running.record import MappingRun, transform_record
@@ -45,7 +46,7 @@ def rescale_run(run: MappingRun) -> None:
     run.state = in_prior_unit(run.state, origin)
     run.records = [transform_record(record, similarity) for record in run.records]
     if run.back_end is not None:
-        run.back_end.transform(range(len(run.back_end.poses)), similarity)
+        run.back_end = transform_nodes(run.back_end, range(len(run.back_end.poses)), similarity)
 
 
 def rescaled(state: SlamState, factor: float, origin: np.ndarray) -> SlamState:

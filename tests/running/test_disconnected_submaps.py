@@ -137,9 +137,10 @@ def test_without_a_back_end_frames_without_a_relation_are_lost_as_those_of_which
 
 def test_what_holds_two_parts_together_is_as_sure_as_the_place_was_in_its_unit_then():
     """The place was found to 1 cm in the map as it was then, whichever of the two has moved since."""
-    end, unit = BackEnd(config().graph, (300.0, 300.0, 160.0, 120.0), 0.0), 0.4
-    end.poses, end.log_scales = [np.eye(4) for _ in range(3)], [0.1, np.log(2.0), np.log(3.0)]
-    end.poses[2][:3, 3] = 1.0, 2.0, 3.0
+    poses, unit = [np.eye(4) for _ in range(3)], 0.4
+    poses[2][:3, 3] = 1.0, 2.0, 3.0
+    scales = [0.1, np.log(2.0), np.log(3.0)]
+    end = BackEnd(config().graph, (300.0, 300.0, 160.0, 120.0), 0.0, poses=poses, log_scales=scales)
     edge = join_factor(end, RelocalizedPose(np.eye(4), 0.0, 1e-4 * np.eye(7), 1), unit)
     assert (edge.a, edge.b) == (1, 2) and edge.log_ratio == pytest.approx(np.log(1.5))
     np.testing.assert_allclose(edge.Z_a_b[:3, 3], [0.5, 1.0, 1.5])
