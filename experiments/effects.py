@@ -16,7 +16,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from emgs_jax.report.columns import MAIN, Column, cell, markdown
+from emgs_jax.report.columns import MAIN, Column, Table, cell, markdown
 from emgs_jax.report.sweeps import read_sweep
 
 from .command import command
@@ -144,7 +144,7 @@ def table(effects: Sequence[Effect], alignment: str = "protocol") -> str:
         runs = max(map(len, effect.metrics.values()), default=0)
         numbers = [(effect.metrics.get(key, []), factor, digits) for key, _, factor, digits, _ in shown]
         lines.append([effect.data, change, str(runs), *(spread(*entry, effect.key is not None) for entry in numbers)])
-    return markdown(["data", "change", "runs", *(column.title for column in shown)], lines)
+    return markdown(Table(["data", "change", "runs", *(column.title for column in shown)], lines))
 
 
 @command("effects")

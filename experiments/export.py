@@ -5,9 +5,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from emgs_jax.io.files import new_folder
-from emgs_jax.report.export import IMAGE_FORMATS, ExportConfig, export, find_factor
+from emgs_jax.report.export import IMAGE_FORMATS, ExportConfig, export, find_factor, write_scaled
 from emgs_jax.report.recorded_run import read_run
-from emgs_jax.report.scaling import write_scaled
 from emgs_jax.running.values import check_value, declared
 
 from .command import command

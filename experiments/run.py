@@ -28,8 +28,8 @@ from emgs_jax.report.metrics import (
     spent,
 )
 from emgs_jax.report.page import write_report
-from emgs_jax.report.printout import frame_lines, last_words, time_words
-from emgs_jax.report.provenance import is_metric, print_metrics_table, provenance, signature, write_metrics
+from emgs_jax.report.printout import frame_lines, last_words, metrics_table, time_words
+from emgs_jax.report.provenance import is_metric, provenance, signature, write_metrics
 from emgs_jax.report.recorded_run import REPORT_FILE, read_run
 from emgs_jax.report.run_files import claim_folder, save_classes, save_outputs, save_progress
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE, Keeper
@@ -167,7 +167,7 @@ def main(config: DictConfig) -> float:
     """Run, print the table and the folder; returns the trajectory error for Hydra's sweepers, inf without one."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     metrics = run(config, folder)
-    print(print_metrics_table(metrics) if "trajectory/num_frames" in metrics else "no ground truth, so no errors")
+    print(metrics_table(metrics) if "trajectory/num_frames" in metrics else "no ground truth, so no errors")
     for key, value in metrics.items():
         if value is not None and (key.startswith("prior/") or key == "segmentation/miou_percent"):
             print(f"{key} {value:.4g}")

@@ -18,10 +18,10 @@ from omegaconf import DictConfig, OmegaConf
 
 import emgs_jax
 from emgs_jax.io.files import atomic_write
-from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, cell, markdown
+from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, Line, markdown, metric_table
 from emgs_jax.report.provenance import git_revision
 from emgs_jax.report.results import METRICS_FILE, Estimate, estimates_of, read_metrics
-from emgs_jax.report.tables import Row, average
+from emgs_jax.report.tables import average
 
 from .command import command
 from .evaluate import Job, evaluate, plan
@@ -114,24 +114,12 @@ def _table(
     estimates: Sequence[Estimate], titles: Mapping[str, str], columns: Sequence[Column], is_best_bold: bool = False
 ) -> str:
     """A line for each data set, setting and kind; with `is_best_bold` the best of each data set and setting is bold."""
-    rows = sorted(average(estimates, each_sequence=True), key=lambda row: list(titles).index(row.dataset))
     lines = []
-    for row in rows:
-        rivals = [other for other in rows if (other.dataset, other.variant) == (row.dataset, row.variant)]
-        cells = []
-        for column in columns:
-            text = cell(row.values.get(column.key), row.spreads.get(column.key), column.factor, column.digits)
-            cells.append(f"**{text}**" if is_best_bold and _is_best(row, rivals, column) else text)
+    for row in sorted(average(estimates, each_sequence=True), key=lambda row: list(titles).index(row.dataset)):
         name = titles[row.dataset] + ("" if row.variant == "default" else f", {row.variant}")
-        lines.append([name, row.kind, str(len(row.seeds)), *cells])
-    return markdown(["data, setting", "", "runs", *(column.title for column in columns)], lines)
-
-
-def _is_best(row: Row, rivals: Sequence[Row], column: Column) -> bool:
-    """Test whether no rival, of which the row is one, is better; False where the row has no value."""
-    values = [rival.values.get(column.key) for rival in rivals]
-    best = (min if column.is_lower_better else max)((value for value in values if value is not None), default=None)
-    return best is not None and row.values.get(column.key) == best
+        rivals = (row.dataset, row.variant) if is_best_bold else None
+        lines.append(Line([name, row.kind, str(len(row.seeds))], row.values, row.spreads, rivals))
+    return markdown(metric_table(["data, setting", "", "runs"], columns, lines))
 
 
 def _better(estimates: Sequence[Estimate]) -> str:

@@ -7,7 +7,7 @@ from omegaconf import DictConfig
 from emgs_jax.ops.ranges import Range
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.viewer import Viewer
-from emgs_jax.report.viewer_run import shown
+from emgs_jax.report.viewer_scene import shown
 from emgs_jax.running.values import Declared, check_value
 
 from .command import command

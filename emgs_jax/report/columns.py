@@ -1,6 +1,9 @@
-"""Columns of tables: the main metrics with their units, numbers as text, Markdown."""
+"""Tables: the main metrics as columns with their units, numbers as text, and one writer for Markdown and terminals.
 
-from collections.abc import Iterable, Sequence
+Pages write the same tables by `table` of web/parts.html.
+"""
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 DASH = "–"
@@ -24,15 +27,10 @@ MAIN = (
     Column("reconstruction/f1_5cm_percent", "F1@.05 [%]", 1.0, 1, False),
     Column("reconstruction/normals_abs_cos_percent", "normals [%]", 1.0, 1, False),
 )
-
-PLACED = (  # by their points
-    Column("reconstruction_icp/accuracy_m", "ICP: accuracy [cm]", 100.0, 2, True),
-    Column("reconstruction_icp/completion_m", "ICP: completion [cm]", 100.0, 2, True),
-    Column("reconstruction_icp/f1_20cm_percent", "ICP: F1@.2 [%]", 1.0, 1, False),
-    Column("reconstruction_icp/f1_5cm_percent", "ICP: F1@.05 [%]", 1.0, 1, False),
-    Column("reconstruction_icp/normals_abs_cos_percent", "ICP: normals [%]", 1.0, 1, False),
-)
 BY_PATH = tuple(column._replace(title=f"path: {column.title}") for column in MAIN[1:])  # beside those by points
+PLACED = tuple(  # by their points
+    column._replace(key=column.key.replace("/", "_icp/"), title=f"ICP: {column.title}") for column in MAIN[1:]
+)
 RENDERED = (  # at their own poses
     Column("rendering/coverage_percent", "coverage [%]", 1.0, 1, False),
     Column("rendering/worst_coverage_percent", "at worst [%]", 1.0, 1, False),
@@ -42,6 +40,69 @@ RENDERED = (  # at their own poses
 )
 
 
+class Cell(NamedTuple):
+    """A number in a table, or any text with a kind: `best`, or a CSS class; a plain text is a str."""
+
+    text: str
+    kind: str = ""
+
+
+class Table(NamedTuple):
+    """Titles, and lines of as many cells."""
+
+    titles: Sequence[str]
+    lines: Sequence[Sequence[str | Cell]]
+
+
+class Line(NamedTuple):
+    """Metrics of one estimate.
+
+    Args:
+        labels: its first cells.
+        values: by key; None where there is none.
+        spreads: standard deviations by key.
+        rivals: the same of all lines that it competes with; None: with none.
+    """
+
+    labels: Sequence[str]
+    values: Mapping[str, float | None]
+    spreads: Mapping[str, float | None] = {}
+    rivals: Hashable = ()
+
+
+def known(columns: Iterable[Column], lines: Iterable[Line]) -> list[Column]:
+    """Keep the columns in which some line has a value."""
+    lines = list(lines)
+    return [column for column in columns if any(line.values.get(column.key) is not None for line in lines)]
+
+
+def metric_table(titles: Sequence[str], columns: Sequence[Column], lines: Sequence[Line]) -> Table:
+    """Lay out metrics below the titles of the labels and of the columns; the best of several rivals is marked."""
+    numbers: dict[tuple, list[float]] = {}
+    for line in lines:
+        for column in columns:
+            value = line.values.get(column.key)
+            if value is not None and line.rivals is not None:
+                numbers.setdefault((line.rivals, column), []).append(value)
+    best = {
+        what: (min if what[1].is_lower_better else max)(values) for what, values in numbers.items() if len(values) > 1
+    }
+
+    def number(line: Line, column: Column) -> Cell:
+        value = line.values.get(column.key)
+        text = cell(value, line.spreads.get(column.key), column.factor, column.digits)
+        return Cell(text, "best" if value is not None and value == best.get((line.rivals, column)) else "")
+
+    laid_out = [[*line.labels, *(number(line, column) for column in columns)] for line in lines]
+    return Table([*titles, *(column.title for column in columns)], laid_out)
+
+
+def transposed(table: Table) -> Table:
+    """Swap lines and columns; the first labels become titles."""
+    top, *lines = zip(table.titles, *table.lines, strict=True)
+    return Table([cell_text(title) for title in top], lines)
+
+
 def cell(mean: float | None, spread: float | None, factor: float, digits: int, sign: str = "") -> str:
     """Mean ± spread as text; a dash where there is no mean, NaN included. `sign="+"` writes it of positive ones too."""
     if mean is None or mean != mean:
@@ -49,7 +110,26 @@ def cell(mean: float | None, spread: float | None, factor: float, digits: int, s
     return f"{factor * mean:{sign}.{digits}f}" + ("" if spread is None else f" ± {factor * spread:.{digits}f}")
 
 
-def markdown(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """A table."""
-    rows = [titles, ["---"] * len(titles), *lines]
+def cell_text(content: str | Cell) -> str:
+    """The text of a cell, without its kind."""
+    return content.text if isinstance(content, Cell) else content
+
+
+def markdown(table: Table) -> str:
+    """Write a table in Markdown; the best are bold."""
+
+    def text(content: str | Cell) -> str:
+        return (
+            f"**{cell_text(content)}**" if isinstance(content, Cell) and content.kind == "best" else cell_text(content)
+        )
+
+    rows = [table.titles, ["---"] * len(table.titles), *([text(content) for content in line] for line in table.lines)]
     return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+
+
+def aligned(table: Table) -> str:
+    """Write a table for a terminal: labels to the left, all else to the right, a line below the titles."""
+    texts = [[cell_text(content) for content in line] for line in (table.titles, *table.lines)]
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    rows = ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in texts]
+    return "\n".join([rows[0], "─" * max(map(len, rows)), *rows[1:]])

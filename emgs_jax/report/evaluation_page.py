@@ -1,33 +1,17 @@
 """report.html of an evaluation: what became of every run, ours beside the prior alone and the baselines, the gate."""
 
-from collections.abc import Sequence
-from html import escape
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from emgs_jax.report.columns import MAIN
-from emgs_jax.report.page_words import command_line, first_words, quiet, section, table
+from markupsafe import Markup
+
+from emgs_jax.report.columns import MAIN, Cell, Line, Table, known, metric_table
+from emgs_jax.report.html import MAX_LINES, Head, link, page, picture, thumbnails, write_page
+from emgs_jax.report.provenance import RAW_PRIOR
 from emgs_jax.report.recorded_run import REPORT_FILE
 from emgs_jax.report.results import METRICS_FILE, Estimate, read_metrics
-from emgs_jax.report.table_page import (
-    MAX_LINES,
-    best_of,
-    link,
-    number,
-    picture,
-    rows_of,
-    run_facts,
-    texts,
-    thumbnails,
-    write_page,
-)
-from emgs_jax.report.tables import COLUMNS, Row
-
-_FILES = (
-    ("results.csv", "a line for each estimate with every metric"),
-    ("results.json", "means and deviations, and what is missing"),
-    ("results.md", "the tables as text"),
-)
+from emgs_jax.report.tables import COLUMNS, Row, over
 
 
 class JobLine(NamedTuple):
@@ -63,20 +47,16 @@ def write_evaluation_page(out: Path, found: Found, command: str) -> Path:
     )
     about = f"protocol {', '.join(protocols)}; commit {', '.join(text[:12] for text in revisions)}" if protocols else ""
     title, is_simulated = out.resolve().name, any(item.is_simulated for item in found.estimates)
-    head = first_words("Evaluation", title, *verdict(found), is_simulated) + quiet(about)
-    parts = [section("Runs", _jobs(out, found.jobs))]
-    if found.rows:
-        parts.append(section("Errors: means over the seeds", _errors(found.rows)))
-    if found.gate is not None:
-        lines = "".join(f"<li>{escape(line)}</li>" for line in found.regressions[:MAX_LINES])
-        parts.insert(0, section(f"Gate {found.gate}", f"<ul>{lines}</ul>" if lines else "<p>Nothing is worse.</p>"))
-    parts.append(section("Files", table(("file", "what it is"), _FILES)))
-    names = sorted({(item.dataset, item.prior) for item in found.estimates if item.prior is not None})
-    return write_page(out, f"{title}: evaluation", head + (command_line(command) if command else ""), parts, names)
+    sources = sorted({(item.dataset, item.prior) for item in found.estimates if item.prior is not None})
+    head = Head(f"{title}: evaluation", "Evaluation", title, *verdict(found), is_simulated, [about], command, sources)
+    shown = found.jobs[:MAX_LINES]
+    more = f"and {len(found.jobs) - len(shown)} more runs" if len(found.jobs) > len(shown) else ""
+    values = {"runs": _runs(out, shown), "more": more, "errors": _errors(found.rows), "max_lines": MAX_LINES}
+    return write_page(out, page("evaluation.html", head, found=found, **values))
 
 
 def verdict(found: Found) -> tuple[str, str]:
-    """`good`, `mixed`, `bad` or `unknown`, and how many runs are finished and better than the prior alone.
+    """Judge as `good`, `mixed`, `bad` or `unknown`, and say how many runs are finished and better than the prior alone.
 
     Bad: something is not finished or worse than the gate allows. Mixed: the path of some run is worse than the prior's.
     """
@@ -95,43 +75,36 @@ def verdict(found: Found) -> tuple[str, str]:
     return ("unknown" if not pairs else "good" if better == len(pairs) else "mixed"), f"{words}."
 
 
-def _jobs(out: Path, jobs: Sequence[JobLine]) -> str:
+def run_facts(metrics: Mapping[str, Any]) -> str:
+    """Say the error of the path beside the prior's, and the frames, in one line."""
+    ours, raw = (metrics.get(prefix + MAIN[0].key) for prefix in ("", RAW_PRIOR))
+    words = ["no ground truth"] if ours is None else [f"path off by {100 * ours:.1f} cm"]
+    if ours is not None and raw is not None:
+        words[0] += f" (prior alone: {100 * raw:.1f} cm)"
+    counts = {status: metrics.get(f"frames/{status}") for status in ("tracked", "degraded", "lost", "skipped")}
+    return ", ".join([*words, *(f"{count} {status}" for status, count in counts.items() if count)])
+
+
+def _runs(out: Path, jobs: Sequence[JobLine]) -> Table:
     """A line for each run: picture, name, where it lies, what it came to or why not."""
-    lines, shown = [], jobs[:MAX_LINES]
-    for job, content in zip(shown, thumbnails([job.folder / "overview.png" for job in shown]), strict=True):
-        if job.missing:
-            what = f'<td class="text bad">not finished: {escape(job.missing)}</td>'
-        else:
-            what = texts([run_facts(read_metrics(job.folder / METRICS_FILE))])
-        where = (link(out, job.folder / REPORT_FILE, "report"), link(out, job.folder, "folder"))
-        name = f'<td class="text">{escape(job.name)}<br>{" · ".join(filter(None, where))}</td>'
-        lines.append(f"<td>{picture(content, f'the map of {job.name}')}</td>{name}{what}")
-    more = f"and {len(jobs) - len(shown)} more runs" if len(jobs) > len(shown) else ""
-    return rows_of(("", "run", "what it came to"), (), lines) + quiet(more)
-
-
-def _comparable(row: Row) -> tuple:
-    """Return the values that two rows must share to be compared with each other."""
-    return row.dataset, row.sequences, row.protocol, row.is_simulated
-
-
-def _errors(rows: Sequence[Row]) -> str:
-    """Ours, the raw prior and baselines one below the other; the best on the same data is marked."""
-    columns = [column for column in COLUMNS if any(row.values.get(column.key) is not None for row in rows)]
-    groups: dict[tuple, list[Row]] = {}
-    for row in rows:
-        groups.setdefault(_comparable(row), []).append(row)
-    best = {
-        what: [best_of((row.values.get(column.key) for row in members), column) for column in columns]
-        for what, members in groups.items()
-    }
     lines = []
-    for row in rows[:MAX_LINES]:
-        sequences = row.sequences[0] if len(row.sequences) == 1 else f"mean of {len(row.sequences)}"
+    for job, content in zip(jobs, thumbnails([job.folder / "overview.png" for job in jobs]), strict=True):
+        missing = Cell(f"not finished: {job.missing}", "text bad")
+        what = missing if job.missing else run_facts(read_metrics(job.folder / METRICS_FILE))
+        links = link(out, job.folder / REPORT_FILE, "report"), link(out, job.folder, "folder")
+        name = Markup("{}<br>{}").format(job.name, Markup(" · ").join(filter(None, links)))
+        lines.append([picture(content, f"the map of {job.name}"), name, what])
+    return Table(("", "run", "what it came to"), lines)
+
+
+def _errors(rows: Sequence[Row]) -> Table:
+    """Ours, the raw prior and baselines one below the other; the best of what can be compared is marked."""
+    lines = []
+    for row in rows:
         label = "simulated" if row.is_simulated else "measured"
-        line = texts([row.dataset, sequences, row.variant, row.kind, label, row.protocol, str(len(row.seeds))])
-        for column, top in zip(columns, best[_comparable(row)], strict=True):
-            line += number(row.values.get(column.key), column, top, row.spreads.get(column.key))
-        lines.append(line)
+        labels = [row.dataset, over(row.sequences), row.variant, row.kind, label, row.protocol, str(len(row.seeds))]
+        rivals = row.dataset, row.sequences, row.protocol, row.is_simulated
+        lines.append(Line(labels, row.values, row.spreads, rivals))
     titles = ("data set", "sequence", "setting", "", "source", "protocol", "seeds")
-    return rows_of(titles, [column.title for column in columns], lines)
+    table = metric_table(titles, known(COLUMNS, lines), lines)
+    return table._replace(lines=table.lines[:MAX_LINES])

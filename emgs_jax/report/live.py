@@ -18,9 +18,9 @@ from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.composite import RenderConfig
-from emgs_jax.report.page_map import map_layers
+from emgs_jax.report.layers import map_layers
 from emgs_jax.report.viewer import Viewer
-from emgs_jax.report.viewer_run import Shown
+from emgs_jax.report.viewer_scene import Shown
 from emgs_jax.running.record import FrameRecord, MappingRun
 from emgs_jax.running.window_input import RawView
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
@@ -16,9 +15,9 @@ from PIL import Image, ImageDraw
 from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.geometry import rotated
 from emgs_jax.io.files import atomic_write
+from emgs_jax.report.colors import OURS, PATHS, class_colors, to_bytes
 
-_ESTIMATE, _TRUTH, _ONLINE, _LOOP, _INK = "#e4572e", "#1b998b", "#8d6a9f", "#2e86e4", "#333333"
-_PAPER = "#e3e6ea"
+_INK, _PAPER = "#333333", "#e3e6ea"
 
 
 @dataclass(frozen=True)
@@ -161,22 +160,22 @@ def thumbnail(points: np.ndarray, colors: np.ndarray, poses: np.ndarray, width: 
     picture, (left, right, bottom, top) = seen_from_above(
         points[finite] @ rotation.T, colors[finite].clip(0.0, 1.0), path[:, 2], (40, 100)
     )
-    low, high = path[:, :2].min(0), path[:, :2].max(0)
-    low, high = np.minimum(low, [left, bottom]), np.maximum(high, [right, top])
+    corners = np.array([[left, bottom], [right, top], *path[:, :2]])
+    low, high = corners.min(0), corners.max(0)
     margin = 0.03 * np.max(high - low)
     low, high = low - margin, high + margin
     scale = width / float(np.max(high - low))  # pixels a metre
 
-    def pixels(point: np.ndarray) -> tuple[int, int]:
-        return round(float(point[0] - low[0]) * scale), round(float(high[1] - point[1]) * scale)
+    def pixels(x: float, y: float) -> tuple[int, int]:
+        return round(float(x - low[0]) * scale), round(float(high[1] - y) * scale)
 
-    corner, end = pixels(np.array([left, top])), pixels(np.array([right, bottom]))
+    corner, end = pixels(left, top), pixels(right, bottom)
     size = max(end[0] - corner[0], 1), max(end[1] - corner[1], 1)
-    image = np.rint(255 * picture[::-1]).astype(np.uint8)  # up is the first row
-    small = Image.fromarray(image, "RGBA").resize(size, Image.Resampling.NEAREST)
-    paper = Image.new("RGB", pixels(np.array([high[0], low[1]])), _PAPER)
+    image = Image.fromarray(to_bytes(picture[::-1]), "RGBA")  # up is the first row
+    small = image.resize(size, Image.Resampling.NEAREST)
+    paper = Image.new("RGB", pixels(high[0], low[1]), _PAPER)
     paper.paste(small, corner, small.getchannel("A"))
-    ImageDraw.Draw(paper).line([pixels(point) for point in path], fill=_ESTIMATE, width=2)
+    ImageDraw.Draw(paper).line([pixels(*point) for point in path[:, :2]], fill=OURS, width=2)
     return paper
 
 
@@ -188,16 +187,18 @@ def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
     if len(points):
         image, extent = seen_from_above(points, colors, path[:, 2])
         axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=1)
-    if paths.truth is not None:
-        _draw_path(axes, paths.truth[:, :3, 3] @ rotation.T, _TRUTH, "true path, where it fits best", 5.0)
-    if paths.online is not None:
-        _draw_path(axes, paths.online[:, :3, 3] @ rotation.T, _ONLINE, "as it was placed", 1.6)
+    for name, poses, label, width in (
+        ("truth", paths.truth, "true path, where it fits best", 5.0),
+        ("online", paths.online, "as it was placed", 1.6),
+    ):
+        if poses is not None:
+            _draw_path(axes, poses[:, :3, 3] @ rotation.T, PATHS[name].paper, label, width)
     # Thinner with its outline than the true path, so that one on top of the other shows both.
-    _draw_path(axes, np.where(paths.is_placed[:, None], path, np.nan), _ESTIMATE, "estimated path", 1.6)
+    _draw_path(axes, np.where(paths.is_placed[:, None], path, np.nan), OURS, "estimated path", 1.6)
     if paths.loops:
         ends = path[np.array(paths.loops)]
-        axes.plot(*ends[..., :2].T, color=_LOOP, linewidth=1.6, zorder=3)
-        axes.plot([], [], color=_LOOP, linewidth=1.6, label=f"{len(ends)} loops")
+        lines = axes.plot(*ends[..., :2].T, color=PATHS["loops"].paper, linewidth=1.6, zorder=3)
+        lines[0].set_label(f"{len(ends)} loops")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_facecolor(_PAPER)
     axes.set_xlabel({"m": "metres"}.get(paths.unit, paths.unit), color=_INK)
@@ -276,13 +277,6 @@ def _draw_labels(column: np.ndarray, frames: Sequence[Mapping[str, Any]], classe
     seen = sorted({int(label) for frame in frames for label in np.unique(frame["labels"]) if label >= 0})
     handles = [Patch(color=colors[label], label=classes[label]) for label in seen]
     column[-1].figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
-
-
-def class_colors(count: int) -> np.ndarray:
-    """RGB in [0, 1] (count, 3): hues a golden section apart, alternately dark and light."""
-    number = np.arange(count)
-    light = number % 2
-    return hsv_to_rgb(np.stack([0.618034 * number % 1.0, 0.8 - 0.3 * light, 0.65 + 0.3 * light], -1).reshape(count, 3))
 
 
 def _bare(axes: Axes) -> None:

@@ -1,7 +1,5 @@
 """Small pictures for the page: what the camera saw, what the map shows from there, and how far away it is."""
 
-import base64
-import io
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -12,15 +10,17 @@ import numpy as np
 from PIL import Image
 
 from emgs_jax.data.base import BadFrameError, Dataset
-from emgs_jax.gaussian_map import GaussianMap, confirmed
+from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
+from emgs_jax.report.colors import to_bytes
+from emgs_jax.report.html import jpeg
+from emgs_jax.report.recorded_run import RecordedRun
 from emgs_jax.running.convert import to_se3
 from emgs_jax.running.executables import stored
 
 WIDTH = 200  # pixels; a picture is not wider
-QUALITY = 80  # of JPEG
 _NO_DEPTH = (221, 221, 221)
 
 
@@ -47,35 +47,24 @@ def _drawn(gaussians: Gaussians, pose: jaxlie.SE3, camera: Camera, config: Rende
     return drawing.values, drawing.depth
 
 
-def draw_views(
-    map: GaussianMap,
-    poses: np.ndarray,
-    rows: Sequence[int],
-    placed: np.ndarray,
-    camera: Camera,
-    config: RenderConfig,
-    dataset: Dataset | None,
-) -> Views:
-    """Pictures of some frames, the map drawn by our own renderer.
+def draw_views(run: RecordedRun, rows: Sequence[int], config: RenderConfig, dataset: Dataset | None) -> Views:
+    """Draw the map of a run by our own renderer from some frames, beside their images.
 
     Args:
-        map: whose confirmed Gaussians are drawn.
-        poses: T_world_camera of all frames, (n, 4, 4).
+        run: from a frame that is not placed, nothing is drawn.
         rows: of the frames.
-        placed: bool (n,); from a frame that is not, nothing is drawn.
-        camera: of the frames.
-        config: as they are drawn.
+        config: as the map is drawn.
         dataset: for the images; None: without them.
     """
-    small = downscale(camera, -(-camera.width // WIDTH))
-    drawn = dict(_draw_all(confirmed(map), poses, [row for row in rows if placed[row]], small, config))
+    small, placed = downscale(run.camera, -(-run.camera.width // WIDTH)), run.is_placed
+    drawn = dict(_draw_all(confirmed(run.map), run.poses, [row for row in rows if placed[row]], small, config))
     depths = [depth[depth > 0] for _, depth in drawn.values()]
     known = np.concatenate(depths) if depths else np.zeros(0)
     near, far = (float(value) for value in np.percentile(known, [1, 99])) if len(known) else (0.0, 1.0)
     pictures = []
     for row in rows:
         color, depth = drawn.get(row, (None, None))
-        rendered = "" if color is None else jpeg(np.rint(255 * color.clip(0.0, 1.0)).astype(np.uint8))
+        rendered = "" if color is None else jpeg(to_bytes(color))
         pictures.append(
             Picture(row, _seen(dataset, row), rendered, "" if depth is None else jpeg(_painted(depth, near, far)))
         )
@@ -110,13 +99,5 @@ def _seen(dataset: Dataset | None, row: int) -> str:
 def _painted(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     """Depth in colours, uint8 (h, w, 3); grey where there is none."""
     share = (depth - near) / max(far - near, 1e-9)
-    colors = np.rint(255 * matplotlib.colormaps["turbo"](share)[..., :3]).astype(np.uint8)
+    colors = to_bytes(matplotlib.colormaps["turbo"](share)[..., :3])
     return np.where((depth > 0)[..., None], colors, np.uint8(_NO_DEPTH))
-
-
-def jpeg(image: np.ndarray | Image.Image) -> str:
-    """JPEG in base64 of RGB, uint8 (h, w, 3)."""
-    image = image if isinstance(image, Image.Image) else Image.fromarray(image)
-    content = io.BytesIO()
-    image.convert("RGB").save(content, "JPEG", quality=QUALITY)
-    return base64.b64encode(content.getvalue()).decode("ascii")

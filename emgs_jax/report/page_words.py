@@ -1,19 +1,30 @@
-"""Words and tables of the page: verdict, errors, loops, settings, files, licences. All of it escaped."""
+"""Words and tables of a run's page: verdict, errors, loops, settings, files."""
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from html import escape
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 from emgs_jax.report import provenance
-from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Column, cell
-from emgs_jax.report.page_strip import loop_why, loop_words
-from emgs_jax.report.provenance import RAW_PRIOR, ROWS
+from emgs_jax.report.columns import (
+    BY_PATH,
+    MAIN,
+    PLACED,
+    RENDERED,
+    Column,
+    Line,
+    Table,
+    known,
+    metric_table,
+    transposed,
+)
+from emgs_jax.report.html import Head, commit_words
+from emgs_jax.report.provenance import RAW_PRIOR
 from emgs_jax.report.recorded_run import POLISH, RecordedRun
 from emgs_jax.report.repeat import Repeated
 
 MANY_LOST = 0.1  # share of the frames
+MAX_LOOPS = 500  # that are named
 _SE3 = Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True)
 _COLUMNS = (MAIN[0]._replace(title="ATE Sim(3) [cm]"), _SE3, *PLACED[:1], *PLACED[3:4], *BY_PATH, *RENDERED)
 FILES = {
@@ -41,18 +52,48 @@ POLISHED = (  # key of polish.json, words, digits
     ("depth_within_5_percent", "depth within 5 %, %", 1),
     ("depth_l1_m", "depth L1, m", 3),
 )
-_OWN = "made by this program, Apache-2.0"
-DATA_LICENCES = {
-    "synthetic": _OWN,
-    "apartment": _OWN,
-    "tum": "TUM RGB-D: CC BY 4.0; another folder of this layout: see its publisher",
-    "seven_scenes": "7-Scenes: see the data set's page at Microsoft Research",
-    "bonn": "Bonn RGB-D Dynamic: see the data set's page at the University of Bonn",
-    "euroc": "EuRoC MAV: see the data set's page at ETH Zurich; another folder of this layout: see its publisher",
-    "kitti": "KITTI: CC BY-NC-SA 3.0",
-    "replica": "Replica: Replica Dataset Research Terms, for research and education that is not commercial",
-    **dict.fromkeys(("images", "colmap", "nerfstudio", "rosbag"), "your own images, your own licence"),
+GATES = {
+    "matches": "too few matches fit one motion of the camera",
+    "match_share": "too many matches do not fit one motion of the camera",
+    "pose": "too few points of the one fit the image of the other",
+    "poses_disagree": "the pose from the points of the one is not that from those of the other",
+    "hull": "what both show is in a small part of an image",
+    "collinear": "what both show lies on a line",
+    "small": "what both show is one small object",
+    "depths": "the ratios of the depths scatter",
+    "scale": "the scale is not that of a metric prior",
+    "neighbours": "too few of the neighbouring frames are verified as well",
+    "neighbours_disagree": "the neighbouring frames say otherwise",
+    "contradicted": "the one looks through what the other sees",
+    "revisit": "the prior, asked for both together, says otherwise",
 }
+OUTCOMES = {
+    "accepted": "accepted",
+    "known": "verified; the poses said so already",
+    "unconfirmed": "verified, but others do not agree",
+    "unsolved": "verified, but no better poses were found with it",
+}
+
+
+def loop_why(loop: dict[str, Any]) -> str:
+    """Outcome and reason."""
+    gate = str(loop.get("gate", ""))
+    why = f"refused: {GATES.get(gate, gate)}" if loop["outcome"] == "refused" else OUTCOMES[loop["outcome"]]
+    return f"{why}: {loop['reason']}" if loop.get("reason") else why
+
+
+def loop_words(run: RecordedRun, loop: dict[str, Any]) -> str:
+    """Frames, by their index in the data set as everywhere on the page, outcome and reason."""
+    frame, other = (run.frames[loop[name]]["index"] for name in ("frame", "other"))
+    return f"frames {frame} and {other}: {loop_why(loop)}"
+
+
+class Loops(NamedTuple):
+    """Candidates of loops: counts of their outcomes, what came of them, and each in words."""
+
+    outcomes: Table
+    closures: str
+    each: list[str]
 
 
 def verdict(run: RecordedRun) -> tuple[str, str]:
@@ -91,98 +132,65 @@ def verdict(run: RecordedRun) -> tuple[str, str]:
     return level, f"{words}; {tracked}."
 
 
-def is_metric(run: RecordedRun) -> bool:
-    """Test whether lengths of the map are meant to be metres."""
-    return provenance.is_metric(run.provenance["prior"].get("settings", {}))
-
-
-def head(run: RecordedRun, again: Repeated) -> str:
-    """Return the head of the page: data and prior, verdict, versions, and the command that repeats the run."""
+def head(run: RecordedRun, again: Repeated) -> Head:
+    """Write the head of the page: data and prior, verdict, versions, and the command that repeats the run."""
     block, (level, words) = run.provenance, verdict(run)
     data, prior = block["data"], block["prior"]
-    title = f"{data['name']} {data['sequence']}"
-    parts = [first_words(title, f"prior {prior['name']}", level, words, block["simulated"])]
-    if not is_metric(run):
-        parts.append(quiet("Images alone do not tell the scale: lengths follow from a median depth that was assumed."))
-    git = block.get("git") or {}
-    commit = f"commit {git['revision'][:12]}{' with changes' if git.get('dirty') else ''}" if git else "no checkout"
-    device = block.get("device", {}).get("kind", "")
-    size = f"{run.camera.width} × {run.camera.height} pixels"
-    where = f"emgs_jax {block['versions']['emgs_jax']}, {commit}, on {device}; images of {size}"
-    return "".join([*parts, quiet(where), command_line(again.command)])
+    title, size = f"{data['name']} {data['sequence']}", f"{run.camera.width} × {run.camera.height} pixels"
+    version, device = block["versions"]["emgs_jax"], block["device"]["kind"]
+    remarks = [f"emgs_jax {version}, {commit_words(block['git'])}, on {device}; images of {size}"]
+    if not run.is_metric:
+        remarks.insert(0, "Images alone do not tell the scale: lengths follow from a median depth that was assumed.")
+    sources = [(str(data["name"]), str(prior["name"]))]
+    window, beside = f"{title}: report of a run", f"prior {prior['name']}"
+    return Head(window, title, beside, level, words, block["simulated"], remarks, again.command, sources)
 
 
-def first_words(title: str, more: str, level: str, words: str, is_simulated: bool) -> str:
-    """Title with the simulated label, verdict, and what the label means."""
-    badge = ' <span class="badge">SIMULATED</span>' if is_simulated else ""
-    heading = f"<h1>{escape(title)} <small>{escape(more)}</small>{badge}</h1>"
-    note = "Simulated: the prior is the disturbed ground truth. Numbers must not be set beside published ones."
-    return f'{heading}<p class="verdict {level}">{escape(words)}</p>{quiet(note if is_simulated else "")}'
-
-
-def command_line(command: str) -> str:
-    """Return the command that repeats the run, in HTML."""
-    return f"<p><code>{escape(command)}</code></p>"
-
-
-def errors(run: RecordedRun) -> str:
-    """The table of errors: ours, as placed, the raw prior and baselines."""
-    metrics, config = run.metrics, run.provenance["config"].get("evaluation", {})
+def errors(run: RecordedRun) -> Table | None:
+    """Compare our errors, those as placed, of the raw prior and of baselines, one beside the other; None without."""
+    metrics = run.metrics
     if not any(MAIN[0].key in key for key in metrics):
-        return section("Errors", "<p>None: the data set has no ground truth.</p>")
-    names = {prefix: name for prefix, name in ROWS.items() if any(prefix + c.key in metrics for c in _COLUMNS)}
-    rows = [(name, [metrics.get(prefix + column.key) for column in _COLUMNS]) for prefix, name in names.items()]
-    online = {
-        column.key: metrics.get(column.key.replace("trajectory/", "trajectory_online/")) for column in _COLUMNS[:2]
-    }
+        return None
+    lines = [line._replace(rivals=()) for line in provenance.lines_of(metrics, _COLUMNS)]
+    online = {key: metrics.get(key.replace("trajectory/", "trajectory_online/")) for key, *_ in _COLUMNS[:2]}
     if any(value is not None for value in online.values()):
-        rows.insert(1, ("ours, as placed", [online.get(column.key) for column in _COLUMNS]))
-    lines = []
-    for k, column in enumerate(_COLUMNS):
-        known = [values[k] for _, values in rows if values[k] is not None]
-        if not known:
-            continue
-        best, cells = (min if column.is_lower_better else max)(known), []
-        for _, values in rows:
-            mark = ' class="best"' if values[k] == best and len(known) > 1 else ""
-            cells.append(f"<td{mark}>{cell(values[k], None, column.factor, column.digits)}</td>")
-        lines.append(f"<tr><td>{escape(column.title)}</td>{''.join(cells)}</tr>")
-    titles = "".join(f"<th>{escape(name)}</th>" for name, _ in rows)
-    how = (
-        f"Protocol {run.provenance['protocol']}: {config.get('statistic', 'mean')} distances, clouds placed by their "
-        f"points (ICP) or by the path ({config.get('alignment')}); rendered at each one's own poses. "
-        f"{metrics.get('trajectory/num_frames')} frames with truth. Raw prior: the same predictions without mapping."
+        lines.insert(1, Line(["ours, as placed"], online))
+    return transposed(metric_table([""], known(_COLUMNS, lines), lines))
+
+
+def protocol_words(run: RecordedRun) -> str:
+    """Say how errors are measured."""
+    config = run.provenance["config"].get("evaluation", {})
+    statistic, num_frames = config.get("statistic", "mean"), run.metrics.get("trajectory/num_frames")
+    return (
+        f"Protocol {run.provenance['protocol']}: {statistic} distances, clouds placed by their points (ICP) or by the "
+        f"path ({config.get('alignment')}); rendered at each one's own poses. {num_frames} frames with truth. Raw "
+        "prior: the same predictions without mapping."
     )
-    return section("Errors", f"<table><tr><th></th>{titles}</tr>{''.join(lines)}</table>{quiet(how)}")
 
 
-def loops(run: RecordedRun) -> str:
-    """Counts of outcomes with their reasons, and every candidate; nothing without a back end."""
+def loops(run: RecordedRun) -> Loops | None:
+    """Count the outcomes of loop candidates with their reasons; None without a back end."""
     if not run.loops:
-        return ""
+        return None
     counts = Counter(map(loop_why, run.loops)).most_common()
-    rows = [(f"{count}", words) for words, count in counts]
-    each = "".join(f"<li>{escape(loop_words(run, loop))}</li>" for loop in run.loops[:500])
-    more = f"<li>and {len(run.loops) - 500} more in loops.json</li>" if len(run.loops) > 500 else ""
-    closures = f"{run.metrics.get('loops/closures', 0)} closures moved poses and map."
-    outcomes = table(("candidates", "outcome"), rows)
-    return section(
-        "Loops", f"{outcomes}{quiet(closures)}<details><summary>each of them</summary><ul>{each}{more}</ul></details>"
-    )
+    each = [loop_words(run, loop) for loop in run.loops[:MAX_LOOPS]]
+    each += [f"and {len(run.loops) - MAX_LOOPS} more in loops.json"] if len(run.loops) > MAX_LOOPS else []
+    outcomes = Table(("candidates", "outcome"), [(f"{count}", words) for words, count in counts])
+    return Loops(outcomes, f"{run.metrics.get('loops/closures', 0)} closures moved poses and map.", each)
 
 
-def settings(again: Repeated) -> str:
-    """Return the section of the settings that differ from the defaults."""
+def settings(again: Repeated) -> Table:
+    """List the settings that differ from the defaults."""
     rows = [(key, _plain(value), _plain(default)) for key, value, default in again.differences]
-    body = table(("setting", "here", "default"), rows) if rows else "<p>None: all settings are the defaults.</p>"
-    return section("Settings that differ from the defaults", body)
+    return Table(("setting", "here", "default"), rows)
 
 
-def polished(run: RecordedRun) -> str:
-    """What `emgs polish` has changed on the frames that it held out; nothing where it was not run."""
+def polished(run: RecordedRun) -> tuple[Table, str] | None:
+    """Compare map and splats of `emgs polish` on the frames that it held out; None where it was not run."""
     path = run.folder / POLISH[1]
     if not path.is_file():
-        return ""
+        return None
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         count, held = (int(found[f"polish/{name}"]) for name in ("num_splats", "num_held_out"))
@@ -194,44 +202,13 @@ def polished(run: RecordedRun) -> str:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is not what emgs polish writes ({error!r}): polish again") from error
     words = f"{count:,} splats; the {held} frames that are compared were not fitted."
-    return section("Polished", table(("held-out frames", "map", "splats"), rows) + quiet(words))
+    return Table(("held-out frames", "map", "splats"), rows), words
 
 
-def files(run: RecordedRun, note: str) -> str:
-    """Return the section of the files beside the page, with the programs that open them."""
+def files(run: RecordedRun) -> Table:
+    """List the files beside the page, with the programs that open them."""
     there = [(name, words) for name, words in FILES.items() if name == "report.html" or (run.folder / name).is_file()]
-    return section("Files of the run", table(("file", "what it is; what opens it"), there) + quiet(note))
-
-
-def licences(run: RecordedRun) -> str:
-    """Of the program, the data and the prior of a run."""
-    return licence_words(str(run.provenance["data"]["name"]), str(run.provenance["prior"]["name"]))
-
-
-def licence_words(name: str, prior: str) -> str:
-    """Of the program, a data set and a prior."""
-    data = DATA_LICENCES.get(name, f"{name}: see its publisher")
-    is_own = prior.startswith(("simulated", "multiview_stereo"))
-    network = "" if is_own else "; its weights have a licence of their own: docs/priors.md"
-    own = "Licences. Page and program: emgs_jax, Apache-2.0."
-    return f"<p>{own} Data: {escape(data)}. Prior: {escape(prior)}{network}.</p>"
-
-
-def section(title: str, body: str) -> str:
-    """A part of the page; `body` is HTML."""
-    return f"<section><h2>{escape(title)}</h2>{body}</section>"
-
-
-def table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of texts."""
-    lines = ["".join(f'<td class="text">{escape(text)}</td>' for text in row) for row in rows]
-    top = "".join(f'<th class="text">{escape(title)}</th>' for title in titles)
-    return f"<table><tr>{top}</tr>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
-
-
-def quiet(text: str) -> str:
-    """A side remark; nothing for an empty one."""
-    return f'<p class="quiet">{escape(text)}</p>' if text else ""
+    return Table(("file", "what it is; what opens it"), there)
 
 
 def _plain(value: Any) -> str:

@@ -4,6 +4,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, aligned, metric_table
+from emgs_jax.report.provenance import has_metric_truth, lines_of
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.record import FrameRecord
 from emgs_jax.running.untracked import MANY_IN_A_ROW, REMEDIES, UNTRACKED, called, longest_row, main_reason
@@ -50,3 +52,27 @@ def last_words(metrics: Mapping[str, Any]) -> str:
     apart = metrics["segments/unjoined_frames"]
     words = f", {apart} of them because their part was never joined with the map" if apart else ""
     return f"{count} of {whole} frames are degraded or lost, {row} in a row from frame {start} on{words}; "
+
+
+def metrics_table(metrics: Mapping[str, Any]) -> str:
+    """Lay out the main metrics, one row for the map, the raw prior and each baseline; `–` where there is no value.
+
+    First come clouds placed by their points (ICP), as in the README, below the same rows placed by the path, and what
+    is rendered of them at their own poses.
+    """
+    block, tables = metrics.get("provenance", {}), []
+    for columns in ((MAIN[0], *PLACED), (*BY_PATH, *RENDERED)):
+        if lines := lines_of(metrics, columns):
+            table = metric_table([_label(block)], columns, lines)
+            is_metric = has_metric_truth(block)
+            titles = [title if is_metric else title.replace("[cm]", "[.01 units]") for title in table.titles]
+            tables.append(aligned(table._replace(titles=titles)))
+    return "\n\n".join(tables)
+
+
+def _label(block: Mapping[str, Any]) -> str:
+    """Label a table: empty for measured numbers; `simulated`, with any version, for others."""
+    if not block.get("simulated", False):
+        return ""
+    name = (block.get("prior") or {}).get("name", "")
+    return name if name.startswith("simulated v") else "simulated"

@@ -1,4 +1,4 @@
-"""Provenance of a run, its metrics.json, and the table of its metrics on the terminal."""
+"""Provenance of a run, and its metrics.json."""
 
 import importlib.metadata
 import os
@@ -13,7 +13,7 @@ import jax
 from emgs_jax.data.base import Dataset
 from emgs_jax.io.files import flat, write_json
 from emgs_jax.prior.base import Provenance
-from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Column, cell
+from emgs_jax.report.columns import Column, Line
 
 RESULT_FORMAT = 1  # of metrics.json; another one is refused where results are read
 RAW_PRIOR = "raw_prior/"  # prefix of the same metrics for the prior without any mapping
@@ -101,46 +101,18 @@ def has_metric_truth(block: Mapping[str, Any]) -> bool:
     return (block.get("data") or {}).get("name") not in ("colmap", "nerfstudio")
 
 
-def print_metrics_table(metrics: Mapping[str, Any]) -> str:
-    """Lay out the main metrics, one row for the map, the raw prior and each baseline; `–` where there is no value.
-
-    First come clouds placed by their points (ICP), as in the README, below the same rows placed by the path, and what
-    is rendered of them at their own poses.
-    """
-    tables = [_laid_out(metrics, columns) for columns in ((MAIN[0], *PLACED), (*BY_PATH, *RENDERED))]
-    return "\n\n".join(table for table in tables if table)
+def lines_of(metrics: Mapping[str, Any], columns: Sequence[Column]) -> list[Line]:
+    """One line for each estimate of `ROWS` that has one of these metrics."""
+    return [
+        Line([name], {column.key: metrics.get(prefix + column.key) for column in columns}, rivals=None)
+        for prefix, name in ROWS.items()
+        if any(prefix + column.key in metrics for column in columns)
+    ]
 
 
 def prefix_of(key: str) -> str:
     """The prefix in `ROWS` of a metric's key."""
     return next((prefix for prefix in ROWS if prefix and key.startswith(prefix)), "")
-
-
-def _laid_out(metrics: Mapping[str, Any], columns: Sequence[Column]) -> str:
-    block = metrics.get("provenance", {})
-    titles = (column.title if has_metric_truth(block) else _in_units(column.title) for column in columns)
-    lines = [[_label(block), *titles]]
-    for prefix, name in ROWS.items():
-        if any(prefix + column.key in metrics for column in columns):
-            values = [(metrics.get(prefix + key), None, factor, digits) for key, _, factor, digits, _ in columns]
-            lines.append([name, *(cell(*value) for value in values)])
-    if len(lines) == 1:
-        return ""
-    widths = [max(map(len, texts)) for texts in zip(*lines, strict=True)]
-    rows = ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines]
-    return "\n".join([rows[0], "─" * max(map(len, rows)), *rows[1:]])
-
-
-def _in_units(title: str) -> str:
-    return title.replace("[cm]", "[.01 units]")
-
-
-def _label(block: Mapping[str, Any]) -> str:
-    """Return the label above a table: empty for measured numbers; `simulated`, with any version, for others."""
-    if not block.get("simulated", False):
-        return ""
-    name = (block.get("prior") or {}).get("name", "")
-    return name if name.startswith("simulated v") else "simulated"
 
 
 def _rank(key: str) -> tuple[int, int]:

@@ -8,7 +8,6 @@ unit or zero; `cosines` and `leads` (n, c) float16; `labels` (n,) int16, the wor
 """
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,23 +23,21 @@ from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import atomic_write, write_json
-from emgs_jax.io.npz import read_npz
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.ops.linalg import safe_normalize
-from emgs_jax.report.overview import class_colors
+from emgs_jax.report.colors import class_colors
 from emgs_jax.report.recorded_run import RecordedRun
 from emgs_jax.semantics import Relevance, relevance
 
 QUERY_FILE, SEMANTIC_FILE, SEMANTIC_PLY = "query.json", "semantic.npz", "semantic.ply"
 FORMAT, SEMANTIC_FORMAT, VERSION = "emgs_jax.query", "emgs_jax.semantic", 1
 GREY = 0.75  # of what has no feature
-ARRAYS = ("rows", "means", "features", "cosines", "leads", "labels", "instances")
 _relevance = eqx.filter_jit(relevance)
 
 
 @dataclass(frozen=True)
 class Question:
-    """Query to a map: words, rivals and thresholds.
+    """Query to a map.
 
     Args:
         words: with their vectors.
@@ -62,7 +59,6 @@ class Answer:
     """Result of a query to a map.
 
     Args:
-        question: the query.
         gaussians: the confirmed ones are valid; on the device.
         relevance: of all rows of the map, on the host.
         rows: of the confirmed Gaussians.
@@ -101,54 +97,45 @@ def ask(run: RecordedRun, question: Question) -> Answer:
 
 
 def write_answer(folder: Path, source: Path, answer: Answer) -> dict[str, Any]:
-    """Write query.json, semantic.npz and semantic.ply; returns what query.json says.
+    """Write query.json, semantic.npz and semantic.ply into `folder`; returns what query.json says.
 
-    Args:
-        folder: of the files.
-        source: folder of the run.
-        answer: to write.
+    `source` is the folder of the run.
     """
+    rows, gaussians, labels = answer.rows, answer.gaussians, answer.relevance.labels[answer.rows]
     _save_semantic(folder / SEMANTIC_FILE, answer)
-    rows, gaussians = answer.rows, answer.gaussians
-    save_points_ply(
-        folder / SEMANTIC_PLY,
-        np.asarray(gaussians.means)[rows],
-        np.asarray(gaussians.normals)[rows],
-        painted(answer)[rows],
-        answer.relevance.labels[rows],
-        answer.question.words.names,
-    )
-    said = _said(source, answer)
+    shown = (np.asarray(values)[rows] for values in (gaussians.means, gaussians.normals, painted(answer)))
+    save_points_ply(folder / SEMANTIC_PLY, *shown, labels, answer.question.words.names)
+    said = _said(source, answer, labels)
     write_json(folder / QUERY_FILE, said)
     return said
 
 
-def _said(source: Path, answer: Answer) -> dict[str, Any]:
-    question, labels = answer.question, answer.relevance.labels[answer.rows]
-    features = np.asarray(answer.gaussians.features)[answer.rows]
-    width = features.shape[1]
-    about = {"model": question.words.model, "templates": question.words.templates, "width": width}
-    about |= {"num_gaussians": len(features), "num_with_feature": int(features.any(1).sum())}
-    about |= {"bytes_per_gaussian": 4 * width, "bytes_per_gaussian_in_semantic_npz": 2 * width}
-    words = [
-        {
-            "word": word,
-            "num_gaussians": int((labels == number).sum()),
-            "instances": [_described(instance) for instance in answer.instances[number]],
-        }
-        for number, word in enumerate(question.words.names)
-    ]
-    limits = {"margin": question.margin, "min_cosine": question.min_cosine}
-    limits |= {"reach_m": answer.reach, "min_gaussians": question.instances.min_gaussians}
+def _said(source: Path, answer: Answer, labels: np.ndarray) -> dict[str, Any]:
+    question, features = answer.question, np.asarray(answer.gaussians.features)[answer.rows]
+    count, width = features.shape
     return {
         "format": FORMAT,
         "version": VERSION,
         "map": str(source),
         "frame": "that of map.npz and trajectory.txt",
-        "features": about,
+        "features": {
+            "model": question.words.model,
+            "templates": question.words.templates,
+            "width": width,
+            "num_gaussians": count,
+            "num_with_feature": int(features.any(1).sum()),
+            "bytes_per_gaussian": 4 * width,
+            "bytes_per_gaussian_in_semantic_npz": 2 * width,
+        },
         "against": question.against.names,
-        **limits,
-        "words": words,
+        "margin": question.margin,
+        "min_cosine": question.min_cosine,
+        "reach_m": answer.reach,
+        "min_gaussians": question.instances.min_gaussians,
+        "words": [
+            {"word": word, "num_gaussians": int((labels == number).sum()), "instances": list(map(_described, found))}
+            for number, (word, found) in enumerate(zip(question.words.names, answer.instances, strict=True))
+        ],
         "none_of_these": int((labels < 0).sum()),
     }
 
@@ -190,38 +177,19 @@ def _save_semantic(path: Path, answer: Answer) -> None:
     header = {"format": SEMANTIC_FORMAT, "version": VERSION, "words": question.words.names}
     header |= {"against": question.against.names, "margin": question.margin, "min_cosine": question.min_cosine}
     header |= {"model": question.words.model}
-    features = np.asarray(safe_normalize(answer.gaussians.features[rows]))
-    arrays = {
-        "rows": rows.astype(np.int32),
-        "means": np.asarray(answer.gaussians.means, np.float32)[rows],
-        "features": features.astype(np.float16),
-        "cosines": found.cosines[rows].astype(np.float16),
-        "leads": found.leads[rows].astype(np.float16),
-        "labels": found.labels[rows].astype(np.int16),
-        "instances": _numbered(answer.instances, len(found.labels))[rows].astype(np.int32),
-    }
-    with atomic_write(path) as handle:
-        np.savez(handle, header=np.array(json.dumps(header)), **arrays)
-
-
-def _numbered(instances: Sequence[Sequence[Instance]], count: int) -> np.ndarray:
-    numbers = np.full(count, -1)
-    for found in instances:
-        for number, instance in enumerate(found):
+    numbers = np.full(len(found.labels), -1)
+    for instances in answer.instances:
+        for number, instance in enumerate(instances):
             numbers[instance.rows] = number
-    return numbers
-
-
-def load_semantic(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of a semantic.npz; raises ValueError for a file that is none of this version."""
-    try:
-        arrays = read_npz(path.read_bytes(), ("header", *ARRAYS))
-        header = json.loads(str(arrays.pop("header")))
-        if header["format"] != SEMANTIC_FORMAT or header["version"] != VERSION:
-            raise ValueError(f"it is {header['format']} {header['version']}, expected {SEMANTIC_FORMAT} {VERSION}")
-        count, width = len(arrays["rows"]), len(header["words"])
-        if any(len(values) != count for values in arrays.values()) or arrays["cosines"].shape[1:] != (width,):
-            raise ValueError("its arrays do not fit each other")
-    except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
-        raise ValueError(f"{path} is no semantic.npz that can be read ({error}): ask the map again") from error
-    return header, arrays
+    with atomic_write(path) as handle:
+        np.savez(
+            handle,
+            header=np.array(json.dumps(header)),
+            rows=rows.astype(np.int32),
+            means=np.asarray(answer.gaussians.means, np.float32)[rows],
+            features=np.asarray(safe_normalize(answer.gaussians.features[rows])).astype(np.float16),
+            cosines=found.cosines[rows].astype(np.float16),
+            leads=found.leads[rows].astype(np.float16),
+            labels=found.labels[rows].astype(np.int16),
+            instances=numbers[rows].astype(np.int32),
+        )

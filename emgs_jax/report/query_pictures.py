@@ -1,5 +1,6 @@
 """Pictures of an answer: where a map is relevant for a word, seen from any pose, and the map's features as colours."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,10 +19,9 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import atomic_write
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
-from emgs_jax.report.overview import class_colors
-from emgs_jax.report.page import render_config
+from emgs_jax.report.colors import class_colors
 from emgs_jax.report.query import GREY, Answer, heat, hot, painted
-from emgs_jax.report.recorded_run import RecordedRun
+from emgs_jax.report.recorded_run import RecordedRun, render_config
 from emgs_jax.running.convert import to_se3
 from emgs_jax.semantics import principal_colors
 
@@ -50,10 +50,8 @@ def _drawn(
 
 def drawn(run: RecordedRun, gaussians: Gaussians, values: np.ndarray, view: View, camera: Camera) -> np.ndarray:
     """Values (n, v) of the Gaussians as an image (h, w, v); nan where the map shows nothing."""
-    config = render_config(run)
-    values, alpha = jax.device_get(
-        _drawn(gaussians, jnp.asarray(values, jnp.float32), to_se3(view.pose), camera, config)
-    )
+    config, pose = render_config(run), to_se3(view.pose)
+    values, alpha = jax.device_get(_drawn(gaussians, jnp.asarray(values, jnp.float32), pose, camera, config))
     is_seen = alpha >= max(float(config.min_alpha), 1e-6)
     return np.where(is_seen[..., None], values / np.where(is_seen, alpha, 1.0)[..., None], np.nan)
 
@@ -61,10 +59,8 @@ def drawn(run: RecordedRun, gaussians: Gaussians, values: np.ndarray, view: View
 def views_of(run: RecordedRun) -> list[View]:
     """Poses of frames that are not lost, at most `MAX_POSES`, evenly spread."""
     rows = np.flatnonzero(run.is_placed)
-    chosen = (
-        sorted({rows[int(i)] for i in np.linspace(0, len(rows) - 1, min(MAX_POSES, len(rows)))}) if len(rows) else []
-    )
-    return [View(f"frame {run.frames[row]['index']}", run.poses[row]) for row in chosen]
+    chosen = np.unique(np.linspace(0, len(rows) - 1, min(MAX_POSES, len(rows))).astype(int))
+    return [View(f"frame {run.frames[row]['index']}", run.poses[row]) for row in rows[chosen]]
 
 
 def frame_view(run: RecordedRun, frame: int) -> View:
@@ -102,21 +98,18 @@ def draw_answer(path: Path, run: RecordedRun, answer: Answer, views: Sequence[Se
     Returns:
         How many words are drawn.
     """
-    names = answer.question.words.names
+    names, has_classes = answer.question.words.names, len(views) > 1
     counts = [(answer.relevance.labels == word).sum() for word in range(len(views))]
-    words = [int(word) for word in np.argsort(-np.array(counts), kind="stable")[:max_words]]
-    lines = [(word, view) for word in sorted(words) for view in views[word]]
-    colors = np.asarray(answer.gaussians.colors)
-    pictures = []
-    for word, view in lines:
-        relevance = heat(answer, word)
-        layers = np.concatenate([colors, hot(relevance), painted(answer)], axis=1)
-        image = drawn(run, answer.gaussians, layers, view, run.camera)
-        pictures.append([(view.title, image[..., :3]), (f"relevance: {names[word]}", image[..., 3:6])])
-        if len(views) > 1:
-            pictures[-1].append(("classes", image[..., 6:]))
-    _save(path, pictures, legend(names, counts) if len(views) > 1 else {})
-    return len({word for word, _ in lines})
+    words = sorted(map(int, np.argsort(-np.array(counts), kind="stable")[:max_words]))
+    colors, pictures = np.asarray(answer.gaussians.colors), []
+    for word in words:
+        layers = np.concatenate([colors, hot(heat(answer, word)), painted(answer)], axis=1)
+        for view in views[word]:
+            image = drawn(run, answer.gaussians, layers, view, run.camera)
+            line = [(view.title, image[..., :3]), (f"relevance: {names[word]}", image[..., 3:6])]
+            pictures.append(line + [("classes", image[..., 6:])] * has_classes)
+    _save(path, pictures, legend(names, counts) if has_classes else {})
+    return sum(bool(views[word]) for word in words)
 
 
 def save_labels(folder: Path, run: RecordedRun, answer: Answer, views: Mapping[str, View]) -> None:
@@ -179,11 +172,8 @@ def _save(
     figure = Figure(figsize=size, facecolor="white", layout="constrained")
     if not lines:
         figure.suptitle("no answer is seen from these poses")
-    for axes, (title, image) in zip(
-        figure.subplots(len(lines), columns, squeeze=False).ravel() if lines else (),
-        [panel for line in lines for panel in line],
-        strict=True,
-    ):
+    panels = figure.subplots(len(lines), columns, squeeze=False).ravel() if lines else ()
+    for axes, (title, image) in zip(panels, itertools.chain(*lines), strict=True):
         axes.imshow(np.where(np.isfinite(image), image, GREY).clip(0.0, 1.0))
         axes.set_title(title, fontsize=9)
         axes.set_axis_off()

@@ -5,16 +5,20 @@ from dataclasses import dataclass
 from functools import reduce
 from operator import getitem
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.features.text import TextEmbeddings, read_text
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.map_file import load_map
 from emgs_jax.io.trajectory import from_tum, load_trajectory_tum
 from emgs_jax.ops.camera import Camera
+from emgs_jax.render.composite import RenderConfig
+from emgs_jax.report.provenance import is_metric
 from emgs_jax.report.results import METRICS_FILE, read_metrics
+from emgs_jax.running.values import check_value, declared
 
 TEXT_FILE = "text.npz"  # classes of a map with features, in the format of `experiments.embed`
 LOOPS_FILE = "loops.json"
@@ -50,7 +54,6 @@ class RecordedRun:
     """Outputs of a finished run, as read from its folder.
 
     Args:
-        folder: of the run.
         metrics: of metrics.json.
         frames: lines of frames.jsonl that have a pose, in order.
         skipped: the other lines.
@@ -58,8 +61,6 @@ class RecordedRun:
         online: the same as first estimated, before the back end moved them; nan before it begins, None without one.
         raw: the raw predictions' poses.
         truth: (n, 4, 4), nan where unknown.
-        map: all Gaussians.
-        camera: of the frames.
         text: classes that the map's features are compared with; None without.
         loops: lines of loops.json; empty without a back end.
     """
@@ -91,6 +92,11 @@ class RecordedRun:
     def is_placed(self) -> np.ndarray:
         """Of each frame, bool (n,): its pose means something; a lost one's is a guess."""
         return np.array([frame["status"] != "lost" for frame in self.frames], bool)
+
+    @property
+    def is_metric(self) -> bool:
+        """Lengths of the map are meant to be metres."""
+        return is_metric(self.provenance["prior"]["settings"])
 
 
 def read_run(folder: Path) -> RecordedRun:
@@ -205,3 +211,41 @@ def _loops(path: Path, count: int) -> list[dict[str, Any]]:
     if not is_sound:
         raise ValueError(f"{path} names frames or outcomes that this run does not have: run again")
     return loops
+
+
+def render_config(run: RecordedRun) -> RenderConfig:
+    """Read how the run drew its map; raises ValueError for settings of another version."""
+    settings = {key: value for key, value in run.provenance["config"]["densify"]["render"].items() if key != "_target_"}
+    try:
+        for name, field in declared(RenderConfig).items():
+            check_value(f"densify.render.{name}", settings.get(name), field)
+        return RenderConfig(**settings)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{run.folder}/metrics.json has settings of another version ({error}): run again") from error
+
+
+class PlacedPaths(NamedTuple):
+    """Paths in the frame of the map, (n, 4, 4), nan where unknown, and errors of positions (n,) in metres."""
+
+    truth: np.ndarray
+    raw: np.ndarray
+    errors: dict[str, np.ndarray]
+
+
+def placed_paths(run: RecordedRun) -> PlacedPaths:
+    """Move the true path and the raw prior's to where they fit our path best; what is left of the difference.
+
+    Each path is placed on the true one by itself, as for its error in metrics.json. Without truth the raw prior's path
+    stays where it is.
+    """
+    known, with_scale = run.has_truth, run.provenance["config"].get("evaluation", {}).get("alignment") == "sim3"
+    back, raw, errors = None, run.raw, {}
+    for name, poses in (("ours", run.poses), ("online", run.online), ("raw", run.raw)):
+        rows = known & (poses is not None and np.isfinite(poses).all((1, 2)))
+        if rows.any():
+            alignment, _ = align_poses(poses[rows], run.truth[rows], with_scale)
+            errors[name] = np.linalg.norm(alignment.apply(poses[:, :3, 3]) - run.truth[:, :3, 3], axis=1)
+            back = alignment.inverse() if back is None else back
+            raw = back.apply_to_poses(alignment.apply_to_poses(poses)) if name == "raw" else raw
+    truth = run.truth if back is None else np.where(known[:, None, None], back.apply_to_poses(run.truth), np.nan)
+    return PlacedPaths(truth, raw, errors)

@@ -20,14 +20,10 @@ class Estimate:
 
     Args:
         folder: of the result.
-        dataset: name of the data set.
-        sequence: name of its sequence.
         variant: name of the overrides, or of another system.
         kind: "ours", "raw prior", another one of `ROWS`, or "scored" for another system.
-        seed: of the prior.
-        prior: name of the prior; None for another system.
+        prior: its name; None for another system.
         is_simulated: made from the ground truth.
-        protocol: of the comparison, and alignment.
         revision: of the code; None where unknown.
         values: the metrics that are numbers.
     """
@@ -100,24 +96,27 @@ def read_estimates(out: Path) -> list[Estimate]:
 def estimates_of(path: Path) -> list[Estimate]:
     """Read the estimates of one result: ours, the raw prior and baselines, or another system."""
     metrics = read_metrics(path)
-    kinds = ROWS | {"": "ours" if metrics["provenance"]["prior"] else "scored"}
-    there = {"", *map(prefix_of, metrics)}
-    return [_estimate(path.parent, metrics, kind, prefix) for prefix, kind in kinds.items() if prefix in there]
+    block, folder, there = metrics["provenance"], path.parent, {"", *map(prefix_of, metrics)}
+    kinds = ROWS | {"": "ours" if block["prior"] else "scored"}
 
+    def numbers(prefix: str) -> dict[str, float]:
+        own = {key: value for key, value in metrics.items() if prefix_of(key) == prefix}
+        return {key.removeprefix(prefix): value for key, value in own.items() if isinstance(value, int | float)}
 
-def _estimate(folder: Path, metrics: dict[str, Any], kind: str, prefix: str) -> Estimate:
-    block = metrics["provenance"]
-    own = {key: value for key, value in metrics.items() if prefix_of(key) == prefix}
-    return Estimate(
-        folder=folder,
-        dataset=block["data"]["name"],
-        sequence=block["data"]["sequence"],
-        variant=folder.parent.name,
-        kind=kind,
-        seed=int(folder.name),
-        prior=(block["prior"] or {}).get("name"),
-        is_simulated=block["simulated"],
-        protocol=block["protocol"],
-        revision=(block["git"] or {}).get("revision"),
-        values={key.removeprefix(prefix): value for key, value in own.items() if isinstance(value, int | float)},
-    )
+    return [
+        Estimate(
+            folder=folder,
+            dataset=block["data"]["name"],
+            sequence=block["data"]["sequence"],
+            variant=folder.parent.name,
+            kind=kind,
+            seed=int(folder.name),
+            prior=(block["prior"] or {}).get("name"),
+            is_simulated=block["simulated"],
+            protocol=block["protocol"],
+            revision=(block["git"] or {}).get("revision"),
+            values=numbers(prefix),
+        )
+        for prefix, kind in kinds.items()
+        if prefix in there
+    ]

@@ -22,7 +22,7 @@ from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import loop_list, metric_graph
 from emgs_jax.report.display import closing_covariances
-from emgs_jax.report.page_map import feature_colors
+from emgs_jax.report.layers import feature_colors
 from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, POLISH, REPORT_FILE, TEXT_FILE
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud

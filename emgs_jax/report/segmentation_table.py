@@ -22,7 +22,7 @@ from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.geometry import Sim3
-from emgs_jax.report.columns import DASH, cell, markdown
+from emgs_jax.report.columns import DASH, Table, cell, markdown
 from emgs_jax.report.recorded_run import RecordedRun
 from emgs_jax.semantics import similarities
 
@@ -58,8 +58,6 @@ class SceneResult:
     """One map against the truth of its scene.
 
     Args:
-        scene: its name.
-        folder: of the run.
         is_simulated: the prior is made from the truth.
         confusion: see `scene_confusion`.
         about: how the map was placed, and counts.
@@ -183,7 +181,7 @@ def table(found: Mapping[str, Any], published: Sequence[Mapping[str, Any]]) -> s
     for row in published:
         cells = [DASH if value is None else f"{value:g}" for value in row["values"]]
         lines.append([row["method"], f"quoted: {row['source']}", row["protocol"], "8 of Replica", DASH, *cells])
-    return markdown(_TITLES, lines) + _NOTES
+    return markdown(Table(_TITLES, lines)) + _NOTES
 
 
 def _line(

@@ -1,4 +1,4 @@
-"""The files of a sweep: sweep.json after every chunk, from which it is resumed, then sweep.csv and heat_map.png."""
+"""The files of a sweep: sweep.json after every chunk, from which it is resumed, then sweep.csv; and its table."""
 
 import csv
 import hashlib
@@ -8,11 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from emgs_jax.io.files import atomic_write, jsonable, write_json
-from emgs_jax.report.columns import MAIN, Column, cell, markdown
-from emgs_jax.report.heat_map import HeatMap, draw_heat_maps
+from emgs_jax.report.columns import MAIN, Line, known, markdown, metric_table
 
 FORMAT, VERSION = "emgs_jax.running.stacked", 1
 _REMEDY = "make it again in another folder (hydra.run.dir=…), or move this one away"
@@ -99,49 +96,6 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def table(rows: Sequence[Mapping[str, Any]], axes: Sequence[str]) -> str:
-    """Markdown with the values and main metrics of every row; the best of a column is bold."""
-    shown = _shown(rows)
-    best = {}
-    for key, _, _, _, is_lower_better in shown:
-        best[key] = (min if is_lower_better else max)(row[key] for row in rows if row.get(key) is not None)
-    lines = []
-    for row in rows:
-        cells = [str(row[name]) for name in axes]
-        for key, _, factor, digits, _ in shown:
-            value = row.get(key)
-            text = cell(value, None, factor, digits)
-            cells.append(f"**{text}**" if value is not None and value == best[key] else text)
-        lines.append(cells)
-    return markdown([*axes, *(column.title for column in shown)], lines)
-
-
-def _shown(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
-    """The main metrics that some row has."""
-    return [column for column in MAIN if any(row.get(column.key) is not None for row in rows)]
-
-
-def draw(path: Path, rows: Sequence[Mapping[str, Any]], axes: Mapping[str, Sequence[Any]], title: str) -> str | None:
-    """Draw the main metrics over the first two axes with several values, as means over all others.
-
-    Returns:
-        None, or why there is no picture.
-    """
-    shown = _shown(rows)
-    names = [name for name, values in axes.items() if len(values) > 1]
-    if len(names) < 2 or not shown:
-        return "a picture takes two axes with several values" if shown else "there is no ground truth to compare with"
-    ticks = [[str(value) for value in axes[name]] for name in names[:2]]
-    maps = []
-    for key, metric, factor, digits, is_lower_better in shown:
-        sums, counts = np.zeros((2, len(ticks[0]), len(ticks[1])))
-        for row in rows:
-            at = tuple(labels.index(str(row[name])) for labels, name in zip(ticks, names, strict=False))
-            if row.get(key) is not None:
-                sums[at] += factor * row[key]
-                counts[at] += 1
-        values = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
-        maps.append(HeatMap(metric, values, digits, is_lower_better))
-    if len(names) > 2:
-        title += f", means over {', '.join(names[2:])}"
-    draw_heat_maps(path, maps, (names[0], ticks[0]), (names[1], ticks[1]), title)
-    return None
+    """Write the values and main metrics of every row in Markdown; the best of a column is bold."""
+    lines = [Line([str(row[name]) for name in axes], row) for row in rows]
+    return markdown(metric_table(axes, known(MAIN, lines), lines))

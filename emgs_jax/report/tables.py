@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from emgs_jax.report.columns import DASH, MAIN, PLACED, RENDERED, Column, cell, markdown
+from emgs_jax.report.columns import DASH, MAIN, PLACED, RENDERED, Column, Line, Table, cell, markdown, metric_table
 from emgs_jax.report.results import Estimate
 
 _PAPER_DATASETS = {"seven_scenes": "7-Scenes", "tum": "TUM"}
@@ -42,7 +42,6 @@ class Row:
     """Mean and spread over the seeds of one kind of estimate.
 
     Args:
-        dataset, variant, kind, prior, is_simulated, protocol: as of its estimates.
         sequences: over which each seed's value is the mean.
         seeds: that have a result for each of the sequences.
         values: metric -> mean over the seeds, None where one has none.
@@ -86,7 +85,7 @@ def to_csv(estimates: Sequence[Estimate]) -> str:
 
 
 def paper_table(rows: Sequence[Row], published: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown in the shape of the paper's Table II; empty if no row is of its data sets.
+    """Write rows over all sequences like the paper's Table II, in Markdown; empty if none is of its data sets.
 
     Args:
         rows: over all sequences.
@@ -95,34 +94,35 @@ def paper_table(rows: Sequence[Row], published: Sequence[Mapping[str, Any]]) -> 
     methods: dict[tuple, dict[str, Row]] = defaultdict(dict)
     for row in rows:
         if row.dataset in _PAPER_DATASETS:
-            methods[(row.kind, row.variant, source_of(row), row.protocol)][row.dataset] = row
+            methods[(f"{row.kind}, {row.variant}", source_of(row), row.protocol)][row.dataset] = row
     if not methods:
         return ""
-    titles = [f"{name}: {title}" for name in _PAPER_DATASETS.values() for title, _, _ in _PAPER_COLUMNS]
     lines = []
-    for (kind, variant, source, protocol), members in methods.items():
-        found = [(_PAPER_DATASETS[key], members[key]) for key in _PAPER_DATASETS if key in members]
+    for what, members in methods.items():
+        found = [(name, members[key]) for key, name in _PAPER_DATASETS.items() if key in members]
         runs = "; ".join(f"{name} {len(row.sequences)} × {len(row.seeds)}" for name, row in found)
         cells = [text for key in _PAPER_DATASETS for text in _paper_cells(members.get(key))]
-        lines.append([f"{kind}, {variant}", source, protocol, runs, *cells])
+        lines.append([*what, runs, *cells])
     for row in published:
         cells = [DASH if value is None else f"{value:g}" for key in _PAPER_DATASETS for value in row[key]]
         lines.append([row["method"], f"quoted: {row['source']}", row["protocol"], DASH, *cells])
-    return markdown(["method", "source", "protocol", "sequences × seeds", *titles], lines) + _NOTES
+    titles = [f"{name}: {title}" for name in _PAPER_DATASETS.values() for title, _, _ in _PAPER_COLUMNS]
+    return markdown(Table(["method", "source", "protocol", "sequences × seeds", *titles], lines)) + _NOTES
 
 
 def full_table(rows: Sequence[Row]) -> str:
-    """Markdown: a line per row with the main metrics."""
+    """Write a line per row with the main metrics, in Markdown."""
     lines = []
     for row in rows:
-        sequences = row.sequences[0] if len(row.sequences) == 1 else f"mean of {len(row.sequences)}"
-        cells = [
-            cell(row.values.get(key), row.spreads.get(key), factor, digits) for key, _, factor, digits, _ in COLUMNS
-        ]
-        what = [row.dataset, sequences, f"{row.kind}, {row.variant}", source_of(row), row.protocol]
-        lines.append([*what, str(len(row.seeds)), *cells])
-    titles = ["data set", "sequence", "method", "source", "protocol", "seeds", *(column.title for column in COLUMNS)]
-    return markdown(titles, lines)
+        method = f"{row.kind}, {row.variant}"
+        labels = [row.dataset, over(row.sequences), method, source_of(row), row.protocol, str(len(row.seeds))]
+        lines.append(Line(labels, row.values, row.spreads, rivals=None))
+    return markdown(metric_table(["data set", "sequence", "method", "source", "protocol", "seeds"], COLUMNS, lines))
+
+
+def over(sequences: Sequence[str]) -> str:
+    """Name the sequence of a row, or say of how many it is the mean."""
+    return sequences[0] if len(sequences) == 1 else f"mean of {len(sequences)}"
 
 
 def _row(what: tuple, members: list[Estimate]) -> Row:
@@ -132,11 +132,11 @@ def _row(what: tuple, members: list[Estimate]) -> Row:
     seeds = tuple(seed for seed in seeds if all((sequence, seed) in found for sequence in sequences))
     values: dict[str, float | None] = {}
     spreads: dict[str, float | None] = {}
-    for key in dict.fromkeys(key for item in members for key in item.values):
+    for key in {key: None for item in members for key in item.values}:
         numbers = [[found[sequence, seed].get(key) for sequence in sequences] for seed in seeds]
-        known = bool(seeds) and all(number is not None for line in numbers for number in line)
-        means = [statistics.fmean(line) for line in numbers] if known else []
-        values[key] = statistics.fmean(means) if known else None
+        is_known = all(number is not None for line in numbers for number in line)
+        means = [statistics.fmean(line) for line in numbers] if is_known else []
+        values[key] = statistics.fmean(means) if means else None
         spreads[key] = statistics.stdev(means) if len(means) > 1 else None
     return Row(*what, sequences, seeds, values, spreads)
 

@@ -4,13 +4,14 @@ import os
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import yaml
 from matplotlib.figure import Figure
 
 from emgs_jax.io.files import atomic_write
-from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, cell, markdown
+from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, Line, markdown, metric_table
 from emgs_jax.report.provenance import RAW_PRIOR
 
 DEFAULT, RAW = "default", "raw prior"
@@ -21,9 +22,7 @@ class SequenceResults:
     """Metrics of the settings of a search on one sequence.
 
     Args:
-        name: of the sequence.
         is_held_out: the search did not use it.
-        is_simulated: the prior is made from the ground truth.
         metrics: of DEFAULT and of trials, by name.
     """
 
@@ -41,7 +40,7 @@ def columns_of(objectives: Mapping[str, str]) -> list[Column]:
 
 
 def table(results: Sequence[SequenceResults], objectives: Mapping[str, str]) -> str:
-    """Markdown: the raw prior, the default and the best on each tuned sequence, then on each that was held out.
+    """Write the raw prior, the default and the best on each tuned sequence, then on each that was held out (Markdown).
 
     Of several sequences of a kind there are means, too, of what all of them have. The best of ours is bold.
     """
@@ -50,42 +49,30 @@ def table(results: Sequence[SequenceResults], objectives: Mapping[str, str]) -> 
         some = [result for result in results if result.is_held_out == is_held_out]
         blocks = [(result.name + ", simulated" * result.is_simulated, _rows(result, columns)) for result in some]
         if len(some) > 1:
-            blocks.append((f"mean of {len(some)}", _means([rows for _, rows in blocks])))
+            blocks.append((f"mean of {len(some)}", _means([rows for _, rows in blocks], columns)))
         for name, rows in blocks:
-            marked = _marked(rows, columns)
-            lines += [[kind, name, setting, *cells] for setting, cells in marked.items()]
-    return markdown(["", "sequence", "setting", *(column.title for column in columns)], lines)
+            for setting, values in rows.items():
+                rivals = None if setting == RAW else (kind, name)
+                lines.append(Line([kind, name, setting], values, rivals=rivals))
+    return markdown(metric_table(["", "sequence", "setting"], columns, lines))
 
 
-Rows = dict[str, list[float | None]]
+Rows = Mapping[str, Mapping[str, Any]]  # metrics by setting
 
 
 def _rows(result: SequenceResults, columns: Sequence[Column]) -> Rows:
     first = next(iter(result.metrics.values()))
-    raw = [first.get(RAW_PRIOR + column.key) for column in columns]
-    ours = {name: [values.get(column.key) for column in columns] for name, values in result.metrics.items()}
-    return ({RAW: raw} if any(value is not None for value in raw) else {}) | ours
+    raw = {column.key: first.get(RAW_PRIOR + column.key) for column in columns}
+    return ({RAW: raw} if any(value is not None for value in raw.values()) else {}) | dict(result.metrics)
 
 
-def _means(blocks: Sequence[Rows]) -> Rows:
+def _means(blocks: Sequence[Rows], columns: Sequence[Column]) -> Rows:
     names = [name for name in blocks[0] if all(name in rows for rows in blocks)]
-    return {name: [_mean(values) for values in zip(*(rows[name] for rows in blocks), strict=True)] for name in names}
+    return {name: {c.key: _mean([rows[name].get(c.key) for rows in blocks]) for c in columns} for name in names}
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
     return None if None in values else statistics.fmean(values)
-
-
-def _marked(rows: Rows, columns: Sequence[Column]) -> dict[str, list[str]]:
-    """Cells as text, the best of each column but the raw prior's bold."""
-    found: dict[str, list[str]] = {name: [] for name in rows}
-    for place, column in enumerate(columns):
-        known = [values[place] for name, values in rows.items() if name != RAW and values[place] is not None]
-        best = (min if column.is_lower_better else max)(known) if known else None
-        for name, values in rows.items():
-            text = cell(values[place], None, column.factor, column.digits)
-            found[name].append(f"**{text}**" if name != RAW and values[place] == best and best is not None else text)
-    return found
 
 
 def verdict(results: Sequence[SequenceResults], objectives: Mapping[str, str]) -> dict[str, str]:
@@ -114,11 +101,8 @@ def settings_yaml(setting: Mapping[str, Any], lines: Sequence[str]) -> str:
     """A setting as an option of Hydra that changes keys wherever they stand, below comments."""
     tree: dict[str, Any] = {}
     for key, value in setting.items():
-        node = tree
         *parents, name = key.split(".")
-        for parent in parents:
-            node = node.setdefault(parent, {})
-        node[name] = value
+        reduce(lambda node, parent: node.setdefault(parent, {}), parents, tree)[name] = value
     comments = "".join(f"# {line}\n" for line in ("@package _global_", *lines))
     return comments + yaml.safe_dump(tree, sort_keys=False)
 
@@ -136,7 +120,7 @@ def draw_trials(
         path: of the picture.
         rows: of trials: `trial`, its number, and the objectives, which may be None.
         objectives: metric -> direction.
-        named: number -> words, of the trials that are marked.
+        named: words of the trials that are marked, by their number.
         title: of the picture.
 
     Returns:
@@ -146,15 +130,14 @@ def draw_trials(
     known = [row for row in rows if all(row.get(column.key) is not None for column in shown)]
     if not known:
         return "no trial has all objectives"
-    y = [shown[0].factor * row[shown[0].key] for row in known]
-    x = [shown[1].factor * row[shown[1].key] for row in known] if len(shown) > 1 else [row["trial"] for row in known]
+    y, *others = [[column.factor * row[column.key] for row in known] for column in shown]
+    x = others[0] if others else [row["trial"] for row in known]
     figure = Figure(figsize=(6.4, 4.8), facecolor="white", layout="constrained")
     axes = figure.subplots()
     axes.scatter(x, y, c=["#e4572e" if row["trial"] in named else "#9aa5b1" for row in known], s=28)
     for row, across, up in zip(known, x, y, strict=True):
-        if row["trial"] in named:
-            words = named[row["trial"]]
-            axes.annotate(words, (across, up), textcoords="offset points", xytext=(5, 4), fontsize=8)
+        words = named.get(row["trial"], "")
+        axes.annotate(words, (across, up), textcoords="offset points", xytext=(5, 4), fontsize=8)
     axes.set_ylabel(shown[0].title)
     axes.set_xlabel(shown[1].title if len(shown) > 1 else "trial")
     axes.set_title(title, fontsize=10)

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from emgs_jax.report.viewer_layers import LAYERS, ask, colors_of, find_words, highlighted, picked
-from emgs_jax.report.viewer_run import Shown
-from emgs_jax.report.viewer_scene import Scene, field_of_view, wxyz
+from emgs_jax.report.layers import ALWAYS, layers_of, painted
+from emgs_jax.report.page_words import frame_facts
+from emgs_jax.report.viewer_answers import ask, find_words, highlighted, picked
+from emgs_jax.report.viewer_scene import Scene, Shown, field_of_view, wxyz
 
 if TYPE_CHECKING:
     import viser
@@ -96,13 +97,14 @@ class Viewer:
     def _add_controls(self) -> None:
         """The words come first: people look for them."""
         gui, names = self.server.gui, self._names
-        missing = {"class": not names, "features": "feature" not in self._run.layers}
+        shown = layers_of({*ALWAYS, *self._run.layers, *(["label"] if names else [])})
+        titles = [layer.title for name, layer in shown.items() if name != "similarity"]  # that is what words show
         hint = "words of this run, apart by commas; what is closest to one of them lights up"
         self.words = gui.add_text("Look for", "", hint=hint)
         self.against = gui.add_text("Against", "", hint="what is closer to one of these words is left out")
         self.threshold = gui.add_slider("At least", 0.0, 1.0, 0.01, 0.5, hint="cosine that an answer needs")
         self.answer = gui.add_html(_shown(self._known()))
-        self.layer = gui.add_dropdown("Colours", [name for name in LAYERS if not missing.get(name)])
+        self.layer = gui.add_dropdown("Colours", titles)
         self.kind = gui.add_dropdown("Map as", ["Gaussians", "points"])
         self.show_cameras = gui.add_checkbox("Cameras", True)
         self.show_paths = gui.add_checkbox("Paths (ours orange, true green)", True)
@@ -138,17 +140,17 @@ class Viewer:
 
     def _colors(self) -> tuple[np.ndarray, str]:
         """Of all Gaussians, (n, 3), and what there is to say about the words."""
-        colors, message = colors_of(self.layers, self.layer.value), self._known()
-        if "label" in self.layers and self.words.value.strip():
-            wanted, num_unknown = find_words(self.words.value, self._names)
-            against, more = find_words(self.against.value, self._names)
-            if wanted:
-                found = ask(self.layers, wanted, against, self.threshold.value)
-                colors = highlighted(colors, found)
-                count = int(found.is_found.sum())
-                message = f"{count:,} of {len(colors):,} Gaussians: {escape(', '.join(self._names[r] for r in wanted))}"
-            if num_unknown + more:
-                message += f"<br>{num_unknown + more} of the words are none of this run's. {self._known()}"
+        name = next(name for name, layer in layers_of(self.layers).items() if layer.title == self.layer.value)
+        colors, message = painted(self.layers, name), self._known()
+        if "label" not in self.layers or not self.words.value.strip():
+            return colors, message
+        (wanted, unknown), (against, more) = (find_words(box.value, self._names) for box in (self.words, self.against))
+        if wanted:
+            found = ask(self.layers, wanted, against, self.threshold.value)
+            colors, words = highlighted(colors, found), escape(", ".join(self._names[row] for row in wanted))
+            message = f"{int(found.is_found.sum()):,} of {len(colors):,} Gaussians: {words}"
+        if unknown + more:
+            message += f"<br>{unknown + more} of the words are none of this run's. {self._known()}"
         return colors, message
 
     @_alone
@@ -189,12 +191,8 @@ class Viewer:
         if not self._run.frames:
             return "No frame is mapped yet."
         frame = self._run.frames[row]
-        known = {name: frame[name] for name in ("inliers", "residual", "scale", "new") if frame.get(name) is not None}
-        words = [
-            f"frame {frame['index']}: {frame['status']}",
-            *(f"{name} {round(value, 4)}" for name, value in known.items()),
-        ]
-        return escape(", ".join([*words, *([str(frame["reason"])] if frame.get("reason") else [])]))
+        words = [f"frame {frame['index']}: {frame['status']}", frame_facts(frame), str(frame.get("reason") or "")]
+        return escape(", ".join(filter(None, words)))
 
     def _look(self, client: "viser.ClientHandle | None") -> None:
         if client is not None and self._run.frames:

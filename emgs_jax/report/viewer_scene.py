@@ -1,19 +1,57 @@
-"""Scene of the viewer: the map, both paths, the cameras; and its updates while a run maps."""
+"""A run as the viewer has it, finished or not, and its scene: the map, both paths, the cameras."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import to_rgb
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.ops.camera import Camera
+from emgs_jax.render.composite import RenderConfig
+from emgs_jax.report.colors import OURS, PATHS, STATUS_COLORS, rgb
+from emgs_jax.report.layers import covariances, feature_layer, map_layers
 from emgs_jax.report.overview import view_from_above
-from emgs_jax.report.page_strip import OURS, STATUS_COLORS
-from emgs_jax.report.viewer_layers import covariances
-from emgs_jax.report.viewer_run import Shown
+from emgs_jax.report.recorded_run import RecordedRun, placed_paths, render_config
 
-TRUTH = "#2b8a3e"
 MAX_FRUSTUMS = 300  # more are a carpet; the chosen frame has its own
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A run as the viewer has it.
+
+    Args:
+        layers: of the confirmed Gaussians, as `map_layers` and `feature_layer` make them; empty before there is a map.
+        names: of the classes; none without.
+        frames: what is known of each, as in frames.jsonl.
+        poses: T_world_camera of `frames`, (n, 4, 4).
+        truth: true camera centres in the frame of the map, (n, 3); nan where unknown.
+        camera: of the frames.
+        render: how the map is drawn.
+        image: of the last frame, uint8 (h, w, 3); None where nobody has it.
+    """
+
+    layers: Mapping[str, np.ndarray]
+    names: tuple[str, ...]
+    frames: Sequence[Mapping[str, Any]]
+    poses: np.ndarray
+    truth: np.ndarray
+    camera: Camera
+    render: RenderConfig
+    image: np.ndarray | None = None
+
+    @property
+    def is_placed(self) -> np.ndarray:
+        """Of each frame, bool (n,): its pose means something; a lost one's is a guess."""
+        return np.array([frame["status"] != "lost" for frame in self.frames], bool)
+
+
+def shown(run: RecordedRun) -> Shown:
+    """A finished run; raises ValueError where its parts do not fit each other."""
+    layers, names = map_layers(run.map, run.text) | feature_layer(run.map), () if run.text is None else run.text.names
+    truth = placed_paths(run).truth[:, :3, 3]
+    return Shown(layers, names, run.frames, run.poses, truth, run.camera, render_config(run))
 
 
 class Scene:
@@ -38,7 +76,7 @@ class Scene:
         self._draw_map(run, colors)
         self.paths = [
             self._path("/our path", run.poses[:, :3, 3], run.is_placed, OURS),
-            self._path("/true path", run.truth, np.isfinite(run.truth).all(1), TRUTH),
+            self._path("/true path", run.truth, np.isfinite(run.truth).all(1), PATHS["truth"].paper),
         ]
         self._draw_cameras(run)
         if self.chosen is None:
@@ -137,4 +175,4 @@ def _place(frustum: Any, pose: np.ndarray) -> None:
 
 
 def _rgb(color: str) -> tuple[int, ...]:
-    return tuple(round(255 * channel) for channel in to_rgb(color))
+    return tuple(round(255 * channel) for channel in rgb(color))

@@ -17,7 +17,7 @@ from emgs_jax.running.configure import build
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Texts that a map can be queried for, with their embeddings.
+    """Texts that a map can be queried for.
 
     Args:
         source: where vectors come from, for people.

@@ -134,7 +134,7 @@ def compose(*overrides: str, name: str = "config") -> DictConfig:
             raise ValueError(str(error)) from error
     for group, options in groups().items():
         value = OmegaConf.select(config, group.replace("/", "."), default={})
-        if not isinstance(value, Mapping | DictConfig) and not (value is None and "/" not in group):
+        if not isinstance(value, Mapping | DictConfig):
             raise ValueError(
                 f"{group.replace('/', '.')}={value} would put a word in the place of all its keys: choose one of its "
                 f"options ({', '.join(options)}) with {group}={value if value in options else options[0]}"

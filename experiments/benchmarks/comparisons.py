@@ -144,9 +144,7 @@ def time_render(data: Data, thin: int, num_gaussians: int, repetitions: int) -> 
     dense = (_host(splats), colors, camera.width, lines, config)
     drawn = ours.call()
     ours.facts.update(gaussians=num_gaussians, pixels=camera.width * camera.height, tile_overflow=int(drawn.overflow))
-    # A pixel at the rim of a splat may be in or out.
-    apart = np.abs(np.asarray(drawn.values)[lines] - baselines.render(*dense))
-    ours.facts["color_error_999"] = float(np.quantile(apart, 0.999))
+    ours.facts["color_error_999"] = color_error(np.asarray(drawn.values)[lines], baselines.render(*dense))
     candidates = {"emgs_jax": ours}
     candidates["NumPy"] = Candidate(lambda: baselines.render(*dense), None, {"drawn_lines": num_lines})
     candidates |= _torch_candidates(gaussians, T, camera, dense)
@@ -154,6 +152,11 @@ def time_render(data: Data, thin: int, num_gaussians: int, repetitions: int) -> 
         ours.facts["gsplat"] = "no row: it needs the package, PyTorch and a CUDA GPU"
     timings = interleaved("render", candidates, repetitions)
     return compare([of_all_lines(timing, camera.height) for timing in timings], "NumPy")
+
+
+def color_error(image: np.ndarray, other: np.ndarray) -> float:
+    """Return the difference that one of a thousand values exceeds: a pixel at the rim of a splat may be in or out."""
+    return float(np.quantile(np.abs(image - other), 0.999))
 
 
 def of_all_lines(timing: Timing, height: int) -> Timing:

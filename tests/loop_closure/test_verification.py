@@ -128,6 +128,11 @@ def test_points_are_needed_in_both_directions_and_must_say_the_same_pose():
     a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
     assert_refused(verify(b, with_few_points(a), [], verification_config()), Gate.POSE)
     assert_refused(verify(with_few_points(b), a, [], verification_config()), Gate.POSE)
+    even = [view.descriptors.astype(int).sum(1, keepdims=True) % 2 == 0 for view in (a, b)]  # no point has both depths
+    halves = [np.where(known, view.points, np.nan) for known, view in ((even[0], a), (~even[1], b))]
+    halved = [dataclasses.replace(view, points=points) for view, points in zip((a, b), halves, strict=True)]
+    loop, info = verify(halved[1], halved[0], [], verification_config())
+    assert loop is None and (info.refused_by, info.measured) == (Gate.POSE, 0)
     aside = dataclasses.replace(b, points=b.points + np.float32([0.6, 0, 0]))
     assert_refused(verify(aside, a, [], verification_config()), Gate.POSES_DISAGREE)
 

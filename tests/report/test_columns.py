@@ -2,7 +2,20 @@
 
 import pytest
 
-from emgs_jax.report.columns import DASH, MAIN, PLACED, RENDERED, cell, markdown
+from emgs_jax.report.columns import (
+    DASH,
+    MAIN,
+    PLACED,
+    RENDERED,
+    Cell,
+    Line,
+    Table,
+    aligned,
+    cell,
+    markdown,
+    metric_table,
+    transposed,
+)
 
 
 @pytest.mark.parametrize(
@@ -35,5 +48,15 @@ def test_no_two_columns_of_a_table_have_one_title():
     assert len(set(titles)) == len(titles)
 
 
-def test_a_table_is_markdown():
-    assert markdown(["a", "b"], [["1", "2"], ["3", "4"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |\n| 3 | 4 |\n"
+def test_a_table_is_markdown_or_aligned_text_and_the_best_of_several_rivals_is_marked():
+    column = MAIN[0]._replace(title="e", digits=0)
+    lines = [
+        Line([name], {column.key: value}, rivals=rivals)
+        for name, value, rivals in (("a", 0.02, 0), ("bcd", 0.1, 0), ("e", None, 0), ("f", 0.01, 1), ("g", 0.01, None))
+    ]
+    table = metric_table([""], [column], lines)
+    assert [line[1] for line in table.lines] == [Cell("2", "best"), Cell("10"), Cell(DASH), Cell("1"), Cell("1")]
+    table = table._replace(lines=table.lines[:2])
+    assert markdown(table) == "|  | e |\n| --- | --- |\n| a | **2** |\n| bcd | 10 |\n"
+    assert aligned(table) == "      e\n───────\na     2\nbcd  10"
+    assert transposed(table) == Table(["", "a", "bcd"], [("e", Cell("2", "best"), Cell("10"))])

@@ -7,11 +7,11 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.evaluation.clouds import PointCloud
+from emgs_jax.report.colors import PATHS, class_colors, rgb
 from emgs_jax.report.overview import (
     Paths,
     _draw_map,
     below_ceiling,
-    class_colors,
     draw_overview,
     fill_holes,
     paint_from_above,
@@ -19,7 +19,7 @@ from emgs_jax.report.overview import (
     view_from_above,
 )
 
-OURS, TRUTH, MOVED = (228, 87, 46), (27, 153, 139), ((141, 106, 159), (46, 134, 228))  # and loops, as placed
+OURS, TRUTH, *MOVED = (255 * rgb(PATHS[name].paper) for name in ("poses", "truth", "online", "loops"))
 
 
 def path_along(direction, n=5):
@@ -133,8 +133,13 @@ def test_what_is_lost_or_unknown_is_a_gap_and_loops_are_lines_beside_the_path_be
 def test_lengths_are_metres_only_where_that_is_known():
     for unit, shown in (("m", "metres"), ("units", "units")):
         axes = Figure().subplots()
-        _draw_map(axes, a_cloud(), Paths(path_along([1.0, -0.5, 0.0]), np.ones(5, bool), unit=unit))
+        poses = path_along([1.0, -0.5, 0.0])
+        _draw_map(axes, a_cloud(), Paths(poses, np.ones(5, bool), unit=unit))
         assert axes.get_xlabel() == shown and [text.get_text().split()[1] for text in axes.texts] == [unit]
+        assert not any(spine.get_visible() for spine in axes.spines.values())
+        ends = [(line.get_marker(), *line.get_xydata().T) for line in axes.lines if line.get_marker() in ("o", "s")]
+        path = poses[:, :3, 3] @ view_from_above(poses).T
+        assert ends == [("o", *path[0, :2]), ("s", *path[-1, :2])], "a disc where it begins, a square where it ends"
 
 
 def test_features_are_drawn_from_above_below_the_map(tmp_path):

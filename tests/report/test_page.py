@@ -6,7 +6,6 @@ import json
 import re
 import zlib
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,14 +14,14 @@ from page_elements import HOSTILE, Elements
 from written_run import CLASSES, two_walls, written_run
 
 from emgs_jax.features.text import TextEmbeddings, save_text
-from emgs_jax.report import page_words
 from emgs_jax.report.display import closing_covariances
+from emgs_jax.report.html import DATA_LICENCES
+from emgs_jax.report.layers import COV_UNIT, fitted, packed, thinned
 from emgs_jax.report.page import write_report
-from emgs_jax.report.page_map import COV_UNIT, fitted, packed, thinned
-from emgs_jax.report.page_strip import placed_paths
-from emgs_jax.report.page_words import DATA_LICENCES, verdict
-from emgs_jax.report.provenance import print_metrics_table
-from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.page_words import verdict
+from emgs_jax.report.printout import metrics_table
+from emgs_jax.report.provenance import is_metric
+from emgs_jax.report.recorded_run import placed_paths, read_run
 from emgs_jax.running.configure import groups
 from experiments.report import report
 
@@ -130,7 +129,7 @@ def test_a_large_map_is_thinned_to_what_most_frames_agree_on_and_paths_alone_may
 
 
 @pytest.mark.parametrize(
-    ("settings", "is_metric"),
+    ("settings", "expected"),
     [
         ({"level": 1.0}, True),
         ({"structure": {"median_depth": 2.0}}, False),  # multiview_stereo, and a recording of it
@@ -138,19 +137,18 @@ def test_a_large_map_is_thinned_to_what_most_frames_agree_on_and_paths_alone_may
         ({"scale": "metric"}, True),
     ],
 )
-def test_whether_lengths_are_metres_is_what_the_prior_says_of_itself(settings, is_metric):
-    run = SimpleNamespace(provenance={"prior": {"name": "recorded", "settings": settings}, "config": {"prior": {}}})
-    assert page_words.is_metric(run) == is_metric
+def test_whether_lengths_are_metres_is_what_the_prior_says_of_itself(settings, expected):
+    assert is_metric(settings) == expected
 
 
 def test_a_true_path_that_is_ours_in_another_frame_and_size_lies_on_ours(folder):
     run = read_run(folder)
-    placed = placed_paths(run, with_scale=True)
+    placed = placed_paths(run)
     assert placed.errors["ours"].max() < 0.035 and set(placed.errors) == {"ours", "online", "raw"}
     assert placed.errors["raw"].max() < 1e-6  # its path is the true one, in this run
     similarity = random_similarity(np.random.default_rng(0), 2.5)
     run = replace(run, truth=similarity.apply_to_poses(run.poses))
-    placed = placed_paths(run, with_scale=True)
+    placed = placed_paths(run)
     np.testing.assert_allclose(placed.truth, run.poses, atol=1e-9)  # float64
     assert placed.errors["ours"].max() < 1e-9
 
@@ -176,7 +174,7 @@ def test_errors_against_poses_of_another_program_are_in_its_unit(tmp_path, name,
     run = read_run(folder)
     block = run.provenance | {"data": run.provenance["data"] | {"name": name}}
     run = replace(run, metrics=run.metrics | {"provenance": block})
-    table = print_metrics_table(run.metrics)
+    table = metrics_table(run.metrics)
     assert f"The path is off by {unit}" in verdict(run)[1]
     assert ("[.01 units]" in table, "[cm]" in table) == ((True, False) if name == "colmap" else (False, True))
 

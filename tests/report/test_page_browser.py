@@ -15,8 +15,8 @@ from emgs_jax.gaussian_map import confirmed
 from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import render
 from emgs_jax.report.display import closing_covariances
-from emgs_jax.report.page import render_config, write_report
-from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.page import write_report
+from emgs_jax.report.recorded_run import read_run, render_config
 from emgs_jax.running.convert import to_se3
 
 BACKGROUND = np.array([0.086, 0.098, 0.118])  # main.js

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from emgs_jax.prior.base import Provenance
+from emgs_jax.report.printout import metrics_table
 from emgs_jax.report.provenance import RAW_PRIOR, ROWS, git_revision, prefix_of, prefixed, provenance, write_metrics
-from emgs_jax.report.provenance import print_metrics_table as metrics_table
 
 METRICS = {
     "trajectory/ate_sim3_m": 0.0412,

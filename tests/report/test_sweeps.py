@@ -6,8 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from emgs_jax.report import sweeps
-from emgs_jax.report.sweeps import SweepResults, draw, read_sweep, table, write_csv
+from emgs_jax.report import heat_map
+from emgs_jax.report.heat_map import draw
+from emgs_jax.report.sweeps import SweepResults, read_sweep, table, write_csv
 
 ATE, F1 = "trajectory/ate_sim3_m", "reconstruction/f1_5cm_percent"
 PROVENANCE = {"data": {"name": "room"}, "prior": {"name": "simulated", "settings": {"seed": 0}}, "config": {"a": 1}}
@@ -38,7 +39,7 @@ def test_the_best_of_each_column_is_bold_low_errors_and_high_scores():
 def drawn(monkeypatch, tmp_path, rows, axes):
     """The arguments with which the picture is drawn."""
     calls = []
-    monkeypatch.setattr(sweeps, "draw_heat_maps", lambda *arguments: calls.append(arguments))
+    monkeypatch.setattr(heat_map, "draw_heat_maps", lambda *arguments: calls.append(arguments))
     reason = draw(tmp_path / "map.png", rows, axes, "a sweep")
     return reason, calls
 
@@ -47,17 +48,17 @@ def test_the_picture_has_the_value_of_each_setting_at_its_place(monkeypatch, tmp
     reason, ((_, maps, rows, columns, title),) = drawn(monkeypatch, tmp_path, grid(), AXES)
     assert reason is None and title == "a sweep"
     assert rows == ("slam.em.noise", ["0.5", "1.0"]) and columns == ("slam.em.min_std", ["0.01", "0.02", "0.03"])
-    ate, f1 = maps
-    np.testing.assert_allclose(ate.values, [[1, 2, 3], [4, 5, 6]])
-    np.testing.assert_allclose(f1.values, [[10, 20, 30], [40, 50, np.nan]])
-    assert ate.is_lower_better and not f1.is_lower_better
+    (ate, errors), (f1, scores) = maps
+    np.testing.assert_allclose(errors, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_allclose(scores, [[10, 20, 30], [40, 50, np.nan]])
+    assert (ate.key, f1.key) == (ATE, F1)
 
 
 def test_other_axes_are_averaged_and_named(monkeypatch, tmp_path):
     rows = [row | {"slam.window_size": size, ATE: row[ATE] * size} for row in grid() for size in (1, 3)]
     axes = AXES | {"slam.window_size": [1, 3]}
     _, ((_, maps, _, _, title),) = drawn(monkeypatch, tmp_path, rows, axes)
-    np.testing.assert_allclose(maps[0].values, 2.0 * np.array([[1, 2, 3], [4, 5, 6]]))
+    np.testing.assert_allclose(maps[0][1], 2.0 * np.array([[1, 2, 3], [4, 5, 6]]))
     assert title == "a sweep, means over slam.window_size"
 
 

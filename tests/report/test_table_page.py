@@ -16,13 +16,12 @@ from tiny_run import compose
 from written_run import written_run
 
 from emgs_jax.io.files import write_json
-from emgs_jax.report import table_page
+from emgs_jax.report import html
 from emgs_jax.report.evaluation_page import Found, JobLine, verdict, write_evaluation_page
-from emgs_jax.report.page import MAX_BYTES
+from emgs_jax.report.html import MAX_BYTES, thumbnails
 from emgs_jax.report.results import estimates_of
 from emgs_jax.report.sweep_page import write_sweep_page
 from emgs_jax.report.sweeps import picture_path
-from emgs_jax.report.table_page import thumbnails
 from emgs_jax.report.tables import average
 from experiments.together import shared_settings
 
@@ -141,12 +140,12 @@ def test_pictures_are_as_large_as_all_of_them_fit(tmp_path, monkeypatch):
     paths[2].write_bytes(b"no picture")
     widths = {}
     for budget in (10**7, 40_000, 10_000):
-        monkeypatch.setattr(table_page, "PICTURE_BYTES", budget)
+        monkeypatch.setattr(html, "PICTURE_BYTES", budget)
         found = thumbnails(paths)
         assert found[2:] == ["", ""] and sum(map(len, found)) <= budget
         widths[budget] = [Image.open(io.BytesIO(base64.b64decode(text))).width for text in found if text]
     assert widths[10**7] == [360, 360] and widths[40_000][0] < 360 and len(widths[10_000]) == 2
-    monkeypatch.setattr(table_page, "PICTURE_BYTES", int(1.5 * len(found[0])))
+    monkeypatch.setattr(html, "PICTURE_BYTES", int(1.5 * len(found[0])))
     assert [bool(text) for text in thumbnails(paths)] == [True, False, False, False]  # the first that fit
 
 

@@ -13,12 +13,13 @@ from omegaconf import OmegaConf
 from PIL import Image
 from written_run import CLASSES, two_walls, written_run
 
+from emgs_jax.ops.camera import Camera
 from emgs_jax.report.display import closing_covariances
-from emgs_jax.report.page_map import map_layers
+from emgs_jax.report.layers import covariances, map_layers, painted
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.viewer import HOST, Viewer
-from emgs_jax.report.viewer_layers import ask, colors_of, covariances, find_words, highlighted, picked
-from emgs_jax.report.viewer_run import shown
+from emgs_jax.report.viewer_answers import ask, find_words, highlighted, picked
+from emgs_jax.report.viewer_scene import field_of_view, shown
 from emgs_jax.running import configure
 from experiments.view import view
 
@@ -89,12 +90,12 @@ def test_layers_are_those_of_the_map(run):
     layers, walls = map_layers(run.map, run.text), two_walls()
     drawn = closing_covariances(walls.means, walls.covs, walls.normals)
     np.testing.assert_allclose(covariances(layers), drawn, rtol=1e-3, atol=2e-6)
-    assert (colors_of(layers, "normal") == [128, 128, 0]).all()  # all face the cameras, -z
-    labels = colors_of(layers, "class")
+    assert (painted(layers, "normal") == [128, 128, 0]).all()  # all face the cameras, -z
+    labels = painted(layers, "class")
     is_sofa = np.asarray(walls.features)[:, 1] > 0.5
     assert len(np.unique(labels[is_sofa], axis=0)) == len(np.unique(labels[~is_sofa], axis=0)) == 1
     assert (labels[is_sofa][0] != labels[~is_sofa][0]).any()
-    np.testing.assert_allclose(colors_of(layers, "colour") / 255, walls.colors, atol=0.5 / 255)
+    np.testing.assert_allclose(painted(layers, "color") / 255, walls.colors, atol=0.5 / 255)
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +104,10 @@ def viewer(run):
     viewer = Viewer(shown(run), free_port())
     yield viewer
     viewer.stop()
+
+
+def test_the_field_of_view_is_the_angle_between_the_upper_and_the_lower_edge_of_the_image():
+    assert np.isclose(field_of_view(Camera((1.0, 50.0), (0.0, 0.0), 30, 100)), np.pi / 2)
 
 
 def test_it_listens_on_this_machine_only(viewer):
@@ -123,9 +128,9 @@ def test_words_and_layers_recolour_what_is_served(viewer):
     viewer.recolor()
     assert "0 of" in viewer.answer.content
     viewer.words.value = viewer.against.value = ""
-    viewer.layer.value = "normal"
+    viewer.layer.value = "normals"
     viewer.recolor()
-    np.testing.assert_array_equal(np.array(viewer.scene.points.colors), colors_of(viewer.layers, "normal"))
+    np.testing.assert_array_equal(np.array(viewer.scene.points.colors), painted(viewer.layers, "normal"))
     viewer.layer.value = "colour"
     viewer.recolor()
     np.testing.assert_array_equal(np.array(viewer.scene.splats.rgbs), before)

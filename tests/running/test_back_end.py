@@ -23,7 +23,7 @@ from emgs_jax.pose_graph.factors import Nodes, PoseGraph, residuals
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.report import back_end as report
 from emgs_jax.report.back_end import counts, found_loops, loop_list, metric_graph, revisit_note
-from emgs_jax.report.page_strip import loop_why
+from emgs_jax.report.page_words import loop_why
 from emgs_jax.running import back_end, back_end_update
 from emgs_jax.running.back_end import (
     BackEnd,

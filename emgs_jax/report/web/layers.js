@@ -11,6 +11,12 @@ function turbo(share) {
 }
 
 const NO_CLASS = [90, 96, 104];
+// By the scale of a layer: the number that is shown, and its text in the legend.
+const SCALES = {
+  share: { of: (value) => value / 255, text: (v) => v.toFixed(2) },
+  count: { of: (value) => Math.log10(1 + value), text: (v) => (10 ** v - 1).toFixed(0) },
+  number: { of: (value) => value, text: (v) => v.toFixed(0) },
+};
 
 class Layers {
   constructor(arrays) {
@@ -30,13 +36,10 @@ class Layers {
   }
 
   values(name, word) {
-    const { arrays, count, numClasses } = this;
-    const similarity = (_, row) => arrays.similarity[row * numClasses + word] / 255;
-    if (name === "similarity") return Float32Array.from({ length: count }, similarity);
-    if (name === "existence") return Float32Array.from(arrays.existence, (value) => value / 255);
-    if (name === "updates") return Float32Array.from(arrays.updates, (value) => Math.log10(1 + value));
-    if (name === "birth") return Float32Array.from(arrays.birth);
-    return null;
+    const { array, scale } = ABOUT.layers[name], values = this.arrays[array], { count, numClasses } = this;
+    if (!scale) return null;
+    const at = name === "similarity" ? (row) => values[row * numClasses + word] : (row) => values[row];
+    return Float32Array.from({ length: count }, (_, row) => SCALES[scale].of(at(row)));
   }
 
   // RGBA of all Gaussians. word: number of a class, -1 = all. threshold: of a similarity, as a share of its range.

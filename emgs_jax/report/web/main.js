@@ -154,8 +154,7 @@ function legend(layers, name, word) {
   const range = layers.range(name, word), box = $("legend");
   box.replaceChildren();
   if (range) {
-    const text = { similarity: (v) => v.toFixed(2), existence: (v) => v.toFixed(2), birth: (v) => v.toFixed(0),
-                   updates: (v) => (10 ** v - 1).toFixed(0) }[name];
+    const { text } = SCALES[ABOUT.layers[name].scale];
     const bar = document.createElement("span");
     bar.className = "bar";
     const stops = [0, 0.2, 0.4, 0.6, 0.8, 1].map((share) => `rgb(${turbo(share).map(Math.round)})`);

@@ -1,8 +1,6 @@
 // Lines over the map: paths, the camera of the chosen frame, loops and the ruler.
 "use strict";
 
-const PATHS = { poses: "#ff6b4a", online: "#f3c969", truth: "#2fd1b2", raw: "#8f9bff" };
-
 class Overlay {
   constructor(canvas, arrays, state) {
     Object.assign(this, { canvas, arrays, state, context: canvas.getContext("2d") });
@@ -42,7 +40,7 @@ class Overlay {
       context.fill();
       context.stroke();
     };
-    for (const [name, color] of Object.entries(PATHS))
+    for (const [name, color] of Object.entries(ABOUT.paths))
       if (state.paths[name] && arrays[name]) this.path(arrays[name], color, name === "poses" ? 2.5 : 1.5);
     if (state.paths.loops) this.loops();
     if (!state.atFrame) this.camera(state.frame);
@@ -65,7 +63,7 @@ class Overlay {
   loops() {
     const place = (row) => poseAt(this.arrays.poses, row).position;
     for (const [frame, other, outcome] of ABOUT.loops)
-      if (outcome === "accepted") this.segment(place(frame), place(other), "#63e68b", 1);
+      if (outcome === "accepted") this.segment(place(frame), place(other), ABOUT.paths.loops, 1);
   }
 
   // The chosen frame's camera as a pyramid of a twentieth of the map's size.

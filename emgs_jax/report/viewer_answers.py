@@ -1,4 +1,4 @@
-"""Layers of a map in the viewer: colours of its Gaussians, answers to queries, the Gaussian under a ray."""
+"""Answers of the viewer: Gaussians that are close to words, and the one under a ray."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -8,18 +8,13 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 
-from emgs_jax.report.overview import class_colors
-from emgs_jax.report.page_map import COV_UNIT
+from emgs_jax.report.colors import to_bytes
 from emgs_jax.semantics import answers
 
-LAYERS = ("colour", "class", "features", "normal", "certainty")
-NO_CLASS = 0.35  # grey of what has none
 REACH = 3.0  # standard deviations from its centre at which a Gaussian still stops a ray
 SURFACE = 0.03  # of the distance; Gaussians that are met so near behind the first are of one surface with it
 _answers = eqx.filter_jit(answers)
-_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-
-Layers = Mapping[str, np.ndarray]  # as `page_map.map_layers` makes them, perhaps with `feature_layer`
+Layers = Mapping[str, np.ndarray]  # as `layers.map_layers` makes them, perhaps with `feature_layer`
 
 
 class Answer(NamedTuple):
@@ -32,28 +27,6 @@ class Answer(NamedTuple):
 
     cosines: np.ndarray
     is_found: np.ndarray
-
-
-def covariances(layers: Layers) -> np.ndarray:
-    """(n, 3, 3) in square metres, float32."""
-    covs = np.empty((len(layers["cov"]), 3, 3), np.float32)
-    for column, (i, j) in enumerate(_UPPER):
-        covs[:, i, j] = covs[:, j, i] = layers["cov"][:, column].astype(np.float32) * COV_UNIT
-    return covs
-
-
-def colors_of(layers: Layers, name: str) -> np.ndarray:
-    """RGB of every Gaussian, uint8 (n, 3), in one of LAYERS."""
-    if name == "class" and "label" in layers:
-        known = np.vstack([class_colors(layers["similarity"].shape[1]), np.full(3, NO_CLASS)])  # row -1 is the last
-        return _bytes(known[layers["label"]])
-    if name == "features":
-        return layers["feature"]
-    if name == "normal":
-        return _bytes(0.5 + layers["normal"] / 254.0)
-    if name == "certainty":
-        return _bytes(matplotlib.colormaps["viridis"](layers["existence"] / 255.0)[:, :3])
-    return layers["color"]
 
 
 def find_words(text: str, names: Sequence[str]) -> tuple[list[int], int]:
@@ -95,7 +68,7 @@ def ask(layers: Layers, wanted: Sequence[int], against: Sequence[int], min_cosin
 def highlighted(colors: np.ndarray, answer: Answer) -> np.ndarray:
     """Colours (n, 3), uint8, with what was found in the colour of its cosine, and everything else dark."""
     hot = matplotlib.colormaps["inferno"](0.5 + 0.5 * answer.cosines)[:, :3]
-    return _bytes(np.where(answer.is_found[:, None], 0.25 * colors / 255.0 + 0.75 * hot, 0.25 * colors / 255.0))
+    return to_bytes(np.where(answer.is_found[:, None], 0.25 * colors / 255.0 + 0.75 * hot, 0.25 * colors / 255.0))
 
 
 def picked(means: np.ndarray, covs: np.ndarray, origin: Sequence[float], direction: Sequence[float]) -> int | None:
@@ -110,16 +83,13 @@ def picked(means: np.ndarray, covs: np.ndarray, origin: Sequence[float], directi
     ray, offsets = np.asarray(direction, np.float64), np.asarray(means, np.float64) - np.asarray(origin, np.float64)
     if not len(means):
         return None
-    weighted = np.linalg.solve(np.asarray(covs, np.float64), np.broadcast_to(ray, offsets.shape)[..., None])[..., 0]
+    precisions = np.linalg.inv(np.asarray(covs, np.float64))
+    weighted = precisions @ ray
     along = np.einsum("ni,ni->n", weighted, offsets) / (weighted @ ray)  # where the ray is nearest, by the covariance
     rest = offsets - along[:, None] * ray
-    distances_sq = np.einsum("ni,ni->n", rest, np.linalg.solve(np.asarray(covs, np.float64), rest[..., None])[..., 0])
+    distances_sq = np.einsum("ni,nij,nj->n", rest, precisions, rest)
     is_met = (along > 0) & (distances_sq <= REACH**2)
     if not is_met.any():
         return None
     is_first = is_met & (along <= (1 + SURFACE) * along[is_met].min())
     return int(np.argmin(np.where(is_first, distances_sq, np.inf)))
-
-
-def _bytes(values: np.ndarray) -> np.ndarray:
-    return np.rint(255 * np.clip(values, 0.0, 1.0)).astype(np.uint8)

@@ -1,16 +1,18 @@
-"""The map as the page gets it: layers of a few bytes a Gaussian, packed into one block of text."""
+"""Layers of a map, a few bytes a Gaussian: what the page and the live viewer can show, and how a page holds them."""
 
 import base64
 import math
 import zlib
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Collection, Mapping
+from typing import Any, NamedTuple
 
 import jax
+import matplotlib
 import numpy as np
 
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.gaussian_map import GaussianMap, confirmed
+from emgs_jax.report.colors import class_colors, rgb, to_bytes
 from emgs_jax.report.display import closing_covariances
 from emgs_jax.running.convert import on_device
 from emgs_jax.running.executables import stored
@@ -20,6 +22,65 @@ COV_UNIT = 1e-4  # m²; float16 then holds standard deviations from .1 mm to 2.5
 _LARGEST_HALF = 65504.0
 _similarities, feature_colors = stored(similarities), stored(principal_colors)
 _UPPER = np.triu_indices(3)
+NO_CLASS = "#5a6068"  # of what has none
+
+
+class Layer(NamedTuple):
+    """A layer that a viewer can show.
+
+    Args:
+        title: for people.
+        array: of `map_layers` or `feature_layer`, which it shows.
+        scale: of numbers that get their colour from their place between the 1st and the 99th percentile: `share` of
+            255, `count` (its logarithm) or `number`; "" where the array has colours of its own.
+    """
+
+    title: str
+    array: str
+    scale: str = ""
+
+
+LAYERS = {  # web/layers.js paints them likewise
+    "color": Layer("colour", "color"),
+    "class": Layer("class", "label"),
+    "similarity": Layer("similarity to a class", "similarity", "share"),
+    "feature": Layer("features (main directions)", "feature"),
+    "normal": Layer("normals", "normal"),
+    "existence": Layer("certainty", "existence", "share"),
+    "updates": Layer("updates", "updates", "count"),
+    "birth": Layer("frame of birth", "birth", "number"),
+}
+ALWAYS = ("color", "normal", "existence", "updates", "birth")  # arrays that every map has
+_SCALES = {"share": lambda values: values / 255.0, "count": lambda values: np.log10(1.0 + values), "number": np.float64}
+
+
+def layers_of(arrays: Collection[str]) -> dict[str, Layer]:
+    """Return the layers that can be shown of these arrays."""
+    return {name: layer for name, layer in LAYERS.items() if layer.array in arrays}
+
+
+def painted(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    """Colour every Gaussian, uint8 (n, 3), by one of `LAYERS` that has one value of each."""
+    layer = LAYERS[name]
+    values = arrays[layer.array]
+    if name == "class":
+        colors = np.vstack([class_colors(arrays["similarity"].shape[1]), rgb(NO_CLASS)])  # row -1 is the last
+        return to_bytes(colors[values])
+    if name == "normal":
+        return to_bytes(0.5 + values / 254.0)
+    if not layer.scale:
+        return values
+    numbers = _SCALES[layer.scale](values)
+    low, high = np.percentile(numbers, [1, 99]) if len(numbers) else (0.0, 1.0)
+    return to_bytes(matplotlib.colormaps["turbo"]((numbers - low) / (high - low if high > low else 1.0))[:, :3])
+
+
+def covariances(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Unpack `cov` to (n, 3, 3) in square metres, float32."""
+    covs = np.empty((len(arrays["cov"]), 3, 3), np.float32)
+    covs[:, *_UPPER] = arrays["cov"].astype(np.float32) * COV_UNIT
+    covs[:, _UPPER[1], _UPPER[0]] = covs[:, *_UPPER]
+    return covs
 
 
 def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.ndarray]:
@@ -38,9 +99,9 @@ def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.nd
     layers = {
         "mean": means.astype(np.float32),
         "cov": np.clip(covs, -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16),
-        "color": _bytes(np.asarray(gaussians.colors)[rows]),
+        "color": to_bytes(np.asarray(gaussians.colors)[rows]),
         "normal": np.rint(127 * normals).astype(np.int8),
-        "existence": _bytes(1.0 / (1.0 + np.exp(-np.asarray(map.existence, np.float64)[rows]))),
+        "existence": to_bytes(1.0 / (1.0 + np.exp(-np.asarray(map.existence, np.float64)[rows]))),
         "updates": np.minimum(np.asarray(map.num_updates)[rows], 65535).astype(np.uint16),
         "birth": np.asarray(map.birth)[rows].astype(np.int32),
     }
@@ -54,7 +115,7 @@ def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.nd
     cosines = np.asarray(_similarities(confirmed(map), on_device(text.vectors)))[rows]
     is_known = np.asarray(map.gaussians.features)[rows].any(-1)
     labels = np.where(is_known, cosines.argmax(1), -1).astype(np.int16)
-    return layers | {"label": labels, "similarity": _bytes(cosines)}
+    return layers | {"label": labels, "similarity": to_bytes(cosines)}
 
 
 def feature_layer(map: GaussianMap) -> dict[str, np.ndarray]:
@@ -66,7 +127,7 @@ def feature_layer(map: GaussianMap) -> dict[str, np.ndarray]:
     rows = np.flatnonzero(gaussians.valid)
     if not np.asarray(gaussians.features)[rows].any():
         return {}
-    return {"feature": _bytes(np.asarray(feature_colors(gaussians))[rows])}
+    return {"feature": to_bytes(np.asarray(feature_colors(gaussians))[rows])}
 
 
 def thinned(layers: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
@@ -107,7 +168,3 @@ def packed(arrays: Mapping[str, np.ndarray]) -> tuple[list[dict[str, Any]], str]
         about[-1]["offset"] = offset
         offset += len(parts[-1])
     return about, base64.b64encode(zlib.compress(b"".join(parts), 9)).decode("ascii")
-
-
-def _bytes(values: np.ndarray) -> np.ndarray:
-    return np.rint(255 * np.nan_to_num(values).clip(0.0, 1.0)).astype(np.uint8)

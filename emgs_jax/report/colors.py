@@ -1,0 +1,50 @@
+"""Colours of all that is drawn: statuses of frames, paths, classes."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+STATUS_COLORS = {
+    "tracked": "#2f9e6e",
+    "degraded": "#e69f2e",
+    "lost": "#d9413f",
+    "initialization": "#4c7de0",
+    "skipped": "#a3aab5",
+}
+
+
+class Look(NamedTuple):
+    """A path in pictures: its name for people, its colour on light paper and on a dark ground."""
+
+    words: str
+    paper: str
+    dark: str
+
+
+PATHS = {
+    "poses": Look("estimated path", "#e4572e", "#ff6b4a"),
+    "online": Look("estimated as placed", "#d9a514", "#f3c969"),
+    "truth": Look("true path", "#1b998b", "#2fd1b2"),
+    "raw": Look("raw prior's path", "#6b78e5", "#8f9bff"),
+    "loops": Look("accepted loops", "#2e86e4", "#63e68b"),
+}
+OURS = PATHS["poses"].paper
+
+
+def rgb(color: str) -> np.ndarray:
+    """RGB in [0, 1] (3,) of a colour "#rrggbb"."""
+    return np.frombuffer(bytes.fromhex(color[1:]), np.uint8) / 255.0
+
+
+def class_colors(count: int) -> np.ndarray:
+    """RGB in [0, 1] (count, 3): hues a golden section apart, alternately dark and light."""
+    number = np.arange(count)[:, None]
+    light = number % 2
+    saturation, value = 0.8 - 0.3 * light, 0.65 + 0.3 * light
+    sixth = (np.array([5, 3, 1]) + 6 * (0.618034 * number % 1.0)) % 6  # HSV to RGB, as Wikipedia has it
+    return value - value * saturation * np.clip(np.minimum(sixth, 4 - sixth), 0, 1)
+
+
+def to_bytes(values: np.ndarray) -> np.ndarray:
+    """Values in [0, 1] as uint8; what is outside is clipped, nan becomes 0."""
+    return np.rint(255 * np.nan_to_num(values).clip(0.0, 1.0)).astype(np.uint8)
