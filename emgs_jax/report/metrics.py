@@ -36,7 +36,7 @@ from emgs_jax.evaluation.segmentation import (
 from emgs_jax.evaluation.trajectory import align_poses, trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.loop_closure.two_view_refinement import rescaled
+from emgs_jax.geometry import scale_pose
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import counts, found_loops
@@ -280,7 +280,9 @@ def _loops(run: MappingRun) -> tuple[list[tuple[int, int, np.ndarray]], list[np.
     end = run.back_end
     compared = with_truth(run, run.poses)
     unit = (None if compared is None else trajectory_metrics(*compared)["trajectory/scale"]) or 1.0
-    loops = [(loop.a, loop.b, rescaled(loop.Z_a_b, unit * np.exp(end.log_scales[loop.a]))) for loop in found_loops(end)]
+    loops = [
+        (loop.a, loop.b, scale_pose(loop.Z_a_b, unit * np.exp(end.log_scales[loop.a]))) for loop in found_loops(end)
+    ]
     of_saved: list[np.ndarray | None] = [None] * end.first_node
     return loops, of_saved + run.true_poses[row_of_first_node(run) :]
 

@@ -14,7 +14,7 @@ from emgs_jax.evaluation.baselines import BaselineConfig, Fusion, Pinhole, View
 from emgs_jax.evaluation.clouds import PointCloud, SpooledCloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, posed
 from emgs_jax.evaluation.segmentation import SpooledLabels, nearest_classes
-from emgs_jax.evaluation.trajectory import rotated
+from emgs_jax.geometry import rotated
 from emgs_jax.observation import known_surface
 from emgs_jax.running.record import IN_MAP, MappingRun
 from emgs_jax.running.window_input import RawView

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.geometry import Sim3, scale_covariance
 from emgs_jax.io.trajectory import to_tum
 from emgs_jax.localization import REASONS
 from emgs_jax.loop_closure.prior_query import PriorQuery
@@ -274,6 +275,17 @@ def _step_fields(info: StepInfo) -> dict[str, Any]:
 def row_of_first_node(run: MappingRun) -> int:
     """Return the row of the first record that is a node of the back end; all later ones are nodes, too."""
     return len(run.records) - (len(run.back_end.poses) - run.back_end.first_node)
+
+
+def transform_record(record: FrameRecord, similarity: Sim3) -> FrameRecord:
+    """Map poses, covariance and scale of a record to another world."""
+    poses = {name: getattr(record, name) for name in ("pose", "newest_pose")}
+    return replace(
+        record,
+        **{name: None if pose is None else similarity.apply_to_poses(pose) for name, pose in poses.items()},
+        covariance=None if record.covariance is None else scale_covariance(record.covariance, similarity.scale),
+        scale=None if record.scale is None else similarity.scale * record.scale,
+    )
 
 
 def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
