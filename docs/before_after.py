@@ -22,7 +22,7 @@ from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.repeat import repeat
 from emgs_jax.running.configure import build, build_dataset, build_prior, compose
 from emgs_jax.running.gathering import gather
-from emgs_jax.running.inputs import inputs
+from emgs_jax.running.window_input import window_inputs
 
 TARGET = Path(__file__).with_name("before_after.png")
 LOW, HIGH = 0.4, 1.7  # m above the floor: walls and furniture, no floor and no ceiling
@@ -44,7 +44,7 @@ class Panel(NamedTuple):
 
 def before(run: RecordedRun, dataset, prior, config) -> Panel:
     """What the prior says by itself."""
-    views = (view for given in inputs(dataset, prior, build(config, "slam")) for view in given.raw)
+    views = (view for given in window_inputs(dataset, prior, build(config, "slam")) for view in given.raw)
     evaluation = build(config, "evaluation")
     cloud = gather(views, evaluation, keeps_depths=False).cloud.averaged(evaluation.voxel_m)
     errors = run.metrics["raw_prior/trajectory/ate_sim3_m"], run.metrics["raw_prior/reconstruction/accuracy_m"]

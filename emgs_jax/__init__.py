@@ -13,11 +13,16 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
-    from emgs_jax.continuation import ContinuationConfig, continued
     from emgs_jax.data.base import BadFrameError, Dataset, Frame
     from emgs_jax.em import EmConfig, EmInfo, em_update
     from emgs_jax.evaluation.reconstruction import EvaluationConfig
-    from emgs_jax.existence import ExistenceConfig, join_layers, judge, merge_layers, usefulness
+    from emgs_jax.existence import (
+        ExistenceConfig,
+        fusion_evidence,
+        merge_all_duplicates,
+        merge_duplicates,
+        update_existence,
+    )
     from emgs_jax.gaussian_map import (
         AverageConfig,
         GaussianMap,
@@ -50,24 +55,25 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.render.composite import RenderConfig, Rendering
     from emgs_jax.render.composite import render as render_gaussians
     from emgs_jax.render.densify import DensifyConfig, densify
+    from emgs_jax.running.capacity import advance, start
     from emgs_jax.running.compilation import use_compilation_cache
     from emgs_jax.running.configure import RunConfig, build_dataset, build_prior, compose, load_config
     from emgs_jax.running.convert import FirstWindow, opening, to_camera, to_first_window, to_prediction
-    from emgs_jax.running.drive import map_frames, map_sequence, take
-    from emgs_jax.running.growth import advance, start
-    from emgs_jax.running.inputs import Input, inputs
+    from emgs_jax.running.pipeline import integrate_input, map_frames, map_sequence
     from emgs_jax.running.record import FrameRecord, MappingRun, new_run
-    from emgs_jax.running.unit import own_unit
+    from emgs_jax.running.unit import in_prior_unit
+    from emgs_jax.running.window_input import WindowInput, window_inputs
     from emgs_jax.semantics import classify
     from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
     from emgs_jax.splitting import SplittingConfig, split
+    from emgs_jax.surface_extrapolation import ExtrapolationConfig, extrapolate
 
 # jaxlib 0.10.1 logs an error for every executable that it reads from a cache, for a hint to the compiler that no CPU
 # lists as a feature. What does fail raises an exception. It reads this as it is loaded.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 _HOMES = {
-    "continuation": ("ContinuationConfig", "continued"),
+    "surface_extrapolation": ("ExtrapolationConfig", "extrapolate"),
     "data.base": ("BadFrameError", "Dataset", "Frame"),
     "em": ("EmConfig", "EmInfo", "em_update"),
     "evaluation.reconstruction": ("EvaluationConfig",),
@@ -75,7 +81,7 @@ _HOMES = {
         *("AverageConfig", "GaussianMap", "SubmapConfig"),
         *("confirmed", "empty_map", "grow", "insert", "new_map", "select_submap", "write_back"),
     ),
-    "existence": ("ExistenceConfig", "join_layers", "judge", "merge_layers", "usefulness"),
+    "existence": ("ExistenceConfig", "fusion_evidence", "merge_all_duplicates", "merge_duplicates", "update_existence"),
     "gaussians": ("FitConfig", "Gaussians", "cluster", "fit_to_points"),
     "initialization": ("initialize",),
     "io.map_file": ("load_map", "save_map"),
@@ -92,11 +98,11 @@ _HOMES = {
     "running.compilation": ("use_compilation_cache",),
     "running.configure": ("RunConfig", "build_dataset", "build_prior", "compose", "load_config"),
     "running.convert": ("FirstWindow", "opening", "to_camera", "to_first_window", "to_prediction"),
-    "running.drive": ("map_frames", "map_sequence", "take"),
-    "running.growth": ("advance", "start"),
-    "running.inputs": ("Input", "inputs"),
+    "running.pipeline": ("integrate_input", "map_frames", "map_sequence"),
+    "running.capacity": ("advance", "start"),
+    "running.window_input": ("WindowInput", "window_inputs"),
     "running.record": ("FrameRecord", "MappingRun", "new_run"),
-    "running.unit": ("own_unit",),
+    "running.unit": ("in_prior_unit",),
     "semantics": ("classify",),
     "slam": ("Overflow", "SlamConfig", "SlamState", "StepInfo", "init_state", "step"),
     "splitting": ("SplittingConfig", "split"),

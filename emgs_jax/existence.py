@@ -37,7 +37,7 @@ class ExistenceConfig(eqx.Module):
         num_neighbours: nearest seen Gaussians among which a duplicate surface is searched.
         max_mahalanobis_sq: between two Gaussians that are one, the frame's noise along the normal included; 0 merges
             none, as printed.
-        max_layer_sq: likewise between two of which one stands behind the other, see `nearest_layers`.
+        max_layer_sq: likewise between two of which one stands behind the other, see `nearest_duplicates`.
         min_normal_cos: between their normals.
         feature: of the merged Gaussian: that of the heavier (`medoid`), or the sum of both (`accumulated`), see
             `EmConfig`.
@@ -71,7 +71,7 @@ def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -
     return jnp.where(valid, jnp.stack([least(depth), -least(-depth)]), jnp.nan).reshape(2, -1)
 
 
-def usefulness(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> Int[Array, "n"]:
+def fusion_evidence(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> Int[Array, "n"]:
     """Return a frame's evidence for every Gaussian: 1 with points fused into it, -1 without, 0 outside the submap.
 
     Args:
@@ -83,7 +83,7 @@ def usefulness(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> 
 
 
 @full_precision
-def judge(
+def update_existence(
     map: GaussianMap,
     use: Int[Array, "n"],
     view: Observation,
@@ -106,7 +106,7 @@ def judge(
 
     Args:
         map: all Gaussians, world frame.
-        use: evidence of this frame's points for each, see `usefulness`.
+        use: evidence of this frame's points for each, see `fusion_evidence`.
         view: the frame as it was aligned, world frame; a frame that is not tracked has no valid row.
         T_world_camera: its pose.
         camera: of its rows.
@@ -139,7 +139,7 @@ def judge(
 
 
 @full_precision
-def join_layers(
+def merge_duplicates(
     map: GaussianMap,
     is_seen: Bool[Array, "n"],
     origins: Float[Array, "*#n 3"],
@@ -158,7 +158,7 @@ def join_layers(
         depth_noise: as a fraction of the depth.
         config: gates.
     """
-    partner, is_pair = nearest_layers(map, is_seen, origins, depth_noise, config)
+    partner, is_pair = nearest_duplicates(map, is_seen, origins, depth_noise, config)
     old, other, rows = map.gaussians, take_rows(map, partner), jnp.arange(partner.shape[0])
     is_heavier = (map.weight > other.weight) | ((map.weight == other.weight) & (rows < partner))
     share = other.weight / jnp.maximum(map.weight + other.weight, jnp.finfo(jnp.float32).tiny)
@@ -179,7 +179,7 @@ def join_layers(
 
 
 @full_precision
-def merge_layers(
+def merge_all_duplicates(
     map: GaussianMap, origins: Float[Array, "n 3"], depth_noise: Float[Array, ""], config: ExistenceConfig
 ) -> GaussianMap:
     """Join the layers of a whole map that has moved, until none are left that are each other's nearest.
@@ -198,13 +198,13 @@ def merge_layers(
 
     def once(state: tuple[GaussianMap, Bool[Array, ""]]) -> tuple[GaussianMap, Bool[Array, ""]]:
         map, _ = state
-        joined = join_layers(map, map.gaussians.valid, origins, depth_noise, config)
+        joined = merge_duplicates(map, map.gaussians.valid, origins, depth_noise, config)
         return joined, jnp.any(joined.gaussians.valid != map.gaussians.valid)
 
     return jax.lax.while_loop(is_left, once, (map, jnp.asarray(True)))[0]
 
 
-def nearest_layers(
+def nearest_duplicates(
     map: GaussianMap,
     is_seen: Bool[Array, "n"],
     origins: Float[Array, "*#n 3"],

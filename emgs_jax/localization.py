@@ -15,12 +15,19 @@ from emgs_jax.ops.linalg import Whitening, safe_normalize
 from emgs_jax.ops.neighbours import Groups
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
-from emgs_jax.registration.belief import Belief, certain, measured, moved, next_belief, root_information
 from emgs_jax.registration.icp import IcpInfo, icp
 from emgs_jax.registration.noise import levels_of
+from emgs_jax.registration.pose_estimate import (
+    PoseEstimate,
+    correct,
+    correct_by_points,
+    exact_estimate,
+    propagate,
+    root_information,
+)
 from emgs_jax.registration.pose_noise import LEAST_NOISE, NO_INFORMATION, axis_std, repeat_poses
 from emgs_jax.registration.problem import IcpConfig
-from emgs_jax.registration.repeat import repeat_error, repeat_scale, through_previous
+from emgs_jax.registration.repeated_prediction import repeat_error, repeat_scale, through_previous
 from emgs_jax.registration.rigid import MIN_PAIRS, pose_row, scale_translation
 
 # Bits of LocalizationInfo.reason; the words are for people.
@@ -51,7 +58,7 @@ class LocalizationConfig(eqx.Module):
         pose_shared: part of the variance of the prior's poses that two of its answers about one have in common, see
             `pose_std`; 1: their differences are ignored, those of depths are used (printed).
         num_alike, num_shared: frames that see one part of the map, and whose windows share images: they err alike, see
-            `next_belief` and `measured`.
+            `correct_by_points` and `correct`.
         icp: the fine step.
         min_inlier_fraction: of the points, below which the fine pose is not accepted.
         max_residual: root mean square distance to the map's planes, as a fraction of the depth.
@@ -85,7 +92,7 @@ class CoarsePose(eqx.Module):
         repeat_rms: m; disagreement of the two predictions of the previous image, after alignment.
         mean_depth: m; of the previous image, scaled.
         depth_noise: as a fraction; the larger of this disagreement and what the previous frame differed from the map.
-        belief: covariance of this pose and scale; the rest of the frame before.
+        estimate: covariance of this pose and scale; the rest of the frame before.
         is_usable: False where the prediction has no valid point or pose.
     """
 
@@ -95,7 +102,7 @@ class CoarsePose(eqx.Module):
     repeat_rms: Float[Array, ""]
     mean_depth: Float[Array, ""]
     depth_noise: Float[Array, ""]
-    belief: Belief
+    estimate: PoseEstimate
     is_usable: Bool[Array, ""]
 
 
@@ -112,7 +119,7 @@ class LocalizationInfo(eqx.Module):
         noise: likewise of each point, as those of its level of confidence do, in the order of the rows.
         step_m: between the coarse and the fine pose.
         step_rad: likewise.
-        belief: how well this frame is known.
+        estimate: how well this frame is known.
         icp: of the fine step.
     """
 
@@ -125,7 +132,7 @@ class LocalizationInfo(eqx.Module):
     noise: Float[Array, "p"]
     step_m: Float[Array, ""]
     step_rad: Float[Array, ""]
-    belief: Belief
+    estimate: PoseEstimate
     icp: IcpInfo
 
 
@@ -174,13 +181,13 @@ def _readings(
     return motion, anchored, stack([via_previous, same_image, anchored, chain]), is_linked[2]
 
 
-def _measured(
+def _correct_by_prior(
     T_world_camera: jaxlie.SE3,
     scale: Float[Array, ""],
     anchored: tuple[jaxlie.SE3, Float[Array, "6"]],
-    belief: Belief,
+    estimate: PoseEstimate,
     config: LocalizationConfig,
-) -> tuple[jaxlie.SE3, Float[Array, ""], Belief]:
+) -> tuple[jaxlie.SE3, Float[Array, ""], PoseEstimate]:
     """Pose, scale and belief after the prior's own pose (`fused` only) and the prior's own unit.
 
     A prior that has lost its anchor is wrong altogether, and for long: its pose counts by a Cauchy weight of its
@@ -190,19 +197,19 @@ def _measured(
         T_world_camera: estimate before the measurement.
         scale: likewise.
         anchored: the prior's own pose, and its standard deviations.
-        belief: uncertainty of the estimate.
+        estimate: uncertainty of the estimate.
         config: readings.
     """
     pose, std = anchored
     apart = (T_world_camera.inverse() @ pose).log()
     is_used = (config.coarse == FUSED) & jnp.all(jnp.isfinite(apart)) & jnp.all(jnp.isfinite(std))
     apart, std = jnp.where(is_used, apart, 0.0), jnp.where(is_used, std, 1.0)
-    chi_sq = apart @ jnp.linalg.solve(belief.covariance[:-1, :-1] + jnp.diag(std**2), apart)
+    chi_sq = apart @ jnp.linalg.solve(estimate.covariance[:-1, :-1] + jnp.diag(std**2), apart)
     weights = is_used / (std**2 * (1.0 + chi_sq / apart.shape[0]))
-    difference = jnp.append(apart, belief.log_scale - jnp.log(scale))
+    difference = jnp.append(apart, estimate.log_scale - jnp.log(scale))
     weights = jnp.append(weights, config.scale_std**-2)
-    step, belief = measured(belief, difference, jnp.diag(weights), config.num_shared)
-    return T_world_camera @ jaxlie.SE3.exp(step[:-1]), scale * jnp.exp(step[-1]), belief
+    step, estimate = correct(estimate, difference, jnp.diag(weights), config.num_shared)
+    return T_world_camera @ jaxlie.SE3.exp(step[:-1]), scale * jnp.exp(step[-1]), estimate
 
 
 @full_precision
@@ -212,7 +219,7 @@ def localize_coarse(
     T_world_previous: jaxlie.SE3,
     camera: Camera,
     config: LocalizationConfig,
-    belief: Belief | None = None,
+    estimate: PoseEstimate | None = None,
 ) -> CoarsePose:
     """Coarse registration through the previous frame, which was predicted twice, fused with the prior's own pose.
 
@@ -222,21 +229,21 @@ def localize_coarse(
         T_world_previous: its pose.
         camera: of the (thinned) rows.
         config: readings.
-        belief: of the previous frame; None: its pose is exact.
+        estimate: of the previous frame; None: its pose is exact.
     """
-    now, belief = prediction.previous, certain() if belief is None else belief
-    scale, ratio_std = repeat_scale(now, previous, T_world_previous, jnp.exp(belief.log_scale), config.coarse_scale)
+    now, estimate = prediction.previous, exact_estimate() if estimate is None else estimate
+    scale, ratio_std = repeat_scale(now, previous, T_world_previous, jnp.exp(estimate.log_scale), config.coarse_scale)
     repeat_rms, mean_depth = repeat_error(now, previous, T_world_previous, scale, config.max_pair_distance)
-    depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, belief.depth_noise), LEAST_NOISE)
+    depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, estimate.depth_noise), LEAST_NOISE)
     motion, anchored, forms, is_linked = _readings(prediction, previous, T_world_previous, scale, camera, config)
-    repeats, latest = repeat_poses(prediction, belief.repeats, scale, mean_depth, config.num_shared)
+    repeats, latest = repeat_poses(prediction, estimate.repeats, scale, mean_depth, config.num_shared)
     guess = depth_noise, mean_depth, config.icp.prior_information
     of_motion, of_pose = axis_std(repeats, latest, *guess, config.pose_shared)
     noise = jnp.append(of_motion, _ratio_noise(depth_noise, ratio_std, config))
-    belief = moved(belief, motion, jnp.where(is_linked, noise, _no_motion(mean_depth, config)))
-    belief = eqx.tree_at(lambda b: b.repeats, belief, repeats)
+    estimate = propagate(estimate, motion, jnp.where(is_linked, noise, _no_motion(mean_depth, config)))
+    estimate = eqx.tree_at(lambda b: b.repeats, estimate, repeats)
     known = pose_row(forms, config.coarse.astype(jnp.int32)), scale
-    coarse, scale, belief = _measured(*known, (anchored, of_pose), belief, config)
+    coarse, scale, estimate = _correct_by_prior(*known, (anchored, of_pose), estimate, config)
     is_finite = jnp.all(jnp.isfinite(coarse.wxyz_xyz))
     coarse = jaxlie.SE3(jnp.where(is_finite, coarse.wxyz_xyz, T_world_previous.wxyz_xyz))
     raw_current, raw_newest = pose_row(prediction.T_world_views, 1), pose_row(prediction.T_world_views, 2)
@@ -244,7 +251,7 @@ def localize_coarse(
     has_newest = prediction.has_newest & is_finite & jnp.all(jnp.isfinite(newest.wxyz_xyz))
     newest = jaxlie.SE3(jnp.where(has_newest, newest.wxyz_xyz, coarse.wxyz_xyz))
     is_usable = is_finite & (jnp.sum(prediction.current.valid) >= MIN_PAIRS)
-    return CoarsePose(coarse, newest, scale, repeat_rms, mean_depth, depth_noise, belief, is_usable)
+    return CoarsePose(coarse, newest, scale, repeat_rms, mean_depth, depth_noise, estimate, is_usable)
 
 
 @full_precision
@@ -270,7 +277,7 @@ def localize_fine(
         T_world_camera, the observation in the world frame, and the outcome.
     """
     scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
-    known = root_information(coarse.belief.covariance)
+    known = root_information(coarse.estimate.covariance)
     fine, scale, info = icp(scaled, submap, coarse.T_world_camera, known, coarse.depth_noise, config.icp, white, groups)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     # The length has no gradient where a step is zero, which it is to the bit with an exact prior; this has.
@@ -290,7 +297,7 @@ def localize_fine(
     aligned = transform(T, current, scale)
     aligned = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & coarse.is_usable)
     bits = jnp.sum(failed * 2 ** jnp.arange(failed.shape[0]))
-    belief = next_belief(coarse.belief, info, coarse.depth_noise, scale, is_tracked, config.num_alike)
+    estimate = correct_by_points(coarse.estimate, info, coarse.depth_noise, scale, is_tracked, config.num_alike)
     outcome = LocalizationInfo(
         is_tracked=is_tracked,
         is_lost=~coarse.is_usable,
@@ -301,7 +308,7 @@ def localize_fine(
         noise=info.misfit_of_levels[levels_of(current.confidence, info.level_edges)],
         step_m=step_m,
         step_rad=step_rad,
-        belief=belief,
+        estimate=estimate,
         icp=info,
     )
     return T, aligned, outcome

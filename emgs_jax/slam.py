@@ -1,14 +1,15 @@
 """The pipeline: `init_state` makes the map of the first window, `step` integrates one frame. Both are pure."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
-from emgs_jax.continuation import ContinuationConfig, continued
 from emgs_jax.em import EmConfig, EmInfo, em_update, owners
-from emgs_jax.existence import ExistenceConfig, join_layers, judge, usefulness
+from emgs_jax.existence import ExistenceConfig, fusion_evidence, merge_duplicates, update_existence
 from emgs_jax.gaussian_map import (
     AverageConfig,
     GaussianMap,
@@ -32,9 +33,10 @@ from emgs_jax.ops.neighbours import Groups, group_points, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, static_choice, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
-from emgs_jax.registration.belief import Belief, certain
+from emgs_jax.registration.pose_estimate import PoseEstimate, exact_estimate
 from emgs_jax.registration.rigid import median, pose_row
 from emgs_jax.splitting import SplittingConfig, split
+from emgs_jax.surface_extrapolation import ExtrapolationConfig, extrapolate
 
 
 class SlamConfig(eqx.Module):
@@ -49,7 +51,7 @@ class SlamConfig(eqx.Module):
         submap: what a step works on, and capacities.
         localization: coarse and fine.
         em: E- and M-step.
-        continuation: depth-error extrapolation to points that no Gaussian explains.
+        extrapolation: of depth errors to points that no Gaussian explains.
         splitting: of Gaussians that are too coarse for a nearer view.
         refinement: on the image plane.
         existence: evidence of later frames for and against a Gaussian.
@@ -62,10 +64,23 @@ class SlamConfig(eqx.Module):
     submap: SubmapConfig
     localization: LocalizationConfig
     em: EmConfig
-    continuation: ContinuationConfig
+    extrapolation: ExtrapolationConfig
     splitting: SplittingConfig
     refinement: RefinementConfig
     existence: ExistenceConfig
+
+    @property
+    def fusion(self) -> "FusionConfig":
+        """Settings of the fusion alone: other ones compile it no second time."""
+        return FusionConfig(self.em, self.extrapolation, self.splitting)
+
+
+class FusionConfig(eqx.Module):
+    """Settings of the fusion of a frame's points, see `SlamConfig`."""
+
+    em: EmConfig
+    extrapolation: ExtrapolationConfig
+    splitting: SplittingConfig
 
 
 class SlamState(eqx.Module):
@@ -75,14 +90,14 @@ class SlamState(eqx.Module):
         map: all Gaussians.
         previous: the last frame as it was aligned, world frame.
         T_world_previous: its pose.
-        belief: uncertainty of its pose and scale.
+        estimate: uncertainty of its pose and scale.
         time: frames so far, those that could not be placed included.
     """
 
     map: GaussianMap
     previous: Observation
     T_world_previous: jaxlie.SE3
-    belief: Belief
+    estimate: PoseEstimate
     time: Int[Array, ""]
 
 
@@ -153,16 +168,24 @@ class Fused(eqx.Module):
     Args:
         map: the submap's Gaussians after EM and splitting.
         halves: the second halves of what was split.
-        rest: the points that no Gaussian explains; their depth errors are extrapolated from the map's surfaces.
+        unexplained: points that no Gaussian explains; their depth errors are extrapolated from the map's surfaces.
         origin: median birth of the Gaussians that explain the others; the frame's own time where none does.
         em: counts.
     """
 
     map: GaussianMap
     halves: GaussianMap
-    rest: Observation
+    unexplained: Observation
     origin: Int[Array, ""]
     em: EmInfo
+
+
+class NewGaussians(eqx.Module):
+    """What a frame adds to the map: Gaussians of its points with their number of images, and halves of split ones."""
+
+    gaussians: Gaussians
+    weight: Float[Array, "g"]
+    halves: GaussianMap
 
 
 def _first_weight(weight: Float[Array, "g"], config: AverageConfig) -> Float[Array, "g"]:
@@ -198,7 +221,9 @@ def _first_state(
     time = jnp.asarray(world.valid.shape[0], jnp.int32)
     new = new_map(gaussians, _first_weight(weight, config.em.average), existence, time - 1)
     map, _, overflow = insert(empty_map(config.submap.map_capacity, world.features.shape[-1]), new)
-    state = SlamState(map, jax.tree.map(lambda leaf: leaf[-1], world), pose_row(T_world_views, -1), certain(), time)
+    state = SlamState(
+        map, jax.tree.map(lambda leaf: leaf[-1], world), pose_row(T_world_views, -1), exact_estimate(), time
+    )
     return state, overflow
 
 
@@ -217,16 +242,17 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
     """
     view = downscale(camera, config.observation.thin)  # its pixels are an observation's rows
     num_rows = spacing(camera, config.observation.thin, config.fit)
-    last = state.previous, state.T_world_previous, state.belief
 
-    coarse, guess = _localize_coarse(prediction, *last, view, config.localization)
+    coarse, guess = _localize_coarse(
+        prediction, state.previous, state.T_world_previous, state.estimate, view, config.localization
+    )
     submap = _select(state.map, state.previous, guess, config.submap)
     frame = _localize_fine(prediction.current, submap, coarse, state.time, config.localization)
-    fused = _fuse(submap, frame, view, num_rows, (config.em, config.continuation, config.splitting))
-    candidates, weight = cluster(fused.rest, _order(view), num_rows, config.fit)
+    fused = _fuse(submap, frame, view, num_rows, config.fusion)
+    candidates, weight = cluster(fused.unexplained, _order(view), num_rows, config.fit)
     refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config.refinement)
-    new = fresh, weight, fused.halves
-    map, num_gaussians, overflow, time = _store(state.map, (refined, submap.rows), new, frame, view, config)
+    new = NewGaussians(fresh, weight, fused.halves)
+    map, num_gaussians, overflow, time = _store(state.map, replace(submap, map=refined), new, frame, view, config)
 
     info = StepInfo(
         T_world_camera=frame.T_world_camera,
@@ -238,7 +264,7 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
         num_gaussians=num_gaussians,
         overflow=Overflow(overflow, submap.overflow, refinement.overflow),
     )
-    return SlamState(map, frame.points, frame.T_world_camera, frame.localization.belief, time), info
+    return SlamState(map, frame.points, frame.T_world_camera, frame.localization.estimate, time), info
 
 
 @executable
@@ -246,12 +272,12 @@ def _localize_coarse(
     prediction: Prediction,
     previous: Observation,
     T_world_previous: jaxlie.SE3,
-    belief: Belief,
+    estimate: PoseEstimate,
     view: Camera,
     config: LocalizationConfig,
 ) -> tuple[CoarsePose, Observation]:
     """The coarse pose, and the current frame placed by it."""
-    coarse = localize_coarse(prediction, previous, T_world_previous, view, config, belief)
+    coarse = localize_coarse(prediction, previous, T_world_previous, view, config, estimate)
     return coarse, transform(coarse.T_world_camera, prediction.current, coarse.scale)
 
 
@@ -280,20 +306,20 @@ def _fuse(
     frame: Frame,
     view: Camera,
     num_rows: int,
-    configs: tuple[EmConfig, ContinuationConfig, SplittingConfig],
+    config: FusionConfig,
 ) -> Fused:
     """Fuse the points of a frame that is tracked, and split what they show to be too coarse."""
-    (em, continuation, splitting), T, trusted = configs, frame.T_world_camera, frame.trusted
+    T, trusted = frame.T_world_camera, frame.trusted
     noise = frame.localization.noise[:, None] * (trusted.points - T.translation())
-    map, explained, info = em_update(submap.map, trusted, noise, em, submap.white, submap.groups)
+    map, explained, info = em_update(submap.map, trusted, noise, config.em, submap.white, submap.groups)
     owned = owners(explained, map.birth.shape[0])
     births = take_rows(map.birth, owned).astype(jnp.float32)
     origin = jnp.where(info.num_fused > 0, median(births, explained.is_fused), frame.time).astype(jnp.int32)
-    map, halves = split(map, trusted, noise, owned, num_rows, splitting)
-    explained_by = take_rows(submap.map, owned)
-    rest = continued(trusted, explained_by, explained.is_fused, frame.localization.noise, T, view, continuation)
-    rest = eqx.tree_at(lambda o: o.valid, rest, trusted.valid & ~explained.is_fused)
-    return Fused(map, halves, rest, origin, info)
+    map, halves = split(map, trusted, noise, owned, num_rows, config.splitting)
+    explained_by, noise = take_rows(submap.map, owned), frame.localization.noise
+    moved = extrapolate(trusted, explained_by, explained.is_fused, noise, T, view, config.extrapolation)
+    unexplained = eqx.tree_at(lambda o: o.valid, moved, trusted.valid & ~explained.is_fused)
+    return Fused(map, halves, unexplained, origin, info)
 
 
 @executable
@@ -307,8 +333,8 @@ _refine = executable(refine)
 @executable
 def _store(
     map: GaussianMap,
-    submap: tuple[GaussianMap, Int[Array, "s"]],
-    new: tuple[Gaussians, Float[Array, "g"], GaussianMap],
+    submap: Submap,
+    new: NewGaussians,
     frame: Frame,
     view: Camera,
     config: SlamConfig,
@@ -318,13 +344,12 @@ def _store(
     Returns:
         The map, the number of its Gaussians, how many did not fit, and the time of the next frame.
     """
-    (gaussians, rows), (fresh, weight, halves) = submap, new
-    T, noise = frame.T_world_camera, frame.localization.depth_noise
-    use = usefulness(map, gaussians, rows)
-    map, is_seen = judge(write_back(map, gaussians, rows), use, frame.trusted, T, view, noise, config.existence)
+    rows, T, noise = submap.rows, frame.T_world_camera, frame.localization.depth_noise
+    evidence, map = fusion_evidence(map, submap.map, rows), write_back(map, submap.map, rows)
+    map, is_seen = update_existence(map, evidence, frame.trusted, T, view, noise, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
-    joined = join_layers(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
-    born = new_map(fresh, _first_weight(weight, config.em.average), config.existence.birth, frame.time)
-    born = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), born, halves)
-    map, _, overflow = insert(write_back(map, joined, rows), born)
+    merged = merge_duplicates(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
+    born = new_map(new.gaussians, _first_weight(new.weight, config.em.average), config.existence.birth, frame.time)
+    born = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), born, new.halves)
+    map, _, overflow = insert(write_back(map, merged, rows), born)
     return map, jnp.sum(map.gaussians.valid), overflow, frame.time + 1

@@ -11,8 +11,8 @@ import jax
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.render.densify import DensifyConfig
+from emgs_jax.running.batch import programs
 from emgs_jax.running.configure import build, near
-from emgs_jax.running.stacked import programs
 from emgs_jax.slam import SlamConfig
 
 Value = float | int | str | bool

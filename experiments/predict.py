@@ -45,18 +45,24 @@ def predict(config: DictConfig) -> Path:
 def _record_visits(prior: Prior, dataset: Dataset, config: DictConfig, folder: Path) -> None:
     """Record the predictions of both visits of a loop that a run's back end will need beside the sequence's windows."""
     end, size = graph_config(config), config.slam.window_size
-    if not end.revisit.is_asked or prior.is_sequential:
+    if not end.prior_query.is_used or prior.is_sequential:
         return
     pairs = places_seen_twice(
         Recorded(folder),
         dataset,
         size,
-        end.appearance,
+        end.place_recognition,
         end.verification.alignment,
         lambda windows: tqdm(windows, unit="frame", desc="places seen twice"),
     )
     count = record_visits(
-        prior, dataset, size, folder, pairs, end.revisit.spacing, lambda some: tqdm(some, unit="pair", desc="visits")
+        prior,
+        dataset,
+        size,
+        folder,
+        pairs,
+        end.prior_query.spacing,
+        lambda some: tqdm(some, unit="pair", desc="visits"),
     )
     print(f"{count} windows with both visits of a place, for loops")
 

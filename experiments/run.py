@@ -36,11 +36,11 @@ from emgs_jax.running.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import baseline_configs, build, build_dataset, build_prior, graph_config
 from emgs_jax.running.dense import center_cloud, dense_map
-from emgs_jax.running.drive import map_frames, show_records
 from emgs_jax.running.gathering import Baselines, RawPrior, gather
 from emgs_jax.running.labelling import labelled_map
-from emgs_jax.running.places import load_saved
+from emgs_jax.running.pipeline import map_frames, show_records
 from emgs_jax.running.record import FrameRecord, MappingRun, new_run, to_line
+from emgs_jax.running.saved_map import load_saved_map
 
 from .command import command
 from .shorthand import with_source
@@ -62,7 +62,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             graph, fused = graph_config(config), baseline_configs(config)
             dataset = build_dataset(config)
             prior = build_prior(config, dataset)
-            saved = load_saved(config.map, config.map_mode, graph, dataset.intrinsics, float(slam.fit.min_std))
+            saved = load_saved_map(config.map, config.map_mode, graph, dataset.intrinsics, float(slam.fit.min_std))
             session = new_run(dataset, slam, clock, graph=graph, saved=saved)
             watched = build(config, "view") if config.view else None
             live = stack.enter_context(live_view(watched, session, densify.render, prior, dataset.kept))

@@ -19,11 +19,11 @@ from emgs_jax.report.metrics import Metrics, Scorer, compared_text, score_settin
 from emgs_jax.report.overview import thumbnail
 from emgs_jax.report.provenance import provenance
 from emgs_jax.report.sweeps import picture_path
+from emgs_jax.running.batch import map_together, programs
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.dense import center_cloud
 from emgs_jax.running.gathering import gather
 from emgs_jax.running.record import MappingRun, new_run
-from emgs_jax.running.stacked import map_together, programs
 
 from .grid import Variant
 

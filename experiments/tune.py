@@ -24,9 +24,9 @@ from emgs_jax.report.metrics import Scorer, new_scorer
 from emgs_jax.report.repeat import written
 from emgs_jax.report.sweeps import SweepResults, write_csv
 from emgs_jax.report.tuning import DEFAULT, SequenceResults, draw_trials, settings_yaml, table, verdict
+from emgs_jax.running.batch import programs
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import build, build_dataset, build_prior, compose, near
-from emgs_jax.running.stacked import programs
 
 from .command import command
 from .grid import plain_setting, variant_of

@@ -8,23 +8,23 @@ from omegaconf import OmegaConf
 from scene import CONF
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.loops.appearance import BYTES_PER_UNIT, AppearanceConfig, Keyframe
-from emgs_jax.loops.verification import Neighbour, VerificationConfig
+from emgs_jax.loop_closure.place_recognition import BYTES_PER_UNIT, Keyframe, PlaceRecognitionConfig
+from emgs_jax.loop_closure.verification import Neighbour, VerificationConfig
 
 SIZE, INTRINSICS = (320, 240), (250.0, 260.0, 155.0, 122.5)
 
 
 @cache
 def loops_config(*overrides: str) -> dict:
-    """What conf/graph/default.yaml says of loops, changed by words like `appearance.min_gap=5`."""
-    parts = ["appearance", "verification", "agreement", "revisit", "location"]
+    """What conf/graph/default.yaml says of loops, changed by words like `place_recognition.min_gap=5`."""
+    parts = ["place_recognition", "verification", "consistency", "prior_query", "relocalization"]
     given = OmegaConf.masked_copy(OmegaConf.load(CONF / "graph" / "default.yaml"), parts)
     config = OmegaConf.merge(given, OmegaConf.from_dotlist(list(overrides)))
     return hydra.utils.instantiate(config, _convert_="all")
 
 
-def appearance_config(*overrides: str) -> AppearanceConfig:
-    return loops_config(*(f"appearance.{word}" for word in overrides))["appearance"]
+def place_recognition_config(*overrides: str) -> PlaceRecognitionConfig:
+    return loops_config(*(f"place_recognition.{word}" for word in overrides))["place_recognition"]
 
 
 def verification_config(*overrides: str) -> VerificationConfig:

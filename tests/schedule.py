@@ -11,7 +11,7 @@ GROUPS = {
     "tiny": (
         "running/test_budgets.py",  # counts what is compiled, so it clears what others compiled
         "scripts/test_run.py",
-        "running/test_drive.py",
+        "running/test_pipeline.py",
         "running/test_checkpoint.py",
         "scripts/test_query_and_segment.py",
         "scripts/test_sweep_script.py",
@@ -24,9 +24,9 @@ GROUPS = {
         "report/test_live_browser.py",
         "polish/test_polish.py",
     ),
-    "smoke": ("running/test_coming_back.py", "running/test_segments.py", "scripts/test_walk.py"),
+    "smoke": ("running/test_coming_back.py", "running/test_disconnected_submaps.py", "scripts/test_walk.py"),
     "browser": ("report/test_page_browser.py", "report/test_table_page.py", "report/test_viewer.py"),  # one Chromium
-    "small": ("running/test_growth.py", "test_slam.py", "running/test_stacked.py"),  # the first counts, as above
+    "small": ("running/test_capacity.py", "test_slam.py", "running/test_batch.py"),  # the first counts, as above
 }
 # What the quick subset (-m "not slow") takes nothing of, beside the marked tests: some five CPU seconds and more each.
 SLOW = {
@@ -35,8 +35,8 @@ SLOW = {
     "data/test_rosbag.py",
     "features/test_dino.py",
     "features/test_dinotxt.py",
-    "graph/test_graph_optimize.py",
-    "loops/test_verification.py",
+    "pose_graph/test_pose_graph_optimize.py",
+    "loop_closure/test_verification.py",
     "ops/test_neighbours.py",
     "polish/test_polish.py",
     "prior/files/test_prior_files.py",

@@ -15,14 +15,23 @@ PACKAGE = Path(__file__).resolve().parents[1] / "emgs_jax"
 FILES = sorted(PACKAGE.rglob("*.py"))
 # From the bottom: a room imports rooms to its left and itself, never one to its right.
 CORE_ROOMS = (
-    *("ops", "observation", "gaussians", "gaussian_map", "registration", "graph", "render"),
-    *("initialization", "localization", "em", "continuation", "splitting", "refinement", "existence"),
+    *("ops", "observation", "gaussians", "gaussian_map", "registration", "pose_graph", "render"),
+    *("initialization", "localization", "em", "surface_extrapolation", "splitting", "refinement", "existence"),
     *("semantics", "slam"),
 )
 # What is solved between frames, by SciPy; the core does not import it.
-HOST_FILES = {"graph.sparse", "graph.start", "graph.problem", "graph.optimize"}
-HOST = ("data", "io", "features", "keypoints", "loops", "prior", "evaluation", "running", "polish", "report")
-STAGES = {"initialization", "localization", "em", "continuation", "splitting", "refinement", "existence", "semantics"}
+HOST_FILES = {"pose_graph.sparse", "pose_graph.chordal", "pose_graph.problem", "pose_graph.optimize"}
+HOST = ("data", "io", "features", "keypoints", "loop_closure", "prior", "evaluation", "running", "polish", "report")
+STAGES = {
+    "initialization",
+    "localization",
+    "em",
+    "surface_extrapolation",
+    "splitting",
+    "refinement",
+    "existence",
+    "semantics",
+}
 HOST_PACKAGES = {"numpy", "cv2", "open3d", "trimesh", "matplotlib", "scipy", "torch", "tqdm", "hydra", "omegaconf"}
 
 

@@ -5,14 +5,16 @@ import numpy as np
 import pytest
 from scene import assert_same, at, device, flat_gaussians, fresh_map, join, on_host, pose, replace, rows_of
 
-from emgs_jax.existence import depth_range, join_layers, judge, merge_layers, usefulness
+from emgs_jax.existence import depth_range, fusion_evidence, merge_all_duplicates, merge_duplicates, update_existence
 from emgs_jax.gaussian_map import GaussianMap, confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
 from emgs_jax.ops.camera import Camera
 
 NUM_ROWS = 1200  # of every map, most of them free: one program for all
-judged_map, joined_map, merged_map, ranges = (on_host(f) for f in (judge, join_layers, merge_layers, depth_range))
+judged_map, joined_map, merged_map, ranges = (
+    on_host(f) for f in (update_existence, merge_duplicates, merge_all_duplicates, depth_range)
+)
 CAMERA = Camera([40.0, 44.0], [31.5, 23.5], 64, 48)
 NOISE = device(0.02)
 HERE = pose()
@@ -161,7 +163,7 @@ def test_what_is_seen_through_is_not_confirmed_by_what_it_explains(settings):
 def test_usefulness_is_what_a_frame_fused_into_each_row_of_its_submap():
     map, rows = map_of(discs(WALL[:5])), np.array([3, 1, 5])  # the last is padding
     submap = replace(rows_of(map, np.minimum(rows, 4)), num_updates=np.int32([1 + 2, 1, 1 + 1]))
-    np.testing.assert_array_equal(on_host(usefulness)(map, submap, rows), [0, -1, 0, 1, 0])
+    np.testing.assert_array_equal(on_host(fusion_evidence)(map, submap, rows), [0, -1, 0, 1, 0])
 
 
 EDGE = np.where(np.arange(CAMERA.width) < 32, 1.5, 3.0)

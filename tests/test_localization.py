@@ -10,10 +10,10 @@ import scene as sc
 from emgs_jax.gaussians import fit_to_points
 from emgs_jax.localization import REASONS, localize_coarse, localize_fine
 from emgs_jax.ops.camera import Camera
-from emgs_jax.registration.belief import certain, root_information
 from emgs_jax.registration.icp import icp
-from emgs_jax.registration.pose_noise import none_yet
-from emgs_jax.registration.repeat import repeat_scale
+from emgs_jax.registration.pose_estimate import exact_estimate, root_information
+from emgs_jax.registration.pose_noise import no_repeats
+from emgs_jax.registration.repeated_prediction import repeat_scale
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 
@@ -21,7 +21,7 @@ coarse_step, fine_step, solve = (sc.on_host(f) for f in (localize_coarse, locali
 COARSE = {"via_previous": 0, "same_image": 1, "anchored": 2, "fused": 3}
 SCALES = {"none": 0, "ratio": 1, "estimated": 2}
 FRAME = 3
-CERTAIN = jax.device_get(certain())
+CERTAIN = jax.device_get(exact_estimate())
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +34,9 @@ def world(i, camera):
     return sc.moved_points(sc.path_pose(i), sc.observe_room(sc.path_pose(i), camera))
 
 
-def coarse_of(prediction, camera, config, previous=None, belief=CERTAIN):
+def coarse_of(prediction, camera, config, previous=None, estimate=CERTAIN):
     previous = world(FRAME - 1, camera) if previous is None else previous
-    return coarse_step(prediction, previous, sc.path_pose(FRAME - 1), camera, config, belief)
+    return coarse_step(prediction, previous, sc.path_pose(FRAME - 1), camera, config, estimate)
 
 
 def with_views(prediction, change):
@@ -107,25 +107,25 @@ def test_the_printed_form_estimates_no_scale_and_the_priors_own_unit_holds_it(wi
     prediction, T = sc.predict_room(FRAME, wide, scale=0.9), sc.path_pose(FRAME - 1)
     assert coarse_of(prediction, wide, printed).scale == 1
     ratio = sc.changed(printed, **{"coarse_scale": SCALES["ratio"], "icp.scale_noise": 0.5})
-    belief = sc.replace(CERTAIN, log_scale=0.02)
+    estimate = sc.replace(CERTAIN, log_scale=0.02)
     noise = 0.3 * np.random.default_rng(0).normal(size=(wide.height * wide.width, 1))
     before = sc.observe_room(T, wide)
     before = sc.moved_points(T, sc.replace(before, points=before.points * np.exp(noise)))
     found, known = sc.on_host(repeat_scale)(prediction.previous, before, T, sc.device(1.0), ratio.coarse_scale)
     for std in (0.02, 0.1):
-        result = coarse_of(prediction, wide, sc.at(ratio, "scale_std", std), before, belief)
+        result = coarse_of(prediction, wide, sc.at(ratio, "scale_std", std), before, estimate)
         expected = (known**2 * 0.02 + std**2 * np.log(found)) / (known**2 + std**2)
         np.testing.assert_allclose(np.log(result.scale), expected, atol=1e-4)
-        np.testing.assert_allclose(result.belief.covariance[6, 6], 1 / (known**-2 + std**-2), rtol=1e-3)
-    held = coarse_of(prediction, wide, sc.at(ratio, "icp.scale_noise", 0.0), before, belief)
-    assert held.belief.covariance[6, 6] < 1e-10
+        np.testing.assert_allclose(result.estimate.covariance[6, 6], 1 / (known**-2 + std**-2), rtol=1e-3)
+    held = coarse_of(prediction, wide, sc.at(ratio, "icp.scale_noise", 0.0), before, estimate)
+    assert held.estimate.covariance[6, 6] < 1e-10
 
 
 def test_without_a_pair_the_scale_is_the_priors_own_unit(wide, printed):
     prediction = sc.predict_room(FRAME, wide, scale=0.9)
     blind = eqx.tree_at(lambda p: p.previous.valid, prediction, sc.device(np.zeros(80 * 64, bool)))
     ratio = sc.at(printed, "coarse_scale", SCALES["ratio"])
-    found = coarse_of(blind, wide, ratio, belief=sc.replace(CERTAIN, log_scale=-0.2))
+    found = coarse_of(blind, wide, ratio, estimate=sc.replace(CERTAIN, log_scale=-0.2))
     np.testing.assert_allclose(found.scale, np.exp(-0.2), rtol=1e-5)
 
 
@@ -144,7 +144,7 @@ def test_the_printed_coarse_pose_does_not_use_the_priors_absolute_pose(wide, pri
 def repeats_of(motion: float, own: float):
     """A great many that say these deviations, where three quarters of the variance are shared."""
     log_squares = np.array([[2 * np.log(std) + np.log(0.5) - 0.36898] * 2 for std in (motion, own)])
-    return sc.replace(none_yet(), log_squares=log_squares, counts=np.full(2, 1e6))
+    return sc.replace(no_repeats(), log_squares=log_squares, counts=np.full(2, 1e6))
 
 
 def test_the_fused_pose_lies_between_chain_and_anchor_and_far_from_the_anchor_at_the_chain(wide, printed):
@@ -152,8 +152,10 @@ def test_the_fused_pose_lies_between_chain_and_anchor_and_far_from_the_anchor_at
     config = sc.changed(printed, coarse=COARSE["fused"], pose_shared=0.75)
 
     def distance(motion, own):
-        belief = eqx.tree_at(lambda b: b.repeats, CERTAIN, repeats_of(motion, own))
-        return sc.pose_error(coarse_of(elsewhere, wide, config, belief=belief).T_world_camera, sc.path_pose(FRAME))[0]
+        estimate = eqx.tree_at(lambda b: b.repeats, CERTAIN, repeats_of(motion, own))
+        return sc.pose_error(coarse_of(elsewhere, wide, config, estimate=estimate).T_world_camera, sc.path_pose(FRAME))[
+            0
+        ]
 
     assert distance(10.0, 1e-3) == pytest.approx(0.1, abs=1e-3)
     assert distance(1e-3, 10.0) == pytest.approx(0.0, abs=1e-3)
@@ -166,8 +168,8 @@ def test_the_fused_pose_weighs_chain_and_anchor_by_their_variances(wide, printed
     elsewhere = shifted(sc.predict_room(FRAME, wide), sc.pose(translation=(shifted_by, 0, 0)))
     config = sc.changed(printed, coarse=COARSE["fused"], pose_shared=0.75, num_shared=1e7)
     config = sc.at(config, "icp.prior_information", 30.0)
-    belief = eqx.tree_at(lambda b: b.repeats, CERTAIN, repeats_of(0.005, 0.005 * ratio))
-    result = coarse_of(elsewhere, wide, config, belief=belief)
+    estimate = eqx.tree_at(lambda b: b.repeats, CERTAIN, repeats_of(0.005, 0.005 * ratio))
+    result = coarse_of(elsewhere, wide, config, estimate=estimate)
     motion = (0.005 * float(result.mean_depth)) ** 2
     own = motion * ratio**2
     weighted = own * (1 + shifted_by**2 / (motion + own) / 6)
@@ -175,7 +177,7 @@ def test_the_fused_pose_weighs_chain_and_anchor_by_their_variances(wide, printed
     moved = sc.pose_error(result.T_world_camera, sc.path_pose(FRAME))[0]
     assert moved == pytest.approx(shifted_by * share, abs=1e-3)  # as above
     np.testing.assert_allclose(
-        np.diag(result.belief.covariance)[:3], motion * weighted / (motion + weighted), rtol=0.05
+        np.diag(result.estimate.covariance)[:3], motion * weighted / (motion + weighted), rtol=0.05
     )
 
 
@@ -273,8 +275,8 @@ def test_without_enough_pairs_the_priors_own_pose_stands_in_for_the_chain(wide, 
         noise = own = float(apart.depth_noise * apart.mean_depth) / 30**0.5  # nothing is said twice yet
         far = min(float(fused.max_step), 1.0) * float(apart.mean_depth)
         together = 1 / np.sqrt(1 / own**2 + 1 / (far**2 + noise**2))
-        np.testing.assert_allclose(np.sqrt(np.diag(apart.belief.covariance)[:3]), together, rtol=0.1)
-        assert np.all(np.diag(apart.belief.covariance)[:3] > np.diag(known.belief.covariance)[:3])
+        np.testing.assert_allclose(np.sqrt(np.diag(apart.estimate.covariance)[:3]), together, rtol=0.1)
+        assert np.all(np.diag(apart.estimate.covariance)[:3] > np.diag(known.estimate.covariance)[:3])
     if count == 0:  # nothing is known, and the largest distance of a pair stands in
         unknown = float(printed.max_pair_distance * result.mean_depth)
         assert result.repeat_rms == pytest.approx(1.4826 * unknown, rel=1e-5)
@@ -350,7 +352,7 @@ def test_the_fine_step_is_icp_of_the_scaled_points_with_the_noise_of_the_coarse_
     current = small_prediction(camera).current
     T, aligned, info = fine_step(current, submap, coarse, settings)
     scaled = sc.replace(current, points=coarse_scale * np.asarray(current.points))
-    known = sc.on_host(root_information)(coarse.belief.covariance)
+    known = sc.on_host(root_information)(coarse.estimate.covariance)
     expected, scale, found = solve(scaled, submap, coarse.T_world_camera, known, sc.device(depth_noise), settings.icp)
     # Another program rounds in another order; the solver stops within its tolerance.
     assert max(sc.pose_error(T, expected)) < 1e-4

@@ -14,9 +14,9 @@ from emgs_jax import slam
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
+from emgs_jax.running.capacity import advance, grow_capacities, start
 from emgs_jax.running.convert import FirstWindow, opening
 from emgs_jax.running.executables import call
-from emgs_jax.running.growth import advance, start, with_room
 from emgs_jax.slam import Overflow, SlamState, StepInfo
 
 FRAME = 3
@@ -489,7 +489,7 @@ def test_room_is_doubled_where_rows_did_not_fit(settings):
     zero, some = (sc.device(np.int32(number)) for number in (0, 1))
     room = settings.submap.map_capacity, settings.submap.submap_capacity
     for map, submap in ((zero, zero), (some, zero), (zero, some), (some, some)):
-        grown = with_room(settings, Overflow(map, submap, some)).submap
+        grown = grow_capacities(settings, Overflow(map, submap, some)).submap
         assert (grown.map_capacity, grown.submap_capacity) == (room[0] * (1 + int(map)), room[1] * (1 + int(submap)))
 
 

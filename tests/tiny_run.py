@@ -15,7 +15,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior, PriorPrediction
 from emgs_jax.running import configure
 from emgs_jax.running.configure import CONF  # noqa: F401 (for the tests of scripts)
-from emgs_jax.running.drive import map_frames
+from emgs_jax.running.pipeline import map_frames
 from emgs_jax.running.record import MappingRun, new_run
 
 NUM_FRAMES, WINDOW_SIZE = 6, 3

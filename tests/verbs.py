@@ -6,7 +6,6 @@ import numpy as np
 import scene as sc
 
 from emgs_jax import (
-    continuation,
     em,
     existence,
     gaussian_map,
@@ -15,14 +14,15 @@ from emgs_jax import (
     localization,
     semantics,
     splitting,
+    surface_extrapolation,
 )
 from emgs_jax import observation as obs
-from emgs_jax.graph import deform, measurements
 from emgs_jax.ops import camera as cam
 from emgs_jax.ops import clustering, linalg, neighbours
 from emgs_jax.ops.pytree import take_rows
+from emgs_jax.pose_graph import deform, factors
 from emgs_jax.refinement import refine
-from emgs_jax.registration import belief, icp, noise, pose_noise, rigid
+from emgs_jax.registration import icp, noise, pose_estimate, pose_noise, rigid
 from emgs_jax.render import composite, densify, project
 
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
@@ -65,9 +65,11 @@ def image_of(seed: int):
     return tuple(map(sc.device, arrays))
 
 
-def belief_of(seed: int) -> belief.Belief:
+def belief_of(seed: int) -> pose_estimate.PoseEstimate:
     covariance = sc.device(np.diag([4e-4] * 3 + [1e-4] * 4) * (1.0 + seed))
-    return belief.Belief(covariance, covariance, *map(sc.device, (0.01, 0.02, 3.0)), pose_noise.none_yet())
+    return pose_estimate.PoseEstimate(
+        covariance, covariance, *map(sc.device, (0.01, 0.02, 3.0)), pose_noise.no_repeats()
+    )
 
 
 def coarse_of(seed: int) -> localization.CoarsePose:
@@ -97,7 +99,7 @@ def looking(seed: int):
     return sc.pose(translation=(0.1 * seed, 0, 0))
 
 
-def graph_of(seed: int) -> measurements.Graph:
+def graph_of(seed: int) -> factors.PoseGraph:
     """Poses that are some centimetres off what the edges say; one edge is not in use."""
     rng = np.random.default_rng(seed)
     a, b = np.arange(6, dtype=np.int32) % 5, (np.arange(6, dtype=np.int32) + 2) % 5
@@ -107,13 +109,13 @@ def graph_of(seed: int) -> measurements.Graph:
         np.linalg.inv(sc.matrix_of(T[i])) @ sc.matrix_of(T[j]) @ sc.matrix_of(d)
         for i, j, d in zip(a, b, off, strict=True)
     ]
-    nodes = measurements.Nodes(sc.stack_poses(T), sc.device(0.1 * rng.normal(size=5)), sc.device(np.ones(5, bool)))
+    nodes = factors.Nodes(sc.stack_poses(T), sc.device(0.1 * rng.normal(size=5)), sc.device(np.ones(5, bool)))
     said = (
         sc.stack_poses([sc.pose_of(one) for one in between]),
         *map(sc.device, (rng.normal(size=6), rng.normal(size=(6, 7, 7)))),
     )
-    return measurements.Graph(
-        nodes, measurements.Edges(*map(sc.device, (a, b)), *said, sc.device(a % 2), sc.device(np.arange(6) < 5))
+    return factors.PoseGraph(
+        nodes, factors.Factors(*map(sc.device, (a, b)), *said, sc.device(a % 2), sc.device(np.arange(6) < 5))
     )
 
 
@@ -163,11 +165,11 @@ VERBS = {
     ),
     "fit_rigid": (rigid.fit_rigid, lambda s: (points(s).points, points(s + 5).points, sc.device(np.ones(40)))),
     "predict": (
-        lambda b, T: belief.predict(b.covariance, T, jnp.full(7, 0.01)),
+        lambda b, T: pose_estimate.propagate_covariance(b.covariance, T, jnp.full(7, 0.01)),
         lambda s: (belief_of(s), sc.path_pose(s)),
     ),
     "update": (
-        lambda b: belief.update(b.covariance, jnp.linspace(0.0, 0.1, 7), 1e3 * jnp.eye(7)),
+        lambda b: pose_estimate.kalman_update(b.covariance, jnp.linspace(0.0, 0.1, 7), 1e3 * jnp.eye(7)),
         lambda s: (belief_of(s),),
     ),
     "icp": (
@@ -217,39 +219,43 @@ VERBS = {
         lambda g, T: densify.densify(g, T, CAMERA, DENSIFY),
         lambda s: (sc.random_gaussians(32, s, 2), looking(s)),
     ),
-    "continued": (
-        lambda m, o, T: continuation.continued(
+    "extrapolate": (
+        lambda m, o, T: surface_extrapolation.extrapolate(
             o,
             take_rows(m, jnp.asarray(ROWS % 32)),
             jnp.asarray(ROWS % 3 > 0),
             o.confidence,
             T,
             CAMERA,
-            CONFIG.continuation,
+            CONFIG.extrapolation,
         ),
         lambda s: (map_of(s), sc.random_observation(192, s, 2), looking(s)),
     ),
-    "judge": (
-        lambda m, o, T: existence.judge(m, jnp.arange(32) % 3 - 1, o, T, CAMERA, ONE * 0.02, CONFIG.existence),
+    "update_existence": (
+        lambda m, o, T: existence.update_existence(
+            m, jnp.arange(32) % 3 - 1, o, T, CAMERA, ONE * 0.02, CONFIG.existence
+        ),
         lambda s: (map_of(s), sc.random_observation(192, s, 2), looking(s)),
     ),
-    "join_layers": (
-        lambda m, T: existence.join_layers(m, jnp.arange(32) % 3 > 0, T.translation(), ONE * 0.1, CONFIG.existence),
+    "merge_duplicates": (
+        lambda m, T: existence.merge_duplicates(
+            m, jnp.arange(32) % 3 > 0, T.translation(), ONE * 0.1, CONFIG.existence
+        ),
         lambda s: (map_of(s), looking(s)),
     ),
     "num_independent": (
         lambda e, p: noise.num_independent(e, p, jnp.arange(40) % 3 > 0),
         lambda s: (points(s).colors[:, 0], points(s).points),
     ),
-    "move": (measurements.move, lambda s: (graph_of(s).nodes, sc.device(np.full((5, 7), 0.1)))),
+    "move": (factors.move, lambda s: (graph_of(s).nodes, sc.device(np.full((5, 7), 0.1)))),
     "deform": (
         lambda m, before, after: deform.deform(m, before, after, ONE * 0.01, deform.DeformConfig(4, 40.0)),
         lambda s: (map_of(s), graph_of(s).nodes, graph_of(s + 5).nodes),
     ),
-    "residuals": (measurements.residuals, lambda s: (graph_of(s),)),
-    "linearize": (measurements.linearize, lambda s: (graph_of(s),)),
+    "residuals": (factors.residuals, lambda s: (graph_of(s),)),
+    "linearize": (factors.linearize, lambda s: (graph_of(s),)),
     "robust": (
-        lambda chi2, kernel: measurements.robust(chi2, jnp.arange(6) % 2, kernel),
+        lambda chi2, kernel: factors.robust(chi2, jnp.arange(6) % 2, kernel),
         lambda s: (sc.device(np.linspace(0.0, 60.0 + s, 6)), sc.device(16.8)),
     ),
     "classify": (semantics.classify, lambda s: (sc.random_gaussians(9, s, 2), sc.device(np.eye(2)))),

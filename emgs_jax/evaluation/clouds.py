@@ -5,10 +5,10 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
 
 from emgs_jax.data.spool import Spool
 from emgs_jax.evaluation.trajectory import Alignment, align, rotated
@@ -156,31 +156,71 @@ class SpooledCloud:
             return self._averaged[1]
 
 
+def cell_numbers(points: np.ndarray, voxel: float) -> np.ndarray:
+    """Number (n,) of the voxel [m] of the world that each finite point (n, 3) is in, 21 bits an axis.
+
+    What is farther than a million voxels shares the border cells.
+    """
+    index = np.floor(np.clip(points / voxel, -(2.0**20), 2.0**20 - 1)).astype(np.int64) + 2**20
+    return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+
+
+def cell_centers(numbers: np.ndarray, voxel: float) -> np.ndarray:
+    """Centres (n, 3) of the voxels with these `cell_numbers`."""
+    index = (numbers[:, None] >> np.array([42, 21, 0])) & (2**21 - 1)
+    return (index - 2**20 + 0.5) * voxel
+
+
 def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     """Average the points of each voxel [m]; doing it twice changes nothing."""
     return fuse_clouds([cloud], voxel)
 
 
-def tree_of(points: np.ndarray) -> cKDTree:
-    """For nearest points of (n, 3): a cloud's tree is built, and even searched, in half the time if not balanced."""
-    return cKDTree(points, balanced_tree=False, compact_nodes=False)
+class NearestPoints:
+    """Exact nearest neighbours among points (n, 3), by Open3D: SciPy's k-d tree takes twice as long for a scene.
+
+    Args:
+        points: (n, 3), of any unit.
+    """
+
+    def __init__(self, points: np.ndarray) -> None:
+        self.points = np.ascontiguousarray(points, np.float64)
+        self._search: Any = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def query(self, queries: np.ndarray, num_neighbours: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """Distances and rows, (m, k) each and the nearest first, of k = min(`num_neighbours`, n) points."""
+        k = min(num_neighbours, len(self))
+        if not k or not len(queries):
+            return np.empty((len(queries), k)), np.empty((len(queries), k), np.int64)
+        import open3d as o3d  # slow to import, and only a comparison needs it
+
+        if self._search is None:
+            self._search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(self.points))
+            self._search.knn_index()
+        queries = o3d.core.Tensor(np.ascontiguousarray(queries, np.float64))
+        rows, squares = (found.numpy() for found in self._search.knn_search(queries, k))
+        return np.sqrt(squares), rows
 
 
-def register(points: np.ndarray, target: cKDTree, max_distance: float, max_steps: int) -> Alignment:
-    """Find the rigid motion of points (n, 3) onto those of a tree by point-to-point ICP (Besl and McKay 1992).
+def register(points: np.ndarray, target: NearestPoints, max_distance: float, max_steps: int) -> Alignment:
+    """Find the rigid motion of points (n, 3) onto those of a target by point-to-point ICP (Besl and McKay 1992).
 
     Pairs are nearest points within `max_distance` [m]; ends when they stay the same. With fewer than 3 pairs nothing
     holds the cloud: it stays where it is.
     """
     found, known = Alignment(1.0, np.eye(3), np.zeros(3)), np.empty(0)
-    if not target.n:
+    if not len(target):
         return found
     for _ in range(max_steps):
-        distances, partners = target.query(found.apply(points), distance_upper_bound=max_distance, workers=-1)
-        near = np.isfinite(distances)
-        if near.sum() < 3 or np.array_equal(partners, known):
+        distances, partners = (values[:, 0] for values in target.query(found.apply(points)))
+        near = distances < max_distance
+        pairs = np.where(near, partners, -1)
+        if near.sum() < 3 or np.array_equal(pairs, known):
             return found
-        found, known = align(points[near], target.data[partners[near]], with_scale=False), partners
+        found, known = align(points[near], target.points[partners[near]], with_scale=False), pairs
     return found
 
 
@@ -188,9 +228,7 @@ def _cells(cloud: PointCloud, voxel: float) -> tuple[np.ndarray, np.ndarray]:
     """Reduce one cloud to its occupied cells: packed cell numbers (n,), sorted, and sums (n, 10), the last a count."""
     finite = np.isfinite(cloud.points).all(axis=1)
     points = np.asarray(cloud.points[finite], np.float64)
-    # 21 bits an axis; what is farther than a million voxels shares the border cells.
-    index = np.floor(np.clip(points / voxel, -(2.0**20), 2.0**20 - 1)).astype(np.int64) + 2**20
-    keys = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+    keys = cell_numbers(points, voxel)
     rows = np.concatenate([points, cloud.normals[finite], cloud.colors[finite], np.ones((len(points), 1))], axis=1)
     return _sum_cells(keys, rows)
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from emgs_jax.evaluation.clouds import NearestPoints
 from emgs_jax.evaluation.segmentation import LabelledPoints, confusion_matrix, segmentation_metrics, transfer_labels
 from emgs_jax.ops.ranges import number
 
@@ -109,7 +109,7 @@ def scene_confusion(
     if not len(points) or not len(true_points):
         predicted, compared = np.full(len(true), -1), true
     elif p.compared_at == "map":
-        predicted, compared = labels, true[cKDTree(true_points).query(points, workers=-1)[1]]
+        predicted, compared = labels, true[NearestPoints(true_points).query(points)[1][:, 0]]
     elif p.none_votes:
         predicted, compared = transfer_labels(points, labels + 1, true_points, p.num_neighbours) - 1, true
     else:

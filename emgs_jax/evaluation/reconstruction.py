@@ -5,17 +5,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import (
+    NearestPoints,
     PointCloud,
     SpooledCloud,
     fuse_clouds,
     register,
     transform_cloud,
-    tree_of,
     voxel_downsample,
 )
 from emgs_jax.evaluation.trajectory import Alignment, align_poses
@@ -121,19 +120,21 @@ class Reference:
 
     Args:
         cloud: averaged per voxel.
-        tree: of its points.
-        icp_tree: of the points that ICP takes.
+        points: to search its points.
+        icp_points: those that ICP takes.
     """
 
     cloud: PointCloud
-    tree: cKDTree
-    icp_tree: cKDTree
+    points: NearestPoints
+    icp_points: NearestPoints
 
 
 def reference(truth: PointCloud, config: EvaluationConfig) -> Reference:
     """Prepare a true cloud for comparisons under `config`, with either alignment and with or without ICP."""
     cloud = voxel_downsample(truth, config.voxel_m)
-    return Reference(cloud, tree_of(cloud.points), tree_of(voxel_downsample(truth, config.icp_voxel_m).points))
+    return Reference(
+        cloud, NearestPoints(cloud.points), NearestPoints(voxel_downsample(truth, config.icp_voxel_m).points)
+    )
 
 
 def compare_clouds(
@@ -165,7 +166,7 @@ def align_cloud(
     if config.icp_distance_m > 0:
         source = voxel_downsample(aligned, config.icp_voxel_m).points
         aligned = transform_cloud(
-            aligned, register(source, truth.icp_tree, config.icp_distance_m, config.icp_max_steps)
+            aligned, register(source, truth.icp_points, config.icp_distance_m, config.icp_max_steps)
         )
     return aligned, note
 
@@ -189,9 +190,9 @@ def reconstruction_metrics(
         return metrics
     rng = np.random.default_rng(0)  # one for both: equally long clouds must not keep the same rows
     estimate, true = _chosen(estimate, config.max_points, rng), _chosen(true, config.max_points, rng)
-    tree = truth.tree if true is truth.cloud else tree_of(true.points)
-    to_truth, partner = tree.query(estimate.points, workers=-1)
-    to_estimate, back = tree_of(estimate.points).query(true.points, workers=-1)
+    of_truth = truth.points if true is truth.cloud else NearestPoints(true.points)
+    to_truth, partner = (values[:, 0] for values in of_truth.query(estimate.points))
+    to_estimate, back = (values[:, 0] for values in NearestPoints(estimate.points).query(true.points))
     values = [_average(distances, config) for distances in (to_truth, to_estimate)]
     for threshold in config.f1_thresholds_m:
         precision, recall = 100.0 * np.mean(to_truth <= threshold), 100.0 * np.mean(to_estimate <= threshold)

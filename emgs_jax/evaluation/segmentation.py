@@ -12,7 +12,7 @@ import numpy as np
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.spool import Spool
-from emgs_jax.evaluation.clouds import PointCloud, tree_of
+from emgs_jax.evaluation.clouds import NearestPoints, PointCloud, cell_centers, cell_numbers
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, Reference, align_cloud, own_voxel
 from emgs_jax.evaluation.trajectory import align_poses, rotated
 
@@ -35,13 +35,16 @@ class LabelledPoints:
 
 
 def label_cells(frame: Frame, dataset: Dataset, voxel: float, max_depth: float) -> np.ndarray:
-    """The voxels [m] of the world that a frame sees and the true class in them, each pair once: rows (n, 4)."""
+    """The voxels [m] of the world that a frame sees and the true class in them, each pair once.
+
+    Returns rows (n, 2) of a class and a cell's number, ordered by cell.
+    """
     if frame.labels is None or frame.depth is None or frame.T_world_camera is None:
-        return np.empty((0, 4), np.int64)
+        return np.empty((0, 2), np.int64)
     known = (frame.labels >= 0) & (frame.depth > 0) & (frame.depth <= max_depth)
     points = backproject(frame.depth, dataset.intrinsics)[known]
-    index = np.floor((rotated(points, frame.T_world_camera[:3, :3]) + frame.T_world_camera[:3, 3]) / voxel)
-    return _distinct(np.column_stack([index, frame.labels[known]]).astype(np.int64))
+    points = rotated(points, frame.T_world_camera[:3, :3]) + frame.T_world_camera[:3, 3]
+    return _distinct(np.column_stack([frame.labels[known].astype(np.int64), cell_numbers(points, voxel)]))
 
 
 def true_labels(cells: Sequence[np.ndarray], dataset: Dataset, voxel: float) -> LabelledPoints | None:
@@ -49,7 +52,7 @@ def true_labels(cells: Sequence[np.ndarray], dataset: Dataset, voxel: float) -> 
     if not any(map(len, cells)):
         return None
     rows = _distinct(np.concatenate(cells))
-    return LabelledPoints((rows[:, :3] + 0.5) * voxel, rows[:, 3], tuple(dataset.classes))
+    return LabelledPoints(cell_centers(rows[:, 1], voxel), rows[:, 0], tuple(dataset.classes))
 
 
 def align_labels(
@@ -96,31 +99,32 @@ class LabelGrid:
 
     def __init__(self, voxel: float) -> None:
         self._voxel = voxel
-        self._rows = [np.empty((0, 5), np.int64)]  # cell, class, number of views; the first is what was merged
+        self._rows = [np.empty((0, 3), np.int64)]  # class, cell, number of views; the first is what was merged
 
     def add(self, points: np.ndarray, labels: np.ndarray) -> None:
         """Add a view: points (n, 3) and their classes (n,); what has none or is not finite is left out."""
         known = (labels >= 0) & np.isfinite(points).all(-1)
-        cells = np.floor(points[known] / self._voxel).astype(np.int64)
-        rows = _distinct(np.column_stack([cells, labels[known]]))
+        rows = _distinct(np.column_stack([labels[known], cell_numbers(points[known], self._voxel)]))
         self._rows.append(np.column_stack([rows, np.ones(len(rows), np.int64)]))
         if sum(map(len, self._rows[1:])) > max(_MERGE_ROWS, len(self._rows[0])):
             self._rows = [self._merged()]
 
     def points(self, classes: Sequence[str]) -> LabelledPoints:
         """The centre of every voxel with the class of most views; of equally frequent ones the first."""
-        rows = self._merged()
-        rows = rows[np.lexsort((rows[:, 3], -rows[:, 4], *rows.T[:3]))]
-        is_first = np.append(True, (np.diff(rows[:, :3], axis=0) != 0).any(1))[: len(rows)]
-        return LabelledPoints((rows[is_first, :3] + 0.5) * self._voxel, rows[is_first, 3], tuple(classes))
+        labels, cells, views = self._merged().T
+        begins = np.flatnonzero(np.diff(cells, prepend=-1))
+        if len(begins):
+            most = np.repeat(np.maximum.reduceat(views, begins), np.diff(begins, append=len(cells)))
+            labels = np.minimum.reduceat(np.where(views == most, labels, np.iinfo(np.int64).max), begins)
+        return LabelledPoints(cell_centers(cells[begins], self._voxel), labels, tuple(classes))
 
     def _merged(self) -> np.ndarray:
+        """Rows by cell and class, each pair once."""
         rows = np.concatenate(self._rows)
-        if not len(rows):
-            return rows
-        rows = rows[np.lexsort(rows.T[:4])]
-        begins = np.flatnonzero(np.append(True, (np.diff(rows[:, :4], axis=0) != 0).any(1)))
-        return np.column_stack([rows[begins, :4], np.add.reduceat(rows[:, 4], begins)])
+        rows = rows[np.lexsort(rows.T[:2])]
+        begins = _changes(rows[:, :2])
+        views = np.add.reduceat(rows[:, 2], begins) if len(begins) else rows[:, 2]
+        return np.column_stack([rows[begins, :2], views])
 
 
 class SpooledLabels:
@@ -154,8 +158,7 @@ def transfer_labels(points: np.ndarray, labels: np.ndarray, targets: np.ndarray,
     points, labels = points[known], labels[known].astype(np.int64)
     if not len(points):
         return np.full(len(targets), -1)
-    k = min(num_neighbours, len(points))
-    votes = labels[tree_of(points).query(targets, k=[*range(1, k + 1)], workers=-1)[1]]
+    votes = labels[NearestPoints(points).query(targets, num_neighbours)[1]]
     counts = (votes[:, :, None] == votes[:, None, :]).sum(-1)
     candidates = np.where(counts == counts.max(1, keepdims=True), votes, np.iinfo(np.int64).max)
     return candidates.min(1)
@@ -196,6 +199,11 @@ def segmentation_metrics(confusion: np.ndarray, ignored: Collection[int] = ()) -
 
 
 def _distinct(rows: np.ndarray) -> np.ndarray:
-    """Each row (n, 4) once; as `np.unique` along an axis, in a fifth of its time."""
+    """Each row (n, 2) once, ordered by the second column; as `np.unique` along an axis, in a fifth of its time."""
     rows = rows[np.lexsort(rows.T)]
-    return rows[np.append(True, (np.diff(rows, axis=0) != 0).any(1))] if len(rows) else rows
+    return rows[_changes(rows)]
+
+
+def _changes(rows: np.ndarray) -> np.ndarray:
+    """Positions of the rows (n, 2) of numbers from 0 on that differ from the row before."""
+    return np.flatnonzero((np.diff(rows, axis=0, prepend=-1) != 0).any(1))

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from emgs_jax.graph.measurements import LOOP, ODOMETRY, Edges, Graph, Nodes
 from emgs_jax.io.files import atomic_write
+from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Factors, Nodes, PoseGraph
 
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 FORMS = {VERTEX: "id x y z qx qy qz qw", EDGE: "id id x y z qx qy qz qw and the 21 numbers of the upper triangle"}
@@ -19,7 +19,7 @@ UPPER = np.triu_indices(6)
 ROUNDING = 1e-6
 
 
-def load_graph_g2o(path: str | os.PathLike, half_angles: bool = False) -> Graph:
+def load_graph_g2o(path: str | os.PathLike, half_angles: bool = False) -> PoseGraph:
     """Read nodes, in the order of the file, and edges; those between neighbours in it are ODOMETRY, all others LOOP.
 
     Z of an edge `a b` is T_a⁻¹ T_b. Scales are not part of the format: log_scale is 0, the scale row not measured;
@@ -98,14 +98,14 @@ def _roots(upper: np.ndarray, half_angles: bool, places: list[str]) -> np.ndarra
     return roots
 
 
-def _graph(vertices: np.ndarray, ends: np.ndarray, poses: np.ndarray, roots: np.ndarray) -> Graph:
+def _graph(vertices: np.ndarray, ends: np.ndarray, poses: np.ndarray, roots: np.ndarray) -> PoseGraph:
     kind = np.where(np.abs(ends[:, 1] - ends[:, 0]) == 1, ODOMETRY, LOOP)
     with jax.enable_x64(True):
         a, b = jnp.asarray(ends, jnp.int32).T
         nodes = Nodes(_to_poses(vertices), jnp.zeros(len(vertices)), jnp.ones(len(vertices), bool))
         used, ratio = jnp.ones(len(ends), bool), jnp.zeros(len(ends))
-        edges = Edges(a, b, _to_poses(poses), ratio, jnp.asarray(roots), jnp.asarray(kind, jnp.int32), used)
-    return Graph(nodes, edges)
+        edges = Factors(a, b, _to_poses(poses), ratio, jnp.asarray(roots), jnp.asarray(kind, jnp.int32), used)
+    return PoseGraph(nodes, edges)
 
 
 def _to_poses(values: np.ndarray) -> jaxlie.SE3:
@@ -113,13 +113,13 @@ def _to_poses(values: np.ndarray) -> jaxlie.SE3:
     return jaxlie.SE3(jnp.asarray(values[:, [6, 3, 4, 5, 0, 1, 2]])).normalize()
 
 
-def save_graph_g2o(path: str | os.PathLike, graph: Graph, half_angles: bool = False) -> None:
+def save_graph_g2o(path: str | os.PathLike, graph: PoseGraph, half_angles: bool = False) -> None:
     """Write the valid nodes, by their row, and the valid edges; see `load_graph_g2o`.
 
     Raises:
         ValueError: a scale is not 1: the format has none.
     """
-    nodes, edges = graph.nodes, graph.edges
+    nodes, edges = graph.nodes, graph.factors
     valid = np.asarray(nodes.valid)
     if np.any(np.asarray(nodes.log_scale)[valid] != 0):
         raise ValueError("g2o's format has no scales, and log_scale is not 0: write the map instead, or solve with 0")

@@ -4,8 +4,14 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from emgs_jax.data.base import Dataset
-from emgs_jax.loops.alignment import AlignmentConfig, RefusedError, align
-from emgs_jax.loops.appearance import AppearanceConfig, Database, describe, extend, propose
+from emgs_jax.loop_closure.place_recognition import (
+    Database,
+    PlaceRecognitionConfig,
+    add_keyframe,
+    make_keyframe,
+    propose_candidates,
+)
+from emgs_jax.loop_closure.two_view_alignment import AlignmentConfig, RefusedError, align
 from emgs_jax.prior.base import Prior, Window, visits, windows, with_frames
 from emgs_jax.prior.recorded import Recorded, add_visits, visits_file
 
@@ -14,7 +20,7 @@ def places_seen_twice(
     replay: Recorded,
     dataset: Dataset,
     window_size: int,
-    appearance: AppearanceConfig,
+    appearance: PlaceRecognitionConfig,
     alignment: AlignmentConfig,
     progress: Callable[[Sequence[Window]], Iterable[Window]] = iter,
 ) -> list[tuple[int, int]]:
@@ -33,9 +39,9 @@ def places_seen_twice(
                 continue
             seen.add(index)
             image, points, mask = frames[index].image, prediction.points[row], prediction.mask[row]
-            query = describe(index, image, points, mask, dataset.intrinsics, appearance)
-            database = extend(database, query, appearance)
-            for candidate in propose(database, len(database.keyframes) - 1, appearance):
+            query = make_keyframe(index, image, points, mask, dataset.intrinsics, appearance)
+            database = add_keyframe(database, query, appearance)
+            for candidate in propose_candidates(database, len(database.keyframes) - 1, appearance):
                 try:
                     align(database.keyframes[candidate.row], query, alignment)
                 except RefusedError:

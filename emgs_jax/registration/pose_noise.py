@@ -28,26 +28,26 @@ class Repeats(eqx.Module):
     """Differences between repeated predictions so far; rows: motion to the next frame, pose relative to the anchor.
 
     Args:
-        said: both as last predicted, m of the map.
-        is_said: False where they were not predicted; `said` is the identity then.
+        predicted: both as last predicted, m of the map.
+        is_predicted: False where they were not predicted; `predicted` is the identity then.
         log_squares: mean logarithm of the mean square, per axis, of the differences: of lengths in mean depths, angles.
         counts: differences in that mean; a prediction that is the same again is not counted.
     """
 
-    said: jaxlie.SE3
-    is_said: Bool[Array, "*b 2"]
+    predicted: jaxlie.SE3
+    is_predicted: Bool[Array, "*b 2"]
     log_squares: Float[Array, "*b 2 2"]
     counts: Float[Array, "*b 2"]
 
 
-def none_yet() -> Repeats:
+def no_repeats() -> Repeats:
     """Return the repeats of the frame that the map is made of: none so far."""
     return Repeats(jaxlie.SE3.identity((2,)), jnp.zeros(2, bool), jnp.zeros((2, 2)), jnp.zeros(2))
 
 
-def in_unit(repeats: Repeats, factor: Float[Array, ""]) -> Repeats:
+def rescale_repeats(repeats: Repeats, factor: Float[Array, ""]) -> Repeats:
     """Return the repeats after all lengths of the map are multiplied by `factor`."""
-    return eqx.tree_at(lambda r: r.said, repeats, scale_translation(repeats.said, factor))
+    return eqx.tree_at(lambda r: r.predicted, repeats, scale_translation(repeats.predicted, factor))
 
 
 @full_precision
@@ -63,17 +63,17 @@ def repeat_poses(
     Args:
         prediction: the current one.
         before: differences until the last frame.
-        scale: of this prediction. The poses returned are in its own unit: `in_unit` when the scale is final.
+        scale: of this prediction. The poses returned are in its own unit: `rescale_repeats` when the scale is final.
         mean_depth: of the previous frame, m of the map.
         max_count: from this number of differences on older ones are forgotten.
     """
     previous, current, newest = (pose_row(prediction.T_world_views, row) for row in range(3))
     anchor = prediction.T_world_anchor.inverse()
     again = scale_translation(stack([previous.inverse() @ current, anchor @ previous]), scale).wxyz_xyz
-    is_again = before.is_said & jnp.all(jnp.isfinite(again), axis=-1) & prediction.is_repeat
-    again = jnp.where(is_again[:, None], again, before.said.wxyz_xyz)
+    is_again = before.is_predicted & jnp.all(jnp.isfinite(again), axis=-1) & prediction.is_repeat
+    again = jnp.where(is_again[:, None], again, before.predicted.wxyz_xyz)
     units = jnp.stack([mean_depth, jnp.ones(())])[:, None]
-    differences = (before.said.inverse() @ jaxlie.SE3(again)).log().reshape(2, 2, 3) / units
+    differences = (before.predicted.inverse() @ jaxlie.SE3(again)).log().reshape(2, 2, 3) / units
     squares = jnp.mean(differences**2, axis=-1)
     is_again = is_again & jnp.any(squares > SAME_SQUARE, axis=-1)
     squares = jnp.where(is_again[:, None], squares, 0.0)

@@ -9,24 +9,26 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.graph.measurements import Graph
-from emgs_jax.loops.two_views import rescaled
-from emgs_jax.loops.verification import LoopMeasurement
+from emgs_jax.loop_closure.two_view_refinement import rescaled
+from emgs_jax.loop_closure.verification import LoopMeasurement
+from emgs_jax.pose_graph.factors import PoseGraph
 from emgs_jax.running.back_end import BackEnd, Refusal
-from emgs_jax.running.measuring import Edge, stacked
-from emgs_jax.running.revisiting import MEASURED, SILENT, UNUSABLE
+from emgs_jax.running.factors import Factor, stack_factors
+from emgs_jax.running.prior_queries import MEASURED, SILENT, UNUSABLE
 
 
-def metric_graph(end: BackEnd) -> Graph:
+def metric_graph(end: BackEnd) -> PoseGraph:
     """Poses and measurements in the map's scale, without scales of their own: what other solvers read."""
 
-    def scaled(edge: Edge) -> Edge:
+    def scaled(edge: Factor) -> Factor:
         scale = np.exp(end.log_scales[edge.a])
         sqrt_info = edge.sqrt_info / np.array([scale] * 3 + [1.0] * 4)
         return edge._replace(Z_a_b=rescaled(edge.Z_a_b, scale), log_ratio=0.0, sqrt_info=sqrt_info)
 
-    nodes = end.nodes(end.segment)
-    return Graph(replace(nodes, log_scale=jnp.zeros_like(nodes.log_scale)), stacked([*map(scaled, end.edges)]))
+    nodes = end.nodes(end.submap_id)
+    return PoseGraph(
+        replace(nodes, log_scale=jnp.zeros_like(nodes.log_scale)), stack_factors([*map(scaled, end.factors)])
+    )
 
 
 def loop_list(end: BackEnd) -> list[dict[str, Any]]:
@@ -38,7 +40,7 @@ def loop_list(end: BackEnd) -> list[dict[str, Any]]:
     """
     unsolved, outcomes, lines = _unsolved(end), _outcomes(end), []
     found = [Refusal(loop.a, loop.b, "", math.nan) for loop in end.verified]
-    known = (item for item in [*found, *end.refusals] if item.a >= end.first)  # what is older is of another run
+    known = (item for item in [*found, *end.refusals] if item.a >= end.first_node)  # what is older is of another run
     for a, b, gate, measured in sorted(known, key=lambda item: (item.b, item.a)):
         outcome = "refused" if gate else outcomes[a, b]
         line = {"frame": end.frames[b], "other": end.frames[a], "outcome": outcome}
@@ -55,7 +57,7 @@ def found_loops(end: BackEnd) -> list[LoopMeasurement]:
 
 def _outcomes(end: BackEnd) -> dict[tuple[int, int], str]:
     """Of every verified loop, see `loop_list`."""
-    unsolved, accepted, agreed = _unsolved(end), _ends(end.accepted), _ends(end.agreed())
+    unsolved, accepted, agreed = _unsolved(end), _ends(end.accepted), _ends(end.consistent())
     outcomes = {}
     for ends in _ends(end.verified):
         known = "unsolved" if ends in unsolved else "known"
@@ -74,11 +76,11 @@ def _unsolved(end: BackEnd) -> dict[tuple[int, int], str]:
 
 def revisit_note(end: BackEnd | None, is_sequential: bool) -> list[str]:
     """A line where the prior could be asked for no loop, and how it can; none where it was asked, or never can be."""
-    if end is None or is_sequential or set(end.asked.values()) != {SILENT}:
+    if end is None or is_sequential or set(end.queries.values()) != {SILENT}:
         return []
     return [
-        f"loops: {len(end.asked)} were measured by keypoints alone, because this prior has no answer for both visits; "
-        "a recording has them if it is made with `python -m experiments.predict … graph=default`, but for a prior that "
+        f"loops: {len(end.queries)} were measured by keypoints alone, because the prior has no answer for both; a "
+        "recording has them if it is made with `python -m experiments.predict … graph=default`, but for a prior that "
         "answers in order only, as multiview_stereo does"
     ]
 
@@ -89,11 +91,11 @@ def counts(end: BackEnd) -> dict[str, Any]:
     refused = {f"loops/refused_{gate}": count for gate, count in sorted(gates.items())}
     solved = [closure for closure in end.closures if closure.loops]
     return {
-        "loops/verified": sum(loop.b >= end.first for loop in end.verified),
-        "loops/contradicted": sum(loop.b >= end.first for loop in end.contradicted),
-        "loops/accepted": sum(loop.b >= end.first for loop in end.accepted),
-        "loops/measured_again": sum(told == MEASURED for told in end.asked.values()),
-        "loops/unusable_answers": sum(told == UNUSABLE for told in end.asked.values()),
+        "loops/verified": sum(loop.b >= end.first_node for loop in end.verified),
+        "loops/contradicted": sum(loop.b >= end.first_node for loop in end.violating),
+        "loops/accepted": sum(loop.b >= end.first_node for loop in end.accepted),
+        "loops/measured_again": sum(told == MEASURED for told in end.queries.values()),
+        "loops/unusable_answers": sum(told == UNUSABLE for told in end.queries.values()),
         "loops/closures": sum(not closure.info.reason for closure in solved),
         "loops/closures_refused": sum(bool(closure.info.reason) for closure in solved),
     } | refused

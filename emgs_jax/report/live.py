@@ -21,8 +21,8 @@ from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report.layers import map_layers
 from emgs_jax.report.viewer import Viewer
 from emgs_jax.report.viewer_scene import Shown
-from emgs_jax.running.inputs import RawView
 from emgs_jax.running.record import FrameRecord, MappingRun
+from emgs_jax.running.window_input import RawView
 
 SHARE = 0.05  # of the time in which the thread draws, at most
 IMAGE_WIDTH = 320  # pixels

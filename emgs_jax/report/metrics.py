@@ -36,7 +36,7 @@ from emgs_jax.evaluation.segmentation import (
 from emgs_jax.evaluation.trajectory import align_poses, trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.loops.two_views import rescaled
+from emgs_jax.loop_closure.two_view_refinement import rescaled
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import counts, found_loops
@@ -265,14 +265,14 @@ def score_back_end(run: MappingRun) -> Metrics:
     """Score loop closures, relocalization, and the online poses (as first estimated); empty without a back end."""
     if run.back_end is None:
         return {}
-    end, online = run.back_end, run.back_end.online[run.back_end.first :]
+    end, online = run.back_end, run.back_end.online[run.back_end.first_node :]
     before = [record.pose for record in run.records[: row_of_first_node(run)]]
     poses = with_truth(run, np.stack([*before, *online])) if online else None
     causal = {} if poses is None else trajectory_metrics(*poses)
     causal = {key.replace("trajectory/", "trajectory_online/"): x for key, x in causal.items()}
     found = Counter(record.location for record in run.records if record.location is not None)
     located = {f"location/{name}": count for name, count in sorted(found.items())}
-    return counts(end) | loop_metrics(*_loops(run), end.config.appearance.min_gap) | located | causal
+    return counts(end) | loop_metrics(*_loops(run), end.config.place_recognition.min_gap) | located | causal
 
 
 def _loops(run: MappingRun) -> tuple[list[tuple[int, int, np.ndarray]], list[np.ndarray | None]]:
@@ -281,7 +281,7 @@ def _loops(run: MappingRun) -> tuple[list[tuple[int, int, np.ndarray]], list[np.
     compared = with_truth(run, run.poses)
     unit = (None if compared is None else trajectory_metrics(*compared)["trajectory/scale"]) or 1.0
     loops = [(loop.a, loop.b, rescaled(loop.Z_a_b, unit * np.exp(end.log_scales[loop.a]))) for loop in found_loops(end)]
-    of_saved: list[np.ndarray | None] = [None] * end.first
+    of_saved: list[np.ndarray | None] = [None] * end.first_node
     return loops, of_saved + run.true_poses[row_of_first_node(run) :]
 
 

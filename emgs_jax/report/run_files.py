@@ -27,8 +27,8 @@ from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, POLIS
 from emgs_jax.running.checkpoint import CHECKPOINT_FILE
 from emgs_jax.running.dense import DenseMap, center_cloud
 from emgs_jax.running.first_frame import seen_from
-from emgs_jax.running.places import save_places
-from emgs_jax.running.record import SEGMENT, UNJOINED, MappingRun, row_of_first_node, with_truth
+from emgs_jax.running.record import NEW_SUBMAP, UNJOINED, MappingRun, row_of_first_node, with_truth
+from emgs_jax.running.saved_map import save_places
 
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (
@@ -71,13 +71,13 @@ def save_progress(folder: Path, run: MappingRun) -> None:
         save_map_npz(folder / "map.npz", run.state.map)
     end = run.back_end
     if end is not None and end.database.keyframes and run.state is not None:
-        save_places(folder / "places.npz", end, float(run.state.belief.depth_noise))
-    if end is not None and len(end.online) > end.first:
-        online = end.online[end.first :]
+        save_places(folder / "places.npz", end, float(run.state.estimate.depth_noise))
+    if end is not None and len(end.online) > end.first_node:
+        online = end.online[end.first_node :]
         placed = [record.timestamp for record in run.records[-len(online) :]]
         save_trajectory_tum(folder / "trajectory_online.txt", placed, np.stack(online))
         write_json(folder / LOOPS_FILE, loop_list(end))
-        if end.edges:  # of a single frame nothing was measured
+        if end.factors:  # of a single frame nothing was measured
             save_graph_g2o(folder / "graph.g2o", metric_graph(end))
 
 
@@ -87,7 +87,9 @@ def _complete_lines(path: Path, run: MappingRun) -> None:
         return
     lines, records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()], iter(run.records)
     uncertain = [line for line in lines if line["covariance"] is not None]
-    has_one_world = all(record.location != SEGMENT for record in run.records)  # poses as placed, that of the first, too
+    has_one_world = all(
+        record.location != NEW_SUBMAP for record in run.records
+    )  # poses as placed, that of the first, too
     if run.first_covariance is not None and uncertain and has_one_world:
         first = next(line["pose"] for line in lines if line["pose"] is not None)
         placed = from_tum(np.array([first, *(line["pose"] for line in uncertain)]))
@@ -176,6 +178,6 @@ def _moved(run: MappingRun) -> tuple[np.ndarray | None, tuple[tuple[int, int], .
     end = run.back_end
     if end is None or not end.closures:  # frames that are only located in a saved map are no nodes beside its loops
         return None, ()
-    shift = row_of_first_node(run) - end.first  # from a node to the row of its record
-    loops = tuple((shift + loop.a, shift + loop.b) for loop in end.accepted if min(loop.a, loop.b) >= end.first)
-    return np.stack(end.online[end.first :]), loops
+    shift = row_of_first_node(run) - end.first_node  # from a node to the row of its record
+    loops = tuple((shift + loop.a, shift + loop.b) for loop in end.accepted if min(loop.a, loop.b) >= end.first_node)
+    return np.stack(end.online[end.first_node :]), loops

@@ -7,9 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import cKDTree
 
-from emgs_jax.evaluation.clouds import register
+from emgs_jax.evaluation.clouds import NearestPoints, register
 from emgs_jax.evaluation.protocols import (
     NAMES,
     SegmentationProtocol,
@@ -88,7 +87,7 @@ def place(run: RecordedRun, truth: np.ndarray, how: Placement) -> tuple[np.ndarr
     points = alignment.apply(gaussians.means[gaussians.valid].astype(np.float64))
     about = {"placed_by": how.by, "alignment": _plain(alignment), "alignment_note": note}
     if how.by == "points":
-        moved = register(points, cKDTree(truth), how.icp_distance_m, how.icp_max_steps)
+        moved = register(points, NearestPoints(truth), how.icp_distance_m, how.icp_max_steps)
         points = moved.apply(points)
         about["icp"] = _plain(moved)
     return points, about
@@ -120,7 +119,7 @@ def score_scene(
     ignored = ignored_positions(truth.classes, protocol)
     labels = give_classes(cosines, has_feature, truth.labels, ignored, protocol)
     confusion = scene_confusion(LabelledPoints(points, labels, truth.classes), truth, ignored, protocol)
-    distances = cKDTree(points).query(truth.points, workers=-1)[0] if len(points) else np.array([np.inf])
+    distances = NearestPoints(points).query(truth.points)[0] if len(points) else np.array([np.inf])
     about |= {"num_gaussians": len(rows), "num_with_class": int((labels >= 0).sum())}
     about |= {"num_true_points": len(truth.points), "median_distance_to_map_m": float(np.median(distances))}
     is_simulated = bool(run.provenance.get("simulated", False))

@@ -1,4 +1,4 @@
-"""The back end of a run: where frames were placed, what loops say, the best poses for both, and a map that follows.
+"""The back end: a pose graph of keyframes and loop closures; optimized poses deform the map.
 
 Nodes are the frames from the first of the map on, in the order of `SlamState.time`.
 """
@@ -12,21 +12,43 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.graph.deform import DeformConfig
-from emgs_jax.graph.measurements import LOOP, ODOMETRY, Graph, Nodes
-from emgs_jax.graph.optimize import GraphConfig, GraphInfo, optimize
-from emgs_jax.graph.problem import bucket
-from emgs_jax.loops.agreement import AgreementConfig, agreeing
-from emgs_jax.loops.appearance import AppearanceConfig, Database, Keyframe, describe, extend, nearest, propose
-from emgs_jax.loops.location import NO_CANDIDATE, Location, LocationConfig, Places, locate
-from emgs_jax.loops.revisit import RevisitConfig
-from emgs_jax.loops.two_views import rescaled
-from emgs_jax.loops.verification import LoopMeasurement, VerificationConfig, VerifyInfo, neighbours_of, verify
+from emgs_jax.loop_closure.consistency import ConsistencyConfig, spatially_consistent
+from emgs_jax.loop_closure.place_recognition import (
+    Database,
+    Keyframe,
+    PlaceRecognitionConfig,
+    add_keyframe,
+    make_keyframe,
+    most_similar,
+    propose_candidates,
+)
+from emgs_jax.loop_closure.prior_query import PriorQueryConfig
+from emgs_jax.loop_closure.relocalization import (
+    NO_CANDIDATE,
+    PosedKeyframes,
+    RelocalizationConfig,
+    RelocalizedPose,
+    relocalize,
+)
+from emgs_jax.loop_closure.two_view_refinement import rescaled
+from emgs_jax.loop_closure.verification import LoopMeasurement, VerificationConfig, VerifyInfo, neighbours_of, verify
 from emgs_jax.ops.ranges import number
-from emgs_jax.registration.belief import rescaled_belief
+from emgs_jax.pose_graph.deform import DeformConfig
+from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Nodes, PoseGraph
+from emgs_jax.pose_graph.optimize import PoseGraphConfig, PoseGraphInfo, optimize
+from emgs_jax.pose_graph.problem import bucket
+from emgs_jax.registration.pose_estimate import rescale_estimate
 from emgs_jax.running.convert import to_se3
-from emgs_jax.running.following import follow
-from emgs_jax.running.measuring import Edge, Look, NoiseConfig, chain_edge, loop_edge, map_edge, stacked
+from emgs_jax.running.deformation import deform_state
+from emgs_jax.running.factors import (
+    Factor,
+    FrameData,
+    NoiseConfig,
+    loop_factor,
+    map_factor,
+    sequential_factor,
+    stack_factors,
+)
 from emgs_jax.slam import SlamState
 
 
@@ -35,31 +57,31 @@ class BackEndConfig:
     """Settings of the back end: noise of factors, place recognition, loop closures, optimization and relocalization.
 
     Args:
-        noise: of the factors that a frame's pose becomes.
-        appearance: keyframes and candidates.
+        noise: of sequential and map factors.
+        place_recognition: keyframes, and candidates by their appearance.
         verification: of a candidate.
-        agreement: spatial consistency of verified loops.
-        revisit: second measurement of loops by the prior.
+        consistency: spatial consistency of verified loops.
+        prior_query: second measurement of loops by the prior.
         every: frames between keyframes.
-        max_known: χ² of a loop at the current poses, up to which they agree with it: it starts no closure by itself,
-            and the prior is not asked for it.
+        min_violation: χ² of a loop at the current poses beyond which it violates them: only such a loop starts a
+            closure, and only for such a loop the prior is queried.
         min_frames: between two closures.
         solver: of the pose graph.
         deform: of the map, to follow the optimized poses.
-        location: relocalization of a lost camera.
+        relocalization: of a lost camera.
     """
 
     noise: NoiseConfig
-    appearance: AppearanceConfig
+    place_recognition: PlaceRecognitionConfig
     verification: VerificationConfig
-    agreement: AgreementConfig
-    revisit: RevisitConfig
+    consistency: ConsistencyConfig
+    prior_query: PriorQueryConfig
     every: int = number(low=1, high=1000)
-    max_known: float = number(low=0, high=math.inf)
+    min_violation: float = number(low=0, high=math.inf)
     min_frames: int = number(low=0)
-    solver: GraphConfig
+    solver: PoseGraphConfig
     deform: DeformConfig
-    location: LocationConfig
+    relocalization: RelocalizationConfig
 
 
 @dataclass(frozen=True)
@@ -68,11 +90,11 @@ class Closure:
 
     time: int
     loops: tuple[LoopMeasurement, ...]
-    info: GraphInfo
+    info: PoseGraphInfo
 
 
 class Refusal(NamedTuple):
-    """A candidate that was no loop: two nodes, the gate that it did not pass, and what that gate measured."""
+    """A rejected loop candidate: two nodes, the gate that rejected it, and the value that this gate tested."""
 
     a: int
     b: int
@@ -92,19 +114,19 @@ class BackEnd:
         log_scales: σ of their inferences, likewise.
         online: poses as first estimated, in the unit of `poses`.
         frames: index in the data set of every node.
-        is_placed: whether the map holds each of them: those that are neither degraded nor lost.
-        segments: of each of them; the relative pose of two segments is not known.
-        edges: factors.
+        is_placed: True for nodes in the map: those that are neither degraded nor lost.
+        submap_ids: disconnected submap of every node; the relative pose of two submaps is not known.
+        factors: of the pose graph.
         database: keyframes; their `frame` is the node.
         verified: loops that passed every gate of two keyframes.
-        contradicted: loops with a free-space violation.
+        violating: loops with a free-space violation.
         accepted: loops that are factors.
         refusals: candidates that were rejected, and why.
-        asked: loops, by their nodes, that the prior was to measure once more, and the outcome, see `revisiting`.
+        queries: loops, by their nodes, for which the prior was queried, and the outcome, see `prior_queries`.
         closures: optimizations so far.
-        first: node of this run's first frame; those before are of the run that its map was saved by.
-        since: node since which consecutive frames are connected; before it the camera was lost.
-        segment: of the next node.
+        first_node: of this run's first frame; those before are of the run that saved the map.
+        connected_since: node since which consecutive frames are connected; before it the camera was lost.
+        submap_id: of the next node.
         has_one_unit: the inferences of all nodes have one unit, as far as the prior has.
     """
 
@@ -116,25 +138,27 @@ class BackEnd:
     online: list[np.ndarray] = field(default_factory=list)
     frames: list[int] = field(default_factory=list)
     is_placed: list[bool] = field(default_factory=list)
-    segments: list[int] = field(default_factory=list)
-    edges: list[Edge] = field(default_factory=list)
+    submap_ids: list[int] = field(default_factory=list)
+    factors: list[Factor] = field(default_factory=list)
     database: Database = field(default_factory=Database)
     verified: list[LoopMeasurement] = field(default_factory=list)
-    contradicted: list[LoopMeasurement] = field(default_factory=list)
+    violating: list[LoopMeasurement] = field(default_factory=list)
     accepted: list[LoopMeasurement] = field(default_factory=list)
     refusals: list[Refusal] = field(default_factory=list)
-    asked: dict[tuple[int, int], str] = field(default_factory=dict)
+    queries: dict[tuple[int, int], str] = field(default_factory=dict)
     closures: list[Closure] = field(default_factory=list)
-    first: int = 0
-    since: int = 0
-    segment: int = 0
+    first_node: int = 0
+    connected_since: int = 0
+    submap_id: int = 0
     has_one_unit: bool = True
 
-    def add(self, look: Look, pose: np.ndarray, scale: float, origin: int | None, is_placed: bool = True) -> None:
+    def add_node(
+        self, frame: FrameData, pose: np.ndarray, scale: float, origin: int | None, is_placed: bool = True
+    ) -> None:
         """Add a node with the pose of its frame.
 
         Args:
-            look: of the frame.
+            frame: its data.
             pose: T_world_camera.
             scale: of its inference.
             origin: node whose Gaussians it was registered to; None where it was not registered to the map.
@@ -144,153 +168,159 @@ class BackEnd:
         self.poses.append(np.asarray(pose, np.float64))
         self.online.append(self.poses[-1])
         self.log_scales.append(float(np.log(scale)))
-        self.frames.append(look.frame)
+        self.frames.append(frame.index)
         self.is_placed.append(is_placed)
-        self.segments.append(self.segment)
-        chain = chain_edge(look, self.poses, self.log_scales, self._has_place, self.config.noise)
+        self.submap_ids.append(self.submap_id)
+        chain = sequential_factor(frame, self.poses, self.log_scales, self._is_connected, self.config.noise)
         if chain is not None:
-            self.edges.append(chain)
+            self.factors.append(chain)
         if origin is not None and origin < time:
-            self.edges.append(map_edge(look, self.poses, self.log_scales, origin, self.config.noise))
+            self.factors.append(map_factor(frame, self.poses, self.log_scales, origin, self.config.noise))
 
-    def _has_place(self, row: int) -> bool:
+    def _is_connected(self, row: int) -> bool:
         """Test whether a node is in the map or has an odometry factor; False for nodes before the camera was found."""
-        is_led = self.is_placed[row] or any(edge.a == row and edge.kind == ODOMETRY for edge in self.edges)
-        return row >= self.since and is_led
+        has_factor = any(factor.a == row and factor.kind == ODOMETRY for factor in self.factors)
+        return row >= self.connected_since and (self.is_placed[row] or has_factor)
 
-    def look_for_loops(self, look: Look) -> list[LoopMeasurement]:
-        """Describe the last node, and verify what it looks like; returns the new loops that are agreed upon."""
-        time, appearance = len(self.poses) - 1, self.config.appearance
+    def detect_loops(self, frame: FrameData) -> list[LoopMeasurement]:
+        """Add the last node as a keyframe and verify its candidates; return new loops that are spatially consistent."""
+        time, config = len(self.poses) - 1, self.config.place_recognition
         if time % self.config.every:
             return []
-        keyframe = self._described(time, look)
-        self.database = extend(self.database, keyframe, appearance)
+        keyframe = self._keyframe(time, frame)
+        self.database = add_keyframe(self.database, keyframe, config)
         row = len(self.database.keyframes) - 1
-        for candidate in propose(self.database, row, appearance):
-            if self._segment_of(candidate.row) == self.segment:
+        for candidate in propose_candidates(self.database, row, config):
+            if self._submap_id_of(candidate.row) == self.submap_id:
                 self._verify(row, candidate.row)
-        return self.recent()
+        return self.recent_loops()
 
-    def recent(self) -> list[LoopMeasurement]:
-        """Loops of the last queries that are agreed upon and no edges yet."""
-        return self.new(self.agreed(since=len(self.poses) - 1 - self.config.agreement.max_query_gap))
+    def recent_loops(self) -> list[LoopMeasurement]:
+        """Select spatially consistent loops of the last queries that are not in the pose graph yet."""
+        return self.not_in_graph(self.consistent(since=len(self.poses) - 1 - self.config.consistency.max_query_gap))
 
-    def _described(self, time: int, look: Look) -> Keyframe:
-        return describe(time, look.image, look.points, look.mask, self.intrinsics, self.config.appearance)
+    def _keyframe(self, time: int, frame: FrameData) -> Keyframe:
+        return make_keyframe(
+            time, frame.image, frame.points, frame.mask, self.intrinsics, self.config.place_recognition
+        )
 
-    def locate(self, look: Look, elsewhere: bool = False) -> tuple[Location | None, str | None]:
-        """Relocalize a frame among its segment's keyframes that are in the map; else return why that fails.
+    def relocalize(self, frame: FrameData, in_other_submap: bool = False) -> tuple[RelocalizedPose | None, str | None]:
+        """Relocalize a frame by keyframes of its submap that are in the map; else return why that fails.
 
         Args:
-            look: of a frame that is no node yet, or is no keyframe.
-            elsewhere: search the other segment that has the most similar keyframe, whatever the ratio of the units.
+            frame: of a frame that is no node yet, or is no keyframe.
+            in_other_submap: search the other submap that has the most similar keyframe, with a free ratio of units.
         """
-        query = self._described(len(self.poses), look)
-        segment = self._most_alike(query) if elsewhere else self.segment
-        if segment is None:
+        query = self._keyframe(len(self.poses), frame)
+        submap_id = self._most_similar_submap(query) if in_other_submap else self.submap_id
+        if submap_id is None:
             return None, NO_CANDIDATE
-        is_there = [placed and one == segment for placed, one in zip(self.is_placed, self.segments, strict=True)]
-        places = Places(self.database, self.poses, self.log_scales, is_there)
+        is_there = [placed and one == submap_id for placed, one in zip(self.is_placed, self.submap_ids, strict=True)]
+        known = PosedKeyframes(self.database, self.poses, self.log_scales, is_there)
         config = self.config
-        return locate(query, places, config.appearance, self._verification(elsewhere), config.location)
+        return relocalize(
+            query, known, config.place_recognition, self._verification_config(in_other_submap), config.relocalization
+        )
 
-    def _most_alike(self, query: Keyframe) -> int | None:
-        """The other segment with the placed keyframe that looks most like a query."""
+    def _most_similar_submap(self, query: Keyframe) -> int | None:
+        """Find the other submap with the most similar keyframe that is in the map; None without one."""
         keyframes = self.database.keyframes
-        others = [row for row in range(len(keyframes)) if self._segment_of(row) != self.segment]
+        others = [row for row in range(len(keyframes)) if self._submap_id_of(row) != self.submap_id]
         others = [row for row in others if self.is_placed[keyframes[row].frame]]
-        found = nearest(self.database, query, others, 1, self.config.appearance)
-        return self._segment_of(found[0].row) if found else None
+        found = most_similar(self.database, query, others, 1, self.config.place_recognition)
+        return self._submap_id_of(found[0].row) if found else None
 
-    def _segment_of(self, row: int) -> int:
-        """Of a keyframe."""
-        return self.segments[self.database.keyframes[row].frame]
+    def _submap_id_of(self, row: int) -> int:
+        """Submap of a keyframe, a row of the database."""
+        return self.submap_ids[self.database.keyframes[row].frame]
 
-    def _verification(self, is_free: bool) -> VerificationConfig:
-        """Of two keyframes; with the ratio of their units free where it must be."""
+    def _verification_config(self, is_free: bool) -> VerificationConfig:
+        """Settings of the verification; the ratio of the two units is free where they may differ."""
         config = self.config.verification
         if self.has_one_unit and not is_free:
             return config
         return replace(config, alignment=replace(config.alignment, scale_std=math.inf))
 
-    def agreed(self, since: int = 0) -> list[LoopMeasurement]:
+    def consistent(self, since: int = 0) -> list[LoopMeasurement]:
         """Return the verified loops of queries from `since` on that are spatially consistent with others."""
         recent = [loop for loop in self.verified if loop.b >= since]
         poses, log_scales = (dict(enumerate(values)) for values in (self.poses, self.log_scales))
-        yes = agreeing(recent, self.contradicted, poses, log_scales, self.config.agreement)
+        yes = spatially_consistent(recent, self.violating, poses, log_scales, self.config.consistency)
         return [loop for loop, ok in zip(recent, yes, strict=True) if ok]
 
-    def new(self, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
+    def not_in_graph(self, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
         """Select the loops that are not in the pose graph yet."""
         known = {(loop.a, loop.b) for loop in self.accepted}
         return [loop for loop in loops if (loop.a, loop.b) not in known]
 
-    def retract(self, agreed: Sequence[LoopMeasurement]) -> int:
-        """Remove the factors of accepted loops not among `agreed`, all consistent ones; return their number."""
-        good = {(loop.a, loop.b) for loop in agreed}
+    def retract_inconsistent(self, consistent: Sequence[LoopMeasurement]) -> int:
+        """Remove the factors of accepted loops not among all `consistent` ones; return their number."""
+        good = {(loop.a, loop.b) for loop in consistent}
         before = len(self.accepted)
         self.accepted = [loop for loop in self.accepted if (loop.a, loop.b) in good]
-        self.edges = [edge for edge in self.edges if edge.kind != LOOP or (edge.a, edge.b) in good]
+        self.factors = [one for one in self.factors if one.kind != LOOP or (one.a, one.b) in good]
         return before - len(self.accepted)
 
     def _verify(self, row: int, other: int) -> None:
         keyframes = self.database.keyframes
         candidate = keyframes[other]
-        beside = [keyframes[k] for k in (other - 1, other + 1) if 0 <= k < row and self._segment_of(k) == self.segment]
+        beside = [
+            keyframes[k] for k in (other - 1, other + 1) if 0 <= k < row and self._submap_id_of(k) == self.submap_id
+        ]
         neighbours = neighbours_of(candidate, beside, self.poses, self.log_scales)
-        loop, info = verify(keyframes[row], candidate, neighbours, self._verification(is_free=False))
-        self._note((candidate.frame, keyframes[row].frame), loop, info)
+        loop, info = verify(keyframes[row], candidate, neighbours, self._verification_config(is_free=False))
+        self._record((candidate.frame, keyframes[row].frame), loop, info)
 
-    def _note(self, nodes: tuple[int, int], loop: LoopMeasurement | None, info: VerifyInfo) -> None:
-        if info.contradicted is not None:
-            self.contradicted.append(info.contradicted)
+    def _record(self, nodes: tuple[int, int], loop: LoopMeasurement | None, info: VerifyInfo) -> None:
+        if info.violation is not None:
+            self.violating.append(info.violation)
         if loop is None:
             self.refusals.append(Refusal(*nodes, info.refused_by.value, info.measured))
         else:
             self.verified.append(loop)
 
-    def wants_to_close(self, loops: Sequence[LoopMeasurement]) -> bool:
+    def is_closure_due(self, loops: Sequence[LoopMeasurement]) -> bool:
         """Test whether a closure is due: a loop violates the current poses, and the last closure is long enough ago."""
         last = self.closures[-1].time if self.closures else -self.config.min_frames
         is_due = len(self.poses) - 1 - last >= self.config.min_frames
-        return is_due and bool(self.news(loops))
+        return is_due and bool(self.violated(loops))
 
-    def news(self, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
-        """Select the loops that the current poses violate: χ² above `max_known`."""
-        return [loop for loop in loops if self.misfit(loop) > self.config.max_known]
+    def violated(self, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
+        """Select the loops that the current poses violate: χ² above `min_violation`."""
+        return [loop for loop in loops if self.chi2_of(loop) > self.config.min_violation]
 
-    def misfit(self, loop: LoopMeasurement) -> float:
-        """χ² of a loop at the poses and scales as they are."""
+    def chi2_of(self, loop: LoopMeasurement) -> float:
+        """Compute χ² of a loop at the current poses and scales."""
         scale, other = self.log_scales[loop.a], self.log_scales[loop.b]
         now = rescaled(np.linalg.inv(self.poses[loop.a]) @ self.poses[loop.b], np.exp(-scale))
         error = np.linalg.inv(loop.Z_a_b) @ now
         turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
         return float(np.sum((loop.sqrt_info @ [*error[:3, 3], *turn, other - scale - loop.log_ratio]) ** 2))
 
-    def close(self, state: SlamState, loops: Sequence[LoopMeasurement] = ()) -> SlamState:
-        """Solve with `loops` as edges, and move poses and map; if that is refused all stays, and they are no edges."""
-        edges = [*self.edges, *map(loop_edge, loops)]
-        before, solver = self.nodes(self.segment), self.config.solver
+    def close_loops(self, state: SlamState, loops: Sequence[LoopMeasurement] = ()) -> SlamState:
+        """Optimize with `loops` as further factors and deform the map; a refused solution changes nothing."""
+        factors = [*self.factors, *map(loop_factor, loops)]
+        before, solver = self.nodes(self.submap_id), self.config.solver
         if not self.has_one_unit:  # the scales are not all about 1
             solver = replace(solver, scale_std=jnp.asarray(math.inf))
-        after, info = optimize(Graph(before, stacked(edges)), solver)
+        after, info = optimize(PoseGraph(before, stack_factors(factors)), solver)
         self.closures.append(Closure(len(self.poses) - 1, tuple(loops), info))
         if info.reason:
             return state
-        self.edges = edges
+        self.factors = factors
         self.accepted += loops
         count = len(self.poses)
         self.poses = list(np.asarray(after.T_world.as_matrix(), np.float64)[:count])
         self.log_scales = list(np.asarray(after.log_scale, np.float64)[:count])
         change = jnp.mean(after.log_scale - before.log_scale, where=before.valid)
-        state = replace(state, belief=rescaled_belief(state.belief, jnp.exp(change)))
-        return follow(state, before, after, self.min_std, self.config.deform)
+        state = replace(state, estimate=rescale_estimate(state.estimate, jnp.exp(change)))
+        return deform_state(state, before, after, self.min_std, self.config.deform)
 
-    def nodes(self, segment: int | None = None) -> Nodes:
-        """All nodes, or those of a segment, with free rows up to a power of two: the map's part compiles rarely."""
+    def nodes(self, submap_id: int | None = None) -> Nodes:
+        """Stack all nodes, or mark those of a submap as valid; padded to a power of two, so that it compiles rarely."""
         count = len(self.poses)
-        room = bucket(count)
-        poses = to_se3(np.stack([*self.poses, *[np.eye(4)] * (room - count)]))
-        scales = jnp.asarray([*self.log_scales, *[0.0] * (room - count)], jnp.float32)
-        is_asked = [segment in (None, one) for one in self.segments]
-        return Nodes(poses, scales, jnp.asarray(is_asked + [False] * (room - count)))
+        size = bucket(count)
+        poses = to_se3(np.stack([*self.poses, *[np.eye(4)] * (size - count)]))
+        scales = jnp.asarray([*self.log_scales, *[0.0] * (size - count)], jnp.float32)
+        is_valid = [submap_id in (None, one) for one in self.submap_ids]
+        return Nodes(poses, scales, jnp.asarray(is_valid + [False] * (size - count)))

@@ -43,31 +43,31 @@ class Checkpoint:
     """A run after some of its inputs.
 
     Args:
-        num_inputs: that it has taken.
+        num_inputs: integrated so far.
         leaves: of the state, in the order of `jax.tree.leaves`; none before there is a map.
         capacities: of map and submap.
         records: as the frames were placed.
-        aside: leaves of the states that are set aside, by their segment.
+        inactive: leaves of the states of the other disconnected submaps, by their number.
     """
 
     num_inputs: int
     leaves: Sequence[np.ndarray]
     capacities: tuple[int, int]
     records: Sequence[FrameRecord]
-    aside: Mapping[int, Sequence[np.ndarray]] = field(default_factory=dict)
+    inactive: Mapping[int, Sequence[np.ndarray]] = field(default_factory=dict)
 
     def restored(
         self, like: SlamState | None, config: SlamConfig
     ) -> tuple[SlamState | None, dict[int, SlamState], SlamConfig]:
-        """State, those that are set aside, and config; `like` is a state of the same run, of any size."""
+        """Rebuild state, inactive states and config; `like` is a state of the same run, of any size."""
         names = ("map_capacity", "submap_capacity")
         submap = replace(config.submap, **dict(zip(names, self.capacities, strict=True)))
 
         def state(leaves: Sequence[np.ndarray]) -> SlamState:
             return jax.tree.unflatten(jax.tree.structure(like), [jnp.asarray(leaf) for leaf in leaves])
 
-        aside = {segment: state(leaves) for segment, leaves in self.aside.items()}
-        return state(self.leaves) if len(self.leaves) else None, aside, replace(config, submap=submap)
+        inactive = {submap: state(leaves) for submap, leaves in self.inactive.items()}
+        return state(self.leaves) if len(self.leaves) else None, inactive, replace(config, submap=submap)
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint, signature: Mapping[str, Any]) -> None:
@@ -79,12 +79,12 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, signature: Mapping[str, 
         "num_inputs": checkpoint.num_inputs,
         "capacities": checkpoint.capacities,
         "num_leaves": len(checkpoint.leaves),
-        "aside": list(checkpoint.aside),
+        "aside": list(checkpoint.inactive),
         "records": [{k: v for k, v in vars(record).items() if k not in MATRICES} for record in checkpoint.records],
     }
     arrays = {f"leaf_{row}": np.asarray(leaf) for row, leaf in enumerate(checkpoint.leaves)}
-    for segment, leaves in checkpoint.aside.items():
-        arrays |= {f"aside_{segment}_{row}": np.asarray(leaf) for row, leaf in enumerate(leaves)}
+    for submap, leaves in checkpoint.inactive.items():
+        arrays |= {f"aside_{submap}_{row}": np.asarray(leaf) for row, leaf in enumerate(leaves)}
     for name, size in MATRICES.items():
         nothing = np.full((size, size), np.nan)  # stands for None
         found = [nothing if getattr(r, name) is None else getattr(r, name) for r in checkpoint.records]
@@ -114,17 +114,17 @@ def load_checkpoint(path: Path, signature: Mapping[str, Any]) -> Checkpoint:
             for line, found in zip(header["records"], matrices, strict=True)
         ]
         rows = range(header["num_leaves"])
-        aside = {segment: [arrays[f"aside_{segment}_{row}"] for row in rows] for segment in header["aside"]}
+        inactive = {submap: [arrays[f"aside_{submap}_{row}"] for row in rows] for submap in header["aside"]}
         leaves = [arrays[f"leaf_{row}"] for row in rows]
-        return Checkpoint(header["num_inputs"], leaves, tuple(header["capacities"]), records, aside)
+        return Checkpoint(header["num_inputs"], leaves, tuple(header["capacities"]), records, inactive)
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror or error}") from error
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} cannot be gone on from: {error}") from error
+        raise ValueError(f"{path} cannot be resumed: {error}") from error
 
 
 def difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> str | None:
-    """The first key in which two trees as JSON has them differ, and both values; None where they are equal."""
+    """Return the first key in which two trees as JSON has them differ, and both values; None where they are equal."""
     before, now = flat(one), flat(other)
     changed = (key for key in sorted({*before, *now}) if before.get(key) != now.get(key))
     return next((f"{key} was {before.get(key)!r}, now it is {now.get(key)!r}" for key in changed), None)
@@ -156,18 +156,18 @@ class Keeper:
                 self.note = f"{error}; this run begins at its first frame"
 
     def attend(self, run: MappingRun) -> None:
-        """Hear of the records of a run as its frames are placed."""
-        hear = run.on_record
+        """Collect the records of a run, each as first estimated."""
+        forward = run.on_record
 
         def on_record(record: FrameRecord) -> None:
             self._placed.append(record)
-            hear(record)
+            forward(record)
 
         run.on_record = on_record
 
     def keep(self, run: MappingRun, num_inputs: int) -> None:
-        """Take notice that a run has taken so many inputs, and write it if it is time."""
-        self._done = num_inputs, (run.state, run.aside), run.config, len(self._placed)
+        """Note a run's state after so many inputs, and save it if a checkpoint is due."""
+        self._done = num_inputs, (run.state, run.inactive), run.config, len(self._placed)
         if len(self._placed) >= self._num_saved + self._every:
             self.save()
 
@@ -175,10 +175,10 @@ class Keeper:
         """Write the run as it was after its last complete input, if that is not written yet."""
         if not self._every or self._done is None or self._done[-1] <= self._num_saved:
             return
-        num_inputs, (state, aside), config, count = self._done
+        num_inputs, (state, inactive), config, count = self._done
         capacities = config.submap.map_capacity, config.submap.submap_capacity
         leaves = jax.device_get(jax.tree.leaves(state))
-        others = {segment: jax.device_get(jax.tree.leaves(one)) for segment, one in aside.items()}
+        others = {submap: jax.device_get(jax.tree.leaves(one)) for submap, one in inactive.items()}
         checkpoint = Checkpoint(num_inputs, leaves, capacities, self._placed[:count], others)
         save_checkpoint(self.path, checkpoint, self._signature)
         self._num_saved = count

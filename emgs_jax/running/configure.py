@@ -43,6 +43,19 @@ CONF = next(
     folder for folder in (Path(__file__).parents[1] / "conf", Path(__file__).parents[2] / "conf") if folder.is_dir()
 )
 
+RENAMED = {  # keys of earlier versions; of two that fit the longer one counts
+    "slam.continuation": "slam.extrapolation",
+    "graph.appearance": "graph.place_recognition",
+    "graph.agreement": "graph.consistency",
+    "graph.agreement.max_contradicted": "graph.consistency.max_violating_queries",
+    "graph.verification.max_contradicted": "graph.verification.max_free_space_violation",
+    "graph.verification.contradiction_margin": "graph.verification.free_space_margin",
+    "graph.revisit": "graph.prior_query",
+    "graph.revisit.is_asked": "graph.prior_query.is_used",
+    "graph.revisit.num_asked": "graph.prior_query.max_queries",
+    "graph.location": "graph.relocalization",
+    "graph.max_known": "graph.min_violation",
+}
 NO_WORD = (ValueError, TypeError, AssertionError)  # what Hydra raises where an option of a group is no word
 
 
@@ -173,8 +186,18 @@ def _explained(error: Exception, name: str, overrides: Sequence[str]) -> str:
         if parts:
             return f"{override.input_line}: {key} is chosen by its parts: {', '.join(f'{part}=…' for part in parts)}"
         if not override.is_add() and not key.startswith("hydra") and key not in known:
-            return f"{key} is no key of the config; {near(key, sorted(known))}"
+            new = renamed(key)
+            return f"{key} is called {new} now" if new else f"{key} is no key of the config; {near(key, sorted(known))}"
     return f"{' '.join(overrides)}: {error}"
+
+
+def renamed(key: str) -> str | None:
+    """Return today's name of a key or group of an earlier version; None where it has no other."""
+    for old in sorted(RENAMED, key=len, reverse=True):
+        if key.replace("/", ".") == old or key.startswith(f"{old}."):
+            new = RENAMED[old] + key[len(old) :]
+            return new.replace(".", "/") if "/" in key else new
+    return None
 
 
 def first_of_sweep(override: Override) -> str:

@@ -16,8 +16,8 @@ from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, p
 from emgs_jax.evaluation.segmentation import SpooledLabels, nearest_classes
 from emgs_jax.evaluation.trajectory import rotated
 from emgs_jax.observation import known_surface
-from emgs_jax.running.inputs import RawView
-from emgs_jax.running.record import PLACED, MappingRun
+from emgs_jax.running.record import IN_MAP, MappingRun
+from emgs_jax.running.window_input import RawView
 
 has_normal = eqx.filter_jit(known_surface)
 
@@ -68,7 +68,7 @@ class Baselines:
         self.poses.append(record.pose)
         if self._configs:
             self._fuse(self.raw, row, view, T_world_camera, 1.0)
-        if record.status in PLACED and self._configs:
+        if record.status in IN_MAP and self._configs:
             taken = np.asarray(has_normal(points, mask, self._run.config.observation))
             cloud = PointCloud(*(values[taken[mask]] for values in vars(view.cloud).values()))
             view = View(np.where(taken, view.depth, np.float32(0.0)), view.image, cloud)

@@ -1,4 +1,4 @@
-"""One run of the pipeline as far as it is: the state, and what became of each frame.
+"""A run of the pipeline so far: its state, and a record of each frame.
 
 A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; files write it as TUM's seven numbers.
 """
@@ -15,18 +15,19 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.trajectory import to_tum
 from emgs_jax.localization import REASONS
-from emgs_jax.loops.revisit import Ask
+from emgs_jax.loop_closure.prior_query import PriorQuery
 from emgs_jax.ops.camera import Camera
 from emgs_jax.running.back_end import BackEnd, BackEndConfig
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.convert import to_camera
-from emgs_jax.running.inputs import Input, PlacedStructure
-from emgs_jax.running.places import SavedMap
+from emgs_jax.running.saved_map import SavedMap
+from emgs_jax.running.window_input import PlacedStructure, WindowInput
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
 
 Seconds = Mapping[str, float]  # as a `Timer` reads
-PLACED = ("tracked", "initialization")  # statuses of frames that the map holds
-FOUND, ANEW, SEGMENT, JOINED = "found", "anew", "segment", "joined"  # what may become of a camera that is looked for
+IN_MAP = ("tracked", "initialization")  # statuses of frames that the map holds
+# Outcomes of relocalization, `FrameRecord.location`; files have these words.
+RELOCALIZED, RESTARTED, NEW_SUBMAP, JOINED = "found", "anew", "segment", "joined"
 NOT_FOUND = "its place in the saved map is not found"
 UNJOINED = "its part was never joined with the map (unjoined)"
 
@@ -106,21 +107,21 @@ class FrameRecord:
 
 @dataclass
 class MappingRun:
-    """A run as far as it is. It grows with each frame, so an interrupted one still holds what it has.
+    """A run so far. It grows with each frame, so an interrupted one still holds its map and records.
 
     Args:
         camera: of the frames.
         config: all stages; capacities grow where they must.
         clock: counts load, predict and map.
-        on_record: hears of each frame at once.
+        on_record: called with the record of each frame.
         state: None before the first window.
         records: of the frames in use, in order.
-        back_end: what moves poses and map after the fact; None: what is placed stays.
-        saved: what the run begins in; None: it makes its own map.
-        prior_motion: what moves the prior's world since the camera was found; None: nothing.
-        structure: where the prior's frame is, if it is not related to the first frame any more.
-        aside: states of the other parts, by their segment; see `running/segments.py`.
-        ask: the prior, for both visits of a loop; see `running/revisiting.py`.
+        back_end: optimizes poses and deforms the map; None: poses stay as first estimated.
+        saved: map of an earlier run that this one continues; None: it makes its own map.
+        prior_motion: of the prior's world since relocalization; None: the identity.
+        structure: pose of the prior's own world, if it is not related to the first frame any more.
+        inactive: states of the other disconnected submaps, by their number.
+        prior_query: predicts both visits of a loop, see `prior_queries`.
         first_covariance: (6, 6) of the first frame, as frames were placed, when the run has ended (`first_frame.py`).
     """
 
@@ -134,13 +135,13 @@ class MappingRun:
     saved: SavedMap | None = None
     prior_motion: jaxlie.SE3 | None = None
     structure: PlacedStructure | None = None
-    aside: dict[int, SlamState] = field(default_factory=dict)
-    ask: Ask = lambda a, b: None
+    inactive: dict[int, SlamState] = field(default_factory=dict)
+    prior_query: PriorQuery = lambda a, b: None
     first_covariance: np.ndarray | None = None
 
     @property
     def is_fixed(self) -> bool:
-        """Frames are only located: the map and all that was measured for it stay."""
+        """True in localization mode: a saved map and its pose graph stay as they are."""
         return self.saved is not None and self.saved.is_fixed
 
     @property
@@ -172,7 +173,7 @@ def new_run(
     graph: BackEndConfig | None = None,
     saved: SavedMap | None = None,
 ) -> MappingRun:
-    """A run of `dataset` before its first frame; `graph` gives it a back end, `saved` that of an earlier run.
+    """Make a run of `dataset` before its first frame; `graph` gives it a back end, `saved` that of an earlier run.
 
     Raises:
         ValueError: `saved`, and the map of the first window is to be made from all of its views at once.
@@ -187,51 +188,53 @@ def new_run(
     return MappingRun(camera, config, clock, on_record, back_end=saved.back_end, saved=saved)
 
 
-def record_lost(run: MappingRun, given: Input, location: str | None = None) -> None:
-    """Add a frame before there is a place to start from; the anchor's or last pose stands in for the unknown one."""
-    reason, pose = REASONS[0] if location is None else NOT_FOUND, given.T_world_anchor
+def record_lost(run: MappingRun, window_input: WindowInput, location: str | None = None) -> None:
+    """Record a lost frame before a map can start; its pose is the anchor's or the last one, a placeholder."""
+    reason, pose = REASONS[0] if location is None else NOT_FOUND, window_input.T_world_anchor
     if run.saved is not None:
         pose = run.records[-1].pose if run.records else run.saved.back_end.poses[-1]
-    _add(run, given, 0, status="lost", reason=reason, location=location, pose=pose)
+    _add(run, window_input, 0, status="lost", reason=reason, location=location, pose=pose)
 
 
-def record_start(run: MappingRun, given: Input, spent: Seconds) -> None:
-    """Add the frames that the map of `run` was made from; raises ValueError where that map is empty."""
-    poses = np.asarray(given.taken.T_world_views.wxyz_xyz)
+def record_start(run: MappingRun, window_input: WindowInput, spent: Seconds) -> None:
+    """Record the frames that the map was made from; raise ValueError where that map is empty."""
+    poses = np.asarray(window_input.prediction.T_world_views.wxyz_xyz)
     count = int(np.asarray(run.map.gaussians.valid).sum())
     if count == 0:  # no later frame could be localised in it
         raise ValueError(
-            f"the map is empty after {len(poses)} view(s) from {given.frames[0].name}: the prior has no valid point "
-            "there; begin elsewhere (dataset.start=...) or use slam.initialization=merged"
+            f"the map is empty after {len(poses)} view(s) from {window_input.frames[0].name}: the prior has no valid "
+            "point there; begin elsewhere (dataset.start=...) or use slam.initialization=merged"
         )
     share = {key: value / len(poses) for key, value in spent.items()}
     for row, pose in enumerate(poses):
-        _add(run, given, row, status="initialization", pose=to_matrix(pose), num_gaussians=count, **share)
+        _add(run, window_input, row, status="initialization", pose=to_matrix(pose), num_gaussians=count, **share)
 
 
-def record_segment(run: MappingRun, given: Input, spent: Seconds) -> None:
-    """Add the frame that a part of `run` begins with; it stands in where the one before is."""
+def record_new_submap(run: MappingRun, window_input: WindowInput, spent: Seconds) -> None:
+    """Record the first frame of a disconnected submap; its pose is that of the frame before, a placeholder."""
     count = int(np.asarray(run.map.gaussians.valid).sum())
     kept = {"status": "initialization", "pose": run.records[-1].pose, "new": count, "num_gaussians": count}
-    _add(run, given, 0, **kept, location=SEGMENT, **spent)
+    _add(run, window_input, 0, **kept, location=NEW_SUBMAP, **spent)
 
 
-def record_step(run: MappingRun, given: Input, info: StepInfo, spent: Seconds, location=None, similarity=None) -> None:
-    """Add what a step did, `info` on the host, the seconds that it took, and what else the record says."""
+def record_step(
+    run: MappingRun, window_input: WindowInput, info: StepInfo, spent: Seconds, location=None, similarity=None
+) -> None:
+    """Record a step: `info` on the host, the seconds that it took, and the outcome of relocalization."""
     kept = {"fused": 0, "updated": 0, "new": 0, "num_gaussians": run.saved.count} if run.is_fixed else {}
-    if location == ANEW:
+    if location == RESTARTED:
         count = int(np.asarray(run.map.gaussians.valid).sum())
         kept = {"status": "initialization", "new": count - int(info.num_gaussians), "num_gaussians": count}
-    _add(run, given, 0, **_described(info) | kept, location=location, similarity=similarity, **spent)
+    _add(run, window_input, 0, **_step_fields(info) | kept, location=location, similarity=similarity, **spent)
 
 
-def _add(run: MappingRun, given: Input, row: int, **described: Any) -> None:
-    frame = given.frames[row]
+def _add(run: MappingRun, window_input: WindowInput, row: int, **described: Any) -> None:
+    frame = window_input.frames[row]
     record = FrameRecord(
         index=frame.index,
         name=frame.name,
         timestamp=frame.timestamp,
-        raw_pose=given.raw[row].T_world_camera,
+        raw_pose=window_input.raw[row].T_world_camera,
         true_pose=frame.T_world_camera,
         **described,
     )
@@ -239,8 +242,8 @@ def _add(run: MappingRun, given: Input, row: int, **described: Any) -> None:
     run.on_record(record)
 
 
-def _described(info: StepInfo) -> dict[str, Any]:
-    """The fields of a record that a step fills; `info` is on the host."""
+def _step_fields(info: StepInfo) -> dict[str, Any]:
+    """Return the fields of a record that a step fills; `info` is on the host."""
     localization, em, refinement = info.localization, info.em, info.refinement
     reasons = [words for bit, words in enumerate(REASONS) if int(localization.reason) >> bit & 1]
     return {
@@ -248,7 +251,7 @@ def _described(info: StepInfo) -> dict[str, Any]:
         "reason": "; ".join(reasons) or None,
         "pose": to_matrix(info.T_world_camera.wxyz_xyz),
         "newest_pose": to_matrix(info.T_world_newest.wxyz_xyz),
-        "covariance": np.asarray(localization.belief.world_covariance, np.float64)[:-1, :-1],
+        "covariance": np.asarray(localization.estimate.world_covariance, np.float64)[:-1, :-1],
         "inliers": int(localization.icp.num_inliers),
         "residual": float(localization.icp.residual),
         "scale": float(localization.scale),
@@ -269,12 +272,12 @@ def _described(info: StepInfo) -> dict[str, Any]:
 
 
 def row_of_first_node(run: MappingRun) -> int:
-    """The record of the first frame that the back end has as a node of this run; it has all later ones, too."""
-    return len(run.records) - (len(run.back_end.poses) - run.back_end.first)
+    """Return the row of the first record that is a node of the back end; all later ones are nodes, too."""
+    return len(run.records) - (len(run.back_end.poses) - run.back_end.first_node)
 
 
 def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """`poses` and the true ones (n, 4, 4), of the frames whose true pose is known; None if that is no frame."""
+    """Return poses and true poses (n, 4, 4) of the frames whose truth is known; None without any."""
     pairs = [(pose, true) for pose, true in zip(poses, run.true_poses, strict=True) if true is not None]
     if not pairs:
         return None
@@ -283,14 +286,14 @@ def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def to_line(record: FrameRecord) -> dict[str, Any]:
-    """A line of frames.jsonl: poses as tx, ty, tz (m), qx, qy, qz, qw, the covariance by rows."""
+    """Convert a record to a line of frames.jsonl: poses as tx, ty, tz (m), qx, qy, qz, qw, the covariance by rows."""
     line = dict(vars(record))
     poses = {name: value for name, value in line.items() if name.endswith("pose") and value is not None}
     return line | {name: to_tum(pose) for name, pose in poses.items()}
 
 
 def to_matrix(wxyz_xyz: np.ndarray) -> np.ndarray:
-    """(4, 4) float64 of a pose as jaxlie holds it."""
+    """Convert jaxlie's seven numbers of a pose to a (4, 4) float64 matrix."""
     pose, (w, x, y, z, *translation) = np.eye(4), np.asarray(wxyz_xyz, np.float64)
     pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), translation
     return pose

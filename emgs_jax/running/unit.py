@@ -1,4 +1,4 @@
-"""The unit of a finished map: that of the first inference until then, and the mean of what all of them say at last."""
+"""The unit of a map: that of the first inference during the run, and the mean of all inferences' at its end."""
 
 from dataclasses import replace
 
@@ -9,37 +9,37 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from emgs_jax.gaussian_map import GaussianMap
-from emgs_jax.registration.belief import rescaled_belief
+from emgs_jax.registration.pose_estimate import rescale_estimate
 from emgs_jax.running.convert import on_device
 from emgs_jax.running.executables import stored
 from emgs_jax.running.record import MappingRun
 from emgs_jax.slam import SlamState
 
 
-def own_unit(state: SlamState, origin: np.ndarray) -> SlamState:
-    """A state about whose map the prior says, on average, that it has the right size: scaled by e^−γ about `origin`.
+def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
+    """Rescale a state by e^−γ about `origin`, so that the scales of all predictions are 1 on average.
 
-    γ is the mean logarithm of the scales (`Belief.log_scale`). A length of an inference times its scale is one of the
-    map, so that γ is what the map's unit, the first inference's, is short of the prior's own. One inference errs by its
-    scale; their mean errs by less. A state with γ = 0 stays as it is.
+    γ is the mean logarithm of the scales (`PoseEstimate.log_scale`): a length of a prediction times its scale is one of
+    the map. The mean of all predictions errs by less than the first, which gave the map its unit. A state with γ = 0
+    stays as it is.
 
     Args:
         state: after the last step.
         origin: (3,) of the first camera.
     """
-    return rescaled(state, np.exp(-float(state.belief.log_scale)), origin) if state.belief.log_scale else state
+    return rescaled(state, np.exp(-float(state.estimate.log_scale)), origin) if state.estimate.log_scale else state
 
 
-def in_own_unit(run: MappingRun) -> None:
-    """`own_unit` of a run that ends, its poses and those of the back end included.
+def rescale_run(run: MappingRun) -> None:
+    """Apply `in_prior_unit` to a run that ends, its records and its back end included.
 
-    A saved map keeps its own, and so does one of segments that were joined: the mean is of the last one's inferences.
+    A saved map keeps its unit, and so does one of joined submaps: the mean is of the last one's inferences.
     """
-    if run.state is None or run.saved is not None or not run.state.belief.log_scale:
+    if run.state is None or run.saved is not None or not run.state.estimate.log_scale:
         return
     if run.back_end is not None and not run.back_end.has_one_unit:
         return
-    factor = np.exp(-float(run.state.belief.log_scale))
+    factor = np.exp(-float(run.state.estimate.log_scale))
     origin = next(record.pose for record in run.records if record.pose is not None)[:3, 3]  # the anchor's
 
     def placed(pose: np.ndarray | None) -> np.ndarray | None:
@@ -50,7 +50,7 @@ def in_own_unit(run: MappingRun) -> None:
         return moved
 
     units = np.array([factor] * 3 + [1.0] * 3)
-    run.state = own_unit(run.state, origin)
+    run.state = in_prior_unit(run.state, origin)
     run.records = [
         replace(
             record,
@@ -68,7 +68,7 @@ def in_own_unit(run: MappingRun) -> None:
 
 
 def rescaled(state: SlamState, factor: float, origin: np.ndarray) -> SlamState:
-    """All lengths of a state times `factor`, about `origin`; the scales of later predictions follow."""
+    """Multiply all lengths of a state by `factor`, about `origin`."""
     return _rescaled(state, *on_device((np.float32(factor), np.asarray(origin, np.float32))))
 
 
@@ -88,5 +88,5 @@ def _rescaled(state: SlamState, factor: Float[Array, ""], center: Float[Array, "
         map=grown(state.map),
         previous=eqx.tree_at(lambda o: o.points, state.previous, placed(state.previous.points)),
         T_world_previous=jaxlie.SE3.from_rotation_and_translation(T.rotation(), placed(T.translation())),
-        belief=rescaled_belief(state.belief, factor),
+        estimate=rescale_estimate(state.estimate, factor),
     )

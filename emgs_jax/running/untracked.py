@@ -1,11 +1,11 @@
-"""Frames in a row that do not fit the map: nothing is fused while that lasts, so it is said at once."""
+"""Alarms about frames in a row that do not fit the map: nothing is fused while that lasts."""
 
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from emgs_jax.localization import REASONS
-from emgs_jax.running.record import ANEW, JOINED, NOT_FOUND, SEGMENT, UNJOINED, FrameRecord
+from emgs_jax.running.record import JOINED, NEW_SUBMAP, NOT_FOUND, RESTARTED, UNJOINED, FrameRecord
 
 MANY_IN_A_ROW = 10  # single frames fail in every long sequence, so many together do not
 UNTRACKED = ("degraded", "lost")
@@ -34,15 +34,15 @@ def alarm(records: Sequence[FrameRecord]) -> str | None:
     """Return the message after a run's last record, if any: frames in a row untracked, tracked again, or new submap."""
     if not records:
         return None
-    if records[-1].location == ANEW:
+    if records[-1].location == RESTARTED:
         return (
-            f"{called(records[-1])}: the camera is found nowhere, so the map begins anew where the prior puts it; "
-            "loops join the parts where they meet"
+            f"{called(records[-1])}: relocalization fails, so the map restarts at the pose that the prior predicts; "
+            "loop closures correct that pose"
         )
-    if records[-1].location == SEGMENT:
+    if records[-1].location == NEW_SUBMAP:
         return (
-            f"{called(records[-1])}: the prior goes on in a frame of its own, so a new map begins; it is joined with "
-            "what there is where a frame fits both, and left out if none does"
+            f"{called(records[-1])}: the prior continues in a world of its own, so a new map begins; it is joined with "
+            "the other where a frame fits both, and dropped if none does"
         )
     if records[-1].location == JOINED:
         return f"{called(records[-1])} fits what was mapped before, and both are one map from here on"
@@ -62,7 +62,7 @@ def alarm(records: Sequence[FrameRecord]) -> str | None:
 
 
 def longest_row(records: Sequence[FrameRecord]) -> range:
-    """Places in `records` of the most frames in a row that are not tracked, the first of equals; may be empty."""
+    """Find the longest row of untracked frames, as positions in `records`; the first of equals, possibly empty."""
     longest, start = range(0), 0
     for place, record in enumerate(records):
         if record.status not in UNTRACKED:
@@ -73,7 +73,7 @@ def longest_row(records: Sequence[FrameRecord]) -> range:
 
 
 def main_reason(records: Sequence[FrameRecord]) -> tuple[str, int]:
-    """The most frequent reason of frames that are not tracked, and of how many it is one."""
+    """Return the most frequent reason of untracked frames, and its number of frames."""
     reasons = Counter(reason for record in records for reason in (record.reason or REASONS[0]).split("; "))
     return reasons.most_common(1)[0]
 
@@ -84,7 +84,7 @@ def called(record: FrameRecord) -> str:
 
 
 def _last_row(records: Sequence[FrameRecord], most: int) -> Sequence[FrameRecord]:
-    """The frames at the end that are not tracked, at most so many."""
+    """Return the untracked frames at the end, `most` at most."""
     count = 0
     while count < min(most, len(records)) and records[-1 - count].status in UNTRACKED:
         count += 1

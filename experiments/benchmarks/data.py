@@ -17,11 +17,11 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.prior.base import PriorPrediction
+from emgs_jax.running.capacity import start
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import build, build_dataset, build_prior
 from emgs_jax.running.convert import FirstWindow, to_camera, to_first_window, to_prediction
-from emgs_jax.running.growth import start
-from emgs_jax.running.inputs import first_pose, predictions
+from emgs_jax.running.window_input import first_pose, predictions
 from emgs_jax.slam import SlamConfig, SlamState
 
 

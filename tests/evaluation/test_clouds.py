@@ -6,7 +6,17 @@ from cloud_scene import random_cloud
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, read_cloud, register, transform_cloud, voxel_downsample
+from emgs_jax.evaluation.clouds import (
+    NearestPoints,
+    PointCloud,
+    cell_centers,
+    cell_numbers,
+    fuse_clouds,
+    read_cloud,
+    register,
+    transform_cloud,
+    voxel_downsample,
+)
 from emgs_jax.evaluation.trajectory import Alignment
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.ops.ranges import MAX_LENGTH_M
@@ -27,6 +37,27 @@ def test_points_of_a_voxel_become_their_means_and_twice_is_once():
     for name, values in (("points", points), ("normals", expected), ("colors", colors)):
         np.testing.assert_allclose(getattr(small, name), values, rtol=0, atol=1e-12)
         np.testing.assert_allclose(getattr(again, name), getattr(small, name), atol=1e-12)
+
+
+def test_the_centre_of_a_points_cell_is_within_half_a_voxel_of_it():
+    points = np.random.default_rng(10).uniform(-50, 50, (1000, 3))
+    numbers = cell_numbers(points, 0.25)
+    centers = cell_centers(numbers, 0.25)
+    assert np.abs(centers - points).max() <= 0.125 + 1e-12
+    np.testing.assert_array_equal(cell_numbers(centers, 0.25), numbers)
+
+
+@pytest.mark.parametrize("num_neighbours", [1, 5])
+def test_nearest_points_are_those_of_scipys_tree(num_neighbours):
+    rng = np.random.default_rng(11)
+    points, queries = rng.normal(size=(300, 3)), rng.normal(size=(200, 3))
+    distances, rows = cKDTree(points).query(queries, np.arange(1, num_neighbours + 1))
+    found = NearestPoints(points).query(queries, num_neighbours)
+    np.testing.assert_allclose(found[0], distances, rtol=1e-12)
+    np.testing.assert_array_equal(found[1], rows)
+    assert NearestPoints(points[:3]).query(queries, 5)[1].shape == (200, 3)
+    for nothing in (NearestPoints(points[:0]).query(queries), NearestPoints(points).query(queries[:0])):
+        assert all(not values.size for values in nothing)
 
 
 def test_a_similarity_moves_the_points_and_only_turns_the_normals():
@@ -63,7 +94,7 @@ def test_registration_takes_the_steps_of_open3ds_point_to_point_icp(num_steps):
     target = rng.uniform(-1, 1, (800, 3))
     motion = Rotation.from_rotvec([0.05, -0.02, 0.03]).as_matrix()
     points = target[:500] @ motion.T + [0.02, -0.03, 0.01] + 0.01 * rng.normal(size=(500, 3))
-    found = register(points, cKDTree(target), 0.15, num_steps)
+    found = register(points, NearestPoints(target), 0.15, num_steps)
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(rows)) for rows in (points, target)]
     criteria = registration.ICPConvergenceCriteria(0.0, 0.0, num_steps)
     expected = registration.registration_icp(*clouds, 0.15, np.eye(4), criteria=criteria).transformation
@@ -75,7 +106,7 @@ def test_registration_with_less_than_three_pairs_moves_nothing():
     points = np.random.default_rng(6).uniform(size=(20, 3))
     few = np.concatenate([points[:2] + 0.01, points[2:] + 100.0])
     for target in (points + 100.0, points[:0], few, few[1:]):
-        found = register(points, cKDTree(target), 0.03, 10)
+        found = register(points, NearestPoints(target), 0.03, 10)
         np.testing.assert_array_equal(found.apply(points), points)
 
 

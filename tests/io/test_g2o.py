@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.graph.measurements import LOOP, ODOMETRY, residuals
 from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
+from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, residuals
 
 RNG = np.random.default_rng(0)
 ROOT = RNG.normal(size=(6, 6))
@@ -38,11 +38,11 @@ def test_vertices_and_edges_are_what_the_lines_say(tmp_path):
     expected = [matrix(t, q) for t, q in zip(CENTERS, QUATERNIONS, strict=True)]
     np.testing.assert_allclose(graph.nodes.T_world.as_matrix(), expected, atol=1e-6)
     assert graph.nodes.T_world.wxyz_xyz.dtype == np.float64
-    np.testing.assert_array_equal([graph.edges.a, graph.edges.b], [[0, 2], [1, 0]])
+    np.testing.assert_array_equal([graph.factors.a, graph.factors.b], [[0, 2], [1, 0]])
     turned = matrix([1, 0, 0], [0, 0, 0.6, 0.8])
-    np.testing.assert_allclose(graph.edges.Z_a_b.as_matrix(), [matrix([1, 2, 3], [0, 0, 0, 1]), turned], atol=1e-6)
-    np.testing.assert_array_equal(graph.edges.kind, [ODOMETRY, LOOP])
-    roots = np.asarray(graph.edges.sqrt_info)
+    np.testing.assert_allclose(graph.factors.Z_a_b.as_matrix(), [matrix([1, 2, 3], [0, 0, 0, 1]), turned], atol=1e-6)
+    np.testing.assert_array_equal(graph.factors.kind, [ODOMETRY, LOOP])
+    roots = np.asarray(graph.factors.sqrt_info)
     np.testing.assert_allclose((roots.transpose(0, 2, 1) @ roots)[:, :6, :6], [INFORMATION] * 2, atol=1e-9)
     assert not roots[:, 6].any() and not roots[:, :, 6].any()
 
@@ -67,18 +67,18 @@ def test_what_is_written_comes_back(tmp_path, half_angles):
     save_graph_g2o(tmp_path / "again.g2o", graph, half_angles)
     again = load_graph_g2o(tmp_path / "again.g2o", half_angles)
     for one, other in zip(
-        (graph.nodes.T_world.wxyz_xyz, graph.edges.Z_a_b.wxyz_xyz, graph.edges.a, graph.edges.b),
-        (again.nodes.T_world.wxyz_xyz, again.edges.Z_a_b.wxyz_xyz, again.edges.a, again.edges.b),
+        (graph.nodes.T_world.wxyz_xyz, graph.factors.Z_a_b.wxyz_xyz, graph.factors.a, graph.factors.b),
+        (again.nodes.T_world.wxyz_xyz, again.factors.Z_a_b.wxyz_xyz, again.factors.a, again.factors.b),
         strict=True,
     ):
         np.testing.assert_allclose(one, other, atol=1e-15)
-    np.testing.assert_allclose(graph.edges.sqrt_info, again.edges.sqrt_info, atol=1e-9)
+    np.testing.assert_allclose(graph.factors.sqrt_info, again.factors.sqrt_info, atol=1e-9)
 
 
 def test_information_of_less_than_full_rank_is_read_and_scales_are_not_written_silently(tmp_path):
     upper = " ".join(f"{x:g}" for x in np.diag([1.0, 4, 0, 0, 0, 9])[np.triu_indices(6)])
     graph = load_graph_g2o(written(tmp_path, *VERTICES, f"EDGE_SE3:QUAT 7 3 0 0 0 0 0 0 1 {upper}"))
-    root = np.asarray(graph.edges.sqrt_info[0])
+    root = np.asarray(graph.factors.sqrt_info[0])
     np.testing.assert_allclose(np.diag(root.T @ root), [1, 4, 0, 0, 0, 9, 0], atol=1e-12)
     scaled = eqx.tree_at(lambda g: g.nodes.log_scale, graph, graph.nodes.log_scale + 0.1)
     with pytest.raises(ValueError, match="no scales"):

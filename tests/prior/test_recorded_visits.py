@@ -20,9 +20,11 @@ def recorded(tmp_path_factory):
     whole, folder = Synthetic(num_frames=40, size=(160, 120)), tmp_path_factory.mktemp("recording")
     dataset = Listed(whole, [whole[row] for row in ROWS])
     record(Simulated(), dataset, WINDOW_SIZE, folder)
-    config = loops_config("appearance.min_gap=5", "appearance.suppressed_gap=1", "appearance.num_neighbours=2")
+    config = loops_config(
+        "place_recognition.min_gap=5", "place_recognition.suppressed_gap=1", "place_recognition.num_neighbours=2"
+    )
     pairs = places_seen_twice(
-        Recorded(folder), dataset, WINDOW_SIZE, config["appearance"], config["verification"].alignment
+        Recorded(folder), dataset, WINDOW_SIZE, config["place_recognition"], config["verification"].alignment
     )
     return dataset, folder, pairs
 

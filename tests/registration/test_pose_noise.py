@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.observation import Prediction
 from emgs_jax.registration import pose_noise
-from emgs_jax.registration.pose_noise import Repeats, in_unit, none_yet, repeat_poses
+from emgs_jax.registration.pose_noise import Repeats, no_repeats, repeat_poses, rescale_repeats
 
 STEP, DEPTH, MEMORY = pose((0.03, -0.02, 0.05), (0.2, 0.05, -0.1)), 2.5, 10.0
 MOTION, OWN = (0.01, 0.004), (0.03, 0.02)  # standard deviations: lengths in mean depths, rad
@@ -24,7 +24,7 @@ STILL = pose()
 def repeat(prediction, before, scale):
     """What is said again, in the unit of its answer and of the world."""
     repeats, latest = repeat_poses(prediction, before, scale, jnp.asarray(DEPTH), jnp.asarray(MEMORY))
-    return in_unit(repeats, scale), repeats, latest
+    return rescale_repeats(repeats, scale), repeats, latest
 
 
 axis_std, pose_std = on_host(pose_noise.axis_std), on_host(pose_noise.pose_std)
@@ -81,7 +81,7 @@ def said_again(before: Repeats, prediction: Prediction, scale: float = 1.0) -> t
 
 def test_the_deviations_are_those_of_the_answers():
     """400 frames whose answers have three quarters of their variance in common."""
-    rng, shared, repeats = np.random.default_rng(0), 0.75, none_yet()
+    rng, shared, repeats = np.random.default_rng(0), 0.75, no_repeats()
     common = {name: rng.normal(size=(402, 6)) for name in ("motion", "own")}
     found, latests = [], []
     for number in range(1, 401):
@@ -100,18 +100,18 @@ def test_the_deviations_are_those_of_the_answers():
 
 def test_an_answer_that_is_the_same_again_says_nothing_whatever_its_unit():
     """A prior with one pose for every frame, such as `files`, does not contradict itself, and may be wrong."""
-    repeats = none_yet()
+    repeats = no_repeats()
     for number, scale in enumerate((1.0, 1.3, 0.4, 1.0), start=1):
         repeats, latest = said_again(repeats, exact(number, scale=scale), scale)
         assert not np.any(latest)
     np.testing.assert_array_equal(repeats.counts, [0, 0])
-    for values, expected in zip(repeats.said.wxyz_xyz, (STEP, power(4)), strict=True):
+    for values, expected in zip(repeats.predicted.wxyz_xyz, (STEP, power(4)), strict=True):
         np.testing.assert_allclose(matrix_of(jaxlie.SE3(values)), matrix_of(expected), atol=1e-5)
 
 
 def test_a_difference_is_in_mean_depths_and_radians():
     shift, turn = pose((0, 0, 0), (0.3, 0, 0)), pose((0.1, 0, 0), (0, 0, 0))
-    repeats, _ = said_again(none_yet(), exact(1))
+    repeats, _ = said_again(no_repeats(), exact(1))
     for change, expected in ((shift, [0.3 / DEPTH, 0]), (turn, [0, 0.1])):
         _, latest = said_again(repeats, answer(2, STILL, (product(STEP, change), STEP)))
         np.testing.assert_allclose(np.sqrt(3 * latest[0]), expected, atol=1e-4)
@@ -130,7 +130,7 @@ def test_a_difference_is_in_mean_depths_and_radians():
     ],
 )
 def test_what_is_not_said_twice_does_not_count(first, second, counts):
-    before, _ = said_again(none_yet(), exact(1, **first))
+    before, _ = said_again(no_repeats(), exact(1, **first))
     np.testing.assert_array_equal(before.counts, [0, 0])
     after, latest = said_again(before, answer(2, pose((0, 0.1, 0), (1, 0, 0)), (power(2), STEP), **second))
     np.testing.assert_array_equal(after.counts, counts)
@@ -138,7 +138,7 @@ def test_what_is_not_said_twice_does_not_count(first, second, counts):
 
 
 def test_a_pose_that_is_no_number_does_not_count_and_leaves_no_trace():
-    before, _ = said_again(none_yet(), exact(1))
+    before, _ = said_again(no_repeats(), exact(1))
     lost = eqx.tree_at(lambda p: p.T_world_views, exact(2), jaxlie.SE3(device(np.full((3, 7), np.nan))))
     after, latest = said_again(before, lost)
     assert not np.any(latest) and np.all(np.isfinite(after.log_squares))
@@ -150,10 +150,10 @@ def test_a_pose_that_is_no_number_does_not_count_and_leaves_no_trace():
 
 def test_older_repeats_are_forgotten():
     """Ten of one size, then thirty of another: the mean is of the last ones, (1 - 1/10)^30 of the way there."""
-    small, large, repeats = 0.01, 0.1, none_yet()
-    said, _ = said_again(none_yet(), exact(1))
+    small, large, repeats = 0.01, 0.1, no_repeats()
+    said, _ = said_again(no_repeats(), exact(1))
     for size in [small] * 10 + [large] * 30:
-        before = Repeats(said.said, *map(device, (said.is_said, repeats.log_squares, repeats.counts)))
+        before = Repeats(said.predicted, *map(device, (said.is_predicted, repeats.log_squares, repeats.counts)))
         repeats, _ = said_again(before, answer(2, STILL, (product(STEP, pose((0, 0, 0), (size, 0, 0))), STEP)))
     assert float(repeats.counts[0]) == MEMORY
     logs = np.log([size**2 / 3 / DEPTH**2 for size in (small, large)])
@@ -163,9 +163,9 @@ def test_older_repeats_are_forgotten():
 
 def test_without_repeats_the_depths_say_it_and_one_guess_counts_like_one_repeat():
     nothing, guess, shared = np.zeros((2, 2), np.float32), np.float32(0.02), np.float32(0.5)
-    np.testing.assert_allclose(pose_std(none_yet(), nothing, guess, shared), 0.02 * np.ones((2, 2)), rtol=1e-5)
+    np.testing.assert_allclose(pose_std(no_repeats(), nothing, guess, shared), 0.02 * np.ones((2, 2)), rtol=1e-5)
     logs, counts = np.full((2, 2), np.log(0.001**2) - 0.36898), np.array([3.0, 0.0])
-    known = replace(none_yet(), log_squares=device(logs), counts=device(counts))
+    known = replace(no_repeats(), log_squares=device(logs), counts=device(counts))
     std = pose_std(known, nothing, guess, shared)
     np.testing.assert_allclose(std[0], 0.001 ** (3 / 4) * 0.02 ** (1 / 4), rtol=1e-4)
     np.testing.assert_allclose(std[1], 0.02, rtol=1e-5)
@@ -179,15 +179,15 @@ def test_without_repeats_the_depths_say_it_and_one_guess_counts_like_one_repeat(
 def test_along_the_axes_lengths_are_in_mean_depths_and_what_is_informed_of_is_surer():
     """Of the motion and of the pose itself: three lengths, then three angles; nine depths are worth a third of one."""
     latest, shared = np.float32([[0.1**2, 0.2**2], [0.3**2, 0.4**2]]), np.float32(0.5)
-    lengths, angles = pose_std(none_yet(), latest, np.float32(0.01), shared).T
+    lengths, angles = pose_std(no_repeats(), latest, np.float32(0.01), shared).T
     given = np.float32(0.03), np.float32(DEPTH), np.float32(9.0), shared
     expected = np.stack([DEPTH * lengths] * 3 + [angles] * 3, axis=1)
-    np.testing.assert_allclose(axis_std(none_yet(), latest, *given), expected, rtol=1e-5)
+    np.testing.assert_allclose(axis_std(no_repeats(), latest, *given), expected, rtol=1e-5)
 
 
 def test_a_pose_is_at_least_as_uncertain_as_its_own_repeat_differs():
     latest = np.float32([[0.1**2, 0.0], [0.0, 0.2**2]])
-    std = pose_std(none_yet(), latest, np.float32(0.01), np.float32(0.75))
+    std = pose_std(no_repeats(), latest, np.float32(0.01), np.float32(0.75))
     np.testing.assert_allclose(std, [[0.1 * 2**0.5, 0.01], [0.01, 0.2 * 2**0.5]], rtol=1e-5)
 
 
@@ -204,5 +204,5 @@ def test_the_deviations_have_a_finite_gradient_where_answers_agree_and_where_the
 
         return jax.grad(total)(shift)
 
-    for before in (none_yet(), said_again(none_yet(), exact(1))[0]):
+    for before in (no_repeats(), said_again(no_repeats(), exact(1))[0]):
         assert np.isfinite(slope(np.zeros(3, np.float32), before)).all()

@@ -10,7 +10,7 @@ from scene import at, device, matrix_of, on_host
 
 from emgs_jax.ops.linalg import whitening
 from emgs_jax.registration import problem as problems
-from emgs_jax.registration.belief import root_information
+from emgs_jax.registration.pose_estimate import root_information
 from emgs_jax.registration.problem import COLORED, COLORED_RAY, IcpConfig, Problem, Uncertainty, pose_problem
 
 data_information, rows_of = on_host(problems.data_information), on_host(problems.rows_of)

@@ -8,7 +8,7 @@ from scene import device, moved_points, observe_room, on_host, path_pose, replac
 
 from emgs_jax.observation import transform
 from emgs_jax.ops.camera import Camera
-from emgs_jax.registration.repeat import repeat_scale
+from emgs_jax.registration.repeated_prediction import repeat_scale
 
 CAMERA = Camera([30.0, 33.0], [19.5, 15.25], 40, 32)
 T, NOW = path_pose(2), observe_room(path_pose(2), CAMERA)

@@ -66,7 +66,7 @@ def test_what_is_served_follows_the_run_and_at_its_end_is_the_whole_of_it(at_onc
         assert "Gaussians: left" in viewer.answer.content, "words stay asked"
         np.testing.assert_array_equal(viewer.scene.chosen.position, [2.0 * (NUM_FRAMES - 1), 0, 0])
         assert viewer.scene.paths[0].points.shape == (NUM_FRAMES - 1, 2, 3) and viewer.scene.paths[1] is None
-        assert "frame 6: tracked, residual 0.0123" in viewer.facts.content, "its number in the data set"
+        assert "frame 6: tracked, residual 1.2 % of the depth" in viewer.facts.content, "its number in the data set"
 
 
 def test_who_looks_at_an_earlier_frame_is_left_there(at_once):

@@ -13,23 +13,23 @@ from scene import assert_same, random_gaussians, random_observation
 
 from emgs_jax import load_config
 from emgs_jax.gaussian_map import new_map
-from emgs_jax.graph.deform import DeformConfig
-from emgs_jax.graph.measurements import Graph, Nodes, residuals
 from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
-from emgs_jax.loops.appearance import Database, Keyframe
-from emgs_jax.loops.revisit import Revisit
-from emgs_jax.loops.two_views import rescaled
-from emgs_jax.loops.verification import LoopMeasurement
-from emgs_jax.registration.belief import certain
+from emgs_jax.loop_closure.place_recognition import Database, Keyframe
+from emgs_jax.loop_closure.prior_query import JointPrediction
+from emgs_jax.loop_closure.two_view_refinement import rescaled
+from emgs_jax.loop_closure.verification import LoopMeasurement
+from emgs_jax.pose_graph.deform import DeformConfig
+from emgs_jax.pose_graph.factors import Nodes, PoseGraph, residuals
+from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.report.back_end import counts, found_loops, loop_list, metric_graph, revisit_note
 from emgs_jax.report.page_words import loop_why
-from emgs_jax.running import correction
+from emgs_jax.running import back_end_update
 from emgs_jax.running.back_end import BackEnd
-from emgs_jax.running.correction import correct, finish
-from emgs_jax.running.following import settle
-from emgs_jax.running.measuring import Look, chain_edge, map_edge, stacked
+from emgs_jax.running.back_end_update import finish_back_end, update_back_end
+from emgs_jax.running.deformation import merge_duplicates_of_state
+from emgs_jax.running.factors import FrameData, map_factor, sequential_factor, stack_factors
+from emgs_jax.running.prior_queries import query_prior
 from emgs_jax.running.record import FrameRecord, MappingRun
-from emgs_jax.running.revisiting import ask_again
 from emgs_jax.slam import SlamState
 
 COUNT, WINDOW = 60, 10
@@ -49,11 +49,11 @@ def ring(turn: float = 2 * np.pi) -> np.ndarray:
     return poses
 
 
-def look(poses: np.ndarray, index: int, frame: int | None = None) -> Look:
+def look(poses: np.ndarray, index: int, frame: int | None = None) -> FrameData:
     views = {0: poses[0]} | {i: poses[i] for i in range(max(index - WINDOW, 0), min(index + 2, COUNT))}
     views = {i: np.linalg.inv(poses[0]) @ pose for i, pose in views.items()}
     empty = np.zeros((4, 4, 3))
-    return Look(index if frame is None else frame, np.uint8(empty), empty, np.zeros((4, 4), bool), views)
+    return FrameData(index if frame is None else frame, np.uint8(empty), empty, np.zeros((4, 4), bool), views)
 
 
 def state_of(poses: np.ndarray) -> SlamState:
@@ -64,13 +64,13 @@ def state_of(poses: np.ndarray) -> SlamState:
     map = new_map(gaussians, jnp.ones(COUNT), jnp.ones(()), jnp.asarray(0))
     map = eqx.tree_at(lambda m: m.birth, map, jnp.arange(COUNT, dtype=jnp.int32))
     last = jaxlie.SE3.from_matrix(jnp.asarray(poses[-1], jnp.float32))
-    return SlamState(map, random_observation(20), last, certain(), jnp.asarray(COUNT))
+    return SlamState(map, random_observation(20), last, exact_estimate(), jnp.asarray(COUNT))
 
 
 def walked(graph, poses: np.ndarray, scale: float = 1.0) -> BackEnd:
     end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
     for index, pose in enumerate(poses):
-        end.add(look(poses, index), pose, scale, max(index - 3, 0))
+        end.add_node(look(poses, index), pose, scale, max(index - 3, 0))
     return end
 
 
@@ -86,10 +86,10 @@ def error(poses, truth) -> float:
 def test_what_was_measured_without_error_moves_nothing(graph):
     poses = ring()
     end, state = walked(graph, poses), state_of(poses)
-    closed = end.close(state, [loop(poses)])
+    closed = end.close_loops(state, [loop(poses)])
     assert error(end.poses, poses) < 1e-5 and end.closures[-1].info.reason == ""
     np.testing.assert_allclose(closed.map.gaussians.means, state.map.gaussians.means, atol=1e-5)
-    assert end.misfit(loop(poses)) < 1e-3 and not end.wants_to_close([loop(poses)])
+    assert end.chi2_of(loop(poses)) < 1e-3 and not end.is_closure_due([loop(poses)])
 
 
 def test_a_loop_brings_poses_map_and_last_frame_back(graph):
@@ -99,10 +99,10 @@ def test_a_loop_brings_poses_map_and_last_frame_back(graph):
     end = walked(graph, drifted)
     state = state_of(drifted)
     loops = [loop(truth, row) for row in range(1, 9)]
-    assert end.misfit(loops[0]) > graph.max_known and end.wants_to_close(loops)
+    assert end.chi2_of(loops[0]) > graph.min_violation and end.is_closure_due(loops)
     before, gap = error(drifted, truth), lambda poses: np.linalg.norm(poses[1][:3, 3] - poses[-2][:3, 3])
-    closed = end.close(state, loops)
-    assert end.accepted == loops and not end.wants_to_close(loops)
+    closed = end.close_loops(state, loops)
+    assert end.accepted == loops and not end.is_closure_due(loops)
     np.testing.assert_allclose(gap(end.poses), gap(truth), atol=0.02)
     assert error(end.poses, truth) < 0.5 * before
     for pose, scale, mean in zip(end.poses, end.log_scales, closed.map.gaussians.means, strict=True):
@@ -115,15 +115,15 @@ def test_the_mean_of_the_scales_that_the_unit_of_a_run_is_made_of_follows_a_clos
     """Inferences that are all 5 % too small: what the closure grows of the map, a finished run must not grow again."""
     poses, log_scale = ring(), 0.05
     end = walked(graph, poses, np.exp(log_scale))
-    state = eqx.tree_at(lambda s: s.belief.log_scale, state_of(poses), jnp.asarray(log_scale))
+    state = eqx.tree_at(lambda s: s.estimate.log_scale, state_of(poses), jnp.asarray(log_scale))
     records = [FrameRecord(row, None, None, "tracked", pose=pose, scale=1.05) for row, pose in enumerate(poses)]
     records[0] = FrameRecord(0, None, None, "initialization", pose=poses[0])
     run = MappingRun(None, None, state=state, records=records, back_end=end)
     smaller = np.stack([rescaled(pose, 0.9) for pose in poses])
     end.verified = [loop(smaller, row) for row in range(1, 9)]
-    finish(run)
+    finish_back_end(run)
     assert end.accepted and log_scale - np.mean(end.log_scales) > 1e-3  # `scale_std` asks for scales of one
-    assert float(run.state.belief.log_scale) == pytest.approx(np.mean(end.log_scales), abs=1e-5)
+    assert float(run.state.estimate.log_scale) == pytest.approx(np.mean(end.log_scales), abs=1e-5)
     np.testing.assert_allclose([record.scale for record in run.records[1:]], np.exp(end.log_scales[1:]))
     assert run.records[0].scale is None
 
@@ -132,36 +132,44 @@ def test_loops_that_are_contradicted_later_are_no_edges_any_more(graph):
     truth, drifted = ring(), ring(1.95 * np.pi)
     end, loops = walked(graph, drifted), [loop(truth, row) for row in range(1, 9)]
     end.verified = list(loops)
-    assert end.new(end.agreed()) == loops
-    end.close(state_of(drifted), loops)
-    assert end.retract(end.agreed()) == 0 and len(end.accepted) == len(loops) and end.new(end.agreed()) == []
-    end.contradicted = [loop(truth, row) for row in (9, 10)]
-    num_edges = len(end.edges)
-    assert end.retract(end.agreed()) == len(loops) and not end.accepted and len(end.edges) == num_edges - len(loops)
+    assert end.not_in_graph(end.consistent()) == loops
+    end.close_loops(state_of(drifted), loops)
+    assert (
+        end.retract_inconsistent(end.consistent()) == 0
+        and len(end.accepted) == len(loops)
+        and end.not_in_graph(end.consistent()) == []
+    )
+    end.violating = [loop(truth, row) for row in (9, 10)]
+    num_edges = len(end.factors)
+    assert (
+        end.retract_inconsistent(end.consistent()) == len(loops)
+        and not end.accepted
+        and len(end.factors) == num_edges - len(loops)
+    )
 
 
 def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatch):
     truth, drifted = ring(), ring(1.95 * np.pi)
     end, loops = walked(graph, drifted), [loop(truth, row) for row in range(1, 9)]
     end.verified = list(loops)
-    state = end.close(state_of(drifted), loops)
+    state = end.close_loops(state_of(drifted), loops)
     records = [FrameRecord(row, None, None, "tracked", pose=pose) for row, pose in enumerate(end.poses)]
     run = MappingRun(None, None, state=state, records=records, back_end=end)
     run.prior_motion = motion = jaxlie.SE3.from_matrix(jnp.asarray(ring()[7], jnp.float32))
     frame, raw = SimpleNamespace(index=COUNT - 1, image=None), SimpleNamespace(points=None, mask=None)
     given = SimpleNamespace(frames=[frame], raw=[raw], T_anchor_views={})
-    monkeypatch.setattr(end, "add", lambda *arguments: None)
-    monkeypatch.setattr(end, "look_for_loops", lambda look: [])
-    correct(run, given)
+    monkeypatch.setattr(end, "add_node", lambda *arguments: None)
+    monkeypatch.setattr(end, "detect_loops", lambda look: [])
+    update_back_end(run, given)
     assert end.accepted == loops and len(end.closures) == 1 and run.prior_motion is motion
     records = list(run.records)
 
-    def contradict(look: Look) -> list:
-        end.contradicted = [loop(truth, row) for row in (9, 10)]
+    def contradict(look: FrameData) -> list:
+        end.violating = [loop(truth, row) for row in (9, 10)]
         return []
 
-    monkeypatch.setattr(end, "look_for_loops", contradict)
-    correct(run, given)
+    monkeypatch.setattr(end, "detect_loops", contradict)
+    update_back_end(run, given)
     assert not end.accepted and len(end.closures) == 2
     assert error(end.poses, drifted) < 0.01
     assert error([record.pose for record in run.records], end.poses) == 0
@@ -176,7 +184,7 @@ def test_a_loop_that_cannot_be_solved_changes_nothing(graph):
     end, state = walked(graph, poses), state_of(poses)
     broken = loop(poses)
     broken.Z_a_b[0, 3] = np.nan
-    same = end.close(state, [broken])
+    same = end.close_loops(state, [broken])
     assert_same(same, state)
     assert not end.accepted and end.closures[-1].info.reason and error(end.poses, poses) == 0
     assert counts(end)["loops/closures_refused"] == 1
@@ -189,11 +197,11 @@ def test_a_loop_that_others_agree_with_and_that_cannot_be_solved_says_why(graph,
     known, broken = loop(poses), loop(poses)
     broken = replace(broken, b=broken.b - 1)
     end.verified = [known, broken]
-    monkeypatch.setattr(end, "agreed", lambda since=0: end.verified)
+    monkeypatch.setattr(end, "consistent", lambda since=0: end.verified)
     assert [line["outcome"] for line in loop_list(end)] == ["known", "known"]
     assert found_loops(end) == [known, broken], "what the poses say already is found as well"
     bad = replace(broken, Z_a_b=np.full((4, 4), np.nan))
-    end.close(state, [bad])
+    end.close_loops(state, [bad])
     unsolved, other = loop_list(end)
     assert (unsolved["outcome"], other["outcome"]) == ("unsolved", "known")
     assert found_loops(end) == [known]
@@ -207,7 +215,7 @@ def test_the_loops_of_a_map_that_was_loaded_do_not_count(graph):
     poses = ring()
     end = walked(graph, poses)
     old, new = replace(loop(poses), b=10), loop(poses)
-    end.verified, end.accepted, end.contradicted, end.first = [old, new], [old, new], [old], 20
+    end.verified, end.accepted, end.violating, end.first_node = [old, new], [old, new], [old], 20
     found = counts(end)
     assert (found["loops/verified"], found["loops/accepted"], found["loops/contradicted"]) == (1, 1, 0)
 
@@ -215,8 +223,8 @@ def test_the_loops_of_a_map_that_was_loaded_do_not_count(graph):
 def test_a_frame_is_held_where_it_was_placed_and_not_where_it_was_predicted(graph):
     """Both edges, in the unit of the frame's inference, whatever the window says of the two frames."""
     placed, scales = list(ring(1.95 * np.pi)[:31]), [0.0] * 30 + [np.log(1.1)]
-    chain = chain_edge(look(ring(), 30), placed, scales, anywhere, graph.noise)
-    held = map_edge(look(ring(), 30), placed, scales, 12, graph.noise)
+    chain = sequential_factor(look(ring(), 30), placed, scales, anywhere, graph.noise)
+    held = map_factor(look(ring(), 30), placed, scales, 12, graph.noise)
     assert (chain.a, chain.b, held.a, held.b) == (30, 29, 30, 12)
     for edge in (chain, held):
         expected = np.linalg.inv(placed[30]) @ placed[edge.b]
@@ -236,26 +244,26 @@ def test_a_frame_is_not_measured_to_one_whose_pose_only_stands_in(graph):
         seen = look(poses, frame)
         if frame in (1, 2):
             seen.T_anchor_views[frame][:] = np.nan
-        end.add(seen, poses[frame], 1.0, None, is_placed=frame == 0)
-    assert [(edge.a, edge.b) for edge in end.edges] == [(3, 0)]
-    end.add(look(poses, 4), poses[4], 1.0, None, is_placed=False)
-    assert (end.edges[-1].a, end.edges[-1].b) == (4, 3), "a frame that is led to is as good as a placed one"
+        end.add_node(seen, poses[frame], 1.0, None, is_placed=frame == 0)
+    assert [(edge.a, edge.b) for edge in end.factors] == [(3, 0)]
+    end.add_node(look(poses, 4), poses[4], 1.0, None, is_placed=False)
+    assert (end.factors[-1].a, end.factors[-1].b) == (4, 3), "a frame that is led to is as good as a placed one"
 
 
 def test_the_frame_before_is_the_nearest_that_the_window_knows(graph):
     poses, scales = list(ring()[:31]), [0.0] * 31
     measured = look(ring(), 30)
-    next_to = chain_edge(measured, poses, scales, anywhere, graph.noise)
+    next_to = sequential_factor(measured, poses, scales, anywhere, graph.noise)
     for frame in (29, 28):
         measured.T_anchor_views[frame][:] = np.nan
-    edge = chain_edge(measured, poses, scales, anywhere, graph.noise)
+    edge = sequential_factor(measured, poses, scales, anywhere, graph.noise)
     assert edge.b == 27
     np.testing.assert_allclose(edge.sqrt_info * np.sqrt(3), next_to.sqrt_info)
-    assert chain_edge(measured, poses, scales, lambda row: row >= 28, graph.noise) is None, (
+    assert sequential_factor(measured, poses, scales, lambda row: row >= 28, graph.noise) is None, (
         "before that the camera was lost"
     )
     measured.T_anchor_views[30][:] = np.nan
-    assert chain_edge(measured, poses, scales, anywhere, graph.noise) is None, "it is not known itself"
+    assert sequential_factor(measured, poses, scales, anywhere, graph.noise) is None, "it is not known itself"
 
 
 def test_what_is_measured_is_as_sure_as_the_depths_that_it_was_measured_by(graph):
@@ -265,17 +273,17 @@ def test_what_is_measured_is_as_sure_as_the_depths_that_it_was_measured_by(graph
     seeing = replace(blind, points=np.full((4, 4, 3), 7.0), mask=np.arange(16).reshape(4, 4) < 3, depth_noise=0.02)
     seeing.points[0, :3, 2] = 2.0, 2.5, 40.0
     for edge, share in (
-        (chain_edge(seeing, poses, scales, anywhere, graph.noise), graph.noise.pair),
-        (map_edge(seeing, poses, scales, 12, graph.noise), graph.noise.map),
+        (sequential_factor(seeing, poses, scales, anywhere, graph.noise), graph.noise.pair),
+        (map_factor(seeing, poses, scales, 12, graph.noise), graph.noise.map),
     ):
         stds = 0.02 * share * np.array([2.5, 2.5, 2.5, 1, 1, 1])
         np.testing.assert_allclose(1 / np.diag(edge.sqrt_info)[:6], stds)
-    assert chain_edge(seeing, poses, scales, anywhere, graph.noise).sqrt_info[6, 6] == 1 / (
+    assert sequential_factor(seeing, poses, scales, anywhere, graph.noise).sqrt_info[6, 6] == 1 / (
         0.02 * graph.noise.log_scale
     )
-    exact = map_edge(replace(seeing, depth_noise=0.0), poses, scales, 12, graph.noise)
+    exact = map_factor(replace(seeing, depth_noise=0.0), poses, scales, 12, graph.noise)
     assert 1e3 < exact.sqrt_info[0, 0] < 1e5, "more certain than any loop, and finite"
-    first = map_edge(blind, poses, scales, 12, graph.noise)
+    first = map_factor(blind, poses, scales, 12, graph.noise)
     np.testing.assert_allclose(1 / np.diag(first.sqrt_info)[:6], graph.noise.depth * graph.noise.map)
 
 
@@ -284,30 +292,32 @@ def test_without_a_loop_nothing_moves_however_the_predictions_differ(graph):
     placed = ring(1.95 * np.pi)
     end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
     for index, pose in enumerate(placed):
-        end.add(look(ring(), index), pose, 1.0, max(index - 3, 0))
+        end.add_node(look(ring(), index), pose, 1.0, max(index - 3, 0))
     state = state_of(placed)
-    assert_same(end.close(state).map, state.map)
+    assert_same(end.close_loops(state).map, state.map)
 
 
 def test_other_solvers_read_the_graph_in_the_scale_of_the_map(graph, tmp_path):
     poses = ring()
     end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
     for index, pose in enumerate(poses):
-        end.add(look(poses, index), pose, 1.1, None)
+        end.add_node(look(poses, index), pose, 1.1, None)
     save_graph_g2o(tmp_path / "graph.g2o", metric_graph(end))
     read = load_graph_g2o(tmp_path / "graph.g2o")
-    assert int(read.nodes.valid.sum()) == COUNT and len(read.edges.a) == len(end.edges)
-    np.testing.assert_allclose(read.edges.Z_a_b.translation()[0], 1.1 * end.edges[0].Z_a_b[:3, 3], rtol=1e-5, atol=1e-6)
+    assert int(read.nodes.valid.sum()) == COUNT and len(read.factors.a) == len(end.factors)
+    np.testing.assert_allclose(
+        read.factors.Z_a_b.translation()[0], 1.1 * end.factors[0].Z_a_b[:3, 3], rtol=1e-5, atol=1e-6
+    )
 
 
 def test_a_graph_for_other_solvers_costs_what_ours_does_and_has_the_nodes_of_the_map_only(graph):
     poses = ring()
     end = walked(graph, poses, scale=2.0)
     end.poses = [pose @ change for pose, change in zip(end.poses, random_steps(0.01), strict=True)]
-    ours = np.sum(residuals(Graph(end.nodes(), stacked(end.edges))) ** 2, axis=1)[: len(end.edges)]
+    ours = np.sum(residuals(PoseGraph(end.nodes(), stack_factors(end.factors))) ** 2, axis=1)[: len(end.factors)]
     assert ours.min() > 0
     np.testing.assert_allclose(np.sum(residuals(metric_graph(end)) ** 2, axis=1)[: len(ours)], ours, rtol=1e-3)
-    end.segments[:5] = [-1] * 5
+    end.submap_ids[:5] = [-1] * 5
     np.testing.assert_array_equal(np.flatnonzero(metric_graph(end).nodes.valid), range(5, COUNT))
 
 
@@ -325,12 +335,12 @@ def told_again(poses: np.ndarray, off: float = 0.0):
     """A prior that knows the true poses, or one of another place `off` m away; and which frames it was asked for."""
     calls = []
 
-    def ask(a: int, b: int) -> Revisit:
+    def ask(a: int, b: int) -> JointPrediction:
         calls.append((a, b))
         T = np.linalg.inv(poses[a]) @ poses[b]
         T[0, 3] += off
         points = np.float32(np.dstack([np.zeros((48, 64, 2)), np.full((48, 64), 2.0)]))
-        return Revisit(T, (points, points), (np.ones((48, 64), bool),) * 2)
+        return JointPrediction(T, (points, points), (np.ones((48, 64), bool),) * 2)
 
     return ask, calls
 
@@ -351,12 +361,12 @@ def test_a_loop_that_the_prior_sees_too_is_more_certain_and_asked_for_once(graph
     ask, calls = told_again(np.concatenate([np.tile(np.eye(4), (100, 1, 1)), truth]))
     end.verified = [loop(truth, row) for row in range(1, 5)]
     loops = list(end.verified)
-    ask_again(end, loops[:2], ask)
+    query_prior(end, loops[:2], ask)
     assert calls == [(101, 158), (102, 157)] and counts(end)["loops/measured_again"] == 2
     for before, now in zip(loops[:2], end.verified[:2], strict=True):
         np.testing.assert_allclose(now.Z_a_b, before.Z_a_b, atol=1e-6)
         assert (np.diag(now.sqrt_info) > np.diag(before.sqrt_info)).all()
-    ask_again(end, end.verified, ask)
+    query_prior(end, end.verified, ask)
     assert len(calls) == 4 and len(end.verified) == 4 and revisit_note(end, is_sequential=False) == []
 
 
@@ -365,12 +375,12 @@ def test_of_a_closure_the_loops_with_most_inliers_are_asked_for(graph):
     end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
     end.verified = [replace(loop(truth, row), num_inliers=40 + 10 * (row % 3)) for row in range(1, 7)]
     ask, calls = told_again(truth)
-    ask_again(end, end.verified, ask)
-    assert [a for a, _ in calls] == [2, 5, 1] and graph.revisit.num_asked == 3
-    end.asked.clear(), calls.clear()
+    query_prior(end, end.verified, ask)
+    assert [a for a, _ in calls] == [2, 5, 1] and graph.prior_query.max_queries == 3
+    end.queries.clear(), calls.clear()
     same = [replace(one, b=50, num_inliers=40 + one.a) for one in end.verified]  # all of one query: one witness
     end.verified = list(same)
-    ask_again(end, same, ask)
+    query_prior(end, same, ask)
     assert len(calls) == 1 and calls[0][0] == 6
 
 
@@ -382,9 +392,9 @@ def test_what_is_known_already_takes_nobodys_turn(graph):
     false = [replace(loop(ring(1.9 * np.pi), row), num_inliers=40) for row in range(5, 9)]
     end.verified = [*known, *false]
     ask, calls = told_again(poses)
-    ask_again(end, end.news(end.new(end.verified)), ask)
+    query_prior(end, end.violated(end.not_in_graph(end.verified)), ask)
     assert sorted(a for a, _ in calls) == [5, 6, 7] and end.accepted == []
-    assert [one.a for one in end.news(end.verified)] == [8], "asked for, the prior says what the poses say"
+    assert [one.a for one in end.violated(end.verified)] == [8], "asked for, the prior says what the poses say"
 
 
 def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
@@ -392,10 +402,14 @@ def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
     end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
     end.verified = [loop(truth, row) for row in range(1, 5)]
     ask, _ = told_again(truth, off=6.0)
-    ask_again(end, end.verified[:1], ask)
-    assert [known.a for known in end.verified] == [2, 3, 4] and [known.a for known in end.contradicted] == [1]
+    query_prior(end, end.verified[:1], ask)
+    assert [known.a for known in end.verified] == [2, 3, 4] and [known.a for known in end.violating] == [1]
     (refusal,) = end.refusals
-    assert (refusal.a, refusal.b, refusal.gate) == (1, 58, "revisit") and refusal.measured > graph.revisit.max_misfit
+    assert (refusal.a, refusal.b, refusal.gate) == (
+        1,
+        58,
+        "revisit",
+    ) and refusal.measured > graph.prior_query.max_misfit
     assert counts(end)["loops/refused_revisit"] == 1
     (line,) = [one for one in loop_list(end) if one["outcome"] == "refused"]
     assert "the prior, asked for both together, says otherwise" in loop_why(line)
@@ -406,7 +420,7 @@ def test_an_answer_without_a_pose_is_none_and_is_counted(graph):
     end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
     end.verified = [loop(truth, row) for row in range(1, 5)]
     loops, (ask, _) = list(end.verified), told_again(truth)
-    ask_again(end, loops[:1], lambda a, b: replace(ask(a, b), T_a_b=np.full((4, 4), np.nan)))
+    query_prior(end, loops[:1], lambda a, b: replace(ask(a, b), T_a_b=np.full((4, 4), np.nan)))
     assert end.verified == loops and counts(end)["loops/unusable_answers"] == 1
     assert counts(end)["loops/measured_again"] == 0 and revisit_note(end, is_sequential=False) == []
 
@@ -416,14 +430,14 @@ def test_a_loop_for_which_the_prior_has_no_word_and_one_of_another_run_stay(grap
     end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
     end.verified = [loop(truth, row) for row in range(1, 5)]
     loops = list(end.verified)
-    ask_again(end, loops[:2], lambda a, b: None)
+    query_prior(end, loops[:2], lambda a, b: None)
     assert counts(end)["loops/measured_again"] == counts(end)["loops/unusable_answers"] == 0
     (note,) = revisit_note(end, is_sequential=False)
     assert note.startswith("loops: 2 were measured by keypoints alone") and "graph=default" in note
     assert revisit_note(end, is_sequential=True) == revisit_note(None, is_sequential=False) == []
     ask, calls = told_again(truth)
-    end.first = 10
-    ask_again(end, loops[2:], ask)
+    end.first_node = 10
+    query_prior(end, loops[2:], ask)
     assert calls == [] and all(now is before for now, before in zip(end.verified, loops, strict=True))
 
 
@@ -437,10 +451,10 @@ def test_what_moves_the_poses_was_asked_for_before(graph, monkeypatch):
     end.verified = list(loops)
     right, _ = told_again(truth)
     wrong, _ = told_again(truth, off=6.0)
-    run.ask = lambda a, b: wrong(a, b) if a == 2 else right(a, b)
-    agreed = BackEnd.agreed
-    monkeypatch.setattr(BackEnd, "agreed", lambda end, since=0: list(end.verified))
-    finish(run)
+    run.prior_query = lambda a, b: wrong(a, b) if a == 2 else right(a, b)
+    agreed = BackEnd.consistent
+    monkeypatch.setattr(BackEnd, "consistent", lambda end, since=0: list(end.verified))
+    finish_back_end(run)
     assert [one.a for one in end.accepted] == [1, 3, 4] and [refusal.a for refusal in end.refusals] == [2]
     assert end.accepted[0].sqrt_info[0, 0] > loops[0].sqrt_info[0, 0]
     assert error(end.poses, truth) < 0.5 * error(drifted, truth)
@@ -448,11 +462,11 @@ def test_what_moves_the_poses_was_asked_for_before(graph, monkeypatch):
     end = with_keyframes(walked(graph, drifted))
     end.verified = [loop(truth, row) for row in range(1, 9)]
     run.back_end, run.state = end, state_of(drifted)
-    run.ask = lambda a, b: wrong(a, b)
-    monkeypatch.setattr(BackEnd, "agreed", agreed)
-    assert len(end.agreed()) == 8
-    finish(run)
-    assert end.accepted == [] and len(end.refusals) == 3 and end.agreed() == []
+    run.prior_query = lambda a, b: wrong(a, b)
+    monkeypatch.setattr(BackEnd, "consistent", agreed)
+    assert len(end.consistent()) == 8
+    finish_back_end(run)
+    assert end.accepted == [] and len(end.refusals) == 3 and end.consistent() == []
     assert error(end.poses, drifted) == 0
 
 
@@ -477,8 +491,8 @@ def test_a_map_whose_visits_were_joined_is_settled_at_the_end_with_the_noise_of_
         asked.append((noise, gates))
         return replace(state, time=jnp.asarray(-1))
 
-    monkeypatch.setattr(correction, "settle", settled)
-    finish(run)
+    monkeypatch.setattr(back_end_update, "merge_duplicates_of_state", settled)
+    finish_back_end(run)
     assert asked == ([(0.01, "gates")] if has_loop else []) and (run.state.time == -1) == has_loop
 
 
@@ -496,5 +510,5 @@ def test_a_gaussian_is_seen_from_the_node_of_its_birth(graph):
     poses[1, :3, 3] = 8.0, 0.0, 3.0
     nodes = Nodes(jaxlie.SE3.from_matrix(jnp.asarray(poses, jnp.float32)), jnp.zeros(2), jnp.ones(2, bool))
     state = replace(state_of(ring()), map=map)
-    after = settle(state, nodes, 0.02, load_config().slam.existence)
+    after = merge_duplicates_of_state(state, nodes, 0.02, load_config().slam.existence)
     np.testing.assert_array_equal(after.map.gaussians.valid, [True, False, True, True])

@@ -16,7 +16,7 @@ from tiny_run import NUM_FRAMES, TINY, compose
 
 import experiments.run
 from emgs_jax.io.trajectory import load_trajectory_tum
-from emgs_jax.running import drive
+from emgs_jax.running import pipeline
 from emgs_jax.running.checkpoint import (
     CHECKPOINT_FILE,
     Checkpoint,
@@ -43,7 +43,7 @@ class Stopped(BaseException):
 @contextlib.contextmanager
 def in_step(number: int, is_killed: bool, monkeypatch):
     """At this step; who is killed writes nothing any more."""
-    steps, advance = itertools.count(), drive.advance
+    steps, advance = itertools.count(), pipeline.advance
 
     def counted(*arguments):
         if next(steps) == number:
@@ -53,7 +53,7 @@ def in_step(number: int, is_killed: bool, monkeypatch):
         return advance(*arguments)
 
     with monkeypatch.context() as patch, pytest.raises(Stopped):
-        patch.setattr(drive, "advance", counted)
+        patch.setattr(pipeline, "advance", counted)
         yield
 
 
@@ -88,9 +88,9 @@ def whole(*more):
 
 def goes_on(folder: Path, more: tuple[str, ...], num_steps: range, monkeypatch) -> None:
     """The same command takes so many steps, and comes to what the run that nobody stopped has."""
-    steps, advance = [], drive.advance
+    steps, advance = [], pipeline.advance
     with monkeypatch.context() as patch:
-        patch.setattr(drive, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
+        patch.setattr(pipeline, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
         found = experiments.run.run(compose(*OVERRIDES, *more), folder)
     assert len(steps) in num_steps, "the steps before are not repeated"
     expected, metrics = whole(*more)
@@ -152,8 +152,8 @@ def test_a_scheduler_ends_a_run_with_one_word_and_the_same_command_goes_on(tmp_p
     assert ended(program) == 128 + signal.SIGTERM, said.read_text()
     assert "terminated\n" in said.read_text() and "Traceback" not in said.read_text()
     assert f"the same command with hydra.run.dir={folder} goes on" in said.read_text()
-    steps, advance = [], drive.advance
-    monkeypatch.setattr(drive, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
+    steps, advance = [], pipeline.advance
+    monkeypatch.setattr(pipeline, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
     experiments.run.run(compose(*OVERRIDES), folder)
     assert len(steps) < NUM_FRAMES - 1, "in another process"
     for name in ("map.npz", "trajectory.txt"):
@@ -200,7 +200,7 @@ def test_a_damaged_file_is_no_checkpoint_and_no_error(tmp_path, length):
     save_checkpoint(path, checkpoint(), {})
     path.write_bytes(path.read_bytes()[:length])
     keeper = Keeper(path, CheckpointConfig(2), {})
-    assert keeper.found is None and f"{path} cannot be gone on from" in keeper.note
+    assert keeper.found is None and f"{path} cannot be resumed" in keeper.note
     assert "begins at its first frame" in keeper.note
 
 

@@ -10,12 +10,12 @@ from walks import BACK, NEVER_FOUND, THERE, Apart, Blinded, Misled, config, mapp
 
 from emgs_jax import load_map
 from emgs_jax.localization import LEAST_NOISE
-from emgs_jax.loops.two_views import gap_between
+from emgs_jax.loop_closure.two_view_refinement import pose_difference
 from emgs_jax.report.metrics import score_back_end
 from emgs_jax.report.run_files import save_progress
 from emgs_jax.running.checkpoint import CheckpointConfig, Keeper
-from emgs_jax.running.places import load_saved
 from emgs_jax.running.record import MappingRun
+from emgs_jax.running.saved_map import load_saved_map
 
 pytestmark = pytest.mark.slow
 MAX_DISTANCE, MAX_TURN = 0.05, 2.0  # the bar, where the prior errs; here it is exact
@@ -23,7 +23,7 @@ MAX_DISTANCE, MAX_TURN = 0.05, 2.0  # the bar, where the prior errs; here it is 
 
 def assert_near(records) -> None:
     for record in records:
-        distance, turn = gap_between(record.pose, record.true_pose)
+        distance, turn = pose_difference(record.pose, record.true_pose)
         assert distance <= MAX_DISTANCE and turn <= MAX_TURN, record.index
 
 
@@ -34,7 +34,7 @@ def kidnapped() -> MappingRun:
 
 
 def test_a_camera_that_was_carried_off_comes_back():
-    run, patience, noise = kidnapped(), config().graph.location.patience, config().graph.noise
+    run, patience, noise = kidnapped(), config().graph.relocalization.patience, config().graph.noise
     first = len(THERE)
     back = first + patience - 1
     assert all(record.location is None for record in run.records[:back])
@@ -45,9 +45,11 @@ def test_a_camera_that_was_carried_off_comes_back():
     assert_near(run.records[back:])
     assert score_back_end(run)["location/found"] == 1
     end = run.back_end
-    assert end.since == back and not end.is_placed[first]
-    assert not any(edge.a >= end.since > edge.b and edge.b >= first for edge in end.edges), "lost frames hold nothing"
-    chain = [edge for edge in end.edges if edge.a == edge.b + 1 and edge.sqrt_info[6, 6]]  # none by the map
+    assert end.connected_since == back and not end.is_placed[first]
+    assert not any(edge.a >= end.connected_since > edge.b and edge.b >= first for edge in end.factors), (
+        "lost frames hold nothing"
+    )
+    chain = [edge for edge in end.factors if edge.a == edge.b + 1 and edge.sqrt_info[6, 6]]  # none by the map
     assert {end.is_placed[edge.a] for edge in chain} == {True, False}
     for edge in chain:
         record = run.records[edge.a]
@@ -55,7 +57,7 @@ def test_a_camera_that_was_carried_off_comes_back():
         assert edge.sqrt_info[5, 5] == pytest.approx(1 / (told * noise.pair)), "of a lost frame few points fit exactly"
 
 
-NOWHERE = (NEVER_FOUND, "graph.max_known=1e9", "graph.location.max_patience=4")
+NOWHERE = (NEVER_FOUND, "graph.min_violation=1e9", "graph.relocalization.max_patience=4")
 
 
 @pytest.mark.long
@@ -72,7 +74,7 @@ def test_the_map_goes_on_where_the_prior_leads_when_the_camera_is_found_nowhere(
     for row, record in enumerate(run.records):
         start = run.records[0]
         path = np.linalg.inv(start.true_pose) @ record.true_pose
-        assert max(gap_between(record.pose, start.pose @ (path if row < cut else Misled.motion @ path))) < 0.02, row
+        assert max(pose_difference(record.pose, start.pose @ (path if row < cut else Misled.motion @ path))) < 0.02, row
     births = np.asarray(run.map.birth)[np.asarray(run.map.gaussians.valid)]
     assert np.sum(births == anew) > first.new // 2  # some were joined with later ones
     assert not np.any((births >= cut) & (births < anew))
@@ -90,7 +92,7 @@ def test_nothing_begins_anew_where_nothing_leads():
 
 @pytest.mark.long
 def test_a_run_that_is_stopped_after_it_came_back_has_the_same_bits(tmp_path):
-    frames, patience = walk((*THERE, *BACK)), config().graph.location.patience
+    frames, patience = walk((*THERE, *BACK)), config().graph.relocalization.patience
     keep = lambda: Keeper(tmp_path / "checkpoint.npz", CheckpointConfig(every=1000), {})  # noqa: E731
     prior = Blinded(prior_of(frames), len(THERE))
     stopped = mapped(frames, prior, keeper=keep(), stop=len(THERE) + patience + 1)
@@ -109,7 +111,7 @@ def folder(tmp_path_factory):
 
 
 def loaded(folder, mode: str):
-    return load_saved(str(folder), mode, config().graph, walk(BACK).intrinsics, 0.01)
+    return load_saved_map(str(folder), mode, config().graph, walk(BACK).intrinsics, 0.01)
 
 
 def assert_only_located(run: MappingRun, folder) -> None:
@@ -122,7 +124,7 @@ def assert_only_located(run: MappingRun, folder) -> None:
 def test_a_prior_that_goes_on_in_a_frame_of_its_own_is_located_in_a_saved_map_that_stays_as_it_is(folder, cut, back):
     """Symptom: every frame of it was refused, because it had no pose in the world from before."""
     frames = walk((*BACK, 17, 19, 18))
-    run = mapped(frames, Apart(prior_of(frames, "prior.seed=7"), (cut,), (1.0, 1.05)), loaded(folder, "locate"))
+    run = mapped(frames, Apart(prior_of(frames, "prior.seed=7"), (cut,), (1.0, 1.05)), loaded(folder, "localize"))
     tracked = [record for record in run.records if not cut <= record.index < back]
     assert {record.status for record in tracked} == {"tracked"}
     assert_near(tracked)
@@ -132,7 +134,7 @@ def test_a_prior_that_goes_on_in_a_frame_of_its_own_is_located_in_a_saved_map_th
 @pytest.mark.long
 def test_frames_are_located_in_a_saved_map_and_it_stays_as_it_is(folder):
     frames = walk(BACK)
-    run = mapped(frames, prior_of(frames, "prior.seed=7"), loaded(folder, "locate"))
+    run = mapped(frames, prior_of(frames, "prior.seed=7"), loaded(folder, "localize"))
     assert run.records[0].location == "found" and {record.status for record in run.records} == {"tracked"}
     assert_near(run.records)
     assert_only_located(run, folder)
@@ -142,23 +144,25 @@ def test_a_run_goes_on_in_a_saved_map_and_can_be_saved_itself(folder, tmp_path):
     frames = walk(BACK)
     run = mapped(frames, prior_of(frames, "prior.seed=7"), loaded(folder, "extend"))
     end = run.back_end
-    assert run.records[0].location == "found" and len(end.poses) == len(THERE) + len(BACK) and end.first == len(THERE)
+    assert (
+        run.records[0].location == "found" and len(end.poses) == len(THERE) + len(BACK) and end.first_node == len(THERE)
+    )
     assert_near(run.records)
     assert int(run.state.time) == len(end.poses)
     saved = loaded(folder, "extend").map
     assert int(run.map.num_updates.sum()) > int(saved.num_updates.sum()), "what is seen again is fused into that map"
-    new = [edge for edge in end.edges if edge.a >= end.first]
-    assert any(edge.b < end.first for edge in new), "the new frames hang on those that the map was made from"
-    assert all(edge.sqrt_info[6, 6] == 0 for edge in new if edge.b < end.first), "by the map: no window has both"
+    new = [edge for edge in end.factors if edge.a >= end.first_node]
+    assert any(edge.b < end.first_node for edge in new), "the new frames hang on those that the map was made from"
+    assert all(edge.sqrt_info[6, 6] == 0 for edge in new if edge.b < end.first_node), "by the map: no window has both"
     noise = config().graph.noise
     for edge in new:
-        told = max(run.records[edge.a - end.first].depth_noise, LEAST_NOISE)
+        told = max(run.records[edge.a - end.first_node].depth_noise, LEAST_NOISE)
         angle = noise.pair if edge.sqrt_info[6, 6] else noise.map
         assert edge.sqrt_info[5, 5] == pytest.approx(1 / (told * angle)), "as sure as its frame's depths"
     save_progress(tmp_path, run)
     (tmp_path / "metrics.json").write_text("{}")
     again = loaded(tmp_path, "extend")
-    assert again.back_end.first == len(THERE) + len(BACK)
+    assert again.back_end.first_node == len(THERE) + len(BACK)
     assert_same(jax.device_get(again.map), jax.device_get(run.map))
 
 
@@ -175,4 +179,4 @@ def test_a_run_in_a_saved_map_that_is_stopped_has_the_same_bits(folder, tmp_path
 def test_images_of_another_place_are_not_found_and_the_run_says_so(folder):
     other = walk(BACK, "dataset.seed=5")
     with pytest.raises(ValueError, match=r"none of the 5 frames is found in the saved map \(.*matches"):
-        mapped(other, prior_of(other), loaded(folder, "locate"))
+        mapped(other, prior_of(other), loaded(folder, "localize"))

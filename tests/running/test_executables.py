@@ -19,9 +19,9 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
 from emgs_jax.ops.pytree import stack
 from emgs_jax.running import executable_files, executables
+from emgs_jax.running.capacity import start
 from emgs_jax.running.convert import FirstWindow
 from emgs_jax.running.executables import call, outputs, ready, stored
-from emgs_jax.running.growth import start
 from emgs_jax.slam import step
 
 TRACES = []

@@ -12,7 +12,7 @@ from scene import pose, random_gaussians, random_observation, slam_config
 
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.observation import transform
-from emgs_jax.registration.belief import certain
+from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.report.run_files import save_progress
 from emgs_jax.running.first_frame import own_covariance, with_first_frame
 from emgs_jax.running.record import FrameRecord, MappingRun, to_line
@@ -29,11 +29,11 @@ def a_run(count: float = COUNT, shared: float = 0.75) -> MappingRun:
     records += [FrameRecord(i, None, None, "tracked", pose=poses[i], covariance=1e-4 * np.eye(6)) for i in (1, 2)]
     logs = jnp.asarray(np.stack([np.log(DIFFERENCE**2)] * 2) - 0.36898, jnp.float32)  # of χ² with three degrees
     known = logs, jnp.asarray([count, 0.0]), jnp.asarray(0.02)
-    belief = eqx.tree_at(lambda b: (b.repeats.log_squares, b.repeats.counts, b.depth_noise), certain(), known)
+    estimate = eqx.tree_at(lambda b: (b.repeats.log_squares, b.repeats.counts, b.depth_noise), exact_estimate(), known)
     last = jaxlie.SE3.from_matrix(jnp.asarray(poses[-1], jnp.float32))
     map = new_map(random_gaussians(9), jnp.ones(9), jnp.ones(()), jnp.asarray(0))
     seen = transform(last, random_observation(20), jnp.ones(()))
-    state = SlamState(map, seen, last, belief, jnp.asarray(3))
+    state = SlamState(map, seen, last, estimate, jnp.asarray(3))
     return MappingRun(None, slam_config(f"slam.localization.pose_shared={shared}"), state=state, records=records)
 
 

@@ -15,8 +15,8 @@ from emgs_jax.evaluation.segmentation import align_labels
 from emgs_jax.report.metrics import Scorer, score_baselines
 from emgs_jax.running.dense import _voxel
 from emgs_jax.running.gathering import Baselines, gather
-from emgs_jax.running.inputs import RawView
 from emgs_jax.running.record import FrameRecord
+from emgs_jax.running.window_input import RawView
 
 INTRINSICS, SHAPE = (24.0, 24.0, 11.5, 7.5), (16, 24)
 STATUSES = ("initialization", "tracked", "degraded", "lost", "tracked")

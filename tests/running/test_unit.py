@@ -8,9 +8,9 @@ import pytest
 from scene import assert_same, pose, random_gaussians, random_observation
 
 from emgs_jax.gaussian_map import new_map
-from emgs_jax.registration.belief import certain
+from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.running.record import FrameRecord, MappingRun
-from emgs_jax.running.unit import in_own_unit, rescaled
+from emgs_jax.running.unit import rescale_run, rescaled
 from emgs_jax.slam import SlamState
 
 LOG_SCALE = -0.1  # the map is as much too small
@@ -30,18 +30,20 @@ def a_run(log_scale: float) -> MappingRun:
         jnp.eye(7),
         jaxlie.SE3(jnp.tile(pose((0.3, 0, 0), SAID).wxyz_xyz, (2, 1))),
     )
-    belief = eqx.tree_at(lambda b: (b.log_scale, b.covariance, b.world_covariance, b.repeats.said), certain(), known)
+    estimate = eqx.tree_at(
+        lambda b: (b.log_scale, b.covariance, b.world_covariance, b.repeats.predicted), exact_estimate(), known
+    )
     map = new_map(random_gaussians(9), jnp.ones(9), jnp.ones(()), jnp.asarray(0))
     last = jaxlie.SE3.from_matrix(jnp.asarray(poses[-1], jnp.float32))
     return MappingRun(
-        None, None, state=SlamState(map, random_observation(20), last, belief, jnp.asarray(3)), records=records
+        None, None, state=SlamState(map, random_observation(20), last, estimate, jnp.asarray(3)), records=records
     )
 
 
 def test_all_lengths_grow_about_the_first_camera_and_directions_stay():
     run, factor = a_run(LOG_SCALE), np.exp(-LOG_SCALE)
     before, records = run.state, run.records
-    in_own_unit(run)
+    rescale_run(run)
     after, origin = run.state, records[0].pose[:3, 3]
     grown = origin + factor * (np.asarray(before.map.gaussians.means) - origin)
     np.testing.assert_allclose(after.map.gaussians.means, grown, atol=1e-5)
@@ -54,17 +56,19 @@ def test_all_lengths_grow_about_the_first_camera_and_directions_stay():
     assert run.records[1].scale == pytest.approx(0.9 * factor) and run.records[0].scale is None
     np.testing.assert_allclose(run.records[2].newest_pose, run.records[2].pose)
     np.testing.assert_allclose(after.T_world_previous.as_matrix(), run.records[2].pose, atol=1e-5)
-    for covariance in (after.belief.covariance, after.belief.world_covariance):
+    for covariance in (after.estimate.covariance, after.estimate.world_covariance):
         np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [factor] * 3 + [1.0] * 4, rtol=1e-5)
     np.testing.assert_allclose(np.sqrt(np.diag(run.records[1].covariance)), [factor] * 3 + [1.0] * 3, rtol=1e-7)
-    assert float(after.belief.log_scale) == pytest.approx(0.0, abs=1e-6)
-    np.testing.assert_allclose(after.belief.repeats.said.translation(), factor * np.tile(SAID, (2, 1)), rtol=1e-5)
+    assert float(after.estimate.log_scale) == pytest.approx(0.0, abs=1e-6)
+    np.testing.assert_allclose(
+        after.estimate.repeats.predicted.translation(), factor * np.tile(SAID, (2, 1)), rtol=1e-5
+    )
 
 
 def test_a_point_keeps_its_pixel_in_every_view():
     run = a_run(LOG_SCALE)
     means, poses = np.asarray(run.state.map.gaussians.means), run.poses
-    in_own_unit(run)
+    rescale_run(run)
 
     def rays(points: np.ndarray, T: np.ndarray) -> np.ndarray:
         seen = (points - T[:3, 3]) @ T[:3, :3]
@@ -79,9 +83,9 @@ def test_a_point_keeps_its_pixel_in_every_view():
 def test_a_map_in_the_priors_own_unit_keeps_every_bit():
     run = a_run(0.0)
     state, records = run.state, run.records
-    in_own_unit(run)
+    rescale_run(run)
     assert run.state is state and run.records is records
-    in_own_unit(MappingRun(None, None))  # nothing was mapped
+    rescale_run(MappingRun(None, None))  # nothing was mapped
 
 
 def test_there_and_back_is_the_same():
@@ -89,4 +93,4 @@ def test_there_and_back_is_the_same():
     origin = np.array([0.3, -0.2, 1.0])
     back = rescaled(rescaled(state, 1.25, origin), 0.8, origin)
     np.testing.assert_allclose(back.map.gaussians.means, state.map.gaussians.means, atol=1e-5)
-    np.testing.assert_allclose(back.belief.log_scale, state.belief.log_scale, atol=1e-6)
+    np.testing.assert_allclose(back.estimate.log_scale, state.estimate.log_scale, atol=1e-6)

@@ -8,7 +8,7 @@ import pytest
 from tqdm import tqdm
 
 from emgs_jax.localization import REASONS
-from emgs_jax.running.drive import show_records
+from emgs_jax.running.pipeline import show_records
 from emgs_jax.running.record import FrameRecord
 from emgs_jax.running.untracked import MANY_IN_A_ROW, REMEDIES, alarm, longest_row
 
@@ -52,7 +52,7 @@ def test_a_map_that_begins_anew_is_said_once():
     rows[7] = replace(rows[7], location="anew")
     texts = [alarm(rows[: place + 1]) for place in range(len(rows))]
     assert [place for place, text in enumerate(texts) if text] == [7]
-    assert texts[7].startswith("7.jpg: the camera is found nowhere")
+    assert texts[7].startswith("7.jpg: relocalization fails")
 
 
 @pytest.mark.parametrize(("location", "words"), [("segment", "a new map begins"), ("joined", "both are one map")])

@@ -79,8 +79,8 @@ def test_every_value_of_a_protocol_is_in_its_range(option):
         ("prior.level=nan", "prior.level must be a number, got nan"),
         ("graph=default graph.noise.pair=nan", "graph.noise.pair must be a number"),
         (
-            "graph=default graph.appearance.grid=[80,0]",
-            r"graph.appearance.grid must be a list .* from 1 to 4096, got \[80, 0\]",
+            "graph=default graph.place_recognition.grid=[80,0]",
+            r"graph.place_recognition.grid must be a list .* from 1 to 4096, got \[80, 0\]",
         ),
         ("prior=multiview_stereo prior.dense.depth.max_cost=nan", "prior.dense.depth.max_cost must be a number"),
         ("prior=multiview_stereo prior.structure.median_depth=0", "prior.structure.median_depth must be a number"),

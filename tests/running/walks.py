@@ -15,12 +15,12 @@ from emgs_jax import load_config
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior, PriorPrediction
 from emgs_jax.running.configure import build_dataset, build_prior
-from emgs_jax.running.drive import map_frames
+from emgs_jax.running.pipeline import map_frames
 from emgs_jax.running.record import MappingRun, new_run
 
 WORDS = (*SMOKE, "dataset.num_frames=80", "dataset.stop=80", "prior.level=0", "graph=default")
 THERE, BACK = range(0, 24, 2), (7, 9, 11, 13, 15)  # frames of the path: what is mapped, and views between these
-NEVER_FOUND = "graph.location.min_inliers=100000"
+NEVER_FOUND = "graph.relocalization.min_inliers=100000"
 
 
 @cache
@@ -140,6 +140,6 @@ def same_run(one: MappingRun, other: MappingRun) -> None:
     assert_same(jax.device_get(one.state), jax.device_get(other.state))
     np.testing.assert_array_equal(one.poses, other.poses)
     np.testing.assert_array_equal(one.back_end.poses, other.back_end.poses)
-    assert one.back_end.segments == other.back_end.segments
+    assert one.back_end.submap_ids == other.back_end.submap_ids
     for name in ("location", "status"):
         assert [getattr(record, name) for record in one.records] == [getattr(record, name) for record in other.records]

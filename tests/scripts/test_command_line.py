@@ -32,13 +32,22 @@ from experiments.report import positional
     ("overrides", "message"),
     [
         (["em.num_neighbours=4"], r"^em\.num_neighbours is no key of .*; near names: slam\.em\.num_neighbours,"),
+        (
+            ["graph=default", "graph.location.patience=2"],
+            r"^graph\.location\.patience is called graph\.relocalization\.patience now",
+        ),
+        (
+            ["graph=default", "graph.agreement.max_contradicted=1"],
+            r" is called graph\.consistency\.max_violating_queries now",
+        ),
+        (["slam/continuation=paper"], r"^slam/continuation is called slam/extrapolation now"),
         (["slam.em.max_mahalanobis=3"], r"is no key of the config; near names: slam\.em\.max_mahalanobis_sq"),
         (["slam.refinement.render.opacity=0.3"], r"near names: .*\brender\.opacity"),
         (["dataset=tum", "dataset.num_frames=3"], r"dataset\.num_frames is no key of the config"),
         (["prior.nothing=2"], r"near names: prior\.version, prior\.classes, prior\.confusion, prior\.feature_size"),
         (["slam.em=papre"], r"one of its options \(default, paper\) with slam/em=default$"),
         (["render=bright"], "render=bright is no option of render: there are default"),
-        (["slam=paper"], r"slam is chosen by its parts: slam/continuation=…, slam/em=…, slam/existence=…"),
+        (["slam=paper"], r"slam is chosen by its parts: slam/em=…, slam/existence=…, slam/extrapolation=…"),
         (["dataset=scannetpp"], "dataset=scannetpp is no option of dataset: there are apartment, bonn, colmap"),
         (["dataset=1.5"], "^dataset=1.5 is no option of dataset: there are apartment"),
         (["dataset=null"], "^dataset=null: Config group override must be a string"),

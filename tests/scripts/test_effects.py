@@ -89,7 +89,7 @@ def test_a_difference_is_bold_where_three_repetitions_agree_on_its_sign(numbers,
     [
         (None, "no sweep.json below .*experiments.sweep -m"),
         ("{", "is damaged .* make it again"),
-        ('{"format": "emgs_jax.running.stacked", "version": 99}', "not a sweep of version 1"),
+        ('{"format": "emgs_jax.running.batch", "version": 99}', "not a sweep of version 1"),
     ],
 )
 def test_a_folder_without_readable_sweeps_is_refused_with_the_remedy(content, message, tmp_path):

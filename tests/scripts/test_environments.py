@@ -65,7 +65,7 @@ import hydra
 from experiments import run  # everything that a run imports
 from emgs_jax.running.configure import build_dataset, build_prior, compose
 from emgs_jax.running.record import new_run
-from emgs_jax.running.inputs import predictions
+from emgs_jax.running.window_input import predictions
 from emgs_jax.running.convert import to_first_window
 import numpy as np
 

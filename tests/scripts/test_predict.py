@@ -38,11 +38,11 @@ def test_the_recording_holds_what_the_prior_says_of_every_window(tmp_path, capsy
 
 def test_with_a_back_end_places_that_are_seen_twice_are_recorded_too(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(experiments.predict, "places_seen_twice", lambda *_: [(0, 4), (1, 5)])
-    folder = record(tmp_path / "out", "graph=default", "graph.revisit.spacing=1")
+    folder = record(tmp_path / "out", "graph=default", "graph.prior_query.spacing=1")
     assert "2 windows with both visits of a place" in capsys.readouterr().out
     names = sorted(path.name for path in folder.glob("visits_*"))
     assert names == ["visits_000000_000001_000003_000004.npz", "visits_000001_000000_000002_000004_000005.npz"]
-    none = record(tmp_path / "none", "graph=default", "graph.revisit.is_asked=false")
+    none = record(tmp_path / "none", "graph=default", "graph.prior_query.is_used=false")
     assert not list(none.glob("visits_*")) and "visits" not in capsys.readouterr().out
 
 

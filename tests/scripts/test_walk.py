@@ -11,7 +11,13 @@ from experiments.segment import segment
 pytestmark = pytest.mark.long
 
 # Any two views that share a place are a loop here, and each is worth a closure, so that ten frames have one.
-EAGER = ("appearance.min_gap=5", "appearance.suppressed_gap=2", "max_known=0", "min_frames=1", "agreement.min_others=0")
+EAGER = (
+    "place_recognition.min_gap=5",
+    "place_recognition.suppressed_gap=2",
+    "min_violation=0",
+    "min_frames=1",
+    "consistency.min_others=0",
+)
 WALK = ("experiment=smoke", "dataset.num_frames=120", "prior.version=2", "graph=default")
 WALK += tuple(f"graph.{word}" for word in EAGER)
 

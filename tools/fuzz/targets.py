@@ -38,15 +38,15 @@ from emgs_jax.evaluation.clouds import read_cloud
 from emgs_jax.evaluation.labelled_mesh import read_labelled_mesh
 from emgs_jax.features.text import TextEmbeddings, load_text, save_text
 from emgs_jax.gaussian_map import empty_map
-from emgs_jax.graph.measurements import LOOP, ODOMETRY, Graph, Nodes
 from emgs_jax.io.colmap import save_colmap
 from emgs_jax.io.g2o import load_graph_g2o
 from emgs_jax.io.map_file import load_map, save_map
 from emgs_jax.io.nerfstudio import save_transforms
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
-from emgs_jax.loops.appearance import Keyframe, extend
+from emgs_jax.loop_closure.place_recognition import Keyframe, add_keyframe
 from emgs_jax.ops.camera import Camera
+from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Nodes, PoseGraph
 from emgs_jax.prior.base import windows
 from emgs_jax.prior.files.prior import Files
 from emgs_jax.prior.recorded import Recorded, record
@@ -56,9 +56,9 @@ from emgs_jax.report.recorded_run import read_run
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from emgs_jax.running.configure import compose, keys_of
-from emgs_jax.running.measuring import Look
-from emgs_jax.running.places import load_places, save_places
+from emgs_jax.running.factors import FrameData
 from emgs_jax.running.record import FrameRecord
+from emgs_jax.running.saved_map import load_places, save_places
 from emgs_jax.running.values import check_values
 from tests.data.written_benchmarks import write_euroc, write_kitti
 from tests.data.written_scene import color_image, plane_depth, scene_pose, write_depth
@@ -338,18 +338,18 @@ def write_places(folder: Path) -> None:
     end, rng = BackEnd(load_config("graph=default").graph, (50.0, 50.0, 31.5, 23.5), 0.01), np.random.default_rng(0)
     image, mask = np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), bool)
     for frame in range(3):
-        end.add(Look(frame, image, np.zeros((48, 64, 3)), mask, {}), np.eye(4), 1.0, None)
+        end.add_node(FrameData(frame, image, np.zeros((48, 64, 3)), mask, {}), np.eye(4), 1.0, None)
         pixels, descriptors = rng.uniform(0, 40, (9, 2)), rng.integers(0, 99, (9, 128))
         shown = np.float32(pixels), np.uint8(descriptors), np.full((9, 3), np.nan, np.float32)
         one = Keyframe(frame, *shown, end.intrinsics, (64, 48), np.zeros((6, 8), np.float16))
-        end.database = extend(end.database, one, end.config.appearance)
+        end.database = add_keyframe(end.database, one, end.config.place_recognition)
     save_places(folder / "places.npz", end, 0.01)
 
 
 def read_places(folder: Path) -> None:
     end = BackEnd(load_config("graph=default").graph, (50.0, 50.0, 31.5, 23.5), 0.01)
     load_places(folder / "places.npz", end)
-    assert np.isfinite(end.poses).all() and len(end.poses) == len(end.is_placed) == end.first
+    assert np.isfinite(end.poses).all() and len(end.poses) == len(end.is_placed) == end.first_node
     assert all(0 <= one.frame < len(end.poses) for one in end.database.keyframes)
 
 
@@ -374,11 +374,11 @@ def write_graph(folder: Path) -> None:
 
 
 def read_graph(folder: Path) -> None:
-    graph: Graph = load_graph_g2o(folder / "graph.g2o")
+    graph: PoseGraph = load_graph_g2o(folder / "graph.g2o")
     nodes: Nodes = graph.nodes
     assert np.isfinite(np.asarray(nodes.T_world.wxyz_xyz)).all()
-    assert set(np.asarray(graph.edges.kind).tolist()) <= {ODOMETRY, LOOP}
-    assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(graph.edges))
+    assert set(np.asarray(graph.factors.kind).tolist()) <= {ODOMETRY, LOOP}
+    assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(graph.factors))
 
 
 def write_embeddings(folder: Path) -> None:

@@ -13,8 +13,8 @@ from tools.mutants.by_hand import BY_HAND
 from tools.mutants.operators import Edit, changed, edits
 
 ROOT = Path(__file__).resolve().parents[2]
-CORE = "ops observation gaussians gaussian_map registration graph render initialization localization em continuation"
-CORE = {*CORE.split(), "splitting", "refinement", "existence", "semantics", "slam"}
+CORE = "ops observation gaussians gaussian_map registration pose_graph render initialization localization em"
+CORE = {*CORE.split(), "surface_extrapolation", "splitting", "refinement", "existence", "semantics", "slam"}
 CORE_SHARE = 0.5  # of a sample; the core is a fifth of the source, and an error in it the hardest to see
 MOST_OF_A_KIND = 0.15  # of a sample; a third of all places are numbers
 

@@ -13,7 +13,7 @@ from emgs_jax.prior.simulated.prior import Simulated
 from emgs_jax.report.metrics import STATUSES
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import build
-from emgs_jax.running.drive import map_frames
+from emgs_jax.running.pipeline import map_frames
 from emgs_jax.running.record import FrameRecord, MappingRun, new_run
 from tests.tiny_run import compose
 

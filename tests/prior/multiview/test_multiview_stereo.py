@@ -18,7 +18,7 @@ from emgs_jax.prior.multiview.prior import tried_depths
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.convert import to_first_window, to_se3
-from emgs_jax.running.inputs import predictions
+from emgs_jax.running.window_input import predictions
 
 WINDOW_SIZE, NUM_NEWER, NUM_FRAMES = 5, 2, 8
 

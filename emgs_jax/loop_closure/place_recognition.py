@@ -1,0 +1,265 @@
+"""Place recognition: keyframes, and loop candidates among them by the appearance of their images.
+
+RootSIFT (Arandjelović and Zisserman, CVPR 2012) summed up as VLAD (Jégou et al., CVPR 2010), words of the sequence's
+own descriptors. How alike two images of one place are depends on the scene, so a candidate is compared with the
+keyframes just before the query, never with an absolute number.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float16, Float32, Int, UInt8
+
+from emgs_jax.keypoints import sift
+from emgs_jax.ops.ranges import number
+
+# A unit descriptor's entries as bytes; few exceed a half, and SIFT itself clips its own at .2.
+BYTES_PER_UNIT = 512.0
+
+
+@dataclass(frozen=True)
+class PlaceRecognitionConfig:
+    """Description of keyframes and choice of candidates; gaps count frames.
+
+    Args:
+        num_features: keypoints of one image, at most.
+        min_contrast: of a keypoint (SIFT).
+        max_depth_step: between the depths of the four pixels around a keypoint, relative to the smallest; where it is
+            larger a depth between them would lie on no surface.
+        grid: columns and rows of the depths that are kept.
+        num_words: of the vocabulary.
+        max_training: descriptors that it is trained on.
+        num_iterations: of k-means.
+        seed: of its start.
+        min_gap: between the query and a candidate.
+        suppressed_gap: around a candidate, in which a less similar one is left out.
+        num_candidates: at most.
+        num_neighbours: keyframes before the query, whose similarities to it give the threshold.
+        quantile: of these similarities, which a candidate must reach.
+    """
+
+    num_features: int = number(low=1)
+    min_contrast: float = number(low=0, high=1)
+    max_depth_step: float = number(low=0, high=math.inf)
+    grid: tuple[int, int] = number(low=1, high=4096)
+    num_words: int = number(low=1, high=65536)
+    max_training: int = number(low=1, high=1e8)
+    num_iterations: int = number(low=0, high=1000)
+    seed: int = number(low=0, high=2**31)
+    min_gap: int = number(low=0)
+    suppressed_gap: int = number(low=0)
+    num_candidates: int = number(low=1, high=1000)
+    num_neighbours: int = number(low=1, high=1000)
+    quantile: float = number(low=0, high=1)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.quantile <= 1:
+            raise ValueError(f"quantile must be between 0 and 1, got {self.quantile}")
+        if self.num_neighbours < 1:
+            raise ValueError(f"num_neighbours must be 1 or more, got {self.num_neighbours}")
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """Description of an image for place recognition; some 85 kB with 500 keypoints and 80 by 60 depths.
+
+    Args:
+        frame: its number.
+        pixels: of the keypoints, centres at integers.
+        descriptors: RootSIFT as bytes; `unit_descriptors` decodes them.
+        points: of the keypoints in the camera's own frame, units of its own inference; NaN without depth.
+        intrinsics: fx, fy, cx, cy in pixels.
+        size: width and height of the image.
+        depths: z at the centres of the cells of a regular grid over the image, units of the inference; 0 without depth.
+    """
+
+    frame: int
+    pixels: Float32[np.ndarray, "n 2"]
+    descriptors: UInt8[np.ndarray, "n 128"]
+    points: Float32[np.ndarray, "n 3"]
+    intrinsics: tuple[float, float, float, float]
+    size: tuple[int, int]
+    depths: Float16[np.ndarray, "y x"]
+
+
+@dataclass(frozen=True)
+class Database:
+    """Keyframes in the order of time, and a vector for each whose products are cosines.
+
+    Args:
+        words: the vocabulary (k, 128); empty before the first keypoint.
+        num_trained: keyframes that the words were trained on.
+    """
+
+    keyframes: tuple[Keyframe, ...] = ()
+    words: Float32[np.ndarray, "k 128"] = field(default_factory=lambda: np.zeros((0, sift.DESCRIPTOR_SIZE), np.float32))
+    vectors: Float32[np.ndarray, "n v"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    num_trained: int = 0
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A keyframe, as row of the database, that may show the query's place, and its cosine with the query."""
+
+    row: int
+    score: float
+
+
+def make_keyframe(
+    frame: int,
+    image: UInt8[np.ndarray, "h w 3"],
+    points: Float32[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+    intrinsics: Sequence[float],
+    config: PlaceRecognitionConfig,
+) -> Keyframe:
+    """Make a keyframe of an RGB image and its prediction: camera-frame points, where the mask is on.
+
+    Raises:
+        ValueError: image, points and mask differ in size.
+    """
+    if image.shape[:2] != points.shape[:2] or points.shape[:2] != mask.shape:
+        raise ValueError(
+            f"image {image.shape[:2]}, points {points.shape[:2]} and mask {mask.shape} must be of one height and width"
+        )
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    pixels, descriptors = sift.detect(gray, config.num_features, config.min_contrast)
+    # SIFT may give more than asked for, where the last are equally strong.
+    pixels, descriptors = np.float32(pixels[: config.num_features]), descriptors[: config.num_features]
+    as_bytes = np.uint8(np.clip(np.round(BYTES_PER_UNIT * descriptors), 0, 255))
+    at_pixels = _interpolated(points, mask, pixels, config.max_depth_step)
+    depths = sampled_depths(points, mask, config.grid)
+    return Keyframe(frame, pixels, as_bytes, at_pixels, tuple(map(float, intrinsics)), mask.shape[::-1], depths)
+
+
+def grid_pixels(size: tuple[int, int], grid: tuple[int, int]) -> tuple[Int[np.ndarray, " x"], Int[np.ndarray, " y"]]:
+    """The pixels nearest to the centres of a grid's columns and rows over an image of this width and height."""
+    x, y = (np.int64((np.arange(cells) + 0.5) * pixels / cells) for cells, pixels in zip(grid, size, strict=True))
+    return x, y
+
+
+def sampled_depths(
+    points: Float32[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], grid: tuple[int, int]
+) -> Float16[np.ndarray, "y x"]:
+    """Depth of camera-frame points at the centres of a grid of so many columns and rows; 0 where the mask is off."""
+    x, y = grid_pixels(mask.shape[::-1], grid)
+    return np.float16(np.where(mask, points[..., 2], 0.0)[np.ix_(y, x)])
+
+
+def _interpolated(
+    points: np.ndarray, mask: np.ndarray, pixels: Float32[np.ndarray, "n 2"], max_depth_step: float
+) -> Float32[np.ndarray, "n 3"]:
+    """Points (h, w, 3) between the four pixels around each keypoint; NaN where one has none or they are apart."""
+    corner = np.clip(np.int64(pixels), 0, np.array(mask.shape)[::-1] - 2)
+    x, y = (corner[:, None] + np.array([(0, 0), (1, 0), (0, 1), (1, 1)])).transpose(2, 0, 1)
+    around, is_known = np.float64(points[y, x]), mask[y, x].all(axis=1)
+    right, down = (pixels - corner).T
+    weights = np.stack([(1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down], axis=1)
+    nearest, farthest = around[..., 2].min(axis=1), around[..., 2].max(axis=1)
+    is_known &= (nearest > 0) & (farthest - nearest <= max_depth_step * nearest)
+    mean = np.einsum("nk,nkd->nd", weights, around)
+    return np.float32(np.where(is_known[:, None], mean, np.nan))
+
+
+def unit_descriptors(keyframe: Keyframe) -> Float32[np.ndarray, "n 128"]:
+    """Descriptors of a keyframe, each of length 1 again."""
+    descriptors = np.float32(keyframe.descriptors)
+    return descriptors / np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1.0)
+
+
+def add_keyframe(database: Database, keyframe: Keyframe, config: PlaceRecognitionConfig) -> Database:
+    """Add a keyframe to the database; the words are trained anew whenever the number of keyframes has doubled.
+
+    Raises:
+        ValueError: the keyframe is not later than the last.
+    """
+    if database.keyframes and keyframe.frame <= database.keyframes[-1].frame:
+        raise ValueError(f"frame {keyframe.frame} must come after {database.keyframes[-1].frame}: extend in order")
+    keyframes = (*database.keyframes, keyframe)
+    if len(keyframes) < 2 * database.num_trained:
+        vector = vlad(unit_descriptors(keyframe), database.words)
+        return Database(keyframes, database.words, np.vstack([database.vectors, vector]), database.num_trained)
+    words = train_vocabulary(np.concatenate([unit_descriptors(one) for one in keyframes]), config)
+    vectors = np.stack([vlad(unit_descriptors(one), words) for one in keyframes])
+    return Database(keyframes, words, vectors, len(keyframes) if len(words) else 0)
+
+
+def train_vocabulary(
+    descriptors: Float32[np.ndarray, "n 128"], config: PlaceRecognitionConfig
+) -> Float32[np.ndarray, "k 128"]:
+    """Train words, the centres of k-means over evenly chosen descriptors; none with fewer descriptors than words."""
+    if len(descriptors) < config.num_words:
+        return np.zeros((0, sift.DESCRIPTOR_SIZE), np.float32)
+    count = min(len(descriptors), config.max_training)
+    chosen = descriptors[np.linspace(0, len(descriptors) - 1, count).astype(int)]
+    cv2.setRNGSeed(config.seed)
+    stop = (cv2.TERM_CRITERIA_MAX_ITER, config.num_iterations, 0.0)
+    return cv2.kmeans(chosen, config.num_words, None, stop, 1, cv2.KMEANS_PP_CENTERS)[2]
+
+
+def vlad(descriptors: Float32[np.ndarray, "n 128"], words: Float32[np.ndarray, "k 128"]) -> Float32[np.ndarray, " v"]:
+    """VLAD: for each word the sum of what its descriptors differ from it by, one unit vector; 0 without descriptors.
+
+    Every word's part is made as long as any other's before the signed root: what repeats in the image must not outweigh
+    the rest (Arandjelović and Zisserman, CVPR 2013).
+    """
+    parts = np.zeros_like(words)
+    if len(words):
+        word = (descriptors @ words.T - 0.5 * (words**2).sum(axis=1)).argmax(axis=1)
+        np.add.at(parts, word, descriptors - words[word])
+    parts = _unit(parts)
+    return _unit((np.sign(parts) * np.sqrt(np.abs(parts))).ravel())
+
+
+def _unit(vectors: Float32[np.ndarray, "*b d"]) -> Float32[np.ndarray, "*b d"]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-6)
+
+
+def propose_candidates(database: Database, row: int, config: PlaceRecognitionConfig) -> list[Candidate]:
+    """Propose loop candidates: earlier keyframes at least as similar as the query's own last neighbours, best first.
+
+    At least `min_gap` frames older, the best only within `suppressed_gap` frames, `num_candidates` at most; none for
+    the first keyframe. The threshold is a quantile of the similarity to neighbours (LoopSplat, ViSTA-SLAM).
+    """
+    similarity = database.vectors[: row + 1] @ database.vectors[row]
+    neighbours = similarity[max(row - config.num_neighbours, 0) : row]
+    if not len(neighbours):
+        return []
+    frames = np.array([keyframe.frame for keyframe in database.keyframes[: row + 1]])
+    is_old = frames <= frames[row] - config.min_gap
+    # An image without keypoints is like none, itself included.
+    is_alike = (similarity >= np.quantile(neighbours, config.quantile)) & (similarity > 0)
+    return _apart(similarity, frames, is_old & is_alike, config.num_candidates, config.suppressed_gap)
+
+
+def most_similar(
+    database: Database, query: Keyframe, rows: Sequence[int], count: int, config: PlaceRecognitionConfig
+) -> list[Candidate]:
+    """Find the keyframes (rows) most similar to one without a known time, the best only within `suppressed_gap` frames.
+
+    There is no threshold of the similarity: that of `propose_candidates` comes from the query's neighbours in time.
+    """
+    similarity = database.vectors @ vlad(unit_descriptors(query), database.words)
+    frames = np.array([keyframe.frame for keyframe in database.keyframes])
+    is_allowed = np.zeros(len(frames), bool)
+    is_allowed[list(rows)] = True
+    return _apart(similarity, frames, is_allowed & (similarity > 0), count, config.suppressed_gap)
+
+
+def _apart(
+    similarity: Float32[np.ndarray, " n"],
+    frames: Int[np.ndarray, " n"],
+    is_allowed: Bool[np.ndarray, " n"],
+    count: int,
+    gap: int,
+) -> list[Candidate]:
+    """The most similar of the allowed rows, `count` at most, each more than `gap` frames from the better ones."""
+    chosen: list[Candidate] = []
+    for row in np.argsort(-similarity, kind="stable"):
+        apart = [abs(frames[row] - frames[one.row]) > gap for one in chosen]
+        if is_allowed[row] and all(apart) and len(chosen) < count:
+            chosen.append(Candidate(int(row), float(similarity[row])))
+    return chosen

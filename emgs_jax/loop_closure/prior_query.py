@@ -1,0 +1,105 @@
+"""Second measurement of a loop: one prediction of the prior with views of both visits.
+
+A feed-forward model predicts relative poses of images however far apart in time they were taken, without the path
+between them. Keypoints have found the loop; the prediction is an independent measurement of it, which confirms it or
+rejects it.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.loop_closure.place_recognition import Keyframe, sampled_depths
+from emgs_jax.loop_closure.two_view_refinement import Similarity, perturbed, rescaled
+from emgs_jax.loop_closure.verification import LoopMeasurement
+from emgs_jax.ops.ranges import number
+
+
+@dataclass(frozen=True)
+class PriorQueryConfig:
+    """Second measurement of loops by the prior: whether it is made, on which views, and its standard deviations.
+
+    Args:
+        is_used: measure loops that violate the poses in this way, too, where the prior can predict both visits.
+        max_queries: loops of a closure that are measured, each of another query, those with most inliers.
+        spacing: frames between the two visits' frames and the neighbouring ones that the prior sees as well.
+        std, std_share: of each axis of the pose between the two visits: in units of the earlier one, and of its length.
+        std_deg: of its rotation, about each axis.
+        log_ratio_std: of the ratio of the units of the two inferences that the loop is between.
+        min_cells: of the grid of depths that an image of either must have in common with its own inference.
+        max_misfit: χ² of the two measurements of a loop, of seven degrees of freedom, beyond which it is refused.
+    """
+
+    is_used: bool
+    max_queries: int = number(low=1, high=1000)
+    spacing: int = number(low=1, high=1000)
+    std: float = number(low=1e-6, high=1000)
+    std_share: float = number(low=0, high=10)
+    std_deg: float = number(low=1e-6, high=180)
+    log_ratio_std: float = number(low=1e-6, high=10)
+    min_cells: int = number(low=1)
+    max_misfit: float = number(low=0, high=math.inf)
+
+
+@dataclass(frozen=True)
+class JointPrediction:
+    """Prediction of one inference that shows both visits of a place, in its own unit.
+
+    Args:
+        T_a_b: camera b -> camera a; not finite where it is not predicted.
+        points: of a and of b, each in its own camera's frame.
+        masks: of these.
+    """
+
+    T_a_b: Float[np.ndarray, "4 4"]
+    points: tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w 3"]]
+    masks: tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]
+
+
+PriorQuery = Callable[
+    [int, int], JointPrediction | None
+]  # of two frames, the earlier first; None where the prior does not say
+
+
+def measure_by_prior(joint: JointPrediction, a: Keyframe, b: Keyframe, config: PriorQueryConfig) -> Similarity | None:
+    """Measure the similarity between two keyframes' inferences by an inference that shows both visits.
+
+    Its unit is neither's: the depths of a and b stand in both, e^{ρ_x} = median z'_x / z_x. So t = e^{-ρ_a} t', and the
+    ratio of a's unit to b's is ρ_b - ρ_a.
+
+    Returns:
+        The similarity in units of a, its covariance diagonal; None where the inference has no pose, or too few depths.
+    """
+    if not np.isfinite(joint.T_a_b).all():
+        return None
+    ratios = []
+    for keyframe, points, mask in zip((a, b), joint.points, joint.masks, strict=True):
+        new, own = np.float64(sampled_depths(points, mask, keyframe.depths.shape[::-1])), np.float64(keyframe.depths)
+        both = (new > 0) & (own > 0) & np.isfinite(new) & np.isfinite(own)  # float16 ends at 65504
+        if both.sum() < config.min_cells:
+            return None
+        ratios.append(float(np.median(np.log(new[both] / own[both]))))
+    T_a_b = rescaled(joint.T_a_b, np.exp(-ratios[0]))
+    std = config.std + config.std_share * np.linalg.norm(T_a_b[:3, 3])
+    stds = [std] * 3 + [np.radians(config.std_deg)] * 3 + [config.log_ratio_std]
+    return Similarity(T_a_b, ratios[1] - ratios[0], np.diag(np.square(stds)))
+
+
+def fuse_measurements(loop: LoopMeasurement, other: Similarity) -> tuple[LoopMeasurement, float]:
+    """Fuse two measurements of a loop, weighted by their information; return also χ² of their difference.
+
+    With e = Log(Z⁻¹ Z') to first order, Λ = WᵀW + Σ'⁻¹ and ξ = Λ⁻¹ Σ'⁻¹ e the loop is at Z Exp(ξ), and
+    χ² = eᵀ (Σ + Σ')⁻¹ e.
+    """
+    gap = np.linalg.inv(loop.Z_a_b) @ other.T_a_b
+    error = np.array([*gap[:3, 3], *Rotation.from_matrix(gap[:3, :3]).as_rotvec(), other.log_ratio - loop.log_ratio])
+    own, theirs = loop.sqrt_info.T @ loop.sqrt_info, np.linalg.inv(other.covariance)
+    misfit = float(error @ np.linalg.solve(np.linalg.inv(own) + other.covariance, error))
+    information = own + theirs
+    Z_a_b, log_ratio = perturbed(loop.Z_a_b, loop.log_ratio, np.linalg.solve(information, theirs @ error))
+    sqrt_info = np.linalg.cholesky(information).T
+    return replace(loop, Z_a_b=Z_a_b, log_ratio=float(log_ratio), sqrt_info=sqrt_info), misfit

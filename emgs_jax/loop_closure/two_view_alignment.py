@@ -1,0 +1,212 @@
+"""Relative pose of two keyframes that show the same place, with gates on the pair itself, cheap ones first."""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from emgs_jax.keypoints.poses import calibration, essential, pose_of
+from emgs_jax.keypoints.sift import mutual
+from emgs_jax.loop_closure.place_recognition import Keyframe, unit_descriptors
+from emgs_jax.loop_closure.two_view_refinement import (
+    MAD_TO_STD,
+    Pairs,
+    RefineConfig,
+    Similarity,
+    log_ratios,
+    pose_difference,
+    refine,
+    rescaled,
+)
+from emgs_jax.ops.ranges import number
+
+MIN_POSE = 6  # points that a pose needs
+
+
+class Gate(StrEnum):
+    """Reasons to reject a loop candidate, in the order in which the gates are tested."""
+
+    MATCHES = "matches"  # too few that fit an essential matrix
+    MATCH_SHARE = "match_share"  # too many that do not
+    POSE = "pose"  # too few points of the one fit the image of the other
+    POSES_DISAGREE = "poses_disagree"  # found from the points of the one, and of the other
+    HULL = "hull"  # seen in a small part of an image
+    COLLINEAR = "collinear"
+    SMALL = "small"  # all on one small object
+    DEPTHS = "depths"  # their ratios scatter
+    SCALE = "scale"  # not that of a metric prior
+    NEIGHBOURS = "neighbours"  # too few of the candidate's neighbours were verified
+    NEIGHBOURS_DISAGREE = "neighbours_disagree"
+    FREE_SPACE = "contradicted"  # one camera sees through what the other sees
+    PRIOR_QUERY = "revisit"  # a prediction with views of both visits differs
+
+
+@dataclass(frozen=True)
+class AlignmentConfig:
+    """Thresholds; lengths in units of the first keyframe's inference, errors in pixels.
+
+    Args:
+        max_ratio: distance to the best descriptor over that to the second.
+        max_epipolar_error: of a match that fits the essential matrix.
+        min_matches: that fit it.
+        min_match_share: of all mutual matches.
+        max_reprojection_error: of a point that fits a pose.
+        min_pose_points: that fit, in either direction.
+        max_pose_gap: between the poses of the two directions, times the median depth.
+        max_pose_turn_deg: between these.
+        min_hull: of the points in either image, share of its area.
+        min_flatness: second standard deviation of the points over the first: 0 on a line.
+        min_extent: between the 5 % and the 95 % quantile along one of the axes.
+        max_depth_scatter: standard deviation of the points' log depth ratio (from the MAD).
+        scale_std: of the prior's log-scale; the ratio of two may be 3 √2 times that. Infinite without a metric prior.
+        refine: the final pose.
+    """
+
+    max_ratio: float = number(low=0, high=1)
+    max_epipolar_error: float = number(low=0, high=1000)
+    min_matches: int = number(low=1)
+    min_match_share: float = number(low=0, high=1)
+    max_reprojection_error: float = number(low=0, high=1000)
+    min_pose_points: int = number(low=1)
+    max_pose_gap: float = number(low=0, high=math.inf)
+    max_pose_turn_deg: float = number(low=0, high=math.inf)
+    min_hull: float = number(low=0, high=1)
+    min_flatness: float = number(low=0, high=1)
+    min_extent: float = number(low=0)
+    max_depth_scatter: float = number(low=0, high=math.inf)
+    scale_std: float = number(low=0, high=math.inf)
+    refine: RefineConfig
+
+    def __post_init__(self) -> None:
+        if min(self.min_matches, self.min_pose_points) < MIN_POSE:
+            raise ValueError(
+                f"min_matches and min_pose_points must be {MIN_POSE} or more, which a pose needs; "
+                f"got {self.min_matches}, {self.min_pose_points}"
+            )
+
+
+class RefusedError(Exception):
+    """A gate is not passed.
+
+    Args:
+        measured: what the gate compares with its threshold.
+    """
+
+    def __init__(self, gate: Gate, measured: float) -> None:
+        super().__init__(f"{gate}: {measured:.3g}")
+        self.gate, self.measured = gate, float(measured)
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Two keyframes that show the same.
+
+    Args:
+        similarity: of camera b in the frame of a.
+        num_inliers: points that fit in every direction in which they have a depth.
+        median_depth: of these, in a's units.
+    """
+
+    similarity: Similarity
+    num_inliers: int
+    median_depth: float
+
+
+def require(gate: Gate, passes: bool, measured: float) -> None:
+    """Raise RefusedError where a gate is not passed."""
+    if not passes:
+        raise RefusedError(gate, measured)
+
+
+def align(a: Keyframe, b: Keyframe, config: AlignmentConfig) -> Aligned:
+    """The similarity between two keyframes; raises RefusedError where they may not show the same."""
+    pairs = _matched(a, b, config)
+    T_a_b, by_points_of_a = _posed(pairs.points_a, pairs.pixels_b, pairs.K_b, config)
+    T_b_a, by_points_of_b = _posed(pairs.points_b, pairs.pixels_a, pairs.K_a, config)
+    in_a, in_b = np.isfinite(pairs.points_a[:, 2]), np.isfinite(pairs.points_b[:, 2])
+    # A point that fits in one direction only has a wrong depth in the other.
+    fits = (by_points_of_a | ~in_a) & (by_points_of_b | ~in_b) & (in_a | in_b)
+    both = pairs.rows(fits & in_a & in_b)
+    require(Gate.POSE, len(both.pixels_a) >= MIN_POSE, len(both.pixels_a))
+    log_ratio = float(np.median(np.log(_depths(T_a_b, both.points_a) / both.points_b[:, 2])))
+    median_depth = float(np.median(both.points_a[:, 2]))
+    _check_poses(T_a_b, rescaled(np.linalg.inv(T_b_a), np.exp(log_ratio)), median_depth, config)
+    _check_spread(pairs.rows(fits), both.points_a, a.size, b.size, config)
+    _check_scale(both, T_a_b, log_ratio, config)
+    similarity = refine(pairs.rows(fits), T_a_b, log_ratio, config.refine)
+    return Aligned(similarity, int(fits.sum()), median_depth)
+
+
+def _matched(a: Keyframe, b: Keyframe, config: AlignmentConfig) -> Pairs:
+    """Mutual matches that fit one essential matrix."""
+    rows_a, rows_b = mutual(unit_descriptors(a), unit_descriptors(b), config.max_ratio)
+    require(Gate.MATCHES, len(rows_a) >= config.min_matches, len(rows_a))
+    pairs = Pairs(
+        *(np.float64(array) for array in (a.pixels[rows_a], b.pixels[rows_b], a.points[rows_a], b.points[rows_b])),
+        *(calibration(keyframe.intrinsics) for keyframe in (a, b)),
+    )
+    # In the pixels of one camera: the essential matrix is of two that are alike.
+    as_a = (pairs.pixels_b - pairs.K_b[:2, 2]) / pairs.K_b.diagonal()[:2] * pairs.K_a.diagonal()[:2] + pairs.K_a[:2, 2]
+    _, mask = essential(pairs.pixels_a, as_a, pairs.K_a, config.max_epipolar_error)
+    inliers = np.zeros(len(rows_a), bool) if mask is None else mask.ravel() > 0
+    require(Gate.MATCHES, inliers.sum() >= config.min_matches, inliers.sum())
+    require(Gate.MATCH_SHARE, inliers.mean() >= config.min_match_share, inliers.mean())
+    return pairs.rows(inliers)
+
+
+def _posed(
+    points: Float[np.ndarray, "n 3"], pixels: Float[np.ndarray, "n 2"], K: np.ndarray, config: AlignmentConfig
+) -> tuple[Float[np.ndarray, "4 4"], Bool[np.ndarray, " n"]]:
+    """T_points_camera of the camera that sees the points at the pixels, and which of them (n,) fit."""
+    known = np.flatnonzero(np.isfinite(points[:, 2]))
+    found = pose_of(points[known], pixels[known], K, MIN_POSE, config.max_reprojection_error)
+    count = 0 if found is None else len(found[1])
+    require(Gate.POSE, count >= config.min_pose_points, count)
+    T, rows = found
+    fits = np.zeros(len(points), bool)
+    fits[known[rows]] = True
+    return T, fits
+
+
+def _depths(T_a_b: Float[np.ndarray, "4 4"], points_a: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Of points of frame a, seen by camera b."""
+    return (points_a - T_a_b[:3, 3]) @ T_a_b[:3, 2]
+
+
+def _check_poses(one: np.ndarray, other: np.ndarray, median_depth: float, config: AlignmentConfig) -> None:
+    distance, turn = pose_difference(one, other)
+    require(Gate.POSES_DISAGREE, distance <= config.max_pose_gap * median_depth, distance)
+    require(Gate.POSES_DISAGREE, turn <= config.max_pose_turn_deg, turn)
+
+
+def _check_spread(
+    pairs: Pairs,
+    points: Float[np.ndarray, "n 3"],
+    size_a: tuple[int, int],
+    size_b: tuple[int, int],
+    config: AlignmentConfig,
+) -> None:
+    """Points that are close together, or on a line, leave the pose open."""
+    share = min(_hull_share(pairs.pixels_a, size_a), _hull_share(pairs.pixels_b, size_b))
+    require(Gate.HULL, share >= config.min_hull, share)
+    centred = points - points.mean(axis=0)
+    _, spread, axes = np.linalg.svd(centred, full_matrices=False)
+    flatness = spread[1] / max(spread[0], np.finfo(float).tiny)
+    require(Gate.COLLINEAR, flatness >= config.min_flatness, flatness)
+    extent = np.ptp(np.quantile(centred @ axes.T, [0.05, 0.95], axis=0), axis=0).max()
+    require(Gate.SMALL, extent >= config.min_extent, extent)
+
+
+def _hull_share(pixels: Float[np.ndarray, "n 2"], size: tuple[int, int]) -> float:
+    """Area of the convex hull over that of the image."""
+    return cv2.contourArea(cv2.convexHull(np.float32(pixels))) / (size[0] * size[1])
+
+
+def _check_scale(both: Pairs, T_a_b: np.ndarray, log_ratio: float, config: AlignmentConfig) -> None:
+    ratios = log_ratios(both, T_a_b, log_ratio)
+    scatter = MAD_TO_STD * np.median(np.abs(ratios - np.median(ratios)))
+    require(Gate.DEPTHS, scatter <= config.max_depth_scatter, scatter)
+    require(Gate.SCALE, abs(log_ratio) <= 3 * np.sqrt(2) * config.scale_std, log_ratio)

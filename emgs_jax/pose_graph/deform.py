@@ -1,0 +1,115 @@
+"""A map that follows its frames: every Gaussian moves as those of its neighbourhood were born."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.observation import Observation, transform
+from emgs_jax.ops.neighbours import knn
+from emgs_jax.ops.precision import full_precision
+from emgs_jax.ops.pytree import static, take_rows, traced, where_rows
+from emgs_jax.pose_graph.factors import Nodes
+from emgs_jax.registration.rigid import pose_row
+
+
+class DeformConfig(eqx.Module):
+    """Over which Gaussians a motion is averaged, so that a surface which several frames made has no seams.
+
+    Args:
+        num_neighbours: nearest Gaussians, itself among them; 1: each moves with the frame of its own birth alone.
+        max_gap: nodes between the births of a Gaussian and of one that counts: two visits of a place move apart.
+    """
+
+    num_neighbours: int = static(low=1, high=256)
+    max_gap: Float[Array, "*b"] = traced(low=0)
+
+
+class _Motions(eqx.Module):
+    """Similarities that move the surroundings of nodes from their old to their new poses: x' = s ΔR (x - t) + t'."""
+
+    turn: jaxlie.SO3
+    scale: Float[Array, "*n"]
+    old: Float[Array, "*n 3"]
+    new: Float[Array, "*n 3"]
+    has_moved: Bool[Array, "*n"]
+
+    def __call__(self, points: Float[Array, "*m 3"]) -> Float[Array, "*n 3"]:
+        return self.new + self.scale[..., None] * (self.turn @ (points - self.old))
+
+
+def _motions(before: Nodes, after: Nodes) -> _Motions:
+    """Of each node, and whether it moved at all."""
+    turn = after.T_world.rotation() @ before.T_world.rotation().inverse()
+    is_same = jnp.all(before.T_world.wxyz_xyz == after.T_world.wxyz_xyz, axis=-1)
+    has_moved = before.valid & ~(is_same & (before.log_scale == after.log_scale))
+    scale = jnp.exp(after.log_scale - before.log_scale)
+    return _Motions(turn, scale, before.T_world.translation(), after.T_world.translation(), has_moved)
+
+
+@full_precision
+def deform(
+    map: GaussianMap, before: Nodes, after: Nodes, min_std: Float[Array, ""], config: DeformConfig
+) -> GaussianMap:
+    """Move every Gaussian as the cameras moved by which it and its neighbours were made.
+
+    A node's motion is x' = s ΔR (x - t) + t' with ΔR = R' Rᵀ and s = e^{σ' - σ}: the scale acts in the old camera's
+    frame, so that what the camera saw at a pixel stays at it. A Gaussian takes the mean over its neighbours' births of
+    where it would go, μ' = mean x'_k(μ), and of how it would turn and grow: Σ' = s² ΔR (Σ - min_std² I) ΔRᵀ +
+    min_std² I, n' = ΔR n. Where all of them moved alike that is their motion.
+
+    Args:
+        map: world frame; `birth` is the row of a node.
+        before: the nodes that the map conforms to.
+        after: the same, where they are to be.
+        min_std: m; the floor of the covariances, which is no length of the scene.
+        config: which neighbours count.
+
+    Returns:
+        The map; a Gaussian of whose neighbours no node moved is the same bit for bit.
+    """
+    gaussians = map.gaussians
+    births, counts = _births(map, config)
+    motions = take_rows(_motions(before, after), births)
+    share = counts / jnp.sum(counts, axis=-1, keepdims=True)
+    means = jnp.einsum("nk,nki->ni", share, motions(gaussians.means[:, None]))
+    scale = jnp.exp(jnp.sum(share * jnp.log(motions.scale), axis=-1))
+    turn = _mean_turn(motions.turn, share).as_matrix()
+    floor = min_std**2 * jnp.eye(3)
+    shapes = jnp.einsum("nij,njk,nlk->nil", turn, gaussians.covs - floor, turn)
+    shapes = 0.5 * (shapes + shapes.mT)  # as equal as roundings were not
+    normals = jnp.einsum("nij,nj->ni", turn, gaussians.normals)
+    changed = means, scale[:, None, None] ** 2 * shapes + floor, normals
+    moved = eqx.tree_at(lambda g: (g.means, g.covs, g.normals), gaussians, changed)
+    has_moved = jnp.any(motions.has_moved & (counts > 0), axis=-1)
+    moved = where_rows(has_moved & gaussians.valid, moved, gaussians)
+    return eqx.tree_at(lambda m: m.gaussians, map, moved)
+
+
+def _births(map: GaussianMap, config: DeformConfig) -> tuple[Int[Array, "n k"], Float[Array, "n k"]]:
+    """Nodes by which a Gaussian and its neighbours were made, its own first, and 1 where one counts."""
+    gaussians, own = map.gaussians, map.birth[:, None]
+    num = min(config.num_neighbours, map.birth.shape[0])
+    if num == 1:
+        return own, jnp.ones(own.shape)
+    rows, exists = knn(gaussians.means, gaussians.means, gaussians.valid, num, gaussians.valid)
+    births = map.birth[rows]
+    counts = exists & (rows != jnp.arange(len(rows))[:, None]) & (jnp.abs(births - own) <= config.max_gap)
+    return jnp.concatenate([own, births], axis=1), jnp.pad(counts * 1.0, ((0, 0), (1, 0)), constant_values=1.0)
+
+
+def _mean_turn(turns: jaxlie.SO3, share: Float[Array, "n k"]) -> jaxlie.SO3:
+    """Weighted mean of rotations that are near the first: of quaternions on the side of its own, made a unit again."""
+    sides = jnp.sign(jnp.einsum("nki,ni->nk", turns.wxyz, turns.wxyz[:, 0]))
+    mean = jnp.einsum("nk,nki->ni", share * sides, turns.wxyz)
+    return jaxlie.SO3(mean / jnp.linalg.norm(mean, axis=-1, keepdims=True))
+
+
+@full_precision
+def deform_view(view: Observation, before: Nodes, after: Nodes, row: Int[Array, ""]) -> Observation:
+    """A frame that was placed by node `row`, world frame, where that node is now; see `deform`."""
+    motions = _motions(before, after)
+    old, new = (pose_row(nodes.T_world, row) for nodes in (before, after))
+    moved = transform(new, transform(old.inverse(), view, jnp.ones(())), motions.scale[row])
+    return where_rows(motions.has_moved[row] & view.valid, moved, view)

@@ -1,0 +1,209 @@
+"""Pose-graph optimization, poses and scales: Levenberg–Marquardt on the host, in float64."""
+
+import math
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+
+from emgs_jax.ops.pytree import static, static_choice, traced
+from emgs_jax.pose_graph.chordal import chordal_initialization
+from emgs_jax.pose_graph.factors import DEGREES, LOOP, ODOMETRY, Nodes, PoseGraph
+from emgs_jax.pose_graph.problem import Linear, Problem, linear, moved, num_rows, problem_of
+from emgs_jax.pose_graph.sparse import damped_step
+
+# χ² of a measured row that nothing is to be gained from: errors of a thousandth of their standard deviation.
+NOTHING_TO_GAIN = 1e-6
+MAX_DAMPING = 1e8
+
+
+class PoseGraphConfig(eqx.Module):
+    """Settings of the pose-graph optimization: scale prior, robust kernel, start, convergence and acceptance.
+
+    Args:
+        scale_std: s_p: standard deviation of every σ about 0; 0: scales stay as they are (SE(3)); inf: no prior.
+        kernel: φ of dynamic covariance scaling on loop factors, in χ²; inf: quadratic.
+        start: `current` poses, or `chordal` (errors spread over the paths, where that costs less; and, where a loop
+            would be rejected, the solution with all loops at full weight).
+        max_iterations: of Levenberg and Marquardt; 0: nothing moves.
+        damping: λ at the start, times the Hessian's diagonal.
+        min_decrease: relative, of the cost; less has converged.
+        max_misfit: χ² per measured row of the odometry: a result that bends it more, and more than it was, is refused.
+    """
+
+    scale_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    kernel: Float[Array, "*b"] = traced(low=1e-6, high=math.inf)
+    start: str = static_choice("current", "chordal")
+    max_iterations: int = static(low=0, high=10000)
+    damping: Float[Array, "*b"] = traced(low=0)
+    min_decrease: Float[Array, "*b"] = traced(low=0, high=1)
+    max_misfit: Float[Array, "*b"] = traced(low=0, high=math.inf)
+
+
+@dataclass(frozen=True)
+class PoseGraphInfo:
+    """Result of a pose-graph optimization, reported also where it is refused and the nodes stay.
+
+    Args:
+        reason: why the nodes stay where they were; empty: they moved, or there is nothing to gain.
+        cost_before: Σρ over factors, and half the squared scale prior.
+        cost: likewise, at the end.
+        num_iterations: tried steps.
+        converged: the last step gained next to nothing.
+        factor_chi2: (e,) χ² of every factor at the end, unweighted; 0 where it is not in use.
+        factor_weights: (e,) share of that χ² that counts: s² of dynamic covariance scaling, 1 for odometry.
+        odometry_chi2: sum over the odometry.
+        loop_chi2: weighted sum over loops.
+        num_odometry_rows: measured rows of the odometry.
+        num_loop_rows: likewise of loops.
+        dof: measured rows, those of the scale prior included, minus free unknowns.
+        num_disconnected: nodes without a path to the gauge, which stay where they are.
+    """
+
+    reason: str
+    cost_before: float
+    cost: float
+    num_iterations: int
+    converged: bool
+    factor_chi2: np.ndarray
+    factor_weights: np.ndarray
+    odometry_chi2: float
+    loop_chi2: float
+    num_odometry_rows: int
+    num_loop_rows: int
+    dof: int
+    num_disconnected: int
+
+
+def _minimize(problem: Problem, now: Linear, config: PoseGraphConfig) -> tuple[Linear, int, bool]:
+    """Levenberg and Marquardt: the best that was found, the number of tried steps, and whether it converged."""
+    damping, kernel = float(config.damping), float(config.kernel)
+    floor = NOTHING_TO_GAIN * num_rows(problem.graph.factors)
+    for iteration in range(config.max_iterations):
+        enough = float(config.min_decrease) * (now.cost + floor)
+        step = damped_step(now.equations, damping)
+        if step is not None and np.isfinite(step).all():
+            pull = damping * now.equations.hessian.diagonal()[:, None] * step - now.equations.gradient
+            promised = 0.5 * np.sum(step * pull)
+            trial = linear(problem, moved(now.nodes, step.reshape(-1, DEGREES)), kernel)
+            gain = now.cost - trial.cost
+            if gain > 0:  # not where it is NaN
+                now, damping = trial, 0.1 * damping
+            if promised <= enough or 0 < gain <= enough:
+                return now, iteration + 1, True
+            if gain > 0:
+                continue
+        damping *= 10.0
+        if damping > MAX_DAMPING:
+            return now, iteration + 1, False
+    return now, config.max_iterations, False
+
+
+def _info(
+    problem: Problem, before: float, end: Linear, tried: tuple[int, bool], num_edges: int, reason: str = ""
+) -> PoseGraphInfo:
+    edges, count = problem.graph.factors, int(problem.used.sum())
+    edge_chi2, edge_weights = np.zeros(num_edges), np.ones(num_edges)
+    edge_chi2[problem.used], edge_weights[problem.used] = end.chi2[:count], end.weights[:count]
+    is_loop = np.asarray(edges.kind) == LOOP
+    num_odometry_rows, num_loop_rows = num_rows(edges, ODOMETRY), num_rows(edges, LOOP)
+    num_prior = int(np.sum(problem.free[:, 6])) if problem.scale_information > 0 else 0
+    return PoseGraphInfo(
+        reason=reason,
+        cost_before=before,
+        cost=end.cost,
+        num_iterations=tried[0],
+        converged=tried[1],
+        factor_chi2=edge_chi2,
+        factor_weights=edge_weights,
+        odometry_chi2=float(np.sum(end.chi2[~is_loop])),
+        loop_chi2=float(np.sum((end.weights * end.chi2)[is_loop])),
+        num_odometry_rows=num_odometry_rows,
+        num_loop_rows=num_loop_rows,
+        dof=num_odometry_rows + num_loop_rows + num_prior - int(np.sum(end.equations.measured)),
+        num_disconnected=problem.num_disconnected,
+    )
+
+
+def _refused(graph: PoseGraph, reason: str) -> PoseGraphInfo:
+    """Build the result of a graph that cannot be solved."""
+    num_edges, nothing = graph.factors.a.shape[0], float("nan")
+    zeros = np.zeros(num_edges)
+    return PoseGraphInfo(reason, nothing, nothing, 0, False, zeros, np.ones(num_edges), 0.0, 0.0, 0, 0, 0, 0)
+
+
+def _start(problem: Problem, given: Linear, config: PoseGraphConfig) -> Linear:
+    """The given poses, or those with the errors spread, whichever cost less."""
+    nodes = chordal_initialization(problem.graph, problem.free) if config.start == "chordal" else None
+    if nodes is None:
+        return given
+    other = linear(problem, nodes, float(config.kernel))
+    return other if other.cost < given.cost else given
+
+
+def _solve(problem: Problem, given: Linear, config: PoseGraphConfig) -> tuple[Linear, int, bool]:
+    """The best of two searches, where a loop is left out by the first: the other begins where all loops count in full.
+
+    The cost of a loop is bounded, so what the first begins too far from pulls no more, and stays out for good.
+    """
+    found = _minimize(problem, _start(problem, given, config), config)
+    is_loop = np.asarray(problem.graph.factors.kind) == LOOP
+    if config.start == "current" or not np.any(found[0].weights[is_loop] < 1):
+        return found
+    full = eqx.tree_at(lambda c: c.kernel, config, np.inf)
+    begin = linear(problem, problem.graph.nodes, np.inf)
+    begin = _minimize(problem, _start(problem, begin, full), full)[0]
+    other = _minimize(problem, linear(problem, begin.nodes, float(config.kernel)), config)
+    return other if other[0].cost < found[0].cost else found
+
+
+def _rejection(problem: Problem, given: Linear, end: Linear, converged: bool, config: PoseGraphConfig) -> str:
+    """Return why a solution is rejected; empty where it is accepted."""
+    if end is given and not converged:
+        return "no step lowers the cost"
+    is_odometry = np.asarray(problem.graph.factors.kind) == ODOMETRY
+    allowed = float(config.max_misfit) * num_rows(problem.graph.factors, ODOMETRY)
+    bent = float(np.sum(end.chi2[is_odometry]))
+    if bent > max(allowed, float(np.sum(given.chi2[is_odometry]))):
+        return f"the loops contradict the odometry: their χ² would be {bent:.4g}, more than {allowed:.4g}"
+    return ""
+
+
+def _write_back(nodes: Nodes, problem: Problem, end: Nodes) -> Nodes:
+    """The nodes that may move, in the given precision; the others bit for bit."""
+    n = nodes.valid.shape[0]
+
+    def put(old: Array, new: Array, free: np.ndarray) -> Array:
+        return jnp.where(free.reshape(-1, *[1] * (old.ndim - 1)), jnp.asarray(new[:n], old.dtype), old)
+
+    poses = put(nodes.T_world.wxyz_xyz, end.T_world.wxyz_xyz, problem.free[:n, 0])
+    return Nodes(jaxlie.SE3(poses), put(nodes.log_scale, end.log_scale, problem.free[:n, 6]), nodes.valid)
+
+
+def optimize(graph: PoseGraph, config: PoseGraphConfig) -> tuple[Nodes, PoseGraphInfo]:
+    """Poses and scales of least Σρ(χ²) + Σ(σ/s_p)²/2; the first valid node keeps its own.
+
+    Nodes without a path of measurements to it stay where they are. What is computed is float64, whatever the graph is
+    stored in. Nothing is raised: where the graph cannot be solved or there is nothing to gain, the nodes that were
+    given come back, and `PoseGraphInfo.reason` says why (empty where there is nothing to gain).
+    """
+    num_edges = graph.factors.a.shape[0]
+    with jax.enable_x64(True):
+        problem = problem_of(graph, float(config.scale_std))
+        if isinstance(problem, str):
+            return graph.nodes, _refused(graph, problem)
+        given = linear(problem, problem.graph.nodes, float(config.kernel))
+        if not np.isfinite(given.cost):
+            return graph.nodes, _refused(graph, "the cost is not finite")
+        is_settled = given.cost <= NOTHING_TO_GAIN * num_rows(problem.graph.factors)
+        if is_settled or config.max_iterations == 0:
+            return graph.nodes, _info(problem, given.cost, given, (0, is_settled), num_edges)
+        end, num_iterations, converged = _solve(problem, given, config)
+        reason = _rejection(problem, given, end, converged, config)
+        info = _info(problem, given.cost, end, (num_iterations, converged), num_edges, reason)
+        keeps = bool(reason) or end is given
+        return graph.nodes if keeps else _write_back(graph.nodes, problem, end.nodes), info

@@ -1,0 +1,155 @@
+"""Estimate of a frame's pose and scale: prediction and correction of a Kalman filter from frame to frame.
+
+The error of a pose T and a scale s is T Exp(ξ) and s e^σ with (ξ, σ) ~ N(0, P), in the order translation (m), rotation
+(rad), logarithm of the scale. There are two P. One is relative to the map, into which a frame is fitted. The other is
+relative to the first frame, and includes the errors of the map: it is for the user, and no pose depends on it.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from emgs_jax.ops.precision import full_precision
+from emgs_jax.registration.icp import IcpInfo
+from emgs_jax.registration.pose_noise import Repeats, no_repeats, rescale_repeats
+
+DEGREES = 7
+
+
+class PoseEstimate(eqx.Module):
+    """Estimate from the last frame that the next step starts from, beside the pose itself.
+
+    Args:
+        covariance: P of its pose and scale, relative to the map.
+        world_covariance: P relative to the first frame.
+        depth_noise: how much its points differ from the map, as a fraction of their depth.
+        log_scale: mean logarithm of the scales of the tracked frames: the prior's own unit, in that of the map.
+        num_scales: number of these scales.
+        repeats: differences between repeated predictions of one pose.
+    """
+
+    covariance: Float[Array, "*b 7 7"]
+    world_covariance: Float[Array, "*b 7 7"]
+    depth_noise: Float[Array, "*b"]
+    log_scale: Float[Array, "*b"]
+    num_scales: Float[Array, "*b"]
+    repeats: Repeats
+
+
+def exact_estimate() -> PoseEstimate:
+    """Return the estimate of the frame that the map is made of: its pose is exact, and its scale is the unit."""
+    exact = jnp.zeros((DEGREES, DEGREES))
+    return PoseEstimate(exact, exact, jnp.zeros(()), jnp.zeros(()), jnp.ones(()), no_repeats())
+
+
+@full_precision
+def propagate_covariance(
+    covariance: Float[Array, "7 7"], T_previous_current: jaxlie.SE3, noise: Float[Array, "7"]
+) -> Float[Array, "7 7"]:
+    """P of the current frame: A P A' + Q, with A the adjoint of the motion's inverse, and Q = diag(noise²).
+
+    What the scale's error does to the length of the motion is left out: it is small against `noise`.
+    A motion that is not finite counts as none.
+    """
+    adjoint = T_previous_current.inverse().adjoint()
+    adjoint = jnp.where(jnp.all(jnp.isfinite(adjoint)), adjoint, jnp.eye(DEGREES - 1))
+    A = jnp.eye(DEGREES).at[:-1, :-1].set(adjoint)
+    return A @ covariance @ A.T + jnp.diag(noise**2)
+
+
+@full_precision
+def kalman_update(
+    covariance: Float[Array, "7 7"], difference: Float[Array, "7"], information: Float[Array, "7 7"]
+) -> tuple[Float[Array, "7"], Float[Array, "7 7"]]:
+    """Correct an estimate by a measurement: step (ξ, σ) of the mean, and P: (P⁻¹ + W)⁻¹ W d and (P⁻¹ + W)⁻¹.
+
+    Args:
+        covariance: P, which may be singular.
+        difference: d, the innovation: the measurement relative to the estimate.
+        information: W of the measurement; zero where nothing is measured.
+    """
+    posterior = jnp.linalg.solve(jnp.eye(DEGREES) + covariance @ information, covariance)
+    posterior = 0.5 * (posterior + posterior.T)
+    return posterior @ information @ difference, posterior
+
+
+def rescale_estimate(estimate: PoseEstimate, factor: Float[Array, ""]) -> PoseEstimate:
+    """Return the estimate after all lengths of the map are multiplied by `factor`."""
+    units = jnp.ones(DEGREES).at[:3].set(factor)
+    return eqx.tree_at(
+        lambda b: (b.covariance, b.world_covariance, b.log_scale, b.repeats),
+        estimate,
+        (
+            units[:, None] * estimate.covariance * units,
+            units[:, None] * estimate.world_covariance * units,
+            estimate.log_scale + jnp.log(factor),
+            rescale_repeats(estimate.repeats, factor),
+        ),
+    )
+
+
+def propagate(estimate: PoseEstimate, T_previous_current: jaxlie.SE3, noise: Float[Array, "7"]) -> PoseEstimate:
+    """Propagate the estimate to the current frame, before any measurement; see `propagate_covariance`."""
+    found = (
+        propagate_covariance(P, T_previous_current, noise) for P in (estimate.covariance, estimate.world_covariance)
+    )
+    return eqx.tree_at(lambda b: (b.covariance, b.world_covariance), estimate, tuple(found))
+
+
+def correct(
+    estimate: PoseEstimate,
+    difference: Float[Array, "7"],
+    information: Float[Array, "7 7"],
+    num_shared: Float[Array, ""],
+) -> tuple[Float[Array, "7"], PoseEstimate]:
+    """Correct the pose estimate by a measurement: return the step of the mean, and the estimate; see `kalman_update`.
+
+    The errors of a prior's own poses are alike in all frames whose windows share images: about the pose in the world
+    each of these `num_shared` frames has only that part of the information.
+    """
+    step, covariance = kalman_update(estimate.covariance, difference, information)
+    _, world = kalman_update(estimate.world_covariance, difference, information / num_shared)
+    return step, eqx.tree_at(lambda b: (b.covariance, b.world_covariance), estimate, (covariance, world))
+
+
+@full_precision
+def root_information(covariance: Float[Array, "7 7"]) -> Float[Array, "7 7"]:
+    """L⁻¹ of P = L L': |L⁻¹ x|² is the squared Mahalanobis distance of x. P must be positive definite."""
+    std = jnp.sqrt(jnp.diagonal(covariance))
+    correlation = covariance / std / std[:, None]
+    return jnp.linalg.inv(jnp.linalg.cholesky(correlation)) / std
+
+
+@full_precision
+def correct_by_points(
+    estimate: PoseEstimate,
+    found: IcpInfo,
+    depth_noise: Float[Array, ""],
+    scale: Float[Array, ""],
+    is_tracked: Bool[Array, ""],
+    num_alike: Float[Array, ""],
+) -> PoseEstimate:
+    """Correct the estimate by the points of a frame; it stays as it is where the frame is not tracked.
+
+    Args:
+        estimate: estimate at the frame's coarse pose.
+        found: result of ICP. Where the points fit worse than `depth_noise`, the coarse pose is less certain by the same
+            factor.
+        depth_noise: expected, as a fraction of the depth.
+        scale: of its prediction.
+        is_tracked: the fine pose was accepted.
+        num_alike: frames that see one part of the map, which is wrong for all of them in the same way: the information
+            of one frame's points about the scale, and about the pose in the world, is divided by it.
+    """
+    worth, nothing = jnp.maximum(found.misfit / depth_noise, 1.0) ** 2, jnp.zeros(DEGREES)
+    units = jnp.ones(DEGREES).at[-1].set(num_alike**-0.5)
+    _, covariance = kalman_update(worth * estimate.covariance, nothing, units[:, None] * found.information * units)
+    _, world = kalman_update(worth * estimate.world_covariance, nothing, found.information / num_alike)
+    num_scales = estimate.num_scales + 1.0
+    log_scale = estimate.log_scale + (jnp.log(scale) - estimate.log_scale) / num_scales
+    # What the prior said of its poses is said whether its points fit or not.
+    estimate = eqx.tree_at(lambda b: b.repeats, estimate, rescale_repeats(estimate.repeats, scale))
+    after = PoseEstimate(covariance, world, found.misfit, log_scale, num_scales, estimate.repeats)
+    return jax.tree.map(lambda new, old: jnp.where(is_tracked, new, old), after, estimate)

@@ -1,0 +1,223 @@
+"""Disconnected submaps of a run, whose relative poses are not known until the camera sees both.
+
+A prior that has lost the first view may continue in a world of its own. There a new map starts, and the one before
+becomes inactive. Where a frame fits an inactive map, the similarity between its two poses joins both submaps: the newer
+one moves, poses, scales and Gaussians. Submaps that are never joined are dropped at the end.
+"""
+
+from collections import Counter
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emgs_jax.loop_closure.relocalization import RelocalizedPose
+from emgs_jax.loop_closure.two_view_refinement import rescaled
+from emgs_jax.observation import Prediction
+from emgs_jax.pose_graph.factors import ODOMETRY
+from emgs_jax.registration.pose_estimate import rescale_estimate
+from emgs_jax.running.back_end import BackEnd
+from emgs_jax.running.capacity import add_map, advance, start
+from emgs_jax.running.convert import FirstWindow, to_se3
+from emgs_jax.running.deformation import deform_state, move_map
+from emgs_jax.running.factors import Factor
+from emgs_jax.running.record import UNJOINED, FrameRecord, MappingRun, row_of_first_node, to_matrix
+from emgs_jax.running.relocalization import (
+    anchor_motion_of,
+    as_step_prediction,
+    frame_data,
+    rejection,
+    relocalized_start,
+)
+from emgs_jax.running.window_input import PlacedStructure, WindowInput
+from emgs_jax.slam import SlamConfig, SlamState, StepInfo
+
+UNKNOWN = np.full((4, 4), np.nan)  # pose
+
+
+def step_prediction(run: MappingRun, window_input: WindowInput) -> Prediction:
+    """Return a step's prediction in the world of the map; without poses where they are not related to it."""
+    prediction = as_step_prediction(window_input.prediction)
+    if run.structure is None or not is_related(run, window_input):
+        return prediction
+    return in_structure(prediction, window_input, run.structure)
+
+
+def in_structure(prediction: Prediction, window_input: WindowInput, placed: PlacedStructure) -> Prediction:
+    """Transform a step's input from the prior's own world to that of the map."""
+    here = window_input.frames[0].index
+    rows = here - 1, here, here + int(prediction.has_newest)
+    T_world_views = placed.T_world_structure @ np.stack([window_input.T_anchor_views.get(row, UNKNOWN) for row in rows])
+    return replace(prediction, T_world_views=to_se3(T_world_views), T_world_anchor=to_se3(placed.T_world_anchor))
+
+
+def is_related(run: MappingRun, window_input: WindowInput) -> bool:
+    """Test whether the predicted poses are in a world whose pose in the map is known."""
+    return window_input.structure == (0 if run.structure is None else run.structure.number)
+
+
+def place_structure(window_input: WindowInput, pose: np.ndarray) -> PlacedStructure:
+    """Place the prior's own world by the pose of the current frame in the map; lengths are scaled about that frame."""
+    own = window_input.T_anchor_views.get(window_input.frames[0].index, UNKNOWN)
+    return PlacedStructure(window_input.structure, pose @ np.linalg.inv(own), pose)
+
+
+def start_submap(run: MappingRun, window_input: WindowInput) -> tuple[SlamState, SlamConfig] | None:
+    """Start a map of this frame alone, at the pose of the frame before; None where no submap starts.
+
+    Its unit is the prior's own: that of another map does not apply.
+    """
+    pose = window_input.T_anchor_views.get(window_input.frames[0].index)
+    is_new = (
+        run.back_end is not None and run.state is not None and not run.is_fixed and not is_related(run, window_input)
+    )
+    if not is_new or pose is None or not np.isfinite(pose).all():
+        return None
+    view = jax.tree.map(lambda leaf: leaf[None], as_step_prediction(window_input.prediction).current)
+    alone, config = start(FirstWindow(view, to_se3(run.records[-1].pose[None])), run.camera, run.config)
+    if not bool(alone.map.gaussians.valid.any()):
+        return None
+    time = run.state.time
+    map = replace(alone.map, birth=jnp.full_like(alone.map.birth, time))
+    return replace(alone, map=map, time=time + 1), config
+
+
+def enter_submap(run: MappingRun, window_input: WindowInput, before: SlamState) -> None:
+    """Switch to the submap that the last frame has started; the state `before` it becomes inactive."""
+    run.inactive = run.inactive | {run.back_end.submap_id: before}
+    run.back_end.submap_id = window_input.structure
+    run.structure, run.prior_motion = place_structure(window_input, run.records[-1].pose), None
+
+
+def match_submap(run: MappingRun, window_input: WindowInput, info: StepInfo) -> np.ndarray | None:
+    """Relocalize a tracked frame in an inactive submap; return the similarity (4, 4) between both worlds, or None.
+
+    The relocalized pose must pass the tests of a lost camera's, the fit to the map included.
+
+    Args:
+        run: before this frame.
+        window_input: this frame.
+        info: of its step, in its own submap.
+    """
+    if not run.inactive or not bool(info.localization.is_tracked):
+        return None
+    place, _ = run.back_end.relocalize(frame_data(window_input)[0], in_other_submap=True)
+    if place is None:
+        return None
+    other = run.inactive[run.back_end.submap_ids[place.keyframe]]
+    # This frame determines the prior's unit in that map.
+    estimate = replace(other.estimate, log_scale=jnp.asarray(place.log_scale, jnp.float32))
+    visiting = replace(run, state=replace(other, estimate=estimate))
+    begin, again = relocalized_start(visiting, step_prediction(run, window_input), place)
+    _, there, _ = advance(begin, again, run.camera, run.config)
+    if rejection(there, again, place, run.back_end.config.relocalization) is not None:
+        return None
+    return similarity_between(info, there)
+
+
+def similarity_between(here: StepInfo, there: StepInfo) -> np.ndarray:
+    """Return the similarity between a frame's two poses, lengths included: (4, 4) with e^σ R in the place of R."""
+    before, after = (to_matrix(np.asarray(info.T_world_camera.wxyz_xyz)) for info in (here, there))
+    before[:3, :3] *= float(here.localization.scale)
+    after[:3, :3] *= float(there.localization.scale)
+    return after @ np.linalg.inv(before)
+
+
+def moved_pose(similarity: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
+    """Transform a pose (4, 4) by a similarity."""
+    moved = similarity @ T_world_camera
+    moved[:3, :3] /= scale_of(similarity)
+    return moved
+
+
+def scale_of(similarity: np.ndarray) -> float:
+    """Return the factor by which a similarity multiplies lengths."""
+    return float(np.cbrt(np.linalg.det(similarity[:3, :3])))
+
+
+def join_submaps(run: MappingRun, window_input: WindowInput) -> None:
+    """Join the submap of the last frame, which is a node already, with the one in which it was relocalized.
+
+    The newer one moves, by the similarity of the record or its inverse.
+    """
+    end, similarity = run.back_end, run.records[-1].similarity
+    place, _ = end.relocalize(frame_data(window_input)[-1], in_other_submap=True)  # where `match_submap` has found it
+    here, there = end.submap_id, end.submap_ids[place.keyframe]
+    if here < there:
+        similarity = np.linalg.inv(similarity)
+    newer, older, before = max(here, there), min(here, there), end.nodes()
+    unit = np.exp(end.log_scales[place.keyframe])  # of the place's covariance: its map may be the one that moves
+    rows = [row for row, one in enumerate(end.submap_ids) if one == newer]
+    for row in rows:
+        end.poses[row] = moved_pose(similarity, end.poses[row])
+        end.online[row] = moved_pose(similarity, end.online[row])
+        end.log_scales[row] += float(np.log(scale_of(similarity)))
+    after, first = end.nodes(), row_of_first_node(run) - end.first_node
+    for row in rows:
+        run.records[first + row] = _moved_record(similarity, run.records[first + row])
+    end.submap_ids = [older if one == newer else one for one in end.submap_ids]
+    end.submap_id, end.has_one_unit = older, False
+    end.factors.append(join_factor(end, place, unit))
+    other = run.inactive[there]
+    run.inactive = {one: state for one, state in run.inactive.items() if one != there}
+    state = deform_state(run.state, before, after, end.min_std, end.config.deform)
+    moved = move_map(other.map, before, after, jnp.asarray(end.min_std, jnp.float32), end.config.deform)
+    map, run.config = add_map(state.map, moved, run.config)
+    run.state = replace(state, map=map)
+    if here == newer:
+        factor = jnp.asarray(scale_of(similarity), jnp.float32)
+        run.state = replace(run.state, estimate=rescale_estimate(state.estimate, factor))
+        run.prior_motion = anchor_motion_of(run.records[-1], step_prediction(run, window_input))
+
+
+def join_factor(end: BackEnd, place: RelocalizedPose, unit: float) -> Factor:
+    """Build the join factor of two submaps: the last node relative to the keyframe that relocalized it, as now.
+
+    `unit` is a length of that keyframe's inference in the map in which the pose was found.
+    """
+    a, b = place.keyframe, len(end.poses) - 1
+    scale = np.exp(end.log_scales[a])
+    units = np.array([unit] * 3 + [1.0] * 4)
+    information = np.linalg.inv(place.covariance / units[:, None] / units)
+    measured = rescaled(np.linalg.inv(end.poses[a]) @ end.poses[b], 1.0 / scale)
+    ratio = end.log_scales[b] - end.log_scales[a]
+    return Factor(a, b, measured, ratio, np.linalg.cholesky(information).T, ODOMETRY)
+
+
+def _moved_record(similarity: np.ndarray, record: FrameRecord) -> FrameRecord:
+    scale = scale_of(similarity)
+    units = np.array([scale] * 3 + [1.0] * 3)
+    poses = {name: getattr(record, name) for name in ("pose", "newest_pose")}
+    return replace(
+        record,
+        **{name: None if pose is None else moved_pose(similarity, pose) for name, pose in poses.items()},
+        covariance=None if record.covariance is None else units[:, None] * record.covariance * units,
+        scale=None if record.scale is None else scale * record.scale,
+    )
+
+
+def drop_unjoined_submaps(run: MappingRun) -> None:
+    """Keep the submap of most placed frames, or the saved map's, and drop those that were never joined with it.
+
+    The other frames are lost: the poses of their submaps are placeholders.
+    """
+    if not run.inactive:
+        return
+    end = run.back_end
+    counts = Counter(one for one, is_placed in zip(end.submap_ids, end.is_placed, strict=True) if is_placed)
+    kept = 0 if run.saved is not None else max(sorted(counts), key=lambda one: counts[one])
+    run.state, run.inactive = ({end.submap_id: run.state} | run.inactive)[kept], {}
+    is_kept = [one == kept for one in end.submap_ids]
+    end.is_placed = [placed and here for placed, here in zip(end.is_placed, is_kept, strict=True)]
+    end.submap_id = kept
+    for name in ("factors", "verified", "violating", "accepted"):
+        setattr(end, name, [one for one in getattr(end, name) if is_kept[one.a] and is_kept[one.b]])
+    known = end.database
+    rows = [row for row, one in enumerate(known.keyframes) if is_kept[one.frame]]
+    end.database = replace(known, keyframes=tuple(known.keyframes[row] for row in rows), vectors=known.vectors[rows])
+    first = row_of_first_node(run) - end.first_node
+    for row in range(end.first_node, len(is_kept)):
+        if not is_kept[row]:
+            lost = {"status": "lost", "reason": UNJOINED, "covariance": None}
+            run.records[first + row] = replace(run.records[first + row], **lost)

@@ -1,0 +1,133 @@
+"""What is known from frame to frame: against samples of the errors, and against the textbook's Kalman filter."""
+
+import equinox as eqx
+import jax
+import jaxlie
+import numpy as np
+import pytest
+from scene import device, on_host, pose, replace
+
+from emgs_jax.registration import pose_estimate
+from emgs_jax.registration.icp import IcpInfo
+from emgs_jax.registration.pose_estimate import exact_estimate
+
+measured, moved, next_belief, predict, rescaled, root_information, update = (
+    on_host(f)
+    for f in (
+        *(
+            pose_estimate.correct,
+            pose_estimate.propagate,
+            pose_estimate.correct_by_points,
+            pose_estimate.propagate_covariance,
+        ),
+        *(pose_estimate.rescale_estimate, pose_estimate.root_information, pose_estimate.kalman_update),
+    )
+)
+MOTION = pose((0.2, -0.1, 0.3), (0.3, 0.05, -0.4))
+NOISE, STEP = np.float32(np.linspace(0.005, 0.02, 7)), np.float32(np.linspace(-0.1, 0.1, 7))
+
+
+def covariance(seed: int = 0) -> np.ndarray:
+    """Positive definite, centimetres and hundredths."""
+    factor = np.random.default_rng(seed).normal(size=(7, 7)) * 0.01
+    return np.float32(factor @ factor.T + 1e-5 * np.eye(7))
+
+
+def both_known():
+    return replace(exact_estimate(), covariance=covariance(), world_covariance=covariance(2))
+
+
+def test_the_errors_of_the_next_pose_are_distributed_as_predicted():
+    """T Exp(ξ) Z Exp(noise) = T Z Exp(error) for 20,000 draws."""
+    P, rng = covariance(), np.random.default_rng(1)
+    before = rng.multivariate_normal(np.zeros(7), np.asarray(P, float), 20_000)
+    own = rng.normal(size=(20_000, 7)) * NOISE
+
+    @on_host
+    def errors_of(before, own):
+        moved = jaxlie.SE3.exp(before) @ MOTION @ jaxlie.SE3.exp(own)
+        return (MOTION.inverse() @ moved).log()
+
+    errors = np.column_stack([errors_of(np.float32(before[:, :6]), np.float32(own[:, :6])), before[:, 6] + own[:, 6]])
+    sampled, predicted = np.cov(errors.T), predict(P, MOTION, NOISE)
+    std = np.sqrt(np.diag(predicted))
+    np.testing.assert_allclose(sampled / np.outer(std, std), predicted / np.outer(std, std), atol=0.04)
+
+
+def test_a_motion_that_is_not_finite_only_adds_noise():
+    P, lost = covariance(), jaxlie.SE3(device(np.full(7, np.nan)))
+    np.testing.assert_allclose(predict(P, lost, np.full(7, 0.1, np.float32)), P + 0.01 * np.eye(7), rtol=1e-6)
+
+
+def test_in_another_unit_of_length_all_is_known_as_well_as_before():
+    """Of which a metre has three times as many: motion, noise and errors of the pose are three times as long."""
+    factor, units = np.float32(3.0), np.float32([3.0] * 3 + [1.0] * 4)
+    longer = jaxlie.SE3(MOTION.wxyz_xyz * np.float32([1.0] * 4 + [3.0] * 3))
+    found = moved(rescaled(both_known(), factor), longer, units * NOISE)
+    expected = rescaled(moved(both_known(), MOTION, NOISE), factor)
+    for name in ("covariance", "world_covariance"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-4, atol=1e-9)
+        np.testing.assert_array_equal(
+            getattr(rescaled(both_known(), factor), name)[3:, 3:], getattr(both_known(), name)[3:, 3:]
+        )
+    assert expected.log_scale == pytest.approx(np.log(3.0))
+
+
+def test_an_update_is_that_of_the_kalman_filter():
+    P, R = (covariance(seed).astype(float) for seed in (0, 1))
+    gain = P @ np.linalg.inv(P + R)
+    step, after = update(np.float32(P), STEP, np.float32(np.linalg.inv(R)))
+    np.testing.assert_allclose(step, gain @ STEP, atol=2e-3)
+    np.testing.assert_allclose(after, (np.eye(7) - gain) @ P, atol=1e-5)
+
+
+def test_what_is_certain_stays_and_what_is_not_measured_says_nothing():
+    ones, nothing = np.ones(7, np.float32), np.zeros((7, 7), np.float32)
+    step, after = update(nothing, ones, np.eye(7, dtype=np.float32))
+    assert not np.any(step) and not np.any(after)
+    step, after = update(covariance(), ones, nothing)
+    assert not np.any(step)
+    np.testing.assert_allclose(after, covariance(), rtol=1e-4, atol=1e-8)
+
+
+def test_both_covariances_take_motion_and_measurement_and_the_step_is_that_in_the_map():
+    W = np.linalg.inv(covariance(1))
+    step, after = measured(moved(both_known(), MOTION, NOISE), STEP, W, np.float32(4.0))
+    expected_step, expected = update(predict(covariance(), MOTION, NOISE), STEP, W)
+    np.testing.assert_allclose(step, expected_step, rtol=1e-5)
+    np.testing.assert_allclose(after.covariance, expected, rtol=1e-5)
+    _, expected = update(predict(covariance(2), MOTION, NOISE), STEP, W / 4.0)  # four frames err alike in the world
+    np.testing.assert_allclose(after.world_covariance, expected, rtol=1e-5)
+
+
+def test_the_root_measures_the_mahalanobis_distance():
+    P, x = covariance(), np.linspace(-0.1, 0.2, 7)
+    expected = x @ np.linalg.solve(P.astype(float), x)
+    assert np.sum((root_information(P) @ x) ** 2) == pytest.approx(expected, rel=1e-2)
+
+
+def test_a_frame_that_is_tracked_is_known_as_its_points_say_and_another_as_before():
+    twice = jaxlie.SE3(device(np.tile(MOTION.wxyz_xyz, (2, 1))))
+    before = jax.device_get(eqx.tree_at(lambda b: b.repeats.predicted, both_known(), twice))
+    zero, one, information = device(0.0), device(np.int32(1)), 1e4 * np.eye(7)
+    numbers = zero, zero, device(0.04), device(np.zeros(8)), device(np.zeros(7)), device(information), zero, zero
+    found = IcpInfo(one, *numbers, one, device(True))
+    arguments = before, found, np.float32(0.02), np.float32(1.1)
+    after = next_belief(*arguments, np.array(True), np.float32(5.0))
+    # Twice the noise is four times P, and five frames whose points err alike say of the scale what one of them does.
+    nothing, said = np.zeros(7, np.float32), np.float32(np.diag([1e4] * 6 + [2e3]))
+    _, expected = update(4.0 * covariance(), nothing, said)
+    np.testing.assert_allclose(after.covariance, expected, rtol=1e-5)
+    # And so of the place in the world.
+    _, expected = update(4.0 * covariance(2), nothing, np.float32(information / 5.0))
+    np.testing.assert_allclose(after.world_covariance, expected, rtol=1e-5)
+    np.testing.assert_allclose(after.log_scale, np.log(1.1) / 2, rtol=1e-5)
+    assert after.num_scales == 2 and after.depth_noise == pytest.approx(0.04)
+    same = next_belief(*arguments, np.array(False), np.float32(5.0))
+    # What the prior said of the poses is said, whether its points fit or not: in the unit of its final scale.
+    for known in (after, same):
+        said = known.repeats.predicted.wxyz_xyz[:, 4:]
+        np.testing.assert_allclose(said, 1.1 * before.repeats.predicted.wxyz_xyz[:, 4:], rtol=1e-6)
+    same = eqx.tree_at(lambda b: b.repeats, same, before.repeats)
+    for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(before), strict=True):
+        np.testing.assert_array_equal(a, b)
