@@ -208,7 +208,16 @@ def record_start(run: MappingRun, window_input: WindowInput, spent: Seconds) -> 
         )
     share = {key: value / len(poses) for key, value in spent.items()}
     for row, pose in enumerate(poses):
-        _add(run, window_input, row, status="initialization", pose=to_matrix(pose), scale=1.0, num_gaussians=count, **share)
+        _add(
+            run,
+            window_input,
+            row,
+            status="initialization",
+            pose=to_matrix(pose),
+            scale=1.0,
+            num_gaussians=count,
+            **share,
+        )
 
 
 def record_new_submap(run: MappingRun, window_input: WindowInput, spent: Seconds) -> None:
