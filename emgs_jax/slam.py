@@ -181,7 +181,7 @@ class Fused(eqx.Module):
 
 
 class NewGaussians(eqx.Module):
-    """What a frame adds to the map: Gaussians of its points with their number of images, and halves of split ones."""
+    """Gaussians that a frame adds to the map: of its points, with their number of images, and halves of split ones."""
 
     gaussians: Gaussians
     weight: Float[Array, "g"]

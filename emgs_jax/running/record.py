@@ -197,7 +197,7 @@ def record_lost(run: MappingRun, window_input: WindowInput, location: str | None
     _add(run, window_input, 0, status="lost", reason=reason, location=location, pose=pose)
 
 
-def record_start(run: MappingRun, window_input: WindowInput, spent: Seconds) -> None:
+def record_start(run: MappingRun, window_input: WindowInput, seconds: Seconds) -> None:
     """Record the frames that the map was made from; raise ValueError where that map is empty."""
     poses = np.asarray(window_input.prediction.T_world_views.wxyz_xyz)
     count = int(np.asarray(run.map.gaussians.valid).sum())
@@ -206,27 +206,27 @@ def record_start(run: MappingRun, window_input: WindowInput, spent: Seconds) -> 
             f"the map is empty after {len(poses)} view(s) from {window_input.frames[0].name}: the prior has no valid "
             "point there; begin elsewhere (dataset.start=...) or use slam.initialization=merged"
         )
-    share = {key: value / len(poses) for key, value in spent.items()}
+    share = {key: value / len(poses) for key, value in seconds.items()}
     for row, pose in enumerate(poses):
         _add(run, window_input, row, status="initialization", pose=to_matrix(pose), num_gaussians=count, **share)
 
 
-def record_new_submap(run: MappingRun, window_input: WindowInput, spent: Seconds) -> None:
+def record_new_submap(run: MappingRun, window_input: WindowInput, seconds: Seconds) -> None:
     """Record the first frame of a disconnected submap; its pose is that of the frame before, a placeholder."""
     count = int(np.asarray(run.map.gaussians.valid).sum())
     kept = {"status": "initialization", "pose": run.records[-1].pose, "new": count, "num_gaussians": count}
-    _add(run, window_input, 0, **kept, location=NEW_SUBMAP, **spent)
+    _add(run, window_input, 0, **kept, location=NEW_SUBMAP, **seconds)
 
 
 def record_step(
-    run: MappingRun, window_input: WindowInput, info: StepInfo, spent: Seconds, location=None, similarity=None
+    run: MappingRun, window_input: WindowInput, info: StepInfo, seconds: Seconds, location=None, similarity=None
 ) -> None:
     """Record a step: `info` on the host, the seconds that it took, and the outcome of relocalization."""
     kept = {"fused": 0, "updated": 0, "new": 0, "num_gaussians": run.saved.count} if run.is_fixed else {}
     if location == RESTARTED:
         count = int(np.asarray(run.map.gaussians.valid).sum())
         kept = {"status": "initialization", "new": count - int(info.num_gaussians), "num_gaussians": count}
-    _add(run, window_input, 0, **_step_fields(info) | kept, location=location, similarity=similarity, **spent)
+    _add(run, window_input, 0, **_step_fields(info) | kept, location=location, similarity=similarity, **seconds)
 
 
 def _add(run: MappingRun, window_input: WindowInput, row: int, **described: Any) -> None:

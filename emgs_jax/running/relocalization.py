@@ -84,11 +84,11 @@ def frame_data(window_input: WindowInput) -> list[FrameData]:
     ]
 
 
-def as_step_prediction(taken: FirstWindow | Prediction) -> Prediction:
+def as_step_prediction(opening: FirstWindow | Prediction) -> Prediction:
     """Convert the first view of a sequence to a step's input; return a step's input as it is."""
-    if isinstance(taken, Prediction):
-        return taken
-    view, T = jax.tree.map(lambda leaf: leaf[0], taken.views), pose_row(taken.T_world_views, 0)
+    if isinstance(opening, Prediction):
+        return opening
+    view, T = jax.tree.map(lambda leaf: leaf[0], opening.views), pose_row(opening.T_world_views, 0)
     return Prediction(
         current=view,
         previous=view,
