@@ -37,9 +37,9 @@ class SavedMap:
 
     Args:
         map: of an earlier run.
-        back_end: what was measured then; its `first` node is the next.
+        back_end: of that run; its `first_node` is that of the next one.
         depth_noise: how much a frame differed from the map, as a fraction of its depth.
-        is_fixed: frames are only located in it; it stays as it is.
+        is_fixed: True in localization mode: the map stays as it is.
         checksum: of its files.
     """
 
@@ -51,7 +51,7 @@ class SavedMap:
 
     @property
     def count(self) -> int:
-        """Of its Gaussians."""
+        """Number of its Gaussians."""
         return int(np.asarray(self.map.gaussians.valid).sum())
 
 
