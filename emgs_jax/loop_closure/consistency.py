@@ -89,7 +89,7 @@ def spatially_consistent(
 
 def pairs_within(frames: Int[np.ndarray, " n"], max_gap: int) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
     """Positions in `frames` of all pairs that lie within a gap of each other, in both orders, each with itself, too."""
-    order = np.argsort(frames, kind="stable")
+    order = np.argsort(frames)
     ordered = frames[order]
     begin, end = (
         np.searchsorted(ordered, ordered + gap, side) for gap, side in ((-max_gap, "left"), (max_gap, "right"))

@@ -32,12 +32,12 @@ OURS = PATHS["poses"].paper
 
 
 def rgb(color: str) -> np.ndarray:
-    """RGB in [0, 1] (3,) of a colour "#rrggbb"."""
+    """Convert a colour "#rrggbb" to RGB in [0, 1] (3,)."""
     return np.frombuffer(bytes.fromhex(color[1:]), np.uint8) / 255.0
 
 
 def class_colors(count: int) -> np.ndarray:
-    """RGB in [0, 1] (count, 3): hues a golden section apart, alternately dark and light."""
+    """Return RGB in [0, 1] (count, 3): hues a golden section apart, alternately dark and light."""
     number = np.arange(count)[:, None]
     light = number % 2
     saturation, value = 0.8 - 0.3 * light, 0.65 + 0.3 * light
@@ -46,5 +46,5 @@ def class_colors(count: int) -> np.ndarray:
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:
-    """Values in [0, 1] as uint8; what is outside is clipped, nan becomes 0."""
+    """Convert values in [0, 1] to uint8; what is outside is clipped, nan becomes 0."""
     return np.rint(255 * np.nan_to_num(values).clip(0.0, 1.0)).astype(np.uint8)

@@ -104,14 +104,14 @@ def transposed(table: Table) -> Table:
 
 
 def cell(mean: float | None, spread: float | None, factor: float, digits: int, sign: str = "") -> str:
-    """Mean ± spread as text; a dash where there is no mean, NaN included. `sign="+"` writes it of positive ones too."""
+    """Write mean ± spread; a dash where there is no mean, NaN included. `sign="+"` writes it of positive ones too."""
     if mean is None or mean != mean:
         return DASH
     return f"{factor * mean:{sign}.{digits}f}" + ("" if spread is None else f" ± {factor * spread:.{digits}f}")
 
 
 def cell_text(content: str | Cell) -> str:
-    """The text of a cell, without its kind."""
+    """Return the text of a cell, without its kind."""
     return content.text if isinstance(content, Cell) else content
 
 

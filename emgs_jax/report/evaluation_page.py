@@ -86,7 +86,7 @@ def run_facts(metrics: Mapping[str, Any]) -> str:
 
 
 def _runs(out: Path, jobs: Sequence[JobLine]) -> Table:
-    """A line for each run: picture, name, where it lies, what it came to or why not."""
+    """Write a line for each run: picture, name, where it lies, what it came to or why not."""
     lines = []
     for job, content in zip(jobs, thumbnails([job.folder / "overview.png" for job in jobs]), strict=True):
         missing = Cell(f"not finished: {job.missing}", "text bad")
@@ -98,7 +98,7 @@ def _runs(out: Path, jobs: Sequence[JobLine]) -> Table:
 
 
 def _errors(rows: Sequence[Row]) -> Table:
-    """Ours, the raw prior and baselines one below the other; the best of what can be compared is marked."""
+    """Lay out ours, the raw prior and baselines, one below the other; the best of what can be compared is marked."""
     lines = []
     for row in rows:
         label = "simulated" if row.is_simulated else "measured"

@@ -88,7 +88,7 @@ def find_factor(run: RecordedRun, config: ExportConfig) -> float | None:
 
 
 def _colmap(run: RecordedRun, folder: Path, dataset: ReadableFrames, max_points: int) -> None:
-    """A project folder: images/ and sparse/0/."""
+    """Write a project folder: images/ and sparse/0/."""
     with new_folder(folder) as new:
         names = _write_images(new / "images", run, dataset)
         model = new / "sparse" / "0"
@@ -97,7 +97,7 @@ def _colmap(run: RecordedRun, folder: Path, dataset: ReadableFrames, max_points:
 
 
 def _nerfstudio(run: RecordedRun, folder: Path, dataset: ReadableFrames, max_points: int) -> None:
-    """images/, points.ply and transforms.json."""
+    """Write images/, points.ply and transforms.json."""
     with new_folder(folder) as new:
         names = _write_images(new / "images", run, dataset)
         points, colors = _cloud(run, max_points)
@@ -108,7 +108,7 @@ def _nerfstudio(run: RecordedRun, folder: Path, dataset: ReadableFrames, max_poi
 
 
 def _frustums(run: RecordedRun, path: Path) -> None:
-    """A pyramid for every frame in the colour of its status; the path is not drawn where the camera was lost."""
+    """Write a pyramid for every frame in the colour of its status; the path is cut where the camera was lost."""
     colors = np.array([rgb(STATUS_COLORS.get(frame["status"], OURS)) for frame in run.frames])
     is_joined = run.is_placed[1:] & run.is_placed[:-1]
     save_frustums(path, run.camera, run.poses, colors, is_joined, rgb(OURS))
@@ -129,7 +129,7 @@ def _write_images(folder: Path, run: RecordedRun, dataset: ReadableFrames) -> li
 
 
 def _cloud(run: RecordedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (p, 3) and colours (p, 3), uint8, of the dense cloud, at most so many; the same ones every time."""
+    """Draw at most so many points (p, 3) with colours (p, 3), uint8, of the dense cloud; the same ones every time."""
     columns = read_vertices(run.folder / POINTS_FILE)
     count = len(columns["x"])
     rows = np.sort(np.random.default_rng(0).permutation(count)[:max_points])
@@ -140,7 +140,7 @@ def _cloud(run: RecordedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def factor_of(run: RecordedRun, length: Sequence[float]) -> float:
-    """The factor that makes the distance between two cameras as long as it is known to be.
+    """Find the factor that makes the distance between two cameras as long as it is known to be.
 
     Args:
         run: whose poses.
@@ -183,7 +183,7 @@ def write_scaled(run: RecordedRun, folder: Path, factor: float) -> RecordedRun:
 
 
 def scaled_map(map: GaussianMap, factor: float) -> GaussianMap:
-    """Means and covariances of the valid rows in another unit; free rows stay neutral."""
+    """Scale means and covariances of the valid rows; free rows stay neutral."""
     gaussians = map.gaussians
     means = np.asarray(gaussians.means) * np.float32(factor)
     is_valid = np.asarray(gaussians.valid)[:, None, None]

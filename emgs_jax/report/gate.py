@@ -61,26 +61,19 @@ def write_gate(path: str | os.PathLike, rows: Sequence[Row], tolerances: Mapping
     baseline = {}
     for row in rows:
         if row.kind == "ours" and row.seeds:
-            metrics = {
-                key: {"value": row.values[key], **rule}
-                for key, rule in tolerances.items()
-                if row.values.get(key) is not None
-            }
+            known = {key: rule for key, rule in tolerances.items() if row.values.get(key) is not None}
+            metrics = {key: {"value": row.values[key], **rule} for key, rule in known.items()}
             baseline[_name(row)] = {"protocol": row.protocol, "seeds": list(row.seeds), "metrics": metrics}
     if not baseline:
         raise ValueError(f"{path} is not written: there is no result of ours to take a baseline from")
-    head = list(itertools.takewhile(lambda line: line.startswith("#"), _lines(Path(path))))
+    before = Path(path).read_text(encoding="utf-8").splitlines(keepends=True) if Path(path).is_file() else []
     with atomic_write(path, "w") as handle:
-        handle.writelines(head)
+        handle.writelines(itertools.takewhile(lambda line: line.startswith("#"), before))
         yaml.safe_dump({"format": GATE_FORMAT, "baseline": baseline}, handle, sort_keys=False)
 
 
-def _lines(path: Path) -> list[str]:
-    return path.read_text(encoding="utf-8").splitlines(keepends=True) if path.is_file() else []
-
-
 def read_gate(path: str | os.PathLike) -> dict[str, Any]:
-    """The baseline by name of its row, from YAML or JSON; ValueError where it cannot be compared with."""
+    """Read a baseline by name of its row, from YAML or JSON; raises ValueError where it cannot be compared with."""
     remedy = "write one with python -m experiments.evaluate … write_gate=FILE"
     if not Path(path).is_file():
         raise ValueError(f"gate={path} does not exist: {remedy}")
@@ -100,7 +93,7 @@ def read_gate(path: str | os.PathLike) -> dict[str, Any]:
 
 
 def regressions(baseline: Mapping[str, Any], rows: Sequence[Row]) -> list[str]:
-    """One line for each metric that is worse than the baseline allows, or that is missing."""
+    """Name each metric that is worse than the baseline allows, or that is missing, in a line."""
     found = {(_name(row), row.protocol): row for row in rows if row.kind == "ours"}
     lines = []
     for name, entry in baseline.items():

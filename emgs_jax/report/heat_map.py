@@ -34,7 +34,7 @@ def draw(
 
 
 def means(rows: Sequence[Mapping[str, Any]], column: Column, down: Axis, across: Axis) -> np.ndarray:
-    """Means of a metric in its column's unit, (values down, values across); nan where there is none."""
+    """Average a metric in its column's unit, (values down, values across); nan where there is none."""
     cells: dict[tuple[str, str], list[float]] = {}
     for row in rows:
         if row.get(column.key) is not None:

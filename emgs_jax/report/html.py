@@ -123,7 +123,7 @@ def link(page_folder: Path, path: Path, words: str) -> Markup:
 
 
 def thumbnails(paths: Sequence[Path], widths: Sequence[int] = _WIDTHS) -> list[str]:
-    """JPEGs in base64 of pictures, "" where there is none: as large as all of them fit, the smallest if none do."""
+    """Encode pictures as JPEG in base64, as large as all of them fit; "" where there is none, or no room for it."""
     images: list[Image.Image | None] = []
     for path in paths:
         try:

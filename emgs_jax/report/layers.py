@@ -131,7 +131,7 @@ def feature_layer(map: GaussianMap) -> dict[str, np.ndarray]:
 
 
 def thinned(layers: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
-    """The `count` Gaussians that most frames agree on, in their order; all of them where there are no more."""
+    """Keep the `count` Gaussians that most frames agree on, in their order; all of them where there are no more."""
     order = np.argsort(-layers["updates"].astype(np.int64), kind="stable")[:count]
     keep = np.sort(order)
     return {name: values[keep] for name, values in layers.items()}
@@ -140,7 +140,7 @@ def thinned(layers: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarra
 def fitted(
     layers: Mapping[str, np.ndarray], paths: Mapping[str, np.ndarray], limit: int
 ) -> tuple[list[dict[str, Any]], str, str]:
-    """As `packed`, at most `limit` characters: with fewer Gaussians where all of them are too many; the last says so.
+    """Pack at most `limit` characters, with fewer Gaussians where all of them are too many; the last item says so.
 
     The paths of some 15,000 frames are too many by themselves: then there is no Gaussian.
     """
@@ -154,7 +154,7 @@ def fitted(
 
 
 def packed(arrays: Mapping[str, np.ndarray]) -> tuple[list[dict[str, Any]], str]:
-    """Arrays as a list of what they are, and their bytes: column by column, little-endian, deflated, in base64.
+    """Describe arrays, and pack their bytes: column by column, little-endian, deflated, in base64.
 
     Columns of one kind, and the first bytes of all numbers before their second ones, deflate to two thirds.
     """

@@ -76,7 +76,7 @@ class LiveView:
             self._is_idle()
 
     def wait(self) -> None:
-        """Until nothing is being drawn."""
+        """Wait until nothing is being drawn."""
         if self._drawing is not None:
             self._drawing.exception()
 
@@ -126,9 +126,6 @@ def live_view(
         render: how the map is drawn.
         prior: whose classes can be looked for.
         kept: index in the data set of each frame in use.
-
-    Raises:
-        ValueError: the port is taken, or viser is not installed.
     """
     if config is None:
         yield None

@@ -148,8 +148,8 @@ def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
     if poses is None:
         return {}
     rendered = Rendered(scorer.dataset, poses, scorer.evaluation, has_classes=raw.classes is not None)
-    for row in range(len(raw.depths)):
-        rendered.add(row, raw.depths[row], None, _own_classes(raw, row, scorer))
+    for row in range(len(raw.points)):
+        rendered.add(row, raw.points[row][..., 2], None, _own_classes(raw, row, scorer))
     with ThreadPoolExecutor(1, "classes of the raw prior") as thread:
         of_labels = thread.submit(_score_labels, raw.labels, poses, scorer)
         metrics = trajectory_metrics(*poses) | score_cloud(raw.cloud, poses, scorer) | rendered.metrics()
@@ -181,7 +181,7 @@ def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer
     is_known = [record.status != "lost" for record in run.records]
     metrics: Metrics = {}
     for fusions, poses, rows, kind in (
-        (baselines.raw, run.raw_poses, [raw.depths[row].any() for row in range(len(raw.depths))], "raw"),
+        (baselines.raw, run.raw_poses, [raw.points[row].any() for row in range(len(raw.points))], "raw"),
         (baselines.ours, np.stack(baselines.poses), is_known, "ours"),
     ):
         compared = with_truth(run, poses)
@@ -218,7 +218,7 @@ def score_settings(
         if all(pose is None for pose in run.true_poses):
             return counts
         labelled = labelled_map(run, scorer.prior)
-        dense = dense_map(run, scorer.dataset, config, scorer.evaluation, labelled, 0, raw.depths)
+        dense = dense_map(run, scorer.dataset, config, scorer.evaluation, labelled, 0, raw.points)
         labels = None if labelled is None else labelled.centers
         return score_map(run, dense.cloud, center_cloud(run), labels, scorer) | dense.rendering | counts
 

@@ -79,7 +79,7 @@ def draw_overview(
 
 
 def view_from_above(poses: np.ndarray) -> np.ndarray:
-    """World → picture rotation (3, 3) with rows right, forward, up; up is the cameras' mean -y (OpenCV axes)."""
+    """Return world → picture (3, 3) with rows right, forward, up; up is the cameras' mean -y (OpenCV axes)."""
     up = -poses[:, :3, 1].mean(0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else -poses[0, :3, 1]
     centers = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
@@ -94,7 +94,7 @@ def view_from_above(poses: np.ndarray) -> np.ndarray:
 
 
 def below_ceiling(heights: np.ndarray, camera_heights: np.ndarray) -> np.ndarray:
-    """Mask of what may be seen from above: nothing higher than the camera, unless that would hide most of the map."""
+    """Mask what may be seen from above: nothing higher than the camera, unless that would hide most of the map."""
     visible = heights <= camera_heights.max() + 0.1
     return visible if visible.mean() > 0.2 else np.ones_like(visible)
 
@@ -129,7 +129,7 @@ def fill_holes(image: np.ndarray) -> np.ndarray:
 def seen_from_above(
     points: np.ndarray, colors: np.ndarray, camera_heights: np.ndarray, cells: tuple[int, int] = (100, 700)
 ) -> tuple[np.ndarray, tuple[float, ...]]:
-    """The picture of finite points, at least one (x, y right and up, z height), and its extent, as `paint_from_above`.
+    """Paint finite points, at least one (x, y right and up, z height); returns as `paint_from_above` does.
 
     What is above the cameras is left out, as are far points. The longer side has as many `cells` as the points fill.
     """
@@ -145,7 +145,7 @@ def seen_from_above(
 
 
 def thumbnail(points: np.ndarray, colors: np.ndarray, poses: np.ndarray, width: int = 240) -> Image.Image:
-    """A small picture of a map from above with its path.
+    """Draw a small picture of a map from above with its path.
 
     Args:
         points: (n, 3), in the frame of the poses; rows that are not finite are left out.
@@ -224,7 +224,7 @@ def _draw_features(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
 
 
 def _draw_path(axes: Axes, path: np.ndarray, color: str, label: str, width: float) -> None:
-    """A line with a gap where the path (n, 3) is not known, a disc where it begins and a square where it ends."""
+    """Draw a line, broken where the path (n, 3) is unknown, with a disc where it begins and a square where it ends."""
     outline = [withStroke(linewidth=width + 1.6, foreground="white")]
     axes.plot(path[:, 0], path[:, 1], color=color, linewidth=width, label=label, path_effects=outline)
     known = path[np.isfinite(path).all(1)]
@@ -267,7 +267,7 @@ def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _draw_labels(column: np.ndarray, frames: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> None:
-    """The classes of some frames, and a legend of those that are seen."""
+    """Draw the classes of some frames, and a legend of those that are seen."""
     colors = class_colors(len(classes))
     for axes, frame in zip(column, frames, strict=True):
         labels = np.asarray(frame["labels"])

@@ -56,7 +56,7 @@ def _for_shader(config: RenderConfig) -> dict[str, float]:
 
 
 def _path_arrays(run: RecordedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
-    """The upper three rows of poses (n, 12), float32, in the frame of the map; only what is known."""
+    """Collect the upper three rows of poses (n, 12), float32, in the frame of the map; only what is known."""
     found = {"poses": run.poses, "online": run.online, "truth": paths.truth, "raw": paths.raw}
     return {
         name: poses[:, :3].reshape(-1, 12).astype(np.float32)
@@ -133,7 +133,7 @@ def _page(
 
 
 def _overview(run: RecordedRun) -> Markup:
-    """The picture of the run for who reads without a program."""
+    """Show the picture of the run to who reads without a program."""
     path = run.folder / "overview.png"
     if not path.is_file():
         return Markup()

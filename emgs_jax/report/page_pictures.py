@@ -74,7 +74,7 @@ def draw_views(run: RecordedRun, rows: Sequence[int], config: RenderConfig, data
 def _draw_all(
     gaussians: Gaussians, poses: np.ndarray, rows: Sequence[int], camera: Camera, config: RenderConfig
 ) -> Iterator[tuple[int, tuple[np.ndarray, np.ndarray]]]:
-    """Colour (h, w, 3) and depth (h, w) of rows; the next is being drawn while one is fetched."""
+    """Yield colour (h, w, 3) and depth (h, w) of rows; the next is being drawn while one is fetched."""
     pending = None
     for row in rows:
         drawing = row, _drawn(gaussians, to_se3(poses[row]), camera, config)
@@ -97,7 +97,7 @@ def _seen(dataset: Dataset | None, row: int) -> str:
 
 
 def _painted(depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Depth in colours, uint8 (h, w, 3); grey where there is none."""
+    """Colour depth, uint8 (h, w, 3); grey where there is none."""
     share = (depth - near) / max(far - near, 1e-9)
     colors = to_bytes(matplotlib.colormaps["turbo"](share)[..., :3])
     return np.where((depth > 0)[..., None], colors, np.uint8(_NO_DEPTH))

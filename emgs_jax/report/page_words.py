@@ -5,19 +5,8 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from emgs_jax.report import provenance
-from emgs_jax.report.columns import (
-    BY_PATH,
-    MAIN,
-    PLACED,
-    RENDERED,
-    Column,
-    Line,
-    Table,
-    known,
-    metric_table,
-    transposed,
-)
+from emgs_jax.report import columns, provenance
+from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Line, Table
 from emgs_jax.report.html import Head, commit_words
 from emgs_jax.report.provenance import RAW_PRIOR
 from emgs_jax.report.recorded_run import POLISH, RecordedRun
@@ -25,7 +14,7 @@ from emgs_jax.report.repeat import Repeated
 
 MANY_LOST = 0.1  # share of the frames
 MAX_LOOPS = 500  # that are named
-_SE3 = Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True)
+_SE3 = columns.Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True)
 _COLUMNS = (MAIN[0]._replace(title="ATE Sim(3) [cm]"), _SE3, *PLACED[:1], *PLACED[3:4], *BY_PATH, *RENDERED)
 FILES = {
     "report.html": "this page; any browser of 2023 or later",
@@ -76,14 +65,14 @@ OUTCOMES = {
 
 
 def loop_why(loop: dict[str, Any]) -> str:
-    """Outcome and reason."""
+    """Say the outcome of a loop candidate, and its reason."""
     gate = str(loop.get("gate", ""))
     why = f"refused: {GATES.get(gate, gate)}" if loop["outcome"] == "refused" else OUTCOMES[loop["outcome"]]
     return f"{why}: {loop['reason']}" if loop.get("reason") else why
 
 
 def loop_words(run: RecordedRun, loop: dict[str, Any]) -> str:
-    """Frames, by their index in the data set as everywhere on the page, outcome and reason."""
+    """Name frames, by their index in the data set as everywhere on the page, outcome and reason."""
     frame, other = (run.frames[loop[name]]["index"] for name in ("frame", "other"))
     return f"frames {frame} and {other}: {loop_why(loop)}"
 
@@ -97,7 +86,7 @@ class Loops(NamedTuple):
 
 
 def verdict(run: RecordedRun) -> tuple[str, str]:
-    """`good`, `mixed`, `bad` or `unknown`, and one sentence. Without ground truth only the tracking is judged.
+    """Judge as `good`, `mixed`, `bad` or `unknown`, in one sentence; without ground truth by the tracking alone.
 
     Bad: more than a tenth of the frames is lost, or the path is worse than the raw prior's. Mixed: of the true depth
     fewer pixels are met than by the raw prior, or a tenth of the frames is degraded.
@@ -155,7 +144,7 @@ def errors(run: RecordedRun) -> Table | None:
     online = {key: metrics.get(key.replace("trajectory/", "trajectory_online/")) for key, *_ in _COLUMNS[:2]}
     if any(value is not None for value in online.values()):
         lines.insert(1, Line(["ours, as placed"], online))
-    return transposed(metric_table([""], known(_COLUMNS, lines), lines))
+    return columns.transposed(columns.metric_table([""], columns.known(_COLUMNS, lines), lines))
 
 
 def protocol_words(run: RecordedRun) -> str:
@@ -218,7 +207,7 @@ def _plain(value: Any) -> str:
 
 
 def frame_facts(line: Mapping[str, Any]) -> str:
-    """Numbers of a frame in one line."""
+    """Say the numbers of a frame in one line."""
     known = {
         "inliers": lambda v: f"{v:,} inliers",
         "residual": lambda v: f"residual {100 * v:.1f} % of the depth",

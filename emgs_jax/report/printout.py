@@ -43,7 +43,7 @@ def time_words(clock: Clock, num_frames: int) -> str:
 
 
 def last_words(metrics: Mapping[str, Any]) -> str:
-    """For the line that ends a run: how many frames are not in the map and from which on; empty where all are."""
+    """Say for a run's last line how many frames are not in the map and from which on; empty where all are."""
     count = metrics["frames/degraded"] + metrics["frames/lost"]
     if not count:
         return ""

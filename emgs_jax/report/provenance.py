@@ -69,7 +69,7 @@ def signature(block: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def git_revision(folder: Path) -> dict[str, Any] | None:
-    """Revision of the checkout whose top is `folder`, and whether tracked files differ from it; None elsewhere."""
+    """Return revision and changes of tracked files of the checkout whose top is `folder`; None elsewhere."""
     top = _git(folder, "rev-parse", "--show-toplevel")
     # An installed package may lie somewhere inside another project's checkout, which says nothing about this code.
     if top is None or Path(top).resolve() != folder.resolve():
@@ -80,7 +80,7 @@ def git_revision(folder: Path) -> dict[str, Any] | None:
 
 
 def prefixed(metrics: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """The same metrics under `prefix`, for example RAW_PRIOR."""
+    """Put metrics under a prefix, for example RAW_PRIOR."""
     return {prefix + key: value for key, value in metrics.items()}
 
 
@@ -102,7 +102,7 @@ def has_metric_truth(block: Mapping[str, Any]) -> bool:
 
 
 def lines_of(metrics: Mapping[str, Any], columns: Sequence[Column]) -> list[Line]:
-    """One line for each estimate of `ROWS` that has one of these metrics."""
+    """Return a line for each estimate of `ROWS` that has one of these metrics."""
     return [
         Line([name], {column.key: metrics.get(prefix + column.key) for column in columns}, rivals=None)
         for prefix, name in ROWS.items()
@@ -111,7 +111,7 @@ def lines_of(metrics: Mapping[str, Any], columns: Sequence[Column]) -> list[Line
 
 
 def prefix_of(key: str) -> str:
-    """The prefix in `ROWS` of a metric's key."""
+    """Return the prefix in `ROWS` of a metric's key."""
     return next((prefix for prefix in ROWS if prefix and key.startswith(prefix)), "")
 
 

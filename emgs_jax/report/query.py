@@ -147,7 +147,7 @@ def _described(instance: Instance) -> dict[str, Any]:
 
 
 def heat(answer: Answer, word: int) -> np.ndarray:
-    """Relevance of every Gaussian for a word in [0, 1]: its lead, from the 1st to the 99th percentile; nan without."""
+    """Return every Gaussian's lead for a word, scaled from its 1st to its 99th percentile to [0, 1]; nan without."""
     leads = answer.relevance.leads[:, word].astype(np.float64)
     known = np.zeros(len(leads), bool)
     known[answer.rows] = np.asarray(answer.gaussians.features)[answer.rows].any(1)
@@ -158,16 +158,13 @@ def heat(answer: Answer, word: int) -> np.ndarray:
 
 
 def painted(answer: Answer) -> np.ndarray:
-    """Colours of all Gaussians (n, 3): the relevance of a single word, else the class; grey where there is none."""
-    names = answer.question.words.names
-    if len(names) > 1:
-        labels = answer.relevance.labels
-        return np.where(labels[:, None] >= 0, class_colors(len(names))[labels], GREY)
-    return hot(heat(answer, 0))
+    """Colour all Gaussians (n, 3): the relevance of a single word, else the class; grey where there is none."""
+    count, labels = len(answer.question.words.names), answer.relevance.labels
+    return hot(heat(answer, 0)) if count == 1 else np.where(labels[:, None] >= 0, class_colors(count)[labels], GREY)
 
 
 def hot(values: np.ndarray) -> np.ndarray:
-    """Colours (…, 3) of numbers in [0, 1]; grey where they are nan."""
+    """Colour numbers in [0, 1], (…, 3); grey where they are nan."""
     colors = matplotlib.colormaps["inferno"](np.nan_to_num(values))[..., :3]
     return np.where(np.isfinite(values)[..., None], colors, GREY)
 

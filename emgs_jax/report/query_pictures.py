@@ -49,7 +49,7 @@ def _drawn(
 
 
 def drawn(run: RecordedRun, gaussians: Gaussians, values: np.ndarray, view: View, camera: Camera) -> np.ndarray:
-    """Values (n, v) of the Gaussians as an image (h, w, v); nan where the map shows nothing."""
+    """Draw values (n, v) of the Gaussians as an image (h, w, v); nan where the map shows nothing."""
     config, pose = render_config(run), to_se3(view.pose)
     values, alpha = jax.device_get(_drawn(gaussians, jnp.asarray(values, jnp.float32), pose, camera, config))
     is_seen = alpha >= max(float(config.min_alpha), 1e-6)
@@ -57,14 +57,14 @@ def drawn(run: RecordedRun, gaussians: Gaussians, values: np.ndarray, view: View
 
 
 def views_of(run: RecordedRun) -> list[View]:
-    """Poses of frames that are not lost, at most `MAX_POSES`, evenly spread."""
+    """Choose poses of frames that are not lost, at most `MAX_POSES`, evenly spread."""
     rows = np.flatnonzero(run.is_placed)
     chosen = np.unique(np.linspace(0, len(rows) - 1, min(MAX_POSES, len(rows))).astype(int))
     return [View(f"frame {run.frames[row]['index']}", run.poses[row]) for row in rows[chosen]]
 
 
 def frame_view(run: RecordedRun, frame: int) -> View:
-    """The pose of one frame; raises ValueError where the run has none."""
+    """Return the pose of one frame; raises ValueError where the run has none."""
     known = [line["index"] for line in run.frames]
     if frame not in known:
         raise ValueError(f"{run.folder} has no pose of frame={frame}: choose one from {min(known)} to {max(known)}")
@@ -72,7 +72,7 @@ def frame_view(run: RecordedRun, frame: int) -> View:
 
 
 def best_views(run: RecordedRun, answer: Answer, count: int) -> list[list[View]]:
-    """Of each word the poses from which most pixels show answers to it, best first; none where there is no answer."""
+    """Find for each word the poses from which most pixels answer it, best first; none where there is no answer."""
     camera = downscale(run.camera, -(-run.camera.width // SMALL_WIDTH))
     words = len(answer.question.words.names)
     answers = answer.relevance.labels[:, None] == np.arange(words)
@@ -135,7 +135,7 @@ def save_labels(folder: Path, run: RecordedRun, answer: Answer, views: Mapping[s
 
 
 def label_image(run: RecordedRun, answer: Answer, view: View) -> np.ndarray:
-    """The word (h, w) with the largest share of each pixel, from 1; 0 where that is none of them, or nothing."""
+    """Draw the word (h, w) with the largest share of each pixel, from 1; 0 where that is none of them, or nothing."""
     labels, count = answer.relevance.labels + 1, len(answer.question.words.names) + 1
     best, found = np.zeros((run.camera.height, run.camera.width)), np.zeros((run.camera.height, run.camera.width), int)
     for first in range(0, count, WORDS_AT_ONCE):
@@ -155,7 +155,7 @@ def draw_features(path: Path, run: RecordedRun, views: Sequence[View]) -> None:
 
 
 def legend(names: Sequence[str], counts: Sequence[int]) -> dict[str, np.ndarray]:
-    """The colours of `painted` by word: those with the most answers, in the order of the words."""
+    """Return the colours of `painted` by word: those with the most answers, in the order of the words."""
     most = sorted(np.argsort(-np.array(counts), kind="stable")[:MAX_LEGEND])
     return {names[word]: class_colors(len(names))[word] for word in most if counts[word]}
 
@@ -163,7 +163,7 @@ def legend(names: Sequence[str], counts: Sequence[int]) -> dict[str, np.ndarray]
 def _save(
     path: Path, lines: Sequence[Sequence[tuple[str, np.ndarray]]], legend: Mapping[str, np.ndarray] | None = None
 ) -> None:
-    """Titled images in lines of one length above a legend, as PNG; nothing to draw makes a line of text."""
+    """Write titled images in lines of one length above a legend, as PNG; nothing to draw makes a line of text."""
     columns = max((len(line) for line in lines), default=1)
     height, width = lines[0][0][1].shape[:2] if lines else (1, 4)
     handles = [Patch(color=color, label=name) for name, color in (legend or {}).items()] if lines else []

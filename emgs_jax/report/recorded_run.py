@@ -159,12 +159,11 @@ def _lines(path: Path) -> list[dict[str, Any]]:
     lines = []
     for number, text in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
         try:
-            line = json.loads(text)
-            if not isinstance(line["index"], int) or not isinstance(line["status"], str):
+            lines.append(json.loads(text))
+            if not isinstance(lines[-1]["index"], int) or not isinstance(lines[-1]["status"], str):
                 raise TypeError("index and status must be a number and a word")
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise ValueError(f"{path}:{number} is no record of a frame ({error!r}): run again") from error
-        lines.append(line)
     return lines
 
 
@@ -186,7 +185,7 @@ def _online(path: Path, count: int) -> np.ndarray | None:
 
 
 def _camera(path: Path, metrics: dict[str, Any]) -> Camera:
-    """Of the frames, straight and in the size in use."""
+    """Return the camera of the frames, straight and in the size in use."""
     try:
         known = metrics["provenance"]["data"]["frames"]
         fx, fy, cx, cy = (float(value) for value in known["intrinsics"])

@@ -31,7 +31,7 @@ class Repeated(NamedTuple):
 
     @property
     def command(self) -> str:
-        """The line for a shell."""
+        """Write the line for a shell."""
         return shlex.join(["emgs", "run", *self.words])
 
 
@@ -59,7 +59,7 @@ def _values(config: DictConfig) -> dict[str, Any]:
 
 
 def _options(settings: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Group, option and default of every group with an option nearer than the default; files alone are read."""
+    """List group, option and default of every group with an option nearer than the default; reads files alone."""
     found = []
     for group, default in _default_options().items():
         wanted = flat(_at(settings, group.split("/")))
@@ -75,7 +75,7 @@ def _options(settings: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def _default_options() -> dict[str, str]:
-    """The option of every group that conf/config.yaml names."""
+    """Return the option of every group that conf/config.yaml names."""
     lines = [line for line in _read(CONF / "config.yaml")["defaults"] if isinstance(line, dict)]
     named = {group: option for line in lines for group, option in line.items()}
     return {group: option for group, option in named.items() if option and (CONF / group).is_dir()}
@@ -88,7 +88,7 @@ def _at(tree: Mapping[str, Any], path: list[str]) -> Mapping[str, Any]:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """Values by dotted key of a file of conf/, with those that it inherits from others beside it."""
+    """Read values by dotted key of a file of conf/, with those that it inherits from others beside it."""
     node = _read(path)
     parents = [path.parent / f"{name}.yaml" for name in node.pop("defaults", []) if isinstance(name, str)]
     inherited = [_content(parent) for parent in parents if parent.is_file()]
@@ -100,7 +100,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def written(value: Any) -> str:
-    """A value as Hydra's grammar reads it back."""
+    """Write a value as Hydra's grammar reads it back."""
     if isinstance(value, list):
         return f"[{','.join(written(item) for item in value)}]"
     if isinstance(value, dict):

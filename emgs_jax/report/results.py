@@ -42,7 +42,7 @@ class Estimate:
 
 
 def result_folder(out: Path, dataset: str, sequence: str, variant: str, seed: int) -> Path:
-    """Folder of one result; each part is one level.
+    """Return the folder of one result; each part is one level.
 
     Raises:
         ValueError: a part is no name of one level, so that the folder would be elsewhere.
@@ -55,7 +55,7 @@ def result_folder(out: Path, dataset: str, sequence: str, variant: str, seed: in
 
 
 def read_metrics(path: Path) -> dict[str, Any]:
-    """A metrics.json of this version; any other raises ValueError."""
+    """Read a metrics.json of this version; any other raises ValueError."""
     remedy = "move its folder away or choose another out=FOLDER"
     try:
         metrics = json.loads(path.read_text(encoding="utf-8"))
@@ -88,7 +88,7 @@ def is_finished(folder: Path, config: Mapping[str, Any]) -> bool:
 
 
 def read_estimates(out: Path) -> list[Estimate]:
-    """All results below `out`, in the order of their folders; a folder that is no seed's, such as a copy, is none."""
+    """Read all results below `out`, in the order of their folders; one that is no seed's, such as a copy, is none."""
     paths = (path for path in sorted(out.glob(f"*/*/*/*/{METRICS_FILE}")) if path.parent.name.isdecimal())
     return [item for path in paths for item in estimates_of(path)]
 

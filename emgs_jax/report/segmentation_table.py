@@ -73,7 +73,7 @@ class SceneResult:
 
 
 def place(run: RecordedRun, truth: np.ndarray, how: Placement) -> tuple[np.ndarray, dict[str, Any]]:
-    """The confirmed Gaussians' centres (n, 3) in the frame of true points (m, 3), and how they came there.
+    """Move the confirmed Gaussians' centres (n, 3) to the frame of true points (m, 3); says how, too.
 
     Raises:
         ValueError: no true pose is known.
@@ -104,13 +104,7 @@ def score_scene(
 ) -> SceneResult:
     """Compare the map of a run with the true points of its scene.
 
-    Args:
-        run: finished.
-        scene: its name.
-        truth: points and classes.
-        vectors: text embeddings of the truth's classes, (c, f).
-        how: the map is placed.
-        protocol: of the comparison.
+    `vectors` (c, f) are text embeddings of the truth's classes.
     """
     points, about = place(run, truth.points, how)
     gaussians = confirmed(run.map)
@@ -167,7 +161,7 @@ def summary(
 
 
 def table(found: Mapping[str, Any], published: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown: the mean or sum over the scenes, each scene, and quoted rows.
+    """Write the mean or sum over the scenes, each scene, and quoted rows in Markdown.
 
     Args:
         found: `summary`.

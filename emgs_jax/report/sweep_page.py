@@ -58,7 +58,7 @@ def _best_words(rows: Rows, axes: Sequence[str], columns: Sequence[Column]) -> s
 
 
 def _settings(folder: Path, rows: Rows, axes: Sequence[str], columns: Sequence[Column]) -> Table:
-    """The prior alone, then a line for each setting; without ground truth its frames instead of errors."""
+    """Lay out the prior alone, then each setting; without ground truth its frames instead of errors."""
     raw = {column.key: rows[0].get(RAW_PRIOR + column.key) for column in columns}
     lines = [Line(["", "raw prior", *[""] * (len(axes) - 1)], raw, rivals=None)]
     pictures = thumbnails([picture_path(folder, {key: row[key] for key in axes}) for row in rows])

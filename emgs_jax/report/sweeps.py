@@ -16,7 +16,7 @@ _REMEDY = "make it again in another folder (hydra.run.dir=…), or move this one
 
 
 def read_sweep(path: Path) -> dict[str, Any]:
-    """A sweep.json of this version; any other raises ValueError."""
+    """Read a sweep.json of this version; any other raises ValueError."""
     try:
         sweep = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -27,7 +27,7 @@ def read_sweep(path: Path) -> dict[str, Any]:
 
 
 class SweepResults:
-    """Mapping[str, Any] by setting, on disk after each `add`; a folder that holds some of the same sweep is continued.
+    """Metrics by setting, on disk after each `add`; a folder that holds some of the same sweep is continued.
 
     Args:
         folder: of the results.
@@ -38,18 +38,12 @@ class SweepResults:
     def __init__(self, folder: Path, provenance: Mapping[str, Any]) -> None:
         self.path = folder / "sweep.json"
         self._header = jsonable({"format": FORMAT, "version": VERSION, "provenance": provenance})
-        self._rows: dict[str, dict[str, Any]] = {}
-        if self.path.exists():
-            self._rows = {_key(row["setting"]): row for row in self._read()}
-
-    def _read(self) -> list[dict[str, Any]]:
-        old = read_sweep(self.path)
-        before, now = old["provenance"], self._header["provenance"]
+        old = read_sweep(self.path) if self.path.exists() else self._header | {"settings": []}
         for key in ("data", "prior", "config", "git", "versions"):
-            if before.get(key) != now.get(key):
-                changed = difference(before.get(key), now.get(key), key)
-                raise ValueError(f"{self.path} holds a sweep with {changed}: {_REMEDY}")
-        return old["settings"]
+            before, now = (sweep["provenance"].get(key) for sweep in (old, self._header))
+            if before != now:
+                raise ValueError(f"{self.path} holds a sweep with {difference(before, now, key)}: {_REMEDY}")
+        self._rows: dict[str, dict[str, Any]] = {_key(row["setting"]): row for row in old["settings"]}
 
     def __contains__(self, setting: Mapping[str, Any]) -> bool:
         return _key(setting) in self._rows
@@ -61,7 +55,7 @@ class SweepResults:
         write_json(self.path, self._header | {"settings": list(self._rows.values())})
 
     def rows(self, settings: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """One flat row for each setting: its values, then its metrics."""
+        """Return one flat row for each setting: its values, then its metrics."""
         found = [self._rows[_key(setting)] for setting in settings]
         return [{"setting": number} | row["setting"] | row["metrics"] for number, row in enumerate(found)]
 
@@ -76,7 +70,7 @@ def picture_path(folder: Path, setting: Mapping[str, Any]) -> Path:
 
 
 def difference(old: Any, new: Any, path: str) -> str:
-    """The first value that differs, with its path, in words."""
+    """Say the first value that differs, with its path, in words."""
     if isinstance(old, dict) and isinstance(new, dict):
         for name in [*old, *new]:
             if old.get(name) != new.get(name):

@@ -61,7 +61,7 @@ class Row:
 
 
 def average(estimates: Iterable[Estimate], each_sequence: bool) -> list[Row]:
-    """Rows in the order of the estimates: one over all sequences of a data set, or one for each of them.
+    """Average over seeds, in the order of the estimates: all sequences of a data set together, or each by itself.
 
     A seed counts if it has a result for every sequence that any seed has: means over different sequences differ.
     """
@@ -73,7 +73,7 @@ def average(estimates: Iterable[Estimate], each_sequence: bool) -> list[Row]:
 
 
 def to_csv(estimates: Sequence[Estimate]) -> str:
-    """One line per estimate: what it is of, then every metric."""
+    """Write one line per estimate: what it is of, then every metric."""
     names = ("dataset", "sequence", "variant", "kind", "seed", "prior", "is_simulated", "protocol", "revision")
     metrics = sorted({key for item in estimates for key in item.values})
     text = io.StringIO()

@@ -33,7 +33,7 @@ class SequenceResults:
 
 
 def columns_of(objectives: Mapping[str, str]) -> list[Column]:
-    """The objectives, then the other main metrics; metric -> `minimize` or `maximize`."""
+    """Return columns of the objectives (metric -> `minimize` or `maximize`), then of the other main metrics."""
     known = {column.key: column for column in (*MAIN, *PLACED, *RENDERED)}
     own = [known.get(key, Column(key, key, 1.0, 4, direction == "minimize")) for key, direction in objectives.items()]
     return own + [column for column in MAIN if column.key not in objectives]
@@ -76,7 +76,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def verdict(results: Sequence[SequenceResults], objectives: Mapping[str, str]) -> dict[str, str]:
-    """For each trial that was held out: how its objectives differ from the default's there, in one line."""
+    """Say in one line for each trial that was held out how its objectives differ from the default's there."""
     held_out = [result.metrics for result in results if result.is_held_out]
     lines = {}
     for trial in held_out[0] if held_out else ():
@@ -98,7 +98,7 @@ def _compared(held_out: Sequence[Mapping[str, Mapping[str, Any]]], trial: str, k
 
 
 def settings_yaml(setting: Mapping[str, Any], lines: Sequence[str]) -> str:
-    """A setting as an option of Hydra that changes keys wherever they stand, below comments."""
+    """Write a setting as an option of Hydra that changes keys wherever they stand, below comments."""
     tree: dict[str, Any] = {}
     for key, value in setting.items():
         *parents, name = key.split(".")

@@ -63,7 +63,7 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """To open in a browser of this machine."""
+        """Return what to open in a browser of this machine."""
         return f"http://{HOST}:{self.server.get_port()}"
 
     def stop(self) -> None:
@@ -95,7 +95,7 @@ class Viewer:
             self.picture = self.server.gui.add_image(run.image, label="Newest frame")
 
     def _add_controls(self) -> None:
-        """The words come first: people look for them."""
+        """Add the controls, the words first: people look for them."""
         gui, names = self.server.gui, self._names
         shown = layers_of({*ALWAYS, *self._run.layers, *(["label"] if names else [])})
         titles = [layer.title for name, layer in shown.items() if name != "similarity"]  # that is what words show
@@ -130,7 +130,7 @@ class Viewer:
 
     @_alone
     def recolor(self) -> None:
-        """Colours as the controls say."""
+        """Colour the map as the controls say."""
         if not self._run.frames:
             return
         colors, message = self._colors()
@@ -139,7 +139,7 @@ class Viewer:
         self.answer.content = _shown(message)
 
     def _colors(self) -> tuple[np.ndarray, str]:
-        """Of all Gaussians, (n, 3), and what there is to say about the words."""
+        """Colour all Gaussians, (n, 3), and say what there is to say about the words."""
         name = next(name for name, layer in layers_of(self.layers).items() if layer.title == self.layer.value)
         colors, message = painted(self.layers, name), self._known()
         if "label" not in self.layers or not self.words.value.strip():

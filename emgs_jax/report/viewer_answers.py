@@ -30,7 +30,7 @@ class Answer(NamedTuple):
 
 
 def find_words(text: str, names: Sequence[str]) -> tuple[list[int], int]:
-    """Rows of the class names that stand in a text, words apart by commas, and how many of its words are no class.
+    """Find rows of the class names in a text, words apart by commas, and how many of its words are no class.
 
     A word that is being typed is the class that begins with it, where there is only one.
     """
@@ -66,13 +66,13 @@ def ask(layers: Layers, wanted: Sequence[int], against: Sequence[int], min_cosin
 
 
 def highlighted(colors: np.ndarray, answer: Answer) -> np.ndarray:
-    """Colours (n, 3), uint8, with what was found in the colour of its cosine, and everything else dark."""
+    """Return colours (n, 3), uint8, with what was found in the colour of its cosine, and everything else dark."""
     hot = matplotlib.colormaps["inferno"](0.5 + 0.5 * answer.cosines)[:, :3]
     return to_bytes(np.where(answer.is_found[:, None], 0.25 * colors / 255.0 + 0.75 * hot, 0.25 * colors / 255.0))
 
 
 def picked(means: np.ndarray, covs: np.ndarray, origin: Sequence[float], direction: Sequence[float]) -> int | None:
-    """Row of the Gaussian that a ray meets nearest to its centre on the first surface; None where there is none.
+    """Find the Gaussian that a ray meets nearest to its centre on the first surface; None where there is none.
 
     Args:
         means: (n, 3).

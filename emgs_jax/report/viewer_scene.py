@@ -48,7 +48,7 @@ class Shown:
 
 
 def shown(run: RecordedRun) -> Shown:
-    """A finished run; raises ValueError where its parts do not fit each other."""
+    """Show a finished run; raises ValueError where its parts do not fit each other."""
     layers, names = map_layers(run.map, run.text) | feature_layer(run.map), () if run.text is None else run.text.names
     truth = placed_paths(run).truth[:, :3, 3]
     return Shown(layers, names, run.frames, run.poses, truth, run.camera, render_config(run))
@@ -85,7 +85,7 @@ class Scene:
             self._place_views(run.poses[0])
 
     def recolor(self, colors: np.ndarray) -> None:
-        """Colours (n, 3) of all Gaussians, if there are any."""
+        """Give all Gaussians, if there are any, colours (n, 3)."""
         if self.splats is not None:
             self.splats.rgbs = colors
             self.points.colors = colors
@@ -116,7 +116,7 @@ class Scene:
         self.points = self._scene.add_point_cloud("/points", means, colors, point_size=0.01, precision="float32")
 
     def _draw_cameras(self, run: Shown) -> None:
-        """Those that stand there are moved, as a back end moves poses."""
+        """Draw the cameras; those that stand there are moved, as a back end moves poses."""
         count = len(run.poses)
         rows = {int(row) for row in np.linspace(0, count - 1, min(count, MAX_FRUSTUMS))}
         for row in set(self.frustums) - rows:
@@ -129,7 +129,7 @@ class Scene:
                 self.frustums[row] = self._frustum(run, f"/cameras/{row}", row, color, 0.04)
 
     def _path(self, name: str, centers: np.ndarray, is_known: np.ndarray, color: str) -> Any:
-        """Segments between neighbours that are both known; None where there are none."""
+        """Draw segments between neighbours that are both known; None where there are none."""
         joined = np.flatnonzero(is_known[1:] & is_known[:-1])
         if not len(joined):
             return None
@@ -138,20 +138,13 @@ class Scene:
 
     def _frustum(self, run: Shown, name: str, row: int, color: str, scale: float) -> Any:
         camera, pose = run.camera, run.poses[row]
-        return self._scene.add_camera_frustum(
-            name,
-            field_of_view(camera),
-            camera.width / camera.height,
-            scale=scale,
-            thickness=1.5,
-            thickness_units="screen",
-            color=_rgb(color),
-            wxyz=wxyz(pose),
-            position=pose[:3, 3],
-        )
+        look = {"scale": scale, "thickness": 1.5, "thickness_units": "screen", "color": _rgb(color)}
+        place = {"wxyz": wxyz(pose), "position": pose[:3, 3]}
+        ratio = camera.width / camera.height
+        return self._scene.add_camera_frustum(name, field_of_view(camera), ratio, **look, **place)
 
     def _place_views(self, pose: np.ndarray) -> None:
-        """Behind the first camera, a little, looking as it does."""
+        """Look from a little behind the first camera, as it does."""
         first = self._server.initial_camera
         first.position = pose[:3, 3] - 0.3 * pose[:3, 2]
         first.look_at, first.up = pose[:3, 3] + pose[:3, 2], -pose[:3, 1]
@@ -161,12 +154,12 @@ class Scene:
 
 
 def field_of_view(camera: Camera) -> float:
-    """Vertical, in radians."""
+    """Return the vertical field of view in radians."""
     return 2 * float(np.arctan2(camera.height / 2, float(camera.focal[1])))
 
 
 def wxyz(pose: np.ndarray) -> np.ndarray:
-    """Quaternion of a pose (4, 4), as viser takes it."""
+    """Return the quaternion of a pose (4, 4), as viser takes it."""
     return Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
 
 

@@ -32,9 +32,8 @@ class Vocabulary:
     model: FeatureModel | None = None
 
     def embed(self, names: Sequence[str]) -> TextEmbeddings:
-        """Vectors of names, in their order; raises ValueError where there is no vector of one or it is too wide."""
-        names = tuple(names)
-        text = self._find(names) if self.model is None else self.model.embed(names)
+        """Embed names, in their order; raises ValueError where there is no vector of one or it is too wide."""
+        text = self._find(tuple(names)) if self.model is None else self.model.embed(tuple(names))
         if text.vectors.shape != (len(names), self.width):
             raise ValueError(
                 f"{self.source} has embeddings of width {text.vectors.shape[1]}, and the map's features have width "
@@ -57,7 +56,7 @@ class Vocabulary:
 
 
 def feature_space(run: RecordedRun) -> dict[str, Any]:
-    """Identity of the model whose features a run's map holds; {"prior": name} for those of a prior without a model."""
+    """Identify the model whose features a run's map holds; {"prior": name} for those of a prior without a model."""
     settings = run.provenance["prior"]["settings"]
     features = settings.get("features") if isinstance(settings, Mapping) else None
     if isinstance(features, Mapping) and isinstance(features.get("model"), Mapping):
@@ -67,11 +66,6 @@ def feature_space(run: RecordedRun) -> dict[str, Any]:
 
 def vocabulary(run: RecordedRun, file: str | None, model: FeatureModel | None) -> Vocabulary:
     """Choose the vocabulary for a run's map: of the file if given, else of the model, else the run's classes.
-
-    Args:
-        run: finished.
-        file: of `experiments.embed`.
-        model: with a text encoder.
 
     Raises:
         ValueError: the map has no features, or file or model are of other features; the message names both.
@@ -99,14 +93,14 @@ def vocabulary(run: RecordedRun, file: str | None, model: FeatureModel | None) -
 
 
 def feature_model(config: DictConfig, words: Sequence[str]) -> FeatureModel | None:
-    """The text encoder of a config; None with features=none, or where `features.text` has the embeddings."""
+    """Build the text encoder of a config; None with features=none, or where `features.text` has the embeddings."""
     if "_target_" not in config.features or config.features.text is not None:
         return None
     return build(config, "features", classes=list(words))
 
 
 def words_of(value: Any, key: str) -> tuple[str, ...]:
-    """One word or a list of them as a tuple; raises ValueError where one is empty, no text or there twice."""
+    """Return one word or a list of them as a tuple; raises ValueError where one is empty, no text or there twice."""
     is_list = isinstance(value, Sequence) and not isinstance(value, str)
     words = list(value) if is_list else [] if value is None else [value]
     if not all(isinstance(word, str) and word.strip() for word in words) or len(set(words)) < len(words):

@@ -55,7 +55,7 @@ class FrameRecord:
             estimated, relative to the first frame.
         inliers: points that agree with the map.
         residual: of these to the map's planes, as a fraction of their depth.
-        scale: factor on the prediction's lengths.
+        scale: factor on the prediction's lengths; the frames that a map is made from give it its unit.
         depth_noise: how much the points differ from the map, as a fraction of their depth; None where none agrees.
         step_m: between the coarse and the fine pose.
         step_rad: likewise.
@@ -208,14 +208,14 @@ def record_start(run: MappingRun, window: WindowInput, seconds: Seconds) -> None
         )
     share = {key: value / len(poses) for key, value in seconds.items()}
     for row, pose in enumerate(poses):
-        _add(run, window, row, status="initialization", pose=to_matrix(pose), num_gaussians=count, **share)
+        _add(run, window, row, **share, status="initialization", pose=to_matrix(pose), scale=1.0, num_gaussians=count)
 
 
 def record_new_submap(run: MappingRun, window: WindowInput, seconds: Seconds) -> None:
     """Record the first frame of a disconnected submap; its pose is that of the frame before, a placeholder."""
     count = int(np.asarray(run.map.gaussians.valid).sum())
     kept = {"status": "initialization", "pose": run.records[-1].pose, "new": count, "num_gaussians": count}
-    _add(run, window, 0, **kept, location=NEW_SUBMAP, **seconds)
+    _add(run, window, 0, **kept, scale=1.0, location=NEW_SUBMAP, **seconds)
 
 
 def record_step(

@@ -145,9 +145,6 @@ def test_a_failed_copy_leaves_nothing(run):
         ({"length": [1, 3, 2]}, "frame 3 is lost, so its pose is a guess"),
         ({"length": [1, 1, 2]}, "these two cameras are at one place"),
         ({"scale": 0}, "scale must be .*, got 0"),
-        ({"scale": math.nan}, "scale must be"),
-        ({"scale": -1}, "scale must be"),
-        ({"scale": math.inf}, "scale must be"),
         ({"scale": 2, "length": [1, 5, 2]}, "give one of them"),
     ],
 )

@@ -129,7 +129,7 @@ def test_the_mean_of_the_scales_that_the_unit_of_a_run_is_made_of_follows_a_clos
     end = walked(graph, poses, np.exp(log_scale))
     state = eqx.tree_at(lambda s: s.estimate.log_scale, state_of(poses), jnp.asarray(log_scale))
     records = [FrameRecord(row, None, None, "tracked", pose=pose, scale=1.05) for row, pose in enumerate(poses)]
-    records[0] = FrameRecord(0, None, None, "initialization", pose=poses[0])
+    records[0] = FrameRecord(0, None, None, "initialization", pose=poses[0], scale=1.0)
     smaller = np.stack([scale_pose(pose, 0.9) for pose in poses])
     end = replace(end, verified=[loop(smaller, row) for row in range(1, 9)])
     run = MappingRun(None, None, state=state, records=records, back_end=end)
@@ -137,8 +137,7 @@ def test_the_mean_of_the_scales_that_the_unit_of_a_run_is_made_of_follows_a_clos
     end = run.back_end
     assert end.accepted and log_scale - np.mean(end.log_scales) > 1e-3  # `scale_std` asks for scales of one
     assert float(run.state.estimate.log_scale) == pytest.approx(np.mean(end.log_scales), abs=1e-5)
-    np.testing.assert_allclose([record.scale for record in run.records[1:]], np.exp(end.log_scales[1:]))
-    assert run.records[0].scale is None
+    np.testing.assert_allclose([record.scale for record in run.records], np.exp(end.log_scales))
 
 
 def test_loops_that_are_contradicted_later_are_no_edges_any_more(graph):

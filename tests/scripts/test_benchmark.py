@@ -88,10 +88,7 @@ def test_candidates_take_turns_and_a_ratio_compares_the_same_turn(monkeypatch):
     np.testing.assert_allclose(timings[1].facts["times_faster_than"]["a"], (8, 4, 16))
     assert spread([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
     assert np.isclose(comparisons.color_error(np.linspace(0, -1, 1001), np.zeros(1001)), 0.999)
-    assert (
-        comparisons.color_error(np.ones(1001), np.eye(1, 1001)[0]) == 1.0
-        and comparisons.color_error(np.ones(2), np.ones(2)) == 0
-    )
+    assert comparisons.color_error(np.ones(2), np.ones(2)) == 0.0
     part = comparisons.of_all_lines(Timing("render", "a part", [0.1, 0.2], facts={"drawn_lines": 3}), 12)
     np.testing.assert_allclose(part.seconds, [0.4, 0.8])
     assert comparisons.of_all_lines(timings[0], 12) == timings[0]

@@ -70,9 +70,6 @@ def test_a_finished_setting_is_not_mapped_again_and_another_sweep_is_not_mixed_i
     assert row | {"setting": 2} == rows[2]
     with pytest.raises(ValueError, match=r"em\.noise 1\.0, and this one has 0\.5: .*another folder"):
         experiments.sweep.sweep(compose(AXES, "slam.em.noise=0.5", name="sweep"), tmp_path)
-    (tmp_path / "sweep.json").write_text('{"format": "emgs_jax.running.batch", "version": 99}')
-    with pytest.raises(ValueError, match="version 1.*another folder"):
-        experiments.sweep.sweep(subset, tmp_path)
 
 
 @pytest.mark.slow

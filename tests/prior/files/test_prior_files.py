@@ -15,8 +15,6 @@ from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.prior.base import Prior, relative_poses
 from emgs_jax.prior.files.prior import Files
 from emgs_jax.prior.files.view import Camera, View, at_frame, whole_image
-from emgs_jax.running import configure
-from experiments.command import check_arguments
 
 SIZE = (48, 64)
 
@@ -218,23 +216,3 @@ def test_the_script_of_the_documentation_writes_what_the_prior_reads(tmp_path, m
         depth = np.stack([truth()[index].depth for index in dense])
         np.testing.assert_allclose(prediction.points[..., 2], depth, rtol=1e-6)
         np.testing.assert_allclose(prediction.confidence, depth + 1, rtol=1e-6)
-
-
-MINE = """
-from emgs_jax.prior.base import Prior, Provenance
-class Mine(Prior):
-    def __init__(self, size):
-        self.provenance = Provenance("mine", {"size": size})
-    def predict(self, window, frames, intrinsics):
-        raise NotImplementedError
-"""
-
-
-def test_a_class_from_outside_of_the_repository_is_a_prior_as_the_documentation_says(tmp_path, monkeypatch):
-    (tmp_path / "mine_outside.py").write_text(MINE)
-    (tmp_path / "conf" / "prior").mkdir(parents=True)
-    (tmp_path / "conf" / "prior" / "Mine.yaml").write_text("_target_: mine_outside.Mine\nsize: 3\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    words = [f"hydra.searchpath=[file://{tmp_path}/conf]", "prior=Mine", "prior.size=4"]
-    check_arguments("config", words)
-    assert configure.build(configure.compose(*words), "prior").provenance.settings == {"size": 4}
