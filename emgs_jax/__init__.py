@@ -38,13 +38,7 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.gaussians import FitConfig, Gaussians, cluster, fit_to_points
     from emgs_jax.initialization import initialize
     from emgs_jax.io.map_file import load_map, save_map
-    from emgs_jax.localization import (
-        CoarsePose,
-        LocalizationConfig,
-        LocalizationInfo,
-        localize_coarse,
-        localize_fine,
-    )
+    from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
     from emgs_jax.observation import Observation, ObservationConfig, Prediction, observe, transform
     from emgs_jax.ops.camera import Camera, downscale
     from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows

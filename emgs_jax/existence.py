@@ -134,8 +134,8 @@ def update_existence(
     change = config.hit * ((use > 0) & ~is_seen_through) - config.miss * (is_seen_through | is_superfluous)
     existence = jnp.clip(map.existence + change, -config.max_log_odds, config.max_log_odds)
     existence = jnp.where(change == 0, map.existence, existence)
-    judged = eqx.tree_at(lambda m: m.existence, map, existence)
-    return without(judged, existence < config.refuted), is_seen
+    updated = eqx.tree_at(lambda m: m.existence, map, existence)
+    return without(updated, existence < config.refuted), is_seen
 
 
 @full_precision
@@ -184,7 +184,7 @@ def merge_all_duplicates(
 ) -> GaussianMap:
     """Join the layers of a whole map that has moved, until none are left that are each other's nearest.
 
-    Where two visits come to lie on each other nobody looks again: each Gaussian is seen from where it was made.
+    Two visits that come to lie on each other are not observed again: each Gaussian is seen from where it was made.
 
     Args:
         map: all Gaussians, world frame.

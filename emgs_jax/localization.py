@@ -160,7 +160,7 @@ def _readings(
 ) -> tuple[jaxlie.SE3, jaxlie.SE3, jaxlie.SE3, Bool[Array, ""]]:
     """The prior's motion from the previous frame, its own pose of the current one, and where each reading begins (R7).
 
-    Last, whether the previous frame leads here at all. If not, the prior's own pose stands in for the broken chain.
+    Last, True if the prior connects the previous frame with this one. If not, its own pose replaces the broken chain.
     """
     anchor, paired = prediction.T_world_anchor, prediction.previous.valid & previous.valid
     raw_previous, raw_current = pose_row(prediction.T_world_views, 0), pose_row(prediction.T_world_views, 1)
@@ -188,7 +188,7 @@ def _correct_by_prior(
     estimate: PoseEstimate,
     config: LocalizationConfig,
 ) -> tuple[jaxlie.SE3, Float[Array, ""], PoseEstimate]:
-    """Pose, scale and belief after the prior's own pose (`fused` only) and the prior's own unit.
+    """Correct pose, scale and their estimate by the prior's own pose (`fused` only) and the prior's own unit.
 
     A prior that has lost its anchor is wrong altogether, and for long: its pose counts by a Cauchy weight of its
     distance from the estimate, w = 1 / (1 + χ² / 6).

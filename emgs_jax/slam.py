@@ -181,7 +181,7 @@ class Fused(eqx.Module):
 
 
 class NewGaussians(eqx.Module):
-    """What a frame adds to the map: Gaussians of its points with their number of images, and halves of split ones."""
+    """Gaussians that a frame adds to the map: of its points, with their number of images, and halves of split ones."""
 
     gaussians: Gaussians
     weight: Float[Array, "g"]
@@ -301,13 +301,7 @@ def _localize_fine(
 
 
 @executable
-def _fuse(
-    submap: Submap,
-    frame: Frame,
-    view: Camera,
-    num_rows: int,
-    config: FusionConfig,
-) -> Fused:
+def _fuse(submap: Submap, frame: Frame, view: Camera, num_rows: int, config: FusionConfig) -> Fused:
     """Fuse the points of a frame that is tracked, and split what they show to be too coarse."""
     T, trusted = frame.T_world_camera, frame.trusted
     noise = frame.localization.noise[:, None] * (trusted.points - T.translation())

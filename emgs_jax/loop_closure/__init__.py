@@ -1,1 +1,1 @@
-"""Has the camera been here before? Keyframes, candidates, their verification, and what loops say together."""
+"""Loop closure: place recognition, verification and spatial consistency of loops, and relocalization."""

@@ -61,9 +61,7 @@ class JointPrediction:
     masks: tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]
 
 
-PriorQuery = Callable[
-    [int, int], JointPrediction | None
-]  # of two frames, the earlier first; None where the prior does not say
+PriorQuery = Callable[[int, int], JointPrediction | None]  # of two frames, the earlier first; None without an answer
 
 
 def measure_by_prior(joint: JointPrediction, a: Keyframe, b: Keyframe, config: PriorQueryConfig) -> Similarity | None:

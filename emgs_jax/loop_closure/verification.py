@@ -56,7 +56,7 @@ class Neighbour:
 
 @dataclass(frozen=True)
 class LoopMeasurement:
-    """An edge of the graph between a, the candidate, and b, the query.
+    """A verified loop: the relative pose of a, the candidate, and b, the query.
 
     Args:
         a, b: their frames.
@@ -97,7 +97,7 @@ def verify(
     """Measure where the query's camera is from the candidate's; None with the reason where it is not sure to be there.
 
     Args:
-        neighbours: keyframes just before and after the candidate, which know their place from it without the query.
+        neighbours: keyframes just before and after the candidate, with known poses relative to it.
     """
     try:
         found = align(candidate, query, config.alignment)

@@ -16,23 +16,23 @@ def chordal_initialization(graph: PoseGraph, free: np.ndarray) -> Nodes | None:
     Source: Carlone et al., "Initialization techniques for 3D SLAM", 2015, section V.B.
 
     Args:
-        graph: every edge in use and finite.
+        graph: every factor in use and finite.
         free: (n, 7) unknowns that may move; others than these keep their value.
 
     Returns:
         Nodes; None where a linear problem cannot be solved.
     """
-    nodes, edges = graph.nodes, graph.factors
-    ends = np.stack([edges.a, edges.b], axis=-1)
-    information = np.sum(np.asarray(edges.sqrt_info) ** 2, axis=1)  # the diagonal
+    nodes, factors = graph.nodes, graph.factors
+    ends = np.stack([factors.a, factors.b], axis=-1)
+    information = np.sum(np.asarray(factors.sqrt_info) ** 2, axis=1)  # the diagonal
     rotations = np.asarray(nodes.T_world.rotation().as_matrix())
-    turns = np.asarray(edges.Z_a_b.rotation().as_matrix())
+    turns = np.asarray(factors.Z_a_b.rotation().as_matrix())
     changed = _solve(
         ends,
         np.sqrt(np.mean(information[:, 3:6], axis=1))[:, None, None],
         turns.transpose(0, 2, 1),  # of R_aᵀ, so that the unknowns stand to the right
         rotations.transpose(0, 2, 1),
-        np.zeros_like(rotations[edges.a]),
+        np.zeros_like(rotations[factors.a]),
         free[:, 3:6],
     )
     if changed is None:
@@ -41,13 +41,13 @@ def chordal_initialization(graph: PoseGraph, free: np.ndarray) -> Nodes | None:
     u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
     rotations = np.where(free[:, 3, None, None], u @ vt, rotations)
 
-    scaled = np.exp(np.asarray(nodes.log_scale))[edges.a, None] * np.asarray(edges.Z_a_b.translation())
+    scaled = np.exp(np.asarray(nodes.log_scale))[factors.a, None] * np.asarray(factors.Z_a_b.translation())
     translations = _solve(
         ends,
         np.sqrt(np.mean(information[:, :3], axis=1))[:, None, None],
         np.ones((len(ends), 1, 1)),
         np.asarray(nodes.T_world.translation())[:, None],
-        (rotations[edges.a] @ scaled[..., None]).transpose(0, 2, 1),
+        (rotations[factors.a] @ scaled[..., None]).transpose(0, 2, 1),
         free[:, :1],
     )
     if translations is None:

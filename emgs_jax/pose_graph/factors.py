@@ -66,64 +66,64 @@ def move(nodes: Nodes, steps: Float[Array, "n 7"]) -> Nodes:
 
 def factors_in_use(graph: PoseGraph) -> Bool[Array, "e"]:
     """Edges that are valid and whose two nodes are."""
-    nodes, edges = graph.nodes, graph.factors
+    nodes, factors = graph.nodes, graph.factors
     n = nodes.valid.shape[0]
-    exists = (edges.a >= 0) & (edges.a < n) & (edges.b >= 0) & (edges.b < n)
-    both = jnp.take(nodes.valid, edges.a, mode="clip") & jnp.take(nodes.valid, edges.b, mode="clip")
-    return edges.valid & exists & both
+    exists = (factors.a >= 0) & (factors.a < n) & (factors.b >= 0) & (factors.b < n)
+    both = jnp.take(nodes.valid, factors.a, mode="clip") & jnp.take(nodes.valid, factors.b, mode="clip")
+    return factors.valid & exists & both
 
 
-def _residual(ends: Nodes, edge: Factors) -> Float[Array, "7"]:
-    """W (Log(Z⁻¹ (R_aᵀR_b, e^{−σ_a} R_aᵀ(t_b − t_a))), σ_b − σ_a − log_ratio) of one edge and its two nodes.
+def _residual(ends: Nodes, factor: Factors) -> Float[Array, "7"]:
+    """W (Log(Z⁻¹ (R_aᵀR_b, e^{−σ_a} R_aᵀ(t_b − t_a))), σ_b − σ_a − log_ratio) of one factor and its two nodes.
 
     In the inference's own units: a growing σ_a cannot buy a lower cost.
     """
     T_a_b = pose_row(ends.T_world, 0).inverse() @ pose_row(ends.T_world, 1)
-    error = (edge.Z_a_b.inverse() @ scale_translation(T_a_b, jnp.exp(-ends.log_scale[0]))).log()
-    return edge.sqrt_info @ jnp.append(error, ends.log_scale[1] - ends.log_scale[0] - edge.log_ratio)
+    error = (factor.Z_a_b.inverse() @ scale_translation(T_a_b, jnp.exp(-ends.log_scale[0]))).log()
+    return factor.sqrt_info @ jnp.append(error, ends.log_scale[1] - ends.log_scale[0] - factor.log_ratio)
 
 
-def _with_ends(nodes: Nodes, edge: Factors, used: Bool[Array, ""]) -> tuple[Nodes, Factors]:
-    """The two nodes of one edge, and the edge; neutral values where it is not in use."""
-    ends = take_rows(nodes, jnp.where(used, jnp.stack([edge.a, edge.b]), 0))
-    still = jnp.zeros_like(edge.Z_a_b.wxyz_xyz).at[0].set(1.0)
-    zeros = jnp.zeros_like(edge.log_ratio), jnp.zeros_like(edge.sqrt_info)
+def _with_ends(nodes: Nodes, factor: Factors, used: Bool[Array, ""]) -> tuple[Nodes, Factors]:
+    """Return the two nodes of a factor, and the factor; neutral values where it is not in use."""
+    ends = take_rows(nodes, jnp.where(used, jnp.stack([factor.a, factor.b]), 0))
+    still = jnp.zeros_like(factor.Z_a_b.wxyz_xyz).at[0].set(1.0)
+    zeros = jnp.zeros_like(factor.log_ratio), jnp.zeros_like(factor.sqrt_info)
     neutral_ends = Nodes(jaxlie.SE3(jnp.stack([still, still])), jnp.zeros_like(ends.log_scale), ends.valid)
-    neutral = eqx.tree_at(lambda e: (e.Z_a_b.wxyz_xyz, e.log_ratio, e.sqrt_info), edge, (still, *zeros))
-    return jax.tree.map(lambda x, y: jnp.where(used, x, y), (ends, edge), (neutral_ends, neutral))
+    neutral = eqx.tree_at(lambda e: (e.Z_a_b.wxyz_xyz, e.log_ratio, e.sqrt_info), factor, (still, *zeros))
+    return jax.tree.map(lambda x, y: jnp.where(used, x, y), (ends, factor), (neutral_ends, neutral))
 
 
 @full_precision
 def residuals(graph: PoseGraph) -> Float[Array, "e 7"]:
-    """Whitened residual of every edge, see `_residual`; 0 where an edge is not in use."""
+    """Whitened residual of every factor, see `_residual`; 0 where a factor is not in use."""
 
-    def of_edge(edge: Factors, used: Bool[Array, ""]) -> Float[Array, "7"]:
-        return _residual(*_with_ends(graph.nodes, edge, used))
+    def of_factor(factor: Factors, used: Bool[Array, ""]) -> Float[Array, "7"]:
+        return _residual(*_with_ends(graph.nodes, factor, used))
 
-    return jax.vmap(of_edge)(graph.factors, factors_in_use(graph))
+    return jax.vmap(of_factor)(graph.factors, factors_in_use(graph))
 
 
 @full_precision
 def linearize(graph: PoseGraph) -> tuple[Float[Array, "e 7"], Float[Array, "e 7 14"]]:
-    """Residuals, and their derivatives by the steps of `move` of the nodes a and b; 0 where an edge is not in use."""
+    """Residuals, and their derivatives by the steps of `move` of the nodes a and b; 0 where a factor is not in use."""
 
-    def of_edge(edge: Factors, used: Bool[Array, ""]) -> tuple[Float[Array, "7"], Float[Array, "7 14"]]:
-        ends, edge = _with_ends(graph.nodes, edge, used)
+    def of_factor(factor: Factors, used: Bool[Array, ""]) -> tuple[Float[Array, "7"], Float[Array, "7 14"]]:
+        ends, factor = _with_ends(graph.nodes, factor, used)
 
         def after(steps: Float[Array, "14"]) -> tuple[Float[Array, "7"], Float[Array, "7"]]:
-            residual = _residual(move(ends, steps.reshape(2, DEGREES)), edge)
+            residual = _residual(move(ends, steps.reshape(2, DEGREES)), factor)
             return residual, residual
 
         jacobian, residual = jax.jacfwd(after, has_aux=True)(jnp.zeros(2 * DEGREES, ends.log_scale.dtype))
         return residual, jacobian
 
-    return jax.vmap(of_edge)(graph.factors, factors_in_use(graph))
+    return jax.vmap(of_factor)(graph.factors, factors_in_use(graph))
 
 
 def robust(
     chi2: Float[Array, "e"], kind: Int[Array, "e"], kernel: Float[Array, ""]
 ) -> tuple[Float[Array, "e"], Float[Array, "e"]]:
-    """Cost of every edge and the weight of its χ² in the quadratic model: dynamic covariance scaling on loops.
+    """Cost of every factor and the weight of its χ² in the quadratic model: dynamic covariance scaling on loops.
 
     ρ = χ²/2 up to φ, and 2φχ²/(φ + χ²) − φ/2 beyond, which never exceeds 3φ/2; weight s², s = min(1, 2φ/(φ + χ²)).
     Source: Agarwal et al., "Robust map optimization using dynamic covariance scaling", 2013; the kernel after MacTavish

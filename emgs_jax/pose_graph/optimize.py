@@ -106,11 +106,11 @@ def _minimize(problem: Problem, now: Linear, config: PoseGraphConfig) -> tuple[L
 def _info(
     problem: Problem, before: float, end: Linear, tried: tuple[int, bool], num_edges: int, reason: str = ""
 ) -> PoseGraphInfo:
-    edges, count = problem.graph.factors, int(problem.used.sum())
+    factors, count = problem.graph.factors, int(problem.used.sum())
     edge_chi2, edge_weights = np.zeros(num_edges), np.ones(num_edges)
     edge_chi2[problem.used], edge_weights[problem.used] = end.chi2[:count], end.weights[:count]
-    is_loop = np.asarray(edges.kind) == LOOP
-    num_odometry_rows, num_loop_rows = num_rows(edges, ODOMETRY), num_rows(edges, LOOP)
+    is_loop = np.asarray(factors.kind) == LOOP
+    num_odometry_rows, num_loop_rows = num_rows(factors, ODOMETRY), num_rows(factors, LOOP)
     num_prior = int(np.sum(problem.free[:, 6])) if problem.scale_information > 0 else 0
     return PoseGraphInfo(
         reason=reason,
@@ -136,39 +136,39 @@ def _refused(graph: PoseGraph, reason: str) -> PoseGraphInfo:
     return PoseGraphInfo(reason, nothing, nothing, 0, False, zeros, np.ones(num_edges), 0.0, 0.0, 0, 0, 0, 0)
 
 
-def _start(problem: Problem, given: Linear, config: PoseGraphConfig) -> Linear:
-    """The given poses, or those with the errors spread, whichever cost less."""
+def _start(problem: Problem, initial: Linear, config: PoseGraphConfig) -> Linear:
+    """Return the initial nodes, or those with the errors spread, whichever cost less."""
     nodes = chordal_initialization(problem.graph, problem.free) if config.start == "chordal" else None
     if nodes is None:
-        return given
+        return initial
     other = linear(problem, nodes, float(config.kernel))
-    return other if other.cost < given.cost else given
+    return other if other.cost < initial.cost else initial
 
 
-def _solve(problem: Problem, given: Linear, config: PoseGraphConfig) -> tuple[Linear, int, bool]:
-    """The best of two searches, where a loop is left out by the first: the other begins where all loops count in full.
+def _solve(problem: Problem, initial: Linear, config: PoseGraphConfig) -> tuple[Linear, int, bool]:
+    """Return the better of two searches if the first downweights a loop; the second starts with all at full weight.
 
-    The cost of a loop is bounded, so what the first begins too far from pulls no more, and stays out for good.
+    The cost of a loop is bounded, so a loop that is violated too much at the start stays an outlier.
     """
-    found = _minimize(problem, _start(problem, given, config), config)
+    found = _minimize(problem, _start(problem, initial, config), config)
     is_loop = np.asarray(problem.graph.factors.kind) == LOOP
     if config.start == "current" or not np.any(found[0].weights[is_loop] < 1):
         return found
     full = eqx.tree_at(lambda c: c.kernel, config, np.inf)
-    begin = linear(problem, problem.graph.nodes, np.inf)
-    begin = _minimize(problem, _start(problem, begin, full), full)[0]
-    other = _minimize(problem, linear(problem, begin.nodes, float(config.kernel)), config)
+    start = linear(problem, problem.graph.nodes, np.inf)
+    start = _minimize(problem, _start(problem, start, full), full)[0]
+    other = _minimize(problem, linear(problem, start.nodes, float(config.kernel)), config)
     return other if other[0].cost < found[0].cost else found
 
 
-def _rejection(problem: Problem, given: Linear, end: Linear, converged: bool, config: PoseGraphConfig) -> str:
+def _rejection(problem: Problem, initial: Linear, end: Linear, converged: bool, config: PoseGraphConfig) -> str:
     """Return why a solution is rejected; empty where it is accepted."""
-    if end is given and not converged:
+    if end is initial and not converged:
         return "no step lowers the cost"
     is_odometry = np.asarray(problem.graph.factors.kind) == ODOMETRY
     allowed = float(config.max_misfit) * num_rows(problem.graph.factors, ODOMETRY)
     bent = float(np.sum(end.chi2[is_odometry]))
-    if bent > max(allowed, float(np.sum(given.chi2[is_odometry]))):
+    if bent > max(allowed, float(np.sum(initial.chi2[is_odometry]))):
         return f"the loops contradict the odometry: their χ² would be {bent:.4g}, more than {allowed:.4g}"
     return ""
 
@@ -196,14 +196,14 @@ def optimize(graph: PoseGraph, config: PoseGraphConfig) -> tuple[Nodes, PoseGrap
         problem = problem_of(graph, float(config.scale_std))
         if isinstance(problem, str):
             return graph.nodes, _refused(graph, problem)
-        given = linear(problem, problem.graph.nodes, float(config.kernel))
-        if not np.isfinite(given.cost):
+        initial = linear(problem, problem.graph.nodes, float(config.kernel))
+        if not np.isfinite(initial.cost):
             return graph.nodes, _refused(graph, "the cost is not finite")
-        is_settled = given.cost <= NOTHING_TO_GAIN * num_rows(problem.graph.factors)
+        is_settled = initial.cost <= NOTHING_TO_GAIN * num_rows(problem.graph.factors)
         if is_settled or config.max_iterations == 0:
-            return graph.nodes, _info(problem, given.cost, given, (0, is_settled), num_edges)
-        end, num_iterations, converged = _solve(problem, given, config)
-        reason = _rejection(problem, given, end, converged, config)
-        info = _info(problem, given.cost, end, (num_iterations, converged), num_edges, reason)
-        keeps = bool(reason) or end is given
+            return graph.nodes, _info(problem, initial.cost, initial, (0, is_settled), num_edges)
+        end, num_iterations, converged = _solve(problem, initial, config)
+        reason = _rejection(problem, initial, end, converged, config)
+        info = _info(problem, initial.cost, end, (num_iterations, converged), num_edges, reason)
+        keeps = bool(reason) or end is initial
         return graph.nodes if keeps else _write_back(graph.nodes, problem, end.nodes), info

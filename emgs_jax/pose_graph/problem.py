@@ -19,10 +19,10 @@ class Problem(NamedTuple):
     """A graph as it is solved: float64, in buckets of powers of two, the gauge's part only.
 
     Args:
-        graph: padded; edges of other parts are not in use.
+        graph: padded; factors of other parts are not in use.
         free: (n, 7) unknowns that may move.
         scale_information: 1/s_p²; 0 without a prior.
-        used: (e,) edges of the original graph that count.
+        used: (e,) factors of the original graph that count.
         num_disconnected: nodes.
     """
 
@@ -72,22 +72,23 @@ def _parts(graph: PoseGraph, used: np.ndarray) -> np.ndarray:
 
 def problem_of(graph: PoseGraph, scale_std: float) -> Problem | str:
     """Build the least-squares problem of a pose graph, or return the reason why it has no solution."""
-    nodes, edges = graph.nodes, graph.factors
+    nodes, factors = graph.nodes, graph.factors
     used, valid = np.asarray(factors_in_use(graph)), np.asarray(nodes.valid)
     numbers = np.concatenate(
-        [edges.Z_a_b.wxyz_xyz, np.asarray(edges.log_ratio)[:, None], np.asarray(edges.sqrt_info).reshape(-1, 49)], 1
+        [factors.Z_a_b.wxyz_xyz, np.asarray(factors.log_ratio)[:, None], np.asarray(factors.sqrt_info).reshape(-1, 49)],
+        1,
     )
     bad = np.flatnonzero(used & ~np.isfinite(numbers).all(axis=1))
     if len(bad):
-        return f"edges {bad[:5].tolist()} are not finite"
+        return f"factors {bad[:5].tolist()} are not finite"
     poses = np.concatenate([nodes.T_world.wxyz_xyz, np.asarray(nodes.log_scale)[:, None]], 1)
     bad = np.flatnonzero(valid & ~np.isfinite(poses).all(axis=1))
     if len(bad):
         return f"nodes {bad[:5].tolist()} are not finite"
     if not used.any():
-        return "no edge is in use"
+        return "no factor is in use"
     joined = _parts(graph, used)
-    used = used & joined[np.asarray(edges.a) * used] & joined[np.asarray(edges.b) * used]
+    used = used & joined[np.asarray(factors.a) * used] & joined[np.asarray(factors.b) * used]
     if not used.any():
         return "no measurement leads to the first node"
 
@@ -95,7 +96,7 @@ def problem_of(graph: PoseGraph, scale_std: float) -> Problem | str:
     still = np.array(jaxlie.SE3.identity((n,)).wxyz_xyz, poses.dtype)
     still[: len(valid)][joined] = poses[joined, :7]
     scales = np.where(joined, poses[:, 7], 0.0)
-    padded = jax.tree.map(lambda leaf: jnp.asarray(_pad(np.asarray(leaf)[used], e)), edges)
+    padded = jax.tree.map(lambda leaf: jnp.asarray(_pad(np.asarray(leaf)[used], e)), factors)
     padded = where_rows(padded.valid, padded, eqx.tree_at(lambda x: x.Z_a_b, padded, jaxlie.SE3.identity((e,))))
     moving = Nodes(jaxlie.SE3(jnp.asarray(still)), jnp.asarray(_pad(scales, n)), jnp.asarray(_pad(joined, n)))
     free = np.repeat(np.asarray(moving.valid)[:, None], DEGREES, axis=1)
@@ -107,21 +108,21 @@ def problem_of(graph: PoseGraph, scale_std: float) -> Problem | str:
 
 def linear(problem: Problem, nodes: Nodes, kernel: float) -> Linear:
     """Cost and normal equations about some nodes."""
-    edges = problem.graph.factors
-    residuals, jacobians = map(np.asarray, _linearize(PoseGraph(nodes, edges)))
+    factors = problem.graph.factors
+    residuals, jacobians = map(np.asarray, _linearize(PoseGraph(nodes, factors)))
     chi2 = np.sum(residuals**2, axis=1)
-    costs, weights = map(np.asarray, _robust(chi2, edges.kind, kernel))
+    costs, weights = map(np.asarray, _robust(chi2, factors.kind, kernel))
     root = np.sqrt(weights)[:, None, None]
     prior = np.zeros((*problem.free.shape, 2))
     prior[:, 6, 0] = problem.scale_information
     prior[:, 6, 1] = problem.scale_information * np.asarray(nodes.log_scale)
-    ends = np.stack([edges.a, edges.b], axis=-1)
+    ends = np.stack([factors.a, factors.b], axis=-1)
     equations = normal_equations(ends, root * residuals[..., None], root * jacobians, problem.free, prior)
     held = 0.5 * np.sum(problem.free[:, 6] * prior[:, 6, 1] * np.asarray(nodes.log_scale))
     return Linear(nodes, float(np.sum(costs) + held), chi2, weights, equations)
 
 
-def num_rows(edges: Factors, kind: int | None = None) -> int:
-    """Measured rows of all edges in use, or of one kind."""
-    counts = np.any(np.asarray(edges.sqrt_info) != 0, axis=2).sum(axis=1) * np.asarray(edges.valid)
-    return int(np.sum(counts if kind is None else counts * (np.asarray(edges.kind) == kind)))
+def num_rows(factors: Factors, kind: int | None = None) -> int:
+    """Measured rows of all factors in use, or of one kind."""
+    counts = np.any(np.asarray(factors.sqrt_info) != 0, axis=2).sum(axis=1) * np.asarray(factors.valid)
+    return int(np.sum(counts if kind is None else counts * (np.asarray(factors.kind) == kind)))

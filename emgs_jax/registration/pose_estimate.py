@@ -149,7 +149,7 @@ def correct_by_points(
     _, world = kalman_update(worth * estimate.world_covariance, nothing, found.information / num_alike)
     num_scales = estimate.num_scales + 1.0
     log_scale = estimate.log_scale + (jnp.log(scale) - estimate.log_scale) / num_scales
-    # What the prior said of its poses is said whether its points fit or not.
+    # Predicted poses are repeated predictions of the next frame, whether the points fit or not.
     estimate = eqx.tree_at(lambda b: b.repeats, estimate, rescale_repeats(estimate.repeats, scale))
     after = PoseEstimate(covariance, world, found.misfit, log_scale, num_scales, estimate.repeats)
     return jax.tree.map(lambda new, old: jnp.where(is_tracked, new, old), after, estimate)

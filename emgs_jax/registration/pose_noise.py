@@ -2,9 +2,9 @@
 
 In the prediction before the current one, the current frame was the newest and the previous frame the current one: it
 has the motion of the camera between the two, and the previous pose relative to the anchor. The current prediction has
-both again. Depths tell less: a prior may keep those of an image, and one that solves for poses knows them better than
+both again. Depths show less: a prior may keep those of an image, and one that solves for poses knows them better than
 any depth. Two predictions that are equal up to rounding are one prediction, of a prior that has one pose for a frame:
-its consistency says nothing about its error, and the pose is as uncertain as without a repeated prediction.
+its consistency is no evidence of its error, and the pose is as uncertain as without a repeated prediction.
 """
 
 import equinox as eqx
@@ -80,10 +80,10 @@ def repeat_poses(
     counts = jnp.minimum(before.counts + is_again, max_count)
     changes = (jnp.log(squares + SMALLEST_SQUARE) - before.log_squares) / jnp.maximum(counts, 1.0)[:, None]
     log_squares = before.log_squares + jnp.where(is_again[:, None], changes, 0.0)
-    said = stack([current.inverse() @ newest, anchor @ current]).wxyz_xyz
-    is_said = jnp.all(jnp.isfinite(said), axis=-1) & jnp.stack([prediction.has_newest, jnp.asarray(True)])
-    said = jaxlie.SE3(jnp.where(is_said[:, None], said, jaxlie.SE3.identity().wxyz_xyz))
-    return Repeats(said, is_said, log_squares, counts), squares
+    predicted = stack([current.inverse() @ newest, anchor @ current]).wxyz_xyz
+    is_predicted = jnp.all(jnp.isfinite(predicted), axis=-1) & jnp.stack([prediction.has_newest, jnp.asarray(True)])
+    predicted = jaxlie.SE3(jnp.where(is_predicted[:, None], predicted, jaxlie.SE3.identity().wxyz_xyz))
+    return Repeats(predicted, is_predicted, log_squares, counts), squares
 
 
 @full_precision

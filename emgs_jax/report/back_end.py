@@ -94,8 +94,8 @@ def counts(end: BackEnd) -> dict[str, Any]:
         "loops/verified": sum(loop.b >= end.first_node for loop in end.verified),
         "loops/contradicted": sum(loop.b >= end.first_node for loop in end.violating),
         "loops/accepted": sum(loop.b >= end.first_node for loop in end.accepted),
-        "loops/measured_again": sum(told == MEASURED for told in end.queries.values()),
-        "loops/unusable_answers": sum(told == UNUSABLE for told in end.queries.values()),
+        "loops/measured_again": sum(outcome == MEASURED for outcome in end.queries.values()),
+        "loops/unusable_answers": sum(outcome == UNUSABLE for outcome in end.queries.values()),
         "loops/closures": sum(not closure.info.reason for closure in solved),
         "loops/closures_refused": sum(bool(closure.info.reason) for closure in solved),
     } | refused

@@ -27,18 +27,18 @@ from emgs_jax.running.relocalization import frame_data
 from emgs_jax.running.window_input import WindowInput
 
 
-def update_back_end(run: MappingRun, window_input: WindowInput) -> None:
+def update_back_end(run: MappingRun, window: WindowInput) -> None:
     """Add the last input's frames to the back end, detect loops, and close them where the poses violate them.
 
     Args:
         run: with a back end, and a state.
-        window_input: the last one.
+        window: the last one.
     """
-    added, frames = run.records[-len(window_input.frames) :], frame_data(window_input)
+    added, frames = run.records[-len(window.frames) :], frame_data(window)
     for frame, record in zip(frames, added, strict=True):
         run.back_end = _with_frame(run.back_end, frame, record)
     if added[-1].similarity is not None:
-        join_submaps(run, window_input)
+        join_submaps(run, window)
     before = run.back_end
     end = detect_loops(before, frames[-1])
     loops = recent_loops(end)

@@ -69,14 +69,14 @@ def map_together(
     ]
     num_alone = 2  # inputs with a map: the first compiles `init_state`, the second the step, once for all groups
     with ThreadPoolExecutor(num_threads) as threads:
-        for window_input in window_inputs(dataset, prior, runs[0].config, clock):
+        for window in window_inputs(dataset, prior, runs[0].config, clock):
             with clock.phase("map"):
                 alone = integrators[: 1 if num_alone else 0]
                 for integrate in alone:
-                    integrate(window_input)
-                list(threads.map(lambda one, window_input=window_input: one(window_input), integrators[len(alone) :]))
-            num_alone -= bool(num_alone) and window_input.prediction is not None
-            yield from window_input.raw
+                    integrate(window)
+                list(threads.map(lambda one, window=window: one(window), integrators[len(alone) :]))
+            num_alone -= bool(num_alone) and window.prediction is not None
+            yield from window.raw
     for group in stacks:
         group.hand_out()
     for run in runs:
@@ -94,25 +94,23 @@ class Stack:
         self._runs, self._configs = runs, stack([run.config for run in runs])
         self._states: SlamState | None = None
 
-    def integrate(self, window_input: WindowInput) -> None:
+    def integrate(self, window: WindowInput) -> None:
         """Integrate one input into all runs; where the map or submap of one is full, all capacities grow."""
         timer, camera = Timer(self._runs[0].clock), self._runs[0].camera
-        match window_input.prediction:
+        match window.prediction:
             case None:
                 for run in self._runs:
-                    record_lost(run, window_input)
+                    record_lost(run, window)
             case FirstWindow() as first:
                 self._states, self._configs = start(first, camera, self._configs, init_states)
                 self.hand_out()
                 for run in self._runs:
-                    record_start(run, window_input, seconds_of(window_input, timer, len(self._runs)))
+                    record_start(run, window, seconds_of(window, timer, len(self._runs)))
             case Prediction() as prediction:
                 stepped = advance(self._states, prediction, camera, self._configs, step_states)
                 self._states, infos, self._configs = stepped[0], jax.device_get(stepped[1]), stepped[2]
                 for position, run in enumerate(self._runs):
-                    record_step(
-                        run, window_input, _item(infos, position), seconds_of(window_input, timer, len(self._runs))
-                    )
+                    record_step(run, window, _item(infos, position), seconds_of(window, timer, len(self._runs)))
 
     def hand_out(self) -> None:
         """Give every run its own state and config."""

@@ -153,7 +153,7 @@ class Keeper:
                 self.found = load_checkpoint(path, signature)
                 self._num_saved = len(self.found.records)
             except ValueError as error:
-                self.note = f"{error}; this run begins at its first frame"
+                self.note = f"{error}; this run starts at its first frame"
 
     def attend(self, run: MappingRun) -> None:
         """Collect the records of a run, each as first estimated."""

@@ -36,45 +36,43 @@ from emgs_jax.slam import SlamConfig, SlamState, StepInfo
 UNKNOWN = np.full((4, 4), np.nan)  # pose
 
 
-def step_prediction(run: MappingRun, window_input: WindowInput) -> Prediction:
+def step_prediction(run: MappingRun, window: WindowInput) -> Prediction:
     """Return a step's prediction in the world of the map; without poses where they are not related to it."""
-    prediction = as_step_prediction(window_input.prediction)
-    if run.structure is None or not is_related(run, window_input):
+    prediction = as_step_prediction(window.prediction)
+    if run.structure is None or not is_related(run, window):
         return prediction
-    return in_structure(prediction, window_input, run.structure)
+    return in_structure(prediction, window, run.structure)
 
 
-def in_structure(prediction: Prediction, window_input: WindowInput, placed: PlacedStructure) -> Prediction:
+def in_structure(prediction: Prediction, window: WindowInput, placed: PlacedStructure) -> Prediction:
     """Transform a step's input from the prior's own world to that of the map."""
-    here = window_input.frames[0].index
+    here = window.frames[0].index
     rows = here - 1, here, here + int(prediction.has_newest)
-    T_world_views = placed.T_world_structure @ np.stack([window_input.T_anchor_views.get(row, UNKNOWN) for row in rows])
+    T_world_views = placed.T_world_structure @ np.stack([window.T_anchor_views.get(row, UNKNOWN) for row in rows])
     return replace(prediction, T_world_views=to_se3(T_world_views), T_world_anchor=to_se3(placed.T_world_anchor))
 
 
-def is_related(run: MappingRun, window_input: WindowInput) -> bool:
+def is_related(run: MappingRun, window: WindowInput) -> bool:
     """Test whether the predicted poses are in a world whose pose in the map is known."""
-    return window_input.structure == (0 if run.structure is None else run.structure.number)
+    return window.structure == (0 if run.structure is None else run.structure.number)
 
 
-def place_structure(window_input: WindowInput, pose: np.ndarray) -> PlacedStructure:
+def place_structure(window: WindowInput, pose: np.ndarray) -> PlacedStructure:
     """Place the prior's own world by the pose of the current frame in the map; lengths are scaled about that frame."""
-    own = window_input.T_anchor_views.get(window_input.frames[0].index, UNKNOWN)
-    return PlacedStructure(window_input.structure, pose @ np.linalg.inv(own), pose)
+    own = window.T_anchor_views.get(window.frames[0].index, UNKNOWN)
+    return PlacedStructure(window.structure, pose @ np.linalg.inv(own), pose)
 
 
-def start_submap(run: MappingRun, window_input: WindowInput) -> tuple[SlamState, SlamConfig] | None:
+def start_submap(run: MappingRun, window: WindowInput) -> tuple[SlamState, SlamConfig] | None:
     """Start a map of this frame alone, at the pose of the frame before; None where no submap starts.
 
     Its unit is the prior's own: that of another map does not apply.
     """
-    pose = window_input.T_anchor_views.get(window_input.frames[0].index)
-    is_new = (
-        run.back_end is not None and run.state is not None and not run.is_fixed and not is_related(run, window_input)
-    )
+    pose = window.T_anchor_views.get(window.frames[0].index)
+    is_new = run.back_end is not None and run.state is not None and not run.is_fixed and not is_related(run, window)
     if not is_new or pose is None or not np.isfinite(pose).all():
         return None
-    view = jax.tree.map(lambda leaf: leaf[None], as_step_prediction(window_input.prediction).current)
+    view = jax.tree.map(lambda leaf: leaf[None], as_step_prediction(window.prediction).current)
     alone, config = start(FirstWindow(view, to_se3(run.records[-1].pose[None])), run.camera, run.config)
     if not bool(alone.map.gaussians.valid.any()):
         return None
@@ -83,33 +81,33 @@ def start_submap(run: MappingRun, window_input: WindowInput) -> tuple[SlamState,
     return replace(alone, map=map, time=time + 1), config
 
 
-def enter_submap(run: MappingRun, window_input: WindowInput, before: SlamState) -> None:
+def enter_submap(run: MappingRun, window: WindowInput, before: SlamState) -> None:
     """Switch to the submap that the last frame has started; the state `before` it becomes inactive."""
     run.inactive = run.inactive | {run.back_end.submap_id: before}
-    run.back_end = replace(run.back_end, submap_id=window_input.structure)
-    run.structure, run.prior_motion = place_structure(window_input, run.records[-1].pose), None
+    run.back_end = replace(run.back_end, submap_id=window.structure)
+    run.structure, run.prior_motion = place_structure(window, run.records[-1].pose), None
 
 
-def match_submap(run: MappingRun, window_input: WindowInput, info: StepInfo) -> np.ndarray | None:
+def match_submap(run: MappingRun, window: WindowInput, info: StepInfo) -> np.ndarray | None:
     """Relocalize a tracked frame in an inactive submap; return the similarity (4, 4) between both worlds, or None.
 
     The relocalized pose must pass the tests of a lost camera's, the fit to the map included.
 
     Args:
         run: before this frame.
-        window_input: this frame.
+        window: this frame.
         info: of its step, in its own submap.
     """
     if not run.inactive or not bool(info.localization.is_tracked):
         return None
-    place, _ = relocalize_frame(run.back_end, frame_data(window_input)[0], in_other_submap=True)
+    place, _ = relocalize_frame(run.back_end, frame_data(window)[0], in_other_submap=True)
     if place is None:
         return None
     other = run.inactive[run.back_end.submap_ids[place.keyframe]]
     # This frame determines the prior's unit in that map.
     estimate = replace(other.estimate, log_scale=jnp.asarray(place.log_scale, jnp.float32))
     visiting = replace(run, state=replace(other, estimate=estimate))
-    begin, again = relocalized_start(visiting, step_prediction(run, window_input), place)
+    begin, again = relocalized_start(visiting, step_prediction(run, window), place)
     _, there, _ = advance(begin, again, run.camera, run.config)
     if rejection(there, again, place, run.back_end.config.relocalization) is not None:
         return None
@@ -122,13 +120,13 @@ def _camera_in_world(info: StepInfo) -> Sim3:
     return Sim3(float(info.localization.scale), T[:3, :3], T[:3, 3])
 
 
-def join_submaps(run: MappingRun, window_input: WindowInput) -> None:
+def join_submaps(run: MappingRun, window: WindowInput) -> None:
     """Join the submap of the last frame, which is a node already, with the one in which it was relocalized.
 
     The newer one moves, by the similarity of the record or its inverse.
     """
     end, similarity = run.back_end, Sim3.from_matrix(run.records[-1].similarity)
-    frame = frame_data(window_input)[-1]
+    frame = frame_data(window)[-1]
     place, _ = relocalize_frame(end, frame, in_other_submap=True)  # where `match_submap` has found it
     here, there = end.submap_id, end.submap_ids[place.keyframe]
     if here < there:
@@ -152,7 +150,7 @@ def join_submaps(run: MappingRun, window_input: WindowInput) -> None:
     if here == newer:
         scale = jnp.asarray(similarity.scale, jnp.float32)
         run.state = replace(run.state, estimate=rescale_estimate(state.estimate, scale))
-        run.prior_motion = anchor_motion_of(run.records[-1], step_prediction(run, window_input))
+        run.prior_motion = anchor_motion_of(run.records[-1], step_prediction(run, window))
 
 
 def join_factor(end: BackEnd, place: RelocalizedPose, unit: float) -> Factor:

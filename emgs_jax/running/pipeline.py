@@ -119,14 +119,14 @@ def map_frames(run: MappingRun, dataset: Dataset, prior: Prior, keeper: Keeper |
         spacing = run.back_end.config.prior_query.spacing
         run.prior_query = make_prior_query(prior, dataset, spacing, run.config.window_size, run.clock)
     try:
-        for position, window_input in enumerate(window_inputs(dataset, prior, run.config, run.clock)):
+        for position, window in enumerate(window_inputs(dataset, prior, run.config, run.clock)):
             with run.clock.phase("map"):
                 if keeper.found is not None and position < keeper.found.num_inputs:
-                    replay_input(run, window_input, keeper.found, is_last=position + 1 == keeper.found.num_inputs)
+                    replay_input(run, window, keeper.found, is_last=position + 1 == keeper.found.num_inputs)
                 else:
-                    integrate_input(run, window_input)
+                    integrate_input(run, window)
             keeper.keep(run, position + 1)
-            yield from window_input.raw
+            yield from window.raw
         keeper.save()
         if run.saved is not None and run.state is None:
             raise ValueError(not_found_message(run))
@@ -144,47 +144,47 @@ def map_frames(run: MappingRun, dataset: Dataset, prior: Prior, keeper: Keeper |
         rescale_run(run)
 
 
-def integrate_input(run: MappingRun, window_input: WindowInput) -> None:
+def integrate_input(run: MappingRun, window: WindowInput) -> None:
     """Integrate one input into the map of `run`, and record what became of its frames."""
     timer = Timer(run.clock)
-    match window_input.prediction:
+    match window.prediction:
         case None:
-            record_lost(run, window_input)
+            record_lost(run, window)
             return
         case FirstWindow() as first if run.saved is None:
             prepare_step(first, run.camera, run.config)
             run.state, run.config = start(first, run.camera, run.config)
-            record_start(run, window_input, seconds_of(window_input, timer))
+            record_start(run, window, seconds_of(window, timer))
         case prediction:
             if isinstance(prediction, FirstWindow):
                 prepare_step(prediction, run.camera, run.config)
-            before, new = run.state, start_submap(run, window_input)
+            before, new = run.state, start_submap(run, window)
             if new is not None:
                 run.state, run.config = new
-                record_new_submap(run, window_input, seconds_of(window_input, timer))
-                enter_submap(run, window_input, before)
-            elif not _integrate_step(run, window_input, timer):
+                record_new_submap(run, window, seconds_of(window, timer))
+                enter_submap(run, window, before)
+            elif not _integrate_step(run, window, timer):
                 return
     if run.back_end is not None and not run.is_fixed:
         with run.clock.phase("back_end"):
-            update_back_end(run, window_input)
+            update_back_end(run, window)
 
 
-def _integrate_step(run: MappingRun, window_input: WindowInput, timer: Timer) -> bool:
+def _integrate_step(run: MappingRun, window: WindowInput, timer: Timer) -> bool:
     """Run one step and record it; return False where the camera has no pose yet."""
-    info, location = step_or_relocalize(run, window_input, step_prediction(run, window_input))
+    info, location = step_or_relocalize(run, window, step_prediction(run, window))
     if info is None:
-        record_lost(run, window_input, location)
+        record_lost(run, window, location)
         return False
-    similarity = match_submap(run, window_input, info) if location is None else None
+    similarity = match_submap(run, window, info) if location is None else None
     location = location if similarity is None else JOINED
-    record_step(run, window_input, jax.device_get(info), seconds_of(window_input, timer), location, similarity)
-    reanchor_prior(run, window_input)
+    record_step(run, window, jax.device_get(info), seconds_of(window, timer), location, similarity)
+    reanchor_prior(run, window)
     return True
 
 
 def step_or_relocalize(
-    run: MappingRun, window_input: WindowInput, prediction: Prediction
+    run: MappingRun, window: WindowInput, prediction: Prediction
 ) -> tuple[StepInfo | None, str | None]:
     """Integrate one input by a step; a lost camera is relocalized first, and the step starts at the pose found.
 
@@ -197,20 +197,20 @@ def step_or_relocalize(
     if state is not None:
         state, info, config = advance(state, move_prediction(prediction, run.prior_motion), run.camera, config)
     if is_relocalization_due(run, info):
-        place, location = relocalize_frame(run.back_end, frame_data(window_input)[0])
+        place, location = relocalize_frame(run.back_end, frame_data(window)[0])
         if place is not None:
-            is_known = is_related(run, window_input)
+            is_known = is_related(run, window)
             seen = (
                 prediction
                 if is_known
-                else in_structure(prediction, window_input, place_structure(window_input, place.T_world_camera))
+                else in_structure(prediction, window, place_structure(window, place.T_world_camera))
             )
             begin, again = relocalized_start(run, seen, place, has_other_unit=not is_known)
             found = advance(begin, again, run.camera, run.config)
             location = rejection(found[1], again, place, run.back_end.config.relocalization) or RELOCALIZED
             if location == RELOCALIZED:
                 state, info, config = found
-        if location not in (None, RELOCALIZED) and info is not None and is_restart_due(run, window_input, state, info):
+        if location not in (None, RELOCALIZED) and info is not None and is_restart_due(run, window, state, info):
             location, (state, config) = RESTARTED, restart_map(state, run.camera, config)
     if run.is_fixed and state is not None:
         state = replace_map(state, run.saved.map, config.submap.map_capacity)
@@ -218,38 +218,38 @@ def step_or_relocalize(
     return info, location
 
 
-def reanchor_prior(run: MappingRun, window_input: WindowInput) -> None:
+def reanchor_prior(run: MappingRun, window: WindowInput) -> None:
     """Anchor the prior's world at the last frame, if relocalization has found its pose."""
     if run.records[-1].location != RELOCALIZED:
         return
-    if is_related(run, window_input):
-        run.prior_motion = anchor_motion_of(run.records[-1], step_prediction(run, window_input))
+    if is_related(run, window):
+        run.prior_motion = anchor_motion_of(run.records[-1], step_prediction(run, window))
     else:  # the prior continues in a world of its own, which moves with this frame
-        run.structure, run.prior_motion = place_structure(window_input, run.records[-1].pose), jaxlie.SE3.identity()
+        run.structure, run.prior_motion = place_structure(window, run.records[-1].pose), jaxlie.SE3.identity()
 
 
-def replay_input(run: MappingRun, window_input: WindowInput, checkpoint: Checkpoint, is_last: bool) -> None:
+def replay_input(run: MappingRun, window: WindowInput, checkpoint: Checkpoint, is_last: bool) -> None:
     """Replay an input from a checkpoint's records; after the last one the run has the checkpoint's state."""
-    if isinstance(window_input.prediction, FirstWindow):
-        prepare_step(window_input.prediction, run.camera, run.config)
+    if isinstance(window.prediction, FirstWindow):
+        prepare_step(window.prediction, run.camera, run.config)
         if run.saved is None:
-            run.state, run.config = start(window_input.prediction, run.camera, run.config)
+            run.state, run.config = start(window.prediction, run.camera, run.config)
     first = len(run.records)
-    for record in checkpoint.records[first : first + len(window_input.frames)]:
+    for record in checkpoint.records[first : first + len(window.frames)]:
         run.records.append(record)
         run.on_record(record)
     if run.records[-1].location == NEW_SUBMAP:
-        enter_submap(run, window_input, run.state)
-    reanchor_prior(run, window_input)
+        enter_submap(run, window, run.state)
+    reanchor_prior(run, window)
     if run.state is None and run.records[-1].location == RELOCALIZED:
-        run.state = state_in_saved_map(run, as_step_prediction(window_input.prediction))
+        run.state = state_in_saved_map(run, as_step_prediction(window.prediction))
     if run.back_end is not None and run.state is not None and not run.is_fixed:
         with run.clock.phase("back_end"):
-            update_back_end(run, window_input)  # deforms a map that the checkpoint's state replaces
+            update_back_end(run, window)  # deforms a map that the checkpoint's state replaces
     if is_last:
         run.state, run.inactive, run.config = checkpoint.restored(run.state, run.config)
 
 
-def seconds_of(window_input: WindowInput, timer: Timer, num_sharing: int = 1) -> Mapping[str, float]:
+def seconds_of(window: WindowInput, timer: Timer, num_sharing: int = 1) -> Mapping[str, float]:
     """Add the seconds of the conversion to those of a timer, which `num_sharing` runs share equally."""
-    return {name: window_input.seconds.get(name, 0.0) + seconds / num_sharing for name, seconds in timer.read().items()}
+    return {name: window.seconds.get(name, 0.0) + seconds / num_sharing for name, seconds in timer.read().items()}

@@ -189,62 +189,53 @@ def new_run(
     return MappingRun(camera, config, clock, on_record, back_end=saved.back_end, saved=saved)
 
 
-def record_lost(run: MappingRun, window_input: WindowInput, location: str | None = None) -> None:
+def record_lost(run: MappingRun, window: WindowInput, location: str | None = None) -> None:
     """Record a lost frame before a map can start; its pose is the anchor's or the last one, a placeholder."""
-    reason, pose = REASONS[0] if location is None else NOT_FOUND, window_input.T_world_anchor
+    reason, pose = REASONS[0] if location is None else NOT_FOUND, window.T_world_anchor
     if run.saved is not None:
         pose = run.records[-1].pose if run.records else run.saved.back_end.poses[-1]
-    _add(run, window_input, 0, status="lost", reason=reason, location=location, pose=pose)
+    _add(run, window, 0, status="lost", reason=reason, location=location, pose=pose)
 
 
-def record_start(run: MappingRun, window_input: WindowInput, spent: Seconds) -> None:
+def record_start(run: MappingRun, window: WindowInput, seconds: Seconds) -> None:
     """Record the frames that the map was made from; raise ValueError where that map is empty."""
-    poses = np.asarray(window_input.prediction.T_world_views.wxyz_xyz)
+    poses = np.asarray(window.prediction.T_world_views.wxyz_xyz)
     count = int(np.asarray(run.map.gaussians.valid).sum())
     if count == 0:  # no later frame could be localised in it
         raise ValueError(
-            f"the map is empty after {len(poses)} view(s) from {window_input.frames[0].name}: the prior has no valid "
+            f"the map is empty after {len(poses)} view(s) from {window.frames[0].name}: the prior has no valid "
             "point there; begin elsewhere (dataset.start=...) or use slam.initialization=merged"
         )
-    share = {key: value / len(poses) for key, value in spent.items()}
+    share = {key: value / len(poses) for key, value in seconds.items()}
     for row, pose in enumerate(poses):
-        _add(
-            run,
-            window_input,
-            row,
-            status="initialization",
-            pose=to_matrix(pose),
-            scale=1.0,
-            num_gaussians=count,
-            **share,
-        )
+        _add(run, window, row, **share, status="initialization", pose=to_matrix(pose), scale=1.0, num_gaussians=count)
 
 
-def record_new_submap(run: MappingRun, window_input: WindowInput, spent: Seconds) -> None:
+def record_new_submap(run: MappingRun, window: WindowInput, seconds: Seconds) -> None:
     """Record the first frame of a disconnected submap; its pose is that of the frame before, a placeholder."""
     count = int(np.asarray(run.map.gaussians.valid).sum())
     kept = {"status": "initialization", "pose": run.records[-1].pose, "new": count, "num_gaussians": count}
-    _add(run, window_input, 0, **kept, scale=1.0, location=NEW_SUBMAP, **spent)
+    _add(run, window, 0, **kept, scale=1.0, location=NEW_SUBMAP, **seconds)
 
 
 def record_step(
-    run: MappingRun, window_input: WindowInput, info: StepInfo, spent: Seconds, location=None, similarity=None
+    run: MappingRun, window: WindowInput, info: StepInfo, seconds: Seconds, location=None, similarity=None
 ) -> None:
     """Record a step: `info` on the host, the seconds that it took, and the outcome of relocalization."""
     kept = {"fused": 0, "updated": 0, "new": 0, "num_gaussians": run.saved.count} if run.is_fixed else {}
     if location == RESTARTED:
         count = int(np.asarray(run.map.gaussians.valid).sum())
         kept = {"status": "initialization", "new": count - int(info.num_gaussians), "num_gaussians": count}
-    _add(run, window_input, 0, **_step_fields(info) | kept, location=location, similarity=similarity, **spent)
+    _add(run, window, 0, **_step_fields(info) | kept, location=location, similarity=similarity, **seconds)
 
 
-def _add(run: MappingRun, window_input: WindowInput, row: int, **described: Any) -> None:
-    frame = window_input.frames[row]
+def _add(run: MappingRun, window: WindowInput, row: int, **described: Any) -> None:
+    frame = window.frames[row]
     record = FrameRecord(
         index=frame.index,
         name=frame.name,
         timestamp=frame.timestamp,
-        raw_pose=window_input.raw[row].T_world_camera,
+        raw_pose=window.raw[row].T_world_camera,
         true_pose=frame.T_world_camera,
         **described,
     )

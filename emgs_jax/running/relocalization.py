@@ -31,7 +31,7 @@ def is_relocalization_due(run: MappingRun, info: StepInfo | None) -> bool:
     return info is None or _num_untracked(run, info) >= run.back_end.config.relocalization.patience
 
 
-def is_restart_due(run: MappingRun, window_input: WindowInput, state: SlamState, info: StepInfo) -> bool:
+def is_restart_due(run: MappingRun, window: WindowInput, state: SlamState, info: StepInfo) -> bool:
     """Test whether the map restarts from a frame that was not relocalized, at the pose that the prior predicts.
 
     Only after many untracked frames, and where the prior connects a frame in the map with this one and knows what it
@@ -39,26 +39,26 @@ def is_restart_due(run: MappingRun, window_input: WindowInput, state: SlamState,
 
     Args:
         run: before this frame.
-        window_input: this frame.
+        window: this frame.
         state: after its step.
         info: of its step.
     """
     count = _num_untracked(run, info)
     is_due = not run.is_fixed and count >= run.back_end.config.relocalization.max_patience
-    if not is_due or info.localization.is_lost or not _is_connected(run.back_end, window_input):
+    if not is_due or info.localization.is_lost or not _is_connected(run.back_end, window):
         return False
     depths = np.asarray(depth_in(state.T_world_previous, state.previous))
     depth = np.median(depths[np.asarray(state.previous.valid)])
     return bool(info.localization.repeat_rms <= run.config.localization.max_residual * depth)
 
 
-def _is_connected(end: BackEnd, window_input: WindowInput) -> bool:
+def _is_connected(end: BackEnd, window: WindowInput) -> bool:
     """Test whether a chain of predictions, each of two consecutive frames, leads from the map to the given frame.
 
     Frames that the prior itself has lost are skipped, where a later prediction shows frames of both sides. The anchor
     does not count as a link: a prior that has lost the connection predicts a pose of the anchor, too.
     """
-    here, before = (window_input.T_anchor_views.get(window_input.frames[0].index - offset) for offset in (0, 1))
+    here, before = (window.T_anchor_views.get(window.frames[0].index - offset) for offset in (0, 1))
     if here is None or before is None or not np.isfinite([here, before]).all():
         return False
     parents = {e.a: e.b for e in end.factors if e.kind == ODOMETRY and (e.b > end.first_node or e.a == e.b + 1)}
@@ -76,19 +76,19 @@ def _num_untracked(run: MappingRun, info: StepInfo) -> int:
     return 0 if info.localization.is_tracked else len(run.records) - (placed[-1] if placed else -1)
 
 
-def frame_data(window_input: WindowInput) -> list[FrameData]:
+def frame_data(window: WindowInput) -> list[FrameData]:
     """Collect what the back end needs of each frame."""
     return [
-        FrameData(frame.index, frame.image, raw.points, raw.mask, window_input.T_anchor_views)
-        for frame, raw in zip(window_input.frames, window_input.raw, strict=True)
+        FrameData(frame.index, frame.image, raw.points, raw.mask, window.T_anchor_views)
+        for frame, raw in zip(window.frames, window.raw, strict=True)
     ]
 
 
-def as_step_prediction(taken: FirstWindow | Prediction) -> Prediction:
+def as_step_prediction(opening: FirstWindow | Prediction) -> Prediction:
     """Convert the first view of a sequence to a step's input; return a step's input as it is."""
-    if isinstance(taken, Prediction):
-        return taken
-    view, T = jax.tree.map(lambda leaf: leaf[0], taken.views), pose_row(taken.T_world_views, 0)
+    if isinstance(opening, Prediction):
+        return opening
+    view, T = jax.tree.map(lambda leaf: leaf[0], opening.views), pose_row(opening.T_world_views, 0)
     return Prediction(
         current=view,
         previous=view,

@@ -25,7 +25,7 @@ from emgs_jax.running.factors import Factor
 PLACES_FILE, MAP_FILE, METRICS_FILE = "places.npz", "map.npz", "metrics.json"
 FORMAT, VERSION, DESCRIPTORS = "emgs_jax.places", 1, "rootsift"
 MODES = ("extend", "localize")
-LEFT_OUT = -1  # segment of nodes whose part was never joined with the map
+LEFT_OUT = -1  # submap of nodes that were never joined with the map
 NODES = ("poses", "log_scales", "frames", "is_placed")
 LOOPS = {"verified": "verified", "contradicted": "violating", "accepted": "accepted"}  # in the file: in a back end
 OF_POINTS, OF_KEYFRAMES = ("pixels", "descriptors", "points"), ("frame", "intrinsics", "size", "depths")
@@ -33,13 +33,13 @@ OF_POINTS, OF_KEYFRAMES = ("pixels", "descriptors", "points"), ("frame", "intrin
 
 @dataclass(frozen=True)
 class SavedMap:
-    """A map that a run begins in.
+    """A map of an earlier run in which another one continues.
 
     Args:
         map: of an earlier run.
-        back_end: what was measured then; its `first` node is the next.
+        back_end: of that run; its `first_node` is that of the next one.
         depth_noise: how much a frame differed from the map, as a fraction of its depth.
-        is_fixed: frames are only located in it; it stays as it is.
+        is_fixed: True in localization mode: the map stays as it is.
         checksum: of its files.
     """
 
@@ -51,7 +51,7 @@ class SavedMap:
 
     @property
     def count(self) -> int:
-        """Of its Gaussians."""
+        """Number of its Gaussians."""
         return int(np.asarray(self.map.gaussians.valid).sum())
 
 

@@ -373,10 +373,10 @@ def test_what_is_not_finite_is_refused_by_row():
     nodes, edges = graph.nodes, graph.factors
     nowhere = jaxlie.SE3(spoilt(edges.Z_a_b.wxyz_xyz, (7, 2), np.nan))
     refused(PoseGraph(nodes, put(edges, Z_a_b=nowhere)), "[7]")
-    refused(PoseGraph(nodes, put(edges, sqrt_info=spoilt(edges.sqrt_info, 3, np.inf))), "edges [3]")
+    refused(PoseGraph(nodes, put(edges, sqrt_info=spoilt(edges.sqrt_info, 3, np.inf))), "factors [3]")
     refused(PoseGraph(put(nodes, log_scale=spoilt(nodes.log_scale, 5, np.nan)), edges), "nodes [5]")
     refused(PoseGraph(put(nodes, log_scale=spoilt(nodes.log_scale, 5, -1e3)), edges), "cost")
-    refused(PoseGraph(nodes, put(edges, valid=np.zeros(edges.a.shape, bool))), "no edge")
+    refused(PoseGraph(nodes, put(edges, valid=np.zeros(edges.a.shape, bool))), "no factor")
     alone = (np.asarray(edges.a) != 0) & (np.asarray(edges.b) != 0)
     refused(PoseGraph(nodes, put(edges, valid=alone)), "no measurement leads to the first node")
 

@@ -172,7 +172,7 @@ def test_another_command_in_the_folder_begins_anew_and_says_why(tmp_path, monkey
     metrics = experiments.run.run(compose(*OVERRIDES, "slam.em.noise=0.5"), tmp_path)
     assert metrics["frames/tracked"] > 0
     text = "".join(capsys.readouterr())
-    assert "config.slam.em.noise was" in text and "begins at its first frame" in text
+    assert "config.slam.em.noise was" in text and "starts at its first frame" in text
     assert (tmp_path / "previous-1" / CHECKPOINT_FILE).exists(), "nothing is lost"
 
 
@@ -201,7 +201,7 @@ def test_a_damaged_file_is_no_checkpoint_and_no_error(tmp_path, length):
     path.write_bytes(path.read_bytes()[:length])
     keeper = Keeper(path, CheckpointConfig(2), {})
     assert keeper.found is None and f"{path} cannot be resumed" in keeper.note
-    assert "begins at its first frame" in keeper.note
+    assert "starts at its first frame" in keeper.note
 
 
 def test_without_a_number_of_frames_nothing_is_written_or_read(tmp_path):
