@@ -117,13 +117,16 @@ def _target(image: np.ndarray, view: DenseView) -> np.ndarray:
 
 
 def _spreads(run: RecordedRun, rows: list[int], config: PolishConfig) -> np.ndarray:
-    """Square roots of the covariances of frames (m, 6, 6); 0 where a pose stays or nothing is known of it."""
+    """Square roots of the covariances of frames (m, 6, 6); 0 where poses stay.
+
+    A frame without one, as the first, to which the others' are relative, has that of the nearest frame with one.
+    """
     spreads = np.zeros((len(rows), 6, 6))
-    for number, row in enumerate(rows):
-        covariance = run.frames[row].get("covariance")
-        if config.poses and covariance is not None:
-            values, axes = np.linalg.eigh(np.asarray(covariance, np.float64).reshape(6, 6))
-            spreads[number] = axes * np.sqrt(np.maximum(values, 0.0))
+    known = np.array([row for row, line in enumerate(run.frames) if line.get("covariance") is not None])
+    for number, row in enumerate(rows) if config.poses and len(known) else ():
+        covariance = run.frames[known[np.abs(known - row).argmin()]]["covariance"]
+        values, axes = np.linalg.eigh(np.asarray(covariance, np.float64).reshape(6, 6))
+        spreads[number] = axes * np.sqrt(np.maximum(values, 0.0))
     return spreads
 
 
