@@ -118,7 +118,7 @@ def _about(run: RecordedRun, layers: dict[str, np.ndarray], paths: PlacedPaths) 
         "pivot": (0.5 * (low + high)).tolist(),
         "size": max(float(np.linalg.norm(high - low)), 1e-3),
         "covUnit": COV_UNIT,
-        "unitNote": "" if page_words.is_metric(run) else " (not metric)",
+        "isMetric": page_words.is_metric(run),
         "camera": {
             **dict(zip(("fx", "fy"), map(float, camera.focal), strict=True)),
             **dict(zip(("cx", "cy"), map(float, camera.center), strict=True)),
@@ -155,7 +155,7 @@ def _page(run: RecordedRun, paths: PlacedPaths, views: Views, about: dict[str, A
         "layers": _layers(run, {array["name"] for array in about["arrays"]}),
         "words": _options({-1: "all"} | dict(enumerate(about["classes"]))),
         "paths": _path_boxes(about),
-        "depths": f"{views.near:.1f} to {views.far:.1f} m",
+        "depths": f"{views.near:.1f} to {views.far:.1f} {'m' if page_words.is_metric(run) else 'units'}",
         "strip": strip(run, paths.errors),
         "key": key_of(run, paths.errors),
         "sections": page_words.errors(run)
