@@ -1,7 +1,7 @@
 """A finished run in the formats of other programs: COLMAP, nerfstudio, cameras as a mesh."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -34,12 +34,14 @@ class ExportConfig:
         max_points: of the dense cloud, drawn evenly.
         scale: factor on all lengths; None = 1.
         length: instead of it two frames and the metres between their cameras, see `factor_of`.
+        images: as `used` in the run, or in the `original` size on disk; either way without distortion.
     """
 
     formats: Sequence[str]
     max_points: int = number(low=1, high=2**26)
     scale: float | None = number(low=1e-6, high=1e6)
     length: Sequence[float] | None = number(low=0, high=2**31)
+    images: str = field(default="used", metadata={"choices": ("used", "original")})
 
 
 def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
