@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -39,12 +39,14 @@ class ExportConfig:
         max_points: of the dense cloud, drawn evenly.
         scale: factor on all lengths; None = 1.
         length: instead of it two frames and the metres between their cameras, see `factor_of`.
+        images: as `used` in the run, or in the `original` size on disk; either way without distortion.
     """
 
     formats: Sequence[str]
     max_points: int = number(low=1, high=2**26)
     scale: float | None = number(low=1e-6, high=1e6)
     length: Sequence[float] | None = number(low=0, high=2**31)
+    images: str = field(default="used", metadata={"choices": ("used", "original")})
 
 
 def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
