@@ -46,7 +46,10 @@ SLOW = {
     "registration/test_pose_noise.py",
     "registration/test_problem.py",
     *(f"report/{name}.py" for name in ("test_page", "test_page_browser", "test_query", "test_repeat")),
-    *(f"running/{name}.py" for name in ("test_back_end", "test_compilation", "test_executables", "test_locating")),
+    *(
+        f"running/{name}.py"
+        for name in ("test_back_end", "test_compilation", "test_executables", "test_relocalized_start")
+    ),
     "running/test_values.py",
     *(f"scripts/{name}.py" for name in ("test_command_line", "test_evaluate", "test_score", "test_sweep_script")),
     "scripts/test_tune.py",

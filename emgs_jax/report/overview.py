@@ -246,15 +246,16 @@ def _draw_scale_bar(axes: Axes, unit: str) -> None:
 
 
 def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]]) -> None:
-    depths = [np.asarray(frame["rendered_depth"])[np.asarray(frame["valid"])] for frame in frames]
-    depths = np.concatenate([depth[np.isfinite(depth) & (depth > 0)].ravel() for depth in depths])
-    near, far = np.percentile(depths, [1, 99]) if len(depths) else (0.0, 1.0)
+    depths = []
+    for frame in frames:
+        depth = np.asarray(frame["rendered_depth"], np.float64)
+        depths.append(np.ma.masked_where(~(np.asarray(frame["valid"]) & np.isfinite(depth)), depth))
+    seen = np.concatenate([depth.compressed() for depth in depths])
+    near, far = np.percentile(seen[seen > 0], [1, 99]) if (seen > 0).any() else (0.0, 1.0)
     mappable = None
-    for row, frame in zip(grid, frames, strict=True):
-        covered = np.asarray(frame["valid"]) & np.isfinite(frame["rendered_depth"])
+    for row, frame, depth in zip(grid, frames, depths, strict=True):
         row[0].imshow(np.asarray(frame["image"]))
         row[1].imshow(np.nan_to_num(np.asarray(frame["rendered_color"], np.float64)).clip(0.0, 1.0))
-        depth = np.ma.masked_where(~covered, np.asarray(frame["rendered_depth"], np.float64))
         mappable = row[2].imshow(depth, cmap="turbo", vmin=near, vmax=far)
         row[2].set_facecolor("#dddddd")
         row[0].set_ylabel(str(frame["title"]), fontsize=10, color=_INK)

@@ -129,24 +129,15 @@ def summary(
     total = np.sum([result.confusion for result in results], axis=0)
     right, true = np.diagonal(total), total.sum(1)
     union = true + total.sum(0)[: len(classes)] - right
-    by_class = {
-        name: {
-            "iou_percent": 100.0 * right[row] / union[row],
-            "recall_percent": 100.0 * right[row] / true[row] if true[row] else None,
-            "num_true": int(true[row]),
-        }
-        for row, name in enumerate(classes)
-        if union[row] > 0
-    }
     ates = [result.ate_m for result in results]
+    mean_ate = {"ate_sim3_m": None if None in ates else float(np.mean(ates))}
     return {
         "format": FORMAT,
         "version": VERSION,
         "protocol": asdict(protocol),
         "placement": asdict(how),
         "simulated": any(result.is_simulated for result in results),
-        "total": table_metrics([result.confusion for result in results], ignored, protocol)
-        | {"ate_sim3_m": None if None in ates else float(np.mean(ates))},
+        "total": table_metrics([result.confusion for result in results], ignored, protocol) | mean_ate,
         "scenes": [
             {"scene": result.scene, "map": result.folder, "simulated": result.is_simulated, "ate_sim3_m": result.ate_m}
             | matrix_metrics(result.confusion, ignored, protocol)
@@ -155,7 +146,15 @@ def summary(
             for result in results
         ],
         "classes": list(classes),
-        "by_class": by_class,
+        "by_class": {
+            name: {
+                "iou_percent": 100.0 * right[row] / union[row],
+                "recall_percent": 100.0 * right[row] / true[row] if true[row] else None,
+                "num_true": int(true[row]),
+            }
+            for row, name in enumerate(classes)
+            if union[row] > 0
+        },
     }
 
 
