@@ -74,13 +74,13 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             keeper = Keeper(folder / CHECKPOINT_FILE, build(config, "checkpoint"), signature(origin))
         for note in [*filter(None, [keeper.note]), *claim_folder(folder, keeper.found is not None)]:
             tqdm.write(note)
-        keeps_depths = dataset.has_ground_truth or densify.points == "own"
-        raw = _map(session, dataset, prior, (baselines, evaluation, keeps_depths), folder, keeper, live)
+        keeps_points = dataset.has_ground_truth or densify.points == "own"
+        raw = _map(session, dataset, prior, (baselines, evaluation, keeps_points), folder, keeper, live)
         with clock.phase("export"):
             save_progress(folder, session)
         with _said(clock, "densify", "drawing the map from the pose of every frame"):
             labelled = labelled_map(session, prior)
-            dense = dense_map(session, dataset, densify, evaluation, labelled, depths=raw.depths)
+            dense = dense_map(session, dataset, densify, evaluation, labelled, own=raw.points)
         with _said(clock, "export", "writing the map, its points, a mesh and the overview"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
             unit = "m" if is_metric(prior.provenance.settings) else "units"
@@ -131,7 +131,7 @@ def _map(
     """Map all frames and log each; returns what the prior alone says. What an interrupted run has is written."""
     if keeper.found is not None:
         tqdm.write(f"going on after frame {len(keeper.found.records)}: those before are read and predicted only")
-    baselines, evaluation, keeps_depths = compared
+    baselines, evaluation, keeps_points = compared
     with FrameLog(folder / "frames.jsonl") as log, tqdm(total=len(dataset), unit="frame", desc="mapping") as bar:
 
         def on_record(record: FrameRecord) -> None:
@@ -148,7 +148,7 @@ def _map(
                 return gather(
                     views if live is None else live.watch(views, session),
                     evaluation,
-                    keeps_depths,
+                    keeps_points,
                     baselines,
                     compared_text(dataset, prior),
                 )

@@ -8,9 +8,9 @@ import numpy as np
 from scene import compose
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.evaluation.trajectory import Alignment
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.gaussians import Gaussians
+from emgs_jax.geometry import Sim3
 from emgs_jax.ops.camera import Camera
 from emgs_jax.running.record import FrameRecord
 
@@ -58,13 +58,8 @@ def random_poses(rng, count: int) -> np.ndarray:
     return poses
 
 
-def random_similarity(rng, scale: float) -> Alignment:
-    return Alignment(scale, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
-
-
-def inverse(similarity: Alignment) -> Alignment:
-    rotation = similarity.rotation.T
-    return Alignment(1 / similarity.scale, rotation, -rotation @ similarity.translation / similarity.scale)
+def random_similarity(rng, scale: float) -> Sim3:
+    return Sim3(scale, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
 
 
 def hand_run(poses, raw_poses, true_poses, statuses=STATUSES, gaussians=None) -> SimpleNamespace:

@@ -21,7 +21,19 @@ CORE_ROOMS = (
 )
 # What is solved between frames, by SciPy; the core does not import it.
 HOST_FILES = {"pose_graph.sparse", "pose_graph.chordal", "pose_graph.problem", "pose_graph.optimize"}
-HOST = ("data", "io", "features", "keypoints", "loop_closure", "prior", "evaluation", "running", "polish", "report")
+HOST = (
+    "geometry",
+    "data",
+    "io",
+    "features",
+    "keypoints",
+    "loop_closure",
+    "prior",
+    "evaluation",
+    "running",
+    "polish",
+    "report",
+)
 STAGES = {
     "initialization",
     "localization",

@@ -12,7 +12,7 @@ import numpy as np
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.evaluation.clouds import PointCloud, VoxelGrid, transform_cloud
-from emgs_jax.evaluation.trajectory import Alignment, rotated
+from emgs_jax.geometry import Sim3, rotated
 from emgs_jax.ops.ranges import number
 
 Image = tuple[np.ndarray, np.ndarray]  # camera-space z (h, w), 0 where there is none, and RGB in [0, 1], (h, w, 3)
@@ -123,7 +123,7 @@ class _Voxels:
         self._config, self._pinhole, self._grid = config, pinhole, VoxelGrid(config.voxel_m)
 
     def add(self, view: View, T_world_camera: np.ndarray, scale: float) -> None:
-        motion = Alignment(scale, T_world_camera[:3, :3], T_world_camera[:3, 3])
+        motion = Sim3(scale, T_world_camera[:3, :3], T_world_camera[:3, 3])
         self._grid.add(transform_cloud(view.cloud, motion))
 
     def cloud(self) -> PointCloud:

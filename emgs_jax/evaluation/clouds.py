@@ -11,7 +11,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from emgs_jax.data.spool import Spool
-from emgs_jax.evaluation.trajectory import Alignment, align, rotated
+from emgs_jax.evaluation.trajectory import align
+from emgs_jax.geometry import Sim3, rotated
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.ops.ranges import MAX_LENGTH_M
 
@@ -79,7 +80,7 @@ def _fitted_normals(points: np.ndarray, num_neighbours: int) -> np.ndarray:
     return np.asarray(cloud.normals)
 
 
-def transform_cloud(cloud: PointCloud, alignment: Alignment) -> PointCloud:
+def transform_cloud(cloud: PointCloud, alignment: Sim3) -> PointCloud:
     """Bring a cloud into the reference's frame."""
     return PointCloud(alignment.apply(cloud.points), rotated(cloud.normals, alignment.rotation), cloud.colors)
 
@@ -205,13 +206,13 @@ class NearestPoints:
         return np.sqrt(squares), rows
 
 
-def register(points: np.ndarray, target: NearestPoints, max_distance: float, max_steps: int) -> Alignment:
+def register(points: np.ndarray, target: NearestPoints, max_distance: float, max_steps: int) -> Sim3:
     """Find the rigid motion of points (n, 3) onto those of a target by point-to-point ICP (Besl and McKay 1992).
 
     Pairs are nearest points within `max_distance` [m]; ends when they stay the same. With fewer than 3 pairs nothing
     holds the cloud: it stays where it is.
     """
-    found, known = Alignment(1.0, np.eye(3), np.zeros(3)), np.empty(0)
+    found, known = Sim3(1.0, np.eye(3), np.zeros(3)), np.empty(0)
     if not len(target):
         return found
     for _ in range(max_steps):

@@ -17,7 +17,8 @@ from emgs_jax.evaluation.clouds import (
     transform_cloud,
     voxel_downsample,
 )
-from emgs_jax.evaluation.trajectory import Alignment, align_poses
+from emgs_jax.evaluation.trajectory import align_poses
+from emgs_jax.geometry import Sim3
 from emgs_jax.ops.ranges import number
 
 _BAND_ROWS = 40  # of an image whose normals are fitted at a time: what is computed in between stays in the cache
@@ -96,7 +97,7 @@ def camera_cloud(points: np.ndarray, mask: np.ndarray, image: np.ndarray, config
 
 def posed(cloud: PointCloud, T_world_camera: np.ndarray) -> PointCloud:
     """A cloud in the frame of a camera, in the world."""
-    return transform_cloud(cloud, Alignment(1.0, T_world_camera[:3, :3], T_world_camera[:3, 3]))
+    return transform_cloud(cloud, Sim3(1.0, T_world_camera[:3, :3], T_world_camera[:3, 3]))
 
 
 def ground_truth_cloud(
@@ -145,7 +146,7 @@ def compare_clouds(
     return reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
 
 
-def own_voxel(alignment: Alignment, config: EvaluationConfig) -> float:
+def own_voxel(alignment: Sim3, config: EvaluationConfig) -> float:
     """Side of a voxel of `voxel_m` in the lengths of the estimate that is aligned."""
     return config.voxel_m / alignment.scale if alignment.scale > 0 else config.voxel_m
 

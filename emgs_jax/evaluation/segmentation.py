@@ -14,7 +14,8 @@ from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.spool import Spool
 from emgs_jax.evaluation.clouds import NearestPoints, PointCloud, cell_centers, cell_numbers
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, Reference, align_cloud, own_voxel
-from emgs_jax.evaluation.trajectory import align_poses, rotated
+from emgs_jax.evaluation.trajectory import align_poses
+from emgs_jax.geometry import rotated
 
 _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
 

@@ -3,47 +3,16 @@
 All errors are root mean squares. Poses are `T_world_camera`, float (n, 4, 4), in metres.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from emgs_jax.data.timestamps import resolution
+from emgs_jax.geometry import Sim3
 
 _MIN_SPREAD_M = 1e-6  # below this RMS distance from its centroid a path gives no direction and no scale
 
 
 class DegenerateTrajectoryError(ValueError):
     """The positions do not determine the alignment that was asked for."""
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """Similarity that maps the estimate's frame to the reference's: y = scale · rotation @ x + translation."""
-
-    scale: float
-    rotation: np.ndarray  # (3, 3), determinant +1
-    translation: np.ndarray  # (3,), metres of the reference
-
-    def apply(self, points: np.ndarray) -> np.ndarray:
-        """Map points (..., 3) into the reference's frame."""
-        return rotated(self.scale * points, self.rotation) + self.translation
-
-    def apply_to_poses(self, poses: np.ndarray) -> np.ndarray:
-        """Map camera poses (n, 4, 4); the result stays rigid, the scale acts on the positions only."""
-        moved = np.array(poses, np.float64)
-        moved[:, :3, :3] = self.rotation @ moved[:, :3, :3]
-        moved[:, :3, 3] = self.apply(moved[:, :3, 3])
-        return moved
-
-    def inverse(self) -> "Alignment":
-        """From the reference's frame to the estimate's."""
-        rotation = self.rotation.T
-        return Alignment(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
-
-
-def rotated(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """R v of each vector (..., 3). Not by BLAS: its threads wait for each other longer than so thin a product takes."""
-    return np.einsum("ij,...j->...i", rotation, vectors)
 
 
 def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
@@ -62,7 +31,7 @@ def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -
     return rows[keep], to_b[keep]
 
 
-def align(estimate: np.ndarray, reference: np.ndarray, with_scale: bool) -> Alignment:
+def align(estimate: np.ndarray, reference: np.ndarray, with_scale: bool) -> Sim3:
     """Find the least-squares similarity (Umeyama 1991) from points (n, 3) to their partners (n, 3).
 
     Without scale it is the best rigid motion. Of a straight path the roll about the line is arbitrary (the residual
@@ -76,7 +45,7 @@ def align(estimate: np.ndarray, reference: np.ndarray, with_scale: bool) -> Alig
     return _solve(estimate, reference, target.T @ centered / len(estimate), with_scale)
 
 
-def align_poses(estimate: np.ndarray, truth: np.ndarray, with_scale: bool) -> tuple[Alignment, str | None]:
+def align_poses(estimate: np.ndarray, truth: np.ndarray, with_scale: bool) -> tuple[Sim3, str | None]:
     """Align poses (n, 4, 4) by their positions, and by their orientations where positions leave something open.
 
     Unlike `align` this answers for every sequence of at least one pose: on a straight path the orientations decide
@@ -96,7 +65,7 @@ def align_poses(estimate: np.ndarray, truth: np.ndarray, with_scale: bool) -> tu
     return _solve(x, y, covariance, with_scale, rotation), "straight path: roll about it aligned by orientation"
 
 
-def ate(estimate: np.ndarray, reference: np.ndarray, alignment: Alignment) -> float:
+def ate(estimate: np.ndarray, reference: np.ndarray, alignment: Sim3) -> float:
     """Root mean square distance [m] of the aligned positions (n, 3) from the reference (n, 3)."""
     return _rms(np.linalg.norm(alignment.apply(estimate) - reference, axis=-1))
 
@@ -138,7 +107,7 @@ def trajectory_metrics(estimate: np.ndarray, truth: np.ndarray) -> dict[str, flo
 
 def _solve(
     x: np.ndarray, y: np.ndarray, covariance: np.ndarray, with_scale: bool, rotation: np.ndarray | None = None
-) -> Alignment:
+) -> Sim3:
     """Solve for the rotation (unless given) that maximises trace(Rᵀ · covariance), then scale, then translation."""
     if rotation is None:
         u, _, vt = np.linalg.svd(covariance)
@@ -147,7 +116,7 @@ def _solve(
     scale = 1.0
     if with_scale:
         scale = float(np.trace(rotation.T @ covariance)) / _spread(x) ** 2
-    return Alignment(scale, rotation, y.mean(0) - scale * rotation @ x.mean(0))
+    return Sim3(scale, rotation, y.mean(0) - scale * rotation @ x.mean(0))
 
 
 def _checked(estimate: np.ndarray, reference: np.ndarray, minimum: int) -> tuple[np.ndarray, np.ndarray]:

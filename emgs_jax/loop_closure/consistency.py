@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from emgs_jax.loop_closure.two_view_refinement import pose_difference, rescaled
+from emgs_jax.geometry import pose_difference, scale_pose
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.ops.ranges import number
 
@@ -66,7 +66,7 @@ def spatially_consistent(
     every = [*loops, *violating]
     if not every:
         return np.zeros(0, bool)
-    implied = np.stack([poses[loop.a] @ rescaled(loop.Z_a_b, np.exp(log_scales[loop.a])) for loop in every])
+    implied = np.stack([poses[loop.a] @ scale_pose(loop.Z_a_b, np.exp(log_scales[loop.a])) for loop in every])
     now = np.stack([poses[loop.b] for loop in every])
     corrections = implied @ np.linalg.inv(now)
     queries, candidates = (np.array([getattr(loop, name) for loop in every]) for name in ("b", "a"))

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import minimum_filter
 
+from emgs_jax.geometry import transform_points
 from emgs_jax.loop_closure.place_recognition import Keyframe, grid_pixels
-from emgs_jax.loop_closure.two_view_refinement import Similarity, moved_by
+from emgs_jax.loop_closure.two_view_refinement import Similarity
 
 
 def free_space_violation(a: Keyframe, b: Keyframe, similarity: Similarity, margin: float) -> float:
@@ -23,8 +24,8 @@ def free_space_violation(a: Keyframe, b: Keyframe, similarity: Similarity, margi
     T_b_a = np.linalg.inv(similarity.T_a_b)
     in_units_of_b = np.exp(-similarity.log_ratio)
     return max(
-        _share(moved_by(similarity.T_a_b, points_b), a, margin),
-        _share(in_units_of_b * moved_by(T_b_a, _points(a)), b, margin),
+        _share(transform_points(similarity.T_a_b, points_b), a, margin),
+        _share(in_units_of_b * transform_points(T_b_a, _points(a)), b, margin),
     )
 
 

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.geometry import scale_pose
 from emgs_jax.loop_closure.place_recognition import Keyframe, sampled_depths
-from emgs_jax.loop_closure.two_view_refinement import Similarity, perturbed, rescaled
+from emgs_jax.loop_closure.two_view_refinement import Similarity, perturbed
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.ops.ranges import number
 
@@ -83,7 +84,7 @@ def measure_by_prior(joint: JointPrediction, a: Keyframe, b: Keyframe, config: P
         if both.sum() < config.min_cells:
             return None
         ratios.append(float(np.median(np.log(new[both] / own[both]))))
-    T_a_b = rescaled(joint.T_a_b, np.exp(-ratios[0]))
+    T_a_b = scale_pose(joint.T_a_b, np.exp(-ratios[0]))
     std = config.std + config.std_share * np.linalg.norm(T_a_b[:3, 3])
     stds = [std] * 3 + [np.radians(config.std_deg)] * 3 + [config.log_ratio_std]
     return Similarity(T_a_b, ratios[1] - ratios[0], np.diag(np.square(stds)))

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from emgs_jax.geometry import pose_difference, scale_covariance, scale_pose
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe, PlaceRecognitionConfig, most_similar
 from emgs_jax.loop_closure.two_view_alignment import Gate
-from emgs_jax.loop_closure.two_view_refinement import pose_difference, rescaled
 from emgs_jax.loop_closure.verification import LoopMeasurement, VerificationConfig, neighbours_of, verify
 from emgs_jax.ops.ranges import number
 
@@ -137,7 +137,6 @@ def relocalize(
 def _query_pose(loop: LoopMeasurement, known: PosedKeyframes) -> RelocalizedPose:
     """Return the pose of a loop's query in the world, by the pose and scale of its candidate."""
     scale = np.exp(known.log_scales[loop.a])
-    units = np.array([scale] * 3 + [1.0] * 4)
-    covariance = np.linalg.inv(loop.sqrt_info.T @ loop.sqrt_info) * units[:, None] * units
-    pose = known.poses[loop.a] @ rescaled(loop.Z_a_b, scale)
+    covariance = scale_covariance(np.linalg.inv(loop.sqrt_info.T @ loop.sqrt_info), scale)
+    pose = known.poses[loop.a] @ scale_pose(loop.Z_a_b, scale)
     return RelocalizedPose(pose, known.log_scales[loop.a] + loop.log_ratio, covariance, loop.a)

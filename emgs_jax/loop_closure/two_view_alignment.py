@@ -8,19 +8,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from emgs_jax.geometry import pose_difference, scale_pose
 from emgs_jax.keypoints.poses import calibration, essential, pose_of
 from emgs_jax.keypoints.sift import mutual
 from emgs_jax.loop_closure.place_recognition import Keyframe, unit_descriptors
-from emgs_jax.loop_closure.two_view_refinement import (
-    MAD_TO_STD,
-    Pairs,
-    RefineConfig,
-    Similarity,
-    log_ratios,
-    pose_difference,
-    refine,
-    rescaled,
-)
+from emgs_jax.loop_closure.two_view_refinement import Pairs, RefineConfig, Similarity, log_ratios, refine
+from emgs_jax.ops.constants import MAD_TO_STD
 from emgs_jax.ops.ranges import number
 
 MIN_POSE = 6  # points that a pose needs
@@ -133,7 +126,7 @@ def align(a: Keyframe, b: Keyframe, config: AlignmentConfig) -> Aligned:
     require(Gate.POSE, len(both.pixels_a) >= MIN_POSE, len(both.pixels_a))
     log_ratio = float(np.median(np.log(_depths(T_a_b, both.points_a) / both.points_b[:, 2])))
     median_depth = float(np.median(both.points_a[:, 2]))
-    _check_poses(T_a_b, rescaled(np.linalg.inv(T_b_a), np.exp(log_ratio)), median_depth, config)
+    _check_poses(T_a_b, scale_pose(np.linalg.inv(T_b_a), np.exp(log_ratio)), median_depth, config)
     _check_spread(pairs.rows(fits), both.points_a, a.size, b.size, config)
     _check_scale(both, T_a_b, log_ratio, config)
     similarity = refine(pairs.rows(fits), T_a_b, log_ratio, config.refine)

@@ -13,9 +13,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from threadpoolctl import ThreadpoolController
 
+from emgs_jax.geometry import transform_points
+from emgs_jax.ops.constants import MAD_TO_STD
 from emgs_jax.ops.ranges import number
 
-MAD_TO_STD = 1.4826  # of a normal distribution
 HUBER = 1.345  # standard deviations: 95 % efficient where all is normal
 
 
@@ -77,31 +78,13 @@ class Similarity:
     covariance: Float[np.ndarray, "7 7"]
 
 
-def rescaled(T: Float[np.ndarray, "4 4"], scale: float) -> Float[np.ndarray, "4 4"]:
-    """A pose with its translation in other units."""
-    return np.block([[T[:3, :3], scale * T[:3, 3:]], [T[3:]]])
-
-
-def moved_by(T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Points in the frame that T leads to."""
-    return points @ T[:3, :3].T + T[:3, 3]
-
-
-def pose_difference(
-    T: Float[np.ndarray, "*n 4 4"], other: Float[np.ndarray, "*n 4 4"]
-) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    """Distance of two camera centres, and the angle between the cameras in degrees; of one pair or of n."""
-    angle = Rotation.from_matrix(T[..., :3, :3].mT @ other[..., :3, :3]).magnitude()
-    return np.linalg.norm(T[..., :3, 3] - other[..., :3, 3], axis=-1), np.degrees(angle)
-
-
 def log_ratios(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float) -> Float[np.ndarray, "n"]:
     """log of a's depth over b's of each point, the mean of what it is seen from b and from a; NaN where one has none.
 
     `log_ratio` only brings b's points into a's units where they are seen from a.
     """
-    from_b = moved_by(np.linalg.inv(T_a_b), pairs.points_a)[:, 2] / pairs.points_b[:, 2]
-    from_a = pairs.points_a[:, 2] / moved_by(T_a_b, np.exp(log_ratio) * pairs.points_b)[:, 2]
+    from_b = transform_points(np.linalg.inv(T_a_b), pairs.points_a)[:, 2] / pairs.points_b[:, 2]
+    from_a = pairs.points_a[:, 2] / transform_points(T_a_b, np.exp(log_ratio) * pairs.points_b)[:, 2]
     with np.errstate(invalid="ignore"):
         return 0.5 * (np.log(from_b) + np.log(from_a) + log_ratio)
 
@@ -160,8 +143,8 @@ def _kinds(pairs: Pairs) -> np.ndarray:
 def _errors(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float) -> Float[np.ndarray, " r"]:
     """In pixels of b, then of a, of the points that the other has; then in log depth where both have one."""
     in_a, in_b = _has_points(pairs)
-    seen_by_b = moved_by(np.linalg.inv(T_a_b), pairs.points_a[in_a])
-    seen_by_a = moved_by(T_a_b, np.exp(log_ratio) * pairs.points_b[in_b])
+    seen_by_b = transform_points(np.linalg.inv(T_a_b), pairs.points_a[in_a])
+    seen_by_a = transform_points(T_a_b, np.exp(log_ratio) * pairs.points_b[in_b])
     in_pixels = [
         (_project(seen_by_b, pairs.K_b) - pairs.pixels_b[in_a]).ravel(),
         (_project(seen_by_a, pairs.K_a) - pairs.pixels_a[in_b]).ravel(),

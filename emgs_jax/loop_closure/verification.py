@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from emgs_jax.geometry import pose_difference, scale_pose
 from emgs_jax.loop_closure.free_space import free_space_violation
 from emgs_jax.loop_closure.place_recognition import Keyframe
 from emgs_jax.loop_closure.two_view_alignment import Aligned, AlignmentConfig, Gate, RefusedError, align, require
-from emgs_jax.loop_closure.two_view_refinement import pose_difference, rescaled
 from emgs_jax.ops.ranges import number
 
 
@@ -123,7 +123,7 @@ def neighbours_of(
     """Return other keyframes with their poses and log-scales relative to a candidate; inputs are indexed by frame."""
     inverse, scale = np.linalg.inv(poses[candidate.frame]), log_scales[candidate.frame]
     return [
-        Neighbour(one, rescaled(inverse @ poses[one.frame], np.exp(-scale)), log_scales[one.frame] - scale)
+        Neighbour(one, scale_pose(inverse @ poses[one.frame], np.exp(-scale)), log_scales[one.frame] - scale)
         for one in others
     ]
 
@@ -138,7 +138,7 @@ def _check_neighbours(
             similarity = align(neighbour.keyframe, query, config.alignment).similarity
         except RefusedError:
             continue
-        T_neighbour_query = rescaled(similarity.T_a_b, np.exp(neighbour.log_ratio))
+        T_neighbour_query = scale_pose(similarity.T_a_b, np.exp(neighbour.log_ratio))
         distance, turn = pose_difference(neighbour.T_candidate_neighbour @ T_neighbour_query, found.similarity.T_a_b)
         allowed = config.max_neighbour_gap * found.median_depth + config.max_neighbour_distance
         require(Gate.NEIGHBOURS_DISAGREE, distance <= allowed, distance)

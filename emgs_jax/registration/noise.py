@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from emgs_jax.ops.constants import MAD_TO_STD
 from emgs_jax.ops.ranks import kth_smallest
 from emgs_jax.registration.rigid import MIN_PAIRS, median
 
 NUM_LEVELS = 8  # of confidence
-NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute value
 NUM_CELLS = 4  # along each side of the image, whose errors are compared; few, for errors may be alike over much of it
 
 
@@ -30,8 +30,8 @@ def levels_of(confidence: Float[Array, "p"], edges: Float[Array, "l"]) -> Int[Ar
 
 
 def robust_std(errors: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
-    """`NORMAL` times the median absolute error, the standard deviation of Gaussian errors; 0 without any."""
-    return jnp.where(jnp.any(valid), NORMAL * median(jnp.abs(errors), valid), 0.0)
+    """`MAD_TO_STD` times the median absolute error, the standard deviation of Gaussian errors; 0 without any."""
+    return jnp.where(jnp.any(valid), MAD_TO_STD * median(jnp.abs(errors), valid), 0.0)
 
 
 def noise_of_levels(

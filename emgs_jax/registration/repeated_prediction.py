@@ -7,9 +7,10 @@ from jaxtyping import Array, Bool, Float
 
 from emgs_jax.observation import Observation, Prediction, depth_in, transform
 from emgs_jax.ops.camera import Camera, nearest_pixel, project
+from emgs_jax.ops.constants import MAD_TO_STD
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import stack
-from emgs_jax.registration.noise import NORMAL, num_independent, robust_std
+from emgs_jax.registration.noise import num_independent, robust_std
 from emgs_jax.registration.rigid import MIN_PAIRS, fit_rigid, fit_rigid_robust, median, pose_row
 
 
@@ -61,7 +62,7 @@ def repeat_error(
     """
     paired, mean_depth = now.valid & before.valid, scale * median(now.points[:, 2], now.valid)
     apart = jnp.linalg.norm(transform(T_world_previous, now, scale).points - before.points, axis=-1)
-    apart = jnp.where(jnp.any(paired), robust_std(apart, paired), NORMAL * max_pair_distance * mean_depth)
+    apart = jnp.where(jnp.any(paired), robust_std(apart, paired), MAD_TO_STD * max_pair_distance * mean_depth)
     return apart, mean_depth
 
 

@@ -36,8 +36,8 @@ class DensifyConfig(eqx.Module):
         min_alpha: a pixel with less coverage has no depth.
         min_std: m; the floor of the covariances, which is not drawn along the surface, see `without_floor`.
         render: how the front is found.
-        points: at the depth of the `map` (the paper's rule), or at a frame's `own` where the map confirms it, see
-            `emgs_jax.running.dense.at_own_depth`.
+        points: those of the `map` (the paper's rule), or the frames' `own` that the map does not contradict, see
+            `emgs_jax.running.dense.uncontradicted`.
     """
 
     surface_depth: Float[Array, "*b"] = traced(low=0)

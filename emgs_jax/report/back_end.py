@@ -9,10 +9,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.loop_closure.two_view_refinement import rescaled
+from emgs_jax.geometry import scale_pose
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.pose_graph.factors import PoseGraph
-from emgs_jax.running.back_end import BackEnd, Refusal
+from emgs_jax.running.back_end import BackEnd, Refusal, consistent_loops, nodes_of
 from emgs_jax.running.factors import Factor, stack_factors
 from emgs_jax.running.prior_queries import MEASURED, SILENT, UNUSABLE
 
@@ -23,9 +23,9 @@ def metric_graph(end: BackEnd) -> PoseGraph:
     def scaled(edge: Factor) -> Factor:
         scale = np.exp(end.log_scales[edge.a])
         sqrt_info = edge.sqrt_info / np.array([scale] * 3 + [1.0] * 4)
-        return edge._replace(Z_a_b=rescaled(edge.Z_a_b, scale), log_ratio=0.0, sqrt_info=sqrt_info)
+        return edge._replace(Z_a_b=scale_pose(edge.Z_a_b, scale), log_ratio=0.0, sqrt_info=sqrt_info)
 
-    nodes = end.nodes(end.submap_id)
+    nodes = nodes_of(end, end.submap_id)
     return PoseGraph(
         replace(nodes, log_scale=jnp.zeros_like(nodes.log_scale)), stack_factors([*map(scaled, end.factors)])
     )
@@ -57,7 +57,7 @@ def found_loops(end: BackEnd) -> list[LoopMeasurement]:
 
 def _outcomes(end: BackEnd) -> dict[tuple[int, int], str]:
     """Of every verified loop, see `loop_list`."""
-    unsolved, accepted, agreed = _unsolved(end), _ends(end.accepted), _ends(end.consistent())
+    unsolved, accepted, agreed = _unsolved(end), _ends(end.accepted), _ends(consistent_loops(end))
     outcomes = {}
     for ends in _ends(end.verified):
         known = "unsolved" if ends in unsolved else "known"

@@ -36,7 +36,7 @@ from emgs_jax.evaluation.segmentation import (
 from emgs_jax.evaluation.trajectory import align_poses, trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.loop_closure.two_view_refinement import rescaled
+from emgs_jax.geometry import scale_pose
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import counts, found_loops
@@ -148,8 +148,8 @@ def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
     if poses is None:
         return {}
     rendered = Rendered(scorer.dataset, poses, scorer.evaluation, has_classes=raw.classes is not None)
-    for row in range(len(raw.depths)):
-        rendered.add(row, raw.depths[row], None, _own_classes(raw, row, scorer))
+    for row in range(len(raw.points)):
+        rendered.add(row, raw.points[row][..., 2], None, _own_classes(raw, row, scorer))
     with ThreadPoolExecutor(1, "classes of the raw prior") as thread:
         of_labels = thread.submit(_score_labels, raw.labels, poses, scorer)
         metrics = trajectory_metrics(*poses) | score_cloud(raw.cloud, poses, scorer) | rendered.metrics()
@@ -181,7 +181,7 @@ def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer
     is_known = [record.status != "lost" for record in run.records]
     metrics: Metrics = {}
     for fusions, poses, rows, kind in (
-        (baselines.raw, run.raw_poses, [raw.depths[row].any() for row in range(len(raw.depths))], "raw"),
+        (baselines.raw, run.raw_poses, [raw.points[row].any() for row in range(len(raw.points))], "raw"),
         (baselines.ours, np.stack(baselines.poses), is_known, "ours"),
     ):
         compared = with_truth(run, poses)
@@ -218,7 +218,7 @@ def score_settings(
         if all(pose is None for pose in run.true_poses):
             return counts
         labelled = labelled_map(run, scorer.prior)
-        dense = dense_map(run, scorer.dataset, config, scorer.evaluation, labelled, 0, raw.depths)
+        dense = dense_map(run, scorer.dataset, config, scorer.evaluation, labelled, 0, raw.points)
         labels = None if labelled is None else labelled.centers
         return score_map(run, dense.cloud, center_cloud(run), labels, scorer) | dense.rendering | counts
 
@@ -280,7 +280,9 @@ def _loops(run: MappingRun) -> tuple[list[tuple[int, int, np.ndarray]], list[np.
     end = run.back_end
     compared = with_truth(run, run.poses)
     unit = (None if compared is None else trajectory_metrics(*compared)["trajectory/scale"]) or 1.0
-    loops = [(loop.a, loop.b, rescaled(loop.Z_a_b, unit * np.exp(end.log_scales[loop.a]))) for loop in found_loops(end)]
+    loops = [
+        (loop.a, loop.b, scale_pose(loop.Z_a_b, unit * np.exp(end.log_scales[loop.a]))) for loop in found_loops(end)
+    ]
     of_saved: list[np.ndarray | None] = [None] * end.first_node
     return loops, of_saved + run.true_poses[row_of_first_node(run) :]
 

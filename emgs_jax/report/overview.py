@@ -13,7 +13,7 @@ from matplotlib.patheffects import withStroke
 from PIL import Image, ImageDraw
 
 from emgs_jax.evaluation.clouds import PointCloud
-from emgs_jax.evaluation.trajectory import rotated
+from emgs_jax.geometry import rotated
 from emgs_jax.io.files import atomic_write
 from emgs_jax.report.colors import OURS, PATHS, class_colors, to_bytes
 

@@ -19,8 +19,9 @@ from emgs_jax.evaluation.protocols import (
     table_metrics,
 )
 from emgs_jax.evaluation.segmentation import LabelledPoints
-from emgs_jax.evaluation.trajectory import Alignment, align_poses
+from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.gaussian_map import confirmed
+from emgs_jax.geometry import Sim3
 from emgs_jax.report.columns import DASH, Table, cell, markdown
 from emgs_jax.report.recorded_run import RecordedRun
 from emgs_jax.semantics import similarities
@@ -184,5 +185,5 @@ def _line(
     return [method, source, found["protocol"]["name"], scenes, found["placement"]["by"], *cells]
 
 
-def _plain(alignment: Alignment) -> dict[str, Any]:
+def _plain(alignment: Sim3) -> dict[str, Any]:
     return {"scale": alignment.scale, "rotation": alignment.rotation, "translation": alignment.translation}

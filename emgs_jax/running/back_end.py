@@ -4,14 +4,16 @@ Nodes are the frames from the first of the map on, in the order of `SlamState.ti
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.geometry import Sim3, scale_pose
 from emgs_jax.loop_closure.consistency import ConsistencyConfig, spatially_consistent
 from emgs_jax.loop_closure.place_recognition import (
     Database,
@@ -30,8 +32,7 @@ from emgs_jax.loop_closure.relocalization import (
     RelocalizedPose,
     relocalize,
 )
-from emgs_jax.loop_closure.two_view_refinement import rescaled
-from emgs_jax.loop_closure.verification import LoopMeasurement, VerificationConfig, VerifyInfo, neighbours_of, verify
+from emgs_jax.loop_closure.verification import LoopMeasurement, VerificationConfig, neighbours_of, verify
 from emgs_jax.ops.ranges import number
 from emgs_jax.pose_graph.deform import DeformConfig
 from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Nodes, PoseGraph
@@ -102,9 +103,9 @@ class Refusal(NamedTuple):
     measured: float
 
 
-@dataclass
+@dataclass(frozen=True)
 class BackEnd:
-    """State of the back end: nodes, factors and loops of the pose graph so far.
+    """State of the back end: nodes, factors and loops of the pose graph so far. Nothing of it is ever changed in place.
 
     Args:
         config: all settings.
@@ -133,194 +134,225 @@ class BackEnd:
     config: BackEndConfig
     intrinsics: tuple[float, float, float, float]
     min_std: float
-    poses: list[np.ndarray] = field(default_factory=list)
-    log_scales: list[float] = field(default_factory=list)
-    online: list[np.ndarray] = field(default_factory=list)
-    frames: list[int] = field(default_factory=list)
-    is_placed: list[bool] = field(default_factory=list)
-    submap_ids: list[int] = field(default_factory=list)
-    factors: list[Factor] = field(default_factory=list)
+    poses: Sequence[np.ndarray] = field(default_factory=list)
+    log_scales: Sequence[float] = field(default_factory=list)
+    online: Sequence[np.ndarray] = field(default_factory=list)
+    frames: Sequence[int] = field(default_factory=list)
+    is_placed: Sequence[bool] = field(default_factory=list)
+    submap_ids: Sequence[int] = field(default_factory=list)
+    factors: Sequence[Factor] = field(default_factory=list)
     database: Database = field(default_factory=Database)
-    verified: list[LoopMeasurement] = field(default_factory=list)
-    violating: list[LoopMeasurement] = field(default_factory=list)
-    accepted: list[LoopMeasurement] = field(default_factory=list)
-    refusals: list[Refusal] = field(default_factory=list)
-    queries: dict[tuple[int, int], str] = field(default_factory=dict)
-    closures: list[Closure] = field(default_factory=list)
+    verified: Sequence[LoopMeasurement] = field(default_factory=list)
+    violating: Sequence[LoopMeasurement] = field(default_factory=list)
+    accepted: Sequence[LoopMeasurement] = field(default_factory=list)
+    refusals: Sequence[Refusal] = field(default_factory=list)
+    queries: Mapping[tuple[int, int], str] = field(default_factory=dict)
+    closures: Sequence[Closure] = field(default_factory=list)
     first_node: int = 0
     connected_since: int = 0
     submap_id: int = 0
     has_one_unit: bool = True
 
-    def add_node(
-        self, frame: FrameData, pose: np.ndarray, scale: float, origin: int | None, is_placed: bool = True
-    ) -> None:
-        """Add a node with the pose of its frame.
 
-        Args:
-            frame: its data.
-            pose: T_world_camera.
-            scale: of its inference.
-            origin: node whose Gaussians it was registered to; None where it was not registered to the map.
-            is_placed: the map holds it: it was registered to it, or the map was made from it.
-        """
-        time = len(self.poses)
-        self.poses.append(np.asarray(pose, np.float64))
-        self.online.append(self.poses[-1])
-        self.log_scales.append(float(np.log(scale)))
-        self.frames.append(frame.index)
-        self.is_placed.append(is_placed)
-        self.submap_ids.append(self.submap_id)
-        chain = sequential_factor(frame, self.poses, self.log_scales, self._is_connected, self.config.noise)
-        if chain is not None:
-            self.factors.append(chain)
-        if origin is not None and origin < time:
-            self.factors.append(map_factor(frame, self.poses, self.log_scales, origin, self.config.noise))
+def add_node(
+    end: BackEnd, frame: FrameData, pose: np.ndarray, scale: float, origin: int | None, is_placed: bool = True
+) -> BackEnd:
+    """Add a node with the pose of its frame, and its sequential and map factors.
 
-    def _is_connected(self, row: int) -> bool:
-        """Test whether a node is in the map or has an odometry factor; False for nodes before the camera was found."""
-        has_factor = any(factor.a == row and factor.kind == ODOMETRY for factor in self.factors)
-        return row >= self.connected_since and (self.is_placed[row] or has_factor)
+    Args:
+        end: the back end.
+        frame: its data.
+        pose: T_world_camera.
+        scale: of its inference.
+        origin: node whose Gaussians it was registered to; None where it was not registered to the map.
+        is_placed: the map holds it: it was registered to it, or the map was made from it.
+    """
+    time, pose = len(end.poses), np.asarray(pose, np.float64)
+    end = replace(
+        end,
+        poses=[*end.poses, pose],
+        online=[*end.online, pose],
+        log_scales=[*end.log_scales, float(np.log(scale))],
+        frames=[*end.frames, frame.index],
+        is_placed=[*end.is_placed, is_placed],
+        submap_ids=[*end.submap_ids, end.submap_id],
+    )
+    sequential = sequential_factor(frame, end.poses, end.log_scales, partial(_is_connected, end), end.config.noise)
+    factors = [] if sequential is None else [sequential]
+    if origin is not None and origin < time:
+        factors.append(map_factor(frame, end.poses, end.log_scales, origin, end.config.noise))
+    return replace(end, factors=[*end.factors, *factors])
 
-    def detect_loops(self, frame: FrameData) -> list[LoopMeasurement]:
-        """Add the last node as a keyframe and verify its candidates; return new loops that are spatially consistent."""
-        time, config = len(self.poses) - 1, self.config.place_recognition
-        if time % self.config.every:
-            return []
-        keyframe = self._keyframe(time, frame)
-        self.database = add_keyframe(self.database, keyframe, config)
-        row = len(self.database.keyframes) - 1
-        for candidate in propose_candidates(self.database, row, config):
-            if self._submap_id_of(candidate.row) == self.submap_id:
-                self._verify(row, candidate.row)
-        return self.recent_loops()
 
-    def recent_loops(self) -> list[LoopMeasurement]:
-        """Select spatially consistent loops of the last queries that are not in the pose graph yet."""
-        return self.not_in_graph(self.consistent(since=len(self.poses) - 1 - self.config.consistency.max_query_gap))
+def _is_connected(end: BackEnd, row: int) -> bool:
+    """Test whether a node is in the map or has an odometry factor; False for nodes before the camera was found."""
+    has_factor = any(factor.a == row and factor.kind == ODOMETRY for factor in end.factors)
+    return row >= end.connected_since and (end.is_placed[row] or has_factor)
 
-    def _keyframe(self, time: int, frame: FrameData) -> Keyframe:
-        return make_keyframe(
-            time, frame.image, frame.points, frame.mask, self.intrinsics, self.config.place_recognition
-        )
 
-    def relocalize(self, frame: FrameData, in_other_submap: bool = False) -> tuple[RelocalizedPose | None, str | None]:
-        """Relocalize a frame by keyframes of its submap that are in the map; else return why that fails.
+def detect_loops(end: BackEnd, frame: FrameData) -> BackEnd:
+    """Add the last node as a keyframe, and verify its loop candidates."""
+    time, config = len(end.poses) - 1, end.config.place_recognition
+    if time % end.config.every:
+        return end
+    end = replace(end, database=add_keyframe(end.database, _keyframe(end, time, frame), config))
+    row = len(end.database.keyframes) - 1
+    for candidate in propose_candidates(end.database, row, config):
+        if _submap_id_of(end, candidate.row) == end.submap_id:
+            end = _verify_candidate(end, row, candidate.row)
+    return end
 
-        Args:
-            frame: of a frame that is no node yet, or is no keyframe.
-            in_other_submap: search the other submap that has the most similar keyframe, with a free ratio of units.
-        """
-        query = self._keyframe(len(self.poses), frame)
-        submap_id = self._most_similar_submap(query) if in_other_submap else self.submap_id
-        if submap_id is None:
-            return None, NO_CANDIDATE
-        is_there = [placed and one == submap_id for placed, one in zip(self.is_placed, self.submap_ids, strict=True)]
-        known = PosedKeyframes(self.database, self.poses, self.log_scales, is_there)
-        config = self.config
-        return relocalize(
-            query, known, config.place_recognition, self._verification_config(in_other_submap), config.relocalization
-        )
 
-    def _most_similar_submap(self, query: Keyframe) -> int | None:
-        """Find the other submap with the most similar keyframe that is in the map; None without one."""
-        keyframes = self.database.keyframes
-        others = [row for row in range(len(keyframes)) if self._submap_id_of(row) != self.submap_id]
-        others = [row for row in others if self.is_placed[keyframes[row].frame]]
-        found = most_similar(self.database, query, others, 1, self.config.place_recognition)
-        return self._submap_id_of(found[0].row) if found else None
+def recent_loops(end: BackEnd) -> list[LoopMeasurement]:
+    """Select spatially consistent loops of the last queries that are not in the pose graph yet, after a keyframe."""
+    time = len(end.poses) - 1
+    if time % end.config.every:
+        return []
+    return not_in_graph(end, consistent_loops(end, since=time - end.config.consistency.max_query_gap))
 
-    def _submap_id_of(self, row: int) -> int:
-        """Submap of a keyframe, a row of the database."""
-        return self.submap_ids[self.database.keyframes[row].frame]
 
-    def _verification_config(self, is_free: bool) -> VerificationConfig:
-        """Settings of the verification; the ratio of the two units is free where they may differ."""
-        config = self.config.verification
-        if self.has_one_unit and not is_free:
-            return config
-        return replace(config, alignment=replace(config.alignment, scale_std=math.inf))
+def _keyframe(end: BackEnd, time: int, frame: FrameData) -> Keyframe:
+    return make_keyframe(time, frame.image, frame.points, frame.mask, end.intrinsics, end.config.place_recognition)
 
-    def consistent(self, since: int = 0) -> list[LoopMeasurement]:
-        """Return the verified loops of queries from `since` on that are spatially consistent with others."""
-        recent = [loop for loop in self.verified if loop.b >= since]
-        poses, log_scales = (dict(enumerate(values)) for values in (self.poses, self.log_scales))
-        yes = spatially_consistent(recent, self.violating, poses, log_scales, self.config.consistency)
-        return [loop for loop, ok in zip(recent, yes, strict=True) if ok]
 
-    def not_in_graph(self, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
-        """Select the loops that are not in the pose graph yet."""
-        known = {(loop.a, loop.b) for loop in self.accepted}
-        return [loop for loop in loops if (loop.a, loop.b) not in known]
+def relocalize_frame(
+    end: BackEnd, frame: FrameData, in_other_submap: bool = False
+) -> tuple[RelocalizedPose | None, str | None]:
+    """Relocalize a frame by keyframes of its submap that are in the map; else return why that fails.
 
-    def retract_inconsistent(self, consistent: Sequence[LoopMeasurement]) -> int:
-        """Remove the factors of accepted loops not among all `consistent` ones; return their number."""
-        good = {(loop.a, loop.b) for loop in consistent}
-        before = len(self.accepted)
-        self.accepted = [loop for loop in self.accepted if (loop.a, loop.b) in good]
-        self.factors = [one for one in self.factors if one.kind != LOOP or (one.a, one.b) in good]
-        return before - len(self.accepted)
+    Args:
+        end: the back end.
+        frame: of a frame that is no node yet, or is no keyframe.
+        in_other_submap: search the other submap that has the most similar keyframe, with a free ratio of units.
+    """
+    query = _keyframe(end, len(end.poses), frame)
+    submap_id = _most_similar_submap(end, query) if in_other_submap else end.submap_id
+    if submap_id is None:
+        return None, NO_CANDIDATE
+    is_there = [placed and one == submap_id for placed, one in zip(end.is_placed, end.submap_ids, strict=True)]
+    known = PosedKeyframes(end.database, end.poses, end.log_scales, is_there)
+    verification = _verification_config(end, in_other_submap)
+    return relocalize(query, known, end.config.place_recognition, verification, end.config.relocalization)
 
-    def _verify(self, row: int, other: int) -> None:
-        keyframes = self.database.keyframes
-        candidate = keyframes[other]
-        beside = [
-            keyframes[k] for k in (other - 1, other + 1) if 0 <= k < row and self._submap_id_of(k) == self.submap_id
-        ]
-        neighbours = neighbours_of(candidate, beside, self.poses, self.log_scales)
-        loop, info = verify(keyframes[row], candidate, neighbours, self._verification_config(is_free=False))
-        self._record((candidate.frame, keyframes[row].frame), loop, info)
 
-    def _record(self, nodes: tuple[int, int], loop: LoopMeasurement | None, info: VerifyInfo) -> None:
-        if info.violation is not None:
-            self.violating.append(info.violation)
-        if loop is None:
-            self.refusals.append(Refusal(*nodes, info.refused_by.value, info.measured))
-        else:
-            self.verified.append(loop)
+def _most_similar_submap(end: BackEnd, query: Keyframe) -> int | None:
+    """Find the other submap with the most similar keyframe that is in the map; None without one."""
+    keyframes = end.database.keyframes
+    others = [row for row in range(len(keyframes)) if _submap_id_of(end, row) != end.submap_id]
+    others = [row for row in others if end.is_placed[keyframes[row].frame]]
+    found = most_similar(end.database, query, others, 1, end.config.place_recognition)
+    return _submap_id_of(end, found[0].row) if found else None
 
-    def is_closure_due(self, loops: Sequence[LoopMeasurement]) -> bool:
-        """Test whether a closure is due: a loop violates the current poses, and the last closure is long enough ago."""
-        last = self.closures[-1].time if self.closures else -self.config.min_frames
-        is_due = len(self.poses) - 1 - last >= self.config.min_frames
-        return is_due and bool(self.violated(loops))
 
-    def violated(self, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
-        """Select the loops that the current poses violate: χ² above `min_violation`."""
-        return [loop for loop in loops if self.chi2_of(loop) > self.config.min_violation]
+def _submap_id_of(end: BackEnd, row: int) -> int:
+    """Submap of a keyframe, a row of the database."""
+    return end.submap_ids[end.database.keyframes[row].frame]
 
-    def chi2_of(self, loop: LoopMeasurement) -> float:
-        """Compute χ² of a loop at the current poses and scales."""
-        scale, other = self.log_scales[loop.a], self.log_scales[loop.b]
-        now = rescaled(np.linalg.inv(self.poses[loop.a]) @ self.poses[loop.b], np.exp(-scale))
-        error = np.linalg.inv(loop.Z_a_b) @ now
-        turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
-        return float(np.sum((loop.sqrt_info @ [*error[:3, 3], *turn, other - scale - loop.log_ratio]) ** 2))
 
-    def close_loops(self, state: SlamState, loops: Sequence[LoopMeasurement] = ()) -> SlamState:
-        """Optimize with `loops` as further factors and deform the map; a refused solution changes nothing."""
-        factors = [*self.factors, *map(loop_factor, loops)]
-        before, solver = self.nodes(self.submap_id), self.config.solver
-        if not self.has_one_unit:  # the scales are not all about 1
-            solver = replace(solver, scale_std=jnp.asarray(math.inf))
-        after, info = optimize(PoseGraph(before, stack_factors(factors)), solver)
-        self.closures.append(Closure(len(self.poses) - 1, tuple(loops), info))
-        if info.reason:
-            return state
-        self.factors = factors
-        self.accepted += loops
-        count = len(self.poses)
-        self.poses = list(np.asarray(after.T_world.as_matrix(), np.float64)[:count])
-        self.log_scales = list(np.asarray(after.log_scale, np.float64)[:count])
-        change = jnp.mean(after.log_scale - before.log_scale, where=before.valid)
-        state = replace(state, estimate=rescale_estimate(state.estimate, jnp.exp(change)))
-        return deform_state(state, before, after, self.min_std, self.config.deform)
+def _verification_config(end: BackEnd, is_free: bool) -> VerificationConfig:
+    """Settings of the verification; the ratio of the two units is free where they may differ."""
+    config = end.config.verification
+    if end.has_one_unit and not is_free:
+        return config
+    return replace(config, alignment=replace(config.alignment, scale_std=math.inf))
 
-    def nodes(self, submap_id: int | None = None) -> Nodes:
-        """Stack all nodes, or mark those of a submap as valid; padded to a power of two, so that it compiles rarely."""
-        count = len(self.poses)
-        size = bucket(count)
-        poses = to_se3(np.stack([*self.poses, *[np.eye(4)] * (size - count)]))
-        scales = jnp.asarray([*self.log_scales, *[0.0] * (size - count)], jnp.float32)
-        is_valid = [submap_id in (None, one) for one in self.submap_ids]
-        return Nodes(poses, scales, jnp.asarray(is_valid + [False] * (size - count)))
+
+def consistent_loops(end: BackEnd, since: int = 0) -> list[LoopMeasurement]:
+    """Return the verified loops of queries from `since` on that are spatially consistent with others."""
+    recent = [loop for loop in end.verified if loop.b >= since]
+    poses, log_scales = (dict(enumerate(values)) for values in (end.poses, end.log_scales))
+    yes = spatially_consistent(recent, end.violating, poses, log_scales, end.config.consistency)
+    return [loop for loop, ok in zip(recent, yes, strict=True) if ok]
+
+
+def not_in_graph(end: BackEnd, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
+    """Select the loops that are not in the pose graph yet."""
+    known = {(loop.a, loop.b) for loop in end.accepted}
+    return [loop for loop in loops if (loop.a, loop.b) not in known]
+
+
+def remove_inconsistent(end: BackEnd) -> BackEnd:
+    """Remove the factors of accepted loops that are not spatially consistent any more."""
+    good = {(loop.a, loop.b) for loop in consistent_loops(end)}
+    accepted = [loop for loop in end.accepted if (loop.a, loop.b) in good]
+    factors = [one for one in end.factors if one.kind != LOOP or (one.a, one.b) in good]
+    return replace(end, accepted=accepted, factors=factors)
+
+
+def _verify_candidate(end: BackEnd, row: int, other: int) -> BackEnd:
+    """Verify a loop between two keyframes, rows of the database, the later first, and record the outcome."""
+    keyframes = end.database.keyframes
+    candidate, rows = keyframes[other], (k for k in (other - 1, other + 1) if 0 <= k < row)
+    beside = [keyframes[k] for k in rows if _submap_id_of(end, k) == end.submap_id]
+    neighbours = neighbours_of(candidate, beside, end.poses, end.log_scales)
+    loop, info = verify(keyframes[row], candidate, neighbours, _verification_config(end, is_free=False))
+    if info.violation is not None:
+        end = replace(end, violating=[*end.violating, info.violation])
+    if loop is not None:
+        return replace(end, verified=[*end.verified, loop])
+    refusal = Refusal(candidate.frame, keyframes[row].frame, info.refused_by.value, info.measured)
+    return replace(end, refusals=[*end.refusals, refusal])
+
+
+def is_closure_due(end: BackEnd, loops: Sequence[LoopMeasurement]) -> bool:
+    """Test whether a closure is due: a loop violates the current poses, and the last closure is long enough ago."""
+    last = end.closures[-1].time if end.closures else -end.config.min_frames
+    return len(end.poses) - 1 - last >= end.config.min_frames and bool(violated(end, loops))
+
+
+def violated(end: BackEnd, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
+    """Select the loops that the current poses violate: χ² above `min_violation`."""
+    return [loop for loop in loops if loop_chi2(end, loop) > end.config.min_violation]
+
+
+def loop_chi2(end: BackEnd, loop: LoopMeasurement) -> float:
+    """Compute χ² of a loop at the current poses and scales."""
+    scale, other = end.log_scales[loop.a], end.log_scales[loop.b]
+    now = scale_pose(np.linalg.inv(end.poses[loop.a]) @ end.poses[loop.b], np.exp(-scale))
+    error = np.linalg.inv(loop.Z_a_b) @ now
+    turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
+    return float(np.sum((loop.sqrt_info @ [*error[:3, 3], *turn, other - scale - loop.log_ratio]) ** 2))
+
+
+def close_loops(end: BackEnd, state: SlamState, loops: Sequence[LoopMeasurement] = ()) -> tuple[BackEnd, SlamState]:
+    """Optimize with `loops` as further factors and deform the map; a refused solution moves nothing."""
+    factors = [*end.factors, *map(loop_factor, loops)]
+    before, solver = nodes_of(end, end.submap_id), end.config.solver
+    if not end.has_one_unit:  # the scales are not all about 1
+        solver = replace(solver, scale_std=jnp.asarray(math.inf))
+    after, info = optimize(PoseGraph(before, stack_factors(factors)), solver)
+    end = replace(end, closures=[*end.closures, Closure(len(end.poses) - 1, tuple(loops), info)])
+    if info.reason:
+        return end, state
+    count = len(end.poses)
+    end = replace(
+        end,
+        factors=factors,
+        accepted=[*end.accepted, *loops],
+        poses=list(np.asarray(after.T_world.as_matrix(), np.float64)[:count]),
+        log_scales=list(np.asarray(after.log_scale, np.float64)[:count]),
+    )
+    change = jnp.mean(after.log_scale - before.log_scale, where=before.valid)
+    state = replace(state, estimate=rescale_estimate(state.estimate, jnp.exp(change)))
+    return end, deform_state(state, before, after, end.min_std, end.config.deform)
+
+
+def transform_nodes(end: BackEnd, rows: Collection[int], similarity: Sim3) -> BackEnd:
+    """Map the poses and scales of some nodes to another world."""
+
+    def moved(poses: Sequence[np.ndarray]) -> list[np.ndarray]:
+        return [similarity.apply_to_poses(pose) if row in rows else pose for row, pose in enumerate(poses)]
+
+    change = float(np.log(similarity.scale))
+    log_scales = [scale + change if row in rows else scale for row, scale in enumerate(end.log_scales)]
+    return replace(end, poses=moved(end.poses), online=moved(end.online), log_scales=log_scales)
+
+
+def nodes_of(end: BackEnd, submap_id: int | None = None) -> Nodes:
+    """Stack all nodes, or mark those of a submap as valid; padded to a power of two, so that it compiles rarely."""
+    count = len(end.poses)
+    size = bucket(count)
+    poses = to_se3(np.stack([*end.poses, *[np.eye(4)] * (size - count)]))
+    scales = jnp.asarray([*end.log_scales, *[0.0] * (size - count)], jnp.float32)
+    is_valid = [submap_id in (None, one) for one in end.submap_ids]
+    return Nodes(poses, scales, jnp.asarray(is_valid + [False] * (size - count)))

@@ -4,11 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 
+from emgs_jax.running.back_end import (
+    BackEnd,
+    add_node,
+    close_loops,
+    consistent_loops,
+    detect_loops,
+    is_closure_due,
+    nodes_of,
+    not_in_graph,
+    recent_loops,
+    remove_inconsistent,
+    violated,
+)
 from emgs_jax.running.convert import to_se3
 from emgs_jax.running.deformation import merge_duplicates_of_state
 from emgs_jax.running.disconnected_submaps import join_submaps
+from emgs_jax.running.factors import FrameData
 from emgs_jax.running.prior_queries import query_prior
-from emgs_jax.running.record import IN_MAP, NEW_SUBMAP, RELOCALIZED, MappingRun, row_of_first_node
+from emgs_jax.running.record import IN_MAP, NEW_SUBMAP, RELOCALIZED, FrameRecord, MappingRun, row_of_first_node
 from emgs_jax.running.relocalization import frame_data
 from emgs_jax.running.window_input import WindowInput
 
@@ -20,23 +34,30 @@ def update_back_end(run: MappingRun, window_input: WindowInput) -> None:
         run: with a back end, and a state.
         window_input: the last one.
     """
-    end, added, frames = run.back_end, run.records[-len(window_input.frames) :], frame_data(window_input)
+    added, frames = run.records[-len(window_input.frames) :], frame_data(window_input)
     for frame, record in zip(frames, added, strict=True):
-        if record.location in (RELOCALIZED, NEW_SUBMAP):
-            end.connected_since = len(end.poses)
-        frame = replace(frame, depth_noise=record.depth_noise if record.status == "tracked" else None)
-        end.add_node(frame, record.pose, record.scale or 1.0, record.origin, record.status in IN_MAP)
+        run.back_end = _with_frame(run.back_end, frame, record)
     if added[-1].similarity is not None:
         join_submaps(run, window_input)
-    num_violating = len(end.violating)
-    found = end.detect_loops(frames[-1])
-    if end.is_closure_due(found):
-        query_prior(end, end.violated(found), run.prior_query)
-        found = end.recent_loops()
-    has_retracted = len(end.violating) > num_violating and end.retract_inconsistent(end.consistent()) > 0
-    if has_retracted or end.is_closure_due(found):
-        run.state = end.close_loops(run.state, found)
+    before = run.back_end
+    end = detect_loops(before, frames[-1])
+    loops = recent_loops(end)
+    if is_closure_due(end, loops):
+        end = query_prior(end, violated(end, loops), run.prior_query)
+        loops = recent_loops(end)
+    kept = remove_inconsistent(end) if len(end.violating) > len(before.violating) else end
+    run.back_end = kept
+    if len(kept.accepted) < len(end.accepted) or is_closure_due(kept, loops):
+        run.back_end, run.state = close_loops(kept, run.state, loops)
         _update_records(run)
+
+
+def _with_frame(end: BackEnd, frame: FrameData, record: FrameRecord) -> BackEnd:
+    """Add a frame with its record as a node; after relocalization and in a new submap it is not connected."""
+    if record.location in (RELOCALIZED, NEW_SUBMAP):
+        end = replace(end, connected_since=len(end.poses))
+    frame = replace(frame, depth_noise=record.depth_noise if record.status == "tracked" else None)
+    return add_node(end, frame, record.pose, record.scale or 1.0, record.origin, record.status in IN_MAP)
 
 
 def finish_back_end(run: MappingRun) -> None:
@@ -46,19 +67,18 @@ def finish_back_end(run: MappingRun) -> None:
     estimated. Else duplicate surfaces are merged that came to lie on each other and that nobody saw again.
     """
     end = run.back_end
-    query_prior(end, end.violated(end.not_in_graph(end.consistent())), run.prior_query)
-    consistent = end.consistent()
-    has_retracted = end.retract_inconsistent(consistent) > 0
-    loops = end.violated(end.not_in_graph(consistent))
-    if has_retracted or end.accepted or loops:
-        run.state = end.close_loops(run.state, loops)
+    end = query_prior(end, violated(end, not_in_graph(end, consistent_loops(end))), run.prior_query)
+    kept = remove_inconsistent(end)
+    loops = violated(kept, not_in_graph(kept, consistent_loops(kept)))
+    run.back_end = kept
+    if len(kept.accepted) < len(end.accepted) or kept.accepted or loops:
+        run.back_end, run.state = close_loops(kept, run.state, loops)
         _update_records(run)
-    tracked = [record for record in run.records if record.status == "tracked"]
+    end, tracked = run.back_end, [record for record in run.records if record.status == "tracked"]
     noise = [record.depth_noise for record in tracked if record.depth_noise is not None]
     if noise and (end.accepted or not end.has_one_unit):  # at the end only: what was made one Gaussian stays one
-        run.state = merge_duplicates_of_state(
-            run.state, end.nodes(end.submap_id), float(np.median(noise)), run.config.existence
-        )
+        nodes = nodes_of(end, end.submap_id)
+        run.state = merge_duplicates_of_state(run.state, nodes, float(np.median(noise)), run.config.existence)
 
 
 def _update_records(run: MappingRun) -> None:

@@ -6,15 +6,17 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
-from emgs_jax.evaluation.reconstruction import EvaluationConfig, own_voxel
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, own_voxel, posed_cloud
 from emgs_jax.evaluation.rendering import Rendered
 from emgs_jax.evaluation.segmentation import LabelledPoints, translate
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.gaussian_map import confirmed
+from emgs_jax.ops.camera import Camera, nearest_pixel, project
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.running.convert import to_se3
 from emgs_jax.running.executables import stored
@@ -48,7 +50,7 @@ def dense_map(
     evaluation: EvaluationConfig,
     labelled: LabelledMap | None = None,
     num_pictures: int = 4,
-    depths: Sequence[np.ndarray] | None = None,
+    own: Sequence[np.ndarray] | None = None,
 ) -> DenseMap:
     """Render the map from the pose of every frame that is not lost.
 
@@ -60,11 +62,11 @@ def dense_map(
             compared with the truth under it.
         labelled: `labelled_map` of the run, which says the class of each point.
         num_pictures: frames that are shown, evenly spread.
-        depths: what the prior says of every frame, camera-space z (h, w) in its own lengths, 0 where it says none; for
-            `densify.points=own` only.
+        own: what the prior says of every frame, camera-frame points (h, w, 3) in its own lengths, 0 where it says
+            nothing; for `densify.points=own` only.
     """
-    if config.points == "own" and depths is None:
-        raise ValueError("densify.points=own puts points at the depths of the frames: give depths=")
+    if config.points != "map" and own is None:
+        raise ValueError(f"densify.points={config.points} takes the points of the frames: give own=")
     known = [row for row, record in enumerate(run.records) if record.status != "lost"]
     shown = {known[int(i)] for i in np.linspace(0, len(known) - 1, num_pictures)} if known else set()
     pictures: list[dict[str, Any]] = []
@@ -79,14 +81,17 @@ def dense_map(
                 pictures.append(_picture(run, dataset, row, view) | ({} if labels is None else {"labels": labels}))
             found = translate(labels, labelled.classes, dataset.classes) if compares_classes else None
             rendered.add(row, np.where(view.valid, view.depth, 0.0), view.colors, found)
-            points, valid = view.points, view.valid
-            if config.points == "own":
-                scale = run.records[row].scale  # the map's unit is that of the first frames
-                own = depths[row] * (1.0 if scale is None else scale)
-                points, valid = at_own_depth(view, own, run.poses[row][:3, 3], float(config.surface_depth))
             # A voxel's colour is the mean of all pixels that see it: those of near and frontal views are most of them.
-            seen = dataset[row].image[valid] / 255.0
-            yield PointCloud(*(rows[valid].astype(np.float64) for rows in (points, view.normals)), seen)
+            image = dataset[row].image
+            if config.points == "map":
+                drawn = (view.points, view.normals, image / 255.0)
+                yield PointCloud(*(values[view.valid].astype(np.float64) for values in drawn))
+            else:
+                points = run.records[row].scale * own[row]
+                kept, normals = uncontradicted(points, view, run.camera, float(config.surface_depth))
+                seen = posed_cloud(points, kept, image, run.poses[row], evaluation)
+                normals = np.where(normals[kept].any(-1, keepdims=True), normals[kept], seen.normals)
+                yield PointCloud(seen.points, normals, seen.colors)
 
     cloud = fuse_clouds(clouds(), _voxel(with_truth(run, run.poses), evaluation))
     points = cloud.points
@@ -94,30 +99,35 @@ def dense_map(
     return DenseMap(cloud, labels, pictures, rendered.metrics())
 
 
-def at_own_depth(
-    view: DenseView, own: np.ndarray, center: np.ndarray, surface_depth: float
+def uncontradicted(
+    points: np.ndarray, view: DenseView, camera: Camera, surface_depth: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The points of a view at the depth of its own frame, valid where map and frame show one surface.
+    """The points of a frame that the map does not contradict, and the map's normals there.
 
     The mean of W depths of variance σ² whose errors have the correlation ρ has the variance σ² (ρ + (1 - ρ) / W). Where
     frames err alike, as those of multi-view stereo do, which are matched with the same images, ρ is near 1: the mean is
     no more precise than any of them, and what is smaller than a Gaussian is missing in it. There the map says which
-    depths are right, and the frame where: x = c + (z / z_map) (x_map - c) where |z - z_map| <= `surface_depth` z_map,
-    and no point where the frame says something else, or nothing (two gates, as in the geometric and photometric
-    consistency of COLMAP, Schönberger et al. 2016).
+    points are right, and the frame where they are (two gates, as in the geometric and photometric consistency of
+    COLMAP, Schönberger et al. 2016). Where the map shows nothing, as at the rim of what few frames see, it contradicts
+    nothing.
 
     Args:
-        view: drawn, on the host.
-        own: camera-space z (h, w) of the frame in the map's lengths; 0 where there is none.
-        center: of the camera, world frame.
-        surface_depth: fraction of the depth, as of `DensifyConfig`.
+        points: of the frame, camera frame, (h, w, 3) in the map's lengths; 0 where there is none. They need not lie on
+            the rays of the camera.
+        view: the map as it is drawn from the frame's pose, on the host.
+        camera: of the view.
+        surface_depth: fraction of the map's depth by which a point may differ from it.
 
     Returns:
-        Points (h, w, 3), world frame, and which are valid; the map's where they are not.
+        Whether a point is kept (h, w), and normals (h, w, 3), world frame; 0 where the map shows nothing.
     """
-    valid = view.valid & (own > 0) & (np.abs(own - view.depth) <= surface_depth * view.depth)
-    ratio = np.where(valid, own, 1.0) / np.where(valid, view.depth, 1.0)
-    return center + ratio[..., None] * (view.points - center), valid
+    pixels, depth = project(camera, jnp.asarray(points, jnp.float32))
+    index, is_inside, depth = jax.device_get((*nearest_pixel(pixels, depth.shape), depth))
+    there = view.depth.ravel()[index]
+    is_shown = is_inside & view.valid.ravel()[index]
+    is_near = np.abs(depth - there) <= surface_depth * there
+    normals = view.normals.reshape(-1, 3)[index]
+    return (depth > 0) & (is_near | ~is_shown), np.where(is_shown[..., None], normals, 0.0)
 
 
 def _voxel(poses: tuple[np.ndarray, np.ndarray] | None, config: EvaluationConfig) -> float:

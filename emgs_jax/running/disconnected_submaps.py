@@ -12,17 +12,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emgs_jax.geometry import Sim3, scale_covariance, scale_pose
 from emgs_jax.loop_closure.relocalization import RelocalizedPose
-from emgs_jax.loop_closure.two_view_refinement import rescaled
 from emgs_jax.observation import Prediction
 from emgs_jax.pose_graph.factors import ODOMETRY
 from emgs_jax.registration.pose_estimate import rescale_estimate
-from emgs_jax.running.back_end import BackEnd
+from emgs_jax.running.back_end import BackEnd, nodes_of, relocalize_frame, transform_nodes
 from emgs_jax.running.capacity import add_map, advance, start
 from emgs_jax.running.convert import FirstWindow, to_se3
 from emgs_jax.running.deformation import deform_state, move_map
 from emgs_jax.running.factors import Factor
-from emgs_jax.running.record import UNJOINED, FrameRecord, MappingRun, row_of_first_node, to_matrix
+from emgs_jax.running.record import UNJOINED, MappingRun, row_of_first_node, to_matrix, transform_record
 from emgs_jax.running.relocalization import (
     anchor_motion_of,
     as_step_prediction,
@@ -86,7 +86,7 @@ def start_submap(run: MappingRun, window_input: WindowInput) -> tuple[SlamState,
 def enter_submap(run: MappingRun, window_input: WindowInput, before: SlamState) -> None:
     """Switch to the submap that the last frame has started; the state `before` it becomes inactive."""
     run.inactive = run.inactive | {run.back_end.submap_id: before}
-    run.back_end.submap_id = window_input.structure
+    run.back_end = replace(run.back_end, submap_id=window_input.structure)
     run.structure, run.prior_motion = place_structure(window_input, run.records[-1].pose), None
 
 
@@ -102,7 +102,7 @@ def match_submap(run: MappingRun, window_input: WindowInput, info: StepInfo) -> 
     """
     if not run.inactive or not bool(info.localization.is_tracked):
         return None
-    place, _ = run.back_end.relocalize(frame_data(window_input)[0], in_other_submap=True)
+    place, _ = relocalize_frame(run.back_end, frame_data(window_input)[0], in_other_submap=True)
     if place is None:
         return None
     other = run.inactive[run.back_end.submap_ids[place.keyframe]]
@@ -113,27 +113,13 @@ def match_submap(run: MappingRun, window_input: WindowInput, info: StepInfo) -> 
     _, there, _ = advance(begin, again, run.camera, run.config)
     if rejection(there, again, place, run.back_end.config.relocalization) is not None:
         return None
-    return similarity_between(info, there)
+    return (_camera_in_world(there) @ _camera_in_world(info).inverse()).as_matrix()
 
 
-def similarity_between(here: StepInfo, there: StepInfo) -> np.ndarray:
-    """Return the similarity between a frame's two poses, lengths included: (4, 4) with e^σ R in the place of R."""
-    before, after = (to_matrix(np.asarray(info.T_world_camera.wxyz_xyz)) for info in (here, there))
-    before[:3, :3] *= float(here.localization.scale)
-    after[:3, :3] *= float(there.localization.scale)
-    return after @ np.linalg.inv(before)
-
-
-def moved_pose(similarity: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
-    """Transform a pose (4, 4) by a similarity."""
-    moved = similarity @ T_world_camera
-    moved[:3, :3] /= scale_of(similarity)
-    return moved
-
-
-def scale_of(similarity: np.ndarray) -> float:
-    """Return the factor by which a similarity multiplies lengths."""
-    return float(np.cbrt(np.linalg.det(similarity[:3, :3])))
+def _camera_in_world(info: StepInfo) -> Sim3:
+    """Similarity from a camera's frame, in the unit of its prediction, to the world."""
+    T = to_matrix(np.asarray(info.T_world_camera.wxyz_xyz))
+    return Sim3(float(info.localization.scale), T[:3, :3], T[:3, 3])
 
 
 def join_submaps(run: MappingRun, window_input: WindowInput) -> None:
@@ -141,24 +127,22 @@ def join_submaps(run: MappingRun, window_input: WindowInput) -> None:
 
     The newer one moves, by the similarity of the record or its inverse.
     """
-    end, similarity = run.back_end, run.records[-1].similarity
-    place, _ = end.relocalize(frame_data(window_input)[-1], in_other_submap=True)  # where `match_submap` has found it
+    end, similarity = run.back_end, Sim3.from_matrix(run.records[-1].similarity)
+    frame = frame_data(window_input)[-1]
+    place, _ = relocalize_frame(end, frame, in_other_submap=True)  # where `match_submap` has found it
     here, there = end.submap_id, end.submap_ids[place.keyframe]
     if here < there:
-        similarity = np.linalg.inv(similarity)
-    newer, older, before = max(here, there), min(here, there), end.nodes()
+        similarity = similarity.inverse()
+    newer, older, before = max(here, there), min(here, there), nodes_of(end)
     unit = np.exp(end.log_scales[place.keyframe])  # of the place's covariance: its map may be the one that moves
     rows = [row for row, one in enumerate(end.submap_ids) if one == newer]
+    end = transform_nodes(end, rows, similarity)
+    after, first = nodes_of(end), row_of_first_node(run) - end.first_node
     for row in rows:
-        end.poses[row] = moved_pose(similarity, end.poses[row])
-        end.online[row] = moved_pose(similarity, end.online[row])
-        end.log_scales[row] += float(np.log(scale_of(similarity)))
-    after, first = end.nodes(), row_of_first_node(run) - end.first_node
-    for row in rows:
-        run.records[first + row] = _moved_record(similarity, run.records[first + row])
-    end.submap_ids = [older if one == newer else one for one in end.submap_ids]
-    end.submap_id, end.has_one_unit = older, False
-    end.factors.append(join_factor(end, place, unit))
+        run.records[first + row] = transform_record(run.records[first + row], similarity)
+    submap_ids = [older if one == newer else one for one in end.submap_ids]
+    factors = [*end.factors, join_factor(end, place, unit)]
+    run.back_end = replace(end, submap_ids=submap_ids, submap_id=older, has_one_unit=False, factors=factors)
     other = run.inactive[there]
     run.inactive = {one: state for one, state in run.inactive.items() if one != there}
     state = deform_state(run.state, before, after, end.min_std, end.config.deform)
@@ -166,8 +150,8 @@ def join_submaps(run: MappingRun, window_input: WindowInput) -> None:
     map, run.config = add_map(state.map, moved, run.config)
     run.state = replace(state, map=map)
     if here == newer:
-        factor = jnp.asarray(scale_of(similarity), jnp.float32)
-        run.state = replace(run.state, estimate=rescale_estimate(state.estimate, factor))
+        scale = jnp.asarray(similarity.scale, jnp.float32)
+        run.state = replace(run.state, estimate=rescale_estimate(state.estimate, scale))
         run.prior_motion = anchor_motion_of(run.records[-1], step_prediction(run, window_input))
 
 
@@ -178,23 +162,10 @@ def join_factor(end: BackEnd, place: RelocalizedPose, unit: float) -> Factor:
     """
     a, b = place.keyframe, len(end.poses) - 1
     scale = np.exp(end.log_scales[a])
-    units = np.array([unit] * 3 + [1.0] * 4)
-    information = np.linalg.inv(place.covariance / units[:, None] / units)
-    measured = rescaled(np.linalg.inv(end.poses[a]) @ end.poses[b], 1.0 / scale)
+    information = np.linalg.inv(scale_covariance(place.covariance, 1.0 / unit))
+    measured = scale_pose(np.linalg.inv(end.poses[a]) @ end.poses[b], 1.0 / scale)
     ratio = end.log_scales[b] - end.log_scales[a]
     return Factor(a, b, measured, ratio, np.linalg.cholesky(information).T, ODOMETRY)
-
-
-def _moved_record(similarity: np.ndarray, record: FrameRecord) -> FrameRecord:
-    scale = scale_of(similarity)
-    units = np.array([scale] * 3 + [1.0] * 3)
-    poses = {name: getattr(record, name) for name in ("pose", "newest_pose")}
-    return replace(
-        record,
-        **{name: None if pose is None else moved_pose(similarity, pose) for name, pose in poses.items()},
-        covariance=None if record.covariance is None else units[:, None] * record.covariance * units,
-        scale=None if record.scale is None else scale * record.scale,
-    )
 
 
 def drop_unjoined_submaps(run: MappingRun) -> None:
@@ -209,13 +180,19 @@ def drop_unjoined_submaps(run: MappingRun) -> None:
     kept = 0 if run.saved is not None else max(sorted(counts), key=lambda one: counts[one])
     run.state, run.inactive = ({end.submap_id: run.state} | run.inactive)[kept], {}
     is_kept = [one == kept for one in end.submap_ids]
-    end.is_placed = [placed and here for placed, here in zip(end.is_placed, is_kept, strict=True)]
-    end.submap_id = kept
-    for name in ("factors", "verified", "violating", "accepted"):
-        setattr(end, name, [one for one in getattr(end, name) if is_kept[one.a] and is_kept[one.b]])
+    between = {
+        name: [one for one in getattr(end, name) if is_kept[one.a] and is_kept[one.b]]
+        for name in ("factors", "verified", "violating", "accepted")
+    }
     known = end.database
     rows = [row for row, one in enumerate(known.keyframes) if is_kept[one.frame]]
-    end.database = replace(known, keyframes=tuple(known.keyframes[row] for row in rows), vectors=known.vectors[rows])
+    run.back_end = replace(
+        end,
+        is_placed=[placed and here for placed, here in zip(end.is_placed, is_kept, strict=True)],
+        submap_id=kept,
+        database=replace(known, keyframes=tuple(known.keyframes[row] for row in rows), vectors=known.vectors[rows]),
+        **between,
+    )
     first = row_of_first_node(run) - end.first_node
     for row in range(end.first_node, len(is_kept)):
         if not is_kept[row]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.loop_closure.two_view_refinement import rescaled
+from emgs_jax.geometry import scale_pose
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.ops.ranges import number
 from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Factors
@@ -123,7 +123,7 @@ def map_factor(
 
 def _relative_pose(poses: Sequence[np.ndarray], log_scales: Sequence[float], row: int) -> np.ndarray:
     """Node `row` relative to the last one, in the unit of the last one's inference."""
-    return rescaled(np.linalg.inv(poses[-1]) @ poses[row], np.exp(-log_scales[-1]))
+    return scale_pose(np.linalg.inv(poses[-1]) @ poses[row], np.exp(-log_scales[-1]))
 
 
 def loop_factor(loop: LoopMeasurement) -> Factor:

@@ -14,7 +14,7 @@ from emgs_jax.evaluation.baselines import BaselineConfig, Fusion, Pinhole, View
 from emgs_jax.evaluation.clouds import PointCloud, SpooledCloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, posed
 from emgs_jax.evaluation.segmentation import SpooledLabels, nearest_classes
-from emgs_jax.evaluation.trajectory import rotated
+from emgs_jax.geometry import rotated
 from emgs_jax.observation import known_surface
 from emgs_jax.running.record import IN_MAP, MappingRun
 from emgs_jax.running.window_input import RawView
@@ -30,13 +30,13 @@ class RawPrior:
 
     Args:
         cloud: its points at its poses; a voxel's side in its lengths is known once the poses are aligned.
-        depths: camera-space z of each frame (h, w), in the prior's own lengths; 0 without a value.
+        points: camera-frame points of each frame (h, w, 3), in the prior's own lengths; 0 where it says nothing.
         classes: of each frame's pixels (h, w), as positions in the prior's names, -1 = none; None without classes.
         labels: its points likewise, each with the class that its frame sees there; None without classes.
     """
 
     cloud: SpooledCloud
-    depths: Spool
+    points: Spool
     classes: Spool | None = None
     labels: SpooledLabels | None = None
 
@@ -92,7 +92,7 @@ def unit_of(truth: np.ndarray, depth: np.ndarray) -> float:
 def gather(
     views: Iterable[RawView],
     evaluation: EvaluationConfig,
-    keeps_depths: bool,
+    keeps_points: bool,
     baselines: Baselines | None = None,
     text: Text | None = None,
 ) -> RawPrior:
@@ -101,26 +101,26 @@ def gather(
     Args:
         views: of all frames.
         evaluation: how normals are fitted.
-        keeps_depths: the truth is known, or points are to lie at them.
+        keeps_points: the truth is known, or points are to lie at them.
         baselines: that take the views, too.
         text: names of the classes that pixels are labelled with, and their embeddings; None: no labels.
     """
-    cloud, depths, classes = SpooledCloud(), Spool(), Spool()
+    cloud, kept, classes = SpooledCloud(), Spool(), Spool()
     labels = None if text is None else SpooledLabels(text[0])
 
     def take(row: int, view: RawView) -> None:
         points, mask, image, pose, features = view
-        depth = np.where(mask & np.isfinite(points[..., 2]), points[..., 2], 0.0).astype(np.float32)
+        known = mask & np.isfinite(points).all(-1)
+        depth = np.where(known, points[..., 2], 0.0).astype(np.float32)
         seen = camera_cloud(points, mask, image, evaluation)
-        if keeps_depths:
-            depths.append(depth)
+        if keeps_points:
+            kept.append(np.where(known[..., None], points, 0.0).astype(np.float32))
         if text is not None:
             found = resize_nearest(nearest_classes(features, text[1]).astype(np.int32), depth.shape[::-1])
             classes.append(found)
             has_class = mask & (found >= 0)
             labels.append(rotated(points[has_class], pose[:3, :3]) + pose[:3, 3], found[has_class])
         if baselines is not None:
-            known = mask & np.isfinite(points).all(-1)
             baselines.add(row, View(depth, image, seen), points, known, pose)
         cloud.append(posed(seen, pose))
 
@@ -132,4 +132,4 @@ def gather(
             taken = thread.submit(take, row, view)
         if taken is not None:
             taken.result()
-    return RawPrior(cloud, depths) if text is None else RawPrior(cloud, depths, classes, labels)
+    return RawPrior(cloud, kept) if text is None else RawPrior(cloud, kept, classes, labels)

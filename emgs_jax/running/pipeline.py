@@ -12,6 +12,7 @@ from tqdm import tqdm
 from emgs_jax.data.base import Dataset
 from emgs_jax.observation import Prediction
 from emgs_jax.prior.base import Prior
+from emgs_jax.running.back_end import relocalize_frame
 from emgs_jax.running.back_end_update import finish_back_end, update_back_end
 from emgs_jax.running.capacity import advance, prepare_step, restart_map, start
 from emgs_jax.running.checkpoint import Checkpoint, Keeper
@@ -47,12 +48,12 @@ from emgs_jax.running.record import (
 from emgs_jax.running.relocalization import (
     anchor_motion_of,
     as_step_prediction,
+    frame_data,
     is_relocalization_due,
     is_restart_due,
     move_prediction,
     not_found_message,
     rejection,
-    relocalize_frame,
     relocalized_start,
     replace_map,
     state_in_saved_map,
@@ -196,7 +197,7 @@ def step_or_relocalize(
     if state is not None:
         state, info, config = advance(state, move_prediction(prediction, run.prior_motion), run.camera, config)
     if is_relocalization_due(run, info):
-        place, location = relocalize_frame(run, window_input)
+        place, location = relocalize_frame(run.back_end, frame_data(window_input)[0])
         if place is not None:
             is_known = is_related(run, window_input)
             seen = (

@@ -1,6 +1,7 @@
 """Queries of the prior for a second measurement of a loop: it predicts views of both visits together."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.loop_closure.prior_query import JointPrediction, PriorQuery, fuse_measurements, measure_by_prior
@@ -30,7 +31,7 @@ def make_prior_query(prior: Prior, dataset: Dataset, spacing: int, window_size: 
     return query
 
 
-def query_prior(end: BackEnd, loops: Sequence[LoopMeasurement], query: PriorQuery) -> None:
+def query_prior(end: BackEnd, loops: Sequence[LoopMeasurement], query: PriorQuery) -> BackEnd:
     """Query the prior for loops, each once: a measurement that fits is fused, any other rejects the loop.
 
     A rejected loop is evidence against all loops that imply the same correction, as a free-space violation is. A loop
@@ -45,16 +46,21 @@ def query_prior(end: BackEnd, loops: Sequence[LoopMeasurement], query: PriorQuer
             if answer is None
             else measure_by_prior(answer, *(keyframes[node] for node in pair), end.config.prior_query)
         )
-        end.queries[pair] = MEASURED if other is not None else SILENT if answer is None else UNUSABLE
+        outcome = MEASURED if other is not None else SILENT if answer is None else UNUSABLE
+        end = replace(end, queries=end.queries | {pair: outcome})
         if other is None:
             continue
         both, misfit = fuse_measurements(loop, other)
-        row = [(known.a, known.b) for known in end.verified].index(pair)
+        known = end.verified
+        row = [(one.a, one.b) for one in known].index(pair)
+        before, after = end.verified[:row], end.verified[row + 1 :]
         if misfit <= end.config.prior_query.max_misfit:
-            end.verified[row] = both
+            end = replace(end, verified=[*before, both, *after])
         else:
-            end.violating.append(end.verified.pop(row))
-            end.refusals.append(Refusal(*pair, Gate.PRIOR_QUERY.value, misfit))
+            refusal = Refusal(*pair, Gate.PRIOR_QUERY.value, misfit)
+            end = replace(end, verified=[*before, *after], refusals=[*end.refusals, refusal])
+            end = replace(end, violating=[*end.violating, known[row]])
+    return end
 
 
 def _loops_to_query(end: BackEnd, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:

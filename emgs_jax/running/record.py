@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.geometry import Sim3, scale_covariance
 from emgs_jax.io.trajectory import to_tum
 from emgs_jax.localization import REASONS
 from emgs_jax.loop_closure.prior_query import PriorQuery
@@ -54,7 +55,7 @@ class FrameRecord:
             estimated, relative to the first frame.
         inliers: points that agree with the map.
         residual: of these to the map's planes, as a fraction of their depth.
-        scale: factor on the prediction's lengths.
+        scale: factor on the prediction's lengths; the frames that a map is made from give it its unit.
         depth_noise: how much the points differ from the map, as a fraction of their depth; None where none agrees.
         step_m: between the coarse and the fine pose.
         step_rad: likewise.
@@ -207,14 +208,23 @@ def record_start(run: MappingRun, window_input: WindowInput, spent: Seconds) -> 
         )
     share = {key: value / len(poses) for key, value in spent.items()}
     for row, pose in enumerate(poses):
-        _add(run, window_input, row, status="initialization", pose=to_matrix(pose), num_gaussians=count, **share)
+        _add(
+            run,
+            window_input,
+            row,
+            status="initialization",
+            pose=to_matrix(pose),
+            scale=1.0,
+            num_gaussians=count,
+            **share,
+        )
 
 
 def record_new_submap(run: MappingRun, window_input: WindowInput, spent: Seconds) -> None:
     """Record the first frame of a disconnected submap; its pose is that of the frame before, a placeholder."""
     count = int(np.asarray(run.map.gaussians.valid).sum())
     kept = {"status": "initialization", "pose": run.records[-1].pose, "new": count, "num_gaussians": count}
-    _add(run, window_input, 0, **kept, location=NEW_SUBMAP, **spent)
+    _add(run, window_input, 0, **kept, scale=1.0, location=NEW_SUBMAP, **spent)
 
 
 def record_step(
@@ -274,6 +284,17 @@ def _step_fields(info: StepInfo) -> dict[str, Any]:
 def row_of_first_node(run: MappingRun) -> int:
     """Return the row of the first record that is a node of the back end; all later ones are nodes, too."""
     return len(run.records) - (len(run.back_end.poses) - run.back_end.first_node)
+
+
+def transform_record(record: FrameRecord, similarity: Sim3) -> FrameRecord:
+    """Map poses, covariance and scale of a record to another world."""
+    poses = {name: getattr(record, name) for name in ("pose", "newest_pose")}
+    return replace(
+        record,
+        **{name: None if pose is None else similarity.apply_to_poses(pose) for name, pose in poses.items()},
+        covariance=None if record.covariance is None else scale_covariance(record.covariance, similarity.scale),
+        scale=None if record.scale is None else similarity.scale * record.scale,
+    )
 
 
 def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

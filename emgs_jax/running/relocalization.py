@@ -76,11 +76,6 @@ def _num_untracked(run: MappingRun, info: StepInfo) -> int:
     return 0 if info.localization.is_tracked else len(run.records) - (placed[-1] if placed else -1)
 
 
-def relocalize_frame(run: MappingRun, window_input: WindowInput) -> tuple[RelocalizedPose | None, str | None]:
-    """Relocalize the first frame of `window_input`: return its pose, or the reason why there is none."""
-    return run.back_end.relocalize(frame_data(window_input)[0])
-
-
 def frame_data(window_input: WindowInput) -> list[FrameData]:
     """Collect what the back end needs of each frame."""
     return [

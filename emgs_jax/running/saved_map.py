@@ -5,7 +5,7 @@ Keyframes, poses and factors. The other run's frames are further nodes of the sa
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +71,8 @@ def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
         np.savez(handle, __header__=np.array(json.dumps(header)), **arrays)
 
 
-def load_places(path: Path, end: BackEnd) -> float:
-    """Fill a back end that has no node yet; returns the depth noise.
+def load_places(path: Path, end: BackEnd) -> tuple[BackEnd, float]:
+    """Fill a back end that has no node yet; return it, and the depth noise.
 
     Raises:
         ValueError: the file is damaged, of another version, or its descriptors are of another kind.
@@ -87,9 +87,9 @@ def load_places(path: Path, end: BackEnd) -> float:
         for name, array in arrays.items():
             if array.dtype.kind == "f" and name != "keyframes.points" and not np.isfinite(array).all():
                 raise ValueError(f"{name} is not finite")
-        _fill(end, arrays, int(header["num_trained"]))
-        end.has_one_unit = bool(header.get("has_one_unit", True))  # files of before do not say
-        return float(header["depth_noise"])
+        has_one_unit = bool(header.get("has_one_unit", True))  # older files do not have it
+        end = replace(end, has_one_unit=has_one_unit, **_fields(arrays, int(header["num_trained"])))
+        return end, float(header["depth_noise"])
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror or error}") from error
     except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
@@ -129,8 +129,7 @@ def load_saved_map(
         )
     if not (folder / PLACES_FILE).exists():
         raise ValueError(f"map={folder} has no {PLACES_FILE}: map it again with graph=default")
-    end = BackEnd(config, tuple(intrinsics), min_std)
-    depth_noise = load_places(folder / PLACES_FILE, end)
+    end, depth_noise = load_places(folder / PLACES_FILE, BackEnd(config, tuple(intrinsics), min_std))
     size = end.database.keyframes[0].depths.shape[::-1]
     if size != tuple(config.place_recognition.grid):
         raise ValueError(
@@ -144,14 +143,12 @@ def load_saved_map(
     return SavedMap(map, end, depth_noise, mode == "localize", fingerprint(folder, files, {}))
 
 
-def _fill(end: BackEnd, arrays: Mapping[str, np.ndarray], num_trained: int) -> None:
-    """Nodes, keyframes and measurements into an empty back end."""
+def _fields(arrays: Mapping[str, np.ndarray], num_trained: int) -> dict[str, Any]:
+    """Read nodes, keyframes and measurements, as fields of a back end."""
     poses, log_scales, frames, is_placed = (arrays[name] for name in NODES)
     count = len(poses)
     if poses.shape != (count, 4, 4) or not count == len(log_scales) == len(frames) == len(is_placed) > 0:
         raise ValueError(f"{count} nodes have {len(log_scales)} scales, {len(frames)} frames, {len(is_placed)} states")
-    end.poses, end.log_scales, end.online = list(np.float64(poses)), log_scales.tolist(), list(np.float64(poses))
-    end.frames, end.is_placed = frames.tolist(), is_placed.tolist()
     keyframes, words = _keyframes(arrays), arrays["words"]
     if words.ndim != 2 or words.shape[1] != DESCRIPTOR_SIZE:
         raise ValueError(f"words have shape {words.shape}, expected (k, {DESCRIPTOR_SIZE})")
@@ -159,14 +156,23 @@ def _fill(end: BackEnd, arrays: Mapping[str, np.ndarray], num_trained: int) -> N
     if numbers != sorted(set(numbers)) or not 0 <= numbers[0] <= numbers[-1] < count:
         raise ValueError("keyframes are not nodes in their order")
     vectors = np.stack([vlad(unit_descriptors(one), words) for one in keyframes])
-    end.database = Database(keyframes, words, vectors, num_trained)
-    end.factors = [Factor(**row) for row in _rows("edges", arrays, Factor.__annotations__, count)]
-    for name, field in LOOPS.items():
-        rows = _rows(name, arrays, LoopMeasurement.__annotations__, count)
-        setattr(end, field, [LoopMeasurement(**row) for row in rows])
-    end.first_node = end.connected_since = count
-    is_kept = arrays.get("is_kept", np.ones(count, bool))  # files of before do not say
-    end.submap_ids = np.where(is_kept, 0, LEFT_OUT).tolist()
+    is_kept = arrays.get("is_kept", np.ones(count, bool))  # older files do not have it
+    loops = {
+        field: [LoopMeasurement(**row) for row in _rows(name, arrays, LoopMeasurement.__annotations__, count)]
+        for name, field in LOOPS.items()
+    }
+    return {
+        "poses": list(np.float64(poses)),
+        "online": list(np.float64(poses)),
+        "log_scales": log_scales.tolist(),
+        "frames": frames.tolist(),
+        "is_placed": is_placed.tolist(),
+        "submap_ids": np.where(is_kept, 0, LEFT_OUT).tolist(),
+        "factors": [Factor(**row) for row in _rows("edges", arrays, Factor.__annotations__, count)],
+        "database": Database(keyframes, words, vectors, num_trained),
+        "first_node": count,
+        "connected_since": count,
+    } | loops
 
 
 def _keyframes(arrays: Mapping[str, np.ndarray]) -> tuple[Keyframe, ...]:

@@ -9,10 +9,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.geometry import Sim3
 from emgs_jax.registration.pose_estimate import rescale_estimate
+from emgs_jax.running.back_end import transform_nodes
 from emgs_jax.running.convert import on_device
 from emgs_jax.running.executables import stored
-from emgs_jax.running.record import MappingRun
+from emgs_jax.running.record import MappingRun, transform_record
 from emgs_jax.slam import SlamState
 
 
@@ -39,32 +41,12 @@ def rescale_run(run: MappingRun) -> None:
         return
     if run.back_end is not None and not run.back_end.has_one_unit:
         return
-    factor = np.exp(-float(run.state.estimate.log_scale))
     origin = next(record.pose for record in run.records if record.pose is not None)[:3, 3]  # the anchor's
-
-    def placed(pose: np.ndarray | None) -> np.ndarray | None:
-        if pose is None:
-            return None
-        moved = pose.copy()
-        moved[:3, 3] = origin + factor * (pose[:3, 3] - origin)
-        return moved
-
-    units = np.array([factor] * 3 + [1.0] * 3)
+    similarity = Sim3.about(origin, np.exp(-float(run.state.estimate.log_scale)))
     run.state = in_prior_unit(run.state, origin)
-    run.records = [
-        replace(
-            record,
-            pose=placed(record.pose),
-            newest_pose=placed(record.newest_pose),
-            covariance=None if record.covariance is None else units[:, None] * record.covariance * units,
-            scale=None if record.scale is None else factor * record.scale,
-        )
-        for record in run.records
-    ]
+    run.records = [transform_record(record, similarity) for record in run.records]
     if run.back_end is not None:
-        run.back_end.poses = [placed(pose) for pose in run.back_end.poses]
-        run.back_end.online = [placed(pose) for pose in run.back_end.online]
-        run.back_end.log_scales = [float(np.log(factor)) + scale for scale in run.back_end.log_scales]
+        run.back_end = transform_nodes(run.back_end, range(len(run.back_end.poses)), similarity)
 
 
 def rescaled(state: SlamState, factor: float, origin: np.ndarray) -> SlamState:

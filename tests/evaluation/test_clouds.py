@@ -17,7 +17,7 @@ from emgs_jax.evaluation.clouds import (
     transform_cloud,
     voxel_downsample,
 )
-from emgs_jax.evaluation.trajectory import Alignment
+from emgs_jax.geometry import Sim3
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.ops.ranges import MAX_LENGTH_M
 
@@ -63,7 +63,7 @@ def test_nearest_points_are_those_of_scipys_tree(num_neighbours):
 def test_a_similarity_moves_the_points_and_only_turns_the_normals():
     rng = np.random.default_rng(8)
     cloud = random_cloud(rng)
-    move = Alignment(3.0, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
+    move = Sim3(3.0, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
     moved = transform_cloud(cloud, move)
     tips = (move.apply(cloud.points + cloud.normals) - move.apply(cloud.points)) / 3.0
     np.testing.assert_allclose(moved.points, move.apply(cloud.points), atol=1e-12)

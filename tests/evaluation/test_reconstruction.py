@@ -19,7 +19,7 @@ from emgs_jax.evaluation.reconstruction import (
     reconstruction_metrics,
     reference,
 )
-from emgs_jax.evaluation.trajectory import Alignment
+from emgs_jax.geometry import Sim3
 
 REPLICA = Path(__file__).resolve().parents[3] / "shared" / "data" / "replica"
 CONFIG = evaluation_config()
@@ -123,7 +123,7 @@ def test_distances_and_normals_are_those_of_brute_force():
 def test_metrics_follow_a_similarity_of_both_clouds():
     rng = np.random.default_rng(2)
     estimate, truth = random_cloud(rng), random_cloud(rng)
-    move = Alignment(2.0, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
+    move = Sim3(2.0, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
     small = dataclasses.replace(CONFIG, voxel_m=1e-4, f1_thresholds_m=(0.1,))
     large = dataclasses.replace(CONFIG, voxel_m=1e-4, f1_thresholds_m=(0.2,))
     before = list(reconstruction_metrics(estimate, reference(truth, small), small).values())
@@ -212,12 +212,12 @@ def test_distances_are_those_of_open3d_as_mean_and_as_clipped_rmse():
 def test_icp_of_a_protocol_takes_back_a_small_motion_that_the_poses_do_not_show():
     rng = np.random.default_rng(9)
     truth = random_cloud(rng, 1500)
-    small = Alignment(1.0, Rotation.from_rotvec([0.01, -0.01, 0.005]).as_matrix(), np.array([0.01, 0.0, -0.01]))
+    small = Sim3(1.0, Rotation.from_rotvec([0.01, -0.01, 0.005]).as_matrix(), np.array([0.01, 0.0, -0.01]))
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, :3, 3] = rng.normal(size=(5, 3))
     # The estimate has a frame and a size of its own.
     rotation = Rotation.random(rng=rng).as_matrix()
-    away = Alignment(0.5, rotation, np.array([1.0, -2.0, 3.0]))
+    away = Sim3(0.5, rotation, np.array([1.0, -2.0, 3.0]))
     moved, estimated = transform_cloud(transform_cloud(truth, small), away), away.apply_to_poses(poses)
     without = compare_clouds(moved, reference(truth, CONFIG), (estimated, poses), CONFIG)
     refined = dataclasses.replace(CONFIG, icp_distance_m=0.1, icp_voxel_m=1e-4)

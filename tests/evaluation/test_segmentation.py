@@ -124,7 +124,7 @@ def test_the_class_of_a_voxel_is_that_of_most_views_and_a_view_counts_once(monke
     grid.add(np.array([here, [np.nan, 0, 0]]), np.array([0, 0]))
     found = grid.points(("a", "b", "c"))
     np.testing.assert_allclose(found.points, [there, here])  # by cell
-    np.testing.assert_array_equal(found.labels, [1, 0])
+    np.testing.assert_array_equal(found.labels, [0, 1])
     assert found.classes == ("a", "b", "c") and len(LabelGrid(0.1).points(("a",)).labels) == 0
 
 

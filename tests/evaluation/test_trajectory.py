@@ -4,11 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hand_run import inverse, random_poses, random_similarity
+from hand_run import random_poses, random_similarity
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.evaluation.trajectory import (
-    Alignment,
     DegenerateTrajectoryError,
     align,
     align_poses,
@@ -17,6 +16,7 @@ from emgs_jax.evaluation.trajectory import (
     rpe,
     trajectory_metrics,
 )
+from emgs_jax.geometry import Sim3
 from emgs_jax.io.trajectory import load_trajectory_tum
 
 TRAJECTORIES = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "trajectories"
@@ -107,7 +107,7 @@ def test_the_alignment_is_a_minimum_of_the_error():
     best = align(x, y, with_scale=True)
     for change in 1e-3 * rng.normal(size=(30, 7)):
         rotation = best.rotation @ Rotation.from_rotvec(change[:3]).as_matrix()
-        other = Alignment(best.scale + change[6], rotation, best.translation + change[3:6])
+        other = Sim3(best.scale + change[6], rotation, best.translation + change[3:6])
         assert ate(x, y, other) >= ate(x, y, best)
 
 
@@ -190,7 +190,7 @@ def straight_path(rng, n=12):
 def test_on_a_straight_path_orientations_decide_the_roll_and_positions_the_scale(scale):
     rng = np.random.default_rng(6)
     truth, made = straight_path(rng), random_similarity(rng, scale)
-    estimate = inverse(made).apply_to_poses(truth)
+    estimate = made.inverse().apply_to_poses(truth)
     found, note = align_poses(estimate, truth, with_scale=True)
     assert "straight path" in note
     assert_same_alignment(found, made, atol=1e-6)
@@ -211,7 +211,7 @@ def test_without_motion_orientations_decide_the_rotation_and_the_size_stays():
     standing = truth.copy()
     standing[:, :3, 3] = 1.0
     for rows, true in ((slice(0, 1), truth), (slice(None), standing)):
-        found, note = align_poses(inverse(made).apply_to_poses(true[rows]), true[rows], with_scale=True)
+        found, note = align_poses(made.inverse().apply_to_poses(true[rows]), true[rows], with_scale=True)
         assert "without enough motion" in note
         assert_same_alignment(found, made)
     for estimate, reference, rows in ((truth, standing, 6), (standing, truth, 6), (truth, 2.0 * truth, 2)):

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from loop_scene import INTRINSICS, SIZE, loops_config, matrix
 
+from emgs_jax.geometry import pose_difference, scale_pose
 from emgs_jax.loop_closure.place_recognition import Keyframe, sampled_depths
 from emgs_jax.loop_closure.prior_query import JointPrediction, fuse_measurements, measure_by_prior
-from emgs_jax.loop_closure.two_view_refinement import Similarity, pose_difference, rescaled
+from emgs_jax.loop_closure.two_view_refinement import Similarity
 from emgs_jax.loop_closure.verification import LoopMeasurement
 
 CONFIG = loops_config()["prior_query"]
@@ -33,7 +34,7 @@ def keyframe(frame: int, scale: float) -> Keyframe:
 
 def told(T_a_b: np.ndarray = T_A_B, scale: float = 1.0) -> JointPrediction:
     points, mask = seen(scale)
-    return JointPrediction(rescaled(T_a_b, scale), (points, points), (mask, mask))
+    return JointPrediction(scale_pose(T_a_b, scale), (points, points), (mask, mask))
 
 
 def measured(error=(0.0, 0.0, 0.0), std: float = 0.02, log_ratio: float = 0.0) -> LoopMeasurement:
@@ -44,7 +45,7 @@ def measured(error=(0.0, 0.0, 0.0), std: float = 0.02, log_ratio: float = 0.0) -
 def test_an_exact_answer_in_any_unit_is_the_similarity_between_the_two_inferences():
     """A metre is 1.1 of a's inference, .9 of b's and 3 of the new one: the pose is in a's, the ratio a's over b's."""
     found = measure_by_prior(told(scale=3.0), keyframe(3, 1.1), keyframe(70, 0.9), CONFIG)
-    np.testing.assert_allclose(found.T_a_b, rescaled(T_A_B, 1.1), atol=1e-3)
+    np.testing.assert_allclose(found.T_a_b, scale_pose(T_A_B, 1.1), atol=1e-3)
     assert found.log_ratio == pytest.approx(np.log(1.1 / 0.9), abs=1e-3)
 
 

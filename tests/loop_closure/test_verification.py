@@ -24,11 +24,12 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.data.apartment import Apartment
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.plan import APART
+from emgs_jax.geometry import pose_difference, scale_pose
 from emgs_jax.loop_closure.consistency import pairs_within, spatially_consistent
 from emgs_jax.loop_closure.free_space import free_space_violation
 from emgs_jax.loop_closure.place_recognition import Keyframe, make_keyframe
 from emgs_jax.loop_closure.two_view_alignment import Gate
-from emgs_jax.loop_closure.two_view_refinement import Similarity, pose_difference, rescaled
+from emgs_jax.loop_closure.two_view_refinement import Similarity
 from emgs_jax.loop_closure.verification import LoopMeasurement, Neighbour, verify
 
 CANDIDATE = matrix((0, 10, 0), (0.1, 0.0, 0.2))
@@ -67,7 +68,7 @@ def test_the_pose_of_the_query_in_the_candidates_frame_is_exact_and_three_edges_
 def test_lengths_are_in_the_candidates_unit_and_the_ratio_is_it_over_the_querys(scale_a, scale_b, std):
     """A prior without a metric may have any ratio."""
     loop, _ = measured(scale_a=scale_a, scale_b=scale_b, overrides=(f"alignment.scale_std={std}",))
-    np.testing.assert_allclose(loop.Z_a_b, rescaled(TRUTH, scale_a), atol=2e-5)
+    np.testing.assert_allclose(loop.Z_a_b, scale_pose(TRUTH, scale_a), atol=2e-5)
     np.testing.assert_allclose(loop.log_ratio, np.log(scale_a / scale_b), atol=1e-5)
 
 
@@ -183,7 +184,7 @@ def drifted_path(log_scale=0.0):
     scales = dict.fromkeys(truth, log_scale)
 
     def loop(a, b, wrong=None):
-        Z = rescaled(np.linalg.inv(truth[a]) @ truth[b], np.exp(-log_scale))
+        Z = scale_pose(np.linalg.inv(truth[a]) @ truth[b], np.exp(-log_scale))
         return LoopMeasurement(a, b, Z if wrong is None else wrong @ Z, 0.0, np.eye(7), 100)
 
     return now, scales, loop

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hand_run import STATUSES, densify_config, hand_run, inverse, poses_along, random_poses, random_similarity, wall
+from hand_run import STATUSES, densify_config, hand_run, poses_along, random_poses, random_similarity, wall
 from scene import evaluation_config, random_gaussians
 from scipy.spatial.transform import Rotation
 
@@ -62,19 +62,19 @@ class Scene:
         return Scorer(Blind(), self.config, reference(self.cloud, self.config), self.labels, None)
 
     def run(self, **changes):
-        run = hand_run(inverse(self.ours).apply_to_poses(self.poses), self.raw_poses(), self.poses)
+        run = hand_run(self.ours.inverse().apply_to_poses(self.poses), self.raw_poses(), self.poses)
         for name, value in changes.items():
             setattr(run, name, value)
         return run
 
     def raw_poses(self):
-        return inverse(self.raw).apply_to_poses(self.poses)
+        return self.raw.inverse().apply_to_poses(self.poses)
 
     def raw_prior(self):
-        return RawPrior(transform_cloud(self.cloud, inverse(self.raw)), Spool())
+        return RawPrior(transform_cloud(self.cloud, self.raw.inverse()), Spool())
 
     def score(self, run, labels=None):
-        dense = transform_cloud(self.cloud, inverse(self.ours))
+        dense = transform_cloud(self.cloud, self.ours.inverse())
         few = PointCloud(dense.points[::2], dense.normals[::2], dense.colors[::2])
         return score_map(run, dense, few, labels, self.scorer())
 
@@ -82,7 +82,7 @@ class Scene:
 def test_an_estimate_that_is_the_truth_in_another_frame_and_size_has_no_error():
     """Its centres are every other point, and as right; so are their labels, but for those of the other half."""
     scene = Scene()
-    centers = inverse(scene.ours).apply(scene.cloud.points[::2])
+    centers = scene.ours.inverse().apply(scene.cloud.points[::2])
     labels = LabelledPoints(centers, scene.labels.labels[::2], CLASSES)
     metrics = scene.score(scene.run(), labels)
     exact = ("trajectory/ate_sim3_m", "reconstruction/accuracy_m", "reconstruction/completion_m")
@@ -123,7 +123,7 @@ def test_lost_frames_pay_for_their_poses_and_frames_without_a_true_pose_are_not_
 @pytest.mark.parametrize(("alignment", "other"), [("sim3", "se3"), ("se3", "sim3")])
 def test_the_dense_map_is_also_compared_under_the_other_alignment(alignment, other):
     scene = Scene(f"evaluation.alignment={alignment}")
-    run, dense = scene.run(), transform_cloud(scene.cloud, inverse(scene.ours))
+    run, dense = scene.run(), transform_cloud(scene.cloud, scene.ours.inverse())
     metrics = scene.score(run)
     poses = np.stack(run.poses), scene.poses
     for name, prefix in ((alignment, "reconstruction/"), (other, f"reconstruction_{other}/")):
@@ -143,7 +143,7 @@ def test_what_an_alignment_by_poses_leaves_open_is_closed_by_the_points_but_for_
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler("x", 0.5, degrees=True).as_matrix()
     run = scene.run()
-    run.poses = [inverse(scene.ours).apply_to_poses(turn[None] @ pose[None])[0] for pose in scene.poses]
+    run.poses = [scene.ours.inverse().apply_to_poses(turn[None] @ pose[None])[0] for pose in scene.poses]
     metrics = scene.score(run)
     assert metrics["reconstruction/accuracy_m"] > 0.01
     np.testing.assert_allclose(metrics["reconstruction_icp/accuracy_m"], 0.0, atol=1e-9)

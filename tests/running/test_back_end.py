@@ -13,18 +13,30 @@ from scene import assert_same, random_gaussians, random_observation
 
 from emgs_jax import load_config
 from emgs_jax.gaussian_map import new_map
+from emgs_jax.geometry import scale_pose
 from emgs_jax.io.g2o import load_graph_g2o, save_graph_g2o
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe
 from emgs_jax.loop_closure.prior_query import JointPrediction
-from emgs_jax.loop_closure.two_view_refinement import rescaled
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.pose_graph.deform import DeformConfig
 from emgs_jax.pose_graph.factors import Nodes, PoseGraph, residuals
 from emgs_jax.registration.pose_estimate import exact_estimate
+from emgs_jax.report import back_end as report
 from emgs_jax.report.back_end import counts, found_loops, loop_list, metric_graph, revisit_note
 from emgs_jax.report.page_words import loop_why
-from emgs_jax.running import back_end_update
-from emgs_jax.running.back_end import BackEnd
+from emgs_jax.running import back_end, back_end_update
+from emgs_jax.running.back_end import (
+    BackEnd,
+    add_node,
+    close_loops,
+    consistent_loops,
+    is_closure_due,
+    loop_chi2,
+    nodes_of,
+    not_in_graph,
+    remove_inconsistent,
+    violated,
+)
 from emgs_jax.running.back_end_update import finish_back_end, update_back_end
 from emgs_jax.running.deformation import merge_duplicates_of_state
 from emgs_jax.running.factors import FrameData, map_factor, sequential_factor, stack_factors
@@ -70,7 +82,7 @@ def state_of(poses: np.ndarray) -> SlamState:
 def walked(graph, poses: np.ndarray, scale: float = 1.0) -> BackEnd:
     end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
     for index, pose in enumerate(poses):
-        end.add_node(look(poses, index), pose, scale, max(index - 3, 0))
+        end = add_node(end, look(poses, index), pose, scale, max(index - 3, 0))
     return end
 
 
@@ -86,10 +98,10 @@ def error(poses, truth) -> float:
 def test_what_was_measured_without_error_moves_nothing(graph):
     poses = ring()
     end, state = walked(graph, poses), state_of(poses)
-    closed = end.close_loops(state, [loop(poses)])
+    end, closed = close_loops(end, state, [loop(poses)])
     assert error(end.poses, poses) < 1e-5 and end.closures[-1].info.reason == ""
     np.testing.assert_allclose(closed.map.gaussians.means, state.map.gaussians.means, atol=1e-5)
-    assert end.chi2_of(loop(poses)) < 1e-3 and not end.is_closure_due([loop(poses)])
+    assert loop_chi2(end, loop(poses)) < 1e-3 and not is_closure_due(end, [loop(poses)])
 
 
 def test_a_loop_brings_poses_map_and_last_frame_back(graph):
@@ -99,10 +111,10 @@ def test_a_loop_brings_poses_map_and_last_frame_back(graph):
     end = walked(graph, drifted)
     state = state_of(drifted)
     loops = [loop(truth, row) for row in range(1, 9)]
-    assert end.chi2_of(loops[0]) > graph.min_violation and end.is_closure_due(loops)
+    assert loop_chi2(end, loops[0]) > graph.min_violation and is_closure_due(end, loops)
     before, gap = error(drifted, truth), lambda poses: np.linalg.norm(poses[1][:3, 3] - poses[-2][:3, 3])
-    closed = end.close_loops(state, loops)
-    assert end.accepted == loops and not end.is_closure_due(loops)
+    end, closed = close_loops(end, state, loops)
+    assert end.accepted == loops and not is_closure_due(end, loops)
     np.testing.assert_allclose(gap(end.poses), gap(truth), atol=0.02)
     assert error(end.poses, truth) < 0.5 * before
     for pose, scale, mean in zip(end.poses, end.log_scales, closed.map.gaussians.means, strict=True):
@@ -117,59 +129,53 @@ def test_the_mean_of_the_scales_that_the_unit_of_a_run_is_made_of_follows_a_clos
     end = walked(graph, poses, np.exp(log_scale))
     state = eqx.tree_at(lambda s: s.estimate.log_scale, state_of(poses), jnp.asarray(log_scale))
     records = [FrameRecord(row, None, None, "tracked", pose=pose, scale=1.05) for row, pose in enumerate(poses)]
-    records[0] = FrameRecord(0, None, None, "initialization", pose=poses[0])
+    records[0] = FrameRecord(0, None, None, "initialization", pose=poses[0], scale=1.0)
+    smaller = np.stack([scale_pose(pose, 0.9) for pose in poses])
+    end = replace(end, verified=[loop(smaller, row) for row in range(1, 9)])
     run = MappingRun(None, None, state=state, records=records, back_end=end)
-    smaller = np.stack([rescaled(pose, 0.9) for pose in poses])
-    end.verified = [loop(smaller, row) for row in range(1, 9)]
     finish_back_end(run)
+    end = run.back_end
     assert end.accepted and log_scale - np.mean(end.log_scales) > 1e-3  # `scale_std` asks for scales of one
     assert float(run.state.estimate.log_scale) == pytest.approx(np.mean(end.log_scales), abs=1e-5)
-    np.testing.assert_allclose([record.scale for record in run.records[1:]], np.exp(end.log_scales[1:]))
-    assert run.records[0].scale is None
+    np.testing.assert_allclose([record.scale for record in run.records], np.exp(end.log_scales))
 
 
 def test_loops_that_are_contradicted_later_are_no_edges_any_more(graph):
     truth, drifted = ring(), ring(1.95 * np.pi)
     end, loops = walked(graph, drifted), [loop(truth, row) for row in range(1, 9)]
-    end.verified = list(loops)
-    assert end.not_in_graph(end.consistent()) == loops
-    end.close_loops(state_of(drifted), loops)
-    assert (
-        end.retract_inconsistent(end.consistent()) == 0
-        and len(end.accepted) == len(loops)
-        and end.not_in_graph(end.consistent()) == []
-    )
-    end.violating = [loop(truth, row) for row in (9, 10)]
+    end = replace(end, verified=list(loops))
+    assert not_in_graph(end, consistent_loops(end)) == loops
+    end, _ = close_loops(end, state_of(drifted), loops)
+    assert len(remove_inconsistent(end).accepted) == len(end.accepted) == len(loops)
+    assert not_in_graph(end, consistent_loops(end)) == []
+    end = replace(end, violating=[loop(truth, row) for row in (9, 10)])
     num_edges = len(end.factors)
-    assert (
-        end.retract_inconsistent(end.consistent()) == len(loops)
-        and not end.accepted
-        and len(end.factors) == num_edges - len(loops)
-    )
+    end = remove_inconsistent(end)
+    assert not end.accepted and len(end.factors) == num_edges - len(loops)
 
 
 def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatch):
     truth, drifted = ring(), ring(1.95 * np.pi)
     end, loops = walked(graph, drifted), [loop(truth, row) for row in range(1, 9)]
-    end.verified = list(loops)
-    state = end.close_loops(state_of(drifted), loops)
+    end = replace(end, verified=list(loops))
+    end, state = close_loops(end, state_of(drifted), loops)
     records = [FrameRecord(row, None, None, "tracked", pose=pose) for row, pose in enumerate(end.poses)]
     run = MappingRun(None, None, state=state, records=records, back_end=end)
     run.prior_motion = motion = jaxlie.SE3.from_matrix(jnp.asarray(ring()[7], jnp.float32))
     frame, raw = SimpleNamespace(index=COUNT - 1, image=None), SimpleNamespace(points=None, mask=None)
     given = SimpleNamespace(frames=[frame], raw=[raw], T_anchor_views={})
-    monkeypatch.setattr(end, "add_node", lambda *arguments: None)
-    monkeypatch.setattr(end, "detect_loops", lambda look: [])
+    monkeypatch.setattr(back_end_update, "add_node", lambda end, *arguments: end)
+    monkeypatch.setattr(back_end_update, "detect_loops", lambda end, frame: end)
     update_back_end(run, given)
-    assert end.accepted == loops and len(end.closures) == 1 and run.prior_motion is motion
+    assert run.back_end.accepted == loops and len(run.back_end.closures) == 1 and run.prior_motion is motion
     records = list(run.records)
 
-    def contradict(look: FrameData) -> list:
-        end.violating = [loop(truth, row) for row in (9, 10)]
-        return []
+    def contradict(end: BackEnd, frame: FrameData) -> BackEnd:
+        return replace(end, violating=[loop(truth, row) for row in (9, 10)])
 
-    monkeypatch.setattr(end, "detect_loops", contradict)
+    monkeypatch.setattr(back_end_update, "detect_loops", contradict)
     update_back_end(run, given)
+    end = run.back_end
     assert not end.accepted and len(end.closures) == 2
     assert error(end.poses, drifted) < 0.01
     assert error([record.pose for record in run.records], end.poses) == 0
@@ -184,7 +190,7 @@ def test_a_loop_that_cannot_be_solved_changes_nothing(graph):
     end, state = walked(graph, poses), state_of(poses)
     broken = loop(poses)
     broken.Z_a_b[0, 3] = np.nan
-    same = end.close_loops(state, [broken])
+    end, same = close_loops(end, state, [broken])
     assert_same(same, state)
     assert not end.accepted and end.closures[-1].info.reason and error(end.poses, poses) == 0
     assert counts(end)["loops/closures_refused"] == 1
@@ -196,16 +202,16 @@ def test_a_loop_that_others_agree_with_and_that_cannot_be_solved_says_why(graph,
     end, state = walked(graph, poses), state_of(poses)
     known, broken = loop(poses), loop(poses)
     broken = replace(broken, b=broken.b - 1)
-    end.verified = [known, broken]
-    monkeypatch.setattr(end, "consistent", lambda since=0: end.verified)
+    end = replace(end, verified=[known, broken])
+    monkeypatch.setattr(report, "consistent_loops", lambda end: end.verified)
     assert [line["outcome"] for line in loop_list(end)] == ["known", "known"]
     assert found_loops(end) == [known, broken], "what the poses say already is found as well"
     bad = replace(broken, Z_a_b=np.full((4, 4), np.nan))
-    end.close_loops(state, [bad])
+    end, _ = close_loops(end, state, [bad])
     unsolved, other = loop_list(end)
     assert (unsolved["outcome"], other["outcome"]) == ("unsolved", "known")
     assert found_loops(end) == [known]
-    end.accepted = [known]
+    end = replace(end, accepted=[known])
     assert found_loops(end) == [known], "once"
     assert unsolved["reason"] == end.closures[-1].info.reason and "reason" not in other
     assert loop_why(unsolved) == f"verified, but no better poses were found with it: {unsolved['reason']}"
@@ -215,7 +221,7 @@ def test_the_loops_of_a_map_that_was_loaded_do_not_count(graph):
     poses = ring()
     end = walked(graph, poses)
     old, new = replace(loop(poses), b=10), loop(poses)
-    end.verified, end.accepted, end.violating, end.first_node = [old, new], [old, new], [old], 20
+    end = replace(end, verified=[old, new], accepted=[old, new], violating=[old], first_node=20)
     found = counts(end)
     assert (found["loops/verified"], found["loops/accepted"], found["loops/contradicted"]) == (1, 1, 0)
 
@@ -244,9 +250,9 @@ def test_a_frame_is_not_measured_to_one_whose_pose_only_stands_in(graph):
         seen = look(poses, frame)
         if frame in (1, 2):
             seen.T_anchor_views[frame][:] = np.nan
-        end.add_node(seen, poses[frame], 1.0, None, is_placed=frame == 0)
+        end = add_node(end, seen, poses[frame], 1.0, None, is_placed=frame == 0)
     assert [(edge.a, edge.b) for edge in end.factors] == [(3, 0)]
-    end.add_node(look(poses, 4), poses[4], 1.0, None, is_placed=False)
+    end = add_node(end, look(poses, 4), poses[4], 1.0, None, is_placed=False)
     assert (end.factors[-1].a, end.factors[-1].b) == (4, 3), "a frame that is led to is as good as a placed one"
 
 
@@ -292,16 +298,16 @@ def test_without_a_loop_nothing_moves_however_the_predictions_differ(graph):
     placed = ring(1.95 * np.pi)
     end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
     for index, pose in enumerate(placed):
-        end.add_node(look(ring(), index), pose, 1.0, max(index - 3, 0))
+        end = add_node(end, look(ring(), index), pose, 1.0, max(index - 3, 0))
     state = state_of(placed)
-    assert_same(end.close_loops(state).map, state.map)
+    assert_same(close_loops(end, state)[1].map, state.map)
 
 
 def test_other_solvers_read_the_graph_in_the_scale_of_the_map(graph, tmp_path):
     poses = ring()
     end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
     for index, pose in enumerate(poses):
-        end.add_node(look(poses, index), pose, 1.1, None)
+        end = add_node(end, look(poses, index), pose, 1.1, None)
     save_graph_g2o(tmp_path / "graph.g2o", metric_graph(end))
     read = load_graph_g2o(tmp_path / "graph.g2o")
     assert int(read.nodes.valid.sum()) == COUNT and len(read.factors.a) == len(end.factors)
@@ -313,11 +319,11 @@ def test_other_solvers_read_the_graph_in_the_scale_of_the_map(graph, tmp_path):
 def test_a_graph_for_other_solvers_costs_what_ours_does_and_has_the_nodes_of_the_map_only(graph):
     poses = ring()
     end = walked(graph, poses, scale=2.0)
-    end.poses = [pose @ change for pose, change in zip(end.poses, random_steps(0.01), strict=True)]
-    ours = np.sum(residuals(PoseGraph(end.nodes(), stack_factors(end.factors))) ** 2, axis=1)[: len(end.factors)]
+    end = replace(end, poses=[pose @ change for pose, change in zip(end.poses, random_steps(0.01), strict=True)])
+    ours = np.sum(residuals(PoseGraph(nodes_of(end), stack_factors(end.factors))) ** 2, axis=1)[: len(end.factors)]
     assert ours.min() > 0
     np.testing.assert_allclose(np.sum(residuals(metric_graph(end)) ** 2, axis=1)[: len(ours)], ours, rtol=1e-3)
-    end.submap_ids[:5] = [-1] * 5
+    end = replace(end, submap_ids=[-1] * 5 + [0] * (COUNT - 5))
     np.testing.assert_array_equal(np.flatnonzero(metric_graph(end).nodes.valid), range(5, COUNT))
 
 
@@ -350,37 +356,37 @@ def with_keyframes(end: BackEnd) -> BackEnd:
     none = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32)
     wall = np.full((60, 80), 2.0, np.float16)
     keyframes = tuple(Keyframe(row, *none, end.intrinsics, (64, 48), wall) for row in range(len(end.poses)))
-    end.database = Database(keyframes)
-    return end
+    return replace(end, database=Database(keyframes))
 
 
 def test_a_loop_that_the_prior_sees_too_is_more_certain_and_asked_for_once(graph):
     truth = ring()
     end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
-    end.frames = [100 + row for row in range(COUNT)]  # numbers of the data set
+    end = replace(end, frames=[100 + row for row in range(COUNT)])  # numbers of the data set
     ask, calls = told_again(np.concatenate([np.tile(np.eye(4), (100, 1, 1)), truth]))
-    end.verified = [loop(truth, row) for row in range(1, 5)]
+    end = replace(end, verified=[loop(truth, row) for row in range(1, 5)])
     loops = list(end.verified)
-    query_prior(end, loops[:2], ask)
+    end = query_prior(end, loops[:2], ask)
     assert calls == [(101, 158), (102, 157)] and counts(end)["loops/measured_again"] == 2
     for before, now in zip(loops[:2], end.verified[:2], strict=True):
         np.testing.assert_allclose(now.Z_a_b, before.Z_a_b, atol=1e-6)
         assert (np.diag(now.sqrt_info) > np.diag(before.sqrt_info)).all()
-    query_prior(end, end.verified, ask)
+    end = query_prior(end, end.verified, ask)
     assert len(calls) == 4 and len(end.verified) == 4 and revisit_note(end, is_sequential=False) == []
 
 
 def test_of_a_closure_the_loops_with_most_inliers_are_asked_for(graph):
     truth = ring()
     end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
-    end.verified = [replace(loop(truth, row), num_inliers=40 + 10 * (row % 3)) for row in range(1, 7)]
+    end = replace(end, verified=[replace(loop(truth, row), num_inliers=40 + 10 * (row % 3)) for row in range(1, 7)])
     ask, calls = told_again(truth)
-    query_prior(end, end.verified, ask)
+    end = query_prior(end, end.verified, ask)
     assert [a for a, _ in calls] == [2, 5, 1] and graph.prior_query.max_queries == 3
-    end.queries.clear(), calls.clear()
+    end = replace(end, queries={})
+    calls.clear()
     same = [replace(one, b=50, num_inliers=40 + one.a) for one in end.verified]  # all of one query: one witness
-    end.verified = list(same)
-    query_prior(end, same, ask)
+    end = replace(end, verified=list(same))
+    end = query_prior(end, same, ask)
     assert len(calls) == 1 and calls[0][0] == 6
 
 
@@ -390,19 +396,19 @@ def test_what_is_known_already_takes_nobodys_turn(graph):
     end = with_keyframes(walked(graph, poses))
     known = [replace(loop(poses, row), num_inliers=90) for row in range(1, 5)]
     false = [replace(loop(ring(1.9 * np.pi), row), num_inliers=40) for row in range(5, 9)]
-    end.verified = [*known, *false]
+    end = replace(end, verified=[*known, *false])
     ask, calls = told_again(poses)
-    query_prior(end, end.violated(end.not_in_graph(end.verified)), ask)
+    end = query_prior(end, violated(end, not_in_graph(end, end.verified)), ask)
     assert sorted(a for a, _ in calls) == [5, 6, 7] and end.accepted == []
-    assert [one.a for one in end.violated(end.verified)] == [8], "asked for, the prior says what the poses say"
+    assert [one.a for one in violated(end, end.verified)] == [8], "asked for, the prior says what the poses say"
 
 
 def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
     truth = ring()
     end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
-    end.verified = [loop(truth, row) for row in range(1, 5)]
+    end = replace(end, verified=[loop(truth, row) for row in range(1, 5)])
     ask, _ = told_again(truth, off=6.0)
-    query_prior(end, end.verified[:1], ask)
+    end = query_prior(end, end.verified[:1], ask)
     assert [known.a for known in end.verified] == [2, 3, 4] and [known.a for known in end.violating] == [1]
     (refusal,) = end.refusals
     assert (refusal.a, refusal.b, refusal.gate) == (
@@ -418,9 +424,9 @@ def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
 def test_an_answer_without_a_pose_is_none_and_is_counted(graph):
     truth = ring()
     end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
-    end.verified = [loop(truth, row) for row in range(1, 5)]
+    end = replace(end, verified=[loop(truth, row) for row in range(1, 5)])
     loops, (ask, _) = list(end.verified), told_again(truth)
-    query_prior(end, loops[:1], lambda a, b: replace(ask(a, b), T_a_b=np.full((4, 4), np.nan)))
+    end = query_prior(end, loops[:1], lambda a, b: replace(ask(a, b), T_a_b=np.full((4, 4), np.nan)))
     assert end.verified == loops and counts(end)["loops/unusable_answers"] == 1
     assert counts(end)["loops/measured_again"] == 0 and revisit_note(end, is_sequential=False) == []
 
@@ -428,45 +434,46 @@ def test_an_answer_without_a_pose_is_none_and_is_counted(graph):
 def test_a_loop_for_which_the_prior_has_no_word_and_one_of_another_run_stay(graph):
     truth = ring()
     end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
-    end.verified = [loop(truth, row) for row in range(1, 5)]
+    end = replace(end, verified=[loop(truth, row) for row in range(1, 5)])
     loops = list(end.verified)
-    query_prior(end, loops[:2], lambda a, b: None)
+    end = query_prior(end, loops[:2], lambda a, b: None)
     assert counts(end)["loops/measured_again"] == counts(end)["loops/unusable_answers"] == 0
     (note,) = revisit_note(end, is_sequential=False)
     assert note.startswith("loops: 2 were measured by keypoints alone") and "graph=default" in note
     assert revisit_note(end, is_sequential=True) == revisit_note(None, is_sequential=False) == []
     ask, calls = told_again(truth)
-    end.first_node = 10
-    query_prior(end, loops[2:], ask)
+    end = replace(end, first_node=10)
+    end = query_prior(end, loops[2:], ask)
     assert calls == [] and all(now is before for now, before in zip(end.verified, loops, strict=True))
 
 
 def test_what_moves_the_poses_was_asked_for_before(graph, monkeypatch):
     """Of four loops that agree the prior refuses one: the others are edges, and as the prior measures them, too."""
     truth, drifted = ring(), ring(1.95 * np.pi)
-    end = with_keyframes(walked(graph, drifted))
+    loops = [loop(truth, row) for row in range(1, 5)]
+    end = replace(with_keyframes(walked(graph, drifted)), verified=loops)
     run = MappingRun(None, None, state=state_of(drifted), back_end=end)
     run.records = [FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0) for i, pose in enumerate(drifted)]
-    loops = [loop(truth, row) for row in range(1, 5)]
-    end.verified = list(loops)
     right, _ = told_again(truth)
     wrong, _ = told_again(truth, off=6.0)
     run.prior_query = lambda a, b: wrong(a, b) if a == 2 else right(a, b)
-    agreed = BackEnd.consistent
-    monkeypatch.setattr(BackEnd, "consistent", lambda end, since=0: list(end.verified))
-    finish_back_end(run)
+    with monkeypatch.context() as patch:
+        for module in (back_end, back_end_update):
+            patch.setattr(module, "consistent_loops", lambda end, since=0: list(end.verified))
+        finish_back_end(run)
+    end = run.back_end
     assert [one.a for one in end.accepted] == [1, 3, 4] and [refusal.a for refusal in end.refusals] == [2]
     assert end.accepted[0].sqrt_info[0, 0] > loops[0].sqrt_info[0, 0]
     assert error(end.poses, truth) < 0.5 * error(drifted, truth)
     # Two of them against it, and all that imply the same correction fall.
     end = with_keyframes(walked(graph, drifted))
-    end.verified = [loop(truth, row) for row in range(1, 9)]
+    end = replace(end, verified=[loop(truth, row) for row in range(1, 9)])
     run.back_end, run.state = end, state_of(drifted)
     run.prior_query = lambda a, b: wrong(a, b)
-    monkeypatch.setattr(BackEnd, "consistent", agreed)
-    assert len(end.consistent()) == 8
+    assert len(consistent_loops(end)) == 8
     finish_back_end(run)
-    assert end.accepted == [] and len(end.refusals) == 3 and end.consistent() == []
+    end = run.back_end
+    assert end.accepted == [] and len(end.refusals) == 3 and consistent_loops(end) == []
     assert error(end.poses, drifted) == 0
 
 
@@ -476,7 +483,7 @@ def test_a_map_whose_visits_were_joined_is_settled_at_the_end_with_the_noise_of_
 ):
     truth, drifted = ring(), ring(1.95 * np.pi)
     end = walked(graph, drifted)
-    end.verified = [loop(truth, row) for row in range(1, 9)] if has_loop else []
+    end = replace(end, verified=[loop(truth, row) for row in range(1, 9)] if has_loop else [])
     records = [
         FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0, depth_noise=0.01 * (i % 3))
         if i < COUNT // 3
@@ -487,7 +494,7 @@ def test_a_map_whose_visits_were_joined_is_settled_at_the_end_with_the_noise_of_
     run.back_end = end
 
     def settled(state, nodes, noise, gates):
-        np.testing.assert_allclose(nodes.T_world.as_matrix()[: len(end.poses)], end.poses, atol=1e-5)
+        np.testing.assert_allclose(nodes.T_world.as_matrix()[:COUNT], run.back_end.poses, atol=1e-5)
         asked.append((noise, gates))
         return replace(state, time=jnp.asarray(-1))
 

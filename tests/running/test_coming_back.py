@@ -9,8 +9,8 @@ from scene import assert_same
 from walks import BACK, NEVER_FOUND, THERE, Apart, Blinded, Misled, config, mapped, prior_of, same_run, walk
 
 from emgs_jax import load_map
+from emgs_jax.geometry import pose_difference
 from emgs_jax.localization import LEAST_NOISE
-from emgs_jax.loop_closure.two_view_refinement import pose_difference
 from emgs_jax.report.metrics import score_back_end
 from emgs_jax.report.run_files import save_progress
 from emgs_jax.running.checkpoint import CheckpointConfig, Keeper

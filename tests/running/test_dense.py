@@ -11,6 +11,7 @@ from hand_run import STATUSES, densify_config, hand_run, poses_along, wall
 from scene import evaluation_config
 
 from emgs_jax.data.base import Frame
+from emgs_jax.ops.camera import unproject
 from emgs_jax.running.dense import center_cloud, dense_map
 from emgs_jax.running.labelling import LabelledMap
 
@@ -119,13 +120,29 @@ def test_the_classes_of_rendered_pixels_are_compared_with_those_of_the_frames_by
     np.testing.assert_allclose(metrics["rendering/label_accuracy_percent"], 100.0 * 5 / 6, atol=0.5)  # one is lost
 
 
-def test_a_point_lies_where_its_frame_puts_it_if_the_map_shows_that_surface_there_and_nowhere_else(run):
+def own_points(run, said, shift=0.0):
+    """Camera-frame points of every frame at depths (n, h, w), `shift` pixels right of its rays."""
+    points = np.array(unproject(run.camera, jnp.ones((16, 24))))
+    points[..., 0] += shift / 24.0
+    return np.float32(said[..., None] * points)
+
+
+def own_run(run, scale):
+    found = hand_run(run.poses, run.raw_poses, run.true_poses, gaussians=run.state.map.gaussians)
+    found.records = [replace(record, scale=scale) for record in found.records]
+    return found
+
+
+def own_cloud(run, scale, own):
+    config = densify_config("densify.points=own")
+    return dense_map(own_run(run, scale), Pictures(), config, evaluation_config(), own=own).cloud
+
+
+def test_a_point_lies_where_its_frame_puts_it_unless_the_map_shows_another_surface_there(run):
     """The wall is at 2: left of the camera the frames say 2.05, right of it 3, and in the upper row nothing."""
     said = np.full((len(STATUSES), 16, 24), 1.025, np.float32)
     said[:, :, 12:], said[:, 0] = 1.5, 0.0
-    scaled = hand_run(run.poses, run.raw_poses, run.true_poses, gaussians=run.state.map.gaussians)
-    scaled.records = [replace(record, scale=2.0) for record in scaled.records]
-    found = dense_map(scaled, Pictures(), densify_config("densify.points=own"), evaluation_config(), depths=said).cloud
+    found = own_cloud(run, 2.0, own_points(run, said))
     np.testing.assert_allclose(found.points[:, 2], 2.05, atol=1e-5)  # float32
     np.testing.assert_allclose(found.normals, np.broadcast_to([0.0, 0.0, -1.0], found.normals.shape), atol=1e-5)
     offsets = found.points[:, None, 0] - XS[[status != "lost" for status in STATUSES]]
@@ -134,12 +151,32 @@ def test_a_point_lies_where_its_frame_puts_it_if_the_map_shows_that_surface_ther
     assert found.points[:, 1].min() > (0.4 - 7.5) * 2.05 / 24, "the upper row has no depth"
 
 
-def test_depths_of_frames_change_nothing_unless_points_are_to_lie_there_and_are_asked_for_then(run, dense, labels):
-    poison = np.full((len(STATUSES), 16, 24), np.nan, np.float32)
+def test_the_map_is_asked_where_a_point_appears_which_need_not_be_the_pixel_that_it_is_of(run):
+    """The wall ends at x = 1 of frame 0: its right half shows nothing. Points are four pixels right of their rays."""
+    half = own_run(run, 1.0)
+    half.state.map = eqx.tree_at(
+        lambda m: m.gaussians.valid, half.state.map, half.state.map.gaussians.means[:, 0] < XS[0]
+    )
+    said = np.full((len(STATUSES), 16, 24), 3.0, np.float32)
+    config = densify_config("densify.points=own")
+    own = own_points(run, said, shift=4.0)
+    own[1:] = 0.0
+    found = dense_map(half, Pictures(), config, evaluation_config(), own=own).cloud
+    drawn = dense_map(half, Pictures(), densify_config(), evaluation_config()).cloud
+    edge = 24 * (drawn.points[:, 0].max() - XS[0]) / 2.0  # pixels right of the camera's axis that the map covers
+    np.testing.assert_allclose(24 * (found.points[:, 0].min() - XS[0]) / 3.0, edge + 1.0, atol=0.6)
+    np.testing.assert_allclose(found.points[:, 2], 3.0, atol=1e-5)
+    fitted = found.normals.any(axis=1)  # the borders of an image have too few neighbours
+    np.testing.assert_allclose(found.normals[fitted], np.tile([0.0, 0.0, -1.0], (fitted.sum(), 1)), atol=1e-3)
+    assert fitted.sum() > 50
+
+
+def test_points_of_frames_change_nothing_unless_points_are_to_lie_there_and_are_asked_for_then(run, dense, labels):
+    poison = np.full((len(STATUSES), 16, 24, 3), np.nan, np.float32)
     config = densify_config()
-    found = dense_map(run, Pictures(), config, evaluation_config(), labels, num_pictures=3, depths=poison)
+    found = dense_map(run, Pictures(), config, evaluation_config(), labels, num_pictures=3, own=poison)
     np.testing.assert_array_equal(found.cloud.points, dense.cloud.points)
-    with pytest.raises(ValueError, match="depths="):
+    with pytest.raises(ValueError, match="own="):
         dense_map(run, Pictures(), densify_config("densify.points=own"), evaluation_config())
 
 

@@ -10,13 +10,13 @@ from scipy.spatial import cKDTree
 from walks import NEVER_FOUND, Apart, config, mapped, prior_of, same_run, walk
 
 from emgs_jax.data.base import Frame
+from emgs_jax.geometry import Sim3, pose_difference
 from emgs_jax.loop_closure.relocalization import RelocalizedPose
-from emgs_jax.loop_closure.two_view_refinement import pose_difference
 from emgs_jax.report.metrics import score_back_end
 from emgs_jax.report.run_files import save_progress
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.checkpoint import CheckpointConfig, Keeper
-from emgs_jax.running.disconnected_submaps import join_factor, scale_of
+from emgs_jax.running.disconnected_submaps import join_factor
 from emgs_jax.running.record import UNJOINED, MappingRun
 from emgs_jax.running.saved_map import load_saved_map
 
@@ -50,8 +50,8 @@ def test_parts_of_other_frames_and_units_are_joined_where_they_meet_the_map():
             distance, turn = pose_difference(found, record.true_pose)
             assert distance < 0.03 and turn < 1.0, record.index
     np.testing.assert_allclose(np.exp(end.log_scales), 1 / np.array(UNITS)[PART], rtol=0.02)
-    np.testing.assert_allclose(scale_of(run.records[one].similarity), 1 / UNITS[2], rtol=0.02)
-    np.testing.assert_allclose(scale_of(run.records[other].similarity), UNITS[1], rtol=0.02)
+    np.testing.assert_allclose(Sim3.from_matrix(run.records[one].similarity).scale, 1 / UNITS[2], rtol=0.02)
+    np.testing.assert_allclose(Sim3.from_matrix(run.records[other].similarity).scale, UNITS[1], rtol=0.02)
     assert not run.inactive and set(end.submap_ids) == {0}
     anew, noise = said.index("anew"), config().graph.noise
     (chain,) = (edge for edge in end.factors if edge.a == anew and edge.a == edge.b + 1 and edge.sqrt_info[6, 6])
@@ -137,9 +137,10 @@ def test_without_a_back_end_frames_without_a_relation_are_lost_as_those_of_which
 
 def test_what_holds_two_parts_together_is_as_sure_as_the_place_was_in_its_unit_then():
     """The place was found to 1 cm in the map as it was then, whichever of the two has moved since."""
-    end, unit = BackEnd(config().graph, (300.0, 300.0, 160.0, 120.0), 0.0), 0.4
-    end.poses, end.log_scales = [np.eye(4) for _ in range(3)], [0.1, np.log(2.0), np.log(3.0)]
-    end.poses[2][:3, 3] = 1.0, 2.0, 3.0
+    poses, unit = [np.eye(4) for _ in range(3)], 0.4
+    poses[2][:3, 3] = 1.0, 2.0, 3.0
+    scales = [0.1, np.log(2.0), np.log(3.0)]
+    end = BackEnd(config().graph, (300.0, 300.0, 160.0, 120.0), 0.0, poses=poses, log_scales=scales)
     edge = join_factor(end, RelocalizedPose(np.eye(4), 0.0, 1e-4 * np.eye(7), 1), unit)
     assert (edge.a, edge.b) == (1, 2) and edge.log_ratio == pytest.approx(np.log(1.5))
     np.testing.assert_allclose(edge.Z_a_b[:3, 3], [0.5, 1.0, 1.5])

@@ -105,11 +105,11 @@ def test_at_the_priors_poses_is_all_that_the_prior_says_in_its_own_size(gathered
         assert (cloud.points[:, 0] > XS[3] + 1.5).sum() == 1
 
 
-def test_the_raw_priors_depths_are_zero_where_it_says_nothing_and_are_kept_where_they_are_of_use(gathered):
-    depths = gathered[2].depths
-    assert len(depths) == len(STATUSES) and (depths[4] > 0).sum() == 1
-    np.testing.assert_allclose(depths[1], WALL / 2.0, rtol=1e-6)
-    assert len(gather([], evaluation_config(), False).depths) == 0
+def test_the_raw_priors_points_are_zero_where_it_says_nothing_and_are_kept_where_they_are_of_use(gathered):
+    points = gathered[2].points
+    assert len(points) == len(STATUSES) and (points[4][..., 2] > 0).sum() == 1 and (points[4] != 0).any(-1).sum() == 1
+    np.testing.assert_allclose(points[1][..., 2], WALL / 2.0, rtol=1e-6)
+    assert len(gather([], evaluation_config(), False).points) == 0
 
 
 def test_the_classes_of_each_frame_are_kept_and_those_of_its_points_are_where_the_prior_puts_them(gathered):

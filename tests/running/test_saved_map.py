@@ -1,6 +1,7 @@
 """places.npz and the folders that hold it: what comes back is what was there, and what cannot be used is refused."""
 
 import json
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +12,8 @@ from test_back_end import loop, ring, walked
 
 from emgs_jax import load_config, save_map
 from emgs_jax.gaussian_map import new_map
-from emgs_jax.loop_closure.place_recognition import add_keyframe
-from emgs_jax.running.back_end import BackEnd
+from emgs_jax.loop_closure.place_recognition import Database, add_keyframe
+from emgs_jax.running.back_end import BackEnd, nodes_of
 from emgs_jax.running.saved_map import load_places, load_saved_map, save_places
 
 CAMERA = (300.0, 300.0, 160.0, 120.0)
@@ -29,13 +30,18 @@ def graph():
 def end(graph) -> BackEnd:
     """A walk with keyframes of every tenth node and loops of each kind."""
     poses = ring()
-    found = walked(graph, poses)
+    database = Database()
     for frame in range(0, len(poses), 10):
         one = keyframe(room(), matrix((0, frame / 10, 0)), frame)
-        found.database = add_keyframe(found.database, one, graph.place_recognition)
-    found.is_placed[7] = False
-    found.verified, found.violating, found.accepted = [loop(poses), loop(poses, 2)], [loop(poses, 3)], [loop(poses)]
-    return found
+        database = add_keyframe(database, one, graph.place_recognition)
+    return replace(
+        walked(graph, poses),
+        database=database,
+        is_placed=[row != 7 for row in range(len(poses))],
+        verified=[loop(poses), loop(poses, 2)],
+        violating=[loop(poses, 3)],
+        accepted=[loop(poses)],
+    )
 
 
 @pytest.fixture
@@ -65,8 +71,8 @@ def rewritten(folder, **changes):
 
 
 def test_what_is_read_is_what_was_written(end, graph, folder):
-    read = BackEnd(graph, CAMERA, 0.01)
-    assert load_places(folder / "places.npz", read) == 0.01
+    read, depth_noise = load_places(folder / "places.npz", BackEnd(graph, CAMERA, 0.01))
+    assert depth_noise == 0.01
     for name in ("poses", "log_scales", "frames", "is_placed"):
         np.testing.assert_array_equal(getattr(read, name), getattr(end, name))
     for name in ("factors", "verified", "violating", "accepted"):
@@ -89,12 +95,10 @@ def _same(records, others) -> None:
 
 
 def test_a_run_without_loops_and_of_several_units_comes_back_too(graph, end, tmp_path):
-    plain = walked(graph, ring())
-    plain.has_one_unit = False
-    plain.database = add_keyframe(plain.database, end.database.keyframes[0], graph.place_recognition)
+    database = add_keyframe(Database(), end.database.keyframes[0], graph.place_recognition)
+    plain = replace(walked(graph, ring()), has_one_unit=False, database=database)
     save_places(tmp_path / "places.npz", plain, 0.0)
-    read = BackEnd(graph, CAMERA, 0.01)
-    load_places(tmp_path / "places.npz", read)
+    read, _ = load_places(tmp_path / "places.npz", BackEnd(graph, CAMERA, 0.01))
     assert read.accepted == [] and len(read.factors) == len(plain.factors) and not read.has_one_unit
 
 
@@ -102,17 +106,15 @@ def test_what_was_left_out_of_the_map_is_no_part_of_it_when_it_is_loaded_either(
     """Symptom: the kept part was not the first, all its measurements were held by a node that nothing joined with it,
     and no loop ever moved anything again."""
     parted = walked(graph, ring())
-    parted.submap_ids, parted.submap_id = [0] * 3 + [4] * (len(parted.poses) - 3), 4
-    parted.database = add_keyframe(parted.database, end.database.keyframes[1], graph.place_recognition)
+    database = add_keyframe(Database(), end.database.keyframes[1], graph.place_recognition)
+    parted = replace(parted, submap_ids=[0] * 3 + [4] * (len(parted.poses) - 3), submap_id=4, database=database)
     save_places(tmp_path / "places.npz", parted, 0.0)
-    read = BackEnd(graph, CAMERA, 0.01)
-    load_places(tmp_path / "places.npz", read)
-    np.testing.assert_array_equal(read.nodes(read.submap_id).valid, parted.nodes(parted.submap_id).valid)
+    read, _ = load_places(tmp_path / "places.npz", BackEnd(graph, CAMERA, 0.01))
+    np.testing.assert_array_equal(nodes_of(read, read.submap_id).valid, nodes_of(parted, parted.submap_id).valid)
     with np.load(tmp_path / "places.npz") as file:
         arrays = {name: array for name, array in file.items() if name != "is_kept"}  # as of a version before
     np.savez(tmp_path / "places.npz", **arrays)
-    before = BackEnd(graph, CAMERA, 0.01)
-    load_places(tmp_path / "places.npz", before)
+    before, _ = load_places(tmp_path / "places.npz", BackEnd(graph, CAMERA, 0.01))
     assert before.submap_ids == [0] * len(before.poses)
 
 

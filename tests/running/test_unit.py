@@ -21,7 +21,7 @@ def a_run(log_scale: float) -> MappingRun:
     poses = [
         np.asarray(pose((0.1 * i, 0.2, -0.1 * i), (1.0 + 0.3 * i, -2.0, 0.5)).as_matrix(), float) for i in range(3)
     ]
-    records = [FrameRecord(0, None, None, "initialization", pose=poses[0])]
+    records = [FrameRecord(0, None, None, "initialization", pose=poses[0], scale=1.0)]
     known = {"scale": 0.9, "covariance": np.eye(6)}
     records += [FrameRecord(i, None, None, "tracked", pose=poses[i], newest_pose=poses[i], **known) for i in (1, 2)]
     known = (
@@ -53,7 +53,7 @@ def test_all_lengths_grow_about_the_first_camera_and_directions_stay():
     for old, new in zip(records, run.records, strict=True):
         np.testing.assert_allclose(new.pose[:3, 3], origin + factor * (old.pose[:3, 3] - origin), atol=1e-12)
         np.testing.assert_array_equal(new.pose[:3, :3], old.pose[:3, :3])
-    assert run.records[1].scale == pytest.approx(0.9 * factor) and run.records[0].scale is None
+    assert run.records[1].scale == pytest.approx(0.9 * factor) and run.records[0].scale == pytest.approx(factor)
     np.testing.assert_allclose(run.records[2].newest_pose, run.records[2].pose)
     np.testing.assert_allclose(after.T_world_previous.as_matrix(), run.records[2].pose, atol=1e-5)
     for covariance in (after.estimate.covariance, after.estimate.world_covariance):

@@ -8,14 +8,14 @@ from scipy.spatial.transform import Rotation
 from tiny_run import NUM_FRAMES, compose, dataset
 
 from emgs_jax.evaluation.reconstruction import ground_truth_cloud
-from emgs_jax.evaluation.trajectory import Alignment
+from emgs_jax.geometry import Sim3
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.report.results import read_estimates
 from emgs_jax.report.tables import average, full_table
 from experiments.score import coverage, score
 
-SIMILARITY = Alignment(0.4, Rotation.from_rotvec([0.3, -1.2, 0.5]).as_matrix(), np.array([3.0, -1.0, 7.0]))
+SIMILARITY = Sim3(0.4, Rotation.from_rotvec([0.3, -1.2, 0.5]).as_matrix(), np.array([3.0, -1.0, 7.0]))
 
 
 @pytest.fixture(scope="module")

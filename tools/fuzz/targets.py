@@ -5,6 +5,7 @@ import json
 import struct
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -53,7 +54,7 @@ from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.simulated.prior import Simulated
 from emgs_jax.report.page import write_report
 from emgs_jax.report.recorded_run import read_run
-from emgs_jax.running.back_end import BackEnd
+from emgs_jax.running.back_end import BackEnd, add_node
 from emgs_jax.running.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from emgs_jax.running.configure import compose, keys_of
 from emgs_jax.running.factors import FrameData
@@ -338,17 +339,17 @@ def write_places(folder: Path) -> None:
     end, rng = BackEnd(load_config("graph=default").graph, (50.0, 50.0, 31.5, 23.5), 0.01), np.random.default_rng(0)
     image, mask = np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), bool)
     for frame in range(3):
-        end.add_node(FrameData(frame, image, np.zeros((48, 64, 3)), mask, {}), np.eye(4), 1.0, None)
+        end = add_node(end, FrameData(frame, image, np.zeros((48, 64, 3)), mask, {}), np.eye(4), 1.0, None)
         pixels, descriptors = rng.uniform(0, 40, (9, 2)), rng.integers(0, 99, (9, 128))
         shown = np.float32(pixels), np.uint8(descriptors), np.full((9, 3), np.nan, np.float32)
         one = Keyframe(frame, *shown, end.intrinsics, (64, 48), np.zeros((6, 8), np.float16))
-        end.database = add_keyframe(end.database, one, end.config.place_recognition)
+        end = replace(end, database=add_keyframe(end.database, one, end.config.place_recognition))
     save_places(folder / "places.npz", end, 0.01)
 
 
 def read_places(folder: Path) -> None:
     end = BackEnd(load_config("graph=default").graph, (50.0, 50.0, 31.5, 23.5), 0.01)
-    load_places(folder / "places.npz", end)
+    end, _ = load_places(folder / "places.npz", end)
     assert np.isfinite(end.poses).all() and len(end.poses) == len(end.is_placed) == end.first_node
     assert all(0 <= one.frame < len(end.poses) for one in end.database.keyframes)
 

@@ -62,14 +62,14 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
     ),
     (
         "running/disconnected_submaps",
-        "np.array([unit] * 3 + [1.0] * 4)",
-        "np.array([scale] * 3 + [1.0] * 4)",
+        "scale_covariance(place.covariance, 1.0 / unit)",
+        "scale_covariance(place.covariance, 1.0 / scale)",
         "the unit of a place is that of the map after it has moved",
     ),
     (
         "loop_closure/two_view_alignment",
-        "rescaled(np.linalg.inv(T_b_a), np.exp(log_ratio))",
-        "rescaled(np.linalg.inv(T_b_a), np.exp(-log_ratio))",
+        "scale_pose(np.linalg.inv(T_b_a), np.exp(log_ratio))",
+        "scale_pose(np.linalg.inv(T_b_a), np.exp(-log_ratio))",
         "the reverse pose is brought into the wrong unit",
     ),
     (

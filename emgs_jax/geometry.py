@@ -1,0 +1,83 @@
+"""Similarities and rigid poses on the host: float64 matrices, poses are (..., 4, 4) from the camera to the world."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+
+@dataclass(frozen=True)
+class Sim3:
+    """Similarity that maps one world to another: y = scale · rotation @ x + translation."""
+
+    scale: float
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+
+    @classmethod
+    def about(cls, center: Float[np.ndarray, "3"], scale: float) -> "Sim3":
+        """Scale all lengths about a point, which stays."""
+        return cls(scale, np.eye(3), center - scale * center)
+
+    @classmethod
+    def from_matrix(cls, matrix: Float[np.ndarray, "4 4"]) -> "Sim3":
+        """Read a matrix with scale · rotation in the place of a rotation."""
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        return cls(scale, matrix[:3, :3] / scale, matrix[:3, 3])
+
+    def as_matrix(self) -> Float[np.ndarray, "4 4"]:
+        """Return the matrix that `from_matrix` reads."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
+        return matrix
+
+    def apply(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Map points."""
+        return rotated(self.scale * points, self.rotation) + self.translation
+
+    def apply_to_poses(self, poses: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
+        """Map camera poses; the result stays rigid, the scale acts on the positions only."""
+        moved = np.array(poses, np.float64)
+        moved[..., :3, :3] = self.rotation @ moved[..., :3, :3]
+        moved[..., :3, 3] = self.apply(moved[..., :3, 3])
+        return moved
+
+    def __matmul__(self, other: "Sim3") -> "Sim3":
+        """Compose: `other` first."""
+        return Sim3(self.scale * other.scale, self.rotation @ other.rotation, self.apply(other.translation))
+
+    def inverse(self) -> "Sim3":
+        """Map back."""
+        rotation = self.rotation.T
+        return Sim3(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+
+def rotated(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """R v of each vector (..., 3). Not by BLAS: its threads wait for each other longer than so thin a product takes."""
+    return np.einsum("ij,...j->...i", rotation, vectors)
+
+
+def scale_covariance(covariance: np.ndarray, scale: float) -> np.ndarray:
+    """Covariance of (translation, rotation, ...), (d, d), after lengths are multiplied by `scale`."""
+    units = np.ones(len(covariance))
+    units[:3] = scale
+    return units[:, None] * covariance * units
+
+
+def scale_pose(T: Float[np.ndarray, "4 4"], scale: float) -> Float[np.ndarray, "4 4"]:
+    """Return a pose with its translation in other units."""
+    return np.block([[T[:3, :3], scale * T[:3, 3:]], [T[3:]]])
+
+
+def transform_points(T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Map points by a pose."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def pose_difference(
+    T: Float[np.ndarray, "*n 4 4"], other: Float[np.ndarray, "*n 4 4"]
+) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+    """Distance of two camera centres, and the angle between the cameras in degrees; of one pair or of n."""
+    angle = Rotation.from_matrix(T[..., :3, :3].mT @ other[..., :3, :3]).magnitude()
+    return np.linalg.norm(T[..., :3, 3] - other[..., :3, 3], axis=-1), np.degrees(angle)
