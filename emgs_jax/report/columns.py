@@ -70,9 +70,8 @@ class Line(NamedTuple):
     rivals: Hashable = ()
 
 
-def known(columns: Iterable[Column], lines: Iterable[Line]) -> list[Column]:
+def known(columns: Iterable[Column], lines: Sequence[Line]) -> list[Column]:
     """Keep the columns in which some line has a value."""
-    lines = list(lines)
     return [column for column in columns if any(line.values.get(column.key) is not None for line in lines)]
 
 
