@@ -51,9 +51,6 @@ def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: Readab
     """Write a run into `folder`, which is there, in the run's unit; returns what was written.
 
     Args:
-        run: whose poses and points are written.
-        folder: to write into.
-        config: what to write.
         dataset: the images of the run; None where they are gone.
 
     Raises:
@@ -143,7 +140,6 @@ def factor_of(run: RecordedRun, length: Sequence[float]) -> float:
     """Find the factor that makes the distance between two cameras as long as it is known to be.
 
     Args:
-        run: whose poses.
         length: two frames, as `index` of frames.jsonl numbers them, and metres between their camera centres.
 
     Raises:

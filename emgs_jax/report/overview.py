@@ -30,7 +30,6 @@ class Paths:
         truth: aligned with the estimate; NaN where unknown.
         online: as first estimated, before the back end moved poses.
         loops: rows of the frames that loop closures join.
-        unit: of all lengths.
     """
 
     estimate: np.ndarray
@@ -58,8 +57,6 @@ def draw_overview(
         frames: about four, each with `image` uint8 (h, w, 3), `rendered_color` float (h, w, 3), `rendered_depth`
             float (h, w) in metres, `valid` bool (h, w), where it is known, `title`, and with classes `labels`,
             int (h, w), -1 = none.
-        title: of the whole picture.
-        classes: names of the labels.
         features: points in the colours of their features, drawn from above below the map; None without features.
     """
     figure = Figure(figsize=(16, max(6.0, 0.8 + 2.05 * len(frames))), facecolor="white", layout="constrained")

@@ -32,7 +32,6 @@ def write_report(run: RecordedRun, dataset: Dataset | None, note: str = "") -> P
     """Write report.html into the folder of a run; the same run gives the same bytes.
 
     Args:
-        run: as its folder tells it.
         dataset: in use, for the images; None: the page has none.
         note: what could not be shown, and why.
 
