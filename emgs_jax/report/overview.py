@@ -30,7 +30,6 @@ class Paths:
         truth: aligned with the estimate; NaN where unknown.
         online: as first estimated, before the back end moved poses.
         loops: rows of the frames that loop closures join.
-        unit: of all lengths.
     """
 
     estimate: np.ndarray
@@ -58,8 +57,6 @@ def draw_overview(
         frames: about four, each with `image` uint8 (h, w, 3), `rendered_color` float (h, w, 3), `rendered_depth`
             float (h, w) in metres, `valid` bool (h, w), where it is known, `title`, and with classes `labels`,
             int (h, w), -1 = none.
-        title: of the whole picture.
-        classes: names of the labels.
         features: points in the colours of their features, drawn from above below the map; None without features.
     """
     figure = Figure(figsize=(16, max(6.0, 0.8 + 2.05 * len(frames))), facecolor="white", layout="constrained")
@@ -246,15 +243,16 @@ def _draw_scale_bar(axes: Axes, unit: str) -> None:
 
 
 def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]]) -> None:
-    depths = [np.asarray(frame["rendered_depth"])[np.asarray(frame["valid"])] for frame in frames]
-    depths = np.concatenate([depth[np.isfinite(depth) & (depth > 0)].ravel() for depth in depths])
-    near, far = np.percentile(depths, [1, 99]) if len(depths) else (0.0, 1.0)
+    depths = []
+    for frame in frames:
+        depth = np.asarray(frame["rendered_depth"], np.float64)
+        depths.append(np.ma.masked_where(~(np.asarray(frame["valid"]) & np.isfinite(depth)), depth))
+    seen = np.concatenate([depth.compressed() for depth in depths])
+    near, far = np.percentile(seen[seen > 0], [1, 99]) if (seen > 0).any() else (0.0, 1.0)
     mappable = None
-    for row, frame in zip(grid, frames, strict=True):
-        covered = np.asarray(frame["valid"]) & np.isfinite(frame["rendered_depth"])
+    for row, frame, depth in zip(grid, frames, depths, strict=True):
         row[0].imshow(np.asarray(frame["image"]))
         row[1].imshow(np.nan_to_num(np.asarray(frame["rendered_color"], np.float64)).clip(0.0, 1.0))
-        depth = np.ma.masked_where(~covered, np.asarray(frame["rendered_depth"], np.float64))
         mappable = row[2].imshow(depth, cmap="turbo", vmin=near, vmax=far)
         row[2].set_facecolor("#dddddd")
         row[0].set_ylabel(str(frame["title"]), fontsize=10, color=_INK)

@@ -14,7 +14,7 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.io.files import jsonable
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report import page_words
-from emgs_jax.report.colors import PATHS, class_colors, to_bytes
+from emgs_jax.report.colors import NO_CLASS, PATHS, class_colors, rgb, to_bytes
 from emgs_jax.report.html import MAX_BYTES, POLICY, jpeg, page, picture, source, write_page
 from emgs_jax.report.layers import COV_UNIT, feature_layer, fitted, layers_of, map_layers
 from emgs_jax.report.overview import view_from_above
@@ -32,7 +32,6 @@ def write_report(run: RecordedRun, dataset: Dataset | None, note: str = "") -> P
     """Write report.html into the folder of a run; the same run gives the same bytes.
 
     Args:
-        run: as its folder tells it.
         dataset: in use, for the images; None: the page has none.
         note: what could not be shown, and why.
 
@@ -84,6 +83,7 @@ def _about(run: RecordedRun, layers: dict[str, np.ndarray]) -> dict[str, Any]:
         "paths": {name: look.dark for name, look in PATHS.items()},
         "classes": list(names),
         "classColors": to_bytes(class_colors(len(names))).tolist(),
+        "noClass": to_bytes(rgb(NO_CLASS)).tolist(),
         "classesSeen": sorted({int(label) for label in layers.get("label", ())} - {-1}),
         "frames": {
             "title": [f"frame {line['index']}" for line in run.frames],

@@ -9,7 +9,7 @@ from emgs_jax.report import columns, provenance
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Line, Table
 from emgs_jax.report.html import Head, commit_words
 from emgs_jax.report.provenance import RAW_PRIOR
-from emgs_jax.report.recorded_run import POLISH, RecordedRun
+from emgs_jax.report.recorded_run import POLISH, RecordedRun, sound
 from emgs_jax.report.repeat import Repeated
 
 MANY_LOST = 0.1  # share of the frames
@@ -182,7 +182,7 @@ def polished(run: RecordedRun) -> tuple[Table, str] | None:
     path = run.folder / POLISH[1]
     if not path.is_file():
         return None
-    try:
+    with sound(f"{path} is not what emgs polish writes", "polish again"):
         found = json.loads(path.read_text(encoding="utf-8"))
         count, held = (int(found[f"polish/{name}"]) for name in ("num_splats", "num_held_out"))
         rows = [
@@ -190,8 +190,6 @@ def polished(run: RecordedRun) -> tuple[Table, str] | None:
             for name, words, digits in POLISHED
             if found.get(f"polish/before_{name}") is not None
         ]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path} is not what emgs polish writes ({error!r}): polish again") from error
     words = f"{count:,} splats; the {held} frames that are compared were not fitted."
     return Table(("held-out frames", "map", "splats"), rows), words
 
