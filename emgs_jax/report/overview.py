@@ -55,7 +55,7 @@ def draw_overview(
         cloud: in the frame of the paths.
         paths: estimated, true, before poses moved, and loops.
         frames: about four, each with `image` uint8 (h, w, 3), `rendered_color` float (h, w, 3), `rendered_depth`
-            float (h, w) in metres, `valid` bool (h, w), where it is known, `title`, and with classes `labels`,
+            float (h, w) in the unit of the paths, `valid` bool (h, w), where it is known, `title`, and with classes `labels`,
             int (h, w), -1 = none.
         features: points in the colours of their features, drawn from above below the map; None without features.
     """
@@ -68,7 +68,7 @@ def draw_overview(
         _draw_features(axes[1], features, paths)
     if right is not None:
         grid = right.subplots(len(frames), 4 if classes else 3, squeeze=False)
-        _draw_frames(grid[:, [0, 1, -1]], frames)
+        _draw_frames(grid[:, [0, 1, -1]], frames, paths.unit)
         if classes:
             _draw_labels(grid[:, 2], frames, classes)
     with atomic_write(path) as handle:
@@ -242,7 +242,7 @@ def _draw_scale_bar(axes: Axes, unit: str) -> None:
     text.set_path_effects([withStroke(linewidth=3, foreground="white")])
 
 
-def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]]) -> None:
+def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]], unit: str) -> None:
     depths = []
     for frame in frames:
         depth = np.asarray(frame["rendered_depth"], np.float64)
@@ -260,7 +260,7 @@ def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]]) -> None:
             _bare(axes)
     for axes, title in zip(grid[0], ("input", "rendered colour", "rendered depth"), strict=True):
         axes.set_title(title, fontsize=11, color=_INK)
-    bar = grid[0, 0].figure.colorbar(mappable, ax=grid[:, 2].tolist(), shrink=0.6, aspect=30, label="depth [m]")
+    bar = grid[0, 0].figure.colorbar(mappable, ax=grid[:, 2].tolist(), shrink=0.6, aspect=30, label=f"depth [{unit}]")
     bar.outline.set_visible(False)
 
 
