@@ -55,8 +55,8 @@ def draw_overview(
         cloud: in the frame of the paths.
         paths: estimated, true, before poses moved, and loops.
         frames: about four, each with `image` uint8 (h, w, 3), `rendered_color` float (h, w, 3), `rendered_depth`
-            float (h, w) in the unit of the paths, `valid` bool (h, w), where it is known, `title`, and with classes `labels`,
-            int (h, w), -1 = none.
+            float (h, w) in the unit of the paths, `valid` bool (h, w), where it is known, `title`, and with classes
+            `labels`, int (h, w), -1 = none.
         features: points in the colours of their features, drawn from above below the map; None without features.
     """
     figure = Figure(figsize=(16, max(6.0, 0.8 + 2.05 * len(frames))), facecolor="white", layout="constrained")
