@@ -61,9 +61,7 @@ def test_keys_that_are_given_win(video):
     found = with_source([*given, str(video)])
     assert sorted(word for word in found if word in given) == sorted(given) and len(keys_of(found)) == len(found) == 7
     # Another prior may have a unit, another data set its own calibration, and a baseline does without a back end.
-    assert not {"prior", "graph"} & {
-        word.partition("=")[0] for word in with_source([str(video), "prior=files"])[:-1]
-    }
+    assert not {"prior", "graph"} & {word.partition("=")[0] for word in with_source([str(video), "prior=files"])[:-1]}
     assert with_source([str(video), "dataset=tum"])[1:] == ["dataset=tum"]
     assert "graph" not in keys_of(with_source([str(video), "baseline=voxel"]))
 
