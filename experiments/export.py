@@ -1,12 +1,16 @@
 """A finished run for other programs: `python -m experiments.export FOLDER formats=[colmap,nerfstudio,frustums]`."""
 
+from dataclasses import replace
 from pathlib import Path
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
+from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.io.files import new_folder
+from emgs_jax.ops.camera import Camera
 from emgs_jax.report.export import IMAGE_FORMATS, ExportConfig, export, find_factor, write_scaled
-from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.recorded_run import RecordedRun, read_run
+from emgs_jax.running.configure import build_dataset
 from emgs_jax.running.values import check_value, declared
 
 from .command import command
@@ -18,7 +22,7 @@ def export_run(config: DictConfig) -> list[Path]:
     for key, field in declared(ExportConfig).items():
         check_value(key, config[key], field)
     formats, length = [str(name) for name in config.formats], config.length and [float(n) for n in config.length]
-    wanted = ExportConfig(formats, config.max_points, config.scale, length)
+    wanted = ExportConfig(formats, config.max_points, config.scale, length, str(config.images))
     run = read_run(Path(str(config.folder)))
     factor = find_factor(run, wanted)
     dataset = None
@@ -26,6 +30,8 @@ def export_run(config: DictConfig) -> list[Path]:
         dataset, note = images_of(run)
         if dataset is None:
             raise ValueError(f"{note} formats=[frustums] needs no images")
+        if wanted.images == "original":
+            run, dataset = at_original_size(run)
     if factor is None:
         folder = run.folder if config.out is None else Path(str(config.out))
         folder.mkdir(parents=True, exist_ok=True)
@@ -35,6 +41,18 @@ def export_run(config: DictConfig) -> list[Path]:
         export(write_scaled(run, folder, factor), folder, wanted, dataset)
     print(f"all lengths times {factor:.6g}")
     return sorted(target.iterdir())
+
+
+def at_original_size(run: RecordedRun) -> tuple[RecordedRun, ReadableFrames]:
+    """A run with its images in the size on disk, straightened, and their camera; ValueError where it names no size."""
+    size = run.provenance["data"].get("camera", {}).get("size")
+    settings = OmegaConf.create(dict(run.provenance["config"]))
+    if size is None or "size" not in settings.dataset:
+        raise ValueError(f"{run.folder} does not say how large its images on disk are: give images=used")
+    settings.dataset.size = [int(side) for side in size]
+    dataset = build_dataset(settings)
+    fx, fy, cx, cy = dataset.intrinsics
+    return replace(run, camera=Camera((fx, fy), (cx, cy), *dataset.size)), dataset
 
 
 @command("export", positional)

@@ -30,7 +30,7 @@ def polish_run(config: DictConfig) -> dict[str, Any]:
 def main(config: DictConfig) -> None:
     """Polish, and say what it has changed on the frames that were held out."""
     found = polish_run(config)
-    for name in ("psnr_db", "ssim", "depth_within_5_percent", "depth_l1_m"):
+    for name in ("psnr_db", "ssim", "depth_within_5_percent", "depth_l1_m", "ate_m"):
         before, after = (found.get(f"polish/{when}_{name}") for when in ("before", "after"))
         if before is not None and after is not None:
             print(f"{name:24} {before:8.4g} → {after:.4g}")

@@ -44,7 +44,6 @@ def implied(path: Path, given: dict[str, str]) -> list[str]:
         found |= {"dataset.size": f"[{size[0]},{size[1]}]", "dataset.intrinsics": intrinsics}
     if given.get("prior", "multiview_stereo") == "multiview_stereo":
         found["prior"] = "multiview_stereo"
-        found["densify.points"] = "own"  # the depths of neighbouring frames err alike
         if "baseline" not in given:  # it fuses frames where they were placed, the back end moves them afterwards
             found["graph"] = "up_to_scale"
     return [f"{key}={value}" for key, value in found.items() if key not in given]

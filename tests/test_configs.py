@@ -18,7 +18,7 @@ from emgs_jax.slam import SlamConfig
 
 ROOT = CONF.parent
 # Studies and suites hold no class; tests/scripts composes them.
-UNTYPED = {CONF, CONF / "experiment", CONF / "experiment_on", CONF / "suite", CONF / "sweep", CONF / "tune"}
+UNTYPED = {CONF} | {CONF / name for name in ("densify_on", "experiment", "experiment_on", "suite", "sweep", "tune")}
 GATE = CONF / "baseline" / "smoke.yaml"  # results to compare with, no option
 OF_COMMANDS = {"protocol": "segment"}  # groups of another command than a run
 GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent not in UNTYPED and path != GATE)
@@ -80,6 +80,17 @@ def test_every_option_of_slam_instantiates(number):
     assert chosen and max(map(len, chosen.values())) == 2
     config = slam_config(*(f"{group}={options[number % len(options)]}" for group, options in chosen.items()))
     assert isinstance(config, SlamConfig)
+
+
+def test_points_are_the_frames_own_where_these_err_alike_unless_a_key_or_the_paper_says_otherwise():
+    stereo = "prior=multiview_stereo"
+    for words, points in (
+        (["prior=simulated"], "map"),
+        ([stereo], "own"),
+        ([stereo, "experiment=paper"], "map"),
+        ([stereo, "densify.points=map"], "map"),
+    ):
+        assert compose(*words).densify.points == points
 
 
 def test_an_unknown_key_is_refused():

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -41,25 +42,29 @@ class Dataset(Protocol):
 
     With ground truth also `pose(i)`, which reads no image, so that the whole trajectory is checked before the first
     frame: T_world_camera, float64 (4, 4), or None where there is no truth for this frame. It may raise BadFrameError.
+    A subclass has no ground truth and no files unless it says so.
     """
 
     name: str  # e.g. "seven_scenes"
     sequence: str  # e.g. "redkitchen/seq-01"
     size: tuple[int, int]  # (width, height) of every frame
     intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels at `size`, pixel centres at integers
-    calibration: Mapping[str, Any]  # where `intrinsics` are from, plain values for metrics.json; `note` if worth a line
-    classes: tuple[str, ...]  # names of the labels; empty without semantics
-    has_ground_truth: bool  # depth and poses are there
+    calibration: Mapping[str, Any] = MappingProxyType(
+        {}
+    )  # where `intrinsics` are from, plain values for metrics.json; `note` if worth a line
+    classes: tuple[str, ...] = ()  # names of the labels; empty without semantics
+    has_ground_truth: bool = False  # depth and poses are there
 
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> Frame: ...
 
-    def pose(self, index: int) -> np.ndarray | None: ...
+    def pose(self, index: int) -> np.ndarray | None:
+        return None
 
     def files(self, index: int) -> Sequence[Path]:
         """Return the files of frame `index`: its image first, then lists and poses; empty where frames are made."""
-        ...
+        return ()
 
     def fingerprint(self) -> str:
         """Hex digest over what defines the frames (files' names and contents, options), for provenance."""

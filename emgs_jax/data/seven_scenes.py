@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32
+from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
 from emgs_jax.data.backprojection import backproject
-from emgs_jax.data.base import Frame
+from emgs_jax.data.base import BadFrameError, Frame
 from emgs_jax.data.intrinsics import Given, find_lens, pictures_of
 from emgs_jax.data.reading import Intrinsics, Number, Size
 
@@ -42,6 +43,7 @@ class SevenScenes:
         intrinsics: of the 640x480 colour images, as `Images` takes them; None = 525 when registered, else 585.
         depth_scale: raw units per metre.
         register_depth: warp depth into the colour camera and give its pose; else depth and pose are the depth camera's.
+        poses: file with the true poses, in place of the release's, see `read_poses`.
     """
 
     name = "seven_scenes"
@@ -59,6 +61,7 @@ class SevenScenes:
         intrinsics: Given | None = None,
         depth_scale: Number = 1000.0,
         register_depth: bool = True,
+        poses: str | None = None,
     ) -> None:
         self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
         images = find_images(self._folder)
@@ -76,6 +79,8 @@ class SevenScenes:
                 "dataset.intrinsics with distortion is the colour camera's, but with dataset.register_depth=false the "
                 "depth is another camera's, which it does not straighten: set dataset.register_depth=true"
             )
+        self._poses_file = None if poses is None else Path(poses).expanduser()
+        self._poses = None if self._poses_file is None else read_poses(self._poses_file, self._folder.name)
         self.calibration = self._lens.about
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, RAW_SIZE, self.size)
 
@@ -94,6 +99,9 @@ class SevenScenes:
         return Frame(index, frame_number(path), str(path), image, depth, self.pose(index))
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
+        if self._poses is not None:
+            T_world_color = self._poses.get(frame_number(self._images[index]))
+            return T_world_color if self._register or T_world_color is None else T_world_color @ T_COLOR_DEPTH
         path = sibling(self._images[index], "pose.txt")
         T_world_depth = reading.as_pose(reading.read_text(path), path) if path.exists() else None
         is_moved = self._register and T_world_depth is not None
@@ -111,7 +119,48 @@ class SevenScenes:
             "depth_scale": self._depth_scale,
             "register_depth": self._register,
         }
-        return reading.fingerprint(self._folder, reading.all_files(self), options)
+        files = [*reading.all_files(self), *filter(None, [self._poses_file])]
+        return reading.fingerprint(self._folder, files, options)
+
+
+def read_poses(path: Path, sequence: str) -> dict[float, Float[np.ndarray, "4 4"]]:
+    """T_world_camera of the colour camera by frame number, from a list of pseudo ground truth.
+
+    The release's poses are KinectFusion's, whose depth camera is not calibrated: in redkitchen they turn 8 % more, and
+    move 5 % less, than the colour images say, so no reconstruction from these can have the shape of the true one. Poses
+    from structure from motion are published for all scenes (Brachmann, Humenberger, Rother and Sattler, "On the limits
+    of pseudo ground truth in visual camera re-localisation", ICCV 2021), in lines "seq-XX/frame-000000.color.png qw qx
+    qy qz tx ty tz focal", world -> colour camera; # begins a comment.
+
+    Args:
+        path: the list.
+        sequence: seq-XX; lines of other sequences are left out.
+
+    Raises:
+        BadFrameError: a line is none.
+        ValueError: no line is of the sequence.
+    """
+    found = {}
+    for row, line in enumerate(reading.read_text(path).splitlines(), start=1):
+        name, *numbers = line.split() or ["#"]
+        if name.startswith("#") or name.split("/")[-2:-1] != [sequence]:
+            continue
+        try:
+            w, x, y, z, *translation = (float(number) for number in numbers[:7])
+            if not np.isfinite([w, x, y, z, *translation]).all():  # the camera was lost there
+                continue
+            T_camera_world = np.eye(4)
+            T_camera_world[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+            T_camera_world[:3, 3] = translation
+        except ValueError as error:
+            form = "seq-XX/frame-000000.color.png qw qx qy qz tx ty tz focal"
+            raise BadFrameError(f"{path} line {row} is no pose of the form {form}: {reading.REMEDY}") from error
+        T_world_camera = np.linalg.inv(T_camera_world)
+        reading.check_position(T_world_camera[:3, 3], path)
+        found[frame_number(Path(name))] = T_world_camera
+    if not found:
+        raise ValueError(f"{path} has no line of {sequence}: give the list of its scene")
+    return found
 
 
 def find_images(folder: Path) -> list[Path]:

@@ -15,7 +15,14 @@ _SH_C0 = 0.28209479177387814  # constant of the zeroth spherical harmonic, as 3D
 
 
 def save_gaussians_ply(
-    path: str | os.PathLike, means: Any, covs: Any, colors: Any, opacity: Any, normals: Any = None
+    path: str | os.PathLike,
+    means: Any,
+    covs: Any,
+    colors: Any,
+    opacity: Any,
+    normals: Any = None,
+    labels: Any = None,
+    classes: Sequence[str] = (),
 ) -> int:
     """Write Gaussians as 3D Gaussian splatting viewers read them; returns how many, rows that are not finite left out.
 
@@ -25,6 +32,8 @@ def save_gaussians_ply(
         colors: (n, 3), RGB in [0, 1]; written as the zeroth spherical harmonic.
         opacity: a number or (n,), in (0, 1); written as its logit.
         normals: (n, 3) or None for zeros.
+        labels: (n,) or None for no property `label`; as of `save_points_ply`.
+        classes: their names.
     """
     means, covs, colors = (np.asarray(value, np.float64) for value in (means, covs, colors))
     normals = np.zeros_like(means) if normals is None else np.asarray(normals, np.float64)
@@ -38,7 +47,10 @@ def save_gaussians_ply(
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), "opacity"]
     names += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     rows = np.concatenate([flat[keep], scales, quaternions], 1).astype(np.float32)
-    write_ply(path, structured(rows, names))
+    vertices = structured(rows, names)
+    if labels is not None:
+        vertices = _with_labels(vertices, np.asarray(labels)[keep])
+    write_ply(path, vertices, comments=_class_lines(classes))
     return len(rows)
 
 
@@ -53,11 +65,17 @@ def save_points_ply(
     keep = np.isfinite(rows).all(1)
     vertices = with_colors(structured(rows[keep], ["x", "y", "z", "nx", "ny", "nz"]), np.asarray(colors)[keep])
     if labels is not None:
-        numbers = np.asarray(labels)[keep].astype("i4")
-        vertices = recfunctions.append_fields(vertices, "label", numbers, usemask=False)
-    names = [f"label {number} {name}".encode("ascii", "replace").decode() for number, name in enumerate(classes)]
-    write_ply(path, vertices, comments=names)
+        vertices = _with_labels(vertices, np.asarray(labels)[keep])
+    write_ply(path, vertices, comments=_class_lines(classes))
     return int(keep.sum())
+
+
+def _with_labels(vertices: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    return recfunctions.append_fields(vertices, "label", labels.astype("i4"), usemask=False)
+
+
+def _class_lines(classes: Sequence[str]) -> list[str]:
+    return [f"label {number} {name}".encode("ascii", "replace").decode() for number, name in enumerate(classes)]
 
 
 def write_ply(

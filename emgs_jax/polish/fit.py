@@ -1,11 +1,14 @@
-"""Initial splats, and their fit to the frames: Adam, one frame a step, in an order that the seed says."""
+"""The fit of splats, and of poses, to the frames: Adam, one frame a step, in an order that the seed says."""
 
 import hashlib
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -19,19 +22,20 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
 from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, initial, loss
 
-SAME_SURFACE = 0.05  # of the depth; a splat so near the map's surface stands for it
-STEEPEST = 0.3  # cosine; surfaces seen at a more grazing angle begin with splats that are no longer than at it
+POSE_RATE = 0.3  # Adam's for frames that are placed on finished splats, in standard deviations
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rate of each part of `Appearance`."""
+    """Adam's learning rate of each part of `Appearance`, and of the poses in standard deviations of each."""
 
     colors: float = number(low=0, high=10)
     logit: float = number(low=0, high=10)
     log_std: float = number(low=0, high=10)
     turn: float = number(low=0, high=10)
     shift: float = number(low=0, high=10)
+    pose: float = number(low=0, high=10)
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,9 @@ class PolishConfig:
         min_opacity: what has less at the end is left out.
         every: steps after which a stopped fit goes on from there.
         seed: of the order of the frames.
+        poses: whether the poses of the fitted frames are fitted, too; those of the others are then placed on the
+            splats, which stay.
+        pose_steps: of Adam, for each of these.
         rates: learning rates.
         loss: its weights.
     """
@@ -61,6 +68,8 @@ class PolishConfig:
     min_opacity: float = number(low=0, high=1)
     every: int = number(low=1, high=10_000_000)
     seed: int = number(low=0, high=2**31 - 1)
+    pose_steps: int = number(low=0, high=10_000)
+    poses: bool
 
 
 def is_held_out(row: int, config: PolishConfig) -> bool:
@@ -68,113 +77,156 @@ def is_held_out(row: int, config: PolishConfig) -> bool:
     return row % config.held_out_every == 0
 
 
-class Seeds:
-    """Splats on the surface that frames see, one for `pixels_per_splat` of the frame that has the most pixels of it."""
+class Views(NamedTuple):
+    """Frames that splats are fitted to, or that are placed on them.
 
-    def __init__(self, camera: Camera, config: PolishConfig) -> None:
-        self._camera, self._spacing = camera, float(np.sqrt(config.pixels_per_splat))
-        self._rows: list[tuple[np.ndarray, ...]] = []  # means, colours, axes, std of every frame that adds some
+    Args:
+        targets: `loss`'s of each frame, (h, w, 4).
+        poses: T_world_camera of each, (m, 4, 4).
+        spreads: (m, 6, 6); a pose may become T Exp(spread u), 0 for one that stays.
+    """
 
-    def add(self, view, image: np.ndarray, pose: np.ndarray) -> None:
-        """Fill the cells of a frame in which no splat is yet.
+    targets: Spool
+    poses: np.ndarray
+    spreads: np.ndarray
 
-        Args:
-            view: `DenseView` of the map at the frame.
-            image: RGB in [0, 1], (h, w, 3).
-            pose: T_world_camera.
-        """
-        height, width = image.shape[:2]
-        counts = [int(np.ceil(side / self._spacing)) for side in (height, width)]
-        y, x = (
-            np.minimum(((np.arange(n) + 0.5) * self._spacing).astype(int), side - 1)
-            for n, side in zip(counts, (height, width), strict=True)
-        )
-        is_free = view.valid[np.ix_(y, x)] & ~self._held(view, pose, counts)
-        y, x = y[np.nonzero(is_free)[0]], x[np.nonzero(is_free)[1]]
-        points, normals = (np.asarray(values[y, x], np.float64) for values in (view.points, view.normals))
-        rays = points - pose[:3, 3]
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        cosine = -np.einsum("ni,ni->n", rays, normals)
-        along = rays + cosine[:, None] * normals + 1e-6 * pose[:3, 0]  # in which direction the surface is foreshortened
-        along -= np.einsum("ni,ni->n", along, normals)[:, None] * normals
-        along /= np.linalg.norm(along, axis=1, keepdims=True)
-        axes = np.stack([along, np.cross(normals, along), normals], axis=2)
-        std = 0.5 * self._spacing * view.depth[y, x] / float(np.mean(np.asarray(self._camera.focal)))
-        std = np.stack([std / np.clip(cosine, STEEPEST, 1.0), std], axis=1)
-        self._rows.append((points, image[y, x], axes, std))
 
-    def _held(self, view, pose: np.ndarray, counts: Sequence[int]) -> np.ndarray:
-        """Mark the cells of the frame that hold a splat on the surface that the map shows there."""
-        held, (height, width) = np.zeros(counts, bool), view.depth.shape
-        for means, *_ in self._rows:
-            local = (means - pose[:3, 3]) @ pose[:3, :3]
-            z = np.where(local[:, 2] > 0, local[:, 2], 1.0)
-            u, v = (local[:, :2] / z[:, None] * np.asarray(self._camera.focal) + np.asarray(self._camera.center)).T
-            inside = (local[:, 2] > 0) & (u > -0.5) & (v > -0.5) & (u < width - 0.5) & (v < height - 0.5)
-            u, v, z = u[inside], v[inside], z[inside]
-            near = np.abs(view.depth[np.rint(v).astype(int), np.rint(u).astype(int)] - z) < SAME_SURFACE * z
-            cells = (np.clip(values[near] + 0.5, 0, None) / self._spacing for values in (v, u))
-            held[tuple(np.minimum(cell.astype(int), n - 1) for cell, n in zip(cells, counts, strict=True))] = True
-        return held
+class State(NamedTuple):
+    """Where a fit is: what it has found, and Adam's moments."""
 
-    def anchors(self, noise: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> tuple[Anchors, np.ndarray]:
-        """All of them, and their colours; `noise(means, normals)` is the map's, m."""
-        means, colors, axes, std = (np.concatenate(column) for column in zip(*self._rows, strict=True))
-        values = means, axes, std, noise(means, axes[..., 2])
-        return Anchors(*(jnp.asarray(value, jnp.float32) for value in values)), colors
+    fitted: Appearance
+    offsets: Float[Array, "m 6"]  # of the poses, in spreads
+    moments: Any
+    pose_moments: Any  # of each frame by itself, as one is seen in a step
 
 
 def fit(
     anchors: Anchors,
     colors: np.ndarray,
-    frames: tuple[Spool, np.ndarray],
+    views: Views,
     camera: Camera,
     config: PolishConfig,
     path: Path,
     on_step: Callable[[int, float], None] = lambda step, psnr: None,
-) -> Appearance:
+) -> tuple[Appearance, np.ndarray]:
     """Fit the splats' appearance to frames; the same call goes on where one that was stopped had written `path`.
 
     Args:
         anchors: where the splats begin.
         colors: (n, 3), likewise.
-        frames: `loss`'s target of each frame (h, w, 4), and T_world_camera of each, (m, 4, 4).
+        views: the frames.
         camera: of the frames.
         config: how.
         path: of what a stopped fit goes on from; gone at the end.
         on_step: told the number of each step, and the PSNR (dB) of its frame before it.
+
+    Returns:
+        The splats' appearance, and T_world_camera of the frames, (m, 4, 4).
     """
     import optax  # an extra
 
-    targets, poses = frames
-    adam = optax.scale_by_adam(eps=1e-15)  # as 3DGS
+    adam, count = optax.scale_by_adam(eps=1e-15), len(views.poses)  # as 3DGS
     fitted = initial(jnp.asarray(colors, jnp.float32), jnp.float32(config.opacity))
-    moments = adam.init(fitted)
+    offsets = jnp.zeros((count, 6))
+    state = State(fitted, offsets, adam.init(fitted), jax.vmap(adam.init)(offsets))
 
-    @jax.jit
-    def step(fitted: Appearance, moments, anchors: Anchors, target: Float[Array, "h w 4"], T: jaxlie.SE3, decay: Array):
-        (_, error), slope = jax.value_and_grad(loss, has_aux=True)(fitted, anchors, target, T, camera, config.loss)
-        change, moments = adam.update(slope, moments)
-        parts = {
-            name: getattr(fitted, name) - decay * rate * getattr(change, name)
-            for name, rate in vars(config.rates).items()
-        }
-        return Appearance(**parts), moments, error
+    @eqx.filter_jit
+    def step(state: State, anchors: Anchors, view: View, decay: Array, terms: LossConfig):
+        place = jax.tree.map(lambda x: x[view.row], (state.offsets, state.pose_moments))
 
-    signature = _signature(anchors, colors, config)
-    first, (fitted, moments) = _read(path, (fitted, moments), signature)
+        def total(fitted: Appearance, offset: Float[Array, "6"]):
+            return loss(fitted, anchors, view.target, moved(view, offset), camera, terms)
+
+        (_, (error, overflow)), (slope, turn) = jax.value_and_grad(total, (0, 1), has_aux=True)(state.fitted, place[0])
+        change, moments = adam.update(slope, state.moments)
+        rates = {name: decay * rate for name, rate in vars(config.rates).items()}
+        move, pose_moments = adam.update(turn, place[1])
+        place = place[0] - rates.pop("pose") * move, pose_moments
+        parts = {name: getattr(state.fitted, name) - rate * getattr(change, name) for name, rate in rates.items()}
+        places = jax.tree.map(lambda x, y: x.at[view.row].set(y), (state.offsets, state.pose_moments), place)
+        return (State(Appearance(**parts), places[0], moments, places[1]), error), overflow
+
+    terms, signature = config.loss, _signature(anchors, colors, config)
+    first, state = _read(path, state, signature)
     for number_ in range(first, config.steps):
-        epoch, place = divmod(number_, len(poses))
-        row = np.random.default_rng((config.seed, epoch)).permutation(len(poses))[place]
-        target = jnp.asarray(targets[row], jnp.float32)
-        pose = jaxlie.SE3.from_matrix(jnp.asarray(poses[row], jnp.float32))
+        epoch, place = divmod(number_, count)
+        row = np.random.default_rng((config.seed, epoch)).permutation(count)[place]
         decay = jnp.float32(config.final_rate ** (number_ / max(config.steps - 1, 1)))
-        fitted, moments, error = step(fitted, moments, anchors, target, pose, decay)
+        (state, error), terms = with_room(partial(step, state, anchors, view_of(views, row), decay), terms)
         on_step(number_, -10.0 * float(np.log10(max(float(error), 1e-12))))
         if (number_ + 1) % config.every == 0:
-            _write(path, number_ + 1, (fitted, moments), signature)
+            _write(path, number_ + 1, state, signature)
     path.unlink(missing_ok=True)
-    return fitted
+    return state.fitted, placed(views, state.offsets)
+
+
+def locate(anchors: Anchors, fitted: Appearance, views: Views, camera: Camera, config: PolishConfig) -> np.ndarray:
+    """Place frames on splats that stay as they are; returns T_world_camera of each, (m, 4, 4)."""
+    import optax  # an extra
+
+    adam, terms = optax.scale_by_adam(eps=1e-15), config.loss
+
+    @eqx.filter_jit
+    def step(offset: Float[Array, "6"], moments: Any, view: View, rate: Array, splats: tuple, terms: LossConfig):
+        def total(offset: Float[Array, "6"]):
+            return loss(*splats, view.target, moved(view, offset), camera, terms)
+
+        slope, (_, overflow) = jax.grad(total, has_aux=True)(offset)
+        move, moments = adam.update(slope, moments)
+        return (offset - rate * move, moments), overflow
+
+    offsets = []
+    for row in range(len(views.poses)):
+        view, offset = view_of(views, row), jnp.zeros(6)
+        moments = adam.init(offset)
+        for number_ in range(config.pose_steps):
+            rate = jnp.float32(POSE_RATE * config.final_rate ** (number_ / max(config.pose_steps - 1, 1)))
+            call = partial(step, offset, moments, view, rate, (fitted, anchors))
+            (offset, moments), terms = with_room(call, terms)
+        offsets.append(offset)
+    return placed(views, jnp.stack(offsets))
+
+
+def with_room(call: Callable[[LossConfig], tuple[Result, Array]], terms: LossConfig) -> tuple[Result, LossConfig]:
+    """Call with room for all splats in the tiles' lists: twice as much as long as some have none, and kept then.
+
+    Args:
+        call: returns its result and how many splats had no room.
+        terms: with the room so far.
+    """
+    while True:
+        result, overflow = call(terms)
+        if not int(overflow):
+            return result, terms
+        render = replace(terms.render, tile_capacity=2 * terms.render.tile_capacity)
+        terms = replace(terms, render=render)
+
+
+class View(NamedTuple):
+    """One of `Views`, on the device."""
+
+    row: Array
+    target: Float[Array, "h w 4"]
+    pose: jaxlie.SE3
+    spread: Float[Array, "6 6"]
+
+
+def view_of(views: Views, row: int) -> View:
+    """The frame of this row."""
+    pose = jaxlie.SE3.from_matrix(jnp.asarray(views.poses[row], jnp.float32))
+    target, spread = (jnp.asarray(values[row], jnp.float32) for values in (views.targets, views.spreads))
+    return View(jnp.int32(row), target, pose, spread)
+
+
+def moved(view: View, offset: Float[Array, "6"]) -> jaxlie.SE3:
+    """The pose T Exp(spread u)."""
+    return view.pose @ jaxlie.SE3.exp(view.spread @ offset)
+
+
+def placed(views: Views, offsets: Float[Array, "m 6"]) -> np.ndarray:
+    """T_world_camera of all frames, moved: (m, 4, 4) float64; those without a spread stay to the bit."""
+    xi = jnp.asarray(np.einsum("mij,mj->mi", views.spreads, np.asarray(offsets, np.float64)), jnp.float32)
+    return views.poses @ np.asarray(jax.vmap(lambda x: jaxlie.SE3.exp(x).as_matrix())(xi), np.float64)
 
 
 def _signature(anchors: Anchors, colors: np.ndarray, config: PolishConfig) -> str:

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
@@ -97,11 +97,14 @@ def draw(
 
 def loss(
     fitted: Appearance, anchors: Anchors, target: Float[Array, "h w 4"], T: jaxlie.SE3, camera: Camera, c: LossConfig
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Photometric loss of 3DGS with depth and normals of the map as terms; and the mean squared error of the colours.
+) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Int[Array, ""]]]:
+    """Photometric loss of 3DGS with depth and normals of the map as terms.
 
     Args:
         target: RGB of the image and the map's depth (m), 0 where it has none: such pixels count in no term.
+
+    Returns:
+        The loss; the mean squared error of the colours, and how many splats had no room in the tiles' lists.
     """
     gaussians, opacity = gaussians_of(anchors, fitted)
     drawn = draw(gaussians, opacity, T, camera, c.render)
@@ -115,7 +118,7 @@ def loss(
     off = jnp.where(has_both, jnp.abs(drawn.depth - depth) / jnp.where(is_seen, depth, 1.0), 0.0)
     tilt = 1.0 - jnp.sum(gaussians.normals * anchors.axes[..., 2], axis=-1)
     total = photometric + c.depth * jnp.sum(off) / count + c.normal * jnp.mean(tilt)
-    return total, jnp.sum((found - image) ** 2) / (3 * count)
+    return total, (jnp.sum((found - image) ** 2) / (3 * count), drawn.overflow)
 
 
 def ssim(a: Float[Array, "h w c"], b: Float[Array, "h w c"]) -> Float[Array, ""]:

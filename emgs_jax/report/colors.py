@@ -29,6 +29,7 @@ PATHS = {
     "loops": Look("accepted loops", "#2e86e4", "#63e68b"),
 }
 OURS = PATHS["poses"].paper
+NO_CLASS = "#5a6068"  # of what has no class
 
 
 def rgb(color: str) -> np.ndarray:

@@ -70,9 +70,8 @@ class Line(NamedTuple):
     rivals: Hashable = ()
 
 
-def known(columns: Iterable[Column], lines: Iterable[Line]) -> list[Column]:
+def known(columns: Iterable[Column], lines: Sequence[Line]) -> list[Column]:
     """Keep the columns in which some line has a value."""
-    lines = list(lines)
     return [column for column in columns if any(line.values.get(column.key) is not None for line in lines)]
 
 
@@ -119,9 +118,8 @@ def markdown(table: Table) -> str:
     """Write a table in Markdown; the best are bold."""
 
     def text(content: str | Cell) -> str:
-        return (
-            f"**{cell_text(content)}**" if isinstance(content, Cell) and content.kind == "best" else cell_text(content)
-        )
+        mark = "**" if isinstance(content, Cell) and content.kind == "best" else ""
+        return f"{mark}{cell_text(content)}{mark}"
 
     rows = [table.titles, ["---"] * len(table.titles), *([text(content) for content in line] for line in table.lines)]
     return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -11,6 +11,7 @@ import numpy as np
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.geometry import Sim3
 from emgs_jax.io.colmap import save_colmap
 from emgs_jax.io.files import new_folder, write_json
 from emgs_jax.io.frustums import save_frustums
@@ -39,21 +40,20 @@ class ExportConfig:
         max_points: of the dense cloud, drawn evenly.
         scale: factor on all lengths; None = 1.
         length: instead of it two frames and the metres between their cameras, see `factor_of`.
+        images: as `used` in the run, or in the `original` size on disk; either way without distortion.
     """
 
     formats: Sequence[str]
     max_points: int = number(low=1, high=2**26)
     scale: float | None = number(low=1e-6, high=1e6)
     length: Sequence[float] | None = number(low=0, high=2**31)
+    images: str = field(default="used", metadata={"choices": ("used", "original")})
 
 
 def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
     """Write a run into `folder`, which is there, in the run's unit; returns what was written.
 
     Args:
-        run: whose poses and points are written.
-        folder: to write into.
-        config: what to write.
         dataset: the images of the run; None where they are gone.
 
     Raises:
@@ -143,7 +143,6 @@ def factor_of(run: RecordedRun, length: Sequence[float]) -> float:
     """Find the factor that makes the distance between two cameras as long as it is known to be.
 
     Args:
-        run: whose poses.
         length: two frames, as `index` of frames.jsonl numbers them, and metres between their camera centres.
 
     Raises:
@@ -169,11 +168,12 @@ def write_scaled(run: RecordedRun, folder: Path, factor: float) -> RecordedRun:
 
     About the origin of the world, which stays. What the run does not have is left out; truth and features stay.
     """
+    unit = Sim3.about(np.zeros(3), factor)
     for name in TRAJECTORIES:
         if (run.folder / name).is_file():
             times, poses = load_trajectory_tum(run.folder / name)
-            save_trajectory_tum(folder / name, times, _scaled_poses(poses, factor))
-    scaled = replace(run, folder=folder, poses=_scaled_poses(run.poses, factor), map=scaled_map(run.map, factor))
+            save_trajectory_tum(folder / name, times, unit.apply_to_poses(poses))
+    scaled = replace(run, folder=folder, poses=unit.apply_to_poses(run.poses), map=scaled_map(run.map, factor))
     save_map(folder / "map.npz", scaled.map)
     for name in CLOUDS:
         if (run.folder / name).is_file():
@@ -190,9 +190,3 @@ def scaled_map(map: GaussianMap, factor: float) -> GaussianMap:
     covs = np.where(is_valid, np.asarray(gaussians.covs) * np.float32(factor**2), gaussians.covs)
     means = np.where(is_valid[..., 0], means, gaussians.means)
     return eqx.tree_at(lambda m: (m.gaussians.means, m.gaussians.covs), map, (means, covs))
-
-
-def _scaled_poses(poses: np.ndarray, factor: float) -> np.ndarray:
-    scaled = poses.copy()
-    scaled[:, :3, 3] *= factor
-    return scaled

@@ -49,11 +49,8 @@ class Head(NamedTuple):
     """The top of a page, and its foot.
 
     Args:
-        window: title of the window.
         title: of the page, with `beside` in small letters.
         level: of the verdict: good, mixed, bad or unknown.
-        verdict: one sentence.
-        is_simulated: the page is marked as such.
         remarks: side remarks; empty ones are left out.
         command: repeats what the page shows; "" where nobody knows.
         sources: data sets and priors whose licences stand at the foot.

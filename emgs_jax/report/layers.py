@@ -12,7 +12,7 @@ import numpy as np
 
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.gaussian_map import GaussianMap, confirmed
-from emgs_jax.report.colors import class_colors, rgb, to_bytes
+from emgs_jax.report.colors import NO_CLASS, class_colors, rgb, to_bytes
 from emgs_jax.report.display import closing_covariances
 from emgs_jax.running.convert import on_device
 from emgs_jax.running.executables import stored
@@ -22,7 +22,6 @@ COV_UNIT = 1e-4  # m²; float16 then holds standard deviations from .1 mm to 2.5
 _LARGEST_HALF = 65504.0
 _similarities, feature_colors = stored(similarities), stored(principal_colors)
 _UPPER = np.triu_indices(3)
-NO_CLASS = "#5a6068"  # of what has none
 
 
 class Layer(NamedTuple):

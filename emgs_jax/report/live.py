@@ -45,8 +45,6 @@ class LiveView:
     """A run that is watched until `stop`.
 
     Args:
-        config: of the server.
-        start: the run before its first frame.
         text: classes that features are compared with; None without.
         kept: index in the data set of each frame in use.
 
@@ -121,10 +119,6 @@ def live_view(
     """Serve a run inside the `with`, and say where; None, and nothing is served, without a config.
 
     Args:
-        config: of the server.
-        run: before its first frame.
-        render: how the map is drawn.
-        prior: whose classes can be looked for.
         kept: index in the data set of each frame in use.
     """
     if config is None:

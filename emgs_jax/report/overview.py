@@ -30,7 +30,6 @@ class Paths:
         truth: aligned with the estimate; NaN where unknown.
         online: as first estimated, before the back end moved poses.
         loops: rows of the frames that loop closures join.
-        unit: of all lengths.
     """
 
     estimate: np.ndarray
@@ -56,10 +55,8 @@ def draw_overview(
         cloud: in the frame of the paths.
         paths: estimated, true, before poses moved, and loops.
         frames: about four, each with `image` uint8 (h, w, 3), `rendered_color` float (h, w, 3), `rendered_depth`
-            float (h, w) in metres, `valid` bool (h, w), where it is known, `title`, and with classes `labels`,
-            int (h, w), -1 = none.
-        title: of the whole picture.
-        classes: names of the labels.
+            float (h, w) in the unit of the paths, `valid` bool (h, w), where it is known, `title`, and with classes
+            `labels`, int (h, w), -1 = none.
         features: points in the colours of their features, drawn from above below the map; None without features.
     """
     figure = Figure(figsize=(16, max(6.0, 0.8 + 2.05 * len(frames))), facecolor="white", layout="constrained")
@@ -71,7 +68,7 @@ def draw_overview(
         _draw_features(axes[1], features, paths)
     if right is not None:
         grid = right.subplots(len(frames), 4 if classes else 3, squeeze=False)
-        _draw_frames(grid[:, [0, 1, -1]], frames)
+        _draw_frames(grid[:, [0, 1, -1]], frames, paths.unit)
         if classes:
             _draw_labels(grid[:, 2], frames, classes)
     with atomic_write(path) as handle:
@@ -245,16 +242,17 @@ def _draw_scale_bar(axes: Axes, unit: str) -> None:
     text.set_path_effects([withStroke(linewidth=3, foreground="white")])
 
 
-def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]]) -> None:
-    depths = [np.asarray(frame["rendered_depth"])[np.asarray(frame["valid"])] for frame in frames]
-    depths = np.concatenate([depth[np.isfinite(depth) & (depth > 0)].ravel() for depth in depths])
-    near, far = np.percentile(depths, [1, 99]) if len(depths) else (0.0, 1.0)
+def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]], unit: str) -> None:
+    depths = []
+    for frame in frames:
+        depth = np.asarray(frame["rendered_depth"], np.float64)
+        depths.append(np.ma.masked_where(~(np.asarray(frame["valid"]) & np.isfinite(depth)), depth))
+    seen = np.concatenate([depth.compressed() for depth in depths])
+    near, far = np.percentile(seen[seen > 0], [1, 99]) if (seen > 0).any() else (0.0, 1.0)
     mappable = None
-    for row, frame in zip(grid, frames, strict=True):
-        covered = np.asarray(frame["valid"]) & np.isfinite(frame["rendered_depth"])
+    for row, frame, depth in zip(grid, frames, depths, strict=True):
         row[0].imshow(np.asarray(frame["image"]))
         row[1].imshow(np.nan_to_num(np.asarray(frame["rendered_color"], np.float64)).clip(0.0, 1.0))
-        depth = np.ma.masked_where(~covered, np.asarray(frame["rendered_depth"], np.float64))
         mappable = row[2].imshow(depth, cmap="turbo", vmin=near, vmax=far)
         row[2].set_facecolor("#dddddd")
         row[0].set_ylabel(str(frame["title"]), fontsize=10, color=_INK)
@@ -262,7 +260,7 @@ def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]]) -> None:
             _bare(axes)
     for axes, title in zip(grid[0], ("input", "rendered colour", "rendered depth"), strict=True):
         axes.set_title(title, fontsize=11, color=_INK)
-    bar = grid[0, 0].figure.colorbar(mappable, ax=grid[:, 2].tolist(), shrink=0.6, aspect=30, label="depth [m]")
+    bar = grid[0, 0].figure.colorbar(mappable, ax=grid[:, 2].tolist(), shrink=0.6, aspect=30, label=f"depth [{unit}]")
     bar.outline.set_visible(False)
 
 

@@ -14,7 +14,7 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.io.files import jsonable
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report import page_words
-from emgs_jax.report.colors import PATHS, class_colors, to_bytes
+from emgs_jax.report.colors import NO_CLASS, PATHS, class_colors, rgb, to_bytes
 from emgs_jax.report.html import MAX_BYTES, POLICY, jpeg, page, picture, source, write_page
 from emgs_jax.report.layers import COV_UNIT, feature_layer, fitted, layers_of, map_layers
 from emgs_jax.report.overview import view_from_above
@@ -32,7 +32,6 @@ def write_report(run: RecordedRun, dataset: Dataset | None, note: str = "") -> P
     """Write report.html into the folder of a run; the same run gives the same bytes.
 
     Args:
-        run: as its folder tells it.
         dataset: in use, for the images; None: the page has none.
         note: what could not be shown, and why.
 
@@ -78,12 +77,13 @@ def _about(run: RecordedRun, layers: dict[str, np.ndarray]) -> dict[str, Any]:
         "pivot": (0.5 * (low + high)).tolist(),
         "size": max(float(np.linalg.norm(high - low)), 1e-3),
         "covUnit": COV_UNIT,
-        "unitNote": "" if run.is_metric else " (not metric)",
+        "isMetric": run.is_metric,
         "camera": {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": camera.width, "height": camera.height},
         "layers": {name: layer._asdict() for name, layer in layers_of(layers).items()},
         "paths": {name: look.dark for name, look in PATHS.items()},
         "classes": list(names),
         "classColors": to_bytes(class_colors(len(names))).tolist(),
+        "noClass": to_bytes(rgb(NO_CLASS)).tolist(),
         "classesSeen": sorted({int(label) for label in layers.get("label", ())} - {-1}),
         "frames": {
             "title": [f"frame {line['index']}" for line in run.frames],
@@ -106,7 +106,7 @@ def _page(
         "overview": _overview(run),
         "layers": layers_of({array["name"] for array in about["arrays"]}),
         "paths": {name: look for name, look in PATHS.items() if name in shown_paths},
-        "depths": f"{views.near:.1f} to {views.far:.1f} m",
+        "depths": f"{views.near:.1f} to {views.far:.1f} {'m' if run.is_metric else 'units'}",
         "num_frames": len(run.frames),
         "strip": strip(run, paths.errors),
         "key": key_of(run, paths.errors),

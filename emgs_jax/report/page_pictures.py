@@ -52,8 +52,6 @@ def draw_views(run: RecordedRun, rows: Sequence[int], config: RenderConfig, data
 
     Args:
         run: from a frame that is not placed, nothing is drawn.
-        rows: of the frames.
-        config: as the map is drawn.
         dataset: for the images; None: without them.
     """
     small, placed = downscale(run.camera, -(-run.camera.width // WIDTH)), run.is_placed

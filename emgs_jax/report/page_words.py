@@ -9,7 +9,7 @@ from emgs_jax.report import columns, provenance
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Line, Table
 from emgs_jax.report.html import Head, commit_words
 from emgs_jax.report.provenance import RAW_PRIOR
-from emgs_jax.report.recorded_run import POLISH, RecordedRun
+from emgs_jax.report.recorded_run import POLISH, RecordedRun, sound
 from emgs_jax.report.repeat import Repeated
 
 MANY_LOST = 0.1  # share of the frames
@@ -33,6 +33,7 @@ FILES = {
     "splats.ply": "splats fitted to the images (emgs polish), standard 3DGS; SuperSplat, gsplat, nerfstudio",
     "polish.png": "frames that were held out: image, map, splats; any viewer of images",
     "polish.json": "PSNR, SSIM and depth errors of those before and after; any editor",
+    "polish.txt": "poses as they moved with the splats (polish.poses=true), TUM format; evo",
     "cameras.ply": "every camera in the colour of its status, and the path, as a mesh; MeshLab, CloudCompare",
 }
 POLISHED = (  # key of polish.json, words, digits
@@ -40,6 +41,7 @@ POLISHED = (  # key of polish.json, words, digits
     ("ssim", "SSIM", 3),
     ("depth_within_5_percent", "depth within 5 %, %", 1),
     ("depth_l1_m", "depth L1, m", 3),
+    ("ate_m", "ATE of all frames, m", 4),
 )
 GATES = {
     "matches": "too few matches fit one motion of the camera",
@@ -180,7 +182,7 @@ def polished(run: RecordedRun) -> tuple[Table, str] | None:
     path = run.folder / POLISH[1]
     if not path.is_file():
         return None
-    try:
+    with sound(f"{path} is not what emgs polish writes", "polish again"):
         found = json.loads(path.read_text(encoding="utf-8"))
         count, held = (int(found[f"polish/{name}"]) for name in ("num_splats", "num_held_out"))
         rows = [
@@ -188,8 +190,6 @@ def polished(run: RecordedRun) -> tuple[Table, str] | None:
             for name, words, digits in POLISHED
             if found.get(f"polish/before_{name}") is not None
         ]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path} is not what emgs polish writes ({error!r}): polish again") from error
     words = f"{count:,} splats; the {held} frames that are compared were not fitted."
     return Table(("held-out frames", "map", "splats"), rows), words
 

@@ -2,12 +2,14 @@
 
 import importlib.util
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from scipy.spatial import cKDTree
 from tqdm import tqdm
@@ -15,20 +17,26 @@ from tqdm import tqdm
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
 from emgs_jax.evaluation.rendering import rendering_metrics, score_view
-from emgs_jax.evaluation.trajectory import align_poses
+from emgs_jax.evaluation.trajectory import align_poses, ate
 from emgs_jax.gaussian_map import confirmed
+from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import write_json
 from emgs_jax.io.ply import save_gaussians_ply
-from emgs_jax.polish.fit import PolishConfig, Seeds, fit, is_held_out, without_transparent
-from emgs_jax.polish.splats import draw, gaussians_of, ssim
-from emgs_jax.render.densify import DensifyConfig, densify
+from emgs_jax.io.trajectory import save_trajectory_tum
+from emgs_jax.ops.camera import Camera
+from emgs_jax.polish.fit import PolishConfig, Views, fit, is_held_out, locate, with_room, without_transparent
+from emgs_jax.polish.seeds import Seeds
+from emgs_jax.polish.splats import LossConfig, draw, gaussians_of, ssim
+from emgs_jax.render.composite import Rendering
+from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.report.recorded_run import POLISH, RecordedRun
-from emgs_jax.running.convert import to_se3
+from emgs_jax.running.convert import on_device, to_se3
 from emgs_jax.running.executables import stored
+from emgs_jax.semantics import classify
 
-SPLATS_FILE, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE = POLISH
+SPLATS_FILE, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE, PATH_FILE = POLISH
 MAX_PICTURES = 4
-_densify, _ssim = stored(densify), jax.jit(ssim)
+_densify, _classify, _ssim = stored(densify), stored(classify), jax.jit(ssim)
 
 
 def polish(
@@ -62,16 +70,17 @@ def polish(
         view = jax.device_get(_densify(gaussians, to_se3(run.poses[row]), run.camera, densify_config))
         return dataset[row].image / np.float32(255), eqx.tree_at(lambda v: v.rendering, view, None)
 
-    seeds, targets = Seeds(run.camera, config), Spool()
+    seeds, targets = Seeds(run.camera, config.pixels_per_splat), {name: Spool() for name in ("fitted", "held")}
     for row in tqdm(fitted_rows, desc="splats", unit="frame"):
         image, view = seen(row)
         seeds.add(view, image, run.poses[row])
-        depth = np.where(view.valid, view.depth, 0.0)
-        targets.append(np.concatenate([image, depth[..., None]], axis=-1).astype(np.float16))
+        targets["fitted"].append(_target(image, view))
     for row in held:  # what only these see is as the map has it: their images stay out
-        _, view = seen(row)
+        image, view = seen(row)
         seeds.add(view, view.colors, run.poses[row])
-    anchors, colors = seeds.anchors(_map_noise(gaussians))
+        targets["held"].append(_target(image, view))
+    nearest = _nearest(gaussians)
+    anchors, colors = seeds.anchors(_map_noise(gaussians, nearest))
     with tqdm(total=config.steps, desc="polishing", unit="step") as bar:
         recent: list[float] = []
 
@@ -80,48 +89,99 @@ def polish(
             bar.set_postfix_str(f"{np.mean(recent[-len(fitted_rows) :]):.1f} dB", refresh=False)
             bar.update(step + 1 - bar.n)
 
-        frames = targets, run.poses[fitted_rows]
-        fitted = fit(anchors, colors, frames, run.camera, config, run.folder / CHECKPOINT_FILE, on_step)
-    splats, opacity = gaussians_of(*without_transparent(anchors, fitted, config.min_opacity))
-    count = save_gaussians_ply(
-        run.folder / SPLATS_FILE, splats.means, splats.covs, jnp.clip(splats.colors, 0, 1), opacity, splats.normals
-    )
+        views = Views(targets["fitted"], run.poses[fitted_rows], _spreads(run, fitted_rows, config))
+        fitted, moved = fit(anchors, colors, views, run.camera, config, run.folder / CHECKPOINT_FILE, on_step)
+    anchors, fitted = without_transparent(anchors, fitted, config.min_opacity)
+    poses = run.poses.copy()
+    poses[fitted_rows] = moved
+    if config.poses:
+        views = Views(targets["held"], run.poses[held], _spreads(run, held, config))
+        poses[held] = locate(anchors, fitted, views, run.camera, config)
+        save_trajectory_tum(run.folder / PATH_FILE, [line["timestamp"] for line in run.frames], poses)
+    splats, opacity = gaussians_of(anchors, fitted)
+    labels, classes = None, ()
+    if run.text is not None and gaussians.features.shape[-1]:
+        text, classes = on_device(np.asarray(run.text.vectors, np.float32)), run.text.names
+        labels = np.asarray(_classify(gaussians, text))[nearest(np.asarray(splats.means))]
+    shown = jnp.clip(splats.colors, 0, 1), opacity, splats.normals, labels, classes
+    count = save_gaussians_ply(run.folder / SPLATS_FILE, splats.means, splats.covs, *shown)
     metrics = {"polish/num_splats": count, "polish/num_fitted": len(fitted_rows), "polish/num_held_out": len(held)}
-    metrics |= _compare(run, dataset, held, seen, (splats, opacity, config))
+    metrics |= _compare(run, dataset, held, seen, (splats, opacity, poses, config.loss))
     write_json(run.folder / METRICS_FILE, metrics)
     return metrics
 
 
-def _map_noise(gaussians):
+def _target(image: np.ndarray, view: DenseView) -> np.ndarray:
+    """What `loss` compares with, (h, w, 4)."""
+    return np.concatenate([image, np.where(view.valid, view.depth, 0.0)[..., None]], axis=-1).astype(np.float16)
+
+
+def _spreads(run: RecordedRun, rows: list[int], config: PolishConfig) -> np.ndarray:
+    """Square roots of the covariances of frames (m, 6, 6); 0 where poses stay.
+
+    A frame without one, as the first, to which the others' are relative, has that of the nearest frame with one.
+    """
+    spreads = np.zeros((len(rows), 6, 6))
+    known = np.array([row for row, line in enumerate(run.frames) if line.get("covariance") is not None])
+    for number, row in enumerate(rows) if config.poses and len(known) else ():
+        covariance = run.frames[known[np.abs(known - row).argmin()]]["covariance"]
+        values, axes = np.linalg.eigh(np.asarray(covariance, np.float64).reshape(6, 6))
+        spreads[number] = axes * np.sqrt(np.maximum(values, 0.0))
+    return spreads
+
+
+def _nearest(gaussians: Gaussians) -> Callable[[np.ndarray], np.ndarray]:
+    """A function from points (n, 3) to rows of the Gaussians with the nearest means."""
+    rows = np.flatnonzero(np.asarray(gaussians.valid))
+    tree = cKDTree(np.asarray(gaussians.means)[rows])
+    return lambda points: rows[tree.query(points)[1]]
+
+
+def _map_noise(gaussians: Gaussians, nearest: Callable) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """The standard deviation along the normal (m) of the Gaussian that is nearest to each point."""
-    valid = np.asarray(gaussians.valid)
-    tree, covs = cKDTree(np.asarray(gaussians.means)[valid]), np.asarray(gaussians.covs)[valid]
+    covs = np.asarray(gaussians.covs)
 
     def noise(means: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.einsum("ni,nij,nj->n", normals, covs[tree.query(means)[1]], normals))
+        return np.sqrt(np.einsum("ni,nij,nj->n", normals, covs[nearest(means)], normals))
 
     return noise
+
+
+@eqx.filter_jit
+def _drawn(splats: Gaussians, opacity: jax.Array, T: jaxlie.SE3, camera: Camera, terms: LossConfig) -> Rendering:
+    return draw(splats, opacity, T, camera, terms.render)
+
+
+def _picture(*arguments: Any) -> tuple[Rendering, int]:
+    """The splats on the host, and how many had no room."""
+    drawn = jax.device_get(_drawn(*arguments))
+    return drawn, drawn.overflow
 
 
 def _compare(
     run: RecordedRun, dataset: ReadableFrames, held: list[int], seen: Callable, drawn: tuple
 ) -> dict[str, Any]:
-    """PSNR and SSIM over the pixels that the map covers, and depth errors where the truth is known, before and after.
+    """PSNR and SSIM over the pixels that the map covers, depth errors and ATE where the truth is known.
 
-    Where the map covers nothing both pictures are the image itself in SSIM, and do not count in PSNR.
+    Before is the map at the run's poses, after are the splats at theirs. Where the map covers nothing both pictures are
+    the image itself in SSIM, and do not count in PSNR.
     """
-    splats, opacity, config = drawn
+    splats, opacity, poses, terms = drawn
     known = run.has_truth & run.is_placed
-    poses = (run.poses[known], run.truth[known]) if known.any() else None
-    is_metric = run.provenance["config"].get("evaluation", {}).get("alignment") != "sim3"
-    scale = None if poses is None else align_poses(*poses, with_scale=not is_metric)[0].scale
-    picture = eqx.filter_jit(draw)
+    metrics: dict[str, Any] = {}
+    scale = None
+    if known.any():
+        with_scale = run.provenance["config"].get("evaluation", {}).get("alignment") == "sim3"
+        for name, path in (("before", run.poses[known]), ("after", poses[known])):
+            alignment, _ = align_poses(path, run.truth[known], with_scale)
+            metrics[f"polish/{name}_ate_m"] = ate(path[:, :3, 3], run.truth[known][:, :3, 3], alignment)
+            scale = alignment.scale if scale is None else scale
     scores: dict[str, list] = {"before": [], "after": []}
     psnr, similarity = {name: [] for name in scores}, {name: [] for name in scores}
     strips = []
     for row in tqdm(held, desc="held-out frames", unit="frame"):
         image, view = seen(row)
-        after = jax.device_get(picture(splats, opacity, to_se3(run.poses[row]), run.camera, config.loss.render))
+        after, terms = with_room(partial(_picture, splats, opacity, to_se3(poses[row]), run.camera), terms)
         pictures = {
             "before": (view.colors, np.where(view.valid, view.depth, 0.0)),
             "after": (after.values, after.depth),
@@ -133,7 +193,6 @@ def _compare(
             if scale is not None:
                 scores[name].append(score_view(dataset[row], depth, colors, scale, np.inf))
         strips.append(np.concatenate([image, np.clip(view.colors, 0, 1), np.clip(after.values, 0, 1)], axis=1))
-    metrics: dict[str, Any] = {}
     for name in scores:
         metrics[f"polish/{name}_psnr_db"] = float(-10 * np.log10(max(np.mean(psnr[name]), 1e-12)))
         metrics[f"polish/{name}_ssim"] = float(np.mean(similarity[name]))

@@ -19,7 +19,6 @@ def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
     Many are a tenth of all, or `MANY_IN_A_ROW`; these are named, too.
 
     Args:
-        records: of a run.
         num_skipped: frames that could not be read.
     """
     counts = Counter(record.status for record in records) | Counter(skipped=num_skipped)

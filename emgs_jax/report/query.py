@@ -40,11 +40,9 @@ class Question:
     """Query to a map.
 
     Args:
-        words: with their vectors.
         against: rivals, which are not asked for, in the same space; may be empty.
         margin: the lead that an answer needs.
         min_cosine: the cosine that an answer needs.
-        instances: clustering of answers into objects.
     """
 
     words: TextEmbeddings

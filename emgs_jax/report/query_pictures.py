@@ -89,9 +89,6 @@ def draw_answer(path: Path, run: RecordedRun, answer: Answer, views: Sequence[Se
     """Draw a line for each word and view: the map in its colours, the word's relevance, the classes with a legend.
 
     Args:
-        path: of the PNG.
-        run: whose map was asked.
-        answer: to draw.
         views: of each word.
         max_words: those with the most answers.
 
@@ -117,12 +114,6 @@ def save_labels(folder: Path, run: RecordedRun, answer: Answer, views: Mapping[s
 
     NAME.png holds 16-bit ids, 1 for the first word and so on, 0 where the map shows nothing or none of the words;
     classes.txt has a line `id word` for each.
-
-    Args:
-        folder: of the files, made here.
-        run: whose map was asked.
-        answer: with the words.
-        views: by name.
     """
     folder.mkdir(parents=True, exist_ok=True)
     names = answer.question.words.names

@@ -1,6 +1,8 @@
 """A finished run as its folder tells it, for whoever shows it: checked once, read only."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import reduce
 from operator import getitem
@@ -24,7 +26,7 @@ TEXT_FILE = "text.npz"  # classes of a map with features, in the format of `expe
 LOOPS_FILE = "loops.json"
 REPORT_FILE = "report.html"
 FRAMES_FILE = "frames.jsonl"
-POLISH = ("splats.ply", "polish.json", "polish.png", "polish.npz")  # of `experiments.polish`
+POLISH = ("splats.ply", "polish.json", "polish.png", "polish.npz", "polish.txt")  # of `experiments.polish`
 EXPORTS = ("colmap", "nerfstudio", "cameras.ply", "scaled")  # what `experiments.export` writes beside them
 _POSES = ("raw_pose", "true_pose")
 _PROVENANCE = {  # what of `provenance.provenance` is read again, by dotted key
@@ -139,40 +141,48 @@ def read_run(folder: Path) -> RecordedRun:
     )
 
 
+@contextmanager
+def sound(what: str, remedy: str = "run again") -> Iterator[None]:
+    """Raise one ValueError for whatever is wrong with the content of a file that is read inside of the `with`."""
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{what} ({error!r}): {remedy}") from error
+
+
 def _check_metrics(path: Path, metrics: dict[str, Any]) -> None:
     """Raise ValueError where a value is neither a number nor unknown, or what is said of the run lacks something."""
-    said = {key: value for key, value in metrics.items() if key != "provenance" and value is not None}
-    for key, value in said.items():
-        if not isinstance(value, str if key.endswith(_WORDS) else int | float):
-            raise ValueError(f"{path} is not the result of a run ({key} is {value!r}): run again")
+
+    def require(holds: bool, fault: str) -> None:
+        if not holds:
+            raise ValueError(f"{path} is not the result of a run ({fault}): run again")
+
+    for key, value in metrics.items():
+        kinds = str if key.endswith(_WORDS) else int | float
+        require(key == "provenance" or value is None or isinstance(value, kinds), f"{key} is {value!r}")
     block = metrics["provenance"]
     for key, kinds in _PROVENANCE.items():
         *parents, name = key.split(".")
         parent = reduce(getitem, parents, block)  # the rows before have checked these
-        if name not in parent or not isinstance(parent[name], kinds):
-            raise ValueError(f"{path} is not the result of a run (provenance.{key} is {parent.get(name)!r}): run again")
-    if block["git"] is not None and not isinstance(block["git"].get("revision"), str):
-        raise ValueError(f"{path} is not the result of a run (provenance.git has no revision): run again")
+        require(name in parent and isinstance(parent[name], kinds), f"provenance.{key} is {parent.get(name)!r}")
+    has_revision = block["git"] is None or isinstance(block["git"].get("revision"), str)
+    require(has_revision, "provenance.git has no revision")
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:
     lines = []
     for number, text in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
-        try:
+        with sound(f"{path}:{number} is no record of a frame"):
             lines.append(json.loads(text))
             if not isinstance(lines[-1]["index"], int) or not isinstance(lines[-1]["status"], str):
                 raise TypeError("index and status must be a number and a word")
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise ValueError(f"{path}:{number} is no record of a frame ({error!r}): run again") from error
     return lines
 
 
 def _poses(path: Path, frames: list[dict[str, Any]], name: str) -> np.ndarray:
-    try:
+    with sound(f"{path}: some {name} is not the seven numbers of a pose"):
         rows = [[np.nan] * 7 if line.get(name) is None else line[name] for line in frames]
         return from_tum(np.array(rows, np.float64).reshape(len(frames), 7))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: some {name} is not the seven numbers of a pose ({error}): run again") from error
 
 
 def _online(path: Path, count: int) -> np.ndarray | None:
@@ -186,28 +196,21 @@ def _online(path: Path, count: int) -> np.ndarray | None:
 
 def _camera(path: Path, metrics: dict[str, Any]) -> Camera:
     """Return the camera of the frames, straight and in the size in use."""
-    try:
+    with sound(f"{path} does not say which camera it was: an older version wrote it"):
         known = metrics["provenance"]["data"]["frames"]
         fx, fy, cx, cy = (float(value) for value in known["intrinsics"])
-        width, height = (int(value) for value in known["size"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(
-            f"{path} does not say which camera it was ({error!r}): an older version wrote it, run again"
-        ) from error
-    return Camera((fx, fy), (cx, cy), width, height)
+        return Camera((fx, fy), (cx, cy), *(int(value) for value in known["size"]))
 
 
 def _loops(path: Path, count: int) -> list[dict[str, Any]]:
     if not path.is_file():
         return []
-    try:
+    with sound(f"{path} is no list of loops"):
         loops = json.loads(path.read_text(encoding="utf-8"))
-        is_sound = all(
+        is_known = [
             loop["outcome"] in _OUTCOMES and 0 <= loop["other"] < count and 0 <= loop["frame"] < count for loop in loops
-        )
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path} is no list of loops ({error!r}): run again") from error
-    if not is_sound:
+        ]
+    if not all(is_known):
         raise ValueError(f"{path} names frames or outcomes that this run does not have: run again")
     return loops
 
@@ -215,12 +218,10 @@ def _loops(path: Path, count: int) -> list[dict[str, Any]]:
 def render_config(run: RecordedRun) -> RenderConfig:
     """Read how the run drew its map; raises ValueError for settings of another version."""
     settings = {key: value for key, value in run.provenance["config"]["densify"]["render"].items() if key != "_target_"}
-    try:
+    with sound(f"{run.folder}/{METRICS_FILE} has settings of another version"):
         for name, field in declared(RenderConfig).items():
             check_value(f"densify.render.{name}", settings.get(name), field)
         return RenderConfig(**settings)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{run.folder}/metrics.json has settings of another version ({error}): run again") from error
 
 
 class PlacedPaths(NamedTuple):

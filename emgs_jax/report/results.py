@@ -19,11 +19,9 @@ class Estimate:
     """Estimate of one run that was compared with the truth: the map, the raw predictions, or a baseline.
 
     Args:
-        folder: of the result.
         variant: name of the overrides, or of another system.
         kind: "ours", "raw prior", another one of `ROWS`, or "scored" for another system.
         prior: its name; None for another system.
-        is_simulated: made from the ground truth.
         revision: of the code; None where unknown.
         values: the metrics that are numbers.
     """

@@ -8,16 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from emgs_jax.evaluation import protocols
 from emgs_jax.evaluation.clouds import NearestPoints, register
-from emgs_jax.evaluation.protocols import (
-    NAMES,
-    SegmentationProtocol,
-    give_classes,
-    ignored_positions,
-    matrix_metrics,
-    scene_confusion,
-    table_metrics,
-)
+from emgs_jax.evaluation.protocols import NAMES, SegmentationProtocol, ignored_positions, matrix_metrics
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.gaussian_map import confirmed
@@ -44,7 +37,6 @@ class Placement:
         by: `trajectory`, the alignment of the poses; or `points`, from there a rigid ICP of the centres onto the truth.
         with_scale: the alignment of the poses estimates a scale, too.
         icp_distance_m: pairs of ICP are nearer than this.
-        icp_max_steps: of ICP.
     """
 
     by: str
@@ -58,7 +50,6 @@ class SceneResult:
     """One map against the truth of its scene.
 
     Args:
-        is_simulated: the prior is made from the truth.
         confusion: see `scene_confusion`.
         about: how the map was placed, and counts.
         ate_m: of the trajectory, Sim(3); None where unknown.
@@ -112,8 +103,8 @@ def score_scene(
     cosines = np.asarray(similarities(gaussians, jnp.asarray(vectors, jnp.float32)))[rows]
     has_feature = np.asarray(gaussians.features)[rows].any(1)
     ignored = ignored_positions(truth.classes, protocol)
-    labels = give_classes(cosines, has_feature, truth.labels, ignored, protocol)
-    confusion = scene_confusion(LabelledPoints(points, labels, truth.classes), truth, ignored, protocol)
+    labels = protocols.give_classes(cosines, has_feature, truth.labels, ignored, protocol)
+    confusion = protocols.scene_confusion(LabelledPoints(points, labels, truth.classes), truth, ignored, protocol)
     distances = NearestPoints(points).query(truth.points)[0] if len(points) else np.array([np.inf])
     about |= {"num_gaussians": len(rows), "num_with_class": int((labels >= 0).sum())}
     about |= {"num_true_points": len(truth.points), "median_distance_to_map_m": float(np.median(distances))}
@@ -130,24 +121,15 @@ def summary(
     total = np.sum([result.confusion for result in results], axis=0)
     right, true = np.diagonal(total), total.sum(1)
     union = true + total.sum(0)[: len(classes)] - right
-    by_class = {
-        name: {
-            "iou_percent": 100.0 * right[row] / union[row],
-            "recall_percent": 100.0 * right[row] / true[row] if true[row] else None,
-            "num_true": int(true[row]),
-        }
-        for row, name in enumerate(classes)
-        if union[row] > 0
-    }
     ates = [result.ate_m for result in results]
+    mean_ate = {"ate_sim3_m": None if None in ates else float(np.mean(ates))}
     return {
         "format": FORMAT,
         "version": VERSION,
         "protocol": asdict(protocol),
         "placement": asdict(how),
         "simulated": any(result.is_simulated for result in results),
-        "total": table_metrics([result.confusion for result in results], ignored, protocol)
-        | {"ate_sim3_m": None if None in ates else float(np.mean(ates))},
+        "total": protocols.table_metrics([result.confusion for result in results], ignored, protocol) | mean_ate,
         "scenes": [
             {"scene": result.scene, "map": result.folder, "simulated": result.is_simulated, "ate_sim3_m": result.ate_m}
             | matrix_metrics(result.confusion, ignored, protocol)
@@ -156,7 +138,15 @@ def summary(
             for result in results
         ],
         "classes": list(classes),
-        "by_class": by_class,
+        "by_class": {
+            name: {
+                "iou_percent": 100.0 * right[row] / union[row],
+                "recall_percent": 100.0 * right[row] / true[row] if true[row] else None,
+                "num_true": int(true[row]),
+            }
+            for row, name in enumerate(classes)
+            if union[row] > 0
+        },
     }
 
 

@@ -22,7 +22,6 @@ def write_sweep_page(folder: Path, block: Mapping[str, Any], rows: Rows, axes: S
         folder: of the sweep, with heat_map.png and pictures where there are any.
         block: the provenance that all settings share.
         rows: a flat row for each setting, at least one.
-        axes: their keys.
         command: that repeats the sweep; "" where nobody knows.
     """
     columns = known(MAIN, [Line((), row) for row in rows])

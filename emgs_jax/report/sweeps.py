@@ -30,7 +30,6 @@ class SweepResults:
     """Metrics by setting, on disk after each `add`; a folder that holds some of the same sweep is continued.
 
     Args:
-        folder: of the results.
         provenance: what all settings share. Results of other data, predictions, values or code are not mixed with
             these: ValueError.
     """

@@ -117,11 +117,9 @@ def draw_trials(
     """Draw the first objective over the second, or over the trials where there is but one, and write it as PNG.
 
     Args:
-        path: of the picture.
         rows: of trials: `trial`, its number, and the objectives, which may be None.
         objectives: metric -> direction.
         named: words of the trials that are marked, by their number.
-        title: of the picture.
 
     Returns:
         None, or why there is no picture.

@@ -39,10 +39,6 @@ def _alone(method: Callable) -> Callable:
 class Viewer:
     """A run that is being served until `stop`.
 
-    Args:
-        run: that is shown.
-        port: to listen on.
-
     Raises:
         ValueError: the port is taken, or viser is not installed.
     """

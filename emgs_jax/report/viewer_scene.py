@@ -27,8 +27,6 @@ class Shown:
         frames: what is known of each, as in frames.jsonl.
         poses: T_world_camera of `frames`, (n, 4, 4).
         truth: true camera centres in the frame of the map, (n, 3); nan where unknown.
-        camera: of the frames.
-        render: how the map is drawn.
         image: of the last frame, uint8 (h, w, 3); None where nobody has it.
     """
 
@@ -55,11 +53,7 @@ def shown(run: RecordedRun) -> Shown:
 
 
 class Scene:
-    """The scene of a viser server.
-
-    Args:
-        server: whose scene is empty.
-    """
+    """The scene of a viser server."""
 
     def __init__(self, server: Any) -> None:
         self._server, self._scene = server, server.scene

@@ -130,6 +130,45 @@ def test_poses_are_the_published_poses_of_the_colour_camera(shared_data):
         assert (Rotation.from_matrix(frame.T_world_camera[:3, :3]).inv() * rotation).magnitude() < 2e-4
 
 
+def write_poses(path, poses, sequence="seq-01"):
+    """A list of pseudo ground truth of poses by frame number, among lines of another sequence."""
+    lines = ["# file qw qx qy qz tx ty tz focal", "seq-02/frame-000000.color.png 1 0 0 0 9 9 9 525", ""]
+    for number, T_world_camera in poses.items():
+        T = np.linalg.inv(T_world_camera)
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+        numbers = " ".join(map(str, [w, x, y, z, *T[:3, 3], 525.5]))
+        lines.append(f"{sequence}/frame-{number:06d}.color.png {numbers}")
+    path.write_text("\n".join(lines))
+    return str(path)
+
+
+def test_given_poses_are_the_truth_in_place_of_the_files_and_part_of_the_fingerprint(seven_scenes_root, tmp_path):
+    poses = {0: scene_pose(2), 2: scene_pose(1)}
+    path = write_poses(tmp_path / "sfm.txt", poses)
+    with open(path, "a") as file:
+        file.write("\nseq-01/frame-000001.color.png nan nan nan nan nan nan nan 525")  # the camera was lost there
+    for registered, T in ((True, np.eye(4)), (False, T_COLOR_DEPTH)):
+        plain, given = (load(seven_scenes_root, register_depth=registered, poses=p) for p in (None, path))
+        for index, pose in poses.items():
+            np.testing.assert_allclose(given[index].T_world_camera, pose @ T, atol=1e-7)
+            np.testing.assert_array_equal(given[index].depth, plain[index].depth)
+        assert given.pose(1) is None and given[1].T_world_camera is None
+        before = given.fingerprint()
+        assert before != plain.fingerprint()
+    write_poses(tmp_path / "sfm.txt", poses | {0: scene_pose(1)})
+    assert load(seven_scenes_root, register_depth=False, poses=path).fingerprint() != before
+
+
+def test_a_list_of_poses_that_is_damaged_or_of_another_sequence_is_refused(seven_scenes_root, tmp_path):
+    path = write_poses(tmp_path / "sfm.txt", {0: scene_pose(0)}, "seq-03")
+    with pytest.raises(ValueError, match="sfm.txt has no line of seq-01"):
+        load(seven_scenes_root, poses=path)
+    for line in ("1 0 0", "0 0 0 0 1 1 1 525", "1 0 x 0 1 1 1 525"):
+        Path(path).write_text(f"seq-01/frame-000000.color.png {line}")
+        with pytest.raises(BadFrameError, match="sfm.txt line 1 is no pose"):
+            load(seven_scenes_root, poses=path)
+
+
 def test_registration_brings_real_points_and_colours_together(shared_data, depth_gaps):
     """The README's check of the calibration: .98 with registration, .94 with 585 for the colour camera."""
     scores = {}

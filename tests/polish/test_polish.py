@@ -15,8 +15,10 @@ from omegaconf import OmegaConf
 
 from emgs_jax.data.spool import Spool
 from emgs_jax.ops.camera import Camera
-from emgs_jax.polish.fit import Rates, fit, is_held_out
+from emgs_jax.polish.fit import Rates, Views, fit, is_held_out, locate
+from emgs_jax.polish.seeds import Seeds
 from emgs_jax.polish.splats import Anchors, Appearance, draw, gaussians_of, initial, loss, ssim
+from emgs_jax.render.densify import DenseView
 from emgs_jax.report.polish import polish
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.running import configure
@@ -59,7 +61,7 @@ def frames():
         T = jaxlie.SE3.from_matrix(jnp.asarray(pose, jnp.float32))
         drawn = jax.jit(draw)(gaussians, opacity, T, CAMERA, settings.loss.render)
         spool.append(np.concatenate([drawn.values, drawn.depth[..., None]], axis=-1).astype(np.float32))
-    return spool, POSES
+    return Views(spool, POSES, np.zeros((2, 6, 6)))
 
 
 def test_the_gradient_is_that_of_finite_differences(frames):
@@ -70,7 +72,7 @@ def test_the_gradient_is_that_of_finite_differences(frames):
     means = ANCHORS.means.at[:, 2].add(0.2 * ANCHORS.means[:, 0] + 0.13 * ANCHORS.means[:, 1])
     anchors = eqx.tree_at(lambda a: a.means, ANCHORS, means)
     at = jax.tree.map(lambda x: x + jnp.asarray(rng.uniform(-0.2, 0.2, x.shape), jnp.float32), begin)
-    target, T = jnp.asarray(frames[0][0]), sc.pose()
+    target, T = jnp.asarray(frames.targets[0]), sc.pose()
     value = jax.jit(lambda fitted: loss(fitted, anchors, target, T, CAMERA, settings.loss)[0])
     slope = jax.jit(jax.grad(value))(at)
     for name in ("colors", "logit", "log_std", "turn", "shift"):
@@ -87,16 +89,65 @@ def test_the_gradient_is_that_of_finite_differences(frames):
         np.testing.assert_allclose(leaf[row], found, rtol=0.1, err_msg=name)  # float32, and a curved loss
 
 
+def test_the_gradient_by_the_pose_is_that_of_finite_differences(frames):
+    """Splats in other colours than the target's, so that no term is at its minimum."""
+    settings, target = fitting(), jnp.asarray(frames.targets[0])
+    begin = initial(jnp.asarray(COLORS[::-1].copy()), jnp.float32(settings.opacity))
+    value = jax.jit(lambda xi: loss(begin, ANCHORS, target, jaxlie.SE3.exp(xi), CAMERA, settings.loss)[0])
+    at = jnp.asarray([0.02, -0.03, 0.05, 0.01, -0.02, 0.03])
+    slope = np.asarray(jax.jit(jax.grad(value))(at))
+    steps = 2e-3 * np.eye(6)
+    found = [(float(value(at + step)) - float(value(at - step))) / 4e-3 for step in steps]
+    np.testing.assert_allclose(slope, found, rtol=0.1, atol=0.03 * np.abs(slope).max())
+
+
 def test_the_colours_of_a_map_that_was_drawn_are_recovered_and_its_shape_stays(frames, tmp_path):
     settings = fitting("polish.steps=300", "polish.rates.colors=0.05", "polish.final_rate=0.01", "polish.loss.dssim=0")
-    settings = replace(settings, rates=Rates(settings.rates.colors, 0.0, 0.0, 0.0, 0.0))
-    fitted = fit(ANCHORS, np.full_like(COLORS, 0.5), frames, CAMERA, settings, tmp_path / "state.npz")
+    settings = replace(settings, rates=Rates(settings.rates.colors, 0.0, 0.0, 0.0, 0.0, 1.0))
+    fitted, poses = fit(ANCHORS, np.full_like(COLORS, 0.5), frames, CAMERA, settings, tmp_path / "state.npz")
     gaussians, _ = gaussians_of(ANCHORS, fitted)
     pixels = np.asarray(ANCHORS.means)[:, :2] / 2.0 * [20.0, 23.0] + [14.5, 12.25]
     inside = ((pixels > 1) & (pixels < [30, 22])).all(1)
     assert inside.sum() > 30
     np.testing.assert_allclose(np.asarray(gaussians.colors)[inside], COLORS[inside], atol=0.01)
     np.testing.assert_array_equal(gaussians.means, ANCHORS.means)
+    np.testing.assert_array_equal(poses, POSES, "without a spread")
+
+
+def test_poses_that_are_off_find_back_to_where_the_images_were_taken(frames, tmp_path):
+    """Both in the fit and on splats that stay; the splats are the true ones, so only the poses can be wrong."""
+    settings = fitting("polish.steps=80", "polish.pose_steps=40", "polish.final_rate=0.01", "polish.loss.dssim=0")
+    settings = replace(settings, rates=Rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.3))
+    spread = np.diag([0.03] * 3 + [0.01] * 3)
+    xi = spread @ np.random.default_rng(3).choice([-1.0, 1.0], (2, 6, 1))
+    off = POSES @ np.asarray(jax.vmap(lambda x: jaxlie.SE3.exp(x).as_matrix())(jnp.asarray(xi[..., 0], jnp.float32)))
+    views = Views(frames.targets, off, np.stack([spread] * 2))
+    fitted, found = fit(ANCHORS, COLORS, views, CAMERA, settings, tmp_path / "state.npz")
+    for poses in (found, locate(ANCHORS, fitted, views, CAMERA, settings)):
+        error, before = (np.linalg.norm((p - POSES)[:, :3], axis=(1, 2)) for p in (poses, off))
+        assert (error < 0.2 * before).all()
+
+
+def test_splats_that_find_no_room_get_it_and_the_fit_is_that_with_room_from_the_start(frames, tmp_path):
+    settings = [fitting("polish.steps=2", f"polish.loss.render.tile_capacity={room}") for room in (8, 512)]
+    few, many = (fit(ANCHORS, COLORS, frames, CAMERA, s, tmp_path / "state.npz")[0] for s in settings)
+    jax.tree.map(np.testing.assert_array_equal, few, many)
+
+
+def test_a_frame_makes_no_splats_where_it_sees_a_surface_from_the_side_or_beside_a_silhouette():
+    """A wall at 2 m, the left half of which is a box's face at 1 m; the wall's right quarter is seen along it."""
+    depth = np.where(np.arange(32) < 16, 1.0, 2.0) * np.ones((24, 1))
+    rays = (np.stack(np.meshgrid(np.arange(32), np.arange(24)), -1) - [14.5, 12.25]) / [20.0, 23.0]
+    points = np.concatenate([rays, np.ones((24, 32, 1))], -1) * depth[..., None]
+    normals = np.zeros_like(points) + [0, 0, -1.0]
+    normals[:, 24:] = np.array([-1.0, 0, 0.45]) / np.hypot(1, 0.45)  # a cosine of .26 at most
+    is_there = np.ones((24, 32), bool)
+    view = DenseView(points, normals, np.zeros_like(points), depth, is_there, is_there, None)
+    seeds = Seeds(CAMERA, 1)
+    seeds.add(view, np.zeros((24, 32, 3)), np.eye(4))
+    anchors, _ = seeds.anchors(lambda means, normals: np.ones(len(means)))
+    columns = np.rint(np.asarray(anchors.means)[:, 0] / np.asarray(anchors.means)[:, 2] * 20 + 14.5).astype(int)
+    assert set(columns) == set(range(24)) - {15, 16}
 
 
 def test_a_fit_that_was_stopped_goes_on_to_the_same_bits(frames, tmp_path):

@@ -12,6 +12,7 @@ from emgs_jax.report.columns import (
     Table,
     aligned,
     cell,
+    known,
     markdown,
     metric_table,
     transposed,
@@ -54,6 +55,7 @@ def test_a_table_is_markdown_or_aligned_text_and_the_best_of_several_rivals_is_m
         Line([name], {column.key: value}, rivals=rivals)
         for name, value, rivals in (("a", 0.02, 0), ("bcd", 0.1, 0), ("e", None, 0), ("f", 0.01, 1), ("g", 0.01, None))
     ]
+    assert known([*MAIN[1:], column], lines) == [column] and known([column], lines[2:3]) == []
     table = metric_table([""], [column], lines)
     assert [line[1] for line in table.lines] == [Cell("2", "best"), Cell("10"), Cell(DASH), Cell("1"), Cell("1")]
     table = table._replace(lines=table.lines[:2])

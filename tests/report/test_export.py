@@ -205,3 +205,25 @@ def test_the_command_writes_the_images_that_the_run_was_made_of(tmp_path):
     assert found == [tmp_path / "there" / "colmap"]
     image = cv2.cvtColor(cv2.imread(str(found[0] / "images" / "000004.png")), cv2.COLOR_BGR2RGB)
     np.testing.assert_array_equal(image, dataset()[4].image)
+
+
+def test_images_in_their_own_size_come_with_the_intrinsics_of_that_size(tmp_path):
+    """Twice as large as in the run: the same rays, and blocks of four pixels average to the image in use."""
+    folder, used = written_run(tmp_path / "run"), dataset()
+    save_points_ply(folder / "points.ply", np.ones((3, 3)), np.ones((3, 3)), np.ones((3, 3)))
+    path, size = folder / "metrics.json", [2 * side for side in used.size]
+    metrics = json.loads(path.read_text())
+    metrics["provenance"]["data"]["camera"] = {"size": size}
+    path.write_text(json.dumps(metrics))
+    words = f"folder='{folder}'", "formats=[colmap]", "images=original", f"out='{tmp_path / 'there'}'"
+    found = export_run(configure.compose(*words, name="export"))
+    image = cv2.cvtColor(cv2.imread(str(found[0] / "images" / "000004.png")), cv2.COLOR_BGR2RGB)
+    assert image.shape == (size[1], size[0], 3)
+    blocks = image.reshape(size[1] // 2, 2, size[0] // 2, 2, 3).mean((1, 3))
+    assert np.abs(blocks - used[4].image).mean() < 6
+    line = (found[0] / "sparse" / "0" / "cameras.txt").read_text().splitlines()[-1].split()
+    assert line[1:4] == ["PINHOLE", *map(str, size)]
+    fx, fy, cx, cy = used.intrinsics
+    np.testing.assert_allclose([float(v) for v in line[4:]], [2 * fx, 2 * fy, 2 * cx + 1, 2 * cy + 1], rtol=1e-6)
+    with pytest.raises(ValueError, match="images must be one of used, original|images"):
+        export_run(configure.compose(*words[:2], "images=large", name="export"))

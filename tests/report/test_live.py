@@ -15,7 +15,6 @@ from emgs_jax.gaussian_map import new_map
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report import live
 from emgs_jax.report.live import LiveConfig, live_view
-from emgs_jax.report.viewer import HOST
 from emgs_jax.running.configure import build
 from emgs_jax.running.record import FrameRecord
 from experiments.sweep import sweep
@@ -54,7 +53,7 @@ def served(run, config, kept=range(NUM_FRAMES)):
 def test_what_is_served_follows_the_run_and_at_its_end_is_the_whole_of_it(at_once):
     run, counts = GrowingRun(), []
     with served(run, LiveConfig(free_port(), 0.0), kept=[0, 2, 4, 6]) as view:
-        assert view.viewer.server.get_host() == HOST and "No frame" in view.viewer.facts.content
+        assert view.viewer.server.get_host() == "127.0.0.1" and "No frame" in view.viewer.facts.content
         view.viewer.words.value = "left"  # asked before there is a map
         for seen in view.watch(run.views(), run):
             view.wait()

@@ -10,6 +10,7 @@ from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.report.colors import PATHS, class_colors, rgb
 from emgs_jax.report.overview import (
     Paths,
+    _draw_frames,
     _draw_map,
     below_ceiling,
     draw_overview,
@@ -136,6 +137,10 @@ def test_lengths_are_metres_only_where_that_is_known():
         poses = path_along([1.0, -0.5, 0.0])
         _draw_map(axes, a_cloud(), Paths(poses, np.ones(5, bool), unit=unit))
         assert axes.get_xlabel() == shown and [text.get_text().split()[1] for text in axes.texts] == [unit]
+        grid, depth = Figure().subplots(1, 3, squeeze=False), np.ones((4, 5))
+        frame = {"image": np.zeros((4, 5, 3)), "rendered_color": np.zeros((4, 5, 3)), "title": "frame 0"}
+        _draw_frames(grid, [frame | {"rendered_depth": depth, "valid": depth > 0}], unit)
+        assert grid[0, 0].figure.axes[-1].get_ylabel() == f"depth [{unit}]"
         assert not any(spine.get_visible() for spine in axes.spines.values())
         ends = [(line.get_marker(), *line.get_xydata().T) for line in axes.lines if line.get_marker() in ("o", "s")]
         path = poses[:, :3, 3] @ view_from_above(poses).T

@@ -193,7 +193,6 @@ def damage(name: str, before: str, after: str):
     [
         (damage("metrics.json", '"emgs_jax": ', '"emgs_jaz": '), "provenance.versions.emgs_jax is None"),
         (damage("metrics.json", '"git": null', '"git": {"a": 1}'), "git has no revision"),
-        (damage("metrics.json", '"git": null', '"gut": null'), "provenance.git is None"),
         (damage("metrics.json", '"protocol": "', '"prottocol": "'), "provenance.protocol is None"),
         (
             ("metrics.json", lambda text: re.sub('"tile_batch": [0-9]+', '"tile_batch": null', text)),

@@ -36,57 +36,43 @@ def test_the_best_of_each_column_is_bold_low_errors_and_high_scores():
     assert sum(text.startswith("**") for line in lines for text in line) == 2
 
 
-def drawn(monkeypatch, tmp_path, rows, axes):
-    """The arguments with which the picture is drawn."""
+@pytest.fixture
+def drawn(monkeypatch, tmp_path):
+    """`draw` with the maps and the title of the picture in place of it."""
     calls = []
-    monkeypatch.setattr(heat_map, "draw_heat_maps", lambda *arguments: calls.append(arguments))
-    reason = draw(tmp_path / "map.png", rows, axes, "a sweep")
-    return reason, calls
+    monkeypatch.setattr(heat_map, "draw_heat_maps", lambda _, *arguments: calls.append(arguments))
+    return lambda rows, axes: (draw(tmp_path / "map.png", rows, axes, "a sweep"), calls)
 
 
-def test_the_picture_has_the_value_of_each_setting_at_its_place(monkeypatch, tmp_path):
-    reason, ((_, maps, rows, columns, title),) = drawn(monkeypatch, tmp_path, grid(), AXES)
-    assert reason is None and title == "a sweep"
-    assert rows == ("slam.em.noise", ["0.5", "1.0"]) and columns == ("slam.em.min_std", ["0.01", "0.02", "0.03"])
+def test_the_picture_has_the_value_of_each_setting_at_its_place_as_means_over_other_axes(drawn):
+    rows = [row | {"slam.window_size": size, ATE: row[ATE] * size} for row in grid() for size in (1, 3)]
+    reason, ((maps, down, across, title),) = drawn(rows, AXES | {"slam.window_size": [1, 3]})
+    assert reason is None and title == "a sweep, means over slam.window_size"
+    assert (down, across) == (("slam.em.noise", ["0.5", "1.0"]), ("slam.em.min_std", ["0.01", "0.02", "0.03"]))
     (ate, errors), (f1, scores) = maps
-    np.testing.assert_allclose(errors, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_allclose(errors, 2.0 * np.array([[1, 2, 3], [4, 5, 6]]))
     np.testing.assert_allclose(scores, [[10, 20, 30], [40, 50, np.nan]])
     assert (ate.key, f1.key) == (ATE, F1)
 
 
-def test_other_axes_are_averaged_and_named(monkeypatch, tmp_path):
-    rows = [row | {"slam.window_size": size, ATE: row[ATE] * size} for row in grid() for size in (1, 3)]
-    axes = AXES | {"slam.window_size": [1, 3]}
-    _, ((_, maps, _, _, title),) = drawn(monkeypatch, tmp_path, rows, axes)
-    np.testing.assert_allclose(maps[0][1], 2.0 * np.array([[1, 2, 3], [4, 5, 6]]))
-    assert title == "a sweep, means over slam.window_size"
-
-
-def test_without_two_axes_or_without_truth_there_is_no_picture_but_a_reason(monkeypatch, tmp_path):
-    reason, calls = drawn(monkeypatch, tmp_path, grid(), {"slam.em.noise": [0.5, 1.0], "slam.em.min_std": [0.01]})
-    assert "two axes" in reason and not calls
-    blind = [{name: row[name] for name in AXES} for row in grid()]
-    reason, calls = drawn(monkeypatch, tmp_path, blind, AXES)
+def test_without_two_axes_or_without_truth_there_is_no_picture_but_a_reason(drawn):
+    assert "two axes" in drawn(grid(), {"slam.em.noise": [0.5, 1.0], "slam.em.min_std": [0.01]})[0]
+    reason, calls = drawn([{name: row[name] for name in AXES} for row in grid()], AXES)
     assert "no ground truth" in reason and not calls
 
 
-def test_brighter_is_better_in_the_picture_of_either_kind_of_metric(tmp_path):
-    """The same numbers as an error and as a score: the bright end is the other one."""
-    import cv2
-
-    light = {}
-    for key in (ATE, F1):
-        rows = [{name: row[name] for name in AXES} | {key: number} for number, row in enumerate(grid())]
-        assert draw(tmp_path / "map.png", rows, AXES, "") is None
-        image = cv2.imread(str(tmp_path / "map.png"))
-        colored = image.max(axis=-1).astype(int) - image.min(axis=-1) > 60
-        ys, xs = np.nonzero(colored)
-        top, bottom, left, right = ys.min(), ys.max(), xs.min(), xs.max()
-        height, width = (bottom - top) // 8, (right - left) // 12
-        first = image[top + 2 : top + height, left + 2 : left + width]
-        last = image[bottom - height : bottom - 2, right - width : right - 2]
-        light[key] = first.mean(), last.mean()
-    assert light[ATE][0] > light[ATE][1] + 20 and light[F1][1] > light[F1][0] + 20
+def test_brighter_is_better_in_the_picture_of_either_kind_of_metric(tmp_path, monkeypatch):
+    """The same numbers as an error and as a score: the bright end is the other one, and its text is dark."""
+    figures, figure = [], heat_map.Figure
+    monkeypatch.setattr(heat_map, "Figure", lambda **look: figures.append(figure(**look)) or figures[-1])
+    rows = [{name: row[name] for name in AXES} | {ATE: row[ATE], F1: row[ATE]} for row in grid()]
+    assert draw(tmp_path / "map.png", rows, AXES, "") is None
+    for axes, bright in zip(figures[0].axes[:2], ("1.00", "0.1"), strict=True):
+        (image,), texts = axes.images, [(text.get_text(), text.get_color()) for text in axes.texts]
+        light = image.cmap(image.norm(image.get_array()))[..., :3].mean(-1)
+        assert (light[0, 0] > light[1, 2] + 0.1) == (bright == "1.00")
+        assert [text for text, color in texts if color == "black"][:1] == [bright] and len(texts) == 6
+    assert (tmp_path / "map.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_results_are_there_again_when_a_sweep_goes_on_and_rows_come_in_the_order_asked_for(tmp_path):

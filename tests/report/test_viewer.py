@@ -110,11 +110,6 @@ def test_the_field_of_view_is_the_angle_between_the_upper_and_the_lower_edge_of_
     assert np.isclose(field_of_view(Camera((1.0, 50.0), (0.0, 0.0), 30, 100)), np.pi / 2)
 
 
-def test_it_listens_on_this_machine_only(viewer):
-    assert viewer.server.get_host() == "127.0.0.1"
-    assert viewer.address == f"http://127.0.0.1:{viewer.server.get_port()}"
-
-
 def test_words_and_layers_recolour_what_is_served(viewer):
     walls = two_walls()
     is_sofa = np.asarray(walls.features)[:, 1] > 0.5

@@ -31,7 +31,7 @@ def check_all(*overrides: str) -> None:
 
 def test_every_value_of_conf_is_in_its_range():
     """The first options of all groups together, then the second ones, …; what is wrong is named by its full key."""
-    others = ("suite", "sweep", "tune", "experiment", "experiment_on", "protocol")
+    others = ("suite", "sweep", "tune", "experiment", "experiment_on", "densify_on", "protocol")
     options = {group: names for group, names in groups().items() if group not in others}
     options["baseline"] = [name for name in options["baseline"] if name != "smoke"]
     for place in range(max(map(len, options.values()))):

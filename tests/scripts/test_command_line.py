@@ -96,7 +96,7 @@ def test_the_help_of_a_run_lists_exactly_the_choices_that_there_are(monkeypatch,
         if name in own
     }
     own["baseline"].remove("smoke")  # a file of the gate, which is no option
-    of_other_commands = {"experiment_on", "protocol", "suite", "sweep", "tune"}
+    of_other_commands = {"densify_on", "experiment_on", "protocol", "suite", "sweep", "tune"}
     stages = {name for name in own if name.startswith("slam/")}
     assert listed == {name: own[name] for name in {*own} - of_other_commands - stages | {"slam/em"}}
     assert {*re.findall(r"slam/\w+", lines["slam/em"]), "slam/em"} == stages

@@ -40,7 +40,6 @@ def test_a_video_stands_for_the_keys_that_map_it_and_one_line_says_so(video, cap
         "dataset.size": "[336,224]",
         "dataset.intrinsics": "estimate",
         "prior": "multiview_stereo",
-        "densify.points": "own",
         "graph": "up_to_scale",
     }
     said = capsys.readouterr().out
@@ -60,11 +59,9 @@ def test_a_folder_has_the_intrinsics_of_its_exif_where_there_are_any(tmp_path):
 def test_keys_that_are_given_win(video):
     given = ["dataset.intrinsics=[90,90,48,32]", "dataset.size=[64,48]", "graph=none", "dataset.stride=2"]
     found = with_source([*given, str(video)])
-    assert sorted(word for word in found if word in given) == sorted(given) and len(keys_of(found)) == len(found) == 8
+    assert sorted(word for word in found if word in given) == sorted(given) and len(keys_of(found)) == len(found) == 7
     # Another prior may have a unit, another data set its own calibration, and a baseline does without a back end.
-    assert not {"prior", "graph", "densify.points"} & {
-        word.partition("=")[0] for word in with_source([str(video), "prior=files"])[:-1]
-    }
+    assert not {"prior", "graph"} & {word.partition("=")[0] for word in with_source([str(video), "prior=files"])[:-1]}
     assert with_source([str(video), "dataset=tum"])[1:] == ["dataset=tum"]
     assert "graph" not in keys_of(with_source([str(video), "baseline=voxel"]))
 

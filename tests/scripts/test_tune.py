@@ -144,8 +144,6 @@ def test_more_trials_go_on_another_search_is_not_mixed_in_and_one_that_was_told_
     assert experiments.tune.tune([*with_few, "trials=6"], tmp_path)[:4] == rows
     with pytest.raises(ValueError, match=rf"holds a search with search.space.{GATE}.high 20.0, and this one has 10.0"):
         experiments.tune.tune([*with_few, f"space={{{GATE}:{{low:1,high:10,log:true}}}}"], tmp_path)
-    with pytest.raises(ValueError, match=r"em\.noise 1\.0, and this one has 0\.5: .*another folder"):
-        experiments.tune.tune([*with_few, "slam.em.noise=0.5"], tmp_path)
 
 
 def test_a_metric_that_is_none_is_named_and_a_trial_without_a_value_fails_and_the_others_go_on(

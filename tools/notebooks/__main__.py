@@ -42,7 +42,7 @@ def kept(outputs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for data in (output.get("data", {}) for output in found):
         if "image/png" in data:
             data["image/png"] = small(data["image/png"])
-        if len(data.get("text/html", "")) > MAX_PAGE:
+        if len("".join(data.get("text/html", ""))) > MAX_PAGE:
             del data["text/html"]
     return found
 

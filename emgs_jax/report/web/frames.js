@@ -45,6 +45,8 @@ function showPictures(report, row) {
     if (content) $(id).src = `data:image/jpeg;base64,${content}`;
     $(id).hidden = !content;
   });
+  report.state.image = nearest && !away(nearest) && nearest[1] ? $("seen") : null;
+  $("seen").onload = () => report.moved(); // it is in the frame's pyramid, too
 }
 
 // A click: the Gaussian in front there; its numbers, or an end of the ruler.

@@ -10,7 +10,6 @@ function turbo(share) {
           of([0.1067, 12.6419, -60.5820, 110.3628, -89.9031, 27.3482])];
 }
 
-const NO_CLASS = [90, 96, 104];
 // By the scale of a layer: the number that is shown, and its text in the legend.
 const SCALES = {
   share: { of: (value) => value / 255, text: (v) => v.toFixed(2) },
@@ -52,7 +51,7 @@ class Layers {
       let color = own;
       if (name === "class") {
         const label = arrays.label[row];
-        color = label < 0 ? NO_CLASS : ABOUT.classColors[label];
+        color = label < 0 ? ABOUT.noClass : ABOUT.classColors[label];
         if (word >= 0 && label !== word) color = faded(own);
       } else if (name === "feature") {
         color = arrays.feature.subarray(3 * row, 3 * row + 3);

@@ -2,7 +2,7 @@
 "use strict";
 
 const $ = (id) => document.getElementById(id);
-const BACKGROUND = [0.086, 0.098, 0.118];
+const BACKGROUND = [0.086, 0.098, 0.118], LIGHT = [0.957, 0.965, 0.976];
 const SLOW = 60; // ms; a drawing that takes longer is drawn coarsely while the view moves
 const FEW = 20000; // Gaussians that are drawn coarsely
 const FOCAL = 0.9; // heights of the window, unless a frame is chosen
@@ -11,7 +11,7 @@ const REST = 200; // ms without a move until it is drawn in full
 async function start() {
   const arrays = await readArrays();
   const state = { frame: 0, view: null, pivot: ABOUT.pivot, size: ABOUT.size, focal: FOCAL, flies: false,
-                  atFrame: false, ruler: [], measures: false, paths: {}, seesThrough: true };
+                  atFrame: false, image: null, ruler: [], measures: false, paths: {}, seesThrough: true };
   const report = { state, arrays, frameTime: 0 };
   window.report = report; // for the tests, and whoever is curious
   wireStrip(report);
@@ -134,6 +134,10 @@ function wireChoices(report) {
     box.addEventListener("input", show);
     show();
   }
+  $("light").addEventListener("input", () => {
+    splats.background = $("light").checked ? LIGHT : BACKGROUND;
+    report.moved();
+  });
   $("through").addEventListener("input", () => { state.seesThrough = $("through").checked; report.moved(); });
   $("home").addEventListener("click", report.home);
   $("fly").addEventListener("click", () => {

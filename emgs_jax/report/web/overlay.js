@@ -1,6 +1,8 @@
 // Lines over the map: paths, the camera of the chosen frame, loops and the ruler.
 "use strict";
 
+const CELLS = 12; // along each side of an image
+
 class Overlay {
   constructor(canvas, arrays, state) {
     Object.assign(this, { canvas, arrays, state, context: canvas.getContext("2d") });
@@ -43,7 +45,7 @@ class Overlay {
     for (const [name, color] of Object.entries(ABOUT.paths))
       if (state.paths[name] && arrays[name]) this.path(arrays[name], color, name === "poses" ? 2.5 : 1.5);
     if (state.paths.loops) this.loops();
-    if (!state.atFrame) this.camera(state.frame);
+    if (!state.atFrame) this.camera(state.frame, pixel, view);
     this.ruler(pixel, view);
     if (state.atFrame) this.border(pixel);
   }
@@ -66,17 +68,36 @@ class Overlay {
       if (outcome === "accepted") this.segment(place(frame), place(other), ABOUT.paths.loops, 1);
   }
 
-  // The chosen frame's camera as a pyramid of a twentieth of the map's size.
-  camera(frame) {
+  // The chosen frame's camera as a pyramid of a twentieth of the map's size, with its image at the far side.
+  camera(frame, pixel, view) {
     const pose = poseAt(this.arrays.poses, frame);
     const { fx, fy, cx, cy, width, height } = ABOUT.camera, far = 0.06 * this.state.size;
     const at = (x, y) => toWorld(pose, mul([(x - cx) / fx, (y - cy) / fy, 1], far));
+    this.image((x, y) => toCamera(view, at(x * width, y * height)), pixel);
     const corners = [at(0, 0), at(width, 0), at(width, height), at(0, height)];
     corners.forEach((corner, k) => {
       this.segment(pose.position, corner, "#ffffff", 1.5);
       this.segment(corner, corners[(k + 1) % 4], "#ffffff", 1.5);
     });
     this.dot(pose.position, "#ffffff", 4);
+  }
+
+  // The image of the chosen frame, in cells that are small enough to be drawn as parallelograms; place(x, y): where a
+  // share of its width and height is, before the camera of the view.
+  image(place, pixel) {
+    const { context, state } = this, picture = state.image;
+    if (!picture || !picture.complete || !picture.naturalWidth) return;
+    const [w, h] = [picture.naturalWidth / CELLS, picture.naturalHeight / CELLS];
+    for (let row = 0; row < CELLS; row++)
+      for (let column = 0; column < CELLS; column++) {
+        const corners = [[column, row], [column + 1, row], [column, row + 1]];
+        const points = corners.map(([x, y]) => place(x / CELLS, y / CELLS));
+        if (points.some((point) => point[2] < 0.02)) continue;
+        const [p, q, r] = points.map(pixel);
+        context.setTransform((q[0] - p[0]) / w, (q[1] - p[1]) / w, (r[0] - p[0]) / h, (r[1] - p[1]) / h, p[0], p[1]);
+        context.drawImage(picture, column * w, row * h, w, h, 0, 0, w + 0.5, h + 0.5); // without seams
+      }
+    context.resetTransform();
   }
 
   // What the chosen frame's image shows, where the view is its camera.
@@ -107,6 +128,7 @@ class Overlay {
   }
 }
 
-function lengthText(meters) {
-  return (meters < 1 ? `${(100 * meters).toFixed(1)} cm` : `${meters.toFixed(2)} m`) + ABOUT.unitNote;
+function lengthText(length) {
+  if (!ABOUT.isMetric) return `${length.toPrecision(3)} units`;
+  return length < 1 ? `${(100 * length).toFixed(1)} cm` : `${length.toFixed(2)} m`;
 }
