@@ -155,10 +155,10 @@ def test_what_an_alignment_by_poses_leaves_open_is_closed_by_the_points_but_for_
 def test_the_raw_priors_rendering_is_its_own_depth_at_the_scale_of_its_own_path():
     """Raw lengths are 1 / 1.25 of the true ones, ours half: half of each view is right, the rest is not there."""
     scene, spool = Scene(), Spool()
-    depth = np.full((6, 8), 2.0 / 1.25, np.float32)
-    depth[:3] = 0.0
+    points = np.full((6, 8, 3), 2.0 / 1.25, np.float32)
+    points[:3] = 0.0
     for _ in range(len(Room())):
-        spool.append(depth)
+        spool.append(points)
     scorer = dataclasses.replace(scene.scorer(), dataset=Room())
     metrics = score_prior(scene.run(), RawPrior(scene.raw_prior().cloud, spool), scorer)
     assert metrics["raw_prior/rendering/coverage_percent"] == 50.0
