@@ -150,7 +150,7 @@ def fit(
     first, state = _read(path, state, signature)
     for number_ in range(first, config.steps):
         epoch, place = divmod(number_, count)
-        row = np.random.default_rng((config.seed, epoch)).permutation(count)[place]
+        row = int(np.random.default_rng((config.seed, epoch)).permutation(count)[place])
         decay = jnp.float32(config.final_rate ** (number_ / max(config.steps - 1, 1)))
         (state, error), terms = with_room(partial(step, state, anchors, view_of(views, row), decay), terms)
         on_step(number_, -10.0 * float(np.log10(max(float(error), 1e-12))))
@@ -187,7 +187,7 @@ def locate(anchors: Anchors, fitted: Appearance, views: Views, camera: Camera, c
     return placed(views, jnp.stack(offsets))
 
 
-def with_room(call: Callable[[LossConfig], tuple[Result, Array]], terms: LossConfig) -> tuple[Result, LossConfig]:
+def with_room(call: Callable[[LossConfig], tuple[Result, Array | int]], terms: LossConfig) -> tuple[Result, LossConfig]:
     """Call with room for all splats in the tiles' lists: twice as much as long as some have none, and kept then.
 
     Args:

@@ -155,7 +155,7 @@ def _drawn(splats: Gaussians, opacity: jax.Array, T: jaxlie.SE3, camera: Camera,
 def _picture(*arguments: Any) -> tuple[Rendering, int]:
     """The splats on the host, and how many had no room."""
     drawn = jax.device_get(_drawn(*arguments))
-    return drawn, drawn.overflow
+    return drawn, int(drawn.overflow)
 
 
 def _compare(

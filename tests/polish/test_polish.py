@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -18,7 +19,6 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.fit import Rates, Views, fit, is_held_out, locate
 from emgs_jax.polish.seeds import Seeds
 from emgs_jax.polish.splats import Anchors, Appearance, draw, gaussians_of, initial, loss, ssim
-from emgs_jax.render.densify import DenseView
 from emgs_jax.report.polish import polish
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.running import configure
@@ -142,7 +142,7 @@ def test_a_frame_makes_no_splats_where_it_sees_a_surface_from_the_side_or_beside
     normals = np.zeros_like(points) + [0, 0, -1.0]
     normals[:, 24:] = np.array([-1.0, 0, 0.45]) / np.hypot(1, 0.45)  # a cosine of .26 at most
     is_there = np.ones((24, 32), bool)
-    view = DenseView(points, normals, np.zeros_like(points), depth, is_there, is_there, None)
+    view = SimpleNamespace(points=points, normals=normals, depth=depth, valid=is_there)
     seeds = Seeds(CAMERA, 1)
     seeds.add(view, np.zeros((24, 32, 3)), np.eye(4))
     anchors, _ = seeds.anchors(lambda means, normals: np.ones(len(means)))
