@@ -50,7 +50,6 @@ LAYERS = {  # web/layers.js paints them likewise
     "birth": Layer("frame of birth", "birth", "number"),
 }
 ALWAYS = ("color", "normal", "existence", "updates", "birth")  # arrays that every map has
-_SCALES = {"share": lambda values: values / 255.0, "count": lambda values: np.log10(1.0 + values), "number": np.float64}
 
 
 def layers_of(arrays: Collection[str]) -> dict[str, Layer]:
@@ -69,7 +68,7 @@ def painted(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
         return to_bytes(0.5 + values / 254.0)
     if not layer.scale:
         return values
-    numbers = _SCALES[layer.scale](values)
+    numbers = np.log10(1.0 + values) if layer.scale == "count" else values.astype(np.float64)
     low, high = np.percentile(numbers, [1, 99]) if len(numbers) else (0.0, 1.0)
     return to_bytes(matplotlib.colormaps["turbo"]((numbers - low) / (high - low if high > low else 1.0))[:, :3])
 

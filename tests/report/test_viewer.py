@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 
+import matplotlib
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
@@ -96,6 +97,9 @@ def test_layers_are_those_of_the_map(run):
     assert len(np.unique(labels[is_sofa], axis=0)) == len(np.unique(labels[~is_sofa], axis=0)) == 1
     assert (labels[is_sofa][0] != labels[~is_sofa][0]).any()
     np.testing.assert_allclose(painted(layers, "color") / 255, walls.colors, atol=0.5 / 255)
+    ends_and_middle = np.rint(255 * matplotlib.colormaps["turbo"]([0.0, 0.5, 1.0])[:, :3])
+    for name, values in (("updates", [0, 9, 99]), ("birth", [2, 7, 12]), ("existence", [0, 100, 200])):
+        np.testing.assert_array_equal(painted({name: np.repeat(values, 100)}, name)[[0, 150, 299]], ends_and_middle)
 
 
 @pytest.fixture(scope="module")
