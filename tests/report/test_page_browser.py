@@ -202,7 +202,7 @@ INSIDE = """
 const { overlay, state, arrays } = report, { canvas } = overlay, pose = poseAt(arrays.poses, state.frame);
 const { fx, fy, cx, cy, width, height } = ABOUT.camera, lens = report.lens(canvas.width, canvas.height);
 const colors = [];
-for (const [x, y] of [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]]) {
+for (const [x, y] of [[0.15, 0.35], [0.85, 0.35], [0.15, 0.65], [0.85, 0.65]]) { // no edge of the pyramid is there
   const far = mul([(x * width - cx) / fx, (y * height - cy) / fy, 1], 0.06 * state.size);
   const p = toCamera(state.view, toWorld(pose, far));
   const at = [0, 1].map((k) => Math.round((lens.focal[k] * p[k]) / p[2] + lens.center[k]));

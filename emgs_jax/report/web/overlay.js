@@ -95,7 +95,8 @@ class Overlay {
         if (points.some((point) => point[2] < 0.02)) continue;
         const [p, q, r] = points.map(pixel);
         context.setTransform((q[0] - p[0]) / w, (q[1] - p[1]) / w, (r[0] - p[0]) / h, (r[1] - p[1]) / h, p[0], p[1]);
-        context.drawImage(picture, column * w, row * h, w, h, 0, 0, w + 0.5, h + 0.5); // without seams
+        const [right, below] = [w / Math.hypot(q[0] - p[0], q[1] - p[1]), h / Math.hypot(r[0] - p[0], r[1] - p[1])];
+        context.drawImage(picture, column * w, row * h, w, h, 0, 0, w + right, h + below); // a pixel over the next one
       }
     context.resetTransform();
   }
