@@ -187,6 +187,7 @@ class Reads(ast.NodeVisitor):
             is_typed = isinstance(node, ast.arg | ast.AnnAssign) and node.annotation is not None
             if is_typed:
                 words = set(re.findall(r"\w+", ast.unparse(node.annotation)))
+                words |= {f"{word}Config" for word in words}  # `end.config` of a BackEnd is a BackEndConfig
                 name = node.arg if isinstance(node, ast.arg) else last_name(node.target)
                 self.of_name.setdefault(name, set()).update(words & self.names)
         for _ in range(2):  # names for such a name
