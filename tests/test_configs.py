@@ -175,30 +175,21 @@ class Reads(ast.NodeVisitor):
 
     def __init__(self, classes: dict[type, set[str]]) -> None:
         self.names, self.found, self.owner = {module.__name__ for module in classes}, set(), ""
-        self.held: dict[str, set[str]] = {}  # class that is no config, but has one as `config`
         self.of_key: dict[str, set[str]] = {}
         for module, keys in classes.items():
             own = re.sub(r"(?<!^)(?=[A-Z])", "_", module.__name__.removesuffix("Config")).lower()
             for key in keys | {own}:
                 self.of_key.setdefault(key, set()).add(module.__name__)
 
-    def hold(self, tree: ast.AST) -> None:
-        for node in ast.walk(tree):
-            for field in node.body if isinstance(node, ast.ClassDef) else ():
-                if isinstance(field, ast.AnnAssign) and last_name(field.target) == "config":
-                    self.held[node.name] = self.words(field.annotation) & self.names
-
-    def words(self, annotation: ast.AST) -> set[str]:
-        found = set(re.findall(r"\w+", ast.unparse(annotation)))
-        return found.union(*(self.held.get(word, ()) for word in found))
-
     def read(self, tree: ast.AST) -> set[tuple[str, str]]:
         self.of_name = {key: set(names) for key, names in self.of_key.items()}
         for node in ast.walk(tree):
             is_typed = isinstance(node, ast.arg | ast.AnnAssign) and node.annotation is not None
             if is_typed:
+                words = set(re.findall(r"\w+", ast.unparse(node.annotation)))
+                words |= {f"{word}Config" for word in words}  # `end.config` of a BackEnd is a BackEndConfig
                 name = node.arg if isinstance(node, ast.arg) else last_name(node.target)
-                self.of_name.setdefault(name, set()).update(self.words(node.annotation) & self.names)
+                self.of_name.setdefault(name, set()).update(words & self.names)
         for _ in range(2):  # names for such a name
             for node in ast.walk(tree):
                 if isinstance(node, ast.Assign) and len(node.targets) == 1:
@@ -236,10 +227,7 @@ def test_every_field_of_a_config_class_is_read():
     classes = config_classes()
     paths = [path for folder in ("emgs_jax", "experiments") for path in (ROOT / folder).rglob("*.py")]
     reads = Reads(classes)
-    trees = [ast.parse(path.read_text()) for path in paths]
-    for tree in trees:
-        reads.hold(tree)
-    read = set().union(*map(reads.read, trees))
+    read = set().union(*(reads.read(ast.parse(path.read_text())) for path in paths))
     assert {"SlamConfig", "IcpConfig", "DensifyConfig", "EvaluationConfig", "MaskConfig", "SweepConfig"} <= reads.names
     unread = set()
     for module in classes:
