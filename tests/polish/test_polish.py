@@ -55,8 +55,12 @@ COLORS = np.random.default_rng(0).uniform(0.1, 0.9, (len(ANCHORS.means), 3)).ast
 @pytest.fixture(scope="module")
 def frames():
     """What the wall looks like from two poses, in the splats' true colours."""
+    return drawn_from(ANCHORS)
+
+
+def drawn_from(anchors: Anchors) -> Views:
     settings, spool = fitting(), Spool()
-    gaussians, opacity = gaussians_of(ANCHORS, initial(jnp.asarray(COLORS), jnp.float32(settings.opacity)))
+    gaussians, opacity = gaussians_of(anchors, initial(jnp.asarray(COLORS), jnp.float32(settings.opacity)))
     for pose in POSES:
         T = jaxlie.SE3.from_matrix(jnp.asarray(pose, jnp.float32))
         drawn = jax.jit(draw)(gaussians, opacity, T, CAMERA, settings.loss.render)
@@ -64,13 +68,17 @@ def frames():
     return Views(spool, POSES, np.zeros((2, 6, 6)))
 
 
+def tilted() -> Anchors:
+    """The wall at a slant: which splat is in front of which, where the loss jumps, stays as it is."""
+    means = ANCHORS.means.at[:, 2].add(0.2 * ANCHORS.means[:, 0] + 0.13 * ANCHORS.means[:, 1])
+    return eqx.tree_at(lambda a: a.means, ANCHORS, means)
+
+
 def test_the_gradient_is_that_of_finite_differences(frames):
     """Away from where they begin, so that no term is at its minimum; the largest component of each parameter."""
     rng, settings = np.random.default_rng(1), fitting()
     begin = initial(jnp.asarray(COLORS), jnp.float32(settings.opacity))
-    # A wall that is tilted: which splat is in front of which, where the loss jumps, stays as it is.
-    means = ANCHORS.means.at[:, 2].add(0.2 * ANCHORS.means[:, 0] + 0.13 * ANCHORS.means[:, 1])
-    anchors = eqx.tree_at(lambda a: a.means, ANCHORS, means)
+    anchors = tilted()
     at = jax.tree.map(lambda x: x + jnp.asarray(rng.uniform(-0.2, 0.2, x.shape), jnp.float32), begin)
     target, T = jnp.asarray(frames.targets[0]), sc.pose()
     value = jax.jit(lambda fitted: loss(fitted, anchors, target, T, CAMERA, settings.loss)[0])
@@ -114,19 +122,28 @@ def test_the_colours_of_a_map_that_was_drawn_are_recovered_and_its_shape_stays(f
     np.testing.assert_array_equal(poses, POSES, "without a spread")
 
 
-@pytest.mark.xfail(strict=True, reason="half of the way at most, before a wall: polish.poses is not sound yet")
-def test_poses_that_are_off_find_back_to_where_the_images_were_taken(frames, tmp_path):
+def test_poses_that_are_off_find_back_to_where_the_images_were_taken(tmp_path):
     """Both in the fit and on splats that stay; the splats are the true ones, so only the poses can be wrong."""
+    anchors = tilted()
     settings = fitting("polish.steps=80", "polish.pose_steps=40", "polish.final_rate=0.01", "polish.loss.dssim=0")
     settings = replace(settings, rates=Rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.3))
     spread = np.diag([0.03] * 3 + [0.01] * 3)
     xi = spread @ np.random.default_rng(3).choice([-1.0, 1.0], (2, 6, 1))
     off = POSES @ np.asarray(jax.vmap(lambda x: jaxlie.SE3.exp(x).as_matrix())(jnp.asarray(xi[..., 0], jnp.float32)))
-    views = Views(frames.targets, off, np.stack([spread] * 2))
-    fitted, found = fit(ANCHORS, COLORS, views, CAMERA, settings, tmp_path / "state.npz")
-    for poses in (found, locate(ANCHORS, fitted, views, CAMERA, settings)):
-        error, before = (np.linalg.norm((p - POSES)[:, :3], axis=(1, 2)) for p in (poses, off))
-        assert (error < 0.2 * before).all()
+    views = Views(drawn_from(anchors).targets, off, np.stack([spread] * 2))
+    fitted, found = fit(anchors, COLORS, views, CAMERA, settings, tmp_path / "state.npz")
+    # Where the splats are in the images: along a flat wall a turn and a shift nearly do the same.
+    pixels = [
+        pixels_of(anchors, poses) for poses in (POSES, off, found, locate(anchors, fitted, views, CAMERA, settings))
+    ]
+    before, *after = (np.sqrt(np.mean((p - pixels[0]) ** 2)) for p in pixels[1:])
+    assert before > 0.3 and max(after) < 0.2 * before
+
+
+def pixels_of(anchors: Anchors, poses: np.ndarray) -> np.ndarray:
+    """Where the splats' means are in the images, (m, n, 2)."""
+    local = (np.asarray(anchors.means) - poses[:, None, :3, 3]) @ poses[:, :3, :3]
+    return local[..., :2] / local[..., 2:] * [20.0, 23.0] + [14.5, 12.25]
 
 
 def test_splats_that_find_no_room_get_it_and_the_fit_is_that_with_room_from_the_start(frames, tmp_path):
