@@ -29,12 +29,12 @@ from emgs_jax.polish.seeds import Seeds
 from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, draw, gaussians_of, ssim
 from emgs_jax.render.composite import Rendering
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
-from emgs_jax.report.recorded_run import POLISH, RecordedRun
+from emgs_jax.report.recorded_run import POLISH, SPLATS_FILE, RecordedRun
 from emgs_jax.running.convert import on_device, to_se3
 from emgs_jax.running.executables import stored
 from emgs_jax.semantics import classify
 
-SPLATS_FILE, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE, PATH_FILE = POLISH
+_, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE, PATH_FILE = POLISH
 MAX_PICTURES = 4
 Seen: TypeAlias = tuple[np.ndarray, DenseView]  # image (h, w, 3) in [0, 1] of a frame, and the map from its pose
 Nearest: TypeAlias = Callable[[np.ndarray], np.ndarray]
