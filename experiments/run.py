@@ -28,7 +28,8 @@ from emgs_jax.report.metrics import (
     spent,
 )
 from emgs_jax.report.page import write_report
-from emgs_jax.report.printout import frame_lines, last_words, metrics_table, time_words
+from emgs_jax.report.polish import polish, require_optax
+from emgs_jax.report.printout import frame_lines, last_words, metrics_table, polish_lines, time_words
 from emgs_jax.report.provenance import is_metric, provenance, signature, write_metrics
 from emgs_jax.report.recorded_run import REPORT_FILE, read_run
 from emgs_jax.report.run_files import claim_folder, save_classes, save_outputs, save_progress
@@ -65,6 +66,9 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             saved = load_saved_map(config.map, config.map_mode, graph, dataset.intrinsics, float(slam.fit.min_std))
             session = new_run(dataset, slam, clock, graph=graph, saved=saved)
             watched = build(config, "view") if config.view else None
+            fitting = build(config, "polish") if config.polish else None
+            if fitting is not None:
+                require_optax()
             live = stack.enter_context(live_view(watched, session, densify.render, prior, dataset.kept))
             baselines = Baselines(fused, session, dataset)
             settings = OmegaConf.to_container(config, resolve=True)
@@ -99,6 +103,9 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     metrics["provenance"] = origin
     write_metrics(folder / "metrics.json", metrics)
     keeper.drop()
+    if fitting is not None:
+        with _said(clock, "polish", "fitting splats to the images"):
+            notes = [*notes, *polish_lines(polish(read_run(folder), dataset, fitting, densify))]
     with _said(clock, "report", f"writing {REPORT_FILE}"):
         write_report(read_run(folder), dataset)
     if live is not None:

@@ -58,8 +58,7 @@ def polish(
     Raises:
         ValueError: the map is empty, there is no frame to fit or to compare with, or optax is not installed.
     """
-    if importlib.util.find_spec("optax") is None:
-        raise ValueError('emgs polish needs optax: pip install "emgs_jax[polish]"')
+    require_optax()
     gaussians = confirmed(run.map)
     if not np.asarray(gaussians.valid).any():
         raise ValueError(f"{run.folder}: the map has no Gaussian to begin with: run again")
@@ -100,6 +99,12 @@ def polish(
     metrics |= _compare(run, dataset, held, seen, (splats, opacity, poses, config.loss))
     write_json(run.folder / METRICS_FILE, metrics)
     return metrics
+
+
+def require_optax() -> None:
+    """Raise ValueError where the extra is not installed."""
+    if importlib.util.find_spec("optax") is None:
+        raise ValueError('splats are fitted by optax: pip install "emgs_jax[polish]", or polish=none')
 
 
 def _fitted(
