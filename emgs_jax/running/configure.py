@@ -28,7 +28,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.featured import Featured, Requeried
 from emgs_jax.running.overrides import readable
-from emgs_jax.running.truth import check_depth_unit
+from emgs_jax.running.truth import check_truth
 from emgs_jax.running.values import check_values
 
 if TYPE_CHECKING:
@@ -242,8 +242,9 @@ def build_dataset(config: DictConfig) -> ReadableFrames:
         tqdm.write(dataset.calibration["note"])
     progress = partial(tqdm, desc="checking", unit="frame")
     frames = ReadableFrames(dataset, config.on_bad_frame, config.checksums, progress)
-    if config.dataset.get("depth_scale") is not None:  # else the data set knows
-        check_depth_unit(frames, float(config.dataset.depth_scale))
+    if "depth_scale" in config.dataset:  # files of depths; None: the data set knows
+        scale = config.dataset.depth_scale
+        check_truth(frames, None if scale is None else float(scale))
     return frames
 
 
