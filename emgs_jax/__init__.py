@@ -53,7 +53,7 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.running.compilation import use_compilation_cache
     from emgs_jax.running.configure import RunConfig, build_dataset, build_prior, compose, load_config
     from emgs_jax.running.convert import FirstWindow, opening, to_camera, to_first_window, to_prediction
-    from emgs_jax.running.pipeline import integrate_input, map_frames, map_sequence
+    from emgs_jax.running.pipeline import finish_run, integrate, map_frames, map_sequence
     from emgs_jax.running.record import FrameRecord, MappingRun, new_run
     from emgs_jax.running.unit import in_prior_unit
     from emgs_jax.running.window_input import WindowInput, window_inputs
@@ -92,7 +92,7 @@ _HOMES = {
     "running.compilation": ("use_compilation_cache",),
     "running.configure": ("RunConfig", "build_dataset", "build_prior", "compose", "load_config"),
     "running.convert": ("FirstWindow", "opening", "to_camera", "to_first_window", "to_prediction"),
-    "running.pipeline": ("integrate_input", "map_frames", "map_sequence"),
+    "running.pipeline": ("finish_run", "integrate", "map_frames", "map_sequence"),
     "running.capacity": ("advance", "start"),
     "running.window_input": ("WindowInput", "window_inputs"),
     "running.record": ("FrameRecord", "MappingRun", "new_run"),

@@ -39,9 +39,10 @@ from emgs_jax.running.configure import baseline_configs, build, build_dataset, b
 from emgs_jax.running.dense import center_cloud, dense_map
 from emgs_jax.running.gathering import Baselines, RawPrior, gather
 from emgs_jax.running.labelling import labelled_map
-from emgs_jax.running.pipeline import map_frames, show_records
+from emgs_jax.running.pipeline import finish_run, map_frames, show_records
 from emgs_jax.running.record import FrameRecord, MappingRun, new_run, to_line
 from emgs_jax.running.saved_map import load_saved_map
+from emgs_jax.running.window_input import RawView
 
 from .command import command
 from .shorthand import with_source
@@ -70,7 +71,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             if fitting is not None:
                 require_optax()
             live = stack.enter_context(live_view(watched, session, densify.render, prior, dataset.kept))
-            baselines = Baselines(fused, session, dataset)
+            baselines = Baselines(fused, slam.observation, dataset)
             settings = OmegaConf.to_container(config, resolve=True)
             origin = provenance(settings, dataset, prior.provenance)
             if saved is not None:
@@ -79,7 +80,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         for note in [*filter(None, [keeper.note]), *claim_folder(folder, keeper.found is not None)]:
             tqdm.write(note)
         keeps_points = dataset.has_ground_truth or densify.points == "own"
-        raw = _map(session, dataset, prior, (baselines, evaluation, keeps_points), folder, keeper, live)
+        session, raw = _map(session, dataset, prior, (baselines, evaluation, keeps_points), folder, keeper, live)
         # What needs no drawing of the map is compared with the truth while the map is drawn and written.
         with ThreadPoolExecutor(2, "raw prior") as threads:
             truth = threads.submit(new_scorer, dataset, evaluation, prior)
@@ -127,46 +128,51 @@ def _said(clock: Clock, phase: str, words: str) -> Iterator[None]:
 
 
 def _map(
-    session: MappingRun,
+    start: MappingRun,
     dataset: ReadableFrames,
     prior: Prior,
     compared: tuple[Baselines, EvaluationConfig, bool],
     folder: Path,
     keeper: Keeper,
     live: LiveView | None,
-) -> RawPrior:
-    """Map all frames and log each; returns what the prior alone says. What an interrupted run has is written."""
+) -> tuple[MappingRun, RawPrior]:
+    """Map all frames and log each; return the run and the raw predictions. What an interrupted run has is written."""
     if keeper.found is not None:
         tqdm.write(f"going on after frame {len(keeper.found.records)}: those before are read and predicted only")
-    baselines, evaluation, keeps_points = compared
+    run, (baselines, evaluation, keeps_points) = start, compared
     with FrameLog(folder / "frames.jsonl") as log, tqdm(total=len(dataset), unit="frame", desc="mapping") as bar:
 
-        def on_record(record: FrameRecord) -> None:
-            log.append(to_line(record) | {"index": dataset.kept[record.index]})
-            show_records(bar, session.records)
+        def frames() -> Iterator[tuple[FrameRecord, RawView]]:
+            nonlocal run
+            with contextlib.closing(map_frames(start, dataset, prior, keeper)) as inputs:
+                for run, new, views in inputs:
+                    for record in new:
+                        log.append(to_line(record) | {"index": dataset.kept[record.index]})
+                    show_records(bar, run.records, len(new))
+                    for record, view in zip(new, views, strict=True):
+                        if live is not None:
+                            live.show(run, view.image)
+                        yield record, view
 
-        session.on_record = on_record
         for index, reason in dataset.skipped.items():
             log.append(to_line(FrameRecord(index, None, None, "skipped", reason)))
         try:
             # Closed, so that what stops the gathering ends the mapping before what it has is written.
-            mapping = contextlib.closing(map_frames(session, dataset, prior, keeper))
-            with mapping as views, session.clock.phase("raw_prior"):
-                return gather(
-                    views if live is None else live.watch(views, session),
-                    evaluation,
-                    keeps_points,
-                    baselines,
-                    compared_text(dataset, prior),
-                )
+            with contextlib.closing(frames()) as mapped, start.clock.phase("raw_prior"):
+                raw = gather(mapped, evaluation, keeps_points, baselines, compared_text(dataset, prior))
+            run = finish_run(run)
         except BaseException:
             with contextlib.suppress(OSError, ValueError):  # the first error is the one to show
-                save_progress(folder, session)
-                if session.state is not None:
+                run = finish_run(run, is_interrupted=True)
+                save_progress(folder, run)
+                if run.state is not None:
                     tqdm.write(f"ended early: what is mapped so far is in {folder}")
                 if keeper.path.exists():
                     tqdm.write(f"the same command with hydra.run.dir={folder} goes on from there")
             raise
+    if live is not None:
+        live.show_last(run)
+    return run, raw
 
 
 @command("config", rewritten=with_source)

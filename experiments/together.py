@@ -1,7 +1,7 @@
 """Settings that are mapped and scored together on one sequence, for `sweep` and `tune`."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,12 @@ from emgs_jax.report.metrics import Metrics, Scorer, compared_text, score_settin
 from emgs_jax.report.overview import thumbnail
 from emgs_jax.report.provenance import provenance
 from emgs_jax.report.sweeps import picture_path
-from emgs_jax.running.batch import map_together, programs
+from emgs_jax.running.batch import finish_together, map_together, programs
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.dense import center_cloud
 from emgs_jax.running.gathering import gather
 from emgs_jax.running.record import MappingRun, new_run
+from emgs_jax.running.window_input import RawView
 
 from .grid import Variant
 
@@ -103,10 +104,18 @@ def replayed(prior: Prior, dataset: ReadableFrames, window_size: int, folder: Pa
 
 def map_and_score(work: Work, chunk: Sequence[Variant], bar: tqdm) -> list[Metrics]:
     """Map and score some settings that share a program; the metrics of each."""
-    runs = [new_run(work.dataset, variant.slam, work.clock, lambda record: bar.update()) for variant in chunk]
-    views = map_together(runs, work.dataset, work.prior, work.at_once, work.num_threads)
+    groups = start = [new_run(work.dataset, variant.slam, work.clock) for variant in chunk]
+
+    def frames() -> Iterator[tuple[None, RawView]]:
+        nonlocal groups
+        for found in map_together(start, work.dataset, work.prior, work.at_once, work.num_threads):
+            groups, views = found
+            bar.update(len(views) * len(chunk))
+            yield from ((None, view) for view in views)
+
     text = compared_text(work.dataset, work.scorer.prior)
-    raw = gather(views, work.scorer.evaluation, work.dataset.has_ground_truth, text=text)
+    raw = gather(frames(), work.scorer.evaluation, work.dataset.has_ground_truth, text=text)
+    runs = finish_together(groups)
     densify = [variant.densify for variant in chunk]
     metrics = score_settings(runs, raw, densify, work.scorer, work.num_threads)
     if work.folder is not None:

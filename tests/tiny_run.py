@@ -15,7 +15,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior, PriorPrediction
 from emgs_jax.running import configure
 from emgs_jax.running.configure import CONF  # noqa: F401 (for the tests of scripts)
-from emgs_jax.running.pipeline import map_frames
+from emgs_jax.running.pipeline import finish_run, map_frames
 from emgs_jax.running.record import MappingRun, new_run
 
 NUM_FRAMES, WINDOW_SIZE = 6, 3
@@ -83,11 +83,10 @@ def at_inference(number: int, **arrays) -> Callable[[PriorPrediction], PriorPred
 def map_tiny(frames, prior, *overrides: str) -> tuple[MappingRun, list]:
     """A finished run, and the map after each record."""
     maps = []
-    session = new_run(frames, hydra.utils.instantiate(compose(*overrides).slam))
-    session.on_record = lambda record: maps.append(session.state and session.state.map)
-    for _ in map_frames(session, frames, prior):
-        pass
-    return session, maps
+    run = start = new_run(frames, hydra.utils.instantiate(compose(*overrides).slam))
+    for run, new, _ in map_frames(start, frames, prior):
+        maps += [run.map] * len(new)
+    return finish_run(run), maps
 
 
 @cache

@@ -22,7 +22,6 @@ from emgs_jax.report.layers import map_layers
 from emgs_jax.report.viewer import Viewer
 from emgs_jax.report.viewer_scene import Shown
 from emgs_jax.running.record import FrameRecord, MappingRun
-from emgs_jax.running.window_input import RawView
 
 SHARE = 0.05  # of the time in which the thread draws, at most
 IMAGE_WIDTH = 320  # pixels
@@ -57,19 +56,20 @@ class LiveView:
         self._start, self._text, self._kept = start, text, kept
         self._thread, self._due = ThreadPoolExecutor(1, "live view"), 0.0
         self._drawing: Future | None = None
+        self._image: np.ndarray | None = None  # of the last frame
         self._failure: BaseException | None = None
 
-    def watch(self, views: Iterator[RawView], run: MappingRun) -> Iterator[RawView]:
-        """Pass on the views of a run; on the way, and at its end, it is shown as it is."""
-        image = None
-        for view in views:
-            image = view.image
-            if time.monotonic() >= self._due and self._is_idle():
-                self._show(run, image)
-            yield view
+    def show(self, run: MappingRun, image: np.ndarray) -> None:
+        """Show a run as it is, with the image of its last frame, where that is due and nothing is being drawn."""
+        self._image = image
+        if time.monotonic() >= self._due and self._is_idle():
+            self._begin(run)
+
+    def show_last(self, run: MappingRun) -> None:
+        """Show a finished run, and wait until it is drawn."""
         self.wait()
-        if self._is_idle() and image is not None:
-            self._show(run, image)
+        if self._is_idle() and self._image is not None:
+            self._begin(run)
             self.wait()
             self._is_idle()
 
@@ -91,11 +91,11 @@ class LiveView:
                 tqdm.write(f"the live view stays as it is, and the run goes on: {self._failure!r}")
         return self._failure is None and (self._drawing is None or self._drawing.done())
 
-    def _show(self, run: MappingRun, image: np.ndarray) -> None:
+    def _begin(self, run: MappingRun) -> None:
         if run.map is not None:
-            self._drawing = self._thread.submit(self._draw, run.map, list(run.records), image)
+            self._drawing = self._thread.submit(self._draw, run.map, run.records, self._image)
 
-    def _draw(self, map: GaussianMap, records: list[FrameRecord], image: np.ndarray) -> None:
+    def _draw(self, map: GaussianMap, records: Sequence[FrameRecord], image: np.ndarray) -> None:
         begin = time.monotonic()
         step = -(-image.shape[1] // IMAGE_WIDTH)
         self.viewer.update(

@@ -1,9 +1,11 @@
 """Coupling of a run and its back end: frames become nodes, and optimized poses return to records and map."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.running.back_end import (
     BackEnd,
     add_node,
@@ -19,37 +21,41 @@ from emgs_jax.running.back_end import (
 )
 from emgs_jax.running.convert import to_se3
 from emgs_jax.running.deformation import merge_duplicates_of_state
-from emgs_jax.running.disconnected_submaps import join_submaps
 from emgs_jax.running.factors import FrameData
 from emgs_jax.running.prior_queries import query_prior
 from emgs_jax.running.record import IN_MAP, NEW_SUBMAP, RELOCALIZED, FrameRecord, MappingRun, row_of_first_node
-from emgs_jax.running.relocalization import frame_data
 from emgs_jax.running.window_input import WindowInput
 
 
-def update_back_end(run: MappingRun, window: WindowInput) -> None:
-    """Add the last input's frames to the back end, detect loops, and close them where the poses violate them.
+def add_frames(run: MappingRun, window: WindowInput) -> MappingRun:
+    """Add the recorded frames of an input to the pose graph."""
+    end = run.back_end
+    for frame, record in zip(window.data, run.records[-len(window.frames) :], strict=True):
+        end = _with_frame(end, frame, record)
+    return replace(run, back_end=end)
 
-    Args:
-        run: with a back end, and a state.
-        window: the last one.
+
+def verify_loops(run: MappingRun, window: WindowInput) -> tuple[MappingRun, Sequence[LoopMeasurement] | None]:
+    """Detect loops of the last frame, and verify those that the poses violate by the prior.
+
+    Returns:
+        The run, and the loops to close now; None where no closure is due.
     """
-    added, frames = run.records[-len(window.frames) :], frame_data(window)
-    for frame, record in zip(frames, added, strict=True):
-        run.back_end = _with_frame(run.back_end, frame, record)
-    if added[-1].similarity is not None:
-        join_submaps(run, window)
     before = run.back_end
-    end = detect_loops(before, frames[-1])
+    end = detect_loops(before, window.data[-1])
     loops = recent_loops(end)
     if is_closure_due(end, loops):
         end = query_prior(end, violated(end, loops), run.prior_query)
         loops = recent_loops(end)
     kept = remove_inconsistent(end) if len(end.violating) > len(before.violating) else end
-    run.back_end = kept
-    if len(kept.accepted) < len(end.accepted) or is_closure_due(kept, loops):
-        run.back_end, run.state = close_loops(kept, run.state, loops)
-        _update_records(run)
+    is_due = len(kept.accepted) < len(end.accepted) or is_closure_due(kept, loops)
+    return replace(run, back_end=kept), loops if is_due else None
+
+
+def optimize_and_deform(run: MappingRun, loops: Sequence[LoopMeasurement]) -> MappingRun:
+    """Close loops: optimize the poses, and deform map and records accordingly."""
+    end, state = close_loops(run.back_end, run.state, loops)
+    return _with_updated_records(replace(run, back_end=end, state=state))
 
 
 def _with_frame(end: BackEnd, frame: FrameData, record: FrameRecord) -> BackEnd:
@@ -60,7 +66,7 @@ def _with_frame(end: BackEnd, frame: FrameData, record: FrameRecord) -> BackEnd:
     return add_node(end, frame, record.pose, record.scale or 1.0, record.origin, record.status in IN_MAP)
 
 
-def finish_back_end(run: MappingRun) -> None:
+def finish_back_end(run: MappingRun) -> MappingRun:
     """Optimize the poses of a run once more, with all factors, and deform the map accordingly.
 
     Nothing changes where no loop violates, or has violated, the poses: frames and map fit each other better as first
@@ -70,28 +76,29 @@ def finish_back_end(run: MappingRun) -> None:
     end = query_prior(end, violated(end, not_in_graph(end, consistent_loops(end))), run.prior_query)
     kept = remove_inconsistent(end)
     loops = violated(kept, not_in_graph(kept, consistent_loops(kept)))
-    run.back_end = kept
+    run = replace(run, back_end=kept)
     if len(kept.accepted) < len(end.accepted) or kept.accepted or loops:
-        run.back_end, run.state = close_loops(kept, run.state, loops)
-        _update_records(run)
+        run = optimize_and_deform(run, loops)
     end, tracked = run.back_end, [record for record in run.records if record.status == "tracked"]
     noise = [record.depth_noise for record in tracked if record.depth_noise is not None]
     if noise and (end.accepted or not end.has_one_unit):  # at the end only: what was made one Gaussian stays one
         nodes = nodes_of(end, end.submap_id)
-        run.state = merge_duplicates_of_state(run.state, nodes, float(np.median(noise)), run.config.existence)
+        state = merge_duplicates_of_state(run.state, nodes, float(np.median(noise)), run.config.existence)
+        run = replace(run, state=state)
+    return run
 
 
-def _update_records(run: MappingRun) -> None:
+def _with_updated_records(run: MappingRun) -> MappingRun:
     """Write the back end's poses and scales into the records of its frames, which are the last ones.
 
     The prior's world moves with the last frame, where relocalization has anchored it.
     """
-    end, first = run.back_end, row_of_first_node(run)
-    if run.prior_motion is not None:
-        change = to_se3(end.poses[-1] @ np.linalg.inv(run.records[-1].pose))
-        run.prior_motion = change @ run.prior_motion
+    end, first, motion = run.back_end, row_of_first_node(run), run.prior_motion
+    if motion is not None:
+        motion = to_se3(end.poses[-1] @ np.linalg.inv(run.records[-1].pose)) @ motion
     found = zip(end.poses[end.first_node :], np.exp(end.log_scales[end.first_node :]).tolist(), strict=True)
-    run.records[first:] = [
+    moved = [
         replace(record, pose=pose, scale=None if record.scale is None else scale)
         for record, (pose, scale) in zip(run.records[first:], found, strict=True)
     ]
+    return replace(run, records=(*run.records[:first], *moved), prior_motion=motion)

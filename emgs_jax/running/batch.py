@@ -5,9 +5,10 @@ threads step runs or stacks side by side.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from dataclasses import replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,12 +23,18 @@ from emgs_jax.prior.base import Prior
 from emgs_jax.running.capacity import advance, start
 from emgs_jax.running.clock import Timer
 from emgs_jax.running.convert import FirstWindow
-from emgs_jax.running.first_frame import with_first_frame
-from emgs_jax.running.pipeline import integrate_input, seconds_of
-from emgs_jax.running.record import MappingRun, record_lost, record_start, record_step
-from emgs_jax.running.unit import rescale_run
+from emgs_jax.running.pipeline import finish_run, integrate, seconds_of
+from emgs_jax.running.record import MappingRun, TrackedFrame, record_lost, record_start, record_step
 from emgs_jax.running.window_input import RawView, WindowInput, window_inputs
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo, init_state, step
+
+
+class Stack(NamedTuple):
+    """Runs whose states and configs are stacked and stepped by one call; those in `runs` are of the first input."""
+
+    runs: Sequence[MappingRun]
+    states: SlamState | None
+    configs: SlamConfig
 
 
 def programs(configs: Sequence[SlamConfig]) -> list[list[int]]:
@@ -44,8 +51,8 @@ def programs(configs: Sequence[SlamConfig]) -> list[list[int]]:
 
 def map_together(
     runs: Sequence[MappingRun], dataset: Dataset, prior: Prior, at_once: int = 1, num_threads: int = 1
-) -> Iterator[RawView]:
-    """Map several runs as `map_frames` does; yields the raw predictions of each frame on the way.
+) -> Iterator[tuple[Sequence[MappingRun | Stack], Sequence[RawView]]]:
+    """Map several runs as `map_frames` does; `finish_together` completes the last groups.
 
     Args:
         runs: before their first frame, with one clock; their configs share a program.
@@ -55,67 +62,66 @@ def map_together(
             executable of `map_frames`, so its result does not depend on the others, bit for bit.
         num_threads: runs, or stacks of them, that are stepped side by side, which keeps the cores of a CPU busy.
 
+    Yields:
+        Groups of runs after an input, those that are stepped together as a stack; and its frames' raw predictions.
+
     Raises:
         ValueError: the configs do not share a program, or there is nothing to start a map from.
     """
     if len(programs([run.config for run in runs])) != 1:
         raise ValueError("the configs differ in a static field or in `observation`: map each of `programs` by itself")
     clock = runs[0].clock
-    groups = [runs[row : row + at_once] for row in range(0, len(runs), at_once)]
-    stacks = [Stack(some) for some in groups if len(some) > 1]
-    integrators = [
-        *(group.integrate for group in stacks),
-        *(partial(integrate_input, some[0]) for some in groups if len(some) == 1),
-    ]
+    parts = [runs[row : row + at_once] for row in range(0, len(runs), at_once)]
+    groups = [make_stack(some) if len(some) > 1 else some[0] for some in parts]
     num_alone = 2  # inputs with a map: the first compiles `init_state`, the second the step, once for all groups
     with ThreadPoolExecutor(num_threads) as threads:
         for window in window_inputs(dataset, prior, runs[0].config, clock):
             with clock.phase("map"):
-                alone = integrators[: 1 if num_alone else 0]
-                for integrate in alone:
-                    integrate(window)
-                list(threads.map(lambda one, window=window: one(window), integrators[len(alone) :]))
+                alone = [_integrate(group, window) for group in groups[: 1 if num_alone else 0]]
+                others = threads.map(lambda group, window=window: _integrate(group, window), groups[len(alone) :])
+                groups = [*alone, *others]
             num_alone -= bool(num_alone) and window.prediction is not None
-            yield from window.raw
-    for group in stacks:
-        group.hand_out()
-    for run in runs:
-        with_first_frame(run)
-        rescale_run(run)
+            yield groups, window.raw
 
 
-class Stack:
-    """Runs whose states and configs are stacked and stepped by one call.
+def finish_together(groups: Iterable[MappingRun | Stack]) -> list[MappingRun]:
+    """Complete the runs of all groups, in their order."""
+    runs = [run for group in groups for run in (unstacked(group) if isinstance(group, Stack) else [group])]
+    return [finish_run(run) for run in runs]
 
-    The runs get their states from `hand_out`, at the end only.
-    """
 
-    def __init__(self, runs: Sequence[MappingRun]) -> None:
-        self._runs, self._configs = runs, stack([run.config for run in runs])
-        self._states: SlamState | None = None
+def _integrate(group: MappingRun | Stack, window: WindowInput) -> MappingRun | Stack:
+    return integrate_stack(group, window) if isinstance(group, Stack) else integrate(group, window)[0]
 
-    def integrate(self, window: WindowInput) -> None:
-        """Integrate one input into all runs; where the map or submap of one is full, all capacities grow."""
-        timer, camera = Timer(self._runs[0].clock), self._runs[0].camera
-        match window.prediction:
-            case None:
-                for run in self._runs:
-                    record_lost(run, window)
-            case FirstWindow() as first:
-                self._states, self._configs = start(first, camera, self._configs, init_states)
-                self.hand_out()
-                for run in self._runs:
-                    record_start(run, window, seconds_of(window, timer, len(self._runs)))
-            case Prediction() as prediction:
-                stepped = advance(self._states, prediction, camera, self._configs, step_states)
-                self._states, infos, self._configs = stepped[0], jax.device_get(stepped[1]), stepped[2]
-                for position, run in enumerate(self._runs):
-                    record_step(run, window, _item(infos, position), seconds_of(window, timer, len(self._runs)))
 
-    def hand_out(self) -> None:
-        """Give every run its own state and config."""
-        for position, run in enumerate(self._runs):
-            run.state, run.config = _item((self._states, self._configs), position)
+def make_stack(runs: Sequence[MappingRun]) -> Stack:
+    """Stack runs before their first frame."""
+    return Stack(runs, None, stack([run.config for run in runs]))
+
+
+def integrate_stack(group: Stack, window: WindowInput) -> Stack:
+    """Integrate one input into all runs; where the map or submap of one is full, all capacities grow."""
+    runs, states, configs = group
+    timer, camera = Timer(runs[0].clock), runs[0].camera
+    match window.prediction:
+        case None:
+            return group._replace(runs=[record_lost(run, window) for run in runs])
+        case FirstWindow() as first:
+            group = Stack(runs, *start(first, camera, configs, init_states))
+            seconds = seconds_of(window, timer, len(runs))
+            return group._replace(runs=[record_start(run, window, seconds) for run in unstacked(group)])
+        case prediction:
+            states, infos, configs = advance(states, prediction, camera, configs, step_states)
+            infos, seconds = jax.device_get(infos), seconds_of(window, timer, len(runs))
+            frames = [TrackedFrame(info=_item(infos, position)) for position in range(len(runs))]
+            runs = [record_step(run, window, frame, seconds) for run, frame in zip(runs, frames, strict=True)]
+            return Stack(runs, states, configs)
+
+
+def unstacked(group: Stack) -> list[MappingRun]:
+    """Return the runs, each with its own state and config."""
+    own = (_item((group.states, group.configs), position) for position in range(len(group.runs)))
+    return [replace(run, state=state, config=config) for run, (state, config) in zip(group.runs, own, strict=True)]
 
 
 def _item(tree: Tree, position: int) -> Tree:

@@ -19,7 +19,7 @@ from emgs_jax.io.files import atomic_write, flat, jsonable
 from emgs_jax.io.npz import read_npz
 from emgs_jax.ops.ranges import number
 from emgs_jax.running.record import FrameRecord, MappingRun
-from emgs_jax.slam import SlamConfig, SlamState
+from emgs_jax.slam import SlamState
 
 CHECKPOINT_FILE = "checkpoint.npz"
 FORMAT, VERSION = "emgs_jax.checkpoint", 5
@@ -56,18 +56,17 @@ class Checkpoint:
     records: Sequence[FrameRecord]
     inactive: Mapping[int, Sequence[np.ndarray]] = field(default_factory=dict)
 
-    def restored(
-        self, like: SlamState | None, config: SlamConfig
-    ) -> tuple[SlamState | None, dict[int, SlamState], SlamConfig]:
-        """Rebuild state, inactive states and config; `like` is a state of the same run, of any size."""
+    def restored(self, run: MappingRun) -> MappingRun:
+        """Rebuild states and config in a run whose inputs were replayed; its state has any size."""
         names = ("map_capacity", "submap_capacity")
-        submap = replace(config.submap, **dict(zip(names, self.capacities, strict=True)))
+        submap = replace(run.config.submap, **dict(zip(names, self.capacities, strict=True)))
 
         def state(leaves: Sequence[np.ndarray]) -> SlamState:
-            return jax.tree.unflatten(jax.tree.structure(like), [jnp.asarray(leaf) for leaf in leaves])
+            return jax.tree.unflatten(jax.tree.structure(run.state), [jnp.asarray(leaf) for leaf in leaves])
 
         inactive = {submap: state(leaves) for submap, leaves in self.inactive.items()}
-        return state(self.leaves) if len(self.leaves) else None, inactive, replace(config, submap=submap)
+        current = state(self.leaves) if len(self.leaves) else None
+        return replace(run, state=current, inactive=inactive, config=replace(run.config, submap=submap))
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint, signature: Mapping[str, Any]) -> None:
@@ -145,8 +144,7 @@ class Keeper:
         self.path, self._every, self._signature = path, config.every if config else 0, signature
         self.found: Checkpoint | None = None
         self.note: str | None = None  # why a file that is there is of no use
-        self._placed: list[FrameRecord] = []
-        self._done: tuple[int, tuple[SlamState | None, dict[int, SlamState]], SlamConfig, int] | None = None
+        self._done: tuple[MappingRun | None, int, tuple[FrameRecord, ...]] = None, 0, ()
         self._num_saved = 0
         if self._every and path.exists():
             try:
@@ -155,33 +153,24 @@ class Keeper:
             except ValueError as error:
                 self.note = f"{error}; this run starts at its first frame"
 
-    def attend(self, run: MappingRun) -> None:
-        """Collect the records of a run, each as first estimated."""
-        forward = run.on_record
-
-        def on_record(record: FrameRecord) -> None:
-            self._placed.append(record)
-            forward(record)
-
-        run.on_record = on_record
-
-    def keep(self, run: MappingRun, num_inputs: int) -> None:
-        """Note a run's state after so many inputs, and save it if a checkpoint is due."""
-        self._done = num_inputs, (run.state, run.inactive), run.config, len(self._placed)
-        if len(self._placed) >= self._num_saved + self._every:
+    def keep(self, run: MappingRun, records: Sequence[FrameRecord]) -> None:
+        """Note a run after its next input, with the new records as first estimated; save it if a checkpoint is due."""
+        _, num_inputs, placed = self._done
+        self._done = run, num_inputs + 1, (*placed, *records)
+        if len(self._done[-1]) >= self._num_saved + self._every:
             self.save()
 
     def save(self) -> None:
         """Write the run as it was after its last complete input, if that is not written yet."""
-        if not self._every or self._done is None or self._done[-1] <= self._num_saved:
+        run, num_inputs, placed = self._done
+        if not self._every or run is None or len(placed) <= self._num_saved:
             return
-        num_inputs, (state, inactive), config, count = self._done
-        capacities = config.submap.map_capacity, config.submap.submap_capacity
-        leaves = jax.device_get(jax.tree.leaves(state))
-        others = {submap: jax.device_get(jax.tree.leaves(one)) for submap, one in inactive.items()}
-        checkpoint = Checkpoint(num_inputs, leaves, capacities, self._placed[:count], others)
+        capacities = run.config.submap.map_capacity, run.config.submap.submap_capacity
+        leaves = jax.device_get(jax.tree.leaves(run.state))
+        others = {submap: jax.device_get(jax.tree.leaves(one)) for submap, one in run.inactive.items()}
+        checkpoint = Checkpoint(num_inputs, leaves, capacities, placed, others)
         save_checkpoint(self.path, checkpoint, self._signature)
-        self._num_saved = count
+        self._num_saved = len(placed)
 
     def drop(self) -> None:
         """Remove the file of a run that is complete."""

@@ -22,16 +22,23 @@ from emgs_jax.running.capacity import add_map, advance, start
 from emgs_jax.running.convert import FirstWindow, to_se3
 from emgs_jax.running.deformation import deform_state, move_map
 from emgs_jax.running.factors import Factor
-from emgs_jax.running.record import UNJOINED, MappingRun, row_of_first_node, to_matrix, transform_record
+from emgs_jax.running.record import (
+    JOINED,
+    UNJOINED,
+    MappingRun,
+    TrackedFrame,
+    row_of_first_node,
+    to_matrix,
+    transform_record,
+)
 from emgs_jax.running.relocalization import (
     anchor_motion_of,
     as_step_prediction,
-    frame_data,
     rejection,
     relocalized_start,
 )
 from emgs_jax.running.window_input import PlacedStructure, WindowInput
-from emgs_jax.slam import SlamConfig, SlamState, StepInfo
+from emgs_jax.slam import StepInfo
 
 UNKNOWN = np.full((4, 4), np.nan)  # pose
 
@@ -63,10 +70,10 @@ def place_structure(window: WindowInput, pose: np.ndarray) -> PlacedStructure:
     return PlacedStructure(window.structure, pose @ np.linalg.inv(own), pose)
 
 
-def start_submap(run: MappingRun, window: WindowInput) -> tuple[SlamState, SlamConfig] | None:
+def start_submap(run: MappingRun, window: WindowInput) -> MappingRun | None:
     """Start a map of this frame alone, at the pose of the frame before; None where no submap starts.
 
-    Its unit is the prior's own: that of another map does not apply.
+    Its unit is the prior's own: that of another map does not apply. The map before it becomes inactive.
     """
     pose = window.T_anchor_views.get(window.frames[0].index)
     is_new = run.back_end is not None and run.state is not None and not run.is_fixed and not is_related(run, window)
@@ -78,40 +85,45 @@ def start_submap(run: MappingRun, window: WindowInput) -> tuple[SlamState, SlamC
         return None
     time = run.state.time
     map = replace(alone.map, birth=jnp.full_like(alone.map.birth, time))
-    return replace(alone, map=map, time=time + 1), config
+    return replace(enter_submap(run, window), state=replace(alone, map=map, time=time + 1), config=config)
 
 
-def enter_submap(run: MappingRun, window: WindowInput, before: SlamState) -> None:
-    """Switch to the submap that the last frame has started; the state `before` it becomes inactive."""
-    run.inactive = run.inactive | {run.back_end.submap_id: before}
-    run.back_end = replace(run.back_end, submap_id=window.structure)
-    run.structure, run.prior_motion = place_structure(window, run.records[-1].pose), None
+def enter_submap(run: MappingRun, window: WindowInput) -> MappingRun:
+    """Switch to the submap that this frame starts; the state before it becomes inactive."""
+    return replace(
+        run,
+        inactive={**run.inactive, run.back_end.submap_id: run.state},
+        back_end=replace(run.back_end, submap_id=window.structure),
+        structure=place_structure(window, run.records[-1].pose),
+        prior_motion=None,
+    )
 
 
-def match_submap(run: MappingRun, window: WindowInput, info: StepInfo) -> np.ndarray | None:
-    """Relocalize a tracked frame in an inactive submap; return the similarity (4, 4) between both worlds, or None.
+def match_submap(run: MappingRun, window: WindowInput, frame: TrackedFrame) -> TrackedFrame:
+    """Relocalize a tracked frame in an inactive submap; where that succeeds, it gets the similarity of both worlds.
 
     The relocalized pose must pass the tests of a lost camera's, the fit to the map included.
 
     Args:
-        run: before this frame.
+        run: after the step of this frame, before its record.
         window: this frame.
-        info: of its step, in its own submap.
+        frame: likewise, in its own submap.
     """
-    if not run.inactive or not bool(info.localization.is_tracked):
-        return None
-    place, _ = relocalize_frame(run.back_end, frame_data(window)[0], in_other_submap=True)
+    if not run.inactive or frame.location is not None or not bool(frame.info.localization.is_tracked):
+        return frame
+    place, _ = relocalize_frame(run.back_end, window.data[0], in_other_submap=True)
     if place is None:
-        return None
+        return frame
     other = run.inactive[run.back_end.submap_ids[place.keyframe]]
     # This frame determines the prior's unit in that map.
     estimate = replace(other.estimate, log_scale=jnp.asarray(place.log_scale, jnp.float32))
     visiting = replace(run, state=replace(other, estimate=estimate))
-    begin, again = relocalized_start(visiting, step_prediction(run, window), place)
+    begin, again = relocalized_start(visiting, frame.prediction, place)
     _, there, _ = advance(begin, again, run.camera, run.config)
     if rejection(there, again, place, run.back_end.config.relocalization) is not None:
-        return None
-    return (_camera_in_world(there) @ _camera_in_world(info).inverse()).as_matrix()
+        return frame
+    similarity = _camera_in_world(there) @ _camera_in_world(frame.info).inverse()
+    return replace(frame, location=JOINED, similarity=similarity.as_matrix())
 
 
 def _camera_in_world(info: StepInfo) -> Sim3:
@@ -120,14 +132,13 @@ def _camera_in_world(info: StepInfo) -> Sim3:
     return Sim3(float(info.localization.scale), T[:3, :3], T[:3, 3])
 
 
-def join_submaps(run: MappingRun, window: WindowInput) -> None:
+def join_submaps(run: MappingRun, window: WindowInput) -> MappingRun:
     """Join the submap of the last frame, which is a node already, with the one in which it was relocalized.
 
     The newer one moves, by the similarity of the record or its inverse.
     """
     end, similarity = run.back_end, Sim3.from_matrix(run.records[-1].similarity)
-    frame = frame_data(window)[-1]
-    place, _ = relocalize_frame(end, frame, in_other_submap=True)  # where `match_submap` has found it
+    place, _ = relocalize_frame(end, window.data[-1], in_other_submap=True)  # where `match_submap` has found it
     here, there = end.submap_id, end.submap_ids[place.keyframe]
     if here < there:
         similarity = similarity.inverse()
@@ -136,21 +147,24 @@ def join_submaps(run: MappingRun, window: WindowInput) -> None:
     rows = [row for row, one in enumerate(end.submap_ids) if one == newer]
     end = transform_nodes(end, rows, similarity)
     after, first = nodes_of(end), row_of_first_node(run) - end.first_node
+    records = list(run.records)
     for row in rows:
-        run.records[first + row] = transform_record(run.records[first + row], similarity)
+        records[first + row] = transform_record(records[first + row], similarity)
     submap_ids = [older if one == newer else one for one in end.submap_ids]
     factors = [*end.factors, join_factor(end, place, unit)]
-    run.back_end = replace(end, submap_ids=submap_ids, submap_id=older, has_one_unit=False, factors=factors)
+    end = replace(end, submap_ids=submap_ids, submap_id=older, has_one_unit=False, factors=factors)
     other = run.inactive[there]
-    run.inactive = {one: state for one, state in run.inactive.items() if one != there}
     state = deform_state(run.state, before, after, end.min_std, end.config.deform)
     moved = move_map(other.map, before, after, jnp.asarray(end.min_std, jnp.float32), end.config.deform)
-    map, run.config = add_map(state.map, moved, run.config)
-    run.state = replace(state, map=map)
+    map, config = add_map(state.map, moved, run.config)
+    state, motion = replace(state, map=map), run.prior_motion
     if here == newer:
         scale = jnp.asarray(similarity.scale, jnp.float32)
-        run.state = replace(run.state, estimate=rescale_estimate(state.estimate, scale))
-        run.prior_motion = anchor_motion_of(run.records[-1], step_prediction(run, window))
+        state = replace(state, estimate=rescale_estimate(state.estimate, scale))
+        motion = anchor_motion_of(records[-1], step_prediction(run, window))
+    inactive = {one: state for one, state in run.inactive.items() if one != there}
+    changed = {"state": state, "config": config, "records": tuple(records), "inactive": inactive}
+    return replace(run, back_end=end, prior_motion=motion, **changed)
 
 
 def join_factor(end: BackEnd, place: RelocalizedPose, unit: float) -> Factor:
@@ -166,17 +180,16 @@ def join_factor(end: BackEnd, place: RelocalizedPose, unit: float) -> Factor:
     return Factor(a, b, measured, ratio, np.linalg.cholesky(information).T, ODOMETRY)
 
 
-def drop_unjoined_submaps(run: MappingRun) -> None:
+def drop_unjoined_submaps(run: MappingRun) -> MappingRun:
     """Keep the submap of most placed frames, or the saved map's, and drop those that were never joined with it.
 
     The other frames are lost: the poses of their submaps are placeholders.
     """
     if not run.inactive:
-        return
+        return run
     end = run.back_end
     counts = Counter(one for one, is_placed in zip(end.submap_ids, end.is_placed, strict=True) if is_placed)
     kept = 0 if run.saved is not None else max(sorted(counts), key=lambda one: counts[one])
-    run.state, run.inactive = ({end.submap_id: run.state} | run.inactive)[kept], {}
     is_kept = [one == kept for one in end.submap_ids]
     between = {
         name: [one for one in getattr(end, name) if is_kept[one.a] and is_kept[one.b]]
@@ -184,15 +197,16 @@ def drop_unjoined_submaps(run: MappingRun) -> None:
     }
     known = end.database
     rows = [row for row, one in enumerate(known.keyframes) if is_kept[one.frame]]
-    run.back_end = replace(
+    end = replace(
         end,
         is_placed=[placed and here for placed, here in zip(end.is_placed, is_kept, strict=True)],
         submap_id=kept,
         database=replace(known, keyframes=tuple(known.keyframes[row] for row in rows), vectors=known.vectors[rows]),
         **between,
     )
-    first = row_of_first_node(run) - end.first_node
+    first, records = row_of_first_node(run) - end.first_node, list(run.records)
     for row in range(end.first_node, len(is_kept)):
         if not is_kept[row]:
-            lost = {"status": "lost", "reason": UNJOINED, "covariance": None}
-            run.records[first + row] = replace(run.records[first + row], **lost)
+            records[first + row] = replace(records[first + row], status="lost", reason=UNJOINED, covariance=None)
+    state = {run.back_end.submap_id: run.state, **run.inactive}[kept]
+    return replace(run, state=state, inactive={}, back_end=end, records=tuple(records))

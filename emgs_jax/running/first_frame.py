@@ -46,20 +46,20 @@ def _own_std(
     return axis_std(estimate.repeats, jnp.zeros((2, 2)), *guess, *known)[0]
 
 
-def with_first_frame(run: MappingRun) -> None:
+def with_first_frame(run: MappingRun) -> MappingRun:
     """Add `own_covariance`, seen from each frame, to those of a run that ends; those in a saved map have none."""
     if run.state is None or run.saved is not None:
-        return
+        return run
     own = own_covariance(run.state, run.config.localization)
     rows = [row for row, record in enumerate(run.records) if record.covariance is not None]
     if not rows or not own.any():
-        return
-    run.first_covariance = own
+        return run
     first = next(record.pose for record in run.records if record.pose is not None)
     added = seen_from(own, first, np.stack([run.records[row].pose for row in rows]))
+    records = list(run.records)
     for row, covariance in zip(rows, added, strict=True):
-        record = run.records[row]
-        run.records[row] = replace(record, covariance=record.covariance + covariance)
+        records[row] = replace(records[row], covariance=records[row].covariance + covariance)
+    return replace(run, records=tuple(records), first_covariance=own)
 
 
 def seen_from(

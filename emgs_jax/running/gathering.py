@@ -15,8 +15,8 @@ from emgs_jax.evaluation.clouds import PointCloud, SpooledCloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, posed
 from emgs_jax.evaluation.segmentation import SpooledLabels, nearest_classes
 from emgs_jax.geometry import rotated
-from emgs_jax.observation import known_surface
-from emgs_jax.running.record import IN_MAP, MappingRun
+from emgs_jax.observation import ObservationConfig, known_surface
+from emgs_jax.running.record import IN_MAP, FrameRecord
 from emgs_jax.running.window_input import RawView
 
 has_normal = eqx.filter_jit(known_surface)
@@ -52,24 +52,24 @@ class Baselines:
 
     Args:
         configs: by name.
-        run: that is growing.
+        observation: which points the map takes.
         dataset: for the camera and the truth.
     """
 
-    def __init__(self, configs: Mapping[str, BaselineConfig], run: MappingRun, dataset: Dataset) -> None:
+    def __init__(self, configs: Mapping[str, BaselineConfig], observation: ObservationConfig, dataset: Dataset) -> None:
         self.raw: dict[str, Fusion] = {}
         self.ours: dict[str, Fusion] = {}
         self.poses: list[np.ndarray] = []  # ours, as they were: the finished run has another unit
-        self._configs, self._run, self._dataset = configs, run, dataset
+        self._configs, self._observation, self._dataset = configs, observation, dataset
 
-    def add(self, row: int, view: View, points: np.ndarray, mask: np.ndarray, T_world_camera: np.ndarray) -> None:
+    def add(self, record: FrameRecord, view: View, points: np.ndarray, mask: np.ndarray, raw_pose: np.ndarray) -> None:
         """Add the frame of a record, with its points (h, w, 3), which are known, and its pose as the prior says it."""
-        record = self._run.records[row]
+        row = len(self.poses)
         self.poses.append(record.pose)
         if self._configs:
-            self._fuse(self.raw, row, view, T_world_camera, 1.0)
+            self._fuse(self.raw, row, view, raw_pose, 1.0)
         if record.status in IN_MAP and self._configs:
-            taken = np.asarray(has_normal(points, mask, self._run.config.observation))
+            taken = np.asarray(has_normal(points, mask, self._observation))
             cloud = PointCloud(*(values[taken[mask]] for values in vars(view.cloud).values()))
             view = View(np.where(taken, view.depth, np.float32(0.0)), view.image, cloud)
             self._fuse(self.ours, row, view, record.pose, 1.0 if record.scale is None else record.scale)
@@ -90,7 +90,7 @@ def unit_of(truth: np.ndarray, depth: np.ndarray) -> float:
 
 
 def gather(
-    views: Iterable[RawView],
+    frames: Iterable[tuple[FrameRecord | None, RawView]],
     evaluation: EvaluationConfig,
     keeps_points: bool,
     baselines: Baselines | None = None,
@@ -99,7 +99,7 @@ def gather(
     """Take all views of a sequence, one after the other: each in another thread, while the next frame is mapped.
 
     Args:
-        views: of all frames.
+        frames: records, which baselines need, and views of all frames.
         evaluation: how normals are fitted.
         keeps_points: the truth is known, or points are to lie at them.
         baselines: that take the views, too.
@@ -108,7 +108,7 @@ def gather(
     cloud, kept, classes = SpooledCloud(), Spool(), Spool()
     labels = None if text is None else SpooledLabels(text[0])
 
-    def take(row: int, view: RawView) -> None:
+    def take(record: FrameRecord | None, view: RawView) -> None:
         points, mask, image, pose, features = view
         known = mask & np.isfinite(points).all(-1)
         depth = np.where(known, points[..., 2], 0.0).astype(np.float32)
@@ -121,15 +121,15 @@ def gather(
             has_class = mask & (found >= 0)
             labels.append(rotated(points[has_class], pose[:3, :3]) + pose[:3, 3], found[has_class])
         if baselines is not None:
-            baselines.add(row, View(depth, image, seen), points, known, pose)
+            baselines.add(record, View(depth, image, seen), points, known, pose)
         cloud.append(posed(seen, pose))
 
     with ThreadPoolExecutor(1, "raw prior") as thread:
         taken: Future[None] | None = None
-        for row, view in enumerate(views):
+        for record, view in frames:
             if taken is not None:
                 taken.result()  # one at a time: no more of them are in memory, and an error ends the mapping
-            taken = thread.submit(take, row, view)
+            taken = thread.submit(take, record, view)
         if taken is not None:
             taken.result()
     return RawPrior(cloud, kept) if text is None else RawPrior(cloud, kept, classes, labels)

@@ -1,10 +1,9 @@
 """The pipeline over a sequence: inputs are integrated one by one into a run."""
 
 import contextlib
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
-import jax
 import jaxlie
 from omegaconf import OmegaConf
 from tqdm import tqdm
@@ -13,7 +12,7 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.observation import Prediction
 from emgs_jax.prior.base import Prior
 from emgs_jax.running.back_end import relocalize_frame
-from emgs_jax.running.back_end_update import finish_back_end, update_back_end
+from emgs_jax.running.back_end_update import add_frames, finish_back_end, optimize_and_deform, verify_loops
 from emgs_jax.running.capacity import advance, prepare_step, restart_map, start
 from emgs_jax.running.checkpoint import Checkpoint, Keeper
 from emgs_jax.running.clock import Clock, Timer
@@ -25,6 +24,7 @@ from emgs_jax.running.disconnected_submaps import (
     enter_submap,
     in_structure,
     is_related,
+    join_submaps,
     match_submap,
     place_structure,
     start_submap,
@@ -33,12 +33,12 @@ from emgs_jax.running.disconnected_submaps import (
 from emgs_jax.running.first_frame import with_first_frame
 from emgs_jax.running.prior_queries import make_prior_query
 from emgs_jax.running.record import (
-    JOINED,
     NEW_SUBMAP,
     RELOCALIZED,
     RESTARTED,
     FrameRecord,
     MappingRun,
+    TrackedFrame,
     new_run,
     record_lost,
     record_new_submap,
@@ -48,7 +48,6 @@ from emgs_jax.running.record import (
 from emgs_jax.running.relocalization import (
     anchor_motion_of,
     as_step_prediction,
-    frame_data,
     is_relocalization_due,
     is_restart_due,
     move_prediction,
@@ -62,7 +61,7 @@ from emgs_jax.running.saved_map import load_saved_map
 from emgs_jax.running.unit import rescale_run
 from emgs_jax.running.untracked import alarm
 from emgs_jax.running.window_input import RawView, WindowInput, window_inputs
-from emgs_jax.slam import StepInfo
+from emgs_jax.slam import SlamState
 
 
 def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
@@ -86,23 +85,27 @@ def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
         Clock().watching() as clock,
         tqdm(total=len(dataset), unit="frame", desc="mapping", disable=not show_progress) as bar,
     ):
-        run = new_run(dataset, config.slam, clock, graph=config.graph, saved=saved)
-        run.on_record = lambda record: show_records(bar, run.records)
-        deque(map_frames(run, dataset, prior), maxlen=0)
-    return run
+        run = start = new_run(dataset, config.slam, clock, graph=config.graph, saved=saved)
+        for run, new, _ in map_frames(start, dataset, prior):
+            show_records(bar, run.records, len(new))
+        return finish_run(run)
 
 
-def show_records(bar: tqdm, records: Sequence[FrameRecord]) -> None:
-    """Advance the progress bar by one frame and print an alarm where many frames in a row are untracked."""
-    message = None if bar.disable else alarm(records)
-    if message is not None:
-        tqdm.write(message)
-    bar.set_postfix_str(f"{records[-1].status}, {records[-1].num_gaussians or 0} Gaussians", refresh=False)
-    bar.update()
+def show_records(bar: tqdm, records: Sequence[FrameRecord], num_new: int) -> None:
+    """Advance the progress bar by the new records and print an alarm where many frames in a row are untracked."""
+    for count in range(len(records) - num_new + 1, len(records) + 1):
+        message = None if bar.disable else alarm(records[:count])
+        if message is not None:
+            tqdm.write(message)
+        last = records[count - 1]
+        bar.set_postfix_str(f"{last.status}, {last.num_gaussians or 0} Gaussians", refresh=False)
+        bar.update()
 
 
-def map_frames(run: MappingRun, dataset: Dataset, prior: Prior, keeper: Keeper | None = None) -> Iterator[RawView]:
-    """Map a sequence into `run`; yields the raw predictions of each frame on the way, for comparison.
+def map_frames(
+    run: MappingRun, dataset: Dataset, prior: Prior, keeper: Keeper | None = None
+) -> Iterator[tuple[MappingRun, Sequence[FrameRecord], Sequence[RawView]]]:
+    """Map a sequence, input by input; `finish_run` completes the last run.
 
     Args:
         run: before its first frame.
@@ -110,144 +113,165 @@ def map_frames(run: MappingRun, dataset: Dataset, prior: Prior, keeper: Keeper |
         prior: of the predictions.
         keeper: of the run's checkpoint, from which it resumes where there is one.
 
+    Yields:
+        The run after an input; the records of its new frames as first estimated; and their raw predictions.
+
     Raises:
         ValueError: no frame has a point and a pose from which a map can start.
     """
     keeper = keeper or Keeper()
-    keeper.attend(run)
     if run.back_end is not None and run.back_end.config.prior_query.is_used:
         spacing = run.back_end.config.prior_query.spacing
-        run.prior_query = make_prior_query(prior, dataset, spacing, run.config.window_size, run.clock)
+        query = make_prior_query(prior, dataset, spacing, run.config.window_size, run.clock)
+        run = replace(run, prior_query=query)
+    num_known = 0 if keeper.found is None else keeper.found.num_inputs
     try:
-        for position, window in enumerate(window_inputs(dataset, prior, run.config, run.clock)):
+        for number, window in enumerate(window_inputs(dataset, prior, run.config, run.clock), 1):
             with run.clock.phase("map"):
-                if keeper.found is not None and position < keeper.found.num_inputs:
-                    replay_input(run, window, keeper.found, is_last=position + 1 == keeper.found.num_inputs)
+                if number > num_known:
+                    run, records = integrate(run, window)
                 else:
-                    integrate_input(run, window)
-            keeper.keep(run, position + 1)
-            yield from window.raw
+                    run, records = replay(run, window, keeper.found, is_last=number == num_known)
+            keeper.keep(run, records)
+            yield run, records, window.raw
         keeper.save()
-        if run.saved is not None and run.state is None:
-            raise ValueError(not_found_message(run))
-        drop_unjoined_submaps(run)
-        if run.back_end is not None and not run.is_fixed:
-            with run.clock.phase("back_end"):
-                finish_back_end(run)
     except BaseException:
         with contextlib.suppress(OSError):  # the first error is the one to show
             keeper.save()
-        drop_unjoined_submaps(run)
         raise
-    finally:  # what an interrupted run leaves has the same unit
-        with_first_frame(run)
-        rescale_run(run)
+    if run.saved is not None and run.state is None:
+        raise ValueError(not_found_message(run))
 
 
-def integrate_input(run: MappingRun, window: WindowInput) -> None:
-    """Integrate one input into the map of `run`, and record what became of its frames."""
-    timer = Timer(run.clock)
-    match window.prediction:
-        case None:
-            record_lost(run, window)
-            return
-        case FirstWindow() as first if run.saved is None:
-            prepare_step(first, run.camera, run.config)
-            run.state, run.config = start(first, run.camera, run.config)
-            record_start(run, window, seconds_of(window, timer))
-        case prediction:
-            if isinstance(prediction, FirstWindow):
-                prepare_step(prediction, run.camera, run.config)
-            before, new = run.state, start_submap(run, window)
-            if new is not None:
-                run.state, run.config = new
-                record_new_submap(run, window, seconds_of(window, timer))
-                enter_submap(run, window, before)
-            elif not _integrate_step(run, window, timer):
-                return
-    if run.back_end is not None and not run.is_fixed:
+def finish_run(run: MappingRun, is_interrupted: bool = False) -> MappingRun:
+    """Complete a run after its last input; one that was interrupted gets the same unit, and is not optimized again."""
+    run = drop_unjoined_submaps(run)
+    if run.back_end is not None and not run.is_fixed and not is_interrupted:
         with run.clock.phase("back_end"):
-            update_back_end(run, window)
+            run = finish_back_end(run)
+    return rescale_run(with_first_frame(run))
 
 
-def _integrate_step(run: MappingRun, window: WindowInput, timer: Timer) -> bool:
-    """Run one step and record it; return False where the camera has no pose yet."""
-    info, location = step_or_relocalize(run, window, step_prediction(run, window))
-    if info is None:
-        record_lost(run, window, location)
-        return False
-    similarity = match_submap(run, window, info) if location is None else None
-    location = location if similarity is None else JOINED
-    record_step(run, window, jax.device_get(info), seconds_of(window, timer), location, similarity)
-    reanchor_prior(run, window)
-    return True
+def integrate(run: MappingRun, window: WindowInput) -> tuple[MappingRun, Sequence[FrameRecord]]:
+    """Integrate one input into a run; return it, and the new records as first estimated."""
+    tracked = track(run, window)
+    return update_back_end(tracked, window), tracked.records[len(run.records) :]
 
 
-def step_or_relocalize(
-    run: MappingRun, window: WindowInput, prediction: Prediction
-) -> tuple[StepInfo | None, str | None]:
-    """Integrate one input by a step; a lost camera is relocalized first, and the step starts at the pose found.
-
-    Where relocalization fails for long the map restarts at the pose that the step has estimated.
-
-    Returns:
-        Result of the step, None where the camera has no pose yet; and the outcome of relocalization, None without one.
-    """
-    state, config, info, location = run.state, run.config, None, None
-    if state is not None:
-        state, info, config = advance(state, move_prediction(prediction, run.prior_motion), run.camera, config)
-    if is_relocalization_due(run, info):
-        place, location = relocalize_frame(run.back_end, frame_data(window)[0])
-        if place is not None:
-            is_known = is_related(run, window)
-            seen = (
-                prediction
-                if is_known
-                else in_structure(prediction, window, place_structure(window, place.T_world_camera))
-            )
-            begin, again = relocalized_start(run, seen, place, has_other_unit=not is_known)
-            found = advance(begin, again, run.camera, run.config)
-            location = rejection(found[1], again, place, run.back_end.config.relocalization) or RELOCALIZED
-            if location == RELOCALIZED:
-                state, info, config = found
-        if location not in (None, RELOCALIZED) and info is not None and is_restart_due(run, window, state, info):
-            location, (state, config) = RESTARTED, restart_map(state, run.camera, config)
-    if run.is_fixed and state is not None:
-        state = replace_map(state, run.saved.map, config.submap.map_capacity)
-    run.state, run.config = state, config
-    return info, location
-
-
-def reanchor_prior(run: MappingRun, window: WindowInput) -> None:
-    """Anchor the prior's world at the last frame, if relocalization has found its pose."""
-    if run.records[-1].location != RELOCALIZED:
-        return
-    if is_related(run, window):
-        run.prior_motion = anchor_motion_of(run.records[-1], step_prediction(run, window))
-    else:  # the prior continues in a world of its own, which moves with this frame
-        run.structure, run.prior_motion = place_structure(window, run.records[-1].pose), jaxlie.SE3.identity()
-
-
-def replay_input(run: MappingRun, window: WindowInput, checkpoint: Checkpoint, is_last: bool) -> None:
-    """Replay an input from a checkpoint's records; after the last one the run has the checkpoint's state."""
+def track(run: MappingRun, window: WindowInput) -> MappingRun:
+    """Start a map or a submap from an input, or step with it; and record what became of its frames."""
+    timer = Timer(run.clock)
+    if window.prediction is None:
+        return record_lost(run, window)
     if isinstance(window.prediction, FirstWindow):
         prepare_step(window.prediction, run.camera, run.config)
         if run.saved is None:
-            run.state, run.config = start(window.prediction, run.camera, run.config)
+            return record_start(start_map(run, window.prediction), window, seconds_of(window, timer))
+    submap = start_submap(run, window)
+    if submap is not None:
+        return record_new_submap(submap, window, seconds_of(window, timer))
+    run, frame = step_or_relocalize(run, window)
+    if frame.info is None:
+        return record_lost(run, window, frame.location)
+    frame = match_submap(run, window, frame)
+    return reanchor_prior(record_step(run, window, frame, seconds_of(window, timer)), window)
+
+
+def start_map(run: MappingRun, first: FirstWindow) -> MappingRun:
+    """Start the map of a run."""
+    state, config = start(first, run.camera, run.config)
+    return replace(run, state=state, config=config)
+
+
+def step_or_relocalize(run: MappingRun, window: WindowInput) -> tuple[MappingRun, TrackedFrame]:
+    """Run one step; a lost camera is relocalized first, and the step starts at the pose found.
+
+    Where relocalization fails for long the map restarts at the pose that the step has estimated.
+    """
+    before, frame = run, TrackedFrame(step_prediction(run, window))
+    if run.state is not None:
+        run, frame = step_from(run, run.state, move_prediction(frame.prediction, run.prior_motion), frame)
+    if is_relocalization_due(before, frame.info):
+        found, relocalized = step_relocalized(before, window, frame)
+        if relocalized.location == RELOCALIZED:
+            run, frame = found, relocalized
+        else:
+            frame = replace(frame, location=relocalized.location)
+            if frame.info is not None and is_restart_due(before, window, run.state, frame.info):
+                state, config = restart_map(run.state, run.camera, run.config)
+                run, frame = replace(run, state=state, config=config), replace(frame, location=RESTARTED)
+    if run.is_fixed and run.state is not None:
+        state = replace_map(run.state, run.saved.map, run.config.submap.map_capacity)
+        run = replace(run, state=state)
+    return run, frame
+
+
+def step_from(
+    run: MappingRun, state: SlamState, prediction: Prediction, frame: TrackedFrame
+) -> tuple[MappingRun, TrackedFrame]:
+    """Run one step from a state; capacities grow where they must."""
+    state, info, config = advance(state, prediction, run.camera, run.config)
+    return replace(run, state=state, config=config), replace(frame, info=info)
+
+
+def step_relocalized(run: MappingRun, window: WindowInput, frame: TrackedFrame) -> tuple[MappingRun, TrackedFrame]:
+    """Relocalize a lost camera, and run the step from the pose found; `location` tells whether the map accepts it."""
+    place, failure = relocalize_frame(run.back_end, window.data[0])
+    if place is None:
+        return run, replace(frame, location=failure)
+    prediction, is_known = frame.prediction, is_related(run, window)
+    if not is_known:
+        prediction = in_structure(prediction, window, place_structure(window, place.T_world_camera))
+    state, again = relocalized_start(run, prediction, place, has_other_unit=not is_known)
+    found, frame = step_from(run, state, again, frame)
+    failure = rejection(frame.info, again, place, run.back_end.config.relocalization)
+    return found, replace(frame, location=failure or RELOCALIZED)
+
+
+def reanchor_prior(run: MappingRun, window: WindowInput) -> MappingRun:
+    """Anchor the prior's world at the last frame, if relocalization has found its pose."""
+    last = run.records[-1]
+    if last.location != RELOCALIZED:
+        return run
+    if is_related(run, window):
+        return replace(run, prior_motion=anchor_motion_of(last, step_prediction(run, window)))
+    # The prior continues in a world of its own, which moves with this frame.
+    return replace(run, structure=place_structure(window, last.pose), prior_motion=jaxlie.SE3.identity())
+
+
+def update_back_end(run: MappingRun, window: WindowInput) -> MappingRun:
+    """Add frames to the pose graph, join submaps; detect and verify loops, optimize the poses and deform the map."""
+    if run.back_end is None or run.state is None or run.is_fixed:
+        return run
+    with run.clock.phase("back_end"):
+        run = add_frames(run, window)
+        if run.records[-1].similarity is not None:
+            run = join_submaps(run, window)
+        run, loops = verify_loops(run, window)
+        return run if loops is None else optimize_and_deform(run, loops)
+
+
+def replay(
+    run: MappingRun, window: WindowInput, checkpoint: Checkpoint, is_last: bool
+) -> tuple[MappingRun, Sequence[FrameRecord]]:
+    """Replay an input from a checkpoint's records, as `integrate`; after the last one the states are the checkpoint's.
+
+    Until then the back end deforms a map that the checkpoint's replaces.
+    """
+    if isinstance(window.prediction, FirstWindow):
+        prepare_step(window.prediction, run.camera, run.config)
+        if run.saved is None:
+            run = start_map(run, window.prediction)
     first = len(run.records)
-    for record in checkpoint.records[first : first + len(window.frames)]:
-        run.records.append(record)
-        run.on_record(record)
-    if run.records[-1].location == NEW_SUBMAP:
-        enter_submap(run, window, run.state)
-    reanchor_prior(run, window)
-    if run.state is None and run.records[-1].location == RELOCALIZED:
-        run.state = state_in_saved_map(run, as_step_prediction(window.prediction))
-    if run.back_end is not None and run.state is not None and not run.is_fixed:
-        with run.clock.phase("back_end"):
-            update_back_end(run, window)  # deforms a map that the checkpoint's state replaces
-    if is_last:
-        run.state, run.inactive, run.config = checkpoint.restored(run.state, run.config)
+    records = tuple(checkpoint.records[first : first + len(window.frames)])
+    run = replace(run, records=(*run.records, *records))
+    if records[-1].location == NEW_SUBMAP:
+        run = enter_submap(run, window)
+    run = reanchor_prior(run, window)
+    if run.state is None and records[-1].location == RELOCALIZED:
+        run = replace(run, state=state_in_saved_map(run, as_step_prediction(window.prediction)))
+    run = update_back_end(run, window)
+    return checkpoint.restored(run) if is_last else run, records
 
 
 def seconds_of(window: WindowInput, timer: Timer, num_sharing: int = 1) -> Mapping[str, float]:

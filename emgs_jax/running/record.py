@@ -1,12 +1,13 @@
-"""A run of the pipeline so far: its state, and a record of each frame.
+"""State of a run, and a record of each of its frames.
 
 A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; files write it as TUM's seven numbers.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import jax
 import jaxlie
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,6 +18,7 @@ from emgs_jax.geometry import Sim3, scale_covariance
 from emgs_jax.io.trajectory import to_tum
 from emgs_jax.localization import REASONS
 from emgs_jax.loop_closure.prior_query import PriorQuery
+from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
 from emgs_jax.running.back_end import BackEnd, BackEndConfig
 from emgs_jax.running.clock import Clock
@@ -106,15 +108,14 @@ class FrameRecord:
     compile_seconds: float = 0.0
 
 
-@dataclass
+@dataclass(frozen=True)
 class MappingRun:
-    """A run so far. It grows with each frame, so an interrupted one still holds its map and records.
+    """State of a run so far. Nothing of it is ever changed in place: each input makes a new one.
 
     Args:
         camera: of the frames.
         config: all stages; capacities grow where they must.
         clock: counts load, predict and map.
-        on_record: called with the record of each frame.
         state: None before the first window.
         records: of the frames in use, in order.
         back_end: optimizes poses and deforms the map; None: poses stay as first estimated.
@@ -129,14 +130,13 @@ class MappingRun:
     camera: Camera
     config: SlamConfig
     clock: Clock = field(default_factory=Clock)
-    on_record: Callable[[FrameRecord], None] = lambda record: None
     state: SlamState | None = None
-    records: list[FrameRecord] = field(default_factory=list)
+    records: Sequence[FrameRecord] = ()
     back_end: BackEnd | None = None
     saved: SavedMap | None = None
     prior_motion: jaxlie.SE3 | None = None
     structure: PlacedStructure | None = None
-    inactive: dict[int, SlamState] = field(default_factory=dict)
+    inactive: Mapping[int, SlamState] = field(default_factory=dict)
     prior_query: PriorQuery = lambda a, b: None
     first_covariance: np.ndarray | None = None
 
@@ -170,7 +170,6 @@ def new_run(
     dataset: Dataset,
     config: SlamConfig,
     clock: Clock | None = None,
-    on_record: Callable[[FrameRecord], None] = lambda record: None,
     graph: BackEndConfig | None = None,
     saved: SavedMap | None = None,
 ) -> MappingRun:
@@ -182,22 +181,39 @@ def new_run(
     back_end = None if graph is None else BackEnd(graph, tuple(dataset.intrinsics), float(config.fit.min_std))
     clock, camera = Clock() if clock is None else clock, to_camera(dataset)
     if saved is None:
-        return MappingRun(camera, config, clock, on_record, back_end=back_end)
+        return MappingRun(camera, config, clock, back_end=back_end)
     if config.initialization == "merged":
         raise ValueError("map= places one view after the other: use slam.initialization=incremental with it")
     config = replace(config, submap=replace(config.submap, map_capacity=saved.map.weight.shape[0]))
-    return MappingRun(camera, config, clock, on_record, back_end=saved.back_end, saved=saved)
+    return MappingRun(camera, config, clock, back_end=saved.back_end, saved=saved)
 
 
-def record_lost(run: MappingRun, window: WindowInput, location: str | None = None) -> None:
+@dataclass(frozen=True)
+class TrackedFrame:
+    """What is known of a frame after its step.
+
+    Args:
+        prediction: its input, in the world of the map.
+        info: result of the step; None where the camera has no pose yet.
+        location: outcome of relocalization, see `FrameRecord`; None without one.
+        similarity: from its submap to the one that it joins, likewise.
+    """
+
+    prediction: Prediction | None = None
+    info: StepInfo | None = None
+    location: str | None = None
+    similarity: np.ndarray | None = None
+
+
+def record_lost(run: MappingRun, window: WindowInput, location: str | None = None) -> MappingRun:
     """Record a lost frame before a map can start; its pose is the anchor's or the last one, a placeholder."""
     reason, pose = REASONS[0] if location is None else NOT_FOUND, window.T_world_anchor
     if run.saved is not None:
         pose = run.records[-1].pose if run.records else run.saved.back_end.poses[-1]
-    _add(run, window, 0, status="lost", reason=reason, location=location, pose=pose)
+    return _add(run, window, 0, status="lost", reason=reason, location=location, pose=pose)
 
 
-def record_start(run: MappingRun, window: WindowInput, seconds: Seconds) -> None:
+def record_start(run: MappingRun, window: WindowInput, seconds: Seconds) -> MappingRun:
     """Record the frames that the map was made from; raise ValueError where that map is empty."""
     poses = np.asarray(window.prediction.T_world_views.wxyz_xyz)
     count = int(np.asarray(run.map.gaussians.valid).sum())
@@ -208,28 +224,31 @@ def record_start(run: MappingRun, window: WindowInput, seconds: Seconds) -> None
         )
     share = {key: value / len(poses) for key, value in seconds.items()}
     for row, pose in enumerate(poses):
-        _add(run, window, row, **share, status="initialization", pose=to_matrix(pose), scale=1.0, num_gaussians=count)
+        described = {"status": "initialization", "pose": to_matrix(pose), "scale": 1.0, "num_gaussians": count}
+        run = _add(run, window, row, **share, **described)
+    return run
 
 
-def record_new_submap(run: MappingRun, window: WindowInput, seconds: Seconds) -> None:
+def record_new_submap(run: MappingRun, window: WindowInput, seconds: Seconds) -> MappingRun:
     """Record the first frame of a disconnected submap; its pose is that of the frame before, a placeholder."""
     count = int(np.asarray(run.map.gaussians.valid).sum())
     kept = {"status": "initialization", "pose": run.records[-1].pose, "new": count, "num_gaussians": count}
-    _add(run, window, 0, **kept, scale=1.0, location=NEW_SUBMAP, **seconds)
+    return _add(run, window, 0, **kept, scale=1.0, location=NEW_SUBMAP, **seconds)
 
 
-def record_step(
-    run: MappingRun, window: WindowInput, info: StepInfo, seconds: Seconds, location=None, similarity=None
-) -> None:
-    """Record a step: `info` on the host, the seconds that it took, and the outcome of relocalization."""
+def record_step(run: MappingRun, window: WindowInput, frame: TrackedFrame, seconds: Seconds) -> MappingRun:
+    """Record a step and the seconds that it took."""
+    info = jax.device_get(frame.info)
     kept = {"fused": 0, "updated": 0, "new": 0, "num_gaussians": run.saved.count} if run.is_fixed else {}
-    if location == RESTARTED:
+    if frame.location == RESTARTED:
         count = int(np.asarray(run.map.gaussians.valid).sum())
         kept = {"status": "initialization", "new": count - int(info.num_gaussians), "num_gaussians": count}
-    _add(run, window, 0, **_step_fields(info) | kept, location=location, similarity=similarity, **seconds)
+    outcome = {"location": frame.location, "similarity": frame.similarity}
+    return _add(run, window, 0, **_step_fields(info) | kept | outcome, **seconds)
 
 
-def _add(run: MappingRun, window: WindowInput, row: int, **described: Any) -> None:
+def _add(run: MappingRun, window: WindowInput, row: int, **described: Any) -> MappingRun:
+    """Append the record of a frame of a window."""
     frame = window.frames[row]
     record = FrameRecord(
         index=frame.index,
@@ -239,8 +258,7 @@ def _add(run: MappingRun, window: WindowInput, row: int, **described: Any) -> No
         true_pose=frame.T_world_camera,
         **described,
     )
-    run.records.append(record)
-    run.on_record(record)
+    return replace(run, records=(*run.records, record))
 
 
 def _step_fields(info: StepInfo) -> dict[str, Any]:
@@ -311,5 +329,5 @@ def to_matrix(wxyz_xyz: np.ndarray) -> np.ndarray:
     return pose
 
 
-def _stacked(poses: list[np.ndarray]) -> np.ndarray:
+def _stacked(poses: Sequence[np.ndarray]) -> np.ndarray:
     return np.stack(poses) if poses else np.zeros((0, 4, 4))

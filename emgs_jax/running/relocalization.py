@@ -16,7 +16,6 @@ from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.registration.rigid import pose_row, scale_translation
 from emgs_jax.running.back_end import BackEnd
 from emgs_jax.running.convert import FirstWindow, to_se3
-from emgs_jax.running.factors import FrameData
 from emgs_jax.running.record import IN_MAP, FrameRecord, MappingRun
 from emgs_jax.running.window_input import WindowInput
 from emgs_jax.slam import SlamState, StepInfo
@@ -74,14 +73,6 @@ def _num_untracked(run: MappingRun, info: StepInfo) -> int:
     """Count the last frames in a row that are not tracked, the one of `info` included."""
     placed = [row for row, record in enumerate(run.records) if record.status in IN_MAP]
     return 0 if info.localization.is_tracked else len(run.records) - (placed[-1] if placed else -1)
-
-
-def frame_data(window: WindowInput) -> list[FrameData]:
-    """Collect what the back end needs of each frame."""
-    return [
-        FrameData(frame.index, frame.image, raw.points, raw.mask, window.T_anchor_views)
-        for frame, raw in zip(window.frames, window.raw, strict=True)
-    ]
 
 
 def as_step_prediction(opening: FirstWindow | Prediction) -> Prediction:

@@ -32,21 +32,24 @@ def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
     return rescaled(state, np.exp(-float(state.estimate.log_scale)), origin) if state.estimate.log_scale else state
 
 
-def rescale_run(run: MappingRun) -> None:
+def rescale_run(run: MappingRun) -> MappingRun:
     """Apply `in_prior_unit` to a run that ends, its records and its back end included.
 
     A saved map keeps its unit, and so does one of joined submaps: the mean is of the last one's inferences.
     """
+    end = run.back_end
     if run.state is None or run.saved is not None or not run.state.estimate.log_scale:
-        return
-    if run.back_end is not None and not run.back_end.has_one_unit:
-        return
+        return run
+    if end is not None and not end.has_one_unit:
+        return run
     origin = next(record.pose for record in run.records if record.pose is not None)[:3, 3]  # the anchor's
     similarity = Sim3.about(origin, np.exp(-float(run.state.estimate.log_scale)))
-    run.state = in_prior_unit(run.state, origin)
-    run.records = [transform_record(record, similarity) for record in run.records]
-    if run.back_end is not None:
-        run.back_end = transform_nodes(run.back_end, range(len(run.back_end.poses)), similarity)
+    return replace(
+        run,
+        state=in_prior_unit(run.state, origin),
+        records=tuple(transform_record(record, similarity) for record in run.records),
+        back_end=end and transform_nodes(end, range(len(end.poses)), similarity),
+    )
 
 
 def rescaled(state: SlamState, factor: float, origin: np.ndarray) -> SlamState:

@@ -1,8 +1,8 @@
 """Inputs of a run, window by window: frames are read, predicted and converted when they are needed."""
 
 from collections import ChainMap
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ from emgs_jax.observation import Prediction
 from emgs_jax.prior.base import Prior, PriorPrediction, check_unit, windows, with_frames
 from emgs_jax.running.clock import Clock, Timer
 from emgs_jax.running.convert import FirstWindow, opening, to_first_window, to_prediction
+from emgs_jax.running.factors import FrameData
 from emgs_jax.slam import SlamConfig
 
 
@@ -51,6 +52,14 @@ class WindowInput:
     seconds: Mapping[str, float]
     structure: int = 0
 
+    @property
+    def data(self) -> list[FrameData]:
+        """What the back end needs of each frame."""
+        return [
+            FrameData(frame.index, frame.image, raw.points, raw.mask, self.T_anchor_views)
+            for frame, raw in zip(self.frames, self.raw, strict=True)
+        ]
+
 
 @dataclass(frozen=True)
 class PlacedStructure:
@@ -88,9 +97,10 @@ def window_inputs(
         with clock.phase("map"):
             anchor = first_pose(frames)
             raw = _raw_views(prediction, frames, anchor, structure, done, config)
-            convert, unknown = _step if is_started else _opening, np.full((4, 4), np.nan)
-            found = convert(prediction, frames, unknown if structure else anchor, raw, config, clock)
-        yield from (replace(one, structure=structure) for one in found)
+            convert = _step if is_started else _opening
+            known_anchor = np.full((4, 4), np.nan) if structure else anchor
+            found = convert(PredictedWindow(prediction, frames, known_anchor, raw, structure), config, Timer(clock))
+        yield from found
         done |= {index: view.T_world_camera for index, view in raw.items()}
         is_started = found[-1].prediction is not None
     if not is_started:
@@ -118,43 +128,40 @@ def first_pose(frames: Mapping[int, Frame]) -> np.ndarray:
     return np.eye(4) if truth is None else np.asarray(truth, np.float64)
 
 
-def _step(
-    prediction: PriorPrediction,
-    frames: Mapping[int, Frame],
-    anchor: np.ndarray,
-    raw: Mapping[int, RawView],
-    config: SlamConfig,
-    clock: Clock,
-) -> list[WindowInput]:
+class PredictedWindow(NamedTuple):
+    """A window's prediction, its frames, the anchor's pose or NaN, raw views of new frames, and the world's number."""
+
+    prediction: PriorPrediction
+    frames: Mapping[int, Frame]
+    T_world_anchor: np.ndarray
+    raw: Mapping[int, RawView]
+    structure: int
+
+    def input(
+        self, indices: Sequence[int], prediction: FirstWindow | Prediction | None, seconds: Mapping[str, float] = {}
+    ) -> WindowInput:
+        """Make an input of some of its frames."""
+        frames, raw = (tuple(values[index] for index in indices) for values in (self.frames, self.raw))
+        poses = _poses(self.prediction)
+        return WindowInput(frames, raw, prediction, self.T_world_anchor, poses, seconds, self.structure)
+
+
+def _step(window: PredictedWindow, config: SlamConfig, timer: Timer) -> list[WindowInput]:
     """Convert the current frame to the input of a step."""
-    timer, current = Timer(clock), prediction.window.current
-    step = to_prediction(prediction, frames, anchor, config.observation)
-    return [WindowInput((frames[current],), (raw[current],), step, anchor, _poses(prediction), timer.read())]
+    step = to_prediction(*window[:3], config.observation)
+    return [window.input([window.prediction.window.current], step, timer.read())]
 
 
-def _opening(
-    prediction: PriorPrediction,
-    frames: Mapping[int, Frame],
-    anchor: np.ndarray,
-    raw: Mapping[int, RawView],
-    config: SlamConfig,
-    clock: Clock,
-) -> list[WindowInput]:
+def _opening(window: PredictedWindow, config: SlamConfig, timer: Timer) -> list[WindowInput]:
     """Convert the frames before a map can start, the first window, and the steps from the same window."""
-    timer = Timer(clock)
-    window, usable = to_first_window(prediction, frames, anchor, config.observation, since=min(raw))
-    before = [index for index in raw if not usable or index < usable[0]]
-    poses = _poses(prediction)
-    found = [WindowInput((frames[index],), (raw[index],), None, anchor, poses, {}) for index in before]
-    if window is None:
+    views, usable = to_first_window(*window[:3], config.observation, since=min(window.raw))
+    found = [window.input([index], None) for index in window.raw if not usable or index < usable[0]]
+    if views is None:
         return found
-    first, steps = opening(window, config)
+    first, steps = opening(views, config)
     count = len(usable) - len(steps)  # views that the map is made from
-    shown = tuple(frames[index] for index in usable[:count]), tuple(raw[index] for index in usable[:count])
-    found.append(WindowInput(*shown, first, anchor, poses, timer.read()))
-    for index, step in zip(usable[count:], steps, strict=True):
-        found.append(WindowInput((frames[index],), (raw[index],), step, anchor, poses, {}))
-    return found
+    found.append(window.input(usable[:count], first, timer.read()))
+    return found + [window.input([index], step) for index, step in zip(usable[count:], steps, strict=True)]
 
 
 def _poses(prediction: PriorPrediction) -> dict[int, np.ndarray]:

@@ -27,11 +27,12 @@ class GrowingRun:
     """A wall that is a metre longer after each frame; the camera goes along it."""
 
     def __init__(self) -> None:
-        self.camera, self.records, self.map = Camera((24.0, 24.0), (11.5, 7.5), 24, 16), [], None
+        self.camera, self.records, self.map = Camera((24.0, 24.0), (11.5, 7.5), 24, 16), (), None
 
     def views(self):
         for row, pose in enumerate(poses_along(np.arange(NUM_FRAMES))):
-            self.records.append(FrameRecord(row, f"{row}.png", row / 4, "tracked", pose=pose, residual=0.0123456))
+            record = FrameRecord(row, f"{row}.png", row / 4, "tracked", pose=pose, residual=0.0123456)
+            self.records = (*self.records, record)
             gaussians = wall(0.0, row + 1.0)
             self.map = new_map(gaussians, jnp.ones(gaussians.valid.shape[0]), jnp.ones(()), jnp.asarray(0))
             yield SimpleNamespace(image=np.full((16, 24, 3), 10 * row, np.uint8))
@@ -55,11 +56,13 @@ def test_what_is_served_follows_the_run_and_at_its_end_is_the_whole_of_it(at_onc
     with served(run, LiveConfig(free_port(), 0.0), kept=[0, 2, 4, 6]) as view:
         assert view.viewer.server.get_host() == "127.0.0.1" and "No frame" in view.viewer.facts.content
         view.viewer.words.value = "left"  # asked before there is a map
-        for seen in view.watch(run.views(), run):
+        for seen in run.views():
+            view.show(run, seen.image)
             view.wait()
             counts.append((len(view.viewer.layers["mean"]), len(view.viewer.scene.splats.centers)))
             assert view.viewer.frame.value == len(run.records) - 1, "who looks at the last frame goes on to do so"
             np.testing.assert_array_equal(view.viewer.picture.image, seen.image)
+        view.show_last(run)
         viewer = view.viewer
         assert counts == [(200 * n, 200 * n) for n in range(1, NUM_FRAMES + 1)]
         assert "Gaussians: left" in viewer.answer.content, "words stay asked"
@@ -71,10 +74,12 @@ def test_what_is_served_follows_the_run_and_at_its_end_is_the_whole_of_it(at_onc
 def test_who_looks_at_an_earlier_frame_is_left_there(at_once):
     run = GrowingRun()
     with served(run, LiveConfig(free_port(), 0.0)) as view:
-        for row, _ in enumerate(view.watch(run.views(), run)):
+        for row, seen in enumerate(run.views()):
+            view.show(run, seen.image)
             view.wait()
             if row == 2:
                 view.viewer.frame.value = 1
+        view.show_last(run)
         assert view.viewer.frame.value == 1 and "frame 1:" in view.viewer.facts.content
 
 
@@ -82,8 +87,10 @@ def test_a_run_is_not_drawn_more_often_than_asked():
     run, drawn = GrowingRun(), []
     with served(run, LiveConfig(free_port(), 3600.0)) as view:
         view.viewer.update = lambda shown: drawn.append(len(shown.frames))
-        for _ in view.watch(run.views(), run):
+        for seen in run.views():
+            view.show(run, seen.image)
             view.wait()
+        view.show_last(run)
     assert drawn == [1, NUM_FRAMES]
 
 
@@ -96,9 +103,10 @@ def test_the_run_does_not_wait_for_what_is_drawn():
             drawn.append(len(shown.frames))
 
         view.viewer.update = slow
-        for row, _ in enumerate(view.watch(run.views(), run)):
-            if row == NUM_FRAMES - 1:
-                may_end.set()  # all frames have passed, and the first picture is still being drawn
+        for seen in run.views():
+            view.show(run, seen.image)
+        may_end.set()  # all frames have passed, and the first picture is still being drawn
+        view.show_last(run)
     assert drawn == [1, NUM_FRAMES], "the first, and the whole run at its end"
 
 
@@ -110,7 +118,9 @@ def test_a_view_that_fails_is_said_and_ends_no_run(capsys):
             raise RuntimeError("no more memory")
 
         view.viewer.update = broken
-        assert len(list(view.watch(run.views(), run))) == NUM_FRAMES
+        for seen in run.views():
+            view.show(run, seen.image)
+        view.show_last(run)
     assert capsys.readouterr().out.count("the run goes on: RuntimeError('no more memory')") == 1
 
 

@@ -37,11 +37,13 @@ from emgs_jax.running.back_end import (
     remove_inconsistent,
     violated,
 )
-from emgs_jax.running.back_end_update import finish_back_end, update_back_end
+from emgs_jax.running.back_end_update import finish_back_end
 from emgs_jax.running.deformation import merge_duplicates_of_state
 from emgs_jax.running.factors import FrameData, map_factor, sequential_factor, stack_factors
+from emgs_jax.running.pipeline import update_back_end
 from emgs_jax.running.prior_queries import query_prior
 from emgs_jax.running.record import FrameRecord, MappingRun
+from emgs_jax.running.window_input import WindowInput
 from emgs_jax.slam import SlamState
 
 COUNT, WINDOW = 60, 10
@@ -133,7 +135,7 @@ def test_the_mean_of_the_scales_that_the_unit_of_a_run_is_made_of_follows_a_clos
     smaller = np.stack([scale_pose(pose, 0.9) for pose in poses])
     end = replace(end, verified=[loop(smaller, row) for row in range(1, 9)])
     run = MappingRun(None, None, state=state, records=records, back_end=end)
-    finish_back_end(run)
+    run = finish_back_end(run)
     end = run.back_end
     assert end.accepted and log_scale - np.mean(end.log_scales) > 1e-3  # `scale_std` asks for scales of one
     assert float(run.state.estimate.log_scale) == pytest.approx(np.mean(end.log_scales), abs=1e-5)
@@ -160,21 +162,20 @@ def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatc
     end = replace(end, verified=list(loops))
     end, state = close_loops(end, state_of(drifted), loops)
     records = [FrameRecord(row, None, None, "tracked", pose=pose) for row, pose in enumerate(end.poses)]
-    run = MappingRun(None, None, state=state, records=records, back_end=end)
-    run.prior_motion = motion = jaxlie.SE3.from_matrix(jnp.asarray(ring()[7], jnp.float32))
+    motion = jaxlie.SE3.from_matrix(jnp.asarray(ring()[7], jnp.float32))
+    run = MappingRun(None, None, state=state, records=records, back_end=end, prior_motion=motion)
     frame, raw = SimpleNamespace(index=COUNT - 1, image=None), SimpleNamespace(points=None, mask=None)
-    given = SimpleNamespace(frames=[frame], raw=[raw], T_anchor_views={})
+    given = WindowInput((frame,), (raw,), None, None, {}, {})
     monkeypatch.setattr(back_end_update, "add_node", lambda end, *arguments: end)
     monkeypatch.setattr(back_end_update, "detect_loops", lambda end, frame: end)
-    update_back_end(run, given)
+    run = update_back_end(run, given)
     assert run.back_end.accepted == loops and len(run.back_end.closures) == 1 and run.prior_motion is motion
-    records = list(run.records)
 
     def contradict(end: BackEnd, frame: FrameData) -> BackEnd:
         return replace(end, violating=[loop(truth, row) for row in (9, 10)])
 
     monkeypatch.setattr(back_end_update, "detect_loops", contradict)
-    update_back_end(run, given)
+    run = update_back_end(run, given)
     end = run.back_end
     assert not end.accepted and len(end.closures) == 2
     assert error(end.poses, drifted) < 0.01
@@ -452,27 +453,23 @@ def test_what_moves_the_poses_was_asked_for_before(graph, monkeypatch):
     truth, drifted = ring(), ring(1.95 * np.pi)
     loops = [loop(truth, row) for row in range(1, 5)]
     end = replace(with_keyframes(walked(graph, drifted)), verified=loops)
-    run = MappingRun(None, None, state=state_of(drifted), back_end=end)
-    run.records = [FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0) for i, pose in enumerate(drifted)]
+    records = [FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0) for i, pose in enumerate(drifted)]
     right, _ = told_again(truth)
     wrong, _ = told_again(truth, off=6.0)
-    run.prior_query = lambda a, b: wrong(a, b) if a == 2 else right(a, b)
+    run = MappingRun(None, None, state=state_of(drifted), back_end=end, records=records)
+    asking = replace(run, prior_query=lambda a, b: wrong(a, b) if a == 2 else right(a, b))
     with monkeypatch.context() as patch:
         for module in (back_end, back_end_update):
             patch.setattr(module, "consistent_loops", lambda end, since=0: list(end.verified))
-        finish_back_end(run)
-    end = run.back_end
+        end = finish_back_end(asking).back_end
     assert [one.a for one in end.accepted] == [1, 3, 4] and [refusal.a for refusal in end.refusals] == [2]
     assert end.accepted[0].sqrt_info[0, 0] > loops[0].sqrt_info[0, 0]
     assert error(end.poses, truth) < 0.5 * error(drifted, truth)
     # Two of them against it, and all that imply the same correction fall.
     end = with_keyframes(walked(graph, drifted))
     end = replace(end, verified=[loop(truth, row) for row in range(1, 9)])
-    run.back_end, run.state = end, state_of(drifted)
-    run.prior_query = lambda a, b: wrong(a, b)
     assert len(consistent_loops(end)) == 8
-    finish_back_end(run)
-    end = run.back_end
+    end = finish_back_end(replace(run, back_end=end, prior_query=wrong)).back_end
     assert end.accepted == [] and len(end.refusals) == 3 and consistent_loops(end) == []
     assert error(end.poses, drifted) == 0
 
@@ -490,17 +487,19 @@ def test_a_map_whose_visits_were_joined_is_settled_at_the_end_with_the_noise_of_
         else FrameRecord(i, None, None, "degraded", pose=pose, scale=1.0, depth_noise=9.0)  # fits nothing
         for i, pose in enumerate(drifted)
     ]
-    run, asked = MappingRun(None, SimpleNamespace(existence="gates"), state=state_of(drifted), records=records), []
-    run.back_end = end
+    asked, config = [], SimpleNamespace(existence="gates")
+    run = MappingRun(None, config, state=state_of(drifted), records=records, back_end=end)
 
     def settled(state, nodes, noise, gates):
-        np.testing.assert_allclose(nodes.T_world.as_matrix()[:COUNT], run.back_end.poses, atol=1e-5)
-        asked.append((noise, gates))
+        asked.append((noise, gates, nodes.T_world.as_matrix()[:COUNT]))
         return replace(state, time=jnp.asarray(-1))
 
     monkeypatch.setattr(back_end_update, "merge_duplicates_of_state", settled)
-    finish_back_end(run)
-    assert asked == ([(0.01, "gates")] if has_loop else []) and (run.state.time == -1) == has_loop
+    run = finish_back_end(run)
+    assert [one[:2] for one in asked] == ([(0.01, "gates")] if has_loop else [])
+    assert (run.state.time == -1) == has_loop
+    for *_, poses in asked:
+        np.testing.assert_allclose(poses, run.back_end.poses, atol=1e-5)
 
 
 def test_a_gaussian_is_seen_from_the_node_of_its_birth(graph):

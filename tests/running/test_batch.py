@@ -8,9 +8,9 @@ from tiny_run import EditedPrior, dataset
 
 from emgs_jax.data.base import Frame
 from emgs_jax.ops.pytree import stack
-from emgs_jax.running.batch import Stack, map_together, programs
+from emgs_jax.running.batch import integrate_stack, make_stack, map_together, programs, unstacked
 from emgs_jax.running.convert import FirstWindow
-from emgs_jax.running.pipeline import integrate_input
+from emgs_jax.running.pipeline import integrate
 from emgs_jax.running.record import MappingRun
 from emgs_jax.running.window_input import RawView, WindowInput
 
@@ -66,13 +66,11 @@ def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_
         )
     )
     together, alone = ([MappingRun(camera, config) for config in some] for some in (configs, roomy))
-    stacked = Stack(together)
+    stacked = make_stack(together)
     for given in sequence:
-        stacked.integrate(given)
-        for run in alone:
-            integrate_input(run, given)
-    stacked.hand_out()
-    for mine, run in zip(together, alone, strict=True):
+        stacked = integrate_stack(stacked, given)
+        alone = [integrate(run, given)[0] for run in alone]
+    for mine, run in zip(unstacked(stacked), alone, strict=True):
         count = int(run.map.gaussians.valid.sum())
         assert int(mine.map.gaussians.valid.sum()) == count and mine.map.weight.shape == (512,)
         for a, b in zip(jax.tree.leaves(mine.map), jax.tree.leaves(run.map), strict=True):

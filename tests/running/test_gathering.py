@@ -52,21 +52,20 @@ def gather_all(unit: float = 1.0):
         FrameRecord(row, "f", 0.0, status, pose=ours[row], scale=scale)
         for row, (status, scale) in enumerate(zip(STATUSES, SCALES, strict=True))
     ]
-    run = SimpleNamespace(records=[], poses=ours, raw_poses=raw, true_poses=list(ours), config=slam_config())
-    baselines = Baselines(CONFIGS, run, Walls())
+    run = SimpleNamespace(records=records, poses=ours, raw_poses=raw, true_poses=list(ours))
+    baselines = Baselines(CONFIGS, slam_config().observation, Walls())
 
-    def views():
+    def frames():
         for row, record in enumerate(records):
-            run.records.append(record)  # as `map_frames` does: a frame's record is there before its view
             points = backproject(np.full(SHAPE, WALL / (SCALES[row] or 1.0) / unit), INTRINSICS)
             features = np.zeros((1, 2, 2), np.float16)  # left half, right half of the image
             features[0, :, row % 2] = 1.0 if row else [1.0, 0.0]
             mask = np.full(SHAPE, row != 4)
             mask[8, 12] = True  # alone it has no normal
-            yield RawView(points, mask, Walls()[row].image, raw[row], features)
+            yield record, RawView(points, mask, Walls()[row].image, raw[row], features)
 
     text = ("wall", "cat"), np.eye(2, dtype=np.float32)
-    return run, baselines, gather(views(), evaluation_config(), True, baselines, text)
+    return run, baselines, gather(frames(), evaluation_config(), True, baselines, text)
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +160,8 @@ def test_a_prior_scores_the_same_in_whatever_unit_it_answers(metres_per_unit):
             pose = frame.T_world_camera.copy()
             pose[:3, 3] /= unit
             points = (backproject(frame.depth, INTRINSICS) / unit).astype(np.float32)
-            views.append(RawView(points, frame.depth > 0, frame.image, pose, np.ones((1, 1, 1), np.float16)))
+            view = RawView(points, frame.depth > 0, frame.image, pose, np.ones((1, 1, 1), np.float16))
+            views.append((None, view))
             poses.append(pose)
         both, raw = (np.stack(poses), poses_along(XS)), gather(views, evaluation, False, text=text)
         labels = align_labels(raw.labels, truth, both, evaluation)
@@ -191,7 +191,8 @@ def test_what_goes_wrong_in_gathering_ends_the_mapping_one_frame_later():
     def views():
         for number in range(9):
             asked.append(number)
-            yield RawView(np.zeros((2, 2)), np.ones((2, 2), bool), np.zeros((2, 2, 3)), np.eye(4), np.zeros((1, 1, 0)))
+            image, features = np.zeros((2, 2, 3)), np.zeros((1, 1, 0))
+            yield None, RawView(np.zeros((2, 2)), np.ones((2, 2), bool), image, np.eye(4), features)
 
     with pytest.raises(IndexError):
         gather(views(), evaluation_config(), True)

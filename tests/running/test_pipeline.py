@@ -22,7 +22,7 @@ from emgs_jax.running import pipeline
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.dense import dense_map
 from emgs_jax.running.gathering import RawPrior
-from emgs_jax.running.pipeline import map_frames
+from emgs_jax.running.pipeline import finish_run, map_frames
 from emgs_jax.running.record import new_run
 from emgs_jax.running.window_input import predictions, window_inputs
 
@@ -196,7 +196,8 @@ def test_before_the_first_map_nothing_is_saved(tmp_path):
 def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
     session, _ = exact()
     blind = new_run(dataset(), session.config)
-    blind.state, blind.records = session.state, [replace(record, true_pose=None) for record in session.records]
+    unknown = tuple(replace(record, true_pose=None) for record in session.records)
+    blind = replace(blind, state=session.state, records=unknown)
     config = hydra.utils.instantiate(compose().densify)
     protocol = hydra.utils.instantiate(compose().evaluation)
     dense = dense_map(blind, dataset(), config, protocol)
@@ -232,8 +233,8 @@ def test_the_map_does_not_start_at_the_origin_but_at_the_first_true_pose_and_at_
             return super().predict(window, [dataset()[index] for index in window.views], intrinsics)
 
     session = new_run(Blind(dataset()), exact()[0].config)
-    for _ in map_frames(session, Blind(dataset()), Knowing()):
-        pass
+    *_, (session, _, _) = map_frames(session, Blind(dataset()), Knowing())
+    session = finish_run(session)
     origin = np.linalg.inv(dataset()[0].T_world_camera)
     expected = np.stack([origin @ pose for pose in exact()[0].poses])
     np.testing.assert_allclose(session.poses, expected, atol=1e-3)

@@ -23,7 +23,7 @@ from emgs_jax.pose_graph.factors import ODOMETRY
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.running.convert import FirstWindow, to_se3
 from emgs_jax.running.pipeline import reanchor_prior
-from emgs_jax.running.record import RELOCALIZED, FrameRecord, new_run
+from emgs_jax.running.record import RELOCALIZED, FrameRecord, MappingRun, new_run
 from emgs_jax.running.relocalization import (
     anchor_motion,
     anchor_motion_of,
@@ -128,10 +128,10 @@ def test_from_then_on_the_prior_says_its_poses_from_where_the_camera_was_found()
 
 def test_a_frame_of_its_own_is_where_the_camera_was_found_and_goes_with_it_from_then_on():
     own = matrix((0, 40, 0), (1, 2, 3))
-    session = SimpleNamespace(structure=None, prior_motion=None)
-    session.records = [FrameRecord(0, None, None, "tracked", pose=PLACE, scale=1.1, location=RELOCALIZED)]
+    record = FrameRecord(0, None, None, "tracked", pose=PLACE, scale=1.1, location=RELOCALIZED)
+    session = MappingRun(None, None, records=(record,))
     given = SimpleNamespace(structure=2, frames=[SimpleNamespace(index=5)], T_anchor_views={5: own})
-    reanchor_prior(session, given)
+    session = reanchor_prior(session, given)
     np.testing.assert_allclose(session.structure.T_world_structure @ own, PLACE, atol=1e-12)
     assert session.structure.number == 2
     np.testing.assert_allclose(session.prior_motion.as_matrix(), np.eye(4))  # None would stay behind in a closure

@@ -75,5 +75,5 @@ def test_the_longest_row_is_that_of_a_search_over_all_of_them(seed):
 def test_the_console_gets_the_line_and_a_run_without_a_bar_stays_silent(capsys):
     rows = records("i" + "d" * MANY_IN_A_ROW)
     for is_silent in (True, False):
-        show_records(tqdm(disable=is_silent), rows)
+        show_records(tqdm(disable=is_silent), rows, 1)
         assert ("in a row are not tracked" in "".join(capsys.readouterr())) is not is_silent

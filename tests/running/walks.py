@@ -15,7 +15,7 @@ from emgs_jax import load_config
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior, PriorPrediction
 from emgs_jax.running.configure import build_dataset, build_prior
-from emgs_jax.running.pipeline import map_frames
+from emgs_jax.running.pipeline import finish_run, map_frames
 from emgs_jax.running.record import MappingRun, new_run
 
 WORDS = (*SMOKE, "dataset.num_frames=80", "dataset.stop=80", "prior.level=0", "graph=default")
@@ -126,13 +126,11 @@ def mapped(
     frames: ReadableFrames, prior: Prior, saved=None, keeper=None, stop: int | None = None, words=()
 ) -> MappingRun:
     """A run; one that is stopped after so many frames leaves its checkpoint."""
-    run = new_run(frames, config(*words).slam, graph=config(*words).graph, saved=saved)
-    views = map_frames(run, frames, prior, keeper)
-    for _ in itertools.islice(views, stop):
-        pass
+    start = new_run(frames, config(*words).slam, graph=config(*words).graph, saved=saved)
+    *_, (run, _, _) = itertools.islice(map_frames(start, frames, prior, keeper), stop)
     if stop is not None:
         keeper.save()
-    return run
+    return finish_run(run, is_interrupted=stop is not None)
 
 
 def same_run(one: MappingRun, other: MappingRun) -> None:

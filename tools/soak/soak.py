@@ -13,7 +13,7 @@ from emgs_jax.prior.simulated.prior import Simulated
 from emgs_jax.report.metrics import STATUSES
 from emgs_jax.running.clock import Clock
 from emgs_jax.running.configure import build
-from emgs_jax.running.pipeline import map_frames
+from emgs_jax.running.pipeline import finish_run, map_frames
 from emgs_jax.running.record import FrameRecord, MappingRun, new_run
 from tests.tiny_run import compose
 
@@ -45,11 +45,14 @@ def soak(dataset: Dataset, overrides: Sequence[str] = (), seconds: float = np.in
     """Map a sequence with the small setting of the tests and the simulated prior, for so many seconds at most."""
     curves, end = Curves(), time.monotonic() + seconds
     with Clock().watching() as clock:
-        run = new_run(dataset, build(compose(*overrides), "slam"), clock, curves.add)
-        for _ in map_frames(run, dataset, Simulated(seed=0, classes=dataset.classes)):
+        run = start = new_run(dataset, build(compose(*overrides), "slam"), clock)
+        for found in map_frames(start, dataset, Simulated(seed=0, classes=dataset.classes)):
+            run, new, _ = found
+            for record in new:
+                curves.add(record)
             if time.monotonic() > end:
                 break
-    return run, curves
+    return finish_run(run), curves
 
 
 def faults(run: MappingRun, num_frames: int) -> list[str]:
