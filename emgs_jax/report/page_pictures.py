@@ -3,9 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import jaxlie
 import matplotlib
 import numpy as np
@@ -17,7 +15,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
 from emgs_jax.report.colors import to_bytes
-from emgs_jax.report.display import closing_covariances
+from emgs_jax.report.display import closed
 from emgs_jax.report.html import jpeg
 from emgs_jax.report.recorded_run import RecordedRun
 from emgs_jax.running.convert import to_se3
@@ -58,7 +56,7 @@ def draw_views(run: RecordedRun, rows: Sequence[int], config: RenderConfig, data
         dataset: for the images; None: without them.
     """
     small, placed = downscale(run.camera, -(-run.camera.width // WIDTH)), run.is_placed
-    gaussians = _closed(confirmed(run.map))
+    gaussians = closed(confirmed(run.map))
     drawn = dict(_draw_all(gaussians, run.poses, [row for row in rows if placed[row]], small, config))
     depths = [depth[depth > 0] for _, depth in drawn.values()]
     known = np.concatenate(depths) if depths else np.zeros(0)
@@ -71,14 +69,6 @@ def draw_views(run: RecordedRun, rows: Sequence[int], config: RenderConfig, data
             Picture(row, _seen(dataset, row), rendered, "" if depth is None else jpeg(_painted(depth, near, far)))
         )
     return Views(pictures, near, far)
-
-
-def _closed(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians as viewers draw them, see `closing_covariances`."""
-    rows = np.flatnonzero(gaussians.valid)
-    covs = np.array(gaussians.covs)
-    covs[rows] = closing_covariances(*(np.asarray(x)[rows] for x in (gaussians.means, covs, gaussians.normals)))
-    return eqx.tree_at(lambda g: g.covs, gaussians, jnp.asarray(covs))
 
 
 def _draw_all(
