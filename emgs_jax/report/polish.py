@@ -16,6 +16,8 @@ from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
+from emgs_jax.device.arrays import on_device, to_se3
+from emgs_jax.device.executables import stored
 from emgs_jax.evaluation.rendering import rendering_metrics, score_view
 from emgs_jax.evaluation.trajectory import align_poses, ate
 from emgs_jax.gaussian_map import confirmed
@@ -30,8 +32,6 @@ from emgs_jax.polish.splats import LossConfig, draw, gaussians_of, ssim
 from emgs_jax.render.composite import Rendering
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.report.recorded_run import POLISH, RecordedRun
-from emgs_jax.running.convert import on_device, to_se3
-from emgs_jax.running.executables import stored
 from emgs_jax.semantics import classify
 
 SPLATS_FILE, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE, PATH_FILE = POLISH

@@ -13,6 +13,7 @@ from hand_run import random_similarity
 from page_elements import HOSTILE, Elements
 from written_run import CLASSES, two_walls, written_run
 
+from emgs_jax.config.configure import groups
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.html import DATA_LICENCES
@@ -22,7 +23,6 @@ from emgs_jax.report.page_words import verdict
 from emgs_jax.report.printout import metrics_table
 from emgs_jax.report.provenance import is_metric
 from emgs_jax.report.recorded_run import placed_paths, read_run
-from emgs_jax.running.configure import groups
 from experiments.report import report
 
 

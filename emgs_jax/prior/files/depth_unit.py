@@ -1,0 +1,56 @@
+"""Do true depths and true poses of a data set have one unit? A wrong `depth_scale` is found out by two frames."""
+
+import contextlib
+from collections.abc import Iterator
+
+import numpy as np
+
+from emgs_jax.data.backprojection import backproject
+from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.prior.files.conventions import GOOD_MISFIT, MAX_MISFIT, MIN_GAIN, Sight, misfit
+
+KNOWN_SCALES = 256.0, 1000.0, 4000.0, 5000.0, 6553.5  # raw units a metre, of KITTI, most sensors, L515, TUM, Replica
+NUM_PAIRS, GAP = 4, 4  # of frames, and how far apart they are
+
+
+def check_depth_unit(dataset: ReadableFrames, depth_scale: float) -> None:
+    """Raise ValueError where the depths would fit the poses much better with another of the `KNOWN_SCALES`.
+
+    Args:
+        dataset: with ground truth, else nothing is looked at.
+        depth_scale: raw units a metre by which its depths were read.
+    """
+    if not dataset.has_ground_truth:
+        return
+    pairs = [*_pairs(dataset)]
+    fits = {scale: _misfit(pairs, depth_scale / scale, dataset.intrinsics) for scale in (depth_scale, *KNOWN_SCALES)}
+    own, best = fits[depth_scale], min(fits, key=lambda scale: fits[scale])
+    if own > MAX_MISFIT and fits[best] < min(own / MIN_GAIN, GOOD_MISFIT):
+        raise ValueError(
+            f"{dataset.name} {dataset.sequence}: with dataset.depth_scale={depth_scale:g} the depths of two frames "
+            f"differ by {100 * own:.1f} % (inf: they share nothing), and by {100 * fits[best]:.1f} % with {best:g} raw "
+            f"units a metre: give dataset.depth_scale={best:g}, or poses in metres"
+        )
+
+
+def _pairs(dataset: ReadableFrames) -> Iterator[tuple[Sight, Sight]]:
+    """Frames with depth and pose, evenly spread; one that cannot be read says so when it is its turn."""
+    for first in np.unique(np.linspace(0, max(len(dataset) - 1 - GAP, 0), NUM_PAIRS).astype(int)).tolist():
+        with contextlib.suppress(BadFrameError):
+            a, b = (dataset[row] for row in (first, min(first + GAP, len(dataset) - 1)))
+            if not any(frame.depth is None or frame.T_world_camera is None for frame in (a, b)):
+                yield _sight(a, dataset.intrinsics), _sight(b, dataset.intrinsics)
+
+
+def _sight(frame: Frame, intrinsics: tuple[float, ...]) -> Sight:
+    return Sight(backproject(frame.depth, intrinsics), frame.depth > 0, frame.T_world_camera)
+
+
+def _misfit(pairs: list[tuple[Sight, Sight]], factor: float, intrinsics: tuple[float, ...]) -> float:
+    """Median over the pairs, with depths times a factor; 0 without any."""
+    found = []
+    for a, b in pairs:
+        scaled = (sight._replace(points=factor * sight.points) for sight in (a, b))
+        found.append(misfit(*scaled, np.linalg.inv(a.T_world_camera) @ b.T_world_camera, intrinsics))
+    return float(np.median(found)) if found else 0.0
