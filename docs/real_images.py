@@ -20,6 +20,8 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from emgs_jax.config.configure import build, compose
+from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
@@ -29,8 +31,6 @@ from emgs_jax.report.colors import to_bytes
 from emgs_jax.report.display import closed
 from emgs_jax.report.recorded_run import SPLATS_FILE, read_run, render_config
 from emgs_jax.report.splats import read_splats
-from emgs_jax.running.configure import build, compose
-from emgs_jax.running.convert import to_se3
 
 TARGET = Path(__file__).with_name("real_images.jpg")
 NUM_STEPS = 60  # of the flight, there; as many back

@@ -13,7 +13,9 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
+    from emgs_jax.config.configure import build_dataset, build_prior, compose
     from emgs_jax.data.base import BadFrameError, Dataset, Frame
+    from emgs_jax.device.settings import use_compilation_cache
     from emgs_jax.em import EmConfig, EmInfo, em_update
     from emgs_jax.evaluation.reconstruction import EvaluationConfig
     from emgs_jax.existence import (
@@ -39,6 +41,13 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.initialization import initialize
     from emgs_jax.io.map_file import load_map, save_map
     from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
+    from emgs_jax.mapping.capacity import advance, start
+    from emgs_jax.mapping.convert import FirstWindow, opening, to_camera, to_first_window, to_prediction
+    from emgs_jax.mapping.finalize import in_prior_unit
+    from emgs_jax.mapping.pipeline import finish_run, integrate, map_frames
+    from emgs_jax.mapping.records import FrameRecord
+    from emgs_jax.mapping.run import MappingRun, new_run
+    from emgs_jax.mapping.window_input import WindowInput, window_inputs
     from emgs_jax.observation import Observation, ObservationConfig, Prediction, observe, transform
     from emgs_jax.ops.camera import Camera, downscale
     from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, windows
@@ -49,15 +58,8 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
     from emgs_jax.render.composite import RenderConfig, Rendering
     from emgs_jax.render.composite import render as render_gaussians
     from emgs_jax.render.densify import DensifyConfig, densify
-    from emgs_jax.running.capacity import advance, start
-    from emgs_jax.running.compilation import use_compilation_cache
-    from emgs_jax.running.configure import RunConfig, build_dataset, build_prior, compose, load_config
-    from emgs_jax.running.convert import FirstWindow, opening, to_camera, to_first_window, to_prediction
-    from emgs_jax.running.pipeline import finish_run, integrate, map_frames, map_sequence
-    from emgs_jax.running.record import FrameRecord, MappingRun, new_run
-    from emgs_jax.running.unit import in_prior_unit
-    from emgs_jax.running.window_input import WindowInput, window_inputs
     from emgs_jax.semantics import classify
+    from emgs_jax.sequence import RunConfig, load_config, map_sequence
     from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
     from emgs_jax.splitting import SplittingConfig, split
     from emgs_jax.surface_extrapolation import ExtrapolationConfig, extrapolate
@@ -89,15 +91,17 @@ _HOMES = {
     "registration.problem": ("IcpConfig",),
     "render.composite": ("RenderConfig", "Rendering", "render_gaussians"),
     "render.densify": ("DensifyConfig", "densify"),
-    "running.compilation": ("use_compilation_cache",),
-    "running.configure": ("RunConfig", "build_dataset", "build_prior", "compose", "load_config"),
-    "running.convert": ("FirstWindow", "opening", "to_camera", "to_first_window", "to_prediction"),
-    "running.pipeline": ("finish_run", "integrate", "map_frames", "map_sequence"),
-    "running.capacity": ("advance", "start"),
-    "running.window_input": ("WindowInput", "window_inputs"),
-    "running.record": ("FrameRecord", "MappingRun", "new_run"),
-    "running.unit": ("in_prior_unit",),
+    "config.configure": ("build_dataset", "build_prior", "compose"),
+    "device.settings": ("use_compilation_cache",),
+    "mapping.capacity": ("advance", "start"),
+    "mapping.convert": ("FirstWindow", "opening", "to_camera", "to_first_window", "to_prediction"),
+    "mapping.finalize": ("in_prior_unit",),
+    "mapping.pipeline": ("finish_run", "integrate", "map_frames"),
+    "mapping.records": ("FrameRecord",),
+    "mapping.run": ("MappingRun", "new_run"),
+    "mapping.window_input": ("WindowInput", "window_inputs"),
     "semantics": ("classify",),
+    "sequence": ("RunConfig", "load_config", "map_sequence"),
     "slam": ("Overflow", "SlamConfig", "SlamState", "StepInfo", "init_state", "step"),
     "splitting": ("SplittingConfig", "split"),
 }

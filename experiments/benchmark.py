@@ -15,9 +15,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from emgs_jax.config.configure import build_dataset, build_prior
 from emgs_jax.io.files import atomic_write, write_json
 from emgs_jax.report.provenance import provenance
-from emgs_jax.running.configure import build_dataset, build_prior
 
 from .benchmarks.comparisons import time_em, time_icp, time_render
 from .benchmarks.data import load

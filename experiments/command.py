@@ -20,10 +20,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from emgs_jax.running.compilation import use_compilation_cache
-from emgs_jax.running.configure import CONF, compose, first_of_sweep, message_of
-from emgs_jax.running.gpu import leave_memory_to_torch
-from emgs_jax.running.overrides import quoted, readable
+from emgs_jax.config.configure import CONF, compose, first_of_sweep, message_of
+from emgs_jax.config.overrides import quoted, readable
+from emgs_jax.device.settings import leave_memory_to_torch, use_compilation_cache
 
 from .interrupt import clear_interrupt
 from .keys import check_keys

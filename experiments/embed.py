@@ -7,8 +7,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from emgs_jax.config.configure import build
 from emgs_jax.features.text import save_text
-from emgs_jax.running.configure import build
 
 from .command import command
 

@@ -19,14 +19,14 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from emgs_jax.config.configure import compose, message_of
+from emgs_jax.config.overrides import quoted
+from emgs_jax.config.values import check_values
 from emgs_jax.io.files import atomic_write, write_json
 from emgs_jax.report.evaluation_page import Found, JobLine, write_evaluation_page
 from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
 from emgs_jax.report.results import is_finished, read_estimates, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
-from emgs_jax.running.configure import compose, message_of
-from emgs_jax.running.overrides import quoted
-from emgs_jax.running.values import check_values
 
 from .command import command, overrides_of
 from .run import run

@@ -5,13 +5,13 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from emgs_jax.config.configure import build_dataset
+from emgs_jax.config.values import check_value, declared
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.io.files import new_folder
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report.export import IMAGE_FORMATS, ExportConfig, export, find_factor, write_scaled
 from emgs_jax.report.recorded_run import RecordedRun, read_run
-from emgs_jax.running.configure import build_dataset
-from emgs_jax.running.values import check_value, declared
 
 from .command import command
 from .report import images_of, positional

@@ -10,9 +10,9 @@ from typing import Any
 import jax
 from omegaconf import DictConfig, OmegaConf
 
+from emgs_jax.config.configure import build, near
+from emgs_jax.mapping.batch import programs
 from emgs_jax.render.densify import DensifyConfig
-from emgs_jax.running.batch import programs
-from emgs_jax.running.configure import build, near
 from emgs_jax.slam import SlamConfig
 
 Value = float | int | str | bool

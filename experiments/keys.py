@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from emgs_jax.running.configure import CONF
+from emgs_jax.config.configure import CONF
 
 
 class Kind(NamedTuple):

@@ -5,11 +5,11 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from emgs_jax.config.configure import build
 from emgs_jax.report.page import write_report
 from emgs_jax.report.polish import polish
 from emgs_jax.report.printout import polish_lines
 from emgs_jax.report.recorded_run import SPLATS_FILE, read_run
-from emgs_jax.running.configure import build
 
 from .command import command
 from .report import images_of, positional

@@ -12,11 +12,11 @@ from pathlib import Path
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from emgs_jax.config.configure import build_dataset, build_prior, graph_config
 from emgs_jax.data.base import Dataset
 from emgs_jax.prior.base import Prior, Window
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.recorded_visits import places_seen_twice, record_visits
-from emgs_jax.running.configure import build_dataset, build_prior, graph_config
 
 from .command import command
 

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from emgs_jax.config.configure import build
+from emgs_jax.config.values import Declared, check_value
 from emgs_jax.data.class_file import read_classes
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.io.trajectory import load_trajectory_tum
@@ -31,8 +33,6 @@ from emgs_jax.report.query_pictures import (
 )
 from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.vocabulary import Vocabulary, check_folder, feature_model, vocabulary, words_of
-from emgs_jax.running.configure import build
-from emgs_jax.running.values import Declared, check_value
 
 from .command import command
 

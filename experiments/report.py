@@ -5,12 +5,12 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from emgs_jax.config.configure import build_dataset, message_of
+from emgs_jax.config.overrides import KEY, quoted
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.report.page import write_report
 from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.repeat import check_targets
-from emgs_jax.running.configure import build_dataset, message_of
-from emgs_jax.running.overrides import KEY, quoted
 
 from .command import command
 

@@ -11,11 +11,22 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from emgs_jax.back_end.saved_map import load_saved_map
+from emgs_jax.config.configure import baseline_configs, build, build_dataset, build_prior, graph_config
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.device.clock import Clock
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog, owned
+from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE, Keeper
+from emgs_jax.mapping.pipeline import finish_run, map_frames
+from emgs_jax.mapping.records import FrameRecord, show_records, to_line
+from emgs_jax.mapping.run import MappingRun, new_run
+from emgs_jax.mapping.window_input import RawView
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.back_end import revisit_note
+from emgs_jax.report.dense import center_cloud, dense_map
+from emgs_jax.report.gathering import Baselines, RawPrior, gather
+from emgs_jax.report.labelling import labelled_map
 from emgs_jax.report.live import LiveView, live_view
 from emgs_jax.report.metrics import (
     compared_text,
@@ -33,16 +44,6 @@ from emgs_jax.report.printout import frame_lines, last_words, metrics_table, pol
 from emgs_jax.report.provenance import is_metric, provenance, signature, write_metrics
 from emgs_jax.report.recorded_run import REPORT_FILE, read_run
 from emgs_jax.report.run_files import claim_folder, save_classes, save_outputs, save_progress
-from emgs_jax.running.checkpoint import CHECKPOINT_FILE, Keeper
-from emgs_jax.running.clock import Clock
-from emgs_jax.running.configure import baseline_configs, build, build_dataset, build_prior, graph_config
-from emgs_jax.running.dense import center_cloud, dense_map
-from emgs_jax.running.gathering import Baselines, RawPrior, gather
-from emgs_jax.running.labelling import labelled_map
-from emgs_jax.running.pipeline import finish_run, map_frames, show_records
-from emgs_jax.running.record import FrameRecord, MappingRun, new_run, to_line
-from emgs_jax.running.saved_map import load_saved_map
-from emgs_jax.running.window_input import RawView
 
 from .command import command
 from .shorthand import with_source

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from emgs_jax.config.configure import build, build_dataset
+from emgs_jax.config.values import Declared, check_value
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.timestamps import in_seconds
 from emgs_jax.evaluation.clouds import PointCloud, read_cloud
@@ -22,8 +24,6 @@ from emgs_jax.report.metrics import true_cloud
 from emgs_jax.report.provenance import provenance, write_metrics
 from emgs_jax.report.results import METRICS_FILE, estimates_of, is_finished, result_folder
 from emgs_jax.report.tables import average, full_table
-from emgs_jax.running.configure import build, build_dataset
-from emgs_jax.running.values import Declared, check_value
 
 from .command import command
 

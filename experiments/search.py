@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from emgs_jax.config.configure import near
+from emgs_jax.config.values import Declared, check_value, field_of
 from emgs_jax.io.files import jsonable
 from emgs_jax.report.sweeps import difference
-from emgs_jax.running.configure import near
-from emgs_jax.running.values import Declared, check_value, field_of
 
 from .grid import Value, stage_keys
 

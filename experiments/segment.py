@@ -8,6 +8,8 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig
 
+from emgs_jax.config.configure import build
+from emgs_jax.config.values import Declared, check_value
 from emgs_jax.data.class_file import read_classes
 from emgs_jax.evaluation.labelled_mesh import read_labelled_mesh
 from emgs_jax.evaluation.segmentation import LabelledPoints, label_cells, true_labels
@@ -16,8 +18,6 @@ from emgs_jax.ops.ranges import Range
 from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.segmentation_table import ALIGNMENTS, Placement, SceneResult, score_scene, summary, table
 from emgs_jax.report.vocabulary import check_folder, feature_model, vocabulary
-from emgs_jax.running.configure import build
-from emgs_jax.running.values import Declared, check_value
 
 from .command import command
 from .report import images_of

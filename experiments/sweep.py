@@ -16,15 +16,15 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from emgs_jax.config.configure import build, build_dataset, build_prior
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.device.clock import Clock
 from emgs_jax.io.files import owned, remove_temporaries
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.heat_map import draw
 from emgs_jax.report.metrics import new_scorer
 from emgs_jax.report.sweep_page import write_sweep_page
 from emgs_jax.report.sweeps import SweepResults, table, write_csv
-from emgs_jax.running.clock import Clock
-from emgs_jax.running.configure import build, build_dataset, build_prior
 
 from .command import command
 from .grid import Variant, notes, read_axes, variants

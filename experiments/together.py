@@ -12,19 +12,19 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.device.clock import Clock
 from emgs_jax.io.files import atomic_write
+from emgs_jax.mapping.batch import finish_together, map_together, programs
+from emgs_jax.mapping.run import MappingRun, new_run
+from emgs_jax.mapping.window_input import RawView
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.recorded import Recorded, record
+from emgs_jax.report.dense import center_cloud
+from emgs_jax.report.gathering import gather
 from emgs_jax.report.metrics import Metrics, Scorer, compared_text, score_settings
 from emgs_jax.report.overview import thumbnail
 from emgs_jax.report.provenance import provenance
 from emgs_jax.report.sweeps import picture_path
-from emgs_jax.running.batch import finish_together, map_together, programs
-from emgs_jax.running.clock import Clock
-from emgs_jax.running.dense import center_cloud
-from emgs_jax.running.gathering import gather
-from emgs_jax.running.record import MappingRun, new_run
-from emgs_jax.running.window_input import RawView
 
 from .grid import Variant
 

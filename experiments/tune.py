@@ -18,28 +18,20 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from emgs_jax.config.configure import build, build_dataset, build_prior, compose, near
+from emgs_jax.device.clock import Clock
 from emgs_jax.io.files import atomic_write, owned, remove_temporaries
+from emgs_jax.mapping.batch import programs
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.metrics import Scorer, new_scorer
 from emgs_jax.report.repeat import written
 from emgs_jax.report.sweeps import SweepResults, write_csv
 from emgs_jax.report.tuning import DEFAULT, SequenceResults, draw_trials, settings_yaml, table, verdict
-from emgs_jax.running.batch import programs
-from emgs_jax.running.clock import Clock
-from emgs_jax.running.configure import build, build_dataset, build_prior, compose, near
 
 from .command import command
 from .grid import plain_setting, variant_of
 from .search import Space, ask, front, open_study, own_setting, read_objectives, read_space, told
-from .together import (
-    Work,
-    chunks_of,
-    map_and_score,
-    provenance_of,
-    refuse_other_maps,
-    replayed,
-    side_by_side,
-)
+from .together import Work, chunks_of, map_and_score, provenance_of, refuse_other_maps, replayed, side_by_side
 
 Setting = Mapping[str, Any]
 

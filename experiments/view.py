@@ -4,11 +4,11 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from emgs_jax.config.values import Declared, check_value
 from emgs_jax.ops.ranges import Range
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.viewer import Viewer
 from emgs_jax.report.viewer_scene import shown
-from emgs_jax.running.values import Declared, check_value
 
 from .command import command
 from .report import positional

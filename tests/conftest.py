@@ -7,7 +7,7 @@ from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
-from emgs_jax.running.compilation import cache_folder
+from emgs_jax.device.settings import cache_folder
 
 # Before JAX is imported, and for the processes that tests start: most of the time of the tests is compilation. Not
 # where commands keep theirs: that has a limit, for which JAX reads the whole folder, thousands of files, to add one.

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.geometry import Sim3
+from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.ops.camera import Camera
-from emgs_jax.running.record import FrameRecord
 
 STATUSES = ("initialization", "tracked", "degraded", "lost", "tracked", "tracked")
 

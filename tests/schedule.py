@@ -9,10 +9,10 @@ TESTS = Path(__file__).resolve().parent
 # The longest first: a long one at the end would leave the other processes without work.
 GROUPS = {
     "tiny": (
-        "running/test_budgets.py",  # counts what is compiled, so it clears what others compiled
+        "mapping/test_budgets.py",  # counts what is compiled, so it clears what others compiled
         "scripts/test_run.py",
-        "running/test_pipeline.py",
-        "running/test_checkpoint.py",
+        "mapping/test_pipeline.py",
+        "mapping/test_checkpoint.py",
         "scripts/test_query_and_segment.py",
         "scripts/test_sweep_script.py",
         "scripts/test_predict.py",
@@ -24,9 +24,9 @@ GROUPS = {
         "report/test_live_browser.py",
         "polish/test_polish.py",
     ),
-    "smoke": ("running/test_coming_back.py", "running/test_disconnected_submaps.py", "scripts/test_walk.py"),
+    "smoke": ("mapping/test_coming_back.py", "mapping/test_disconnected_submaps.py", "scripts/test_walk.py"),
     "browser": ("report/test_page_browser.py", "report/test_table_page.py", "report/test_viewer.py"),  # one Chromium
-    "small": ("running/test_capacity.py", "test_slam.py", "running/test_batch.py"),  # the first counts, as above
+    "small": ("mapping/test_capacity.py", "test_slam.py", "mapping/test_batch.py"),  # the first counts, as above
 }
 # What the quick subset (-m "not slow") takes nothing of, beside the marked tests: some five CPU seconds and more each.
 SLOW = {
@@ -46,11 +46,11 @@ SLOW = {
     "registration/test_pose_noise.py",
     "registration/test_problem.py",
     *(f"report/{name}.py" for name in ("test_page", "test_page_browser", "test_query", "test_repeat")),
-    *(
-        f"running/{name}.py"
-        for name in ("test_back_end", "test_compilation", "test_executables", "test_relocalized_start")
-    ),
-    "running/test_values.py",
+    "back_end/test_back_end.py",
+    "config/test_values.py",
+    "device/test_compilation.py",
+    "device/test_executables.py",
+    "mapping/test_relocalized_start.py",
     *(f"scripts/{name}.py" for name in ("test_command_line", "test_evaluate", "test_score", "test_sweep_script")),
     "scripts/test_tune.py",
     "test_existence.py",

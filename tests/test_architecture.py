@@ -30,7 +30,11 @@ HOST = (
     "loop_closure",
     "prior",
     "evaluation",
-    "running",
+    "device",
+    "back_end",
+    "mapping",
+    "config",
+    "sequence",
     "polish",
     "report",
 )

@@ -13,7 +13,7 @@ import pytest
 from omegaconf import OmegaConf
 from scene import CONF, compose, slam_config
 
-from emgs_jax.running import configure
+from emgs_jax.config import configure
 from emgs_jax.slam import SlamConfig
 
 ROOT = CONF.parent
@@ -250,7 +250,7 @@ def f(config: IcpConfig, other):
 
 
 def test_every_number_of_a_config_class_declares_its_range():
-    """A threshold that takes any value takes nan; `emgs_jax.running.values` refuses what is out of range."""
+    """A threshold that takes any value takes nan; `emgs_jax.config.values` refuses what is out of range."""
     numeric = re.compile(r"\bint\b|\bfloat\b|Float\[")
     without = [
         f"{module.__name__}.{field.name}"

@@ -15,9 +15,9 @@ from hydra.core.global_hydra import GlobalHydra
 from tiny_run import NUM_FRAMES, TINY, dataset
 
 import emgs_jax
+from emgs_jax.config.configure import CONF, groups
+from emgs_jax.config.configure import compose as compose_as_typed
 from emgs_jax.gaussian_map import GaussianMap
-from emgs_jax.running.configure import CONF, groups
-from emgs_jax.running.configure import compose as compose_as_typed
 
 PACKAGE = Path(emgs_jax.__file__).parent
 NO_MARK = """

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.running.record import FrameRecord, MappingRun
+from emgs_jax.mapping.records import FrameRecord
+from emgs_jax.mapping.run import MappingRun
 from tools.nees.consistency import band, nees, nees_of_run, pose_errors
 
 COUNT = 4000

@@ -9,7 +9,7 @@ import reference
 from scene import assert_same, at, moved_points, observe_room, on_host, path_pose, pose
 
 from emgs_jax import observation
-from emgs_jax.running.values import check_value, declared
+from emgs_jax.config.values import check_value, declared
 
 normals_from_pointmap, observe, transform = (
     on_host(f) for f in (observation.normals_from_pointmap, observation.observe, observation.transform)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from schedule import GROUPS, SLOW, TESTS
 
-from emgs_jax.running.configure import CONF
+from emgs_jax.config.configure import CONF
 from experiments.cli import COMMANDS, main, usage
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -11,12 +11,12 @@ import scene as sc
 from scene import FULL, ROOM, WHOLE
 
 from emgs_jax import slam
+from emgs_jax.device.executables import call
+from emgs_jax.mapping.capacity import advance, grow_capacities, start
+from emgs_jax.mapping.convert import FirstWindow, opening
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
-from emgs_jax.running.capacity import advance, grow_capacities, start
-from emgs_jax.running.convert import FirstWindow, opening
-from emgs_jax.running.executables import call
 from emgs_jax.slam import Overflow, SlamState, StepInfo
 
 FRAME = 3

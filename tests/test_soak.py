@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from emgs_jax.running.record import FrameRecord
+from emgs_jax.mapping.records import FrameRecord
 from tests.hand_run import hand_run, poses_along
 from tools.soak.scenes import NUM_FRAMES, SCENES, ToAndFro, to_and_fro
 from tools.soak.soak import faults, grown, ratio, soak

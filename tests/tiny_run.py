@@ -11,12 +11,12 @@ from pathlib import Path
 import hydra
 from filelock import FileLock
 
+from emgs_jax.config import configure
+from emgs_jax.config.configure import CONF  # noqa: F401 (for the tests of scripts)
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.mapping.pipeline import finish_run, map_frames
+from emgs_jax.mapping.run import MappingRun, new_run
 from emgs_jax.prior.base import Prior, PriorPrediction
-from emgs_jax.running import configure
-from emgs_jax.running.configure import CONF  # noqa: F401 (for the tests of scripts)
-from emgs_jax.running.pipeline import finish_run, map_frames
-from emgs_jax.running.record import MappingRun, new_run
 
 NUM_FRAMES, WINDOW_SIZE = 6, 3
 TINY = (

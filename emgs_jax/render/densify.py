@@ -37,7 +37,7 @@ class DensifyConfig(eqx.Module):
         min_std: m; the floor of the covariances, which is not drawn along the surface, see `without_floor`.
         render: how the front is found.
         points: those of the `map` (the paper's rule), or the frames' `own` that the map does not contradict, see
-            `emgs_jax.running.dense.uncontradicted`.
+            `emgs_jax.report.dense.uncontradicted`.
     """
 
     surface_depth: Float[Array, "*b"] = traced(low=0)

@@ -9,12 +9,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from emgs_jax.back_end.factors import Factor, stack_factors
+from emgs_jax.back_end.loops import MEASURED, SILENT, UNUSABLE, consistent_loops
+from emgs_jax.back_end.optimization import nodes_of
+from emgs_jax.back_end.state import BackEnd, Refusal
 from emgs_jax.geometry import scale_pose
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.pose_graph.factors import PoseGraph
-from emgs_jax.running.back_end import BackEnd, Refusal, consistent_loops, nodes_of
-from emgs_jax.running.factors import Factor, stack_factors
-from emgs_jax.running.prior_queries import MEASURED, SILENT, UNUSABLE
 
 
 def metric_graph(end: BackEnd) -> PoseGraph:

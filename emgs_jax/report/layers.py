@@ -10,12 +10,12 @@ import jax
 import matplotlib
 import numpy as np
 
+from emgs_jax.device.arrays import on_device
+from emgs_jax.device.executables import stored
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.gaussian_map import GaussianMap, confirmed
 from emgs_jax.report.colors import NO_CLASS, class_colors, rgb, to_bytes
 from emgs_jax.report.display import closing_covariances
-from emgs_jax.running.convert import on_device
-from emgs_jax.running.executables import stored
 from emgs_jax.semantics import principal_colors, similarities
 
 COV_UNIT = 1e-4  # m²; float16 then holds standard deviations from .1 mm to 2.5 m

@@ -15,13 +15,14 @@ from tqdm import tqdm
 
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.mapping.records import FrameRecord
+from emgs_jax.mapping.run import MappingRun
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report.layers import map_layers
 from emgs_jax.report.viewer import Viewer
 from emgs_jax.report.viewer_scene import Shown
-from emgs_jax.running.record import FrameRecord, MappingRun
 
 SHARE = 0.05  # of the time in which the thread draws, at most
 IMAGE_WIDTH = 320  # pixels

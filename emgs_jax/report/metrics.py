@@ -11,6 +11,7 @@ import numpy as np
 
 from emgs_jax.data.base import Frame
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.device.clock import Clock, peak_memory_mb
 from emgs_jax.evaluation.clouds import PointCloud, SpooledCloud
 from emgs_jax.evaluation.layers import double_wall_share
 from emgs_jax.evaluation.loops import loop_metrics
@@ -37,16 +38,15 @@ from emgs_jax.evaluation.trajectory import align_poses, trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.geometry import scale_pose
+from emgs_jax.mapping.records import UNJOINED, FrameRecord, longest_row
+from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import counts, found_loops
+from emgs_jax.report.dense import center_cloud, dense_map
+from emgs_jax.report.gathering import Baselines, RawPrior, Text
+from emgs_jax.report.labelling import labelled_map
 from emgs_jax.report.provenance import RAW_PRIOR, prefixed
-from emgs_jax.running.clock import Clock, peak_memory_mb
-from emgs_jax.running.dense import center_cloud, dense_map
-from emgs_jax.running.gathering import Baselines, RawPrior, Text
-from emgs_jax.running.labelling import labelled_map
-from emgs_jax.running.record import UNJOINED, FrameRecord, MappingRun, row_of_first_node, with_truth
-from emgs_jax.running.untracked import longest_row
 
 Metrics = dict[str, Any]
 STATUSES = ("tracked", "degraded", "lost", "initialization")

@@ -10,6 +10,8 @@ import numpy as np
 from PIL import Image
 
 from emgs_jax.data.base import BadFrameError, Dataset
+from emgs_jax.device.arrays import to_se3
+from emgs_jax.device.executables import stored
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, downscale
@@ -18,8 +20,6 @@ from emgs_jax.report.colors import to_bytes
 from emgs_jax.report.display import closed
 from emgs_jax.report.html import jpeg
 from emgs_jax.report.recorded_run import RecordedRun
-from emgs_jax.running.convert import to_se3
-from emgs_jax.running.executables import stored
 
 WIDTH = 200  # pixels; a picture is not wider
 _NO_DEPTH = (221, 221, 221)

@@ -15,6 +15,8 @@ from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
+from emgs_jax.device.arrays import on_device, to_se3
+from emgs_jax.device.executables import stored
 from emgs_jax.evaluation.clouds import NearestPoints
 from emgs_jax.evaluation.rendering import rendering_metrics, score_view
 from emgs_jax.evaluation.trajectory import align_poses, ate
@@ -30,8 +32,6 @@ from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, draw, gaussi
 from emgs_jax.render.composite import Rendering
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.report.recorded_run import POLISH, SPLATS_FILE, RecordedRun
-from emgs_jax.running.convert import on_device, to_se3
-from emgs_jax.running.executables import stored
 from emgs_jax.semantics import classify
 
 _, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE, PATH_FILE = POLISH

@@ -4,11 +4,10 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from emgs_jax.device.clock import Clock
+from emgs_jax.mapping.records import MANY_IN_A_ROW, REMEDIES, UNTRACKED, FrameRecord, called, longest_row, main_reason
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, aligned, metric_table
 from emgs_jax.report.provenance import has_metric_truth, lines_of
-from emgs_jax.running.clock import Clock
-from emgs_jax.running.record import FrameRecord
-from emgs_jax.running.untracked import MANY_IN_A_ROW, REMEDIES, UNTRACKED, called, longest_row, main_reason
 
 MANY = 0.1  # share of frames
 

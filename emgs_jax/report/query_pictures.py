@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import atomic_write
@@ -22,7 +23,6 @@ from emgs_jax.render.composite import RenderConfig, render
 from emgs_jax.report.colors import class_colors
 from emgs_jax.report.query import GREY, Answer, heat, hot, painted
 from emgs_jax.report.recorded_run import RecordedRun, render_config
-from emgs_jax.running.convert import to_se3
 from emgs_jax.semantics import principal_colors
 
 QUERY_PICTURE, FEATURES_PICTURE = "query.png", "features.png"

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from emgs_jax.config.values import check_value, declared
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.features.text import TextEmbeddings, read_text
 from emgs_jax.gaussian_map import GaussianMap
@@ -20,7 +21,6 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report.provenance import is_metric
 from emgs_jax.report.results import METRICS_FILE, read_metrics
-from emgs_jax.running.values import check_value, declared
 
 TEXT_FILE = "text.npz"  # classes of a map with features, in the format of `experiments.embed`
 LOOPS_FILE = "loops.json"

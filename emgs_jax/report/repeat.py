@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
+from emgs_jax.config.configure import CONF, compose
 from emgs_jax.io.files import flat, jsonable
-from emgs_jax.running.configure import CONF, compose
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # of C where it is there: seventy files a report
 _PLAIN = re.compile(r"[A-Za-z_][\w./-]*|/[\w./-]*")

@@ -7,28 +7,29 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from emgs_jax.back_end.g2o import save_graph_g2o
+from emgs_jax.back_end.saved_map import save_places
 from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import atomic_write, remove_temporaries, write_json
-from emgs_jax.io.g2o import save_graph_g2o
 from emgs_jax.io.map_file import save_map_npz
 from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import from_tum, save_trajectory_tum
+from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE
+from emgs_jax.mapping.finalize import seen_from
+from emgs_jax.mapping.records import NEW_SUBMAP, UNJOINED
+from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import loop_list, metric_graph
+from emgs_jax.report.dense import DenseMap, center_cloud
 from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.layers import feature_colors
 from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, POLISH, REPORT_FILE, TEXT_FILE
-from emgs_jax.running.checkpoint import CHECKPOINT_FILE
-from emgs_jax.running.dense import DenseMap, center_cloud
-from emgs_jax.running.first_frame import seen_from
-from emgs_jax.running.record import NEW_SUBMAP, UNJOINED, MappingRun, row_of_first_node, with_truth
-from emgs_jax.running.saved_map import save_places
 
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (

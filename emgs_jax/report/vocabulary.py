@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from emgs_jax.config.configure import build
 from emgs_jax.features.base import FeatureModel
 from emgs_jax.features.text import TextEmbeddings, load_text
 from emgs_jax.report.recorded_run import TEXT_FILE, RecordedRun
-from emgs_jax.running.configure import build
 
 
 @dataclass(frozen=True)

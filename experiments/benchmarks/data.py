@@ -10,18 +10,18 @@ import jaxlie
 import numpy as np
 from omegaconf import DictConfig
 
+from emgs_jax.config.configure import build, build_dataset, build_prior
+from emgs_jax.device.clock import Clock
 from emgs_jax.gaussian_map import GaussianMap, grow
 from emgs_jax.gaussians import Gaussians, cluster
+from emgs_jax.mapping.capacity import start
+from emgs_jax.mapping.convert import FirstWindow, to_camera, to_first_window, to_prediction
+from emgs_jax.mapping.window_input import first_pose, predictions
 from emgs_jax.observation import Observation, Prediction, transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.prior.base import PriorPrediction
-from emgs_jax.running.capacity import start
-from emgs_jax.running.clock import Clock
-from emgs_jax.running.configure import build, build_dataset, build_prior
-from emgs_jax.running.convert import FirstWindow, to_camera, to_first_window, to_prediction
-from emgs_jax.running.window_input import first_pose, predictions
 from emgs_jax.slam import SlamConfig, SlamState
 
 

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from omegaconf import DictConfig, OmegaConf
 
+from emgs_jax.mapping.batch import step_states
 from emgs_jax.ops.pytree import stack
-from emgs_jax.running.batch import step_states
 from emgs_jax.slam import step
 
 from .data import Data, enlarged, first_state, load

@@ -5,11 +5,11 @@ import pytest
 from scene import compose, evaluation_config
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.config.configure import baseline_configs
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.evaluation.baselines import Pinhole, TsdfConfig, View, VoxelConfig, draw_voxels
 from emgs_jax.evaluation.clouds import PointCloud, VoxelGrid, fuse_clouds
 from emgs_jax.evaluation.reconstruction import camera_cloud
-from emgs_jax.running.configure import baseline_configs
 
 PINHOLE = Pinhole((60.0, 55.0, 31.0, 25.5), 64, 48)
 VOXEL, TSDF = VoxelConfig(0.02, 8, 0.1, 1), TsdfConfig(0.02, 0.08, 1)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hydra.utils import instantiate
 
+from emgs_jax.config.configure import compose
 from emgs_jax.evaluation.protocols import (
     NAMES,
     give_classes,
@@ -17,7 +18,6 @@ from emgs_jax.evaluation.protocols import (
     voxel_labels,
 )
 from emgs_jax.evaluation.segmentation import LabelledPoints
-from emgs_jax.running.configure import compose
 
 CLASSES = ("wall", "chair", "table", "lamp")
 

@@ -15,6 +15,8 @@ import scene as sc
 from omegaconf import OmegaConf
 from tiny_run import compose
 
+from emgs_jax.config import configure
+from emgs_jax.config.configure import build
 from emgs_jax.data.spool import Spool
 from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.fit import Rates, Views, fit, is_held_out, locate
@@ -22,8 +24,6 @@ from emgs_jax.polish.seeds import Seeds
 from emgs_jax.polish.splats import Anchors, Appearance, draw, gaussians_of, initial, loss, ssim
 from emgs_jax.report.polish import polish
 from emgs_jax.report.recorded_run import read_run
-from emgs_jax.running import configure
-from emgs_jax.running.configure import build
 from experiments.polish import polish_run
 from experiments.run import run
 

@@ -33,7 +33,7 @@ from rings import (
 )
 from scipy import stats
 
-from emgs_jax.io.g2o import load_graph_g2o
+from emgs_jax.back_end.g2o import load_graph_g2o
 from emgs_jax.pose_graph.chordal import chordal_initialization
 from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Nodes, PoseGraph
 from emgs_jax.pose_graph.optimize import PoseGraphConfig, optimize

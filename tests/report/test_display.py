@@ -7,6 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tiny_run import compose
 
+from emgs_jax.config.configure import build
+from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.ply_reader import read_vertices
@@ -14,8 +16,6 @@ from emgs_jax.render.composite import render
 from emgs_jax.render.densify import densify
 from emgs_jax.report.display import LARGEST, closing_covariances
 from emgs_jax.report.recorded_run import read_run
-from emgs_jax.running.configure import build
-from emgs_jax.running.convert import to_se3
 
 
 def read_gaussians(path) -> Gaussians:

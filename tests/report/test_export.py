@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from tiny_run import dataset
 from written_run import INTRINSICS, SIZE, written_run
 
+from emgs_jax.config import configure
 from emgs_jax.data.calibration_files import read_calibration
 from emgs_jax.data.colmap_model import load_colmap
 from emgs_jax.data.transforms_json import load_transforms
@@ -22,7 +23,6 @@ from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report.export import ExportConfig, export
 from emgs_jax.report.recorded_run import read_run
-from emgs_jax.running import configure
 from experiments.export import export_run
 
 ALL = ExportConfig(("colmap", "nerfstudio", "frustums"), 40, None, None)

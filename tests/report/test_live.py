@@ -11,12 +11,12 @@ from hand_run import poses_along, wall
 from test_viewer import free_port
 from tiny_run import compose
 
+from emgs_jax.config.configure import build
 from emgs_jax.gaussian_map import new_map
+from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report import live
 from emgs_jax.report.live import LiveConfig, live_view
-from emgs_jax.running.configure import build
-from emgs_jax.running.record import FrameRecord
 from experiments.sweep import sweep
 
 NUM_FRAMES = 4

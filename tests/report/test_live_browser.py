@@ -13,8 +13,8 @@ from test_viewer import free_port
 from tiny_run import NUM_FRAMES, compose
 
 import experiments.run
+from emgs_jax.mapping.pipeline import map_frames
 from emgs_jax.report import live
-from emgs_jax.running.pipeline import map_frames
 
 LISTENS = "0A"  # in /proc/net/tcp
 LOOPBACK = "0100007F"  # 127.0.0.1 there

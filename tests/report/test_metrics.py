@@ -17,6 +17,9 @@ from emgs_jax.evaluation.clouds import PointCloud, transform_cloud
 from emgs_jax.evaluation.reconstruction import compare_clouds, reference
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.evaluation.trajectory import trajectory_metrics
+from emgs_jax.mapping.records import FrameRecord
+from emgs_jax.report.dense import center_cloud
+from emgs_jax.report.gathering import RawPrior
 from emgs_jax.report.metrics import (
     Scorer,
     describe,
@@ -27,9 +30,6 @@ from emgs_jax.report.metrics import (
     seconds_per_frame,
     spent,
 )
-from emgs_jax.running.dense import center_cloud
-from emgs_jax.running.gathering import RawPrior
-from emgs_jax.running.record import FrameRecord
 
 CLASSES = ("wall", "floor")
 NUM_FRAMES = len(STATUSES)

@@ -13,6 +13,7 @@ from hand_run import random_similarity
 from page_elements import HOSTILE, Elements
 from written_run import CLASSES, two_walls, written_run
 
+from emgs_jax.config.configure import groups
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.report.display import closing_covariances
@@ -24,7 +25,6 @@ from emgs_jax.report.printout import metrics_table
 from emgs_jax.report.provenance import is_metric
 from emgs_jax.report.recorded_run import placed_paths, read_run
 from emgs_jax.report.splats import read_splats, splats_for_page
-from emgs_jax.running.configure import groups
 from experiments.report import report
 
 

@@ -13,6 +13,7 @@ from PIL import Image
 from test_sample_page import SAMPLE
 from written_run import INTRINSICS, SIZE, two_walls, written_run
 
+from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.ops.camera import Camera
@@ -21,7 +22,6 @@ from emgs_jax.render.composite import render
 from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.page import write_report
 from emgs_jax.report.recorded_run import read_run, render_config
-from emgs_jax.running.convert import to_se3
 
 BACKGROUND = np.array([0.086, 0.098, 0.118])  # main.js
 PIXELS = """

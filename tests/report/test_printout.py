@@ -2,11 +2,10 @@
 
 import pytest
 
+from emgs_jax.device.clock import Clock
 from emgs_jax.localization import REASONS
+from emgs_jax.mapping.records import MANY_IN_A_ROW, REMEDIES, FrameRecord
 from emgs_jax.report.printout import frame_lines, last_words, time_words
-from emgs_jax.running.clock import Clock
-from emgs_jax.running.record import FrameRecord
-from emgs_jax.running.untracked import MANY_IN_A_ROW, REMEDIES
 
 
 def records(**statuses: int) -> list[FrameRecord]:
@@ -56,7 +55,7 @@ def test_the_seconds_of_a_run_are_those_of_all_its_phases():
 
 
 def test_a_remedy_names_keys_that_there_are():
-    from emgs_jax.running.configure import compose, keys_of
+    from emgs_jax.config.configure import compose, keys_of
 
     known = keys_of(compose())
     words = " ".join(REMEDIES.values()).replace("(", " ").replace(")", " ").replace(",", " ").split()

@@ -15,6 +15,7 @@ import trimesh
 from omegaconf import OmegaConf
 from written_run import written_run
 
+from emgs_jax.config.configure import compose
 from emgs_jax.data.labels import LabelFolder
 from emgs_jax.evaluation.instances import InstanceConfig
 from emgs_jax.features.random import RandomFeatures
@@ -26,7 +27,6 @@ from emgs_jax.report.query import Question, ask, heat
 from emgs_jax.report.query_pictures import MAX_LEGEND, drawn, frame_view, legend, save_labels
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.vocabulary import vocabulary
-from emgs_jax.running.configure import compose
 from experiments.query import asked, given_views, named_views, query, rivals
 
 FILES = {"query.json", "query.png", "semantic.npz", "semantic.ply", "features.png", "labels"}

@@ -6,8 +6,8 @@ from functools import cache
 import pytest
 from omegaconf import OmegaConf
 
+from emgs_jax.config.configure import compose
 from emgs_jax.report.repeat import check_targets, repeat
-from emgs_jax.running.configure import compose
 
 
 @cache

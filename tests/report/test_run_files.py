@@ -12,9 +12,9 @@ from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.io.map_file import load_map_npz
 from emgs_jax.io.trajectory import load_trajectory_tum
+from emgs_jax.report.dense import DenseMap
 from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.run_files import OUTPUTS, claim_folder, save_outputs, save_progress
-from emgs_jax.running.dense import DenseMap
 
 NUM_FRAMES = len(STATUSES)
 ESTIMATE, TRUTH = (228, 87, 46), (27, 153, 139)  # colours of the paths

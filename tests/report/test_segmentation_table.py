@@ -9,10 +9,10 @@ from hand_run import random_similarity
 from omegaconf import OmegaConf
 from written_run import written_run
 
+from emgs_jax.config.configure import compose
 from emgs_jax.io.map_file import load_map
 from emgs_jax.io.ply import structured, write_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, to_tum
-from emgs_jax.running.configure import compose
 from experiments.segment import segment
 
 CLASSES = "5 wall\n9 sofa\n"

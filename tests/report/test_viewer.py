@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 from written_run import CLASSES, two_walls, written_run
 
+from emgs_jax.config import configure
 from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report.display import closing_covariances
@@ -22,7 +23,6 @@ from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.viewer import HOST, Viewer
 from emgs_jax.report.viewer_answers import ask, find_words, highlighted, picked
 from emgs_jax.report.viewer_scene import field_of_view, shown
-from emgs_jax.running import configure
 from experiments.view import view
 
 NAMES = ("wall", "sofa", "sofa table", "Chair")

@@ -12,12 +12,12 @@ from hand_run import STATUSES, hand_run, poses_along
 from omegaconf import OmegaConf
 from tiny_run import compose
 
+from emgs_jax.config.configure import build_dataset
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import FrameLog, write_json
 from emgs_jax.io.trajectory import save_trajectory_tum, to_tum
 from emgs_jax.report.run_files import save_progress
-from emgs_jax.running.configure import build_dataset
 
 SIZE = 48, 40  # of the images, pixels
 INTRINSICS = 40.0, 42.0, 22.0, 20.5  # all four differ, and the centre is not in the middle

@@ -19,8 +19,8 @@ from own_process import run
 from tiny_run import CONF
 from tqdm import tqdm
 
-from emgs_jax.running.configure import compose, groups
-from emgs_jax.running.overrides import parsed, readable
+from emgs_jax.config.configure import compose, groups
+from emgs_jax.config.overrides import parsed, readable
 from experiments.cli import COMMANDS, main
 from experiments.command import check_arguments, check_missing, kept_words, nothing_left
 from experiments.evaluate import delegated

@@ -5,8 +5,8 @@ import pytest
 from hydra.utils import instantiate
 from tiny_run import compose, dataset
 
-from emgs_jax.running import configure
-from emgs_jax.running.configure import build_prior
+from emgs_jax.config import configure
+from emgs_jax.config.configure import build_prior
 from experiments.embed import embed
 
 

@@ -63,10 +63,10 @@ MAPPING = """
 import sys
 import hydra
 from experiments import run  # everything that a run imports
-from emgs_jax.running.configure import build_dataset, build_prior, compose
-from emgs_jax.running.record import new_run
-from emgs_jax.running.window_input import predictions
-from emgs_jax.running.convert import to_first_window
+from emgs_jax.config.configure import build_dataset, build_prior, compose
+from emgs_jax.mapping.run import new_run
+from emgs_jax.mapping.window_input import predictions
+from emgs_jax.mapping.convert import to_first_window
 import numpy as np
 
 config = compose(*sys.argv[1:])

@@ -15,11 +15,11 @@ from omegaconf import OmegaConf
 from tiny_run import CONF, TINY
 
 import experiments.evaluate
+from emgs_jax.config.configure import compose, groups
 from emgs_jax.io.files import write_json
 from emgs_jax.report.gate import read_gate
 from emgs_jax.report.provenance import RESULT_FORMAT
 from emgs_jax.report.results import METRICS_FILE
-from emgs_jax.running.configure import compose, groups
 from experiments.command import clear_errors
 
 

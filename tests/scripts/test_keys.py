@@ -6,7 +6,7 @@ from functools import cache
 import pytest
 from omegaconf import OmegaConf
 
-from emgs_jax.running.configure import CONF, compose
+from emgs_jax.config.configure import CONF, compose
 from experiments.keys import KEYS, check_keys
 
 NEEDED = {

@@ -8,9 +8,9 @@ import own_process
 import pytest
 from tiny_run import dataset
 
+from emgs_jax.config import configure
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.report.run_files import claim_folder
-from emgs_jax.running import configure
 from experiments.query import query
 from experiments.segment import segment
 

@@ -13,13 +13,13 @@ from omegaconf import OmegaConf
 from tiny_run import NUM_FRAMES, TINY, WINDOW_SIZE, EditedPrior, compose, dataset
 
 import experiments.run
+from emgs_jax.config.configure import compose as compose_as_typed
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.gaussian_map import GaussianMap, confirmed
 from emgs_jax.io.map_file import load_map_npz
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.io.trajectory import load_trajectory_tum
-from emgs_jax.running.configure import compose as compose_as_typed
 from experiments.command import clear_errors
 
 FILES = {"trajectory.txt", "map.npz", "map.ply", "points.ply", "mesh.ply", "frames.jsonl", "overview.png", "text.npz"}

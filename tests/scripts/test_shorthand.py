@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from emgs_jax.running.configure import compose
+from emgs_jax.config.configure import compose
 from experiments.command import check_arguments
 from experiments.shorthand import frame_size, keys_of, with_source
 

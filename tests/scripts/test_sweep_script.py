@@ -10,8 +10,8 @@ from tiny_run import compose
 
 import experiments.run
 import experiments.sweep
-from emgs_jax.running import configure
-from emgs_jax.running.configure import groups
+from emgs_jax.config import configure
+from emgs_jax.config.configure import groups
 from experiments.grid import notes, read_axes, variants
 
 AXES = "axes={slam.em.max_mahalanobis_sq:[1.0,9.0],slam.em.average.gain:[count,ema_printed]}"

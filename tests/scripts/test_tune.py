@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from tiny_run import TINY
 
 import experiments.tune
-from emgs_jax.running.configure import compose
+from emgs_jax.config.configure import compose
 from experiments.command import check_arguments
 from experiments.search import Between, ask, front, open_study, read_objectives, read_space
 

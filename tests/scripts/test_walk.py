@@ -1,9 +1,9 @@
-"""What a run with a loop leaves behind is read by every other command; running/test_coming_back.py goes on in it."""
+"""What a run with a loop leaves behind is read by every other command; mapping/test_coming_back.py goes on in it."""
 
 import pytest
 
 import experiments.run
-from emgs_jax.running import configure
+from emgs_jax.config import configure
 from experiments.export import export_run
 from experiments.query import query
 from experiments.segment import segment

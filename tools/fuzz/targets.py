@@ -20,6 +20,12 @@ from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
 
 from emgs_jax import load_config
+from emgs_jax.back_end.factors import FrameData
+from emgs_jax.back_end.g2o import load_graph_g2o
+from emgs_jax.back_end.saved_map import load_places, save_places
+from emgs_jax.back_end.state import BackEnd, add_node
+from emgs_jax.config.configure import compose, keys_of
+from emgs_jax.config.values import check_values
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.bonn import Bonn
 from emgs_jax.data.checksums import SUMS_FILE
@@ -40,12 +46,13 @@ from emgs_jax.evaluation.labelled_mesh import read_labelled_mesh
 from emgs_jax.features.text import TextEmbeddings, load_text, save_text
 from emgs_jax.gaussian_map import empty_map
 from emgs_jax.io.colmap import save_colmap
-from emgs_jax.io.g2o import load_graph_g2o
 from emgs_jax.io.map_file import load_map, save_map
 from emgs_jax.io.nerfstudio import save_transforms
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.loop_closure.place_recognition import Keyframe, add_keyframe
+from emgs_jax.mapping.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.ops.camera import Camera
 from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Nodes, PoseGraph
 from emgs_jax.prior.base import windows
@@ -54,13 +61,6 @@ from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.simulated.prior import Simulated
 from emgs_jax.report.page import write_report
 from emgs_jax.report.recorded_run import read_run
-from emgs_jax.running.back_end import BackEnd, add_node
-from emgs_jax.running.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from emgs_jax.running.configure import compose, keys_of
-from emgs_jax.running.factors import FrameData
-from emgs_jax.running.record import FrameRecord
-from emgs_jax.running.saved_map import load_places, save_places
-from emgs_jax.running.values import check_values
 from tests.data.written_benchmarks import write_euroc, write_kitti
 from tests.data.written_scene import color_image, plane_depth, scene_pose, write_depth
 

@@ -58,8 +58,8 @@ def main() -> None:
 
 def calls(words: list[str]) -> list[tuple[Callable, tuple]]:
     """The executables of the step after the first window, and what each is called with."""
+    from emgs_jax.config.configure import compose
     from emgs_jax.ops.executable import calling
-    from emgs_jax.running.configure import compose
     from emgs_jax.slam import step
     from experiments.benchmarks.data import first_state, load
 

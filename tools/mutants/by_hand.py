@@ -55,13 +55,13 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
     ("em", "second - outer(mean[:, :3])", "second", "a covariance about the old mean"),
     ("existence", "gaussians.means - origins", "gaussians.means", "all is seen from the world's origin"),
     (
-        "running/factors",
+        "back_end/factors",
         "np.linalg.inv(poses[-1]) @ poses[row]",
         "np.linalg.inv(poses[row]) @ poses[-1]",
         "edges the other way round",
     ),
     (
-        "running/disconnected_submaps",
+        "mapping/submaps",
         "scale_covariance(place.covariance, 1.0 / unit)",
         "scale_covariance(place.covariance, 1.0 / scale)",
         "the unit of a place is that of the map after it has moved",
@@ -78,7 +78,7 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
         "T[:3, :3] = Rotation.from_rotvec(translation * ",
         "metres for radians",
     ),
-    ("io/g2o", "[6, 3, 4, 5, 0, 1, 2]", "[3, 4, 5, 6, 0, 1, 2]", "quaternions with w first are read"),
+    ("back_end/g2o", "[6, 3, 4, 5, 0, 1, 2]", "[3, 4, 5, 6, 0, 1, 2]", "quaternions with w first are read"),
     (
         "io/trajectory",
         "Rotation.from_quat(values[is_finite, 3:])",

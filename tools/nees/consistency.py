@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from emgs_jax.running.record import MappingRun
+from emgs_jax.mapping.run import MappingRun
 
 DEGREES = 6  # translation, rotation
 

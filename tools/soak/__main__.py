@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from emgs_jax.device.settings import use_compilation_cache
 from emgs_jax.io.files import write_json
-from emgs_jax.running.compilation import use_compilation_cache
-from emgs_jax.running.untracked import UNTRACKED
+from emgs_jax.mapping.records import UNTRACKED
 
 from .scenes import SCENES, ToAndFro
 from .soak import Curves, faults, grown, ratio, soak

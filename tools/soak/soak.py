@@ -8,13 +8,14 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from emgs_jax.config.configure import build
 from emgs_jax.data.base import Dataset
+from emgs_jax.device.clock import Clock
+from emgs_jax.mapping.pipeline import finish_run, map_frames
+from emgs_jax.mapping.records import FrameRecord
+from emgs_jax.mapping.run import MappingRun, new_run
 from emgs_jax.prior.simulated.prior import Simulated
 from emgs_jax.report.metrics import STATUSES
-from emgs_jax.running.clock import Clock
-from emgs_jax.running.configure import build
-from emgs_jax.running.pipeline import finish_run, map_frames
-from emgs_jax.running.record import FrameRecord, MappingRun, new_run
 from tests.tiny_run import compose
 
 PAGE_BYTES = 4096

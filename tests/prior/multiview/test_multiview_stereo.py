@@ -11,14 +11,15 @@ from stereo_scene import similarity_error
 from tiny_run import SMALL_STEREO
 
 from emgs_jax.data.synthetic import Synthetic
+from emgs_jax.device.arrays import to_se3
+from emgs_jax.device.clock import Clock
 from emgs_jax.io.files import jsonable
+from emgs_jax.mapping.convert import to_first_window
+from emgs_jax.mapping.window_input import predictions
 from emgs_jax.prior.base import Prior, windows
 from emgs_jax.prior.multiview.lens import Lens, grid, rectify, straight
 from emgs_jax.prior.multiview.prior import tried_depths
 from emgs_jax.prior.recorded import Recorded, record
-from emgs_jax.running.clock import Clock
-from emgs_jax.running.convert import to_first_window, to_se3
-from emgs_jax.running.window_input import predictions
 
 WINDOW_SIZE, NUM_NEWER, NUM_FRAMES = 5, 2, 8
 

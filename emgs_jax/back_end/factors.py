@@ -1,0 +1,147 @@
+"""Factors of the pose graph that a frame adds: its pose relative to an earlier frame, and to the map."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from emgs_jax.device.arrays import to_se3
+from emgs_jax.geometry import scale_pose
+from emgs_jax.loop_closure.verification import LoopMeasurement
+from emgs_jax.ops.ranges import number
+from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Factors
+from emgs_jax.pose_graph.problem import bucket
+from emgs_jax.registration.pose_noise import LEAST_NOISE
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """Standard deviations of pose factors, as multiples of the relative depth noise ν of a frame's points.
+
+    A rotation has the standard deviation k ν, a translation k ν z with the median depth z: the factors k have no unit,
+    and a prior that is twice as noisy gets half the weight.
+
+    Args:
+        pair: of the relative pose of two consecutive frames; √n times as much for frames n apart.
+        map: of a frame registered to the map, relative to the frame whose Gaussians it was registered to.
+        log_scale: of the log-ratio of two consecutive frames' scales, as `pair`.
+        depth: ν of a frame that was not registered to the map, such as the first.
+    """
+
+    pair: float = number(low=1e-9, high=1000)
+    map: float = number(low=1e-9, high=1000)
+    log_scale: float = number(low=1e-9, high=1000)
+    depth: float = number(low=1e-9, high=1000)
+
+
+@dataclass(frozen=True)
+class FrameData:
+    """Input of the back end from one frame, beside its pose.
+
+    Args:
+        index: in the data set.
+        image: RGB, uint8 (h, w, 3).
+        points: camera frame, m of its inference, (h, w, 3).
+        mask: of these, (h, w).
+        T_anchor_views: by frame index, the poses (4, 4) that its inference predicts; some may not be finite.
+        depth_noise: ν of the points, as they differ from the map; None where the frame was not tracked: the few points
+            that are near the map by chance do not count.
+    """
+
+    index: int
+    image: np.ndarray
+    points: np.ndarray
+    mask: np.ndarray
+    T_anchor_views: Mapping[int, np.ndarray]
+    depth_noise: float | None = None
+
+    @property
+    def depth(self) -> float:
+        """The points' median z, m of its inference; 1 where there are none."""
+        return float(np.median(self.points[self.mask][:, 2])) if self.mask.any() else 1.0
+
+
+class Factor(NamedTuple):
+    """One row of `Factors`, on the host: Z (4, 4), sqrt_info (7, 7)."""
+
+    a: int
+    b: int
+    Z_a_b: np.ndarray
+    log_ratio: float
+    sqrt_info: np.ndarray
+    kind: int
+
+
+def _weights(frame: FrameData, noise: NoiseConfig, angle: float, log_scale: float = np.inf) -> np.ndarray:
+    """Square root (7, 7) of the information of independent errors, in multiples of ν; an infinite one gets weight 0."""
+    depth_noise = noise.depth if frame.depth_noise is None else max(frame.depth_noise, LEAST_NOISE)
+    return np.diag(1.0 / (depth_noise * np.array([angle * frame.depth] * 3 + [angle] * 3 + [log_scale])))
+
+
+def sequential_factor(
+    frame: FrameData,
+    poses: Sequence[np.ndarray],
+    log_scales: Sequence[float],
+    is_connected: Callable[[int], bool],
+    noise: NoiseConfig,
+) -> Factor | None:
+    """Build the last frame's sequential factor to the nearest earlier frame in its window; None without one.
+
+    The measurement is the estimated pose, not the predicted one. The map was made at these poses: a prediction that
+    differs from them by its noise would move every frame by that, each with the Gaussians of its birth, and roughen all
+    surfaces.
+
+    Args:
+        frame: the last one.
+        poses: T_world_camera (4, 4) of all nodes, the last one its own; that of a frame k before it is k before.
+        log_scales: σ of all nodes, likewise.
+        is_connected: true for a node that a factor may join: its pose is an estimate and no placeholder.
+        noise: of the measurements.
+    """
+    time = len(poses) - 1
+    known = {index for index, pose in frame.T_anchor_views.items() if np.isfinite(pose).all()}
+    nearest = sorted(frame.index - index for index in known)
+    offset = next((offset for offset in nearest if 0 < offset <= time and is_connected(time - offset)), None)
+    if frame.index not in known or offset is None:
+        return None
+    row, spread = time - offset, np.sqrt(offset)
+    weights = _weights(frame, noise, spread * noise.pair, spread * noise.log_scale)
+    return Factor(
+        time, row, _relative_pose(poses, log_scales, row), log_scales[row] - log_scales[time], weights, ODOMETRY
+    )
+
+
+def map_factor(
+    frame: FrameData, poses: Sequence[np.ndarray], log_scales: Sequence[float], origin: int, noise: NoiseConfig
+) -> Factor:
+    """Build the map factor: the last frame's pose relative to the frame `origin` whose Gaussians it was fitted to."""
+    measured = _relative_pose(poses, log_scales, origin)
+    return Factor(len(poses) - 1, origin, measured, 0.0, _weights(frame, noise, noise.map), ODOMETRY)
+
+
+def _relative_pose(poses: Sequence[np.ndarray], log_scales: Sequence[float], row: int) -> np.ndarray:
+    """Node `row` relative to the last one, in the unit of the last one's inference."""
+    return scale_pose(np.linalg.inv(poses[-1]) @ poses[row], np.exp(-log_scales[-1]))
+
+
+def loop_factor(loop: LoopMeasurement) -> Factor:
+    """Build the loop factor of a verified loop."""
+    return Factor(loop.a, loop.b, loop.Z_a_b, loop.log_ratio, loop.sqrt_info, LOOP)
+
+
+def stack_factors(factors: Sequence[Factor]) -> Factors:
+    """Stack factors as float32 arrays, padded to a power of two: a growing graph compiles rarely."""
+    count = len(factors)
+    size = bucket(count)
+    a, b, Z, ratios, weights, kinds = zip(*factors, *[factors[0]] * (size - count), strict=True)
+    return Factors(
+        a=jnp.asarray(a, jnp.int32),
+        b=jnp.asarray(b, jnp.int32),
+        Z_a_b=to_se3(np.stack(Z)),
+        log_ratio=jnp.asarray(ratios, jnp.float32),
+        sqrt_info=jnp.asarray(np.stack(weights), jnp.float32),
+        kind=jnp.asarray(kinds, jnp.int32),
+        valid=jnp.asarray(np.arange(size) < count),
+    )

@@ -1,0 +1,82 @@
+"""Optimization of the pose graph, and deformation of a run's state: map, last frame and its pose follow the nodes."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from emgs_jax.back_end.factors import loop_factor, stack_factors
+from emgs_jax.back_end.state import BackEnd, Closure
+from emgs_jax.device.arrays import to_se3
+from emgs_jax.existence import ExistenceConfig, merge_all_duplicates
+from emgs_jax.loop_closure.verification import LoopMeasurement
+from emgs_jax.ops.pytree import take_rows
+from emgs_jax.pose_graph.deform import DeformConfig, deform, deform_view
+from emgs_jax.pose_graph.factors import Nodes, PoseGraph
+from emgs_jax.pose_graph.optimize import optimize
+from emgs_jax.pose_graph.problem import bucket
+from emgs_jax.registration.pose_estimate import rescale_estimate
+from emgs_jax.slam import SlamState
+
+move_map, _move_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)  # a map is compiled for once
+_merge = eqx.filter_jit(merge_all_duplicates)
+
+
+def close_loops(end: BackEnd, state: SlamState, loops: Sequence[LoopMeasurement] = ()) -> tuple[BackEnd, SlamState]:
+    """Optimize with `loops` as further factors and deform the map; a refused solution moves nothing."""
+    factors = [*end.factors, *map(loop_factor, loops)]
+    before, solver = nodes_of(end, end.submap_id), end.config.solver
+    if not end.has_one_unit:  # the scales are not all about 1
+        solver = replace(solver, scale_std=jnp.asarray(math.inf))
+    after, info = optimize(PoseGraph(before, stack_factors(factors)), solver)
+    end = replace(end, closures=[*end.closures, Closure(len(end.poses) - 1, tuple(loops), info)])
+    if info.reason:
+        return end, state
+    count = len(end.poses)
+    end = replace(
+        end,
+        factors=factors,
+        accepted=[*end.accepted, *loops],
+        poses=list(np.asarray(after.T_world.as_matrix(), np.float64)[:count]),
+        log_scales=list(np.asarray(after.log_scale, np.float64)[:count]),
+    )
+    change = jnp.mean(after.log_scale - before.log_scale, where=before.valid)
+    state = replace(state, estimate=rescale_estimate(state.estimate, jnp.exp(change)))
+    return end, deform_state(state, before, after, end.min_std, end.config.deform)
+
+
+def nodes_of(end: BackEnd, submap_id: int | None = None) -> Nodes:
+    """Stack all nodes, or mark those of a submap as valid; padded to a power of two, so that it compiles rarely."""
+    count = len(end.poses)
+    size = bucket(count)
+    poses = to_se3(np.stack([*end.poses, *[np.eye(4)] * (size - count)]))
+    scales = jnp.asarray([*end.log_scales, *[0.0] * (size - count)], jnp.float32)
+    is_valid = [submap_id in (None, one) for one in end.submap_ids]
+    return Nodes(poses, scales, jnp.asarray(is_valid + [False] * (size - count)))
+
+
+def deform_state(state: SlamState, before: Nodes, after: Nodes, min_std: float, config: DeformConfig) -> SlamState:
+    """Deform the map and the last frame from the poses `before` to those `after`."""
+    last = state.time - 1
+    return replace(
+        state,
+        map=move_map(state.map, before, after, jnp.asarray(min_std, jnp.float32), config),
+        previous=_move_view(state.previous, before, after, last),
+        T_world_previous=_moved_pose(state.T_world_previous, before, after, int(last)),
+    )
+
+
+def merge_duplicates_of_state(state: SlamState, nodes: Nodes, depth_noise: float, config: ExistenceConfig) -> SlamState:
+    """Merge duplicate surfaces of the whole map, see `merge_all_duplicates`."""
+    origins = take_rows(nodes.T_world.translation(), state.map.birth)
+    return replace(state, map=_merge(state.map, origins, jnp.asarray(depth_noise, jnp.float32), config))
+
+
+def _moved_pose(T: jaxlie.SE3, before: Nodes, after: Nodes, row: int) -> jaxlie.SE3:
+    """Return the node's new pose; T itself, bit for bit, where the node stays."""
+    old, new = before.T_world.wxyz_xyz[row], after.T_world.wxyz_xyz[row]
+    return jaxlie.SE3(jnp.where(jnp.all(old == new), T.wxyz_xyz, new))

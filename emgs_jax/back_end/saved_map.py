@@ -1,0 +1,208 @@
+"""places.npz: a run's back end, beside map.npz, so that another run can continue in the map.
+
+Keyframes, poses and factors. The other run's frames are further nodes of the same pose graph.
+"""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emgs_jax.back_end.factors import Factor
+from emgs_jax.back_end.state import BackEnd, BackEndConfig
+from emgs_jax.data.reading import fingerprint
+from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.io.files import atomic_write
+from emgs_jax.io.map_file import load_map
+from emgs_jax.io.npz import read_npz
+from emgs_jax.keypoints.sift import DESCRIPTOR_SIZE
+from emgs_jax.loop_closure.place_recognition import Database, Keyframe, unit_descriptors, vlad
+from emgs_jax.loop_closure.verification import LoopMeasurement
+
+PLACES_FILE, MAP_FILE, METRICS_FILE = "places.npz", "map.npz", "metrics.json"
+FORMAT, VERSION, DESCRIPTORS = "emgs_jax.places", 1, "rootsift"
+MODES = ("extend", "localize")
+LEFT_OUT = -1  # submap of nodes that were never joined with the map
+NODES = ("poses", "log_scales", "frames", "is_placed")
+LOOPS = {"verified": "verified", "contradicted": "violating", "accepted": "accepted"}  # in the file: in a back end
+OF_POINTS, OF_KEYFRAMES = ("pixels", "descriptors", "points"), ("frame", "intrinsics", "size", "depths")
+
+
+@dataclass(frozen=True)
+class SavedMap:
+    """A map of an earlier run in which another one continues.
+
+    Args:
+        map: of an earlier run.
+        back_end: of that run; its `first_node` is that of the next one.
+        depth_noise: how much a frame differed from the map, as a fraction of its depth.
+        is_fixed: True in localization mode: the map stays as it is.
+        checksum: of its files.
+    """
+
+    map: GaussianMap
+    back_end: BackEnd
+    depth_noise: float
+    is_fixed: bool
+    checksum: str
+
+    @property
+    def count(self) -> int:
+        """Number of its Gaussians."""
+        return int(np.asarray(self.map.gaussians.valid).sum())
+
+
+def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
+    """Write what `load_places` reads."""
+    keyframes, header = end.database.keyframes, {"format": FORMAT, "version": VERSION, "descriptors": DESCRIPTORS}
+    header |= {"depth_noise": depth_noise, "num_trained": end.database.num_trained, "has_one_unit": end.has_one_unit}
+    arrays = {name: np.asarray(getattr(end, name)) for name in NODES} | {"words": end.database.words}
+    arrays["is_kept"] = np.array(end.submap_ids) == end.submap_id
+    arrays |= {f"keyframes.{name}": np.stack([getattr(one, name) for one in keyframes]) for name in OF_KEYFRAMES}
+    arrays |= {f"keyframes.{name}": np.concatenate([getattr(one, name) for one in keyframes]) for name in OF_POINTS}
+    arrays["keyframes.num_points"] = np.array([len(one.pixels) for one in keyframes])
+    arrays |= _table("edges", end.factors, Factor.__annotations__)
+    for name, field in LOOPS.items():
+        arrays |= _table(name, getattr(end, field), LoopMeasurement.__annotations__)
+    with atomic_write(path) as handle:
+        np.savez(handle, __header__=np.array(json.dumps(header)), **arrays)
+
+
+def load_places(path: Path, end: BackEnd) -> tuple[BackEnd, float]:
+    """Fill a back end that has no node yet; return it, and the depth noise.
+
+    Raises:
+        ValueError: the file is damaged, of another version, or its descriptors are of another kind.
+    """
+    try:
+        with open(path, "rb") as handle:
+            arrays = read_npz(handle)
+        header = json.loads(str(arrays["__header__"]))
+        for name, ours in (("format", FORMAT), ("version", VERSION), ("descriptors", DESCRIPTORS)):
+            if header.get(name) != ours:
+                raise ValueError(f"its {name} is {header.get(name)!r}, this code reads {ours!r}")
+        for name, array in arrays.items():
+            if array.dtype.kind == "f" and name != "keyframes.points" and not np.isfinite(array).all():
+                raise ValueError(f"{name} is not finite")
+        has_one_unit = bool(header.get("has_one_unit", True))  # older files do not have it
+        end = replace(end, has_one_unit=has_one_unit, **_fields(arrays, int(header["num_trained"])))
+        return end, float(header["depth_noise"])
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+        raise ValueError(
+            f"{path} holds no keyframes to continue from ({error}): map again with graph=default"
+        ) from error
+
+
+def load_saved_map(
+    folder: str | None, mode: str, config: BackEndConfig | None, intrinsics: Sequence[float], min_std: float
+) -> SavedMap | None:
+    """The map of a finished run's folder; None without one.
+
+    Args:
+        folder: of the run.
+        mode: `extend` or `localize`.
+        config: of the back end.
+        intrinsics: of the new images, which may be those of another camera.
+        min_std: floor of the map's covariances.
+
+    Raises:
+        ValueError: the folder is not that of a finished run with a back end, or a file of it cannot be used.
+    """
+    if mode not in MODES:
+        raise ValueError(f"map_mode must be one of {', '.join(MODES)}, got {mode!r}")
+    if folder is None:
+        return None
+    folder = Path(folder)
+    if config is None:
+        raise ValueError(f"map={folder} needs the keyframes of a back end: add graph=default")
+    if not folder.is_dir():
+        raise ValueError(f"map={folder} is no folder: give that of a finished run")
+    if not (folder / METRICS_FILE).exists():
+        raise ValueError(
+            f"map={folder} has no {METRICS_FILE}, so its run is not finished: the same command with "
+            f"hydra.run.dir={folder} goes on with it"
+        )
+    if not (folder / PLACES_FILE).exists():
+        raise ValueError(f"map={folder} has no {PLACES_FILE}: map it again with graph=default")
+    end, depth_noise = load_places(folder / PLACES_FILE, BackEnd(config, tuple(intrinsics), min_std))
+    size = end.database.keyframes[0].depths.shape[::-1]
+    if size != tuple(config.place_recognition.grid):
+        raise ValueError(
+            f"map={folder} was made with graph.place_recognition.grid=[{size[0]},{size[1]}]: give that here, too"
+        )
+    map = load_map(folder / MAP_FILE)
+    births = np.asarray(map.birth)[np.asarray(map.gaussians.valid)]
+    if len(births) == 0 or births.min() < 0 or births.max() >= len(end.poses):
+        raise ValueError(f"{folder}: {MAP_FILE} and {PLACES_FILE} are not of one run: map again")
+    files = folder / MAP_FILE, folder / PLACES_FILE
+    return SavedMap(map, end, depth_noise, mode == "localize", fingerprint(folder, files, {}))
+
+
+def _fields(arrays: Mapping[str, np.ndarray], num_trained: int) -> dict[str, Any]:
+    """Read nodes, keyframes and measurements, as fields of a back end."""
+    poses, log_scales, frames, is_placed = (arrays[name] for name in NODES)
+    count = len(poses)
+    if poses.shape != (count, 4, 4) or not count == len(log_scales) == len(frames) == len(is_placed) > 0:
+        raise ValueError(f"{count} nodes have {len(log_scales)} scales, {len(frames)} frames, {len(is_placed)} states")
+    keyframes, words = _keyframes(arrays), arrays["words"]
+    if words.ndim != 2 or words.shape[1] != DESCRIPTOR_SIZE:
+        raise ValueError(f"words have shape {words.shape}, expected (k, {DESCRIPTOR_SIZE})")
+    numbers = [one.frame for one in keyframes]
+    if numbers != sorted(set(numbers)) or not 0 <= numbers[0] <= numbers[-1] < count:
+        raise ValueError("keyframes are not nodes in their order")
+    vectors = np.stack([vlad(unit_descriptors(one), words) for one in keyframes])
+    is_kept = arrays.get("is_kept", np.ones(count, bool))  # older files do not have it
+    loops = {
+        field: [LoopMeasurement(**row) for row in _rows(name, arrays, LoopMeasurement.__annotations__, count)]
+        for name, field in LOOPS.items()
+    }
+    return {
+        "poses": list(np.float64(poses)),
+        "online": list(np.float64(poses)),
+        "log_scales": log_scales.tolist(),
+        "frames": frames.tolist(),
+        "is_placed": is_placed.tolist(),
+        "submap_ids": np.where(is_kept, 0, LEFT_OUT).tolist(),
+        "factors": [Factor(**row) for row in _rows("edges", arrays, Factor.__annotations__, count)],
+        "database": Database(keyframes, words, vectors, num_trained),
+        "first_node": count,
+        "connected_since": count,
+    } | loops
+
+
+def _keyframes(arrays: Mapping[str, np.ndarray]) -> tuple[Keyframe, ...]:
+    counts = arrays["keyframes.num_points"]
+    pixels, descriptors, points = (arrays[f"keyframes.{name}"] for name in OF_POINTS)
+    shapes = {"pixels": (pixels, 2), "descriptors": (descriptors, DESCRIPTOR_SIZE), "points": (points, 3)}
+    for name, (array, width) in shapes.items():
+        if array.shape != (counts.sum(), width):
+            raise ValueError(f"keyframes.{name} have shape {array.shape}, expected {(int(counts.sum()), width)}")
+    parts = [np.split(array, np.cumsum(counts)[:-1]) for array in (pixels, descriptors, points)]
+    frames, intrinsics, sizes, depths = (arrays[f"keyframes.{name}"] for name in OF_KEYFRAMES)
+    return tuple(
+        Keyframe(int(frame), *of_points, tuple(map(float, camera)), tuple(map(int, size)), depth)
+        for frame, *of_points, camera, size, depth in zip(frames, *parts, intrinsics, sizes, depths, strict=True)
+    )
+
+
+def _table(name: str, records: Sequence[Any], fields: Iterable[str]) -> dict[str, np.ndarray]:
+    """One array for each field of all records."""
+    return {f"{name}.{field}": np.array([getattr(record, field) for record in records]) for field in fields}
+
+
+def _rows(name: str, arrays: Mapping[str, np.ndarray], fields: Iterable[str], count: int) -> list[dict[str, Any]]:
+    """Return the records that `_table` was made of, a dict each; a and b must be among `count` nodes."""
+    columns = {field: arrays[f"{name}.{field}"] for field in fields}
+    for field in ("a", "b"):
+        if len(columns[field]) and not 0 <= columns[field].min() <= columns[field].max() < count:
+            raise ValueError(f"{name}.{field} is no node")
+    rows = zip(*columns.values(), strict=True)
+    return [
+        {field: value.item() if np.ndim(value) == 0 else value for field, value in zip(columns, row, strict=True)}
+        for row in rows
+    ]

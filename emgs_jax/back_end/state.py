@@ -1,0 +1,172 @@
+"""The back end: a pose graph of keyframes and loop closures; optimized poses deform the map.
+
+Nodes are the frames from the first of the map on, in the order of `SlamState.time`.
+"""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from emgs_jax.back_end.factors import Factor, FrameData, NoiseConfig, map_factor, sequential_factor
+from emgs_jax.geometry import Sim3
+from emgs_jax.loop_closure.consistency import ConsistencyConfig
+from emgs_jax.loop_closure.place_recognition import Database, PlaceRecognitionConfig
+from emgs_jax.loop_closure.prior_query import PriorQueryConfig
+from emgs_jax.loop_closure.relocalization import RelocalizationConfig
+from emgs_jax.loop_closure.verification import LoopMeasurement, VerificationConfig
+from emgs_jax.ops.ranges import number
+from emgs_jax.pose_graph.deform import DeformConfig
+from emgs_jax.pose_graph.factors import ODOMETRY
+from emgs_jax.pose_graph.optimize import PoseGraphConfig, PoseGraphInfo
+
+
+@dataclass(frozen=True)
+class BackEndConfig:
+    """Settings of the back end: noise of factors, place recognition, loop closures, optimization and relocalization.
+
+    Args:
+        noise: of sequential and map factors.
+        place_recognition: keyframes, and candidates by their appearance.
+        verification: of a candidate.
+        consistency: spatial consistency of verified loops.
+        prior_query: second measurement of loops by the prior.
+        every: frames between keyframes.
+        min_violation: χ² of a loop at the current poses beyond which it violates them: only such a loop starts a
+            closure, and only for such a loop the prior is queried.
+        min_frames: between two closures.
+        solver: of the pose graph.
+        deform: of the map, to follow the optimized poses.
+        relocalization: of a lost camera.
+    """
+
+    noise: NoiseConfig
+    place_recognition: PlaceRecognitionConfig
+    verification: VerificationConfig
+    consistency: ConsistencyConfig
+    prior_query: PriorQueryConfig
+    every: int = number(low=1, high=1000)
+    min_violation: float = number(low=0, high=math.inf)
+    min_frames: int = number(low=0)
+    solver: PoseGraphConfig
+    deform: DeformConfig
+    relocalization: RelocalizationConfig
+
+
+@dataclass(frozen=True)
+class Closure:
+    """One pose-graph optimization: its node, the new loops, and the solver's result."""
+
+    time: int
+    loops: tuple[LoopMeasurement, ...]
+    info: PoseGraphInfo
+
+
+class Refusal(NamedTuple):
+    """A rejected loop candidate: two nodes, the gate that rejected it, and the value that this gate tested."""
+
+    a: int
+    b: int
+    gate: str
+    measured: float
+
+
+@dataclass(frozen=True)
+class BackEnd:
+    """State of the back end: nodes, factors and loops of the pose graph so far. Nothing of it is ever changed in place.
+
+    Args:
+        config: all settings.
+        intrinsics: of the images.
+        min_std: floor of the map's covariances.
+        poses: current T_world_camera (4, 4) of the nodes.
+        log_scales: σ of their inferences, likewise.
+        online: poses as first estimated, in the unit of `poses`.
+        frames: index in the data set of every node.
+        is_placed: True for nodes in the map: those that are neither degraded nor lost.
+        submap_ids: disconnected submap of every node; the relative pose of two submaps is not known.
+        factors: of the pose graph.
+        database: keyframes; their `frame` is the node.
+        verified: loops that passed every gate of two keyframes.
+        violating: loops with a free-space violation.
+        accepted: loops that are factors.
+        refusals: candidates that were rejected, and why.
+        queries: loops, by their nodes, for which the prior was queried, and the outcome, see `prior_queries`.
+        closures: optimizations so far.
+        first_node: of this run's first frame; those before are of the run that saved the map.
+        connected_since: node since which consecutive frames are connected; before it the camera was lost.
+        submap_id: of the next node.
+        has_one_unit: the inferences of all nodes have one unit, as far as the prior has.
+    """
+
+    config: BackEndConfig
+    intrinsics: tuple[float, float, float, float]
+    min_std: float
+    poses: Sequence[np.ndarray] = field(default_factory=list)
+    log_scales: Sequence[float] = field(default_factory=list)
+    online: Sequence[np.ndarray] = field(default_factory=list)
+    frames: Sequence[int] = field(default_factory=list)
+    is_placed: Sequence[bool] = field(default_factory=list)
+    submap_ids: Sequence[int] = field(default_factory=list)
+    factors: Sequence[Factor] = field(default_factory=list)
+    database: Database = field(default_factory=Database)
+    verified: Sequence[LoopMeasurement] = field(default_factory=list)
+    violating: Sequence[LoopMeasurement] = field(default_factory=list)
+    accepted: Sequence[LoopMeasurement] = field(default_factory=list)
+    refusals: Sequence[Refusal] = field(default_factory=list)
+    queries: Mapping[tuple[int, int], str] = field(default_factory=dict)
+    closures: Sequence[Closure] = field(default_factory=list)
+    first_node: int = 0
+    connected_since: int = 0
+    submap_id: int = 0
+    has_one_unit: bool = True
+
+
+def add_node(
+    end: BackEnd, frame: FrameData, pose: np.ndarray, scale: float, origin: int | None, is_placed: bool = True
+) -> BackEnd:
+    """Add a node with the pose of its frame, and its sequential and map factors.
+
+    Args:
+        end: the back end.
+        frame: its data.
+        pose: T_world_camera.
+        scale: of its inference.
+        origin: node whose Gaussians it was registered to; None where it was not registered to the map.
+        is_placed: the map holds it: it was registered to it, or the map was made from it.
+    """
+    time, pose = len(end.poses), np.asarray(pose, np.float64)
+    end = replace(
+        end,
+        poses=[*end.poses, pose],
+        online=[*end.online, pose],
+        log_scales=[*end.log_scales, float(np.log(scale))],
+        frames=[*end.frames, frame.index],
+        is_placed=[*end.is_placed, is_placed],
+        submap_ids=[*end.submap_ids, end.submap_id],
+    )
+    sequential = sequential_factor(frame, end.poses, end.log_scales, partial(_is_connected, end), end.config.noise)
+    factors = [] if sequential is None else [sequential]
+    if origin is not None and origin < time:
+        factors.append(map_factor(frame, end.poses, end.log_scales, origin, end.config.noise))
+    return replace(end, factors=[*end.factors, *factors])
+
+
+def _is_connected(end: BackEnd, row: int) -> bool:
+    """Test whether a node is in the map or has an odometry factor; False for nodes before the camera was found."""
+    has_factor = any(factor.a == row and factor.kind == ODOMETRY for factor in end.factors)
+    return row >= end.connected_since and (end.is_placed[row] or has_factor)
+
+
+def transform_nodes(end: BackEnd, rows: Collection[int], similarity: Sim3) -> BackEnd:
+    """Map the poses and scales of some nodes to another world."""
+
+    def moved(poses: Sequence[np.ndarray]) -> list[np.ndarray]:
+        return [similarity.apply_to_poses(pose) if row in rows else pose for row, pose in enumerate(poses)]
+
+    change = float(np.log(similarity.scale))
+    log_scales = [scale + change if row in rows else scale for row, scale in enumerate(end.log_scales)]
+    return replace(end, poses=moved(end.poses), online=moved(end.online), log_scales=log_scales)

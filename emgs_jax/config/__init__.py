@@ -1,0 +1,1 @@
+"""Configuration: conf/ composed with overrides, and every value checked."""

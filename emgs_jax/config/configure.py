@@ -1,0 +1,237 @@
+"""From words to what a run is made of: conf/ composed with overrides, the data set and the prior that it names.
+
+Nothing here needs JAX, because predictions are recorded where there may be none.
+"""
+
+import copy
+import difflib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.singleton import Singleton
+from hydra.errors import ConfigCompositionException, HydraException, InstantiationException, MissingConfigException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from emgs_jax.config.overrides import readable
+from emgs_jax.config.values import check_values
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.prior.base import Prior
+from emgs_jax.prior.featured import Featured, Requeried
+from emgs_jax.prior.files.truth import check_truth
+
+if TYPE_CHECKING:
+    from emgs_jax.back_end.state import BackEndConfig
+    from emgs_jax.evaluation.baselines import BaselineConfig
+
+# Installed below the package, in a clone beside it.
+CONF = next(
+    folder for folder in (Path(__file__).parents[1] / "conf", Path(__file__).parents[2] / "conf") if folder.is_dir()
+)
+
+RENAMED = {  # keys of earlier versions; of two that fit the longer one counts
+    "slam.continuation": "slam.extrapolation",
+    "graph.appearance": "graph.place_recognition",
+    "graph.agreement": "graph.consistency",
+    "graph.agreement.max_contradicted": "graph.consistency.max_violating_queries",
+    "graph.verification.max_contradicted": "graph.verification.max_free_space_violation",
+    "graph.verification.contradiction_margin": "graph.verification.free_space_margin",
+    "graph.revisit": "graph.prior_query",
+    "graph.revisit.is_asked": "graph.prior_query.is_used",
+    "graph.revisit.num_asked": "graph.prior_query.max_queries",
+    "graph.location": "graph.relocalization",
+    "graph.max_known": "graph.min_violation",
+}
+NO_WORD = (ValueError, TypeError, AssertionError)  # what Hydra raises where an option of a group is no word
+
+
+def build(config: DictConfig, key: str, **more: Any) -> Any:
+    """Instantiate the node at `key`, after all of its values are checked.
+
+    Args:
+        config: composed.
+        key: dotted, of a node with `_target_`.
+        more: parameters that the config does not hold.
+
+    Raises:
+        ValueError: a value is not of the kind or in the range that its field declares; the message has its full key.
+    """
+    if not isinstance(OmegaConf.select(config, key), DictConfig):
+        raise ValueError(f"{key}={OmegaConf.select(config, key)} would stand in the place of all its keys")
+    check_values(config, key)
+    return instantiate(OmegaConf.select(config, key), **more)
+
+
+def graph_config(config: DictConfig) -> "BackEndConfig | None":
+    """The back end of a config; None with `graph=none`."""
+    return build(config, "graph", _convert_="all") if config.graph else None
+
+
+def compose(*overrides: str, name: str = "config") -> DictConfig:
+    """conf/`name`.yaml with overrides; raises ValueError where one names no key or option."""
+    overrides = tuple(readable(overrides))
+    with _hydra():
+        try:
+            config = hydra.compose(name, list(overrides))
+        except (ConfigCompositionException, MissingConfigException, *NO_WORD) as error:
+            raise ValueError(_explained(error, name, overrides)) from error
+        except HydraException as error:  # of the grammar
+            raise ValueError(str(error)) from error
+    for group, options in groups().items():
+        value = OmegaConf.select(config, group.replace("/", "."), default={})
+        if not isinstance(value, Mapping | DictConfig):
+            raise ValueError(
+                f"{group.replace('/', '.')}={value} would put a word in the place of all its keys: choose one of its "
+                f"options ({', '.join(options)}) with {group}={value if value in options else options[0]}"
+            )
+    return config
+
+
+@contextmanager
+def _hydra() -> Iterator[None]:
+    """Hydra over conf/; whatever state of it there is comes back at the end, so this works inside of its programs."""
+    before = copy.deepcopy(Singleton.get_state())
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+            yield
+    finally:
+        Singleton.set_state(before)
+
+
+def groups() -> dict[str, list[str]]:
+    """Every group of conf/ and the names of its options."""
+    found: dict[str, list[str]] = {}
+    for path in sorted(CONF.rglob("*.yaml")):
+        if path.parent != CONF:
+            found.setdefault(path.parent.relative_to(CONF).as_posix(), []).append(path.stem)
+    return found
+
+
+def _explained(error: Exception, name: str, overrides: Sequence[str]) -> str:
+    """Explain the error in the overrides, and name the keys or options that might have been meant."""
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    options = groups()
+    if needed := re.match(r"You must specify '([\w/]+)'", str(error)):
+        return f"{needed[1]} is not given: choose {needed[1]}= one of {', '.join(options.get(needed[1], ()))}"
+    choices = [override for override in parsed if override.key_or_group.split("@")[0] in options]
+    paths = [override for override in parsed if override.key_or_group == "hydra.searchpath"]  # of options beside ours
+    for override in () if paths else choices:
+        group = override.key_or_group
+        if override.value() is not None and str(override.value()) not in options.get(group, [str(override.value())]):
+            return f"{override.input_line} is no option of {group}: there are {', '.join(options[group])}"
+    values = [override for override in parsed if override not in choices]
+    try:
+        known = keys_of(hydra.compose(name, [override.input_line for override in [*choices, *paths]]))
+    except (HydraException, *NO_WORD):
+        return f"{' '.join(overrides)}: {error}"
+    for override in values:
+        key = override.key_or_group
+        parts = [group for group in options if group.startswith(f"{key}/")]
+        if parts:
+            return f"{override.input_line}: {key} is chosen by its parts: {', '.join(f'{part}=…' for part in parts)}"
+        if not override.is_add() and not key.startswith("hydra") and key not in known:
+            new = renamed(key)
+            return f"{key} is called {new} now" if new else f"{key} is no key of the config; {near(key, sorted(known))}"
+    return f"{' '.join(overrides)}: {error}"
+
+
+def renamed(key: str) -> str | None:
+    """Return today's name of a key or group of an earlier version; None where it has no other."""
+    for old in sorted(RENAMED, key=len, reverse=True):
+        if key.replace("/", ".") == old or key.startswith(f"{old}."):
+            new = RENAMED[old] + key[len(old) :]
+            return new.replace(".", "/") if "/" in key else new
+    return None
+
+
+def first_of_sweep(override: Override) -> str:
+    """The override of the first job where there are several values, else the override."""
+    if not override.is_sweep_override():
+        return override.input_line
+    return f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}"
+
+
+def keys_of(config: DictConfig) -> set[str]:
+    """Dotted keys of all nodes."""
+    found = set()
+
+    def walk(node: Any, path: tuple[str, ...]) -> None:
+        found.add(".".join(path))
+        if isinstance(node, Mapping):
+            for name, value in node.items():
+                walk(value, (*path, str(name)))
+
+    walk(OmegaConf.to_container(config, resolve=False), ())
+    return found - {""}
+
+
+def near(key: str, known: Sequence[str]) -> str:
+    """Words that name what `key` may have meant."""
+    known = [name for name in known if not name.rpartition(".")[2].startswith("_")]
+    parent, _, last = key.rpartition(".")
+    ends = {name: name.rpartition(".")[2] for name in known}
+    siblings = [name for name in known if name == f"{parent}.{ends[name]}"]
+    similar = difflib.get_close_matches(last, set(ends.values()), 5)
+    found = [name for name in known if ends[name] == last] + difflib.get_close_matches(key, siblings, 5)
+    found += [name for end in similar for name in siblings if ends[name] == end] or siblings[:5]
+    found += difflib.get_close_matches(key, known, 5) + [name for name in known if ends[name] in similar]
+    found = list(dict.fromkeys(found))[:5]
+    return f"near names: {', '.join(found)}" if found else f"the keys are {', '.join(known)}"
+
+
+def build_dataset(config: DictConfig) -> ReadableFrames:
+    """The data set of a config, without unreadable frames where it says so."""
+    dataset = build(config, "dataset")
+    if "note" in dataset.calibration:
+        tqdm.write(dataset.calibration["note"])
+    progress = partial(tqdm, desc="checking", unit="frame")
+    frames = ReadableFrames(dataset, config.on_bad_frame, config.checksums, progress)
+    if "depth_scale" in config.dataset:  # files of depths; None: the data set knows
+        scale = config.dataset.depth_scale
+        check_truth(frames, None if scale is None else float(scale))
+    return frames
+
+
+def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
+    """The prior of a config; raises ValueError where it cannot answer for the data set."""
+    known = {"classes": list(dataset.classes)} if "classes" in config.prior else {}
+    prior = attach_features(config, dataset, build(config, "prior", **known))
+    prior.check(dataset, config.slam.window_size)
+    return prior
+
+
+def baseline_configs(config: DictConfig) -> dict[str, "BaselineConfig"]:
+    """The baselines of a config by name; raises ValueError where an option of the group is none."""
+    for name, node in config.baseline.items():
+        if not isinstance(node, DictConfig) or "_target_" not in node:
+            raise ValueError(f"baseline.{name} is no baseline: choose baseline=voxel, tsdf, all or none")
+    return {str(name): build(config, f"baseline.{name}") for name in config.baseline}
+
+
+def attach_features(config: DictConfig, dataset: ReadableFrames, prior: Prior) -> Prior:
+    """The prior with the features of a config; without a feature model its own, compared with the text of a file."""
+    features = config.features
+    if "_target_" not in features:
+        return prior if features.text is None else Requeried(prior, features.text)
+    if "classes" not in features:  # the model's own
+        return Featured(prior, build(config, "features"))
+    classes = features.classes
+    if classes is None:  # all names of the file, or the data set's
+        classes = dataset.classes if features.text is None else ()
+    return Featured(prior, build(config, "features", classes=list(classes)))
+
+
+def message_of(error: Exception) -> str:
+    """Return the message of the original error, without Hydra's wrapping."""
+    cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
+    return str(cause) or type(cause).__name__

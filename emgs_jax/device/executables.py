@@ -1,0 +1,237 @@
+"""Executables of the processes before this one, loaded without tracing and lowering, which cost ten times as much.
+
+JAX's own cache finds an executable by its program, which has to be made first. Here it is found by what its program is
+made from: the source of the function and of what that imports, versions, machine, settings, shapes and static values.
+The files are in JAX's folder (`use_compilation_cache`), whose bound is theirs, too; without a folder nothing is kept.
+
+An entry says which program it stands for and what comes out of it; the program's executable is a file of its own, so
+that after a change of the source whatever still is the same program is not compiled again. Loading one runs machine
+code and, inside JAX, a pickle: as JAX's cache the folder has to be the user's own (SECURITY.md).
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import platform
+import re
+import sys
+import threading
+import time
+from collections.abc import Callable
+from functools import cache, partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.monitoring
+from jax.experimental import serialize_executable
+
+from emgs_jax.device.executable_files import described, read, rebuilt, remove, write
+
+PACKAGES = ("jax", "jaxlib", "equinox", "jaxlie", "optimistix", "lineax", "numpy")
+FORMAT = 2  # of entries; 1 had executables of arguments of other shapes
+ROOT = Path(__file__).parents[1]
+COMPILED = "/jax/core/compile/backend_compile_duration"
+# Defaults, but executables that are asked for with one of them are others to JAX's cache: what was taken from there
+# cannot be kept again, as on CPUs it has lost its functions (jaxlib 0.10.1). The second is for a file that was damaged.
+_OPTIONS = {"xla_embed_ir_in_executable": False}, {"xla_dump_hlo_as_text": False}, {"xla_dump_hlo_as_proto": False}
+_loaded: dict[tuple, Callable] = {}
+_thread = threading.local()  # `hits`: executables that JAX took from its cache
+
+
+def call(function: Callable, *arguments: Any) -> Any:
+    """Compute `function(*arguments)` by an executable that is kept on disk.
+
+    Args:
+        function: made by `eqx.filter_jit` from a function of this package.
+        *arguments: of which arrays are traced; where they are traced already, or on another device, nothing is kept.
+    """
+    return (ready(function, *arguments) or function)(*arguments)
+
+
+def stored(function: Callable) -> Callable:
+    """`eqx.filter_jit` whose executables are kept."""
+    return partial(call, eqx.filter_jit(function))
+
+
+def ready(function: Callable, *arguments: Any) -> Callable | None:
+    """The executable of a function for arguments like these, loaded or compiled; None where nothing is kept."""
+    leaves, tree = jax.tree.flatten(arguments)
+    if _folder() is None or not _are_plain(leaves):
+        return None
+    about = tuple(_about(leaf) for leaf in leaves)
+    key = function, tree, about, jax.config.jax_default_matmul_precision, jax.config.jax_enable_x64
+    if key not in _loaded:
+        _loaded[key] = _made(function, arguments, _digest(function, tree, about))
+    return _loaded[key]
+
+
+def outputs(function: Callable, *arguments: Any) -> Any:
+    """`eqx.filter_eval_shape`, which traces the function, or what is kept of that."""
+    leaves, tree = jax.tree.flatten(arguments)
+    entry = None if _folder() is None else _entry(_digest(function, tree, tuple(map(_about, leaves))))
+    return eqx.filter_eval_shape(function, *arguments) if entry is None else rebuilt(entry["outputs"])
+
+
+def forget() -> None:
+    """Drop what this process has loaded and compiled here, as `jax.clear_caches` does for all else."""
+    _loaded.clear()
+
+
+def _folder() -> Path | None:
+    folder = jax.config.jax_compilation_cache_dir if jax.config.jax_enable_compilation_cache else None
+    return None if folder is None else Path(folder)
+
+
+def _are_plain(leaves: list) -> bool:
+    """No tracers, and all arrays on the device on which all else is."""
+    device = {jax.devices()[0]}
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        return False
+    return all(leaf.devices() == device for leaf in leaves if isinstance(leaf, jax.Array))
+
+
+def _about(leaf: Any) -> Any:
+    return (leaf.shape, leaf.dtype.name, leaf.weak_type) if isinstance(leaf, jax.Array) else leaf
+
+
+def _made(function: Callable, arguments: tuple, digest: str) -> Callable:
+    """The executable of an entry, or of a new one where it is missing, damaged or refused."""
+    entry = _entry(digest)
+    found = None if entry is None else _runnable(entry["program"], function, arguments, rebuilt(entry["outputs"]))
+    return _compile(function, arguments, digest) if found is None else found
+
+
+def _compile(function: Callable, arguments: tuple, digest: str) -> Callable:
+    """The executable of a new entry: that of the same program in another entry, or compiled and kept."""
+    lowered = function.lower(*arguments)
+    outputs, text = eqx.filter_eval_shape(function, *arguments), lowered.as_text()
+    shapes = [_about(leaf) for leaf in _arrays(arguments)]  # of those it does not take, too: each call checks them
+    program = _hash(*_machine(), text, *_used(lowered, digest), shapes)
+    found = _runnable(program, function, arguments, outputs)
+    if found is None:
+        found, is_new = _compiled(lowered)
+        if not is_new or "callback" in text:  # which knows where it is in this process
+            return found
+        write(_folder(), program, serialize_executable.serialize(found.compiled)[0])
+    with contextlib.suppress(TypeError):  # something comes out that has no description
+        write(_folder(), digest, json.dumps({"program": program, "outputs": described(outputs)}).encode())
+    return found
+
+
+def _used(lowered: Any, digest: str) -> list[object]:
+    """Numbers of the arguments that a program takes, which its text does not tell; else it is shared by none."""
+    try:
+        return sorted(lowered.lowered._lowering.compile_args["kept_var_idx"])
+    except (AttributeError, KeyError):
+        return [digest]
+
+
+def _compiled(lowered: Any) -> tuple[Callable, bool]:
+    """An executable, and whether it was made here and is not from JAX's cache."""
+    _listen()
+    for options in _OPTIONS:
+        _thread.hits = 0
+        found = lowered.compile(options)
+        if not _thread.hits:
+            break
+    return found, not _thread.hits
+
+
+def _runnable(program: str, function: Callable, arguments: tuple, outputs: Any) -> Callable | None:
+    """The kept executable of a program, as that function of such arguments; told as JAX tells what its cache gives."""
+    begin, payload = time.perf_counter(), read(_folder(), program)
+    if payload is None:
+        return None
+    leaves, structure = jax.tree.flatten(outputs)
+    num_arrays = sum(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves)
+    inputs = jax.tree.structure((tuple(_arrays(arguments)), {}))
+    marked = jax.tree.structure((0, *range(num_arrays)))  # Equinox returns a number before all else
+    _prepare_lapack()
+    try:
+        executable = serialize_executable.deserialize_and_load(
+            payload, inputs, marked, execution_devices=jax.devices()[:1]
+        )
+    except Exception as error:  # whatever XLA dislikes
+        remove(_folder(), program, error)
+        return None
+    name = function.__wrapped__.__name__
+    jax.monitoring.record_event_duration_secs(COMPILED, time.perf_counter() - begin, fun_name=name)
+
+    def run(*arguments: Any) -> Any:
+        _, *found = executable(*_arrays(arguments))
+        arrays = iter(found)
+        filled = [next(arrays) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf for leaf in leaves]
+        return jax.tree.unflatten(structure, filled)
+
+    return run
+
+
+def _arrays(arguments: tuple) -> list[jax.Array]:
+    return [leaf for leaf in jax.tree.leaves(arguments) if isinstance(leaf, jax.Array)]
+
+
+@cache
+def _prepare_lapack() -> None:
+    """Lowering tells executables where SciPy's LAPACK is; one that is loaded without would end the process."""
+    jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), "float32"))
+
+
+@cache
+def _listen() -> None:
+    """Count in each thread what JAX takes from its cache."""
+
+    def hear(event: str, **_: Any) -> None:
+        _thread.hits = getattr(_thread, "hits", 0) + (event == "/jax/compilation_cache/cache_hits")
+
+    jax.monitoring.register_event_listener(hear)
+
+
+def _digest(function: Callable, tree: Any, about: tuple) -> str:
+    """Of all that a program is made from."""
+    named = function.__wrapped__
+    inside = {name: getattr(jax.config, name, value) for name, value in jax.config.values.items()}  # of `with`
+    settings = [f"{name}={inside[name]}" for name in sorted(inside) if "cache" not in name]
+    return _hash(FORMAT, *_machine(), *settings, *_source(named.__module__), named.__qualname__, tree, about)
+
+
+def _hash(*parts: object) -> str:
+    return "emgs-" + hashlib.sha256("\0".join(map(str, parts)).encode()).hexdigest()
+
+
+@cache
+def _machine() -> tuple[str, ...]:
+    """Describe the machine and versions that an executable is for; the number of threads decides how sums are split."""
+    device = jax.devices()[0]
+    cpu = Path("/proc/cpuinfo")
+    features = sorted(set(re.findall(r"^(?:flags|Features)\s*:.*", cpu.read_text(), re.M))) if cpu.exists() else []
+    versions = [f"{name} {version(name)}" for name in PACKAGES]
+    about = platform.python_version(), platform.machine(), os.cpu_count(), os.environ.get("XLA_FLAGS")
+    return *map(str, about), *versions, *features, device.device_kind, device.client.platform_version
+
+
+def _source(module: str) -> list[str]:
+    """Text and constants of a module and of all that it imports of this package, by name."""
+    found: dict[str, str] = {}
+    ahead = [module]
+    while ahead:
+        name = ahead.pop()
+        path = ROOT.parent / (name.replace(".", "/") + ".py")
+        if name not in found and path.exists():
+            found[name] = path.read_text()
+            ahead += re.findall(r"^\s*(?:from|import) (emgs_jax[\w.]*)", found[name], re.M)
+    constants = {name: vars(sys.modules[name]) for name in found if name in sys.modules}
+    said = [f"{name}.{key}={value}" for name in sorted(constants) for key, value in _numbers(constants[name])]
+    return [*(found[name] for name in sorted(found)), *said]
+
+
+def _numbers(names: dict[str, Any]) -> list[tuple[str, Any]]:
+    return sorted((key, value) for key, value in names.items() if key.isupper() and isinstance(value, (int, float)))
+
+
+def _entry(digest: str) -> dict[str, Any] | None:
+    data = read(_folder(), digest)
+    return None if data is None else json.loads(data)

@@ -1,0 +1,65 @@
+"""Settings of JAX: where executables are kept for the next process, and how much of a GPU's memory it takes."""
+
+import os
+import re
+import sys
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+
+MAX_BYTES = 2 * 2**30  # what was not used for longest goes first
+# Where a config says so, and where it has the words that will.
+IN_TORCH = re.compile(
+    r"emgs_jax\.prior\.network\.|emgs_jax\.features\.dino\.|prior[=:] ?mapanything|features[=:] ?dinov\d_text"
+)
+
+
+def cache_folder() -> Path:
+    """Return the default folder of compiled executables: below XDG_CACHE_HOME or ~/.cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "emgs_jax" / "jax"
+
+
+def use_compilation_cache(folder: str | None = "auto") -> None:
+    """Keep executables in a folder from here on; several processes may share it.
+
+    Args:
+        folder: `auto` is `cache_folder()`, but where JAX has been told a folder (JAX_COMPILATION_CACHE_DIR or
+            `jax.config`) that one stays, with its settings; None or `off` keeps nothing that nobody asked for.
+    """
+    if folder is None or str(folder) in ("off", "False"):
+        return
+    try:
+        import jax
+    except ImportError:  # recording predictions needs no JAX, unless the prior does
+        return
+    if str(folder) == "auto" and jax.config.jax_compilation_cache_dir is not None:
+        return
+    path = cache_folder() if str(folder) == "auto" else Path(folder).expanduser()
+    if (problem := _problem_of(path)) is not None:
+        print(f"warning: nothing is kept of what JAX compiles, {path}: {problem}", file=sys.stderr)
+        return
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _problem_of(path: Path) -> str | None:
+    """Why nothing can be written into a folder, which is made where it is missing; None where all is well."""
+    probe = path / f".{os.getpid()}.tmp"
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
+
+
+def leave_memory_to_torch(config: DictConfig) -> None:
+    """Let JAX take the GPU's memory as it needs it where a network runs in PyTorch; else it takes three quarters first.
+
+    It has to be called before JAX's first array. A value of XLA_PYTHON_CLIENT_PREALLOCATE that is there stays.
+    """
+    if IN_TORCH.search(OmegaConf.to_yaml(config)):
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

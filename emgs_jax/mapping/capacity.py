@@ -1,0 +1,153 @@
+"""Capacity of maps on the host: executables for it, and its doubling where a map or submap is full."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from emgs_jax.device.arrays import on_device
+from emgs_jax.device.executables import call, outputs, ready
+from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert
+from emgs_jax.mapping.convert import FirstWindow
+from emgs_jax.observation import Prediction, transform
+from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.executable import calling
+from emgs_jax.ops.precision import full_precision
+from emgs_jax.registration.pose_estimate import exact_estimate
+from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
+
+_insert = eqx.filter_jit(insert)
+_init, _step = (calling(call)(function) for function in (init_state, step))  # by executables that are kept
+_prepared: set[tuple] = set()  # shapes whose step this process has compiled
+
+
+def start(
+    first: FirstWindow, camera: Camera, config: SlamConfig, init: Callable = _init
+) -> tuple[SlamState, SlamConfig]:
+    """Make the map of the first window; return the state, and the config with the capacity that it needs.
+
+    Args:
+        first: views that the map is made from.
+        camera: of the full images.
+        config: all stages; capacities are where to start.
+        init: `init_state`, or its form for stacked configs.
+    """
+    state, overflow = init(first.views, first.T_world_views, camera, config)
+    while np.any(overflow):
+        config = grow_capacities(config, _of_map(overflow))
+        state, overflow = init(first.views, first.T_world_views, camera, config)
+    return state, config
+
+
+def restart_map(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[SlamState, SlamConfig]:
+    """Restart the map from its last frame, at that frame's pose, as from a first window of this one view.
+
+    For a camera that no longer fits the map and cannot be relocalized in it. All Gaussians of the map stay. Relative to
+    the new ones the frame's pose is exact, relative to the first frame it is as uncertain as it was.
+
+    Args:
+        state: after the step of that frame, which has points.
+        camera: of the full images.
+        config: all stages; returned with more capacity where the map needs it.
+    """
+    T = state.T_world_previous
+    view = transform(T.inverse(), state.previous, jnp.ones(()))
+    first = FirstWindow(*jax.tree.map(lambda leaf: leaf[None], (view, T)))
+    alone, _ = start(first, camera, config)
+    new = replace(alone.map, birth=jnp.full_like(alone.map.birth, state.time - 1))
+    map, config = add_map(state.map, new, config)
+    estimate = replace(state.estimate, covariance=jnp.zeros_like(state.estimate.covariance))
+    return replace(state, map=map, estimate=estimate), config
+
+
+def add_map(map: GaussianMap, other: GaussianMap, config: SlamConfig) -> tuple[GaussianMap, SlamConfig]:
+    """Insert all Gaussians of a map into another; return it, and the config with the capacity that it needs."""
+    both, _, overflow = _insert(map, other)
+    while overflow > 0:
+        config = grow_capacities(config, _of_map(overflow))
+        both, _, overflow = _insert(grow(map, config.submap.map_capacity), other)
+    return both, config
+
+
+def prepare_step(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
+    """Load or compile the executables of `step` side by side, which takes as many cores as there are.
+
+    Where none are kept each is called once, with zeros; what a process has already is not called again.
+
+    Args:
+        first: whose shapes the observations of the sequence have.
+        camera: of the full images.
+        config: all stages.
+    """
+    calls: list[tuple[Callable, tuple]] = []
+
+    def note(executable: Callable, *arguments: Any) -> Any:
+        calls.append((executable, arguments))
+        return _zeros(outputs(executable, *arguments))
+
+    view = _zeros(jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), first.views))
+    pose, poses = (jaxlie.SE3(on_device(np.eye(1, 7, dtype=np.float32).repeat(n, 0).squeeze())) for n in (1, 3))
+    unknown = on_device(np.bool_(False))
+    prediction = Prediction(
+        current=view, previous=view, T_world_views=poses, T_world_anchor=pose, has_newest=unknown, is_repeat=unknown
+    )
+    map = _zeros(jax.eval_shape(lambda: empty_map(config.submap.map_capacity, view.features.shape[-1])))
+    key = jax.tree.structure((map, view, config)), tuple(leaf.shape for leaf in jax.tree.leaves((map, view)))
+    if key in _prepared:
+        return
+    state = SlamState(map, view, pose, _zeros(jax.eval_shape(exact_estimate)), on_device(np.int32(0)))
+    with calling(note):
+        step(state, prediction, camera, config)
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        list(threads.map(lambda noted: _prepare(*noted), calls))
+    _prepared.add(key)
+
+
+@full_precision  # as inside `step`: else it is another
+def _prepare(executable: Callable, arguments: tuple) -> None:
+    if ready(executable, *arguments) is None:
+        jax.block_until_ready(executable(*arguments))
+
+
+def _of_map(overflow: jax.Array) -> Overflow:
+    """Overflow of a map alone."""
+    nothing = jnp.zeros_like(overflow)
+    return Overflow(map=overflow, submap=nothing, tiles=nothing)
+
+
+def _zeros(shapes: Any) -> Any:
+    """Replace shapes by arrays of zeros from NumPy, which compiles nothing."""
+    is_shape = lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct)  # noqa: E731
+    return jax.tree.map(lambda leaf: on_device(np.zeros(leaf.shape, leaf.dtype)) if is_shape(leaf) else leaf, shapes)
+
+
+def advance(
+    state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig, step: Callable = _step
+) -> tuple[SlamState, StepInfo, SlamConfig]:
+    """Run one step; where a map or submap is full, double its capacity and repeat the frame.
+
+    That gives the same map as starting with the larger capacity. Splats beyond the tiles' capacity are only
+    counted: they change renderings, not the map. `step` is `slam.step`, or its form for stacked states.
+    """
+    new, info = step(state, prediction, camera, config)
+    while np.any(info.overflow.map) or np.any(info.overflow.submap):
+        config = grow_capacities(config, info.overflow)
+        if config.submap.map_capacity > state.map.weight.shape[-1]:
+            state = eqx.tree_at(lambda s: s.map, state, grow(state.map, config.submap.map_capacity))
+        new, info = step(state, prediction, camera, config)
+    return new, info, config
+
+
+def grow_capacities(config: SlamConfig, overflow: Overflow) -> SlamConfig:
+    """Double the capacities into which rows did not fit; each new size compiles once."""
+    submap = config.submap
+    map_factor, submap_factor = (2 if np.any(lost) else 1 for lost in (overflow.map, overflow.submap))
+    capacities = submap.map_capacity * map_factor, submap.submap_capacity * submap_factor
+    return replace(config, submap=replace(submap, map_capacity=capacities[0], submap_capacity=capacities[1]))

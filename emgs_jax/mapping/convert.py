@@ -1,0 +1,159 @@
+"""From what a prior predicts on the host to the arrays of a step: every check of the input is here."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jaxlie
+import numpy as np
+
+from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.device.arrays import on_device, to_se3
+from emgs_jax.device.executables import stored
+from emgs_jax.observation import Observation, ObservationConfig, Prediction, observe
+from emgs_jax.ops.camera import Camera
+from emgs_jax.prior.base import PriorPrediction
+from emgs_jax.slam import SlamConfig
+
+_observe = stored(observe)
+
+
+class FirstWindow(eqx.Module):
+    """The first prediction of a sequence: all views, camera frames, oldest first, with the prior's poses."""
+
+    views: Observation
+    T_world_views: jaxlie.SE3
+
+
+def to_camera(dataset: Dataset) -> Camera:
+    """The camera of a data set's frames."""
+    fx, fy, cx, cy = dataset.intrinsics
+    return Camera((fx, fy), (cx, cy), *dataset.size)
+
+
+def _check(prediction: PriorPrediction, frames: Mapping[int, Frame]) -> None:
+    height, width = frames[prediction.window.current].image.shape[:2]
+    expected = len(prediction.window.dense), height, width
+    for name, got in (
+        ("points", prediction.points.shape[:-1]),
+        ("confidence", prediction.confidence.shape),
+        ("mask", prediction.mask.shape),
+    ):
+        if got != expected:
+            raise ValueError(
+                f"the prior's {name} have shape {got} at frame {prediction.window.current}, expected {expected} "
+                "(dense views, height, width): predict at the data set's size"
+            )
+    if prediction.features.ndim != 4 or len(prediction.features) != expected[0]:
+        raise ValueError(
+            f"the prior's features have shape {prediction.features.shape} at frame {prediction.window.current}, "
+            f"expected ({expected[0]}, rows, columns, width): a grid that covers the image of each dense view"
+        )
+
+
+def _observation(prediction: PriorPrediction, view: int, frame: Frame, config: ObservationConfig) -> Observation:
+    image, mask = frame.image * np.float32(1.0 / 255.0), np.asarray(prediction.mask[view])
+    points, features, confidence = (
+        np.asarray(values[view], np.float32)
+        for values in (prediction.points, prediction.features, prediction.confidence)
+    )
+    return _observe(*on_device((points, image, features, confidence, mask)), config)
+
+
+def to_first_window(
+    prediction: PriorPrediction,
+    frames: Mapping[int, Frame],
+    T_world_anchor: np.ndarray,
+    config: ObservationConfig,
+    since: int = 0,
+) -> tuple[FirstWindow | None, tuple[int, ...]]:
+    """Select the views that a map can start from: the dense ones, from the first with a pose and a valid point on.
+
+    Args:
+        prediction: of a window.
+        frames: by index; those of the window.
+        T_world_anchor: known pose of the first frame, (4, 4).
+        config: normals and thinning.
+        since: views of earlier frames are left out.
+
+    Returns:
+        The views and their frame indices; None and () where there is no such view. A later view may have no pose:
+        integrated on its own, it is lost.
+
+    Raises:
+        ValueError: a shape differs from the images'.
+    """
+    _check(prediction, frames)
+    rows = [row for row, index in enumerate(prediction.window.dense) if index >= since]
+    dense = [prediction.window.dense[row] for row in rows]
+    views = [_observation(prediction, row, frames[index], config) for row, index in zip(rows, dense, strict=True)]
+    poses = np.asarray(T_world_anchor) @ prediction.T_anchor_view[[prediction.window.views.index(i) for i in dense]]
+    has_points = [np.asarray(view.valid).any() for view in views]
+    usable = [bool(known) and np.isfinite(pose).all() for known, pose in zip(has_points, poses, strict=True)]
+    if not any(usable):
+        return None, ()
+    first = usable.index(True)
+    together = jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(views[first:]))
+    return FirstWindow(on_device(together), to_se3(poses[first:])), tuple(dense[first:])
+
+
+def to_prediction(
+    prediction: PriorPrediction, frames: Mapping[int, Frame], T_world_anchor: np.ndarray, config: ObservationConfig
+) -> Prediction:
+    """The current and the previous view of one step.
+
+    Args:
+        prediction: dense in (previous, current).
+        frames: by index; those of the window.
+        T_world_anchor: known pose of the first frame, (4, 4).
+        config: normals and thinning.
+
+    Raises:
+        ValueError: a shape differs from the images'.
+    """
+    _check(prediction, frames)
+    views, (previous, current) = prediction.window.views, prediction.window.dense
+    has_newest = current + 1 in views
+    rows = [views.index(previous), views.index(current), views.index(current + 1 if has_newest else current)]
+    return Prediction(
+        current=_observation(prediction, 1, frames[current], config),
+        previous=_observation(prediction, 0, frames[previous], config),
+        T_world_views=to_se3(np.asarray(T_world_anchor) @ prediction.T_anchor_view[rows]),
+        T_world_anchor=to_se3(T_world_anchor),
+        has_newest=on_device(np.bool_(has_newest)),
+        is_repeat=on_device(np.bool_(True)),
+    )
+
+
+def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[Prediction]]:
+    """Split the first window into the views that initialize the map and the steps that follow from the same window.
+
+    These are the whole window and none, or (incremental initialisation) the first view alone and each further view as
+    if it were a step's current frame. Consecutive views come from one inference, so the previous image's two
+    predictions agree exactly and the coarse pose of a step is the prior's own.
+
+    Raises:
+        ValueError: `merged`, and a view has no pose.
+    """
+    if config.initialization == "merged":
+        if not np.isfinite(np.asarray(window.T_world_views.wxyz_xyz)).all():
+            raise ValueError(
+                "a view of the first window has no pose, so its points cannot be merged: use "
+                "slam.initialization=incremental, which leaves such a view out, or begin elsewhere (dataset.start=...)"
+            )
+        return window, []
+    found: FirstWindow = jax.device_get(window)
+    num_views, poses = len(found.views.valid), found.T_world_views.wxyz_xyz
+    views = [on_device(jax.tree.map(lambda leaf, row=row: leaf[row], found.views)) for row in range(num_views)]
+    following = [
+        Prediction(
+            current=views[i],
+            previous=views[i - 1],
+            T_world_views=jaxlie.SE3(on_device(poses[[i - 1, i, min(i + 1, num_views - 1)]])),
+            T_world_anchor=jaxlie.SE3(on_device(poses[0])),
+            has_newest=on_device(np.bool_(i + 1 < num_views)),
+            is_repeat=on_device(np.bool_(False)),
+        )
+        for i in range(1, num_views)
+    ]
+    return on_device(jax.tree.map(lambda leaf: leaf[:1], found)), following

@@ -1,0 +1,141 @@
+"""The end of a run: its first frame's own covariance, and the unit of the map.
+
+During a run the unit is that of the first inference, at its end the mean of all inferences'. Covariances of poses are
+relative to the first frame; at the end that one's own is added.
+"""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+
+from emgs_jax.back_end.state import transform_nodes
+from emgs_jax.device.arrays import on_device
+from emgs_jax.device.executables import stored
+from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.geometry import Sim3
+from emgs_jax.localization import LocalizationConfig
+from emgs_jax.mapping.records import transform_record
+from emgs_jax.mapping.run import MappingRun
+from emgs_jax.observation import Observation, depth_in
+from emgs_jax.registration.pose_estimate import PoseEstimate, rescale_estimate
+from emgs_jax.registration.pose_noise import LEAST_NOISE, axis_std
+from emgs_jax.slam import SlamState
+
+
+def own_covariance(state: SlamState, config: LocalizationConfig) -> np.ndarray:
+    """Estimate the covariance (6, 6) of the first frame's pose, in its own axes, from repeated predictions.
+
+    The error of the first pose is in all later ones. It is not known when the map starts: only the repeated predictions
+    of the whole run show how noisy the prior's poses are. 0 where no prediction has repeated another.
+
+    Args:
+        state: after the last step; m of its map.
+        config: of the steps.
+    """
+    estimate, last = state.estimate, state.previous
+    is_known = np.asarray(last.valid).any() and np.asarray(estimate.repeats.counts)[0] > 0
+    if not is_known or float(config.pose_shared) >= 1:
+        return np.zeros((6, 6))
+    std = _own_std(estimate, last, state.T_world_previous, (config.icp.prior_information, config.pose_shared))
+    return np.diag(np.asarray(std, np.float64) ** 2)
+
+
+@stored
+def _own_std(
+    estimate: PoseEstimate,
+    last: Observation,
+    T_world_last: jaxlie.SE3,
+    known: tuple[Float[Array, ""], Float[Array, ""]],
+) -> Float[Array, "6"]:
+    mean_depth = jnp.mean(depth_in(T_world_last, last), where=last.valid)
+    guess = jnp.maximum(estimate.depth_noise, LEAST_NOISE), mean_depth
+    return axis_std(estimate.repeats, jnp.zeros((2, 2)), *guess, *known)[0]
+
+
+def with_first_frame(run: MappingRun) -> MappingRun:
+    """Add `own_covariance`, seen from each frame, to those of a run that ends; those in a saved map have none."""
+    if run.state is None or run.saved is not None:
+        return run
+    own = own_covariance(run.state, run.config.localization)
+    rows = [row for row, record in enumerate(run.records) if record.covariance is not None]
+    if not rows or not own.any():
+        return run
+    first = next(record.pose for record in run.records if record.pose is not None)
+    added = seen_from(own, first, np.stack([run.records[row].pose for row in rows]))
+    records = list(run.records)
+    for row, covariance in zip(rows, added, strict=True):
+        records[row] = replace(records[row], covariance=records[row].covariance + covariance)
+    return replace(run, records=tuple(records), first_covariance=own)
+
+
+def seen_from(
+    own: Float[np.ndarray, "6 6"], T_world_first: Float[np.ndarray, "4 4"], T_world_cameras: Float[np.ndarray, "n 4 4"]
+) -> Float[np.ndarray, "n 6 6"]:
+    """Propagate the first frame's covariance to other poses: Ad own Adᵀ, each in its own axes."""
+    T = np.linalg.inv(T_world_cameras) @ T_world_first
+    rotations, across = T[:, :3, :3], np.cross(T[:, None, :3, 3], T[:, :3, :3], axisb=1, axisc=1)
+    adjoints = np.block([[rotations, across], [np.zeros_like(rotations), rotations]])
+    return adjoints @ own @ adjoints.transpose(0, 2, 1)
+
+
+def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
+    """Rescale a state by e^−γ about `origin`, so that the scales of all predictions are 1 on average.
+
+    γ is the mean logarithm of the scales (`PoseEstimate.log_scale`): a length of a prediction times its scale is one of
+    the map. The mean of all predictions errs by less than the first, which gave the map its unit. A state with γ = 0
+    stays as it is.
+
+    Args:
+        state: after the last step.
+        origin: (3,) of the first camera.
+    """
+    return rescaled(state, np.exp(-float(state.estimate.log_scale)), origin) if state.estimate.log_scale else state
+
+
+def rescale_run(run: MappingRun) -> MappingRun:
+    """Apply `in_prior_unit` to a run that ends, its records and its back end included.
+
+    A saved map keeps its unit, and so does one of joined submaps: the mean is of the last one's inferences.
+    """
+    end = run.back_end
+    if run.state is None or run.saved is not None or not run.state.estimate.log_scale:
+        return run
+    if end is not None and not end.has_one_unit:
+        return run
+    origin = next(record.pose for record in run.records if record.pose is not None)[:3, 3]  # the anchor's
+    similarity = Sim3.about(origin, np.exp(-float(run.state.estimate.log_scale)))
+    return replace(
+        run,
+        state=in_prior_unit(run.state, origin),
+        records=tuple(transform_record(record, similarity) for record in run.records),
+        back_end=end and transform_nodes(end, range(len(end.poses)), similarity),
+    )
+
+
+def rescaled(state: SlamState, factor: float, origin: np.ndarray) -> SlamState:
+    """Multiply all lengths of a state by `factor`, about `origin`."""
+    return _rescaled(state, *on_device((np.float32(factor), np.asarray(origin, np.float32))))
+
+
+@stored
+def _rescaled(state: SlamState, factor: Float[Array, ""], center: Float[Array, "3"]) -> SlamState:
+    def placed(points: jnp.ndarray) -> jnp.ndarray:
+        return center + factor * (points - center)
+
+    def grown(map: GaussianMap) -> GaussianMap:
+        gaussians = map.gaussians
+        lengths = placed(gaussians.means), factor**2 * gaussians.covs
+        return eqx.tree_at(lambda m: (m.gaussians.means, m.gaussians.covs), map, lengths)
+
+    T = state.T_world_previous
+    return replace(
+        state,
+        map=grown(state.map),
+        previous=eqx.tree_at(lambda o: o.points, state.previous, placed(state.previous.points)),
+        T_world_previous=jaxlie.SE3.from_rotation_and_translation(T.rotation(), placed(T.translation())),
+        estimate=rescale_estimate(state.estimate, factor),
+    )

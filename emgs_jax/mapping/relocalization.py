@@ -1,0 +1,183 @@
+"""Relocalization of a camera that is lost, or new in a saved map, and restart where that fails for long."""
+
+from collections import Counter
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+
+from emgs_jax.back_end.state import BackEnd
+from emgs_jax.device.arrays import to_se3
+from emgs_jax.gaussian_map import GaussianMap, grow
+from emgs_jax.loop_closure.relocalization import RelocalizationConfig, RelocalizedPose
+from emgs_jax.mapping.convert import FirstWindow
+from emgs_jax.mapping.records import IN_MAP, FrameRecord
+from emgs_jax.mapping.run import MappingRun
+from emgs_jax.mapping.window_input import WindowInput
+from emgs_jax.observation import Prediction, depth_in, transform
+from emgs_jax.pose_graph.factors import ODOMETRY
+from emgs_jax.registration.pose_estimate import exact_estimate
+from emgs_jax.registration.rigid import pose_row, scale_translation
+from emgs_jax.slam import SlamState, StepInfo
+
+FINE_POSE = "fine_pose"  # reason of a rejection: at the relocalized pose the frame does not fit the map
+
+
+def is_relocalization_due(run: MappingRun, info: StepInfo | None) -> bool:
+    """Test whether relocalization is due: no pose is known yet, or no frame has been tracked for a while."""
+    if run.back_end is None or (run.state is None and run.saved is None):
+        return False
+    return info is None or _num_untracked(run, info) >= run.back_end.config.relocalization.patience
+
+
+def is_restart_due(run: MappingRun, window: WindowInput, state: SlamState, info: StepInfo) -> bool:
+    """Test whether the map restarts from a frame that was not relocalized, at the pose that the prior predicts.
+
+    Only after many untracked frames, and where the prior connects a frame in the map with this one and knows what it
+    sees: there are points, and its two predictions of the previous image agree.
+
+    Args:
+        run: before this frame.
+        window: this frame.
+        state: after its step.
+        info: of its step.
+    """
+    count = _num_untracked(run, info)
+    is_due = not run.is_fixed and count >= run.back_end.config.relocalization.max_patience
+    if not is_due or info.localization.is_lost or not _is_connected(run.back_end, window):
+        return False
+    depths = np.asarray(depth_in(state.T_world_previous, state.previous))
+    depth = np.median(depths[np.asarray(state.previous.valid)])
+    return bool(info.localization.repeat_rms <= run.config.localization.max_residual * depth)
+
+
+def _is_connected(end: BackEnd, window: WindowInput) -> bool:
+    """Test whether a chain of predictions, each of two consecutive frames, leads from the map to the given frame.
+
+    Frames that the prior itself has lost are skipped, where a later prediction shows frames of both sides. The anchor
+    does not count as a link: a prior that has lost the connection predicts a pose of the anchor, too.
+    """
+    here, before = (window.T_anchor_views.get(window.frames[0].index - offset) for offset in (0, 1))
+    if here is None or before is None or not np.isfinite([here, before]).all():
+        return False
+    parents = {e.a: e.b for e in end.factors if e.kind == ODOMETRY and (e.b > end.first_node or e.a == e.b + 1)}
+    node = len(end.poses) - 1
+    while not end.is_placed[node]:
+        if node not in parents:
+            return False
+        node = parents[node]
+    return True
+
+
+def _num_untracked(run: MappingRun, info: StepInfo) -> int:
+    """Count the last frames in a row that are not tracked, the one of `info` included."""
+    placed = [row for row, record in enumerate(run.records) if record.status in IN_MAP]
+    return 0 if info.localization.is_tracked else len(run.records) - (placed[-1] if placed else -1)
+
+
+def as_step_prediction(opening: FirstWindow | Prediction) -> Prediction:
+    """Convert the first view of a sequence to a step's input; return a step's input as it is."""
+    if isinstance(opening, Prediction):
+        return opening
+    view, T = jax.tree.map(lambda leaf: leaf[0], opening.views), pose_row(opening.T_world_views, 0)
+    return Prediction(
+        current=view,
+        previous=view,
+        T_world_views=_repeated(T, 3),
+        T_world_anchor=T,
+        has_newest=jnp.asarray(False),
+        is_repeat=jnp.asarray(False),
+    )
+
+
+def state_in_saved_map(run: MappingRun, prediction: Prediction) -> SlamState:
+    """Return a state in the saved map, with the structure that a checkpoint's state needs."""
+    time = jnp.asarray(len(run.back_end.poses), jnp.int32)
+    return SlamState(run.saved.map, prediction.current, prediction.T_world_anchor, exact_estimate(), time)
+
+
+def relocalized_start(
+    run: MappingRun, prediction: Prediction, location: RelocalizedPose, has_other_unit: bool = False
+) -> tuple[SlamState, Prediction]:
+    """Return a state and prediction whose step starts at the relocalized pose: this frame is its own previous one.
+
+    With `has_other_unit` the prior's lengths are no longer those of the steps before: this frame determines the unit.
+
+    Raises:
+        ValueError: the features of a saved map are not as wide as those of this run.
+    """
+    T, scale = to_se3(location.T_world_camera), jnp.exp(jnp.asarray(location.log_scale, jnp.float32))
+    placed = move_prediction(prediction, anchor_motion(prediction, T, scale))
+    views = placed.T_world_views.wxyz_xyz[jnp.array([1, 1, 2])]
+    again = replace(placed, previous=placed.current, T_world_views=jaxlie.SE3(views), is_repeat=jnp.asarray(False))
+    covariance = jnp.asarray(location.covariance, jnp.float32)
+    if run.state is None:
+        map, time, saved = run.saved.map, len(run.saved.back_end.poses), run.saved
+        widths = map.gaussians.features.shape[-1], prediction.current.features.shape[-1]
+        if widths[0] != widths[1]:
+            raise ValueError(
+                f"the features of the saved map have width {widths[0]} and those of this run {widths[1]}: use prior= "
+                "and features= that it was mapped with"
+            )
+        # This frame determines the prior's unit in the map.
+        depth_noise, log_scale = (jnp.asarray(x, jnp.float32) for x in (saved.depth_noise, location.log_scale))
+        estimate = replace(exact_estimate(), depth_noise=depth_noise, log_scale=log_scale)
+        time = jnp.asarray(time, jnp.int32)
+    else:
+        map, estimate, time = run.state.map, run.state.estimate, run.state.time
+        if has_other_unit:
+            estimate = replace(estimate, log_scale=jnp.asarray(location.log_scale, jnp.float32))
+    estimate = replace(estimate, covariance=covariance, world_covariance=covariance)
+    return SlamState(map, transform(T, prediction.current, scale), T, estimate, time), again
+
+
+def anchor_motion(prediction: Prediction, T_world_camera: jaxlie.SE3, scale: jnp.ndarray) -> jaxlie.SE3:
+    """Return the motion of the prior's world that brings its own current pose, scaled about the anchor, to this one."""
+    anchor, current = prediction.T_world_anchor, pose_row(prediction.T_world_views, 1)
+    return T_world_camera @ scale_translation(anchor.inverse() @ current, scale).inverse() @ anchor.inverse()
+
+
+def anchor_motion_of(record: FrameRecord, prediction: Prediction) -> jaxlie.SE3:
+    """Return `anchor_motion` by the pose and scale of a relocalized frame."""
+    return anchor_motion(prediction, to_se3(record.pose), jnp.asarray(record.scale, jnp.float32))
+
+
+def move_prediction(prediction: Prediction, motion: jaxlie.SE3 | None) -> Prediction:
+    """Apply a motion of the prior's world to a prediction; None changes nothing."""
+    if motion is None:
+        return prediction
+    views = [motion @ pose_row(prediction.T_world_views, row) for row in range(3)]
+    views = jaxlie.SE3(jnp.stack([view.wxyz_xyz for view in views]))
+    return replace(prediction, T_world_views=views, T_world_anchor=motion @ prediction.T_world_anchor)
+
+
+def rejection(
+    info: StepInfo, prediction: Prediction, location: RelocalizedPose, config: RelocalizationConfig
+) -> str | None:
+    """Return why the map rejects a relocalized pose (too few inliers, or they move it too far); None if it does not."""
+    found, current = info.localization, prediction.current
+    depth = np.median(np.asarray(current.points[:, 2])[np.asarray(current.valid)]) * np.exp(location.log_scale)
+    agrees = bool(found.is_tracked) and float(found.icp.inlier_fraction) >= config.min_inlier_fraction
+    stays = found.step_m <= config.max_step * depth and np.degrees(found.step_rad) <= config.max_step_deg
+    return None if agrees and stays else FINE_POSE
+
+
+def not_found_message(run: MappingRun) -> str:
+    """Build the error message of a run of which no frame was relocalized in the saved map, with the reasons."""
+    counts = Counter(record.location for record in run.records if record.location is not None)
+    reasons = ", ".join(f"{name} {count}" for name, count in counts.most_common())
+    return (
+        f"none of the {len(run.records)} frames is found in the saved map ({reasons or 'none has points and a pose'}): "
+        "take images of the same place, or map it anew without map="
+    )
+
+
+def replace_map(state: SlamState, map: GaussianMap, capacity: int) -> SlamState:
+    """Return the state with another map, grown to a capacity."""
+    return replace(state, map=grow(map, capacity) if capacity > map.weight.shape[0] else map)
+
+
+def _repeated(T: jaxlie.SE3, count: int) -> jaxlie.SE3:
+    return jaxlie.SE3(jnp.stack([T.wxyz_xyz] * count))

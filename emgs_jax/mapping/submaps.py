@@ -1,0 +1,202 @@
+"""Disconnected submaps of a run, whose relative poses are not known until the camera sees both.
+
+A prior that has lost the first view may continue in a world of its own. There a new map starts, and the one before
+becomes inactive. Where a frame fits an inactive map, the similarity between its two poses joins both submaps: the newer
+one moves, poses, scales and Gaussians. Submaps that are never joined are dropped at the end.
+"""
+
+from collections import Counter
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from emgs_jax.back_end.factors import Factor
+from emgs_jax.back_end.loops import relocalize_frame
+from emgs_jax.back_end.optimization import deform_state, move_map, nodes_of
+from emgs_jax.back_end.state import BackEnd, transform_nodes
+from emgs_jax.device.arrays import to_matrix, to_se3
+from emgs_jax.geometry import Sim3, scale_covariance, scale_pose
+from emgs_jax.loop_closure.relocalization import RelocalizedPose
+from emgs_jax.mapping.capacity import add_map, advance, start
+from emgs_jax.mapping.convert import FirstWindow
+from emgs_jax.mapping.records import JOINED, UNJOINED, transform_record
+from emgs_jax.mapping.relocalization import anchor_motion_of, as_step_prediction, rejection, relocalized_start
+from emgs_jax.mapping.run import MappingRun, TrackedFrame, row_of_first_node
+from emgs_jax.mapping.window_input import PlacedStructure, WindowInput
+from emgs_jax.observation import Prediction
+from emgs_jax.pose_graph.factors import ODOMETRY
+from emgs_jax.registration.pose_estimate import rescale_estimate
+from emgs_jax.slam import StepInfo
+
+UNKNOWN = np.full((4, 4), np.nan)  # pose
+
+
+def step_prediction(run: MappingRun, window: WindowInput) -> Prediction:
+    """Return a step's prediction in the world of the map; without poses where they are not related to it."""
+    prediction = as_step_prediction(window.prediction)
+    if run.structure is None or not is_related(run, window):
+        return prediction
+    return in_structure(prediction, window, run.structure)
+
+
+def in_structure(prediction: Prediction, window: WindowInput, placed: PlacedStructure) -> Prediction:
+    """Transform a step's input from the prior's own world to that of the map."""
+    here = window.frames[0].index
+    rows = here - 1, here, here + int(prediction.has_newest)
+    T_world_views = placed.T_world_structure @ np.stack([window.T_anchor_views.get(row, UNKNOWN) for row in rows])
+    return replace(prediction, T_world_views=to_se3(T_world_views), T_world_anchor=to_se3(placed.T_world_anchor))
+
+
+def is_related(run: MappingRun, window: WindowInput) -> bool:
+    """Test whether the predicted poses are in a world whose pose in the map is known."""
+    return window.structure == (0 if run.structure is None else run.structure.number)
+
+
+def place_structure(window: WindowInput, pose: np.ndarray) -> PlacedStructure:
+    """Place the prior's own world by the pose of the current frame in the map; lengths are scaled about that frame."""
+    own = window.T_anchor_views.get(window.frames[0].index, UNKNOWN)
+    return PlacedStructure(window.structure, pose @ np.linalg.inv(own), pose)
+
+
+def start_submap(run: MappingRun, window: WindowInput) -> MappingRun | None:
+    """Start a map of this frame alone, at the pose of the frame before; None where no submap starts.
+
+    Its unit is the prior's own: that of another map does not apply. The map before it becomes inactive.
+    """
+    pose = window.T_anchor_views.get(window.frames[0].index)
+    is_new = run.back_end is not None and run.state is not None and not run.is_fixed and not is_related(run, window)
+    if not is_new or pose is None or not np.isfinite(pose).all():
+        return None
+    view = jax.tree.map(lambda leaf: leaf[None], as_step_prediction(window.prediction).current)
+    alone, config = start(FirstWindow(view, to_se3(run.records[-1].pose[None])), run.camera, run.config)
+    if not bool(alone.map.gaussians.valid.any()):
+        return None
+    time = run.state.time
+    map = replace(alone.map, birth=jnp.full_like(alone.map.birth, time))
+    return replace(enter_submap(run, window), state=replace(alone, map=map, time=time + 1), config=config)
+
+
+def enter_submap(run: MappingRun, window: WindowInput) -> MappingRun:
+    """Switch to the submap that this frame starts; the state before it becomes inactive."""
+    return replace(
+        run,
+        inactive={**run.inactive, run.back_end.submap_id: run.state},
+        back_end=replace(run.back_end, submap_id=window.structure),
+        structure=place_structure(window, run.records[-1].pose),
+        prior_motion=None,
+    )
+
+
+def match_submap(run: MappingRun, window: WindowInput, frame: TrackedFrame) -> TrackedFrame:
+    """Relocalize a tracked frame in an inactive submap; where that succeeds, it gets the similarity of both worlds.
+
+    The relocalized pose must pass the tests of a lost camera's, the fit to the map included.
+
+    Args:
+        run: after the step of this frame, before its record.
+        window: this frame.
+        frame: likewise, in its own submap.
+    """
+    if not run.inactive or frame.location is not None or not bool(frame.info.localization.is_tracked):
+        return frame
+    place, _ = relocalize_frame(run.back_end, window.data[0], in_other_submap=True)
+    if place is None:
+        return frame
+    other = run.inactive[run.back_end.submap_ids[place.keyframe]]
+    # This frame determines the prior's unit in that map.
+    estimate = replace(other.estimate, log_scale=jnp.asarray(place.log_scale, jnp.float32))
+    visiting = replace(run, state=replace(other, estimate=estimate))
+    begin, again = relocalized_start(visiting, frame.prediction, place)
+    _, there, _ = advance(begin, again, run.camera, run.config)
+    if rejection(there, again, place, run.back_end.config.relocalization) is not None:
+        return frame
+    similarity = _camera_in_world(there) @ _camera_in_world(frame.info).inverse()
+    return replace(frame, location=JOINED, similarity=similarity.as_matrix())
+
+
+def _camera_in_world(info: StepInfo) -> Sim3:
+    """Similarity from a camera's frame, in the unit of its prediction, to the world."""
+    T = to_matrix(np.asarray(info.T_world_camera.wxyz_xyz))
+    return Sim3(float(info.localization.scale), T[:3, :3], T[:3, 3])
+
+
+def join_submaps(run: MappingRun, window: WindowInput) -> MappingRun:
+    """Join the submap of the last frame, which is a node already, with the one in which it was relocalized.
+
+    The newer one moves, by the similarity of the record or its inverse.
+    """
+    end, similarity = run.back_end, Sim3.from_matrix(run.records[-1].similarity)
+    place, _ = relocalize_frame(end, window.data[-1], in_other_submap=True)  # where `match_submap` has found it
+    here, there = end.submap_id, end.submap_ids[place.keyframe]
+    if here < there:
+        similarity = similarity.inverse()
+    newer, older, before = max(here, there), min(here, there), nodes_of(end)
+    unit = np.exp(end.log_scales[place.keyframe])  # of the place's covariance: its map may be the one that moves
+    rows = [row for row, one in enumerate(end.submap_ids) if one == newer]
+    end = transform_nodes(end, rows, similarity)
+    after, first = nodes_of(end), row_of_first_node(run) - end.first_node
+    records = list(run.records)
+    for row in rows:
+        records[first + row] = transform_record(records[first + row], similarity)
+    submap_ids = [older if one == newer else one for one in end.submap_ids]
+    factors = [*end.factors, join_factor(end, place, unit)]
+    end = replace(end, submap_ids=submap_ids, submap_id=older, has_one_unit=False, factors=factors)
+    other = run.inactive[there]
+    state = deform_state(run.state, before, after, end.min_std, end.config.deform)
+    moved = move_map(other.map, before, after, jnp.asarray(end.min_std, jnp.float32), end.config.deform)
+    map, config = add_map(state.map, moved, run.config)
+    state, motion = replace(state, map=map), run.prior_motion
+    if here == newer:
+        scale = jnp.asarray(similarity.scale, jnp.float32)
+        state = replace(state, estimate=rescale_estimate(state.estimate, scale))
+        motion = anchor_motion_of(records[-1], step_prediction(run, window))
+    inactive = {one: state for one, state in run.inactive.items() if one != there}
+    changed = {"state": state, "config": config, "records": tuple(records), "inactive": inactive}
+    return replace(run, back_end=end, prior_motion=motion, **changed)
+
+
+def join_factor(end: BackEnd, place: RelocalizedPose, unit: float) -> Factor:
+    """Build the join factor of two submaps: the last node relative to the keyframe that relocalized it, as now.
+
+    `unit` is a length of that keyframe's inference in the map in which the pose was found.
+    """
+    a, b = place.keyframe, len(end.poses) - 1
+    scale = np.exp(end.log_scales[a])
+    information = np.linalg.inv(scale_covariance(place.covariance, 1.0 / unit))
+    measured = scale_pose(np.linalg.inv(end.poses[a]) @ end.poses[b], 1.0 / scale)
+    ratio = end.log_scales[b] - end.log_scales[a]
+    return Factor(a, b, measured, ratio, np.linalg.cholesky(information).T, ODOMETRY)
+
+
+def drop_unjoined_submaps(run: MappingRun) -> MappingRun:
+    """Keep the submap of most placed frames, or the saved map's, and drop those that were never joined with it.
+
+    The other frames are lost: the poses of their submaps are placeholders.
+    """
+    if not run.inactive:
+        return run
+    end = run.back_end
+    counts = Counter(one for one, is_placed in zip(end.submap_ids, end.is_placed, strict=True) if is_placed)
+    kept = 0 if run.saved is not None else max(sorted(counts), key=lambda one: counts[one])
+    is_kept = [one == kept for one in end.submap_ids]
+    between = {
+        name: [one for one in getattr(end, name) if is_kept[one.a] and is_kept[one.b]]
+        for name in ("factors", "verified", "violating", "accepted")
+    }
+    known = end.database
+    rows = [row for row, one in enumerate(known.keyframes) if is_kept[one.frame]]
+    end = replace(
+        end,
+        is_placed=[placed and here for placed, here in zip(end.is_placed, is_kept, strict=True)],
+        submap_id=kept,
+        database=replace(known, keyframes=tuple(known.keyframes[row] for row in rows), vectors=known.vectors[rows]),
+        **between,
+    )
+    first, records = row_of_first_node(run) - end.first_node, list(run.records)
+    for row in range(end.first_node, len(is_kept)):
+        if not is_kept[row]:
+            records[first + row] = replace(records[first + row], status="lost", reason=UNJOINED, covariance=None)
+    state = {run.back_end.submap_id: run.state, **run.inactive}[kept]
+    return replace(run, state=state, inactive={}, back_end=end, records=tuple(records))

@@ -1,0 +1,220 @@
+"""Inputs of a run, window by window: frames are read, predicted and converted when they are needed."""
+
+from collections import ChainMap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from emgs_jax.back_end.factors import FrameData
+from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.device.clock import Clock, Timer
+from emgs_jax.loop_closure.prior_query import JointPrediction, PriorQuery
+from emgs_jax.mapping.convert import FirstWindow, opening, to_first_window, to_prediction
+from emgs_jax.observation import Prediction
+from emgs_jax.prior.base import Prior, PriorPrediction, check_unit, visits, windows, with_frames
+from emgs_jax.slam import SlamConfig
+
+
+class RawView(NamedTuple):
+    """Raw prediction of a frame: points (h, w, 3), camera frame, and the mask of those that are confident enough.
+
+    The mapping leaves out points without a normal as well.
+    """
+
+    points: np.ndarray
+    mask: np.ndarray
+    image: np.ndarray
+    T_world_camera: np.ndarray  # of the frame before where the prior has none
+    features: np.ndarray  # (y, x, f), a grid that covers the image
+
+
+@dataclass(frozen=True)
+class WindowInput:
+    """One input of a run: a frame or several, with their prediction.
+
+    Args:
+        frames: one; several where the map is made from all of them.
+        raw: raw prediction of each.
+        prediction: views that the map starts from, or the prediction of a step; None where no map can start yet.
+        T_world_anchor: known pose of the first frame; NaN where the inference is not related to it.
+        T_anchor_views: predicted pose of every view of the window, by frame index.
+        seconds: of the conversion.
+        structure: number of the world that `T_anchor_views` are in, see `PriorPrediction`; 0: that of the first frame.
+            For any other, `prediction` has no pose: the camera's pose in the world is not known.
+    """
+
+    frames: tuple[Frame, ...]
+    raw: tuple[RawView, ...]
+    prediction: FirstWindow | Prediction | None
+    T_world_anchor: np.ndarray
+    T_anchor_views: Mapping[int, np.ndarray]
+    seconds: Mapping[str, float]
+    structure: int = 0
+
+    @property
+    def data(self) -> list[FrameData]:
+        """What the back end needs of each frame."""
+        return [
+            FrameData(frame.index, frame.image, raw.points, raw.mask, self.T_anchor_views)
+            for frame, raw in zip(self.frames, self.raw, strict=True)
+        ]
+
+
+@dataclass(frozen=True)
+class PlacedStructure:
+    """Pose of the prior's own world in that of the disconnected submap that was started in it.
+
+    Args:
+        number: `WindowInput.structure`.
+        T_world_structure: (4, 4).
+        T_world_anchor: (4, 4), of the frame with which the submap started.
+    """
+
+    number: int
+    T_world_structure: np.ndarray
+    T_world_anchor: np.ndarray
+
+
+def window_inputs(
+    dataset: Dataset, prior: Prior, config: SlamConfig, clock: Clock | None = None
+) -> Iterator[WindowInput]:
+    """Yield all inputs of a sequence: frames from which no map can start, the first window, then steps.
+
+    The pose of the first frame is the true one where it is known, else the identity.
+
+    Raises:
+        ValueError: no frame has a point and a pose from which a map can start, or predictions are in no unit that
+            thresholds are for.
+    """
+    done: dict[int, np.ndarray] = {}  # raw poses
+    is_started, clock, structure, known = False, clock or Clock(), 0, set()
+    for prediction, frames in predictions(dataset, prior, config.window_size, clock):
+        check_unit(prediction)
+        here = {index for index, pose in _poses(prediction).items() if np.isfinite(pose).all()}
+        structure += bool(is_started and known and here and not here & known)
+        known = here or known
+        with clock.phase("map"):
+            anchor = first_pose(frames)
+            raw = _raw_views(prediction, frames, anchor, structure, done, config)
+            convert = _step if is_started else _opening
+            known_anchor = np.full((4, 4), np.nan) if structure else anchor
+            found = convert(PredictedWindow(prediction, frames, known_anchor, raw, structure), config, Timer(clock))
+        yield from found
+        done |= {index: view.T_world_camera for index, view in raw.items()}
+        is_started = found[-1].prediction is not None
+    if not is_started:
+        raise ValueError(
+            f"none of the {len(done)} frames of {dataset.name} {dataset.sequence} has a valid point and a "
+            "pose, so there is nothing to start a map from: take frames farther apart or closer together "
+            "(dataset.stride=...), larger images (dataset.size=...) or another prior"
+        )
+
+
+def predictions(
+    dataset: Dataset, prior: Prior, window_size: int, clock: Clock
+) -> Iterator[tuple[PriorPrediction, dict[int, Frame]]]:
+    """Predict window by window; a frame is read when a window needs it and dropped when none does."""
+    calls = windows(len(dataset), window_size, prior.num_newer(window_size))
+    for window, frames in clock.each("load", with_frames(calls, dataset)):
+        with clock.phase("predict"):
+            prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
+        yield prediction, frames
+
+
+def first_pose(frames: Mapping[int, Frame]) -> np.ndarray:
+    """Return T_world_camera of the anchor, (4, 4) float64; the identity where the truth is unknown."""
+    truth = frames[0].T_world_camera
+    return np.eye(4) if truth is None else np.asarray(truth, np.float64)
+
+
+class PredictedWindow(NamedTuple):
+    """A window's prediction, its frames, the anchor's pose or NaN, raw views of new frames, and the world's number."""
+
+    prediction: PriorPrediction
+    frames: Mapping[int, Frame]
+    T_world_anchor: np.ndarray
+    raw: Mapping[int, RawView]
+    structure: int
+
+    def input(
+        self, indices: Sequence[int], prediction: FirstWindow | Prediction | None, seconds: Mapping[str, float] = {}
+    ) -> WindowInput:
+        """Make an input of some of its frames."""
+        frames, raw = (tuple(values[index] for index in indices) for values in (self.frames, self.raw))
+        poses = _poses(self.prediction)
+        return WindowInput(frames, raw, prediction, self.T_world_anchor, poses, seconds, self.structure)
+
+
+def _step(window: PredictedWindow, config: SlamConfig, timer: Timer) -> list[WindowInput]:
+    """Convert the current frame to the input of a step."""
+    step = to_prediction(*window[:3], config.observation)
+    return [window.input([window.prediction.window.current], step, timer.read())]
+
+
+def _opening(window: PredictedWindow, config: SlamConfig, timer: Timer) -> list[WindowInput]:
+    """Convert the frames before a map can start, the first window, and the steps from the same window."""
+    views, usable = to_first_window(*window[:3], config.observation, since=min(window.raw))
+    found = [window.input([index], None) for index in window.raw if not usable or index < usable[0]]
+    if views is None:
+        return found
+    first, steps = opening(views, config)
+    count = len(usable) - len(steps)  # views that the map is made from
+    found.append(window.input(usable[:count], first, timer.read()))
+    return found + [window.input([index], step) for index, step in zip(usable[count:], steps, strict=True)]
+
+
+def _poses(prediction: PriorPrediction) -> dict[int, np.ndarray]:
+    return dict(zip(prediction.window.views, prediction.T_anchor_view, strict=True))
+
+
+def _raw_views(
+    prediction: PriorPrediction,
+    frames: Mapping[int, Frame],
+    anchor: np.ndarray,
+    structure: int,
+    done: dict[int, np.ndarray],
+    config: SlamConfig,
+) -> dict[int, RawView]:
+    """Pose and points of each new frame as predicted; `done`: raw poses of those before."""
+    window, known, views = prediction.window, ChainMap({}, done), {}
+    for row, index in enumerate(window.dense):
+        if index in known:
+            continue
+        mask = prediction.mask[row] & (prediction.confidence[row] >= float(config.observation.min_confidence))
+        pose = anchor @ _poses(prediction)[index] if structure == 0 else _pose_after(prediction, index, known)
+        if not np.isfinite(pose).all():
+            pose, mask = known.get(index - 1, anchor), np.zeros_like(mask)
+        image, features = frames[index].image, prediction.features[row]
+        views[index] = RawView(prediction.points[row], mask, image, pose, features)
+        known[index] = pose
+    return views
+
+
+def _pose_after(prediction: PriorPrediction, index: int, known: Mapping[int, np.ndarray]) -> np.ndarray:
+    """Chain a pose to the last earlier frame with a pose in this prediction; that one's pose may be a placeholder.
+
+    Without such a frame it is the pose of the frame before; NaN where the prediction has no pose of this one.
+    """
+    poses = _poses(prediction)
+    before = [other for other in poses if other in known and np.isfinite(poses[other]).all()]
+    if not before:
+        return known[index - 1] if np.isfinite(poses[index]).all() else poses[index]
+    return known[before[-1]] @ np.linalg.inv(poses[before[-1]]) @ poses[index]
+
+
+def make_prior_query(prior: Prior, dataset: Dataset, spacing: int, window_size: int, clock: Clock) -> PriorQuery:
+    """Return a function by which a run's prior predicts both visits of a loop; the frames are read again."""
+
+    def query(a: int, b: int) -> JointPrediction | None:
+        window = visits(a, b, spacing, window_size)
+        with clock.phase("load"):
+            frames = [dataset[index] for index in window.views]
+        with clock.phase("predict"):
+            found = prior.revisit(window, frames, dataset.intrinsics)
+        if found is None:
+            return None
+        return JointPrediction(found.T_anchor_view[window.views.index(b)], tuple(found.points), tuple(found.mask))
+
+    return query

@@ -1,0 +1,135 @@
+"""Data gathered for comparison while a sequence is mapped: the raw predictions, and baselines."""
+
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import equinox as eqx
+import numpy as np
+
+from emgs_jax.data.base import Dataset
+from emgs_jax.data.reading import resize_nearest
+from emgs_jax.data.spool import Spool
+from emgs_jax.evaluation.baselines import BaselineConfig, Fusion, Pinhole, View
+from emgs_jax.evaluation.clouds import PointCloud, SpooledCloud
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, posed
+from emgs_jax.evaluation.segmentation import SpooledLabels, nearest_classes
+from emgs_jax.geometry import rotated
+from emgs_jax.mapping.records import IN_MAP, FrameRecord
+from emgs_jax.mapping.window_input import RawView
+from emgs_jax.observation import ObservationConfig, known_surface
+
+has_normal = eqx.filter_jit(known_surface)
+
+Text = tuple[tuple[str, ...], np.ndarray]  # names of classes and their embeddings (c, f)
+
+
+@dataclass(frozen=True)
+class RawPrior:
+    """Raw predictions of a sequence, without any mapping.
+
+    Args:
+        cloud: its points at its poses; a voxel's side in its lengths is known once the poses are aligned.
+        points: camera-frame points of each frame (h, w, 3), in the prior's own lengths; 0 where it says nothing.
+        classes: of each frame's pixels (h, w), as positions in the prior's names, -1 = none; None without classes.
+        labels: its points likewise, each with the class that its frame sees there; None without classes.
+    """
+
+    cloud: SpooledCloud
+    points: Spool
+    classes: Spool | None = None
+    labels: SpooledLabels | None = None
+
+
+class Baselines:
+    """Every baseline twice: from the prior's views at the prior's own poses, and at ours.
+
+    At ours it takes what the map took: frames that are tracked or that the map was made from, of each the points with a
+    normal, in the size that the prediction was given there. So what is different is the fusion alone.
+
+    Sizes in metres become lengths of the poses by the first view: a unit is what its true depths are of those that it
+    is fused with (median), so that the prior's own unit does not matter; 1 m where it shows no true depth.
+
+    Args:
+        configs: by name.
+        observation: which points the map takes.
+        dataset: for the camera and the truth.
+    """
+
+    def __init__(self, configs: Mapping[str, BaselineConfig], observation: ObservationConfig, dataset: Dataset) -> None:
+        self.raw: dict[str, Fusion] = {}
+        self.ours: dict[str, Fusion] = {}
+        self.poses: list[np.ndarray] = []  # ours, as they were: the finished run has another unit
+        self._configs, self._observation, self._dataset = configs, observation, dataset
+
+    def add(self, record: FrameRecord, view: View, points: np.ndarray, mask: np.ndarray, raw_pose: np.ndarray) -> None:
+        """Add the frame of a record, with its points (h, w, 3), which are known, and its pose as the prior says it."""
+        row = len(self.poses)
+        self.poses.append(record.pose)
+        if self._configs:
+            self._fuse(self.raw, row, view, raw_pose, 1.0)
+        if record.status in IN_MAP and self._configs:
+            taken = np.asarray(has_normal(points, mask, self._observation))
+            cloud = PointCloud(*(values[taken[mask]] for values in vars(view.cloud).values()))
+            view = View(np.where(taken, view.depth, np.float32(0.0)), view.image, cloud)
+            self._fuse(self.ours, row, view, record.pose, 1.0 if record.scale is None else record.scale)
+
+    def _fuse(self, into: dict[str, Fusion], row: int, view: View, T_world_camera: np.ndarray, scale: float) -> None:
+        if not into:
+            pinhole, truth = Pinhole(self._dataset.intrinsics, *self._dataset.size), self._dataset[row].depth
+            unit = 1.0 if truth is None else unit_of(truth, scale * view.depth)
+            into |= {name: config.start(pinhole, unit) for name, config in self._configs.items()}
+        for fusion in into.values():
+            fusion.add(view, T_world_camera, scale)
+
+
+def unit_of(truth: np.ndarray, depth: np.ndarray) -> float:
+    """Return the metres of one length of a depth (h, w), by the median over pixels known in both; 1 without any."""
+    known = (truth > 0) & (depth > 0)
+    return float(np.median(truth[known] / depth[known])) if known.any() else 1.0
+
+
+def gather(
+    frames: Iterable[tuple[FrameRecord | None, RawView]],
+    evaluation: EvaluationConfig,
+    keeps_points: bool,
+    baselines: Baselines | None = None,
+    text: Text | None = None,
+) -> RawPrior:
+    """Take all views of a sequence, one after the other: each in another thread, while the next frame is mapped.
+
+    Args:
+        frames: records, which baselines need, and views of all frames.
+        evaluation: how normals are fitted.
+        keeps_points: the truth is known, or points are to lie at them.
+        baselines: that take the views, too.
+        text: names of the classes that pixels are labelled with, and their embeddings; None: no labels.
+    """
+    cloud, kept, classes = SpooledCloud(), Spool(), Spool()
+    labels = None if text is None else SpooledLabels(text[0])
+
+    def take(record: FrameRecord | None, view: RawView) -> None:
+        points, mask, image, pose, features = view
+        known = mask & np.isfinite(points).all(-1)
+        depth = np.where(known, points[..., 2], 0.0).astype(np.float32)
+        seen = camera_cloud(points, mask, image, evaluation)
+        if keeps_points:
+            kept.append(np.where(known[..., None], points, 0.0).astype(np.float32))
+        if text is not None:
+            found = resize_nearest(nearest_classes(features, text[1]).astype(np.int32), depth.shape[::-1])
+            classes.append(found)
+            has_class = mask & (found >= 0)
+            labels.append(rotated(points[has_class], pose[:3, :3]) + pose[:3, 3], found[has_class])
+        if baselines is not None:
+            baselines.add(record, View(depth, image, seen), points, known, pose)
+        cloud.append(posed(seen, pose))
+
+    with ThreadPoolExecutor(1, "raw prior") as thread:
+        taken: Future[None] | None = None
+        for record, view in frames:
+            if taken is not None:
+                taken.result()  # one at a time: no more of them are in memory, and an error ends the mapping
+            taken = thread.submit(take, record, view)
+        if taken is not None:
+            taken.result()
+    return RawPrior(cloud, kept) if text is None else RawPrior(cloud, kept, classes, labels)

@@ -1,0 +1,103 @@
+"""Classes of points of the surface: the Gaussians that explain a point vote by their responsibilities."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from emgs_jax.device.arrays import on_device
+from emgs_jax.device.executables import stored
+from emgs_jax.evaluation.segmentation import LabelledPoints
+from emgs_jax.gaussian_map import confirmed
+from emgs_jax.mapping.run import MappingRun
+from emgs_jax.prior.base import Prior
+from emgs_jax.semantics import classify, similarities
+
+NUM_NEIGHBOURS = 8  # Gaussians that may explain a point
+MAX_POINTS = 10_000  # at once; bounds the memory, does not change the result
+_classify, _similarities = stored(classify), stored(similarities)
+
+
+@dataclass(frozen=True)
+class LabelledMap:
+    """Gaussians with what they know of classes.
+
+    Args:
+        means: (n, 3), m.
+        whiten: (n, 3, 3), inverse of the Cholesky factors of the covariances.
+        log_dets: (n,), of the covariances.
+        evidence: (n, c), the feature's projection on the text of each class. Features are sums over the points of all
+            views (R16), so its size says how much is known.
+        classes: names of the c.
+    """
+
+    means: np.ndarray
+    whiten: np.ndarray
+    log_dets: np.ndarray
+    evidence: np.ndarray
+    classes: tuple[str, ...]
+
+    @cached_property
+    def labels(self) -> Int[np.ndarray, "n"]:
+        """The class of each Gaussian by itself, a position in `classes`."""
+        return self.evidence.argmax(1)
+
+    @property
+    def centers(self) -> LabelledPoints:
+        """The means with their classes."""
+        return LabelledPoints(self.means, self.labels, self.classes)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the means."""
+        return cKDTree(self.means)
+
+    def classes_of(self, points: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
+        """The class with most evidence at each point: argmax_c Σ_k r_k e_kc; -1 without Gaussians.
+
+        r_k is the responsibility (eq. 3, by place alone) of one of the nearest Gaussians by their means, as in the
+        E-step. A wall's Gaussian whose mean is near to a cup does not explain the cup, because it is flat; and one that
+        was seen once does not outvote its neighbours, which were seen from all sides.
+        """
+        if not len(self.means):
+            return np.full(len(points), -1)
+        k = min(NUM_NEIGHBOURS, len(self.means))
+        rows = self.tree.query(points, [*range(1, k + 1)], workers=-1)[1]
+        votes = self.labels[rows]
+        classes = votes[:, 0].copy()
+        # Where all neighbours have one class it is that one; the others are few, and the memory for them is bounded.
+        is_open = np.flatnonzero((votes != votes[:, :1]).any(1))
+        for part in np.array_split(is_open, -(-len(is_open) // MAX_POINTS)) if len(is_open) else ():
+            classes[part] = self._elected(points[part], rows[part])
+        return classes
+
+    def _elected(self, points: Float[np.ndarray, "m 3"], rows: Int[np.ndarray, "m k"]) -> Int[np.ndarray, "m"]:
+        white = np.matvec(self.whiten[rows], points[:, None] - self.means[rows])
+        log_density = -0.5 * ((white**2).sum(-1) + self.log_dets[rows])
+        responsibility = np.exp(log_density - log_density.max(1, keepdims=True))  # its sum over k changes no argmax
+        return np.vecmat(responsibility, self.evidence[rows]).argmax(1)
+
+
+def labelled_map(run: MappingRun, prior: Prior) -> LabelledMap | None:
+    """The confirmed Gaussians that have a feature, with its projection on each class's text; None without classes.
+
+    Raises:
+        ValueError: the embeddings' width differs from the features'.
+    """
+    gaussians = confirmed(run.state.map)
+    if not prior.feature_names or not gaussians.features.shape[-1]:
+        return None
+    text = on_device(np.asarray(prior.text_features, np.float32))
+    rows, labels, cosines = jax.device_get((gaussians, _classify(gaussians, text), _similarities(gaussians, text)))
+    known = labels >= 0
+    factors = np.linalg.cholesky(rows.covs[known].astype(np.float64))
+    return LabelledMap(
+        means=rows.means[known].astype(np.float64),
+        whiten=np.linalg.inv(factors),
+        log_dets=2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(-1),
+        evidence=cosines[known] * np.linalg.norm(rows.features[known], axis=-1, keepdims=True),
+        classes=tuple(prior.feature_names),
+    )

@@ -1,1 +1,0 @@
-"""A sequence being mapped: frames, prior, step, record; one run or many configs side by side."""

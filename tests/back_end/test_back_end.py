@@ -1,0 +1,518 @@
+"""Measurements of a walk on a ring, exact: nothing moves; after a drift one loop brings poses and map back."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from scene import assert_same, random_gaussians, random_observation
+
+from emgs_jax import back_end, load_config
+from emgs_jax.back_end.factors import FrameData, map_factor, sequential_factor, stack_factors
+from emgs_jax.back_end.g2o import load_graph_g2o, save_graph_g2o
+from emgs_jax.back_end.loops import (
+    consistent_loops,
+    is_closure_due,
+    loop_chi2,
+    not_in_graph,
+    query_prior,
+    remove_inconsistent,
+    violated,
+)
+from emgs_jax.back_end.optimization import close_loops, merge_duplicates_of_state, nodes_of
+from emgs_jax.back_end.state import BackEnd, add_node
+from emgs_jax.gaussian_map import new_map
+from emgs_jax.geometry import scale_pose
+from emgs_jax.loop_closure.place_recognition import Database, Keyframe
+from emgs_jax.loop_closure.prior_query import JointPrediction
+from emgs_jax.loop_closure.verification import LoopMeasurement
+from emgs_jax.mapping import loop_closing
+from emgs_jax.mapping.loop_closing import finish_back_end
+from emgs_jax.mapping.pipeline import update_back_end
+from emgs_jax.mapping.records import FrameRecord
+from emgs_jax.mapping.run import MappingRun
+from emgs_jax.mapping.window_input import WindowInput
+from emgs_jax.pose_graph.deform import DeformConfig
+from emgs_jax.pose_graph.factors import Nodes, PoseGraph, residuals
+from emgs_jax.registration.pose_estimate import exact_estimate
+from emgs_jax.report import back_end as report
+from emgs_jax.report.back_end import counts, found_loops, loop_list, metric_graph, revisit_note
+from emgs_jax.report.page_words import loop_why
+from emgs_jax.slam import SlamState
+
+COUNT, WINDOW = 60, 10
+
+
+@pytest.fixture(scope="module")
+def graph():
+    return load_config("graph=default").graph
+
+
+def ring(turn: float = 2 * np.pi) -> np.ndarray:
+    """Camera poses (n, 4, 4) along a ring of 2 m that the last one closes; less than a turn drifts."""
+    poses = np.tile(np.eye(4), (COUNT, 1, 1))
+    for pose, angle in zip(poses, turn * np.arange(COUNT) / (COUNT - 1), strict=True):
+        pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        pose[:3, 3] = 2 * np.sin(angle), 0, 2 * np.cos(angle) - 2
+    return poses
+
+
+def look(poses: np.ndarray, index: int, frame: int | None = None) -> FrameData:
+    views = {0: poses[0]} | {i: poses[i] for i in range(max(index - WINDOW, 0), min(index + 2, COUNT))}
+    views = {i: np.linalg.inv(poses[0]) @ pose for i, pose in views.items()}
+    empty = np.zeros((4, 4, 3))
+    return FrameData(index if frame is None else frame, np.uint8(empty), empty, np.zeros((4, 4), bool), views)
+
+
+def state_of(poses: np.ndarray) -> SlamState:
+    """A Gaussian in front of every camera, born with it."""
+    gaussians = random_gaussians(COUNT)
+    means = jnp.asarray([pose[:3, :3] @ [0, 0, 1.5] + pose[:3, 3] for pose in poses], jnp.float32)
+    gaussians = eqx.tree_at(lambda g: g.means, gaussians, means)
+    map = new_map(gaussians, jnp.ones(COUNT), jnp.ones(()), jnp.asarray(0))
+    map = eqx.tree_at(lambda m: m.birth, map, jnp.arange(COUNT, dtype=jnp.int32))
+    last = jaxlie.SE3.from_matrix(jnp.asarray(poses[-1], jnp.float32))
+    return SlamState(map, random_observation(20), last, exact_estimate(), jnp.asarray(COUNT))
+
+
+def walked(graph, poses: np.ndarray, scale: float = 1.0) -> BackEnd:
+    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
+    for index, pose in enumerate(poses):
+        end = add_node(end, look(poses, index), pose, scale, max(index - 3, 0))
+    return end
+
+
+def loop(poses: np.ndarray, row: int = 1) -> LoopMeasurement:
+    Z = np.linalg.inv(poses[row]) @ poses[-row - 1]
+    return LoopMeasurement(row, COUNT - row - 1, Z, 0.0, np.diag([100.0] * 3 + [200.0] * 3 + [100.0]), 50)
+
+
+def error(poses, truth) -> float:
+    return max(np.linalg.norm(pose[:3, 3] - true[:3, 3]) for pose, true in zip(poses, truth, strict=True))
+
+
+def test_what_was_measured_without_error_moves_nothing(graph):
+    poses = ring()
+    end, state = walked(graph, poses), state_of(poses)
+    end, closed = close_loops(end, state, [loop(poses)])
+    assert error(end.poses, poses) < 1e-5 and end.closures[-1].info.reason == ""
+    np.testing.assert_allclose(closed.map.gaussians.means, state.map.gaussians.means, atol=1e-5)
+    assert loop_chi2(end, loop(poses)) < 1e-3 and not is_closure_due(end, [loop(poses)])
+
+
+def test_a_loop_brings_poses_map_and_last_frame_back(graph):
+    """Each Gaussian with its own camera: they are 20 cm apart, no surface that must not be torn."""
+    graph = replace(graph, deform=DeformConfig(num_neighbours=1, max_gap=0))
+    truth, drifted = ring(), ring(1.95 * np.pi)
+    end = walked(graph, drifted)
+    state = state_of(drifted)
+    loops = [loop(truth, row) for row in range(1, 9)]
+    assert loop_chi2(end, loops[0]) > graph.min_violation and is_closure_due(end, loops)
+    before, gap = error(drifted, truth), lambda poses: np.linalg.norm(poses[1][:3, 3] - poses[-2][:3, 3])
+    end, closed = close_loops(end, state, loops)
+    assert end.accepted == loops and not is_closure_due(end, loops)
+    np.testing.assert_allclose(gap(end.poses), gap(truth), atol=0.02)
+    assert error(end.poses, truth) < 0.5 * before
+    for pose, scale, mean in zip(end.poses, end.log_scales, closed.map.gaussians.means, strict=True):
+        np.testing.assert_allclose(mean, pose[:3, :3] @ [0, 0, 1.5 * np.exp(scale)] + pose[:3, 3], atol=1e-4)
+    np.testing.assert_allclose(closed.T_world_previous.as_matrix(), end.poses[-1], atol=1e-5)
+    assert error(end.online, drifted) == 0
+
+
+def test_the_mean_of_the_scales_that_the_unit_of_a_run_is_made_of_follows_a_closure(graph):
+    """Inferences that are all 5 % too small: what the closure grows of the map, a finished run must not grow again."""
+    poses, log_scale = ring(), 0.05
+    end = walked(graph, poses, np.exp(log_scale))
+    state = eqx.tree_at(lambda s: s.estimate.log_scale, state_of(poses), jnp.asarray(log_scale))
+    records = [FrameRecord(row, None, None, "tracked", pose=pose, scale=1.05) for row, pose in enumerate(poses)]
+    records[0] = FrameRecord(0, None, None, "initialization", pose=poses[0], scale=1.0)
+    smaller = np.stack([scale_pose(pose, 0.9) for pose in poses])
+    end = replace(end, verified=[loop(smaller, row) for row in range(1, 9)])
+    run = MappingRun(None, None, state=state, records=records, back_end=end)
+    run = finish_back_end(run)
+    end = run.back_end
+    assert end.accepted and log_scale - np.mean(end.log_scales) > 1e-3  # `scale_std` asks for scales of one
+    assert float(run.state.estimate.log_scale) == pytest.approx(np.mean(end.log_scales), abs=1e-5)
+    np.testing.assert_allclose([record.scale for record in run.records], np.exp(end.log_scales))
+
+
+def test_loops_that_are_contradicted_later_are_no_edges_any_more(graph):
+    truth, drifted = ring(), ring(1.95 * np.pi)
+    end, loops = walked(graph, drifted), [loop(truth, row) for row in range(1, 9)]
+    end = replace(end, verified=list(loops))
+    assert not_in_graph(end, consistent_loops(end)) == loops
+    end, _ = close_loops(end, state_of(drifted), loops)
+    assert len(remove_inconsistent(end).accepted) == len(end.accepted) == len(loops)
+    assert not_in_graph(end, consistent_loops(end)) == []
+    end = replace(end, violating=[loop(truth, row) for row in (9, 10)])
+    num_edges = len(end.factors)
+    end = remove_inconsistent(end)
+    assert not end.accepted and len(end.factors) == num_edges - len(loops)
+
+
+def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatch):
+    truth, drifted = ring(), ring(1.95 * np.pi)
+    end, loops = walked(graph, drifted), [loop(truth, row) for row in range(1, 9)]
+    end = replace(end, verified=list(loops))
+    end, state = close_loops(end, state_of(drifted), loops)
+    records = [FrameRecord(row, None, None, "tracked", pose=pose) for row, pose in enumerate(end.poses)]
+    motion = jaxlie.SE3.from_matrix(jnp.asarray(ring()[7], jnp.float32))
+    run = MappingRun(None, None, state=state, records=records, back_end=end, prior_motion=motion)
+    frame, raw = SimpleNamespace(index=COUNT - 1, image=None), SimpleNamespace(points=None, mask=None)
+    given = WindowInput((frame,), (raw,), None, None, {}, {})
+    monkeypatch.setattr(loop_closing, "add_node", lambda end, *arguments: end)
+    monkeypatch.setattr(loop_closing, "detect_loops", lambda end, frame: end)
+    run = update_back_end(run, given)
+    assert run.back_end.accepted == loops and len(run.back_end.closures) == 1 and run.prior_motion is motion
+
+    def contradict(end: BackEnd, frame: FrameData) -> BackEnd:
+        return replace(end, violating=[loop(truth, row) for row in (9, 10)])
+
+    monkeypatch.setattr(loop_closing, "detect_loops", contradict)
+    run = update_back_end(run, given)
+    end = run.back_end
+    assert not end.accepted and len(end.closures) == 2
+    assert error(end.poses, drifted) < 0.01
+    assert error([record.pose for record in run.records], end.poses) == 0
+    # What the prior says of the next frame is as far from this one as before.
+    change = end.poses[-1] @ np.linalg.inv(records[-1].pose)
+    assert np.linalg.norm(change[:3, 3]) > 1e-3
+    np.testing.assert_allclose(run.prior_motion.as_matrix(), change @ motion.as_matrix(), atol=1e-5)
+
+
+def test_a_loop_that_cannot_be_solved_changes_nothing(graph):
+    poses = ring()
+    end, state = walked(graph, poses), state_of(poses)
+    broken = loop(poses)
+    broken.Z_a_b[0, 3] = np.nan
+    end, same = close_loops(end, state, [broken])
+    assert_same(same, state)
+    assert not end.accepted and end.closures[-1].info.reason and error(end.poses, poses) == 0
+    assert counts(end)["loops/closures_refused"] == 1
+
+
+def test_a_loop_that_others_agree_with_and_that_cannot_be_solved_says_why(graph, monkeypatch):
+    """The page called it known, as if the poses had said so already."""
+    poses = ring()
+    end, state = walked(graph, poses), state_of(poses)
+    known, broken = loop(poses), loop(poses)
+    broken = replace(broken, b=broken.b - 1)
+    end = replace(end, verified=[known, broken])
+    monkeypatch.setattr(report, "consistent_loops", lambda end: end.verified)
+    assert [line["outcome"] for line in loop_list(end)] == ["known", "known"]
+    assert found_loops(end) == [known, broken], "what the poses say already is found as well"
+    bad = replace(broken, Z_a_b=np.full((4, 4), np.nan))
+    end, _ = close_loops(end, state, [bad])
+    unsolved, other = loop_list(end)
+    assert (unsolved["outcome"], other["outcome"]) == ("unsolved", "known")
+    assert found_loops(end) == [known]
+    end = replace(end, accepted=[known])
+    assert found_loops(end) == [known], "once"
+    assert unsolved["reason"] == end.closures[-1].info.reason and "reason" not in other
+    assert loop_why(unsolved) == f"verified, but no better poses were found with it: {unsolved['reason']}"
+
+
+def test_the_loops_of_a_map_that_was_loaded_do_not_count(graph):
+    poses = ring()
+    end = walked(graph, poses)
+    old, new = replace(loop(poses), b=10), loop(poses)
+    end = replace(end, verified=[old, new], accepted=[old, new], violating=[old], first_node=20)
+    found = counts(end)
+    assert (found["loops/verified"], found["loops/accepted"], found["loops/contradicted"]) == (1, 1, 0)
+
+
+def test_a_frame_is_held_where_it_was_placed_and_not_where_it_was_predicted(graph):
+    """Both edges, in the unit of the frame's inference, whatever the window says of the two frames."""
+    placed, scales = list(ring(1.95 * np.pi)[:31]), [0.0] * 30 + [np.log(1.1)]
+    chain = sequential_factor(look(ring(), 30), placed, scales, anywhere, graph.noise)
+    held = map_factor(look(ring(), 30), placed, scales, 12, graph.noise)
+    assert (chain.a, chain.b, held.a, held.b) == (30, 29, 30, 12)
+    for edge in (chain, held):
+        expected = np.linalg.inv(placed[30]) @ placed[edge.b]
+        expected[:3, 3] /= 1.1
+        np.testing.assert_allclose(edge.Z_a_b, expected, atol=1e-12)
+    assert chain.log_ratio == pytest.approx(-np.log(1.1)) and held.sqrt_info[6, 6] == 0
+
+
+def anywhere(row: int) -> bool:
+    return True
+
+
+def test_a_frame_is_not_measured_to_one_whose_pose_only_stands_in(graph):
+    """The prior has lost two frames; its later answer, which knows them again, leads from before to after them."""
+    end, poses = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01), ring()
+    for frame in range(4):
+        seen = look(poses, frame)
+        if frame in (1, 2):
+            seen.T_anchor_views[frame][:] = np.nan
+        end = add_node(end, seen, poses[frame], 1.0, None, is_placed=frame == 0)
+    assert [(edge.a, edge.b) for edge in end.factors] == [(3, 0)]
+    end = add_node(end, look(poses, 4), poses[4], 1.0, None, is_placed=False)
+    assert (end.factors[-1].a, end.factors[-1].b) == (4, 3), "a frame that is led to is as good as a placed one"
+
+
+def test_the_frame_before_is_the_nearest_that_the_window_knows(graph):
+    poses, scales = list(ring()[:31]), [0.0] * 31
+    measured = look(ring(), 30)
+    next_to = sequential_factor(measured, poses, scales, anywhere, graph.noise)
+    for frame in (29, 28):
+        measured.T_anchor_views[frame][:] = np.nan
+    edge = sequential_factor(measured, poses, scales, anywhere, graph.noise)
+    assert edge.b == 27
+    np.testing.assert_allclose(edge.sqrt_info * np.sqrt(3), next_to.sqrt_info)
+    assert sequential_factor(measured, poses, scales, lambda row: row >= 28, graph.noise) is None, (
+        "before that the camera was lost"
+    )
+    measured.T_anchor_views[30][:] = np.nan
+    assert sequential_factor(measured, poses, scales, anywhere, graph.noise) is None, "it is not known itself"
+
+
+def test_what_is_measured_is_as_sure_as_the_depths_that_it_was_measured_by(graph):
+    """Rotation by ν, translation by ν times the median depth in the unit of the inference, whatever that unit is."""
+    poses, scales = list(ring()[:31]), [0.0] * 31
+    blind = look(ring(), 30)
+    seeing = replace(blind, points=np.full((4, 4, 3), 7.0), mask=np.arange(16).reshape(4, 4) < 3, depth_noise=0.02)
+    seeing.points[0, :3, 2] = 2.0, 2.5, 40.0
+    for edge, share in (
+        (sequential_factor(seeing, poses, scales, anywhere, graph.noise), graph.noise.pair),
+        (map_factor(seeing, poses, scales, 12, graph.noise), graph.noise.map),
+    ):
+        stds = 0.02 * share * np.array([2.5, 2.5, 2.5, 1, 1, 1])
+        np.testing.assert_allclose(1 / np.diag(edge.sqrt_info)[:6], stds)
+    assert sequential_factor(seeing, poses, scales, anywhere, graph.noise).sqrt_info[6, 6] == 1 / (
+        0.02 * graph.noise.log_scale
+    )
+    exact = map_factor(replace(seeing, depth_noise=0.0), poses, scales, 12, graph.noise)
+    assert 1e3 < exact.sqrt_info[0, 0] < 1e5, "more certain than any loop, and finite"
+    first = map_factor(blind, poses, scales, 12, graph.noise)
+    np.testing.assert_allclose(1 / np.diag(first.sqrt_info)[:6], graph.noise.depth * graph.noise.map)
+
+
+def test_without_a_loop_nothing_moves_however_the_predictions_differ(graph):
+    """With the window's own poses as edges the solution of a walk was of the raw prior's, and every surface rough."""
+    placed = ring(1.95 * np.pi)
+    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
+    for index, pose in enumerate(placed):
+        end = add_node(end, look(ring(), index), pose, 1.0, max(index - 3, 0))
+    state = state_of(placed)
+    assert_same(close_loops(end, state)[1].map, state.map)
+
+
+def test_other_solvers_read_the_graph_in_the_scale_of_the_map(graph, tmp_path):
+    poses = ring()
+    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
+    for index, pose in enumerate(poses):
+        end = add_node(end, look(poses, index), pose, 1.1, None)
+    save_graph_g2o(tmp_path / "graph.g2o", metric_graph(end))
+    read = load_graph_g2o(tmp_path / "graph.g2o")
+    assert int(read.nodes.valid.sum()) == COUNT and len(read.factors.a) == len(end.factors)
+    np.testing.assert_allclose(
+        read.factors.Z_a_b.translation()[0], 1.1 * end.factors[0].Z_a_b[:3, 3], rtol=1e-5, atol=1e-6
+    )
+
+
+def test_a_graph_for_other_solvers_costs_what_ours_does_and_has_the_nodes_of_the_map_only(graph):
+    poses = ring()
+    end = walked(graph, poses, scale=2.0)
+    end = replace(end, poses=[pose @ change for pose, change in zip(end.poses, random_steps(0.01), strict=True)])
+    ours = np.sum(residuals(PoseGraph(nodes_of(end), stack_factors(end.factors))) ** 2, axis=1)[: len(end.factors)]
+    assert ours.min() > 0
+    np.testing.assert_allclose(np.sum(residuals(metric_graph(end)) ** 2, axis=1)[: len(ours)], ours, rtol=1e-3)
+    end = replace(end, submap_ids=[-1] * 5 + [0] * (COUNT - 5))
+    np.testing.assert_array_equal(np.flatnonzero(metric_graph(end).nodes.valid), range(5, COUNT))
+
+
+def random_steps(std: float) -> np.ndarray:
+    steps = np.random.default_rng(0).normal(0, std, (COUNT, 6))
+    return np.asarray(jaxlie.SE3.exp(jnp.asarray(steps, jnp.float32)).as_matrix(), np.float64)
+
+
+def test_without_a_graph_there_is_no_back_end():
+    assert load_config().graph is None
+    assert OmegaConf.create(load_config().settings).graph == {}
+
+
+def told_again(poses: np.ndarray, off: float = 0.0):
+    """A prior that knows the true poses, or one of another place `off` m away; and which frames it was asked for."""
+    calls = []
+
+    def ask(a: int, b: int) -> JointPrediction:
+        calls.append((a, b))
+        T = np.linalg.inv(poses[a]) @ poses[b]
+        T[0, 3] += off
+        points = np.float32(np.dstack([np.zeros((48, 64, 2)), np.full((48, 64), 2.0)]))
+        return JointPrediction(T, (points, points), (np.ones((48, 64), bool),) * 2)
+
+    return ask, calls
+
+
+def with_keyframes(end: BackEnd) -> BackEnd:
+    """All nodes are keyframes that show a wall 2 m away."""
+    none = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32)
+    wall = np.full((60, 80), 2.0, np.float16)
+    keyframes = tuple(Keyframe(row, *none, end.intrinsics, (64, 48), wall) for row in range(len(end.poses)))
+    return replace(end, database=Database(keyframes))
+
+
+def test_a_loop_that_the_prior_sees_too_is_more_certain_and_asked_for_once(graph):
+    truth = ring()
+    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
+    end = replace(end, frames=[100 + row for row in range(COUNT)])  # numbers of the data set
+    ask, calls = told_again(np.concatenate([np.tile(np.eye(4), (100, 1, 1)), truth]))
+    end = replace(end, verified=[loop(truth, row) for row in range(1, 5)])
+    loops = list(end.verified)
+    end = query_prior(end, loops[:2], ask)
+    assert calls == [(101, 158), (102, 157)] and counts(end)["loops/measured_again"] == 2
+    for before, now in zip(loops[:2], end.verified[:2], strict=True):
+        np.testing.assert_allclose(now.Z_a_b, before.Z_a_b, atol=1e-6)
+        assert (np.diag(now.sqrt_info) > np.diag(before.sqrt_info)).all()
+    end = query_prior(end, end.verified, ask)
+    assert len(calls) == 4 and len(end.verified) == 4 and revisit_note(end, is_sequential=False) == []
+
+
+def test_of_a_closure_the_loops_with_most_inliers_are_asked_for(graph):
+    truth = ring()
+    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
+    end = replace(end, verified=[replace(loop(truth, row), num_inliers=40 + 10 * (row % 3)) for row in range(1, 7)])
+    ask, calls = told_again(truth)
+    end = query_prior(end, end.verified, ask)
+    assert [a for a, _ in calls] == [2, 5, 1] and graph.prior_query.max_queries == 3
+    end = replace(end, queries={})
+    calls.clear()
+    same = [replace(one, b=50, num_inliers=40 + one.a) for one in end.verified]  # all of one query: one witness
+    end = replace(end, verified=list(same))
+    end = query_prior(end, same, ask)
+    assert len(calls) == 1 and calls[0][0] == 6
+
+
+def test_what_is_known_already_takes_nobodys_turn(graph):
+    """Four loops that the poses fit, with more inliers, were asked for, and a false one with less moved the poses."""
+    poses = ring()
+    end = with_keyframes(walked(graph, poses))
+    known = [replace(loop(poses, row), num_inliers=90) for row in range(1, 5)]
+    false = [replace(loop(ring(1.9 * np.pi), row), num_inliers=40) for row in range(5, 9)]
+    end = replace(end, verified=[*known, *false])
+    ask, calls = told_again(poses)
+    end = query_prior(end, violated(end, not_in_graph(end, end.verified)), ask)
+    assert sorted(a for a, _ in calls) == [5, 6, 7] and end.accepted == []
+    assert [one.a for one in violated(end, end.verified)] == [8], "asked for, the prior says what the poses say"
+
+
+def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
+    truth = ring()
+    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
+    end = replace(end, verified=[loop(truth, row) for row in range(1, 5)])
+    ask, _ = told_again(truth, off=6.0)
+    end = query_prior(end, end.verified[:1], ask)
+    assert [known.a for known in end.verified] == [2, 3, 4] and [known.a for known in end.violating] == [1]
+    (refusal,) = end.refusals
+    assert (refusal.a, refusal.b, refusal.gate) == (
+        1,
+        58,
+        "revisit",
+    ) and refusal.measured > graph.prior_query.max_misfit
+    assert counts(end)["loops/refused_revisit"] == 1
+    (line,) = [one for one in loop_list(end) if one["outcome"] == "refused"]
+    assert "the prior, asked for both together, says otherwise" in loop_why(line)
+
+
+def test_an_answer_without_a_pose_is_none_and_is_counted(graph):
+    truth = ring()
+    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
+    end = replace(end, verified=[loop(truth, row) for row in range(1, 5)])
+    loops, (ask, _) = list(end.verified), told_again(truth)
+    end = query_prior(end, loops[:1], lambda a, b: replace(ask(a, b), T_a_b=np.full((4, 4), np.nan)))
+    assert end.verified == loops and counts(end)["loops/unusable_answers"] == 1
+    assert counts(end)["loops/measured_again"] == 0 and revisit_note(end, is_sequential=False) == []
+
+
+def test_a_loop_for_which_the_prior_has_no_word_and_one_of_another_run_stay(graph):
+    truth = ring()
+    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
+    end = replace(end, verified=[loop(truth, row) for row in range(1, 5)])
+    loops = list(end.verified)
+    end = query_prior(end, loops[:2], lambda a, b: None)
+    assert counts(end)["loops/measured_again"] == counts(end)["loops/unusable_answers"] == 0
+    (note,) = revisit_note(end, is_sequential=False)
+    assert note.startswith("loops: 2 were measured by keypoints alone") and "graph=default" in note
+    assert revisit_note(end, is_sequential=True) == revisit_note(None, is_sequential=False) == []
+    ask, calls = told_again(truth)
+    end = replace(end, first_node=10)
+    end = query_prior(end, loops[2:], ask)
+    assert calls == [] and all(now is before for now, before in zip(end.verified, loops, strict=True))
+
+
+def test_what_moves_the_poses_was_asked_for_before(graph, monkeypatch):
+    """Of four loops that agree the prior refuses one: the others are edges, and as the prior measures them, too."""
+    truth, drifted = ring(), ring(1.95 * np.pi)
+    loops = [loop(truth, row) for row in range(1, 5)]
+    end = replace(with_keyframes(walked(graph, drifted)), verified=loops)
+    records = [FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0) for i, pose in enumerate(drifted)]
+    right, _ = told_again(truth)
+    wrong, _ = told_again(truth, off=6.0)
+    run = MappingRun(None, None, state=state_of(drifted), back_end=end, records=records)
+    asking = replace(run, prior_query=lambda a, b: wrong(a, b) if a == 2 else right(a, b))
+    with monkeypatch.context() as patch:
+        for module in (back_end.loops, loop_closing):
+            patch.setattr(module, "consistent_loops", lambda end, since=0: list(end.verified))
+        end = finish_back_end(asking).back_end
+    assert [one.a for one in end.accepted] == [1, 3, 4] and [refusal.a for refusal in end.refusals] == [2]
+    assert end.accepted[0].sqrt_info[0, 0] > loops[0].sqrt_info[0, 0]
+    assert error(end.poses, truth) < 0.5 * error(drifted, truth)
+    # Two of them against it, and all that imply the same correction fall.
+    end = with_keyframes(walked(graph, drifted))
+    end = replace(end, verified=[loop(truth, row) for row in range(1, 9)])
+    assert len(consistent_loops(end)) == 8
+    end = finish_back_end(replace(run, back_end=end, prior_query=wrong)).back_end
+    assert end.accepted == [] and len(end.refusals) == 3 and consistent_loops(end) == []
+    assert error(end.poses, drifted) == 0
+
+
+@pytest.mark.parametrize("has_loop", [True, False])
+def test_a_map_whose_visits_were_joined_is_settled_at_the_end_with_the_noise_of_its_frames(
+    graph, monkeypatch, has_loop
+):
+    truth, drifted = ring(), ring(1.95 * np.pi)
+    end = walked(graph, drifted)
+    end = replace(end, verified=[loop(truth, row) for row in range(1, 9)] if has_loop else [])
+    records = [
+        FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0, depth_noise=0.01 * (i % 3))
+        if i < COUNT // 3
+        else FrameRecord(i, None, None, "degraded", pose=pose, scale=1.0, depth_noise=9.0)  # fits nothing
+        for i, pose in enumerate(drifted)
+    ]
+    asked, config = [], SimpleNamespace(existence="gates")
+    run = MappingRun(None, config, state=state_of(drifted), records=records, back_end=end)
+
+    def settled(state, nodes, noise, gates):
+        asked.append((noise, gates, nodes.T_world.as_matrix()[:COUNT]))
+        return replace(state, time=jnp.asarray(-1))
+
+    monkeypatch.setattr(loop_closing, "merge_duplicates_of_state", settled)
+    run = finish_back_end(run)
+    assert [one[:2] for one in asked] == ([(0.01, "gates")] if has_loop else [])
+    assert (run.state.time == -1) == has_loop
+    for *_, poses in asked:
+        np.testing.assert_allclose(poses, run.back_end.poses, atol=1e-5)
+
+
+def test_a_gaussian_is_seen_from_the_node_of_its_birth(graph):
+    """Two sheets of a wall before the first node, and two that the second one sees from beside."""
+    apart = [[0.0, 0, 3.0], [0, 0, 3.04], [5, 0, 3.0], [5, 0, 3.04]]
+    cov, normal = jnp.diag(jnp.array([0.05, 0.05, 0.003])) ** 2, jnp.array([0.0, 0, -1])
+    gaussians = random_gaussians(4)
+    rows = jnp.asarray(apart, jnp.float32), jnp.tile(cov, (4, 1, 1)), jnp.tile(normal, (4, 1))
+    gaussians = eqx.tree_at(lambda g: (g.means, g.covs, g.normals), gaussians, rows)
+    gaussians = eqx.tree_at(lambda g: g.features, gaussians, jnp.zeros((4, 0)))
+    map = new_map(gaussians, jnp.ones(4), jnp.ones(()), jnp.asarray(0))
+    map = eqx.tree_at(lambda m: m.birth, map, jnp.array([0, 0, 1, 1], jnp.int32))
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, 3] = 8.0, 0.0, 3.0
+    nodes = Nodes(jaxlie.SE3.from_matrix(jnp.asarray(poses, jnp.float32)), jnp.zeros(2), jnp.ones(2, bool))
+    state = replace(state_of(ring()), map=map)
+    after = merge_duplicates_of_state(state, nodes, 0.02, load_config().slam.existence)
+    np.testing.assert_array_equal(after.map.gaussians.valid, [True, False, True, True])

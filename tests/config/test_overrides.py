@@ -1,0 +1,63 @@
+"""What people call their files, for Hydra's grammar; oracle: what Hydra makes of the word."""
+
+import pytest
+
+from emgs_jax.config.configure import compose
+from emgs_jax.config.overrides import joined, parsed, quoted, readable
+
+NAMES = (
+    *(
+        "IMG (1).mp4",
+        "Küche",
+        "名前",
+        "a=b",
+        "[loft]/x",
+        "it's",
+        'a "b"',
+        "C:\\Users\\me\\walk",
+        "end\\",
+        "a'b\\'c",
+        "100%",
+    ),
+    *("a b", "#1", "{x", "a&b;c", "2024", "007", "1e3", "true", "null", "~/walk", "glob*", "x:y", "naïve, Räume"),
+)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_is_read_as_it_stands_whatever_signs_it_has(name):
+    (word,) = readable([f"dataset.root={name}"])
+    assert parsed(word).value() == name or (name == "null" and parsed(word).value() is None)
+    assert readable([word]) == [word] and parsed(f"x={quoted(name)}").value() == name
+    if name in ("IMG (1).mp4", "2024"):
+        assert compose("dataset=images", f"dataset.root={name}").dataset.root == name
+
+
+@pytest.mark.parametrize("name", ["walk, kitchen", "[loft]", "a,b"])
+def test_what_is_there_is_meant_even_where_it_could_be_a_list(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    word = f"prior.folder={name}"
+    before = parsed(readable([word])[0]).value()
+    (tmp_path / name).mkdir()
+    assert before != name and parsed(readable([word])[0]).value() == name
+
+
+def test_choices_of_a_multirun_are_files_each(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("Küche", "Bad (1)"):
+        (tmp_path / name).mkdir()
+    found = parsed(readable(["dataset.root=Küche,Bad (1)"])[0])
+    assert [item.text for item in found.sweep_iterator()] == ["Küche", "Bad (1)"]
+
+
+def test_lists_that_a_shell_has_cut_are_put_together_and_their_items_are_text_where_need_be():
+    words = "dataset.intrinsics=[525, 525.5, 319, 239] -m prior.seed=1,2 x={a: 1, b: [2, 3]} --cfg job"
+    found = readable(words.split())
+    assert parsed(found[0]).value() == [525, 525.5, 319, 239] and parsed(found[3]).value() == {"a": 1, "b": [2, 3]}
+    assert found[1:3] + found[4:] == ["-m", "prior.seed=1,2", "--cfg", "job"]
+    assert parsed(readable(["text=[Stühle,Tisch (rund), wall]"])[0]).value() == ["Stühle", "Tisch (rund)", "wall"]
+    assert joined(["a=[1,", "b"]) == ["a=[1,", "b"]  # without an end
+
+
+def test_what_hydra_reads_stays_as_it_is():
+    words = ["+a=1", "++a.b=[x,y]", "~a", "slam/em=paper", "a='x y'", "x=range(1,4)", "a=null", "seeds=[0,1]", "a=${b}"]
+    assert readable(words) == words

@@ -1,0 +1,148 @@
+"""Parts of a run without a relation; oracles: true poses and surfaces, similarities by hand, bits of other runs."""
+
+from functools import cache
+
+import jax
+import numpy as np
+import pytest
+from scene import assert_same
+from scipy.spatial import cKDTree
+from walks import NEVER_FOUND, Apart, config, mapped, prior_of, same_run, walk
+
+from emgs_jax.back_end.saved_map import load_saved_map
+from emgs_jax.back_end.state import BackEnd
+from emgs_jax.data.base import Frame
+from emgs_jax.geometry import Sim3, pose_difference
+from emgs_jax.loop_closure.relocalization import RelocalizedPose
+from emgs_jax.mapping.checkpoint import CheckpointConfig, Keeper
+from emgs_jax.mapping.records import UNJOINED
+from emgs_jax.mapping.run import MappingRun
+from emgs_jax.mapping.submaps import join_factor
+from emgs_jax.report.metrics import score_back_end
+from emgs_jax.report.run_files import save_progress
+
+# Frames of the path. The last part begins where it sees the first, and walks on to where it sees the second.
+PARTS = (0, 2, 4, 6, 8), (60, 58, 56, 54, 52), (4, 2, 0, 78, 75, 72, 69, 66, 63, 60, 57)
+UNITS = (1.0, 1.25, 0.8)  # of the parts: what the prior gives there as that is a metre
+WHOLE, STARTS = sum(PARTS, ()), (5, 10)
+PART = np.repeat(range(3), [len(part) for part in PARTS])
+
+
+def ran(numbers, starts, *words: str, **more) -> MappingRun:
+    frames = walk(numbers)
+    return mapped(frames, Apart(prior_of(frames), starts, UNITS), words=words, **more)
+
+
+@cache
+def apart(numbers, starts, *words: str) -> MappingRun:
+    return ran(numbers, starts, *words)
+
+
+@pytest.mark.slow
+def test_parts_of_other_frames_and_units_are_joined_where_they_meet_the_map():
+    """The last part is joined with the first, so it moves; then both meet the second, so that one moves."""
+    run = apart(WHOLE, STARTS)
+    end, said = run.back_end, [record.location for record in run.records]
+    assert [row for row, location in enumerate(said) if location == "segment"] == list(STARTS)
+    one, other = (row for row, location in enumerate(said) if location == "joined")
+    assert STARTS[1] < one < said.index("anew") < other, "the jump from 0 to 78 shows nothing of the map"
+    for pose, online, record in zip(end.poses, end.online, run.records, strict=True):
+        for found in (pose, online, record.pose):
+            distance, turn = pose_difference(found, record.true_pose)
+            assert distance < 0.03 and turn < 1.0, record.index
+    np.testing.assert_allclose(np.exp(end.log_scales), 1 / np.array(UNITS)[PART], rtol=0.02)
+    np.testing.assert_allclose(Sim3.from_matrix(run.records[one].similarity).scale, 1 / UNITS[2], rtol=0.02)
+    np.testing.assert_allclose(Sim3.from_matrix(run.records[other].similarity).scale, UNITS[1], rtol=0.02)
+    assert not run.inactive and set(end.submap_ids) == {0}
+    anew, noise = said.index("anew"), config().graph.noise
+    (chain,) = (edge for edge in end.factors if edge.a == anew and edge.a == edge.b + 1 and edge.sqrt_info[6, 6])
+    assert chain.sqrt_info[5, 5] == pytest.approx(1 / (noise.depth * noise.pair)), "what begins anew fits nothing"
+    metrics = score_back_end(run)
+    assert metrics["location/segment"] == metrics["location/joined"] == 2
+
+
+@pytest.mark.slow
+def test_what_was_mapped_apart_lies_on_the_true_surfaces_after_it_is_joined():
+    run, frames = apart(WHOLE, STARTS), walk(WHOLE)
+    truth = cKDTree(np.concatenate([surface(frames[row]) for row in range(len(frames))]))
+    births, valid = np.asarray(run.map.birth), np.asarray(run.map.gaussians.valid)
+    anew = [record.location for record in run.records].index("anew")
+    for born in (range(5), range(5, 10), range(10, 12), [anew], range(anew + 1, len(WHOLE))):
+        means = np.asarray(run.map.gaussians.means)[valid & np.isin(births, born)]
+        distance, _ = truth.query(means)
+        assert len(means) > 15 and np.median(distance) < 0.03 and np.quantile(distance, 0.9) < 0.08, born
+
+
+def surface(frame: Frame) -> np.ndarray:
+    """Points (n, 3) of the true depth, world."""
+    fx, fy, cx, cy = walk(WHOLE).intrinsics
+    y, x = np.nonzero(frame.depth > 0)
+    z = frame.depth[y, x]
+    points = np.stack([(x - cx) / fx * z, (y - cy) / fy * z, z], axis=1)
+    return points @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "stop"),
+    [((), 7), *(pytest.param(*case, marks=pytest.mark.long) for case in (((), 13), ((NEVER_FOUND,), 12)))],
+)
+def test_a_run_that_is_stopped_in_a_part_or_after_it_was_joined_has_the_same_bits(tmp_path, words, stop):
+    keep = lambda: Keeper(tmp_path / "checkpoint.npz", CheckpointConfig(every=1000), {})  # noqa: E731
+    ran(WHOLE, STARTS, *words, keeper=keep(), stop=stop)
+    keeper = keep()
+    assert keeper.found is not None and len(keeper.found.records) == stop and keeper.found.inactive
+    same_run(ran(WHOLE, STARTS, *words, keeper=keeper), apart(WHOLE, STARTS, *words))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_before", [4, pytest.param(9, marks=pytest.mark.long)])
+def test_of_parts_that_never_meet_the_one_with_most_placed_frames_is_the_map(tmp_path, num_before):
+    numbers = (*range(0, 2 * num_before, 2), *range(26, 14, -2))
+    (tmp_path / "frames.jsonl").write_text(
+        '{"index": 99, "status": "skipped", "covariance": null}\n'
+        + "".join(
+            f'{{"index": {row}, "status": "tracked", "reason": null, "pose": [1], "covariance": null}}\n'
+            for row in range(len(numbers))
+        )
+    )
+    run = apart(numbers, (num_before,), NEVER_FOUND)
+    kept = range(num_before) if num_before > 6 else range(num_before, num_before + 6)
+    for row, record in enumerate(run.records):
+        assert (record.status == "lost" and record.reason == UNJOINED) == (row not in kept), row
+    births = np.asarray(run.map.birth)[np.asarray(run.map.gaussians.valid)]
+    assert len(births) > 0 and set(births) <= set(kept)
+    assert run.back_end.is_placed == [row in kept for row in range(len(numbers))]
+    assert {edge.a for edge in run.back_end.factors} <= set(kept)
+    assert {one.frame for one in run.back_end.database.keyframes} == set(kept)
+    save_progress(tmp_path, run)
+    lines = (tmp_path / "frames.jsonl").read_text().splitlines()
+    assert "skipped" in lines[0]
+    assert [UNJOINED in line for line in lines[1:]] == [row not in kept for row in range(len(numbers))]
+    (tmp_path / "metrics.json").write_text("{}")
+    saved = load_saved_map(str(tmp_path), "extend", config().graph, run.back_end.intrinsics, 0.01)
+    assert_same(jax.device_get(saved.map), jax.device_get(run.map))
+
+
+@pytest.mark.slow
+def test_without_a_back_end_frames_without_a_relation_are_lost_as_those_of_which_nothing_is_known():
+    frames = walk((*PARTS[0], *PARTS[1][:3]))
+    runs = [
+        mapped(frames, Apart(prior_of(frames), STARTS[:1], UNITS, is_silent), words=("graph=none",))
+        for is_silent in (False, True)
+    ]
+    assert [record.status for record in runs[0].records[5:]] == ["lost"] * 3
+    assert_same(*(jax.device_get(run.map) for run in runs))
+    np.testing.assert_array_equal(*(run.poses for run in runs))
+
+
+def test_what_holds_two_parts_together_is_as_sure_as_the_place_was_in_its_unit_then():
+    """The place was found to 1 cm in the map as it was then, whichever of the two has moved since."""
+    poses, unit = [np.eye(4) for _ in range(3)], 0.4
+    poses[2][:3, 3] = 1.0, 2.0, 3.0
+    scales = [0.1, np.log(2.0), np.log(3.0)]
+    end = BackEnd(config().graph, (300.0, 300.0, 160.0, 120.0), 0.0, poses=poses, log_scales=scales)
+    edge = join_factor(end, RelocalizedPose(np.eye(4), 0.0, 1e-4 * np.eye(7), 1), unit)
+    assert (edge.a, edge.b) == (1, 2) and edge.log_ratio == pytest.approx(np.log(1.5))
+    np.testing.assert_allclose(edge.Z_a_b[:3, 3], [0.5, 1.0, 1.5])
+    np.testing.assert_allclose(edge.sqrt_info, np.diag([100.0 * unit] * 3 + [100.0] * 4))

@@ -1,0 +1,89 @@
+"""The covariances of a run that ends have the first frame's own error in them, as it is seen from each frame."""
+
+import json
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from scene import pose, random_gaussians, random_observation, slam_config
+
+from emgs_jax.gaussian_map import new_map
+from emgs_jax.mapping.finalize import own_covariance, with_first_frame
+from emgs_jax.mapping.records import FrameRecord, to_line
+from emgs_jax.mapping.run import MappingRun
+from emgs_jax.observation import transform
+from emgs_jax.registration.pose_estimate import exact_estimate
+from emgs_jax.report.run_files import save_progress
+from emgs_jax.slam import SlamState
+from tools.nees.consistency import pose_errors
+
+COUNT = 1e6  # repeats beside which the guess does not count
+DIFFERENCE = np.array([0.01, 0.004])  # between two answers about a motion: mean depths and rad, per axis
+
+
+def a_run(count: float = COUNT, shared: float = 0.75) -> MappingRun:
+    poses = [np.asarray(pose((0.3 * i, 0.2, -0.4 * i), (1.0 + i, -2.0, 0.5)).as_matrix(), float) for i in range(3)]
+    records = [FrameRecord(0, None, None, "initialization", pose=poses[0])]
+    records += [FrameRecord(i, None, None, "tracked", pose=poses[i], covariance=1e-4 * np.eye(6)) for i in (1, 2)]
+    logs = jnp.asarray(np.stack([np.log(DIFFERENCE**2)] * 2) - 0.36898, jnp.float32)  # of χ² with three degrees
+    known = logs, jnp.asarray([count, 0.0]), jnp.asarray(0.02)
+    estimate = eqx.tree_at(lambda b: (b.repeats.log_squares, b.repeats.counts, b.depth_noise), exact_estimate(), known)
+    last = jaxlie.SE3.from_matrix(jnp.asarray(poses[-1], jnp.float32))
+    map = new_map(random_gaussians(9), jnp.ones(9), jnp.ones(()), jnp.asarray(0))
+    seen = transform(last, random_observation(20), jnp.ones(()))
+    state = SlamState(map, seen, last, estimate, jnp.asarray(3))
+    return MappingRun(None, slam_config(f"slam.localization.pose_shared={shared}"), state=state, records=records)
+
+
+def test_the_first_frame_is_as_uncertain_as_the_motions_turned_out_to_be():
+    run = a_run()
+    expected = DIFFERENCE / np.sqrt(2 * 0.25)  # two answers differ by the variance 2 (1 - c) v
+    depth = np.mean(np.asarray(random_observation(20).points)[:, 2])
+    own = own_covariance(run.state, run.config.localization)
+    std = np.repeat(expected * [depth, 1.0], 3)
+    np.testing.assert_allclose(own, np.diag(std**2), rtol=1e-3)
+
+
+@pytest.mark.parametrize("settings", [{"count": 0.0}, {"shared": 1.0}])
+def test_where_answers_say_nothing_of_each_other_nothing_is_added(settings):
+    run = a_run(**settings)
+    assert with_first_frame(run) is run
+
+
+def test_what_is_added_is_the_scatter_of_the_poses_relative_to_a_first_frame_that_is_off():
+    run, rng = a_run(), np.random.default_rng(0)
+    own, first = own_covariance(run.state, run.config.localization), run.records[0].pose
+    before = [record.covariance for record in run.records]
+    run = with_first_frame(run)
+    assert run.records[0].covariance is None, "the first frame itself has none"
+    draws = jaxlie.SE3.exp(jnp.asarray(rng.multivariate_normal(np.zeros(6), own, 4000), jnp.float32)).as_matrix()
+    for row in (1, 2):
+        ours = np.linalg.inv(first) @ run.records[row].pose
+        errors = pose_errors(ours[None], np.linalg.inv(first @ np.asarray(draws, float)) @ run.records[row].pose)
+        added = run.records[row].covariance - before[row]
+        std = np.sqrt(np.diag(added))
+        np.testing.assert_allclose(np.cov(errors.T) / std / std[:, None], added / std / std[:, None], atol=0.07)
+
+
+def test_the_file_of_the_frames_says_it_too(tmp_path):
+    run = a_run()
+    records = [replace(record, timestamp=0.1 * record.index) for record in run.records]
+    run = replace(run, records=(*records, FrameRecord(3, None, 0.3, "lost", pose=records[-1].pose)))
+    lines = [json.dumps(to_line(record), default=np.ndarray.tolist) for record in run.records]
+    skipped = json.dumps(to_line(FrameRecord(9, None, None, "skipped")))
+    (tmp_path / "frames.jsonl").write_text("\n".join([skipped, *lines]) + "\n")
+    run = with_first_frame(run)
+    save_progress(tmp_path, run)
+    found = [json.loads(line) for line in (tmp_path / "frames.jsonl").read_text().splitlines()]
+    assert found[0]["status"] == "skipped" and found[-1]["covariance"] is None
+    for line, record in zip(found[2:4], run.records[1:3], strict=True):
+        np.testing.assert_allclose(line["covariance"], record.covariance, rtol=1e-4, atol=1e-10)
+        assert np.max(line["covariance"]) > 2e-4
+
+
+def test_poses_in_a_saved_map_are_not_relative_to_a_first_frame():
+    run = replace(a_run(), saved=object())
+    assert with_first_frame(run) is run

@@ -1,0 +1,241 @@
+"""Streaming, bad predictions and records; the prior is exact, so the truth is the oracle."""
+
+from collections import Counter
+from dataclasses import replace
+
+import hydra
+import jax
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from tiny_run import NUM_FRAMES, WINDOW_SIZE, EditedPrior, at_inference, compose, dataset, exact, map_tiny
+
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.data.spool import Spool
+from emgs_jax.device.clock import Clock
+from emgs_jax.evaluation.reconstruction import ground_truth_cloud
+from emgs_jax.io.map_file import load_map_npz
+from emgs_jax.io.trajectory import load_trajectory_tum
+from emgs_jax.mapping import pipeline
+from emgs_jax.mapping.pipeline import finish_run, map_frames
+from emgs_jax.mapping.run import new_run
+from emgs_jax.mapping.window_input import predictions, window_inputs
+from emgs_jax.prior.base import Prior
+from emgs_jax.report.dense import dense_map
+from emgs_jax.report.gathering import RawPrior
+from emgs_jax.report.metrics import new_scorer, score_map, score_prior
+from emgs_jax.report.run_files import save_outputs, save_progress
+
+
+def same_bits(tree, other) -> bool:
+    pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
+    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
+
+
+class Counting:
+    """A data set that counts how often each frame is read."""
+
+    def __init__(self, num_frames: int) -> None:
+        self.num_frames, self.reads, self.intrinsics = num_frames, Counter(), (1.0, 1.0, 0.0, 0.0)
+
+    def __len__(self) -> int:
+        return self.num_frames
+
+    def __getitem__(self, index: int) -> int:
+        self.reads[index] += 1
+        return index
+
+
+class Echo(Prior):
+    """Answers with the frames that it was given."""
+
+    def predict(self, window, frames, intrinsics):
+        return window, frames
+
+
+def test_each_frame_is_read_once_just_before_it_is_needed_and_kept_only_while_a_window_holds_it():
+    frames, size = Counting(20), 4
+    for (window, given), held in predictions(frames, Echo(), size, Clock()):
+        assert tuple(given) == window.views == tuple(held)
+        assert len(held) <= size + 3 and max(frames.reads) == max(window.views), "nothing may be read ahead"
+    assert set(frames.reads) == set(range(20)) and set(frames.reads.values()) == {1}
+
+
+@pytest.mark.slow
+def test_every_frame_has_one_record_with_its_true_pose_where_the_prior_is_exact():
+    session, _ = exact()
+    assert [record.index for record in session.records] == list(range(NUM_FRAMES))
+    assert [record.status for record in session.records] == ["initialization"] + ["tracked"] * (NUM_FRAMES - 1)
+    truth = np.stack([dataset()[i].T_world_camera for i in range(NUM_FRAMES)])
+    np.testing.assert_allclose(session.poses, truth, atol=1e-3)  # a tenth of the bar
+    np.testing.assert_allclose(session.raw_poses, truth, atol=1e-12)
+    for record, following in zip(session.records[1:], truth[2:], strict=False):
+        if record.index + 1 != WINDOW_SIZE:  # the last view of the first window has no image after it
+            np.testing.assert_allclose(record.newest_pose[:3, 3], following[:3, 3], atol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "damages",
+    [
+        {1: {"points": np.nan}, 2: {"T_anchor_view": np.nan}},
+        {1: {"mask": False}, 2: {"confidence": np.nan}, 3: {"confidence": 0.0}},
+    ],
+)
+def test_predictions_without_a_valid_point_or_pose_mark_their_frames_and_leave_the_map_bit_identical(damages):
+    def edit(prediction):
+        for number, arrays in damages.items():
+            prediction = at_inference(number, **arrays)(prediction)
+        return prediction
+
+    session, maps = map_tiny(dataset(), EditedPrior(edit))
+    for number in damages:
+        bad = WINDOW_SIZE - 1 + number
+        record = session.records[bad]
+        assert record.status == "lost" and "no valid point or pose" in record.reason
+        assert same_bits(maps[bad], maps[bad - 1])
+    assert (session.records[-1].status == "lost") == (3 in damages), "the frame after them is as all are"
+    assert np.isfinite(session.poses).all() and np.isfinite(session.raw_poses).all()
+    gaussians = session.state.map.gaussians
+    assert np.isfinite(np.asarray(gaussians.means)[np.asarray(gaussians.valid)]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damaged", ["points", "T_anchor_view"])
+def test_a_bad_view_in_the_first_window_is_lost_and_the_others_are_not(damaged):
+    def edit(prediction):
+        if prediction.window.inference == 0:
+            getattr(prediction, damaged)[1] = np.nan
+        return prediction
+
+    session, maps = map_tiny(dataset(), EditedPrior(edit))
+    assert [record.status for record in session.records[:3]] == ["initialization", "lost", "tracked"]
+    assert same_bits(maps[0], maps[1])
+    found, truth = session.poses[2:], [dataset()[i].T_world_camera for i in range(2, NUM_FRAMES)]
+    # The chain is broken, the prior's own pose is not; but how good it is nobody knows, so the tiny map pulls at it.
+    np.testing.assert_allclose(found, truth, atol=0.05)
+
+
+def test_a_view_without_a_pose_cannot_be_merged():
+    def edit(prediction):
+        prediction.T_anchor_view[1] = np.nan
+        return prediction
+
+    with pytest.raises(ValueError, match="slam.initialization=incremental"):
+        map_tiny(dataset(), EditedPrior(edit), "slam.initialization=merged")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_empty", [pytest.param(1, marks=pytest.mark.long), WINDOW_SIZE + 1])
+def test_the_map_starts_at_the_first_frame_with_a_point_and_those_before_are_lost(num_empty):
+    """All later frames were degraded, the map stayed empty and nothing said so."""
+
+    def edit(prediction):
+        for row, index in enumerate(prediction.window.dense):
+            if index < num_empty:
+                prediction.mask[row] = False
+        return prediction
+
+    session, _ = map_tiny(dataset(), EditedPrior(edit))
+    expected = ["lost"] * num_empty + ["initialization"] + ["tracked"] * (NUM_FRAMES - num_empty - 1)
+    assert [record.status for record in session.records] == expected
+    assert [record.index for record in session.records] == list(range(NUM_FRAMES))
+    truth = [dataset()[i].T_world_camera for i in range(NUM_FRAMES)]
+    np.testing.assert_allclose(session.poses[num_empty:], truth[num_empty:], atol=5e-3)
+    np.testing.assert_array_equal(session.poses[:num_empty], [truth[0]] * num_empty)
+
+
+def test_a_prior_without_any_point_is_an_error_and_not_a_run_that_never_maps():
+    with pytest.raises(ValueError, match="none of the .* frames of .*dataset.stride"):
+        map_tiny(dataset(), EditedPrior(lambda prediction: replace(prediction, mask=prediction.mask & False)))
+
+
+def test_a_sequence_without_frames_is_refused():
+    empty = Counting(0)
+    empty.name, empty.sequence = "nothing", ""
+    with pytest.raises(ValueError, match="none of the 0 frames of nothing"):
+        list(window_inputs(empty, Echo(), hydra.utils.instantiate(compose().slam), Clock()))
+
+
+def test_features_without_a_grid_for_each_dense_view_are_refused():
+    def edit(prediction):
+        return replace(prediction, features=prediction.features[0])
+
+    with pytest.raises(ValueError, match=r"features have shape \(48, 64, 16\) at frame 2, expected \(3, rows, columns"):
+        map_tiny(dataset(), EditedPrior(edit))
+
+
+@pytest.mark.slow
+def test_the_merged_initialization_makes_the_map_from_the_whole_window(monkeypatch):
+    """Only the first window: `initialization` is static, so a step would be compiled anew."""
+    monkeypatch.setattr(pipeline, "prepare_step", lambda *_: None)  # of a step, which there is not
+    frames = ReadableFrames(hydra.utils.instantiate(compose(f"dataset.stop={WINDOW_SIZE}").dataset))
+    session, maps = map_tiny(frames, EditedPrior(), "slam.initialization=merged")
+    assert [record.status for record in session.records] == ["initialization"] * WINDOW_SIZE
+    truth = np.stack([frame.T_world_camera for frame in map(dataset().__getitem__, range(WINDOW_SIZE))])
+    np.testing.assert_allclose(session.poses, truth, atol=1e-5)
+    assert len(maps) == WINDOW_SIZE and maps[0].gaussians.valid.sum() == session.records[-1].num_gaussians > 100
+
+
+@pytest.mark.slow
+def test_what_is_saved_reloads_to_the_state_and_to_the_poses_at_the_data_sets_times(tmp_path):
+    session, _ = exact()
+    save_progress(tmp_path, session)
+    assert same_bits(load_map_npz(tmp_path / "map.npz", type(session.state.map)), session.state.map)
+    times, poses = load_trajectory_tum(tmp_path / "trajectory.txt")
+    assert times.tolist() == [dataset()[i].timestamp for i in range(NUM_FRAMES)]
+    np.testing.assert_allclose(poses, session.poses, atol=1e-8)  # nine digits are written
+
+
+def test_before_the_first_map_nothing_is_saved(tmp_path):
+    save_progress(tmp_path, new_run(dataset(), hydra.utils.instantiate(compose().slam)))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
+    session, _ = exact()
+    blind = new_run(dataset(), session.config)
+    unknown = tuple(replace(record, true_pose=None) for record in session.records)
+    blind = replace(blind, state=session.state, records=unknown)
+    config = hydra.utils.instantiate(compose().densify)
+    protocol = hydra.utils.instantiate(compose().evaluation)
+    dense = dense_map(blind, dataset(), config, protocol)
+    assert len(dense.cloud) > 1000 and len(dense.pictures) == 4
+    assert save_outputs(tmp_path, blind, dense, config, "blind", True) == []
+    names = {"map.ply", "points.ply", "mesh.ply", "overview.png"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    scorer = new_scorer(dataset(), protocol, EditedPrior())
+    raw = RawPrior(dense.cloud, Spool())
+    assert score_map(blind, dense.cloud, dense.cloud, None, scorer) == score_prior(blind, raw, scorer) == {}
+    assert dense.rendering == {}
+
+
+@pytest.mark.slow
+def test_the_densified_cloud_of_an_exact_run_lies_on_the_true_surfaces():
+    """Within the size of a Gaussian: 8 points of about 3 cm spacing."""
+    session, _ = exact()
+    protocol = hydra.utils.instantiate(compose().evaluation)
+    dense = dense_map(session, dataset(), hydra.utils.instantiate(compose().densify), protocol)
+    truth = ground_truth_cloud(list(dataset()), dataset().intrinsics, protocol)
+    distance, _ = cKDTree(truth.points).query(dense.cloud.points)
+    assert np.median(distance) < 0.03
+
+
+@pytest.mark.slow
+def test_the_map_does_not_start_at_the_origin_but_at_the_first_true_pose_and_at_the_identity_without_one():
+    class Blind(ReadableFrames):
+        def __getitem__(self, index):
+            return replace(super().__getitem__(index), T_world_camera=None)
+
+    class Knowing(EditedPrior):
+        def predict(self, window, frames, intrinsics):
+            return super().predict(window, [dataset()[index] for index in window.views], intrinsics)
+
+    session = new_run(Blind(dataset()), exact()[0].config)
+    *_, (session, _, _) = map_frames(session, Blind(dataset()), Knowing())
+    session = finish_run(session)
+    origin = np.linalg.inv(dataset()[0].T_world_camera)
+    expected = np.stack([origin @ pose for pose in exact()[0].poses])
+    np.testing.assert_allclose(session.poses, expected, atol=1e-3)
+    assert session.true_poses == [None] * NUM_FRAMES

@@ -1,0 +1,242 @@
+"""Where a step begins once the camera is found; oracle: the pose and the unit that were found."""
+
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from loop_scene import matrix
+from scene import assert_same, random_gaussians, random_observation
+
+import emgs_jax
+from emgs_jax.device.arrays import to_se3
+from emgs_jax.gaussian_map import new_map
+from emgs_jax.localization import localize_coarse
+from emgs_jax.loop_closure.relocalization import RelocalizedPose
+from emgs_jax.mapping.convert import FirstWindow
+from emgs_jax.mapping.pipeline import reanchor_prior
+from emgs_jax.mapping.records import RELOCALIZED, FrameRecord
+from emgs_jax.mapping.relocalization import (
+    anchor_motion,
+    anchor_motion_of,
+    as_step_prediction,
+    is_relocalization_due,
+    is_restart_due,
+    move_prediction,
+    rejection,
+    relocalized_start,
+    replace_map,
+)
+from emgs_jax.mapping.run import MappingRun, new_run
+from emgs_jax.observation import Prediction
+from emgs_jax.ops.camera import Camera
+from emgs_jax.pose_graph.factors import ODOMETRY
+from emgs_jax.registration.pose_estimate import exact_estimate
+from emgs_jax.slam import SlamState
+
+load_config = cache(emgs_jax.load_config)  # nobody changes what it gives
+localized = eqx.filter_jit(localize_coarse)
+PLACE = matrix((10, -70, 20), (3.0, -2.0, 1.0))
+FOUND_THERE = RelocalizedPose(PLACE, float(np.log(1.1)), 1e-4 * np.eye(7), 4)
+CAMERA = Camera((5.0, 5.0), (2.0, 1.5), 5, 4)  # of 20 rows
+
+
+def prediction() -> Prediction:
+    poses = [matrix((0, 5 * k, 0), (0.1 * k, 0, 0.3)) for k in (1, 2, 3)]
+    return Prediction(
+        current=random_observation(20, seed=1),
+        previous=random_observation(20, seed=2),
+        T_world_views=to_se3(np.stack(poses)),
+        T_world_anchor=to_se3(matrix((0, 0, 30), (1, 1, 1))),
+        has_newest=jnp.asarray(True),
+        is_repeat=jnp.asarray(True),
+    )
+
+
+def some_map():
+    return new_map(random_gaussians(30), jnp.ones(30), jnp.ones(()), jnp.asarray(0, jnp.int32))
+
+
+def run(state: SlamState | None = None, saved_map=None, **more) -> SimpleNamespace:
+    end = SimpleNamespace(poses=[np.eye(4)] * 7, config=load_config("graph=default").graph)
+    saved = None if saved_map is None else SimpleNamespace(map=saved_map, back_end=end, depth_noise=0.02)
+    return SimpleNamespace(state=state, saved=saved, back_end=end, **more)
+
+
+def lost_state() -> SlamState:
+    estimate = replace(
+        exact_estimate(), depth_noise=jnp.asarray(0.03), log_scale=jnp.asarray(0.2), num_scales=jnp.asarray(9.0)
+    )
+    return SlamState(some_map(), random_observation(20), jaxlie.SE3.identity(), estimate, jnp.asarray(12, jnp.int32))
+
+
+@pytest.mark.parametrize("coarse", ["via_previous", "same_image", "anchored", "fused"])
+def test_the_coarse_pose_of_the_step_is_where_the_camera_was_found(coarse):
+    """By every reading: the frame before is this one, and the prior's world is moved to it."""
+    config = load_config(f"slam.localization.coarse={coarse}").slam.localization
+    state, again = relocalized_start(run(lost_state()), prediction(), FOUND_THERE)
+    last = state.previous, state.T_world_previous
+    pose = localized(again, *last, CAMERA, config, state.estimate)
+    np.testing.assert_allclose(pose.T_world_camera.as_matrix(), PLACE, atol=1e-4)
+    np.testing.assert_allclose(pose.scale, 1.1, rtol=2e-3)  # .1 from the mean so far, .01 against .1
+    _, here, there = np.array(prediction().T_world_views.as_matrix())
+    motion = np.linalg.inv(here) @ there
+    motion[:3, 3] *= 1.1
+    np.testing.assert_allclose(pose.T_world_newest.as_matrix(), PLACE @ motion, atol=1e-3)
+
+
+def test_map_unit_and_time_of_a_lost_run_go_on():
+    before = lost_state()
+    state, again = relocalized_start(run(before), prediction(), FOUND_THERE)
+    assert_same(state.map, before.map)
+    assert not again.is_repeat  # it is its own previous frame
+    assert int(state.time) == 12 and float(state.estimate.num_scales) == 9
+    np.testing.assert_array_equal(state.estimate.log_scale, before.estimate.log_scale)
+    np.testing.assert_allclose(state.estimate.covariance, FOUND_THERE.covariance)
+
+
+def test_in_a_saved_map_the_unit_is_what_the_first_frame_found_says():
+    state, _ = relocalized_start(run(saved_map=some_map()), prediction(), FOUND_THERE)
+    assert_same(state.map, some_map())
+    assert int(state.time) == 7 and float(state.estimate.num_scales) == 1
+    np.testing.assert_allclose([state.estimate.log_scale, state.estimate.depth_noise], [np.log(1.1), 0.02], rtol=1e-6)
+
+
+def test_features_of_another_width_are_refused():
+    wide = new_map(random_gaussians(30, num_features=8), jnp.ones(30), jnp.ones(()), jnp.asarray(0, jnp.int32))
+    with pytest.raises(ValueError, match=r"width 8 and those of this run 0: use prior= and features="):
+        relocalized_start(run(saved_map=wide), prediction(), FOUND_THERE)
+
+
+def test_from_then_on_the_prior_says_its_poses_from_where_the_camera_was_found():
+    given, scale = prediction(), jnp.asarray(1.1)
+    motion = anchor_motion(given, to_se3(PLACE), scale)
+    there = move_prediction(given, motion)
+    anchor, current = (
+        np.array(T.as_matrix()) for T in (there.T_world_anchor, jaxlie.SE3(there.T_world_views.wxyz_xyz[1]))
+    )
+    relative = np.linalg.inv(anchor) @ current
+    relative[:3, 3] *= 1.1  # as `localize_coarse` scales it
+    np.testing.assert_allclose(anchor @ relative, PLACE, atol=1e-5)
+    assert move_prediction(given, None) is given
+    record = FrameRecord(0, None, None, "tracked", pose=PLACE, scale=1.1)
+    np.testing.assert_allclose(anchor_motion_of(record, given).wxyz_xyz, motion.wxyz_xyz, atol=1e-6)
+
+
+def test_a_frame_of_its_own_is_where_the_camera_was_found_and_goes_with_it_from_then_on():
+    own = matrix((0, 40, 0), (1, 2, 3))
+    record = FrameRecord(0, None, None, "tracked", pose=PLACE, scale=1.1, location=RELOCALIZED)
+    session = MappingRun(None, None, records=(record,))
+    given = SimpleNamespace(structure=2, frames=[SimpleNamespace(index=5)], T_anchor_views={5: own})
+    session = reanchor_prior(session, given)
+    np.testing.assert_allclose(session.structure.T_world_structure @ own, PLACE, atol=1e-12)
+    assert session.structure.number == 2
+    np.testing.assert_allclose(session.prior_motion.as_matrix(), np.eye(4))  # None would stay behind in a closure
+
+
+def test_the_first_view_of_a_sequence_is_its_own_previous_one():
+    views = jax.tree.map(lambda leaf: leaf[None], random_observation(20))
+    found = as_step_prediction(FirstWindow(views, to_se3(PLACE[None])))
+    assert_same(found.current, random_observation(20))
+    assert_same(found.previous, found.current)
+    np.testing.assert_allclose(found.T_world_views.as_matrix(), [PLACE] * 3, atol=1e-5)
+    assert as_step_prediction(prediction()).has_newest and not found.has_newest
+
+
+@pytest.mark.parametrize(
+    ("statuses", "is_tracked", "expected"),
+    [
+        (["tracked", "degraded", "lost"], False, True),  # the third in a row
+        (["tracked", "degraded", "lost"], True, False),
+        (["degraded", "tracked", "lost"], False, False),
+        (["initialization", "lost"], False, False),
+    ],
+)
+def test_a_camera_is_looked_for_after_some_frames_that_are_not_tracked(statuses, is_tracked, expected):
+    info = SimpleNamespace(localization=SimpleNamespace(is_tracked=is_tracked))
+    records = [FrameRecord(row, None, None, status) for row, status in enumerate(statuses)]
+    assert is_relocalization_due(run(lost_state(), records=records), info) == expected
+    assert is_relocalization_due(run(saved_map=some_map(), records=[]), None)
+    without = run(lost_state(), records=records)
+    without.back_end = None
+    assert not is_relocalization_due(without, info)
+
+
+def begins_anew(
+    chain=((3, 2), (4, 3), (5, 4), (6, 5)), here=(6, 7), repeat_rms=0.01, is_lost=False, is_fixed=False, patience=5
+) -> bool:
+    """The last five of eight frames, the given one included, are not tracked; without changes all speaks for it."""
+    config = load_config("graph=default", f"graph.relocalization.max_patience={patience}")
+    poses = np.stack([matrix((0, 0, 0), (0.1 * k, 0, 0)) for k in range(8)])
+    end = SimpleNamespace(poses=list(poses[:7]), config=config.graph)
+    end.factors = [SimpleNamespace(a=a, b=b, kind=ODOMETRY) for a, b in chain]
+    end.is_placed, end.first_node = [True] * 3 + [False] * 4, 0
+    statuses = ["initialization", "tracked", "tracked", *["degraded"] * 4]
+    records = [FrameRecord(row, None, None, status) for row, status in enumerate(statuses)]
+    found = SimpleNamespace(is_tracked=False, is_lost=is_lost, repeat_rms=repeat_rms)
+    given = SimpleNamespace(frames=[SimpleNamespace(index=7)], T_anchor_views={view: poses[view] for view in here})
+    return is_restart_due(
+        SimpleNamespace(back_end=end, records=records, is_fixed=is_fixed, config=config.slam),
+        given,
+        lost_state(),
+        SimpleNamespace(localization=found),
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, True),
+        ({"patience": 6}, False),  # not yet
+        ({"chain": ((4, 3), (5, 4), (6, 5))}, False),  # nothing leads from a frame that was placed
+        ({"chain": ((3, 2), (4, 3), (5, 4))}, False),
+        ({"chain": ((6, 2),)}, True),  # the prior had lost what is between
+        ({"chain": ((6, 0),)}, False),  # the anchor
+        ({"chain": ((3, 2), (6, 4), (5, 4))}, False),
+        ({"here": (7,)}, False),
+        ({"here": (6,)}, False),
+        ({"repeat_rms": 1.0}, False),  # the prior says something else each time
+        ({"is_lost": True}, False),
+        ({"is_fixed": True}, False),
+    ],
+)
+def test_a_map_begins_anew_only_where_the_prior_leads_and_knows_what_it_sees(changes, expected):
+    assert begins_anew(**changes) is expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, None),
+        ({"is_tracked": False}, "fine_pose"),
+        ({"inlier_fraction": 0.3}, "fine_pose"),
+        ({"step_m": 1.0}, "fine_pose"),
+        ({"step_rad": 0.1}, "fine_pose"),
+    ],
+)
+def test_the_map_has_the_last_word(changes, expected):
+    values = {"is_tracked": True, "inlier_fraction": 0.8, "step_m": 0.01, "step_rad": 0.01} | changes
+    found = SimpleNamespace(icp=SimpleNamespace(inlier_fraction=values.pop("inlier_fraction")), **values)
+    config = load_config("graph=default").graph.relocalization
+    assert rejection(SimpleNamespace(localization=found), prediction(), FOUND_THERE, config) == expected
+
+
+def test_a_first_window_as_a_whole_has_no_place_in_a_saved_map():
+    frames = SimpleNamespace(intrinsics=(1.0, 1.0, 0.0, 0.0), size=(5, 4))
+    slam = load_config("slam.initialization=merged").slam
+    with pytest.raises(ValueError, match="use slam.initialization=incremental"):
+        new_run(frames, slam, saved=SimpleNamespace(map=some_map(), back_end=None))
+
+
+def test_a_map_that_stays_gets_the_room_of_the_others_and_keeps_its_rows():
+    state = lost_state()
+    same = replace_map(state, state.map, 30)
+    assert_same(same.map, state.map)
+    larger = replace_map(state, state.map, 64).map
+    assert larger.weight.shape == (64,) and int(larger.gaussians.valid.sum()) == 30
+    assert_same(jax.tree.map(lambda leaf: leaf[:30], larger), state.map)
