@@ -93,6 +93,7 @@ class CoarsePose(eqx.Module):
         mean_depth: m; of the previous image, scaled.
         depth_noise: as a fraction; the larger of this disagreement and what the previous frame differed from the map.
         estimate: covariance of this pose and scale; the rest of the frame before.
+        is_known: False where the prediction has no pose: this one is that of the frame before.
         is_usable: False where the prediction has no valid point or pose.
     """
 
@@ -103,6 +104,7 @@ class CoarsePose(eqx.Module):
     mean_depth: Float[Array, ""]
     depth_noise: Float[Array, ""]
     estimate: PoseEstimate
+    is_known: Bool[Array, ""]
     is_usable: Bool[Array, ""]
 
 
@@ -251,7 +253,7 @@ def localize_coarse(
     has_newest = prediction.has_newest & is_finite & jnp.all(jnp.isfinite(newest.wxyz_xyz))
     newest = jaxlie.SE3(jnp.where(has_newest, newest.wxyz_xyz, coarse.wxyz_xyz))
     is_usable = is_finite & (jnp.sum(prediction.current.valid) >= MIN_PAIRS)
-    return CoarsePose(coarse, newest, scale, repeat_rms, mean_depth, depth_noise, estimate, is_usable)
+    return CoarsePose(coarse, newest, scale, repeat_rms, mean_depth, depth_noise, estimate, is_finite, is_usable)
 
 
 @full_precision
@@ -300,7 +302,7 @@ def localize_fine(
     estimate = correct_by_points(coarse.estimate, info, coarse.depth_noise, scale, is_tracked, config.num_alike)
     outcome = LocalizationInfo(
         is_tracked=is_tracked,
-        is_lost=~coarse.is_usable,
+        is_lost=~coarse.is_known,
         reason=bits,
         scale=scale,
         repeat_rms=coarse.repeat_rms,

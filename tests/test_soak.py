@@ -26,7 +26,7 @@ def test_no_scene_poisons_the_map_and_every_frame_has_a_status(name):
     if name in ("static", "exposure jump"):
         assert "tracked" in curves.status[-3:], "what is easy is tracked"
     if name == "black frames":
-        assert set(curves.status[5:8]) == {"lost"}, "where nothing is known nothing is fused"
+        assert set(curves.status[5:8]) == {"degraded"}, "where nothing is seen nothing is fused"
         assert curves.num_gaussians[7] == curves.num_gaussians[4]
 
 

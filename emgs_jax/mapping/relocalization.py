@@ -46,7 +46,7 @@ def is_restart_due(run: MappingRun, window: WindowInput, state: SlamState, info:
     """
     count = _num_untracked(run, info)
     is_due = not run.is_fixed and count >= run.back_end.config.relocalization.max_patience
-    if not is_due or info.localization.is_lost or not _is_connected(run.back_end, window):
+    if not is_due or not np.any(state.previous.valid) or not _is_connected(run.back_end, window):
         return False
     depths = np.asarray(depth_in(state.T_world_previous, state.previous))
     depth = np.median(depths[np.asarray(state.previous.valid)])

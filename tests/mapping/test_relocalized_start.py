@@ -168,7 +168,7 @@ def test_a_camera_is_looked_for_after_some_frames_that_are_not_tracked(statuses,
 
 
 def begins_anew(
-    chain=((3, 2), (4, 3), (5, 4), (6, 5)), here=(6, 7), repeat_rms=0.01, is_lost=False, is_fixed=False, patience=5
+    chain=((3, 2), (4, 3), (5, 4), (6, 5)), here=(6, 7), repeat_rms=0.01, has_points=True, is_fixed=False, patience=5
 ) -> bool:
     """The last five of eight frames, the given one included, are not tracked; without changes all speaks for it."""
     config = load_config("graph=default", f"graph.relocalization.max_patience={patience}")
@@ -178,12 +178,14 @@ def begins_anew(
     end.is_placed, end.first_node = [True] * 3 + [False] * 4, 0
     statuses = ["initialization", "tracked", "tracked", *["degraded"] * 4]
     records = [FrameRecord(row, None, None, status) for row, status in enumerate(statuses)]
-    found = SimpleNamespace(is_tracked=False, is_lost=is_lost, repeat_rms=repeat_rms)
+    found = SimpleNamespace(is_tracked=False, repeat_rms=repeat_rms)
+    state = lost_state()
+    state = eqx.tree_at(lambda s: s.previous.valid, state, state.previous.valid & has_points)
     given = SimpleNamespace(frames=[SimpleNamespace(index=7)], T_anchor_views={view: poses[view] for view in here})
     return is_restart_due(
         SimpleNamespace(back_end=end, records=records, is_fixed=is_fixed, config=config.slam),
         given,
-        lost_state(),
+        state,
         SimpleNamespace(localization=found),
     )
 
@@ -201,7 +203,7 @@ def begins_anew(
         ({"here": (7,)}, False),
         ({"here": (6,)}, False),
         ({"repeat_rms": 1.0}, False),  # the prior says something else each time
-        ({"is_lost": True}, False),
+        ({"has_points": False}, False),
         ({"is_fixed": True}, False),
     ],
 )

@@ -178,6 +178,30 @@ def known_common(structure: Structure, a: View, b: View) -> tuple[np.ndarray, np
     return rows_a[is_known], rows_b[is_known]
 
 
+def confirmed(structure: Structure, view: View, others: Sequence[View], max_error: float) -> np.ndarray:
+    """Mark the landmarks (l,) that a placed view shows, and one of other placed views too, there where they are.
+
+    Where a camera turns on the spot the rays of a wrong match meet, too: close to the camera. A view from elsewhere
+    shows nothing there.
+
+    Args:
+        structure: of the views.
+        view: whose landmarks are asked for.
+        others: views from elsewhere.
+        max_error: of a keypoint from its landmark's image, pixels.
+    """
+    marked = np.zeros(len(structure.points), bool)
+    for other in others:
+        _, rows = known_common(structure, view, other)
+        ids = other.landmark[rows]
+        local = (structure.points[ids] - other.T_ref_view[:3, 3]) @ other.T_ref_view[:3, :3]
+        seen = local[:, 2] > 0
+        ids, pixels, local = ids[seen], other.pixels[rows[seen]], local[seen] @ structure.K.T
+        error = np.linalg.norm(local[:, :2] / local[:, 2:] - pixels, axis=1)
+        marked[ids[error < max_error]] = True
+    return marked
+
+
 def relative_pose(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, int, float] | None:
     """T_a_b with a unit baseline from the landmarks that two views share; None without enough of them.
 

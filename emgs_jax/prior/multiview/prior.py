@@ -35,7 +35,7 @@ from emgs_jax.prior.multiview.depth import DepthConfig, agreement, estimate_dept
 from emgs_jax.prior.multiview.incremental import StructureConfig, extend
 from emgs_jax.prior.multiview.initialization import begin_again, initialize
 from emgs_jax.prior.multiview.keys import kept, key_views
-from emgs_jax.prior.multiview.landmarks import Structure, detect, forget, link
+from emgs_jax.prior.multiview.landmarks import Structure, confirmed, detect, forget, link
 from emgs_jax.prior.multiview.lens import as_shown, points_shown, rectify, straight
 from emgs_jax.prior.multiview.planar import PlanarConfig, fill_planes
 from emgs_jax.prior.multiview.sources import choose, parallax
@@ -98,7 +98,7 @@ class MultiviewStereo(Prior):
     def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:
         self._structure_config, self._dense_config = structure, dense
         settings = {"structure": _values(structure), "dense": _values(dense)}
-        self.provenance = Provenance("multiview_stereo", {"version": 7} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 8} | settings)
         self._next = 0
         self._structure = Structure(np.eye(3))
 
@@ -213,9 +213,10 @@ class MultiviewStereo(Prior):
         sources = self._sources(frame)
         if not sources:
             return nothing, nothing
-        known = self._structure.known(view)
-        T_view_ref = np.linalg.inv(view.T_ref_view)
-        z = self._structure.points[view.landmark[known]] @ T_view_ref[2, :3] + T_view_ref[2, 3]
+        max_error = self._structure_config.matching.max_reprojection_error
+        views = [self._structure.views[other] for other in sources]
+        points = self._structure.points[confirmed(self._structure, view, views, max_error)]
+        z = (points - view.T_ref_view[:3, 3]) @ view.T_ref_view[:3, 2]
         z = z[z > 0]
         if not len(z):
             return nothing, nothing

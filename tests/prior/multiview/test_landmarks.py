@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from stereo_scene import arc, calibration, cloud, projected, structure_config, structure_of, views_of, whose
+from stereo_scene import arc, calibration, cloud, matrix, projected, structure_config, structure_of, views_of, whose
 
 from emgs_jax.keypoints.sift import mutual
 from emgs_jax.prior.multiview.landmarks import (
     NONE,
     View,
+    confirmed,
     detect,
     forget,
     link,
@@ -269,6 +270,23 @@ def test_rays_without_parallax_or_that_do_not_meet_give_no_point():
     structure.views[2].pixels += (0.0, 4 * CONFIG.max_reprojection_error)
     triangulate(structure, CONFIG)
     assert np.isnan(structure.points).all()
+
+
+def test_a_wrong_match_of_a_camera_that_turns_on_the_spot_is_confirmed_by_no_view_from_elsewhere():
+    """Its rays meet 2 cm from the camera; four such landmarks spent most planes of a sweep there."""
+    turned, elsewhere = matrix((0.0, 0.1, 0.0), (0.003, 0.0, 0.0)), matrix(translation=(0.25, 0.0, 0.0))
+    points = np.concatenate([cloud(12), [[0.001, 0.002, 0.02]]])
+    seen_by = np.ones((3, 13), bool)
+    seen_by[2, 0] = False
+    structure = placed_structure(np.stack([np.eye(4), turned, elsewhere]), points, seen_by)
+    structure.points, (view, beside, far) = points, structure.views.values()
+    far.pixels[12] = view.pixels[12]
+    assert confirmed(structure, view, [beside], CONFIG.max_reprojection_error).all()
+    np.testing.assert_array_equal(
+        confirmed(structure, view, [far], CONFIG.max_reprojection_error), [False] + [True] * 11 + [False]
+    )
+    far.T_ref_view = matrix((0.0, np.pi, 0.0))  # all are behind it
+    assert not confirmed(structure, view, [far], np.inf).any()
 
 
 def test_a_view_is_placed_where_it_is_despite_wrong_landmarks_and_with_too_few_it_is_not():
