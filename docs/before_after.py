@@ -46,7 +46,7 @@ def before(run: RecordedRun, dataset, prior, config) -> Panel:
     """What the prior says by itself."""
     views = (view for given in window_inputs(dataset, prior, build(config, "slam")) for view in given.raw)
     evaluation = build(config, "evaluation")
-    cloud = gather(views, evaluation, keeps_depths=False).cloud.averaged(evaluation.voxel_m)
+    cloud = gather(views, evaluation, keeps_points=False).cloud.averaged(evaluation.voxel_m)
     errors = run.metrics["raw_prior/trajectory/ate_sim3_m"], run.metrics["raw_prior/reconstruction/accuracy_m"]
     return Panel("Before: the predictions as they come", cloud.points, cloud.colors, run.raw, *errors)
 
@@ -86,7 +86,7 @@ def main(folder: Path) -> None:
     walls = true_cloud(dataset, build(config, "evaluation")).cloud.points
     figure = Figure(figsize=(14, 9.6), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
-    top, bottom = figure.subfigures(2, 1, height_ratios=(1, 4))
+    top, bottom = np.ravel(figure.subfigures(2, 1, height_ratios=(1, 4)))
     title = f"{len(dataset)} colour images of a walk through the built-in apartment; prior {prior.provenance.name}"
     top.suptitle(title, fontsize=15)
     rows = np.linspace(0, len(dataset), NUM_IMAGES, endpoint=False).astype(int)

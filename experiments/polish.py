@@ -7,8 +7,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.configure import build
 from emgs_jax.report.page import write_report
-from emgs_jax.report.polish import SPLATS_FILE, polish
-from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.polish import polish
+from emgs_jax.report.printout import polish_lines
+from emgs_jax.report.recorded_run import SPLATS_FILE, read_run
 
 from .command import command
 from .report import images_of, positional
@@ -29,12 +30,8 @@ def polish_run(config: DictConfig) -> dict[str, Any]:
 @command("polish", positional)
 def main(config: DictConfig) -> None:
     """Polish, and say what it has changed on the frames that were held out."""
-    found = polish_run(config)
-    for name in ("psnr_db", "ssim", "depth_within_5_percent", "depth_l1_m", "ate_m"):
-        before, after = (found.get(f"polish/{when}_{name}") for when in ("before", "after"))
-        if before is not None and after is not None:
-            print(f"{name:24} {before:8.4g} → {after:.4g}")
-    print(f"{found['polish/num_splats']:,} splats are in {config.folder}/{SPLATS_FILE}")
+    print("\n".join(polish_lines(polish_run(config))))
+    print(f"everything is in {config.folder}, {SPLATS_FILE} has the splats")
 
 
 if __name__ == "__main__":

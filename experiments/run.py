@@ -39,7 +39,8 @@ from emgs_jax.report.metrics import (
     spent,
 )
 from emgs_jax.report.page import write_report
-from emgs_jax.report.printout import frame_lines, last_words, metrics_table, time_words
+from emgs_jax.report.polish import polish, require_optax
+from emgs_jax.report.printout import frame_lines, last_words, metrics_table, polish_lines, time_words
 from emgs_jax.report.provenance import is_metric, provenance, signature, write_metrics
 from emgs_jax.report.recorded_run import REPORT_FILE, read_run
 from emgs_jax.report.run_files import claim_folder, save_classes, save_outputs, save_progress
@@ -67,6 +68,9 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             saved = load_saved_map(config.map, config.map_mode, graph, dataset.intrinsics, float(slam.fit.min_std))
             session = new_run(dataset, slam, clock, graph=graph, saved=saved)
             watched = build(config, "view") if config.view else None
+            fitting = build(config, "polish") if config.polish else None
+            if fitting is not None:
+                require_optax()
             live = stack.enter_context(live_view(watched, session, densify.render, prior, dataset.kept))
             baselines = Baselines(fused, slam.observation, dataset)
             settings = OmegaConf.to_container(config, resolve=True)
@@ -78,29 +82,32 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             tqdm.write(note)
         keeps_points = dataset.has_ground_truth or densify.points == "own"
         session, raw = _map(session, dataset, prior, (baselines, evaluation, keeps_points), folder, keeper, live)
-        with clock.phase("export"):
-            save_progress(folder, session)
-        with _said(clock, "densify", "drawing the map from the pose of every frame"):
-            labelled = labelled_map(session, prior)
-            dense = dense_map(session, dataset, densify, evaluation, labelled, own=raw.points)
-        with _said(clock, "export", "writing the map, its points, a mesh and the overview"):
-            title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
-            unit = "m" if is_metric(prior.provenance.settings) else "units"
-            notes = save_outputs(folder, session, dense, densify, title, evaluation.alignment == "sim3", unit)
-            save_classes(folder, prior)
-        compared = ", ".join(["the map", "the raw prior", *fused]) if dataset.has_ground_truth else ""
-        with _said(clock, "evaluate", compared and f"comparing with the truth: {compared}"):
-            scorer = new_scorer(dataset, evaluation, prior)
-            labels = None if labelled is None else labelled.centers
-            with ThreadPoolExecutor(1, "raw prior") as thread:
-                of_prior = thread.submit(score_prior, session, raw, scorer)
-                metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer)
-                metrics |= dense.rendering | of_prior.result()
-            metrics |= score_baselines(session, baselines, raw, scorer)
+        # What needs no drawing of the map is compared with the truth while the map is drawn and written.
+        with ThreadPoolExecutor(2, "raw prior") as threads:
+            truth = threads.submit(new_scorer, dataset, evaluation, prior)
+            of_prior = threads.submit(lambda: score_prior(session, raw, truth.result()))
+            with clock.phase("export"):
+                save_progress(folder, session)
+            with _said(clock, "densify", "drawing the map from the pose of every frame"):
+                labelled = labelled_map(session, prior)
+                dense = dense_map(session, dataset, densify, evaluation, labelled, own=raw.points)
+            with _said(clock, "export", "writing the map, its points, a mesh and the overview"):
+                title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
+                unit = "m" if is_metric(prior.provenance.settings) else "units"
+                notes = save_outputs(folder, session, dense, densify, title, evaluation.alignment == "sim3", unit)
+                save_classes(folder, prior)
+            compared = ", ".join(["the map", "the raw prior", *fused]) if dataset.has_ground_truth else ""
+            with _said(clock, "evaluate", compared and f"comparing with the truth: {compared}"):
+                scorer, labels = truth.result(), None if labelled is None else labelled.centers
+                metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer) | dense.rendering
+                metrics |= of_prior.result() | score_baselines(session, baselines, raw, scorer)
         metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()
     metrics["provenance"] = origin
     write_metrics(folder / "metrics.json", metrics)
     keeper.drop()
+    if fitting is not None:
+        with _said(clock, "polish", "fitting splats to the images"):
+            notes = [*notes, *polish_lines(polish(read_run(folder), dataset, fitting, densify))]
     with _said(clock, "report", f"writing {REPORT_FILE}"):
         write_report(read_run(folder), dataset)
     if live is not None:

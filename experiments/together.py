@@ -55,6 +55,8 @@ def refuse_other_maps(config: DictConfig, what: str) -> None:
         raise ValueError(f"map= is for run and evaluate: {what} makes its own maps")
     if config.graph:
         raise ValueError(f"graph= is for run and evaluate: {what} steps many maps at once, and no loop closes in them")
+    if config.polish:
+        raise ValueError(f"polish= is for run and evaluate: {what} draws maps as they are")
     if config.view:
         raise ValueError(f"view= is for run and evaluate: {what} maps many settings at once")
 

@@ -27,7 +27,7 @@ from emgs_jax.config.values import check_values
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.featured import Featured, Requeried
-from emgs_jax.prior.files.depth_unit import check_depth_unit
+from emgs_jax.prior.files.truth import check_truth
 
 if TYPE_CHECKING:
     from emgs_jax.back_end.state import BackEndConfig
@@ -196,8 +196,9 @@ def build_dataset(config: DictConfig) -> ReadableFrames:
         tqdm.write(dataset.calibration["note"])
     progress = partial(tqdm, desc="checking", unit="frame")
     frames = ReadableFrames(dataset, config.on_bad_frame, config.checksums, progress)
-    if config.dataset.get("depth_scale") is not None:  # else the data set knows
-        check_depth_unit(frames, float(config.dataset.depth_scale))
+    if "depth_scale" in config.dataset:  # files of depths; None: the data set knows
+        scale = config.dataset.depth_scale
+        check_truth(frames, None if scale is None else float(scale))
     return frames
 
 

@@ -123,12 +123,17 @@ def _load_text(folder: Path) -> SparseModel:
         ids.append(camera_id)
         poses.append(pose)
         after, points = next(lines, (number + 1, ""))
-        if len(points.split()) % 3:
+        words = points.split()
+        if len(words) % 3 or (words and not _is_whole(words[-1])):  # a name of three words is no point
             raise ValueError(
                 f"{images_file}:{after}: expected the points of image {name} (X Y POINT3D_ID each) or an empty line, "
                 f"got {points[:80]!r}: every image has two lines"
             )
     return _checked(SparseModel(cameras, names, ids, _inverted(poses), (cameras_file, images_file)), folder)
+
+
+def _is_whole(word: str) -> bool:
+    return word.removeprefix("-").isdecimal()
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:

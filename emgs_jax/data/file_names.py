@@ -15,7 +15,9 @@ DATE = re.compile(r"(?<!\d)(20\d\d)([-_.]?)(\d\d)\2(\d\d)[-_.T ]?(\d\d)([-_.:]?)
 PARTS = re.compile(r"(\d{10})[-_](\d{9})$")  # seconds since 1970 and nanoseconds, as drivers of ROS write them
 
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+OTHER_SUFFIXES = (".heic", ".heif", ".avif", ".jxl", ".gif", ".exr", ".hdr", ".ppm", ".pgm", ".dng", ".cr2", ".cr3")
+OTHER_SUFFIXES += (".nef", ".arw", ".raf", ".orf", ".rw2", ".raw")
 
 
 def find_image(folder: Path, name: str) -> Path:
@@ -32,6 +34,16 @@ def find_image(folder: Path, name: str) -> Path:
                 if is_file(ended):
                     return ended
     return folder / name.replace("\\", "/")
+
+
+def unread_note(folder: Path) -> str | None:
+    """Words about the pictures of a folder that are of no format that is read."""
+    endings = [path.suffix.lower() for path in folder.iterdir() if not path.name.startswith(".")]
+    found = {ending: endings.count(ending) for ending in OTHER_SUFFIXES if ending in endings}
+    if not found:
+        return None
+    counts = ", ".join(f"{count} {ending}" for ending, count in found.items())
+    return f"{folder} has {counts}, which are not read: convert them to jpg or png"
 
 
 def is_file(path: Path) -> bool:

@@ -8,13 +8,15 @@ from jaxtyping import UInt8
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import Frame
-from emgs_jax.data.file_names import IMAGE_SUFFIXES, natural_key, times_of
+from emgs_jax.data.file_names import IMAGE_SUFFIXES, natural_key, times_of, unread_note
 from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens, with_notes
 from emgs_jax.data.reading import Size
 from emgs_jax.data.tones import Tones, read_shown, tones_of
 from emgs_jax.data.video import VIDEO_SUFFIXES, Video
 
-LAYOUT = "root[/sequence] = a folder of png, jpg, bmp or tiff images, or a video file (mp4, mov, m4v, avi, mkv, webm)"
+LAYOUT = (
+    "root[/sequence] = a folder of png, jpg, webp, bmp or tiff images, or a video file (mp4, mov, m4v, avi, mkv, webm)"
+)
 
 
 class Images:
@@ -105,12 +107,16 @@ class Folder:
         self._paths = sorted(found, key=lambda p: (natural_key(p), p.name))
         self.count = len(self._paths)
         self._times, note = times_of(self._paths)
-        self.notes: list[str | None] = [note]
+        self.notes: list[str | None] = [note, unread_note(folder)]
+        if not self._paths:
+            folders = [path.name for path in sorted(folder.iterdir()) if path.is_dir()]
+            below = f"it has the folders {', '.join(folders[:5])}: give one of them" if folders else None
+            raise ValueError("; ".join(filter(None, (f"{folder} ({LAYOUT}) has no images", below, self.notes[1]))))
         self.tones: Tones | None = None  # of the images in use
 
     def find_size(self, rows: range) -> Size:
         self.tones = tones_of([self._paths[row] for row in rows])
-        self.notes.append(self.tones and self.tones.note)
+        self.notes += [self.tones and self.tones.note, reading.transparency_note(self._paths[rows[0]])]
         return reading.first_size((self._paths[row] for row in rows), self.folder)
 
     def read(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:

@@ -17,7 +17,7 @@ from emgs_jax.data import reading
 from emgs_jax.data.base import Frame
 from emgs_jax.data.calibration_files import Calibration, colmap_camera, read_calibration
 from emgs_jax.data.colmap_model import BINARY, TEXT, load_colmap
-from emgs_jax.data.file_names import find_image, natural_key, times_of
+from emgs_jax.data.file_names import IMAGE_SUFFIXES, find_image, natural_key, times_of
 from emgs_jax.data.intrinsics import to_lens, with_notes
 from emgs_jax.data.tones import read_shown, tones_of
 from emgs_jax.data.transforms_json import load_transforms
@@ -25,7 +25,7 @@ from emgs_jax.data.transforms_json import load_transforms
 Pose = Float[np.ndarray, "4 4"]
 COLMAP_LAYOUT = "root[/sequence]/{images/, sparse/0/{cameras,images}.txt or .bin}"
 NERFSTUDIO_LAYOUT = "root[/sequence]/{transforms.json, images/}"
-MODEL_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0")
+MODEL_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0")  # sparse/0 stands for all that are numbered
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class Solved:
         source: the file that poses and camera come from.
         files: all that were read.
         times: seconds of each, where the images stand in order of time; None = from their names.
+        note: what is odd.
     """
 
     images: list[Path]
@@ -47,6 +48,7 @@ class Solved:
     source: Path
     files: tuple[Path, ...]
     times: list[float] | None = None
+    note: str | None = None
 
 
 class PosedImages:
@@ -76,7 +78,8 @@ class PosedImages:
         about = {"source": solved.source.name}
         self._lens = to_lens(solved.camera, self._raw_size, str(solved.source), about)
         self._tones = tones_of(self._images)
-        self.calibration = with_notes(self._lens.about, note, self._tones and self._tones.note)
+        shown = self._tones and self._tones.note, reading.transparency_note(self._images[0])
+        self.calibration = with_notes(self._lens.about, solved.note, note, *shown)
         self.sequence = sequence
         self.size = reading.check_size(size)
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
@@ -118,7 +121,7 @@ class Colmap(PosedImages):
     Args:
         root: folder of the project.
         sequence: folder below root; None = root itself.
-        model: folder of the model below that; None = the first of MODEL_FOLDERS that has one.
+        model: folder of the model below that; None = the first of MODEL_FOLDERS that has one, of several the largest.
         images: folder of the images below that.
         start, stop, stride: which of the registered images, in natural order of their names.
         size: (width, height) of the frames given out.
@@ -177,10 +180,21 @@ def find_model(folder: Path, model: str | None) -> Path:
     """The folder of a sparse model, or an error that names where one was looked for."""
     places = [folder / name for name in (MODEL_FOLDERS if model is None else (model,))]
     for place in places:
-        if any(all((place / name).is_file() for name in names) for names in (TEXT, BINARY)):
-            return place
+        beside = [place] if model is not None or place.name != "0" else _numbered(place.parent)
+        if there := [other for other in beside if _has_model(other)]:
+            return max(there, key=lambda other: len(load_colmap(other).names)) if len(there) > 1 else there[0]
     looked = ", ".join(str(place) for place in places)
     raise FileNotFoundError(f"no cameras and images (.txt or .bin) in {looked}; expected the layout {COLMAP_LAYOUT}")
+
+
+def _has_model(place: Path) -> bool:
+    return any(all((place / name).is_file() for name in names) for names in (TEXT, BINARY))
+
+
+def _numbered(folder: Path) -> list[Path]:
+    """The models that COLMAP numbers: what it could not join is in several, and the first need not be the largest."""
+    found = (path for path in folder.glob("*") if path.name.isdecimal())
+    return sorted(found, key=lambda path: int(path.name))
 
 
 def read_colmap(model: Path, folder: Path) -> Solved:
@@ -197,9 +211,11 @@ def read_colmap(model: Path, folder: Path) -> Solved:
             "--ImageReader.single_camera 1 where they were taken by one"
         )
     camera = colmap_camera([*used.pop()], found.files[0])
-    return Solved(
-        [find_image(folder, name) for name in found.names], [*found.T_world_camera], camera, found.files[1], found.files
-    )
+    images = [find_image(folder, name) for name in found.names]
+    there = sum(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.rglob("*"))
+    note = f"{found.files[1]} has {len(images)} of the {there} images in {folder}; the others have no pose"
+    lacking = note if there > len(images) else None
+    return Solved(images, [*found.T_world_camera], camera, found.files[1], found.files, note=lacking)
 
 
 def read_nerfstudio(path: Path) -> Solved:

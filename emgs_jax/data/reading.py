@@ -224,10 +224,24 @@ def first_size(paths: Iterable[Path], where: object, flags: int = 0) -> Size:
     """(width, height) of the first image that can be read, as `read_color` does."""
     for path in paths:
         try:
-            return decode(path, cv2.IMREAD_COLOR | flags).shape[1::-1]
+            return decode(path, OWN_BITS | flags).shape[1::-1]
         except BadFrameError:
             continue
     raise ValueError(f"{where}: none of its images can be read; fetch them again")
+
+
+def transparency_note(path: Path) -> str | None:
+    """Words where an image is transparent in places; None also for one that cannot be read."""
+    try:
+        image = decode(path, cv2.IMREAD_UNCHANGED)
+    except BadFrameError:
+        return None
+    if image.ndim < 3 or image.shape[2] != 4 or image[..., 3].min() == np.iinfo(image.dtype).max:
+        return None
+    return (
+        f"{path.name} is transparent in places, and maybe others: what is there is mapped in the colour that the file "
+        "has below (often black): take such pixels out of the predictions"
+    )
 
 
 def as_pose(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:

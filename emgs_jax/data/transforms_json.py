@@ -32,6 +32,8 @@ def load_transforms(path: Path) -> tuple[list[str], list[list[float]]]:
     for name, matrix in zip(names, matrices, strict=True):
         if not isinstance(name, str) or matrix.shape not in ((3, 4), (4, 4)):
             raise ValueError(f"{path}: frame {name!r} must have a transform_matrix of 4 rows of 4: export it again")
+    if len({*names}) < len(names):
+        raise ValueError(f"{path} has {next(n for n in names if names.count(n) > 1)} twice: export it again")
     bottom = [[0.0, 0.0, 0.0, 1.0]]
     return names, [((m if len(m) == 4 else np.vstack([m, bottom])) * FLIP).ravel().tolist() for m in matrices]
 

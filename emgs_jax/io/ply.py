@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.io.files import atomic_write
 
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
-_SH_C0 = 0.28209479177387814  # constant of the zeroth spherical harmonic, as 3DGS viewers use it
+SH_C0 = 0.28209479177387814  # constant of the zeroth spherical harmonic, as 3DGS viewers use it
 
 
 def save_gaussians_ply(
@@ -38,7 +38,7 @@ def save_gaussians_ply(
     means, covs, colors = (np.asarray(value, np.float64) for value in (means, covs, colors))
     normals = np.zeros_like(means) if normals is None else np.asarray(normals, np.float64)
     opacity = np.broadcast_to(np.asarray(opacity, np.float64), len(means)).clip(1e-6, 1 - 1e-6)
-    flat = np.concatenate([means, normals, (colors - 0.5) / _SH_C0, np.log(opacity / (1 - opacity))[:, None]], 1)
+    flat = np.concatenate([means, normals, (colors - 0.5) / SH_C0, np.log(opacity / (1 - opacity))[:, None]], 1)
     keep = np.isfinite(flat).all(1) & np.isfinite(covs).all((1, 2))
     variances, axes = np.linalg.eigh(covs[keep])
     axes *= np.sign(np.linalg.det(axes))[:, None, None]  # a rotation, not a reflection

@@ -130,6 +130,10 @@ def fit(
     offsets = jnp.zeros((count, 6))
     state = State(fitted, offsets, adam.init(fitted), jax.vmap(adam.init)(offsets))
 
+    each = config.rates
+    rates = {"colors": each.colors, "logit": each.logit, "log_std": each.log_std}
+    rates |= {"turn": each.turn, "shift": each.shift}
+
     @eqx.filter_jit
     def step(state: State, anchors: Anchors, view: View, decay: Array, terms: LossConfig):
         place = jax.tree.map(lambda x: x[view.row], (state.offsets, state.pose_moments))
@@ -139,10 +143,11 @@ def fit(
 
         (_, (error, overflow)), (slope, turn) = jax.value_and_grad(total, (0, 1), has_aux=True)(state.fitted, place[0])
         change, moments = adam.update(slope, state.moments)
-        rates = {name: decay * rate for name, rate in vars(config.rates).items()}
         move, pose_moments = adam.update(turn, place[1])
-        place = place[0] - rates.pop("pose") * move, pose_moments
-        parts = {name: getattr(state.fitted, name) - rate * getattr(change, name) for name, rate in rates.items()}
+        place = place[0] - decay * config.rates.pose * move, pose_moments
+        parts = {
+            name: getattr(state.fitted, name) - decay * rate * getattr(change, name) for name, rate in rates.items()
+        }
         places = jax.tree.map(lambda x, y: x.at[view.row].set(y), (state.offsets, state.pose_moments), place)
         return (State(Appearance(**parts), places[0], moments, places[1]), error), overflow
 

@@ -133,8 +133,10 @@ def light_before(
 
 def _add(sums: Sums, chunks: Chunks, weights: Float[Array, "c k q"], depth: Array, values: Array) -> Sums:
     """The sums over the splats so far, with those of some chunks."""
-    moments = jnp.stack([weights, weights * depth, weights * depth**2], axis=-2).sum(axis=1)
-    more = jnp.einsum("ckv,ckq->cvq", values[chunks.rows], weights), *jnp.unstack(moments, axis=1)
+    # Sums as products with ones: a reduction is one thread's work on a CPU.
+    ones = jnp.ones((*weights.shape[:2], 1))
+    moments = (jnp.einsum("cko,ckq->cq", ones, weights * depth**power) for power in range(3))
+    more = jnp.einsum("ckv,ckq->cvq", values[chunks.rows], weights), *moments
     return jax.tree.map(lambda x, y: x.at[chunks.tiles].add(y, mode="drop"), sums, more)
 
 

@@ -1,7 +1,11 @@
 """Gaussians as viewers draw them: wide enough along the surface that it has no gaps."""
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
+
+from emgs_jax.gaussians import Gaussians
 
 NUM_NEIGHBOURS = 6  # as many as touch a disc in a dense packing
 REACH = 2.0  # standard deviations at which a neighbour may be: opacities of .9 then add up to .9 between them and more
@@ -32,3 +36,11 @@ def closing_covariances(means: np.ndarray, covs: np.ndarray, normals: np.ndarray
     distance_sq = np.sort(np.where(faces_alike, distance_sq, np.inf), axis=1)
     widening = np.clip(distance_sq[:, min(NUM_NEIGHBOURS, rows.shape[1]) - 1] / REACH**2, 1.0, LARGEST**2)
     return covs + (widening - 1.0)[:, None, None] * (plane @ covs @ plane)
+
+
+def closed(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians with `closing_covariances`; for display only."""
+    rows = np.flatnonzero(gaussians.valid)
+    covs = np.array(gaussians.covs)
+    covs[rows] = closing_covariances(*(np.asarray(x)[rows] for x in (gaussians.means, covs, gaussians.normals)))
+    return eqx.tree_at(lambda g: g.covs, gaussians, jnp.asarray(covs))

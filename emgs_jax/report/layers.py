@@ -81,6 +81,11 @@ def covariances(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     return covs
 
 
+def packed_covariances(covs: np.ndarray) -> np.ndarray:
+    """Pack covariances (n, 3, 3) as float16 (n, 6): the upper triangles in `COV_UNIT`."""
+    return np.clip(covs[:, *_UPPER] / COV_UNIT, -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16)
+
+
 def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.ndarray]:
     """Return the attributes of each confirmed Gaussian that the page shows, in the order of the map.
 
@@ -93,10 +98,10 @@ def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.nd
     gaussians = jax.device_get(confirmed(map))
     rows = np.flatnonzero(gaussians.valid)
     means, covs, normals = (np.asarray(x)[rows] for x in (gaussians.means, gaussians.covs, gaussians.normals))
-    covs = closing_covariances(means, covs, normals)[:, _UPPER[0], _UPPER[1]] / COV_UNIT
+    covs = closing_covariances(means, covs, normals)
     layers = {
         "mean": means.astype(np.float32),
-        "cov": np.clip(covs, -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16),
+        "cov": packed_covariances(covs),
         "color": to_bytes(np.asarray(gaussians.colors)[rows]),
         "normal": np.rint(127 * normals).astype(np.int8),
         "existence": to_bytes(1.0 / (1.0 + np.exp(-np.asarray(map.existence, np.float64)[rows]))),
@@ -128,27 +133,31 @@ def feature_layer(map: GaussianMap) -> dict[str, np.ndarray]:
     return {"feature": to_bytes(np.asarray(feature_colors(gaussians))[rows])}
 
 
-def thinned(layers: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
-    """Keep the `count` Gaussians that most frames agree on, in their order; all of them where there are no more."""
-    order = np.argsort(-layers["updates"].astype(np.int64), kind="stable")[:count]
-    keep = np.sort(order)
+def thinned(layers: Mapping[str, np.ndarray], weight: np.ndarray, count: int) -> dict[str, np.ndarray]:
+    """Keep the `count` rows of most weight, in their order; all of them where there are no more."""
+    keep = np.sort(np.argsort(-weight.astype(np.float64), kind="stable")[:count])
     return {name: values[keep] for name, values in layers.items()}
 
 
 def fitted(
-    layers: Mapping[str, np.ndarray], paths: Mapping[str, np.ndarray], limit: int
-) -> tuple[list[dict[str, Any]], str, str]:
-    """Pack at most `limit` characters, with fewer Gaussians where all of them are too many; the last item says so.
+    layers: Mapping[str, np.ndarray], paths: Mapping[str, np.ndarray], weight: np.ndarray, limit: int
+) -> tuple[list[dict[str, Any]], str, int]:
+    """Pack at most `limit` characters, with fewer Gaussians where all of them are too many; the last item is how many.
 
     The paths of some 15,000 frames are too many by themselves: then there is no Gaussian.
+
+    Args:
+        layers: attributes of the Gaussians, by name.
+        paths: other arrays, which stay whole.
+        weight: of the Gaussians: those of most are kept.
+        limit: characters.
     """
-    count = whole = len(layers["mean"])
+    count = len(weight)
     about, text = packed({**layers, **paths})
     while len(text) > limit and count:
         count = int(0.95 * count * limit / len(text))
-        about, text = packed(thinned(layers, count) | dict(paths))
-    note = f"The page shows the {count:,} of {whole:,} Gaussians that most frames agree on; map.npz has all of them."
-    return about, text, note if count < whole else ""
+        about, text = packed(thinned(layers, weight, count) | dict(paths))
+    return about, text, count
 
 
 def packed(arrays: Mapping[str, np.ndarray]) -> tuple[list[dict[str, Any]], str]:

@@ -20,10 +20,12 @@ from emgs_jax.report.layers import COV_UNIT, feature_layer, fitted, layers_of, m
 from emgs_jax.report.overview import view_from_above
 from emgs_jax.report.page_pictures import Views, draw_views
 from emgs_jax.report.page_strip import key_of, strip
-from emgs_jax.report.recorded_run import PlacedPaths, RecordedRun, placed_paths, render_config
+from emgs_jax.report.recorded_run import SPLATS_FILE, PlacedPaths, RecordedRun, placed_paths, render_config
 from emgs_jax.report.repeat import repeat
+from emgs_jax.report.splats import read_splats, splats_for_page
 
 _MAP_BYTES = 2_800_000  # of base64; the rest is for pictures and words
+_SPLAT_BYTES = 2_400_000  # of these for the splats of emgs polish, where there are some
 _MAX_PICTURES = 120  # frames, evenly spread
 _SCRIPTS = ("data.js", "vectors.js", "splats.js", "layers.js", "controls.js", "overlay.js", "frames.js", "main.js")
 
@@ -45,13 +47,26 @@ def write_report(run: RecordedRun, dataset: Dataset | None, note: str = "") -> P
     layers, config = map_layers(run.map, run.text) | feature_layer(run.map), render_config(run)
     rows = sorted({int(row) for row in np.linspace(0, len(run.poses) - 1, min(_MAX_PICTURES, len(run.poses)))})
     views = draw_views(run, rows, config, dataset)
-    arrays, packing, left_out = fitted(layers, _path_arrays(run, paths), _MAP_BYTES)
-    about = _about(run, layers) | {"arrays": arrays, "render": _for_shader(config)}
-    return write_page(run.folder, _page(run, paths, views, about, packing, " ".join(filter(None, [note, left_out]))))
+    splats, packed_splats, few_splats = _splats(run)
+    limit, num = _MAP_BYTES - len(packed_splats), len(layers["mean"])
+    arrays, packed_map, shown = fitted(layers, _path_arrays(run, paths), layers["updates"], limit)
+    few = f"The page shows the {shown:,} of {num:,} Gaussians that most frames agree on; map.npz has all of them."
+    about = _about(run, layers) | {"arrays": arrays, "render": _for_shader(config), "splats": splats}
+    note = " ".join(filter(None, [note, few if shown < num else "", few_splats]))
+    return write_page(run.folder, _page(run, paths, views, about, (packed_map, packed_splats), note))
 
 
 def _for_shader(config: RenderConfig) -> dict[str, float]:
     return {name: float(getattr(config, name)) for name in ("blur", "radius", "opacity")}
+
+
+def _splats(run: RecordedRun) -> tuple[dict[str, Any] | None, str, str]:
+    """`splats_for_page` of what `emgs polish` wrote into the run; None without."""
+    splats = read_splats(run.folder / SPLATS_FILE)
+    if splats is None or not len(splats.means):
+        return None, "", ""
+    about, packed, note = splats_for_page(splats, _SPLAT_BYTES)
+    return about | {"render": {"blur": 0.3, "radius": 3.0, "opacity": 1.0}}, packed, note  # as 3DGS draws
 
 
 def _path_arrays(run: RecordedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
@@ -96,7 +111,12 @@ def _about(run: RecordedRun, layers: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def _page(
-    run: RecordedRun, paths: PlacedPaths, views: Views, about: Mapping[str, Any], packing: str, note: str
+    run: RecordedRun,
+    paths: PlacedPaths,
+    views: Views,
+    about: Mapping[str, Any],
+    packed: tuple[str, str],
+    note: str,
 ) -> bytes:
     """Fill the page, with pictures of as many frames as fit."""
     script, again = Markup("\n".join(map(source, _SCRIPTS))), repeat(run.provenance["config"])
@@ -117,7 +137,8 @@ def _page(
         "settings": page_words.settings(again),
         "files": page_words.files(run),
         "note": note,
-        "arrays": Markup(packing),
+        "arrays": Markup(packed[0]),
+        "splats": Markup(packed[1]),
         "script": script,
         "vertex": source("splats.vert"),
         "fragment": source("splats.frag"),

@@ -17,6 +17,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
 from emgs_jax.report.colors import to_bytes
+from emgs_jax.report.display import closed
 from emgs_jax.report.html import jpeg
 from emgs_jax.report.recorded_run import RecordedRun
 
@@ -55,7 +56,8 @@ def draw_views(run: RecordedRun, rows: Sequence[int], config: RenderConfig, data
         dataset: for the images; None: without them.
     """
     small, placed = downscale(run.camera, -(-run.camera.width // WIDTH)), run.is_placed
-    drawn = dict(_draw_all(confirmed(run.map), run.poses, [row for row in rows if placed[row]], small, config))
+    gaussians = closed(confirmed(run.map))
+    drawn = dict(_draw_all(gaussians, run.poses, [row for row in rows if placed[row]], small, config))
     depths = [depth[depth > 0] for _, depth in drawn.values()]
     known = np.concatenate(depths) if depths else np.zeros(0)
     near, far = (float(value) for value in np.percentile(known, [1, 99])) if len(known) else (0.0, 1.0)

@@ -3,7 +3,7 @@
 import importlib.util
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import equinox as eqx
@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
 from emgs_jax.device.arrays import on_device, to_se3
 from emgs_jax.device.executables import stored
+from emgs_jax.evaluation.clouds import NearestPoints
 from emgs_jax.evaluation.rendering import rendering_metrics, score_view
 from emgs_jax.evaluation.trajectory import align_poses, ate
 from emgs_jax.gaussian_map import confirmed
@@ -28,14 +28,16 @@ from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.fit import PolishConfig, Views, fit, is_held_out, locate, with_room, without_transparent
 from emgs_jax.polish.seeds import Seeds
-from emgs_jax.polish.splats import LossConfig, draw, gaussians_of, ssim
+from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, draw, gaussians_of, ssim
 from emgs_jax.render.composite import Rendering
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
-from emgs_jax.report.recorded_run import POLISH, RecordedRun
+from emgs_jax.report.recorded_run import POLISH, SPLATS_FILE, RecordedRun
 from emgs_jax.semantics import classify
 
-SPLATS_FILE, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE, PATH_FILE = POLISH
+_, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE, PATH_FILE = POLISH
 MAX_PICTURES = 4
+Seen: TypeAlias = tuple[np.ndarray, DenseView]  # image (h, w, 3) in [0, 1] of a frame, and the map from its pose
+Nearest: TypeAlias = Callable[[np.ndarray], np.ndarray]
 _densify, _classify, _ssim = stored(densify), stored(classify), jax.jit(ssim)
 
 
@@ -56,8 +58,7 @@ def polish(
     Raises:
         ValueError: the map is empty, there is no frame to fit or to compare with, or optax is not installed.
     """
-    if importlib.util.find_spec("optax") is None:
-        raise ValueError('emgs polish needs optax: pip install "emgs_jax[polish]"')
+    require_optax()
     gaussians = confirmed(run.map)
     if not np.asarray(gaussians.valid).any():
         raise ValueError(f"{run.folder}: the map has no Gaussian to begin with: run again")
@@ -66,49 +67,69 @@ def polish(
     if not held or not fitted_rows:
         raise ValueError(f"{run.folder} has {len(rows)} placed frames: too few to fit some and compare others")
 
-    def seen(row: int):
+    def seen(row: int) -> Seen:
         view = jax.device_get(_densify(gaussians, to_se3(run.poses[row]), run.camera, densify_config))
         return dataset[row].image / np.float32(255), eqx.tree_at(lambda v: v.rendering, view, None)
 
-    seeds, targets = Seeds(run.camera, config.pixels_per_splat), {name: Spool() for name in ("fitted", "held")}
+    nearest = _nearest(gaussians)
+    seeds, targets = Seeds(run.camera, config.pixels_per_splat), Spool()
     for row in tqdm(fitted_rows, desc="splats", unit="frame"):
         image, view = seen(row)
         seeds.add(view, image, run.poses[row])
-        targets["fitted"].append(_target(image, view))
+        targets.append(_target(image, view))
     for row in held:  # what only these see is as the map has it: their images stay out
-        image, view = seen(row)
+        view = seen(row)[1]
         seeds.add(view, view.colors, run.poses[row])
-        targets["held"].append(_target(image, view))
-    nearest = _nearest(gaussians)
     anchors, colors = seeds.anchors(_map_noise(gaussians, nearest))
+    views = Views(targets, run.poses[fitted_rows], _spreads(run, fitted_rows, config))
+    fitted, moved = _fitted(anchors, colors, views, run, config)
+    anchors, fitted = without_transparent(anchors, fitted, config.min_opacity)
+    poses = run.poses.copy()
+    poses[fitted_rows] = moved
+    if config.poses:
+        targets = Spool()
+        for row in held:
+            targets.append(_target(*seen(row)))
+        views = Views(targets, run.poses[held], _spreads(run, held, config))
+        poses[held] = locate(anchors, fitted, views, run.camera, config)
+        save_trajectory_tum(run.folder / PATH_FILE, [line["timestamp"] for line in run.frames], poses)
+    splats, opacity = gaussians_of(anchors, fitted)
+    count = _save_splats(run, splats, opacity, nearest)
+    metrics = {"polish/num_splats": count, "polish/num_fitted": len(fitted_rows), "polish/num_held_out": len(held)}
+    metrics |= _compare(run, dataset, held, seen, (splats, opacity, poses, config.loss))
+    write_json(run.folder / METRICS_FILE, metrics)
+    return metrics
+
+
+def require_optax() -> None:
+    """Raise ValueError where the extra is not installed."""
+    if importlib.util.find_spec("optax") is None:
+        raise ValueError('splats are fitted by optax: pip install "emgs_jax[polish]", or polish=none')
+
+
+def _fitted(
+    anchors: Anchors, colors: np.ndarray, views: Views, run: RecordedRun, config: PolishConfig
+) -> tuple[Appearance, np.ndarray]:
+    """`fit` with a progress bar."""
     with tqdm(total=config.steps, desc="polishing", unit="step") as bar:
         recent: list[float] = []
 
         def on_step(step: int, psnr: float) -> None:
             recent.append(psnr)
-            bar.set_postfix_str(f"{np.mean(recent[-len(fitted_rows) :]):.1f} dB", refresh=False)
+            bar.set_postfix_str(f"{np.mean(recent[-len(views.poses) :]):.1f} dB", refresh=False)
             bar.update(step + 1 - bar.n)
 
-        views = Views(targets["fitted"], run.poses[fitted_rows], _spreads(run, fitted_rows, config))
-        fitted, moved = fit(anchors, colors, views, run.camera, config, run.folder / CHECKPOINT_FILE, on_step)
-    anchors, fitted = without_transparent(anchors, fitted, config.min_opacity)
-    poses = run.poses.copy()
-    poses[fitted_rows] = moved
-    if config.poses:
-        views = Views(targets["held"], run.poses[held], _spreads(run, held, config))
-        poses[held] = locate(anchors, fitted, views, run.camera, config)
-        save_trajectory_tum(run.folder / PATH_FILE, [line["timestamp"] for line in run.frames], poses)
-    splats, opacity = gaussians_of(anchors, fitted)
-    labels, classes = None, ()
+        return fit(anchors, colors, views, run.camera, config, run.folder / CHECKPOINT_FILE, on_step)
+
+
+def _save_splats(run: RecordedRun, splats: Gaussians, opacity: jax.Array, nearest: Nearest) -> int:
+    """Write splats.ply, with the class of the nearest Gaussian where the map has classes; returns how many."""
+    gaussians, labels, classes = confirmed(run.map), None, ()
     if run.text is not None and gaussians.features.shape[-1]:
         text, classes = on_device(np.asarray(run.text.vectors, np.float32)), run.text.names
         labels = np.asarray(_classify(gaussians, text))[nearest(np.asarray(splats.means))]
     shown = jnp.clip(splats.colors, 0, 1), opacity, splats.normals, labels, classes
-    count = save_gaussians_ply(run.folder / SPLATS_FILE, splats.means, splats.covs, *shown)
-    metrics = {"polish/num_splats": count, "polish/num_fitted": len(fitted_rows), "polish/num_held_out": len(held)}
-    metrics |= _compare(run, dataset, held, seen, (splats, opacity, poses, config.loss))
-    write_json(run.folder / METRICS_FILE, metrics)
-    return metrics
+    return save_gaussians_ply(run.folder / SPLATS_FILE, splats.means, splats.covs, *shown)
 
 
 def _target(image: np.ndarray, view: DenseView) -> np.ndarray:
@@ -130,14 +151,14 @@ def _spreads(run: RecordedRun, rows: list[int], config: PolishConfig) -> np.ndar
     return spreads
 
 
-def _nearest(gaussians: Gaussians) -> Callable[[np.ndarray], np.ndarray]:
+def _nearest(gaussians: Gaussians) -> Nearest:
     """A function from points (n, 3) to rows of the Gaussians with the nearest means."""
     rows = np.flatnonzero(np.asarray(gaussians.valid))
-    tree = cKDTree(np.asarray(gaussians.means)[rows])
-    return lambda points: rows[tree.query(points)[1]]
+    means = NearestPoints(np.asarray(gaussians.means)[rows])
+    return lambda points: rows[means.query(points)[1][:, 0]]
 
 
-def _map_noise(gaussians: Gaussians, nearest: Callable) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+def _map_noise(gaussians: Gaussians, nearest: Nearest) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """The standard deviation along the normal (m) of the Gaussian that is nearest to each point."""
     covs = np.asarray(gaussians.covs)
 
@@ -159,7 +180,7 @@ def _picture(*arguments: Any) -> tuple[Rendering, int]:
 
 
 def _compare(
-    run: RecordedRun, dataset: ReadableFrames, held: list[int], seen: Callable, drawn: tuple
+    run: RecordedRun, dataset: ReadableFrames, held: list[int], seen: Callable[[int], Seen], drawn: tuple
 ) -> dict[str, Any]:
     """PSNR and SSIM over the pixels that the map covers, depth errors and ATE where the truth is known.
 

@@ -74,3 +74,13 @@ def _label(block: Mapping[str, Any]) -> str:
         return ""
     name = (block.get("prior") or {}).get("name", "")
     return name if name.startswith("simulated v") else "simulated"
+
+
+def polish_lines(found: Mapping[str, Any]) -> list[str]:
+    """What polish.json says of the frames that were held out, in lines."""
+    lines = [f"{found['polish/num_splats']:,} splats; of {found['polish/num_held_out']} frames that were not fitted:"]
+    for name in ("psnr_db", "ssim", "depth_within_5_percent", "depth_l1_m", "ate_m"):
+        before, after = (found.get(f"polish/{when}_{name}") for when in ("before", "after"))
+        if before is not None and after is not None:
+            lines.append(f"{name:24} {before:8.4g} → {after:.4g}")
+    return lines

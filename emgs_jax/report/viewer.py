@@ -17,7 +17,7 @@ import numpy as np
 from emgs_jax.report.layers import ALWAYS, layers_of, painted
 from emgs_jax.report.page_words import frame_facts
 from emgs_jax.report.viewer_answers import ask, find_words, highlighted, picked
-from emgs_jax.report.viewer_scene import Scene, Shown, field_of_view, wxyz
+from emgs_jax.report.viewer_scene import KINDS, Scene, Shown, field_of_view, wxyz
 
 if TYPE_CHECKING:
     import viser
@@ -101,7 +101,7 @@ class Viewer:
         self.threshold = gui.add_slider("At least", 0.0, 1.0, 0.01, 0.5, hint="cosine that an answer needs")
         self.answer = gui.add_html(_shown(self._known()))
         self.layer = gui.add_dropdown("Colours", titles)
-        self.kind = gui.add_dropdown("Map as", ["Gaussians", "points"])
+        self.kind = gui.add_dropdown("Map as", KINDS if self._run.splats is not None else KINDS[1:])
         self.show_cameras = gui.add_checkbox("Cameras", True)
         self.show_paths = gui.add_checkbox("Paths (ours orange, true green)", True)
         self.frame = gui.add_slider("Frame", 0, 1, 1, 0)

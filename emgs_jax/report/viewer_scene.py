@@ -12,9 +12,11 @@ from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report.colors import OURS, PATHS, STATUS_COLORS, rgb
 from emgs_jax.report.layers import covariances, feature_layer, map_layers
 from emgs_jax.report.overview import view_from_above
-from emgs_jax.report.recorded_run import RecordedRun, placed_paths, render_config
+from emgs_jax.report.recorded_run import SPLATS_FILE, RecordedRun, placed_paths, render_config
+from emgs_jax.report.splats import Splats, read_splats
 
 MAX_FRUSTUMS = 300  # more are a carpet; the chosen frame has its own
+KINDS = ("splats", "Gaussians", "points")  # as what a map is shown
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,7 @@ class Shown:
         poses: T_world_camera of `frames`, (n, 4, 4).
         truth: true camera centres in the frame of the map, (n, 3); nan where unknown.
         image: of the last frame, uint8 (h, w, 3); None where nobody has it.
+        splats: of `emgs polish`; None where it was not run.
     """
 
     layers: Mapping[str, np.ndarray]
@@ -38,6 +41,7 @@ class Shown:
     camera: Camera
     render: RenderConfig
     image: np.ndarray | None = None
+    splats: Splats | None = None
 
     @property
     def is_placed(self) -> np.ndarray:
@@ -49,7 +53,8 @@ def shown(run: RecordedRun) -> Shown:
     """Show a finished run; raises ValueError where its parts do not fit each other."""
     layers, names = map_layers(run.map, run.text) | feature_layer(run.map), () if run.text is None else run.text.names
     truth = placed_paths(run).truth[:, :3, 3]
-    return Shown(layers, names, run.frames, run.poses, truth, run.camera, render_config(run))
+    splats = read_splats(run.folder / SPLATS_FILE)
+    return Shown(layers, names, run.frames, run.poses, truth, run.camera, render_config(run), splats=splats)
 
 
 class Scene:
@@ -59,6 +64,7 @@ class Scene:
         self._server, self._scene = server, server.scene
         self.splats: Any = None
         self.points: Any = None
+        self.sharp: Any = None  # the splats of `emgs polish`
         self.chosen: Any = None  # the frustum of one frame
         self.paths: list[Any] = []
         self.frustums: dict[int, Any] = {}
@@ -85,9 +91,10 @@ class Scene:
             self.points.colors = colors
 
     def show(self, kind: str, cameras: bool, paths: bool) -> None:
-        """Choose what is visible: the map as `Gaussians` or as `points`, cameras, paths."""
-        if self.splats is not None:
-            self.splats.visible, self.points.visible = kind == "Gaussians", kind == "points"
+        """Choose what is visible: the map as one of `KINDS`, cameras, paths."""
+        for name, drawn in zip(KINDS, (self.sharp, self.splats, self.points), strict=True):
+            if drawn is not None:
+                drawn.visible = kind == name
         for path in filter(None, self.paths):
             path.visible = paths
         for frustum in filter(None, (*self.frustums.values(), self.chosen)):
@@ -107,6 +114,10 @@ class Scene:
             self.splats = self._scene.add_gaussian_splats("/map", means, self.covs, colors, opacities)
         else:
             self.splats.set_gaussians(means, self.covs, colors, opacities)
+        if run.splats is not None and self.sharp is None:
+            places = (values.astype(np.float32) for values in (run.splats.means, run.splats.covs))
+            shades = run.splats.colors[:, :3], run.splats.colors[:, 3:]
+            self.sharp = self._scene.add_gaussian_splats("/splats", *places, *(x.astype(np.float32) for x in shades))
         self.points = self._scene.add_point_cloud("/points", means, colors, point_size=0.01, precision="float32")
 
     def _draw_cameras(self, run: Shown) -> None:

@@ -76,6 +76,35 @@ def test_a_broken_first_image_and_one_of_another_size_are_bad_frames_and_hide_no
     assert number_of(dataset[1]) == 1
 
 
+def test_pictures_that_are_not_read_and_folders_below_are_named(images_root, tmp_path):
+    """A phone's folder with three JPEGs among its HEICs was a sequence of three images, without a word."""
+    (images_root / "IMG_1.HEIC").write_bytes(b"")
+    assert "has 1 .heic, which are not read: convert" in load(images_root).calibration["note"]
+    (tmp_path / "walk" / "rgb").mkdir(parents=True)
+    (tmp_path / "walk" / "1.DNG").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"no images; it has the folders rgb: give one of them; .* has 1 \.dng, which"):
+        load(tmp_path / "walk")
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".tif"])
+def test_formats_of_the_web_and_of_science_are_read(suffix, tmp_path):
+    """No image of a folder of float TIFFs could be read, "fetch them again"."""
+    for i in range(2):
+        image = color_image(i, SIZE)
+        cv2.imwrite(str(tmp_path / f"{i}{suffix}"), np.float32(image) / 255 if suffix == ".tif" else image)
+    dataset = load(tmp_path)
+    assert len(dataset) == 2 and dataset[0].image.max() > 100
+
+
+def test_what_is_transparent_in_images_is_said(tmp_path):
+    image = np.dstack([color_image(0, SIZE), np.full(SIZE[::-1], 255, np.uint8)])
+    cv2.imwrite(str(tmp_path / "0.png"), image)
+    assert "note" not in load(tmp_path).calibration
+    image[:5, :, 3] = 0
+    cv2.imwrite(str(tmp_path / "0.png"), image)
+    assert "0.png is transparent in places" in load(tmp_path).calibration["note"]
+
+
 @pytest.mark.parametrize("suffix", [".avi", ".mp4"])
 def test_a_video_gives_the_right_frame_in_any_order(suffix, tmp_path):
     path = tmp_path / f"clip{suffix}"

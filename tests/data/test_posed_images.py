@@ -303,3 +303,34 @@ def test_images_are_those_that_are_stored_whatever_their_exif_orientation(orient
         (120, 160, 3) if orientation == 3 else (160, 120, 3)
     )
     np.testing.assert_array_equal(Colmap(str(tmp_path), size=SIZE)[0].image, plain)
+
+
+def test_a_name_of_three_words_is_no_line_of_points(tmp_path):
+    """Where a program leaves the points out, every second image was lost without a word."""
+    images = write_colmap(tmp_path) / "images.txt"
+    images.write_text(images.read_text().replace("img", "IMG 2 (3)").replace("\n\n", "\n"))
+    with pytest.raises(ValueError, match=r"images.txt:3: expected the points of image IMG 2 \(3\)10.png"):
+        load_colmap(images.parent)
+
+
+def test_of_several_models_the_largest_is_taken_and_what_has_no_pose_is_said(tmp_path):
+    """COLMAP splits what it cannot join: 2 of 10 images were mapped, those of sparse/0, and nothing said so."""
+    first = write_colmap(tmp_path)
+    second = first.with_name("1")
+    second.mkdir()
+    lines = (first / "images.txt").read_text().splitlines()
+    (second / "images.txt").write_text("\n".join(lines[:5]) + "\n")
+    (second / "cameras.txt").write_text((first / "cameras.txt").read_text())
+    (first / "images.txt").write_text("\n".join(lines[5:]) + "\n")
+    dataset = Colmap(str(tmp_path))
+    assert len(dataset) == 2
+    assert "1/images.txt has 2 of the 3 images in" in dataset.calibration["note"]
+    assert len(Colmap(str(tmp_path), model="sparse/0")) == 1
+
+
+def test_an_image_that_stands_twice_in_transforms_is_refused(tmp_path):
+    write_nerfstudio(tmp_path)
+    values = json.loads((tmp_path / "transforms.json").read_text())
+    (tmp_path / "transforms.json").write_text(json.dumps(values | {"frames": values["frames"] + values["frames"][:1]}))
+    with pytest.raises(ValueError, match="transforms.json has images/img10.png twice"):
+        Nerfstudio(str(tmp_path))

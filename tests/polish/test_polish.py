@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import scene as sc
 from omegaconf import OmegaConf
+from tiny_run import compose
 
 from emgs_jax.config import configure
 from emgs_jax.config.configure import build
@@ -24,6 +25,7 @@ from emgs_jax.polish.splats import Anchors, Appearance, draw, gaussians_of, init
 from emgs_jax.report.polish import polish
 from emgs_jax.report.recorded_run import read_run
 from experiments.polish import polish_run
+from experiments.run import run
 
 pytest.importorskip("optax", reason="the extra of emgs polish: pip install -e .[polish]")
 CAMERA = Camera([20.0, 23.0], [14.5, 12.25], 32, 24)
@@ -252,6 +254,22 @@ def test_what_is_held_out_never_enters_the_fit_and_the_files_say_what_came_out(f
     other = polish(run, Edited(images_of(run)[0], settings), settings, densify)
     assert (folder / "splats.ply").read_bytes() == splats
     assert other["polish/before_psnr_db"] < found["polish/before_psnr_db"] - 3, "they are what is compared"
+
+
+def test_a_run_can_end_with_it_and_says_at_once_that_optax_is_missing(exact_run, tmp_path, monkeypatch, capsys):
+    """The map is that of the run without it, and the splats are those of the command."""
+    own, short = tmp_path / "own", SHORT + ("polish=default",)
+    run(compose("prior.level=0", *short), own)
+    assert "splats; of 2 frames that were not fitted" in "".join(capsys.readouterr())
+    assert (own / "map.npz").read_bytes() == (exact_run[0] / "map.npz").read_bytes()
+    page = (own / "report.html").read_text()
+    assert "polish=default" in page and 'value="splats" selected' in page
+    polish_run(config(*SHORT, folder=shutil.copytree(exact_run[0], tmp_path / "later")))
+    assert (own / "splats.ply").read_bytes() == (tmp_path / "later" / "splats.ply").read_bytes()
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"pip install .*polish.*polish=none"):
+        run(compose("prior.level=0", *short), tmp_path / "without")
+    assert not (tmp_path / "without" / "map.npz").exists()
 
 
 def test_a_run_without_its_images_or_without_a_map_is_one_clear_error(folder, tmp_path):

@@ -15,6 +15,7 @@ from written_run import CLASSES, two_walls, written_run
 
 from emgs_jax.config.configure import groups
 from emgs_jax.features.text import TextEmbeddings, save_text
+from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.html import DATA_LICENCES
 from emgs_jax.report.layers import COV_UNIT, fitted, packed, thinned
@@ -23,6 +24,7 @@ from emgs_jax.report.page_words import verdict
 from emgs_jax.report.printout import metrics_table
 from emgs_jax.report.provenance import is_metric
 from emgs_jax.report.recorded_run import placed_paths, read_run
+from emgs_jax.report.splats import read_splats, splats_for_page
 from experiments.report import report
 
 
@@ -42,10 +44,14 @@ def edited(path, change) -> None:
 
 
 def unpacked(elements) -> dict[str, np.ndarray]:
-    """What the page's program makes of its bytes: of each number all first bytes stand before all second ones."""
-    content = zlib.decompress(base64.b64decode(elements.scripts["arrays"]))
-    arrays = {}
-    for about in json.loads(elements.scripts["about"])["arrays"]:
+    """What the page's program makes of its bytes."""
+    return unpack_block(elements.scripts["arrays"], json.loads(elements.scripts["about"])["arrays"])
+
+
+def unpack_block(text: str, described: list[dict]) -> dict[str, np.ndarray]:
+    """Of each number all first bytes stand before all second ones."""
+    content, arrays = zlib.decompress(base64.b64decode(text)), {}
+    for about in described:
         kind, shape = np.dtype(about["type"]), (about["columns"], about["rows"])
         size = kind.itemsize * shape[0] * shape[1]
         raw = np.frombuffer(content[about["offset"] : about["offset"] + size], np.uint8).reshape(kind.itemsize, -1)
@@ -94,7 +100,7 @@ def test_hostile_names_stay_text_and_loops_name_frames_as_the_rest_of_the_page_d
     write_report(read_run(hostile), None)
     elements = Elements(text_of(hostile))
     tags, plain = ([tag for tag, _ in page.found] for page in (elements, Elements(text_of(folder))))
-    assert tags.count("script") == plain.count("script") == 5 and "alert" not in elements.scripts[""]
+    assert tags.count("script") == plain.count("script") == 6 and "alert" not in elements.scripts[""]
     assert "<" not in elements.scripts["about"]  # an end of a script may have a space or a slash before its >
     assert json.loads(elements.scripts["about"])["frames"]["reason"][0] == HOSTILE
     assert not any(name.startswith("on") for _, attributes in elements.found for name in attributes)
@@ -117,15 +123,40 @@ def test_a_large_map_is_thinned_to_what_most_frames_agree_on_and_paths_alone_may
     rng = np.random.default_rng(0)
     layers = {"updates": rng.permutation(1000), "mean": rng.normal(size=(1000, 3)).astype(np.float32)}
     paths = {"poses": rng.normal(size=(6, 12)).astype(np.float32)}
-    about, text, note = fitted(layers, paths, 5_000)
-    count = about[1]["rows"]
-    assert 4_000 < len(text) <= 5_000 and f"shows the {count:,} of 1,000 Gaussians" in note
-    most = np.flatnonzero(layers["updates"] >= 1000 - count)  # in the order of the map
-    np.testing.assert_array_equal(thinned(layers, count)["mean"], layers["mean"][most])
-    assert fitted(layers, paths, 5_000)[1] == packed(thinned(layers, count) | paths)[1]
-    assert fitted(layers, paths, 10**6) == (*packed(layers | paths), "")
-    about, _, note = fitted(layers, paths, 10)
-    assert [item["rows"] for item in about] == [0, 0, 6] and "shows the 0 of 1,000" in note
+    updates = layers["updates"]
+    about, text, count = fitted(layers, paths, updates, 5_000)
+    assert 4_000 < len(text) <= 5_000 and about[1]["rows"] == count < 1000
+    most = np.flatnonzero(updates >= 1000 - count)  # in the order of the map
+    np.testing.assert_array_equal(thinned(layers, updates, count)["mean"], layers["mean"][most])
+    assert text == packed(thinned(layers, updates, count) | paths)[1]
+    assert fitted(layers, paths, updates, 10**6) == (*packed(layers | paths), 1000)
+    about, _, count = fitted(layers, paths, updates, 10)
+    assert [item["rows"] for item in about] == [0, 0, 6] and count == 0
+
+
+def test_the_page_holds_the_splats_of_a_polished_run_and_of_too_many_those_that_cover_most(tmp_path):
+    """Means to a 65,535th of their box, covariances to float16; half of them are a hundredth as opaque."""
+    walls = two_walls()
+    opacity = np.where(np.arange(len(walls.means)) % 2, 0.9, 0.009)
+    folder = written_run(tmp_path / "run")
+    save_gaussians_ply(folder / "splats.ply", walls.means, walls.covs, walls.colors, opacity, walls.normals)
+    elements = Elements(write_report(read_run(folder), None).read_text())
+    about = json.loads(elements.scripts["about"])["splats"]
+    arrays = unpack_block(elements.scripts["splats"], about["arrays"])
+    means = np.array(about["low"]) + arrays["mean"] * np.array(about["step"])
+    np.testing.assert_allclose(means, walls.means, atol=4.0 / 65535)
+    variances = arrays["cov"].astype(float)[:, [0, 3, 5]] * COV_UNIT
+    np.testing.assert_allclose(variances, [[3e-3, 2.5e-3, 1e-4]] * len(means), rtol=1e-3)
+    np.testing.assert_allclose(arrays["color"] / 255, np.c_[walls.colors, opacity], atol=0.5 / 255 + 1e-6)
+    np.testing.assert_array_equal(arrays["normal"], 127 * np.asarray(walls.normals))
+    few, text, note = splats_for_page(read_splats(folder / "splats.ply"), 2_000)
+    count = few["arrays"][0]["rows"]
+    assert f"shows the {count:,} of {len(means):,} splats" in note and count < len(means) / 2
+    assert len(text) <= 2_000 and (unpack_block(text, few["arrays"])["color"][:, 3] > 200).all()
+    damaged = (folder / "splats.ply").read_bytes().replace(b"rot_3", b"turn3")
+    (folder / "splats.ply").write_bytes(damaged)
+    with pytest.raises(ValueError, match=r"splats.ply has no rot_3.*run emgs polish again"):
+        write_report(read_run(folder), None)
 
 
 @pytest.mark.parametrize(

@@ -2,18 +2,22 @@
 
 import base64
 import io
+from dataclasses import replace
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 from test_sample_page import SAMPLE
-from written_run import INTRINSICS, SIZE, written_run
+from written_run import INTRINSICS, SIZE, two_walls, written_run
 
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import confirmed
+from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.ops.camera import Camera
+from emgs_jax.polish.splats import draw
 from emgs_jax.render.composite import render
 from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.page import write_report
@@ -31,9 +35,17 @@ return btoa(String.fromCharCode(...pixels));
 """
 
 
+def splats_of_the_run():
+    """Means, covariances, colours and opacities as `emgs polish` may leave them: blue walls, the far one half clear."""
+    walls = two_walls()
+    is_near = np.asarray(walls.features)[:, 1] > 0.5
+    return walls.means, 0.5 * walls.covs, np.asarray(walls.colors)[:, ::-1], np.where(is_near, 0.95, 0.5), walls.normals
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     run = read_run(written_run(tmp_path_factory.mktemp("run")))
+    save_gaussians_ply(run.folder / "splats.ply", *splats_of_the_run())
     write_report(run, None)
     return run
 
@@ -48,6 +60,7 @@ def page(run, chromium):
 @pytest.fixture(autouse=True)
 def begun(page):
     """Every test begins with the whole map in its own colours."""
+    choose(page, "kind", "gaussians")
     choose(page, "layer", "color")
     page.run("window.scrollTo(0, 0); report.home()")
     drawn_in_full(page)
@@ -111,6 +124,31 @@ def test_the_page_draws_what_our_renderer_draws(page, run):
     theirs, ours = drawn_by_the_page(page, 5, size, intrinsics), drawn_by_us(run, 5, size, intrinsics)
     assert psnr(theirs, ours) > 35
     assert psnr(np.roll(theirs, 1, axis=1), ours) < psnr(theirs, ours) - 3  # half a pixel would be seen
+
+
+def test_the_page_draws_the_splats_of_a_polished_run_as_they_were_fitted(page, run):
+    """The oracle is the drawing that `emgs polish` fits, each splat in its own opacity; then the map is back."""
+    size, intrinsics = (3 * SIZE[0], 3 * SIZE[1]), [3 * value for value in INTRINSICS]
+    before = drawn_by_the_page(page, 5, size, intrinsics)
+    choose(page, "kind", "splats")
+    theirs = drawn_by_the_page(page, 5, size, intrinsics)
+    means, covs, colors, opacity, normals = splats_of_the_run()
+    walls = eqx.tree_at(lambda g: (g.covs, g.colors), two_walls(), (covs, jnp.asarray(colors)))
+    config = replace(render_config(run), covariance_scale=1.0, blur=0.3, radius=3.0, opacity=1.0)
+    drawn = jax.device_get(
+        draw(
+            walls,
+            jnp.asarray(opacity, jnp.float32),
+            to_se3(run.poses[5]),
+            Camera(intrinsics[:2], intrinsics[2:], *size),
+            config,
+        )
+    )
+    ours = np.asarray(drawn.values) + (1 - np.asarray(drawn.alpha)[..., None]) * BACKGROUND
+    assert psnr(theirs, ours) > 35 and psnr(theirs, before) < 25
+    assert page.run("return document.getElementById('layer').disabled")
+    choose(page, "kind", "gaussians")
+    np.testing.assert_array_equal(drawn_by_the_page(page, 5, size, intrinsics), before)
 
 
 WHOLE = """

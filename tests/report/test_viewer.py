@@ -15,6 +15,7 @@ from PIL import Image
 from written_run import CLASSES, two_walls, written_run
 
 from emgs_jax.config import configure
+from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.layers import covariances, map_layers, painted
@@ -133,6 +134,25 @@ def test_words_and_layers_recolour_what_is_served(viewer):
     viewer.layer.value = "colour"
     viewer.recolor()
     np.testing.assert_array_equal(np.array(viewer.scene.splats.rgbs), before)
+
+
+def test_a_polished_run_can_be_shown_as_its_splats(tmp_path, viewer):
+    walls = two_walls()
+    folder = written_run(tmp_path / "run")
+    save_gaussians_ply(folder / "splats.ply", walls.means, walls.covs, walls.colors, 0.25, walls.normals)
+    polished = Viewer(shown(read_run(folder)), free_port())
+    try:
+        sharp, gaussians = polished.scene.sharp, polished.scene.splats
+        assert polished.kind.options == ("splats", "Gaussians", "points")
+        assert (sharp.visible, gaussians.visible) == (True, False)
+        np.testing.assert_allclose(sharp.centers, walls.means, atol=1e-6)
+        np.testing.assert_allclose(np.ravel(sharp.opacities) / 255, 0.25, atol=0.01)
+        polished.kind.value = "Gaussians"
+        polished._show()
+        assert (sharp.visible, gaussians.visible) == (False, True)
+    finally:
+        polished.stop()
+    assert viewer.kind.options == ("Gaussians", "points") and viewer.scene.sharp is None
 
 
 def test_a_click_tells_the_numbers_of_the_near_wall(viewer):

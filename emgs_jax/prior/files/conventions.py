@@ -1,18 +1,23 @@
-"""Do poses and depths fit each other? A pose of another convention or unit is found out by the depths of two views."""
+"""Do poses and depths fit each other? What is of another convention or unit is found out by the depths of two views."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from emgs_jax.ops.axes import FLIP
 
-MAX_MISFIT = 0.02  # of the depth, median; below, poses are right enough whatever else fits
+MAX_MISFIT = 0.02  # of the depth, median; below, all is right enough whatever else fits
 MIN_GAIN, GOOD_MISFIT = 3.0, 0.05  # by which another convention must fit better to be named, and how well at least
 MIN_SHARED = 100  # points
 STEP = 4  # every fourth pixel of every fourth row
-MILLIMETRES = 1000.0
+FACTORS = np.geomspace(1e-3, 1e3, 241)  # of depths in another unit: 6 % apart
+MIN_FACTOR = 2.0  # what is nearer to 1 is a prediction's error
+AHEAD_LEFT_UP = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # OpenCV's axes in a robot's
+AHEAD_RIGHT_DOWN = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 
 
 class Sight(NamedTuple):
@@ -24,27 +29,35 @@ class Sight(NamedTuple):
 
 
 def check_conventions(pairs: Iterable[tuple[Sight, Sight]], intrinsics: Sequence[float], source: str) -> None:
-    """Raise ValueError where poses of another convention or unit fit the depths much better than those given.
+    """Raise ValueError where poses or depths of another convention or unit fit each other much better.
 
     Args:
         pairs: of views that see the same.
         intrinsics: fx, fy, cx, cy.
-        source: file and key of the poses.
+        source: where poses and depths are from.
     """
-    misfits: dict[str, list[float]] = {}
-    for a, b in pairs:
-        for name, (pose_a, pose_b) in _readings(a.T_world_camera, b.T_world_camera).items():
-            misfits.setdefault(name, []).append(misfit(a, b, np.linalg.inv(pose_a) @ pose_b, intrinsics))
-    found = {name: float(np.median(values)) for name, values in misfits.items()}
-    if not found or not found["as they are"] > MAX_MISFIT:
+    pairs = [*pairs]
+    own = _median_misfit(pairs, intrinsics, lambda sight: sight)
+    if not own > MAX_MISFIT:
         return
-    best = min(found, key=lambda name: found[name])
-    if found[best] < min(found["as they are"] / MIN_GAIN, GOOD_MISFIT):
+    found = {words: _median_misfit(pairs, intrinsics, read) for words, read in _readings().items()}
+    best = min(found, key=lambda words: found[words])
+    if found[best] < min(own / MIN_GAIN, GOOD_MISFIT):
         raise ValueError(
-            f"{source}: the depths of two views differ by {100 * found['as they are']:.1f} % (inf: they share "
-            f"nothing), and by {100 * found[best]:.1f} % where the poses are taken as {best}: expected are camera -> "
-            "world, axes of OpenCV (x right, y down, z ahead), and one unit for poses and depths"
+            f"{source}: the depths of two views differ by {100 * own:.1f} % (inf: they share nothing), and by "
+            f"{100 * found[best]:.1f} % where {best}: expected are poses camera -> world, axes of OpenCV (x right, "
+            "y down, z ahead), depths along z, and one unit for poses and depths"
         )
+
+
+def _median_misfit(
+    pairs: Sequence[tuple[Sight, Sight]], intrinsics: Sequence[float], read: Callable[[Sight], Sight]
+) -> float:
+    """`misfit` of the pairs as `read` takes them, 0 without any."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # where there is no depth
+        sights = [(read(a), read(b)) for a, b in pairs]
+    found = [misfit(a, b, np.linalg.inv(a.T_world_camera) @ b.T_world_camera, intrinsics) for a, b in sights]
+    return float(np.median(found)) if found else 0.0
 
 
 def misfit(a: Sight, b: Sight, T_a_b: Float[np.ndarray, "4 4"], intrinsics: Sequence[float]) -> float:
@@ -64,16 +77,50 @@ def misfit(a: Sight, b: Sight, T_a_b: Float[np.ndarray, "4 4"], intrinsics: Sequ
     return float(np.median(np.abs(np.log(ratios))))
 
 
-def _readings(a: np.ndarray, b: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Two poses as they are and as other conventions have them."""
-    flip, inverse = np.array(FLIP), np.linalg.inv
-    found = {
-        "as they are": (a, b),
-        "world -> camera": (inverse(a), inverse(b)),
-        "camera -> world of OpenGL's axes": (a * flip, b * flip),
-        "world -> camera of OpenGL's axes": (inverse(a) * flip, inverse(b) * flip),
+def _readings() -> dict[str, Callable[[Sight], Sight]]:
+    """What a sight is in other conventions, by words for each."""
+    inverse = np.linalg.inv
+    poses: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+        "world -> camera": inverse,
+        "camera -> world of OpenGL's axes": lambda pose: pose * FLIP,
+        "world -> camera of OpenGL's axes": lambda pose: inverse(pose) * FLIP,
+        "of axes x ahead, y left, z up": lambda pose: pose @ AHEAD_LEFT_UP,
+        "of axes x ahead, y right, z down": lambda pose: pose @ AHEAD_RIGHT_DOWN,
+        "with quaternions w, x, y, z": _scalar_first,
+        "world -> camera with quaternions w, x, y, z": lambda pose: inverse(_scalar_first(pose)),
     }
-    for name, factor in (("in millimetres", 1 / MILLIMETRES), ("in metres beside depths in mm", MILLIMETRES)):
-        scale = np.array([[1, 1, 1, factor]] * 3 + [[1, 1, 1, 1]])
-        found[name] = a * scale, b * scale
+    found = {
+        f"the poses are taken as {words}": lambda sight, change=change: sight._replace(
+            T_world_camera=change(sight.T_world_camera)
+        )
+        for words, change in poses.items()
+    }
+    found["the depths are taken as lengths of the rays"] = lambda sight: _times(sight, 1 / _stretch(sight.points))
+    for factor in FACTORS:
+        if abs(np.log(factor)) > np.log(MIN_FACTOR):
+            found[f"the depths are multiplied by about {factor:.4g}, or the positions by {1 / factor:.4g}"] = partial(
+                _times, factor=factor
+            )
+        found[f"the depths are taken as {factor:.4g} / depth"] = partial(_inverse, factor=factor)
     return found
+
+
+def _scalar_first(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The pose whose quaternion w, x, y, z was read as x, y, z, w."""
+    changed = pose.copy()
+    changed[:3, :3] = Rotation.from_quat(Rotation.from_matrix(pose[:3, :3]).as_quat()[[1, 2, 3, 0]]).as_matrix()
+    return changed
+
+
+def _times(sight: Sight, factor: float | Float[np.ndarray, "h w"]) -> Sight:
+    return sight._replace(points=sight.points * np.asarray(factor)[..., None])
+
+
+def _inverse(sight: Sight, factor: float) -> Sight:
+    """The sight whose depths are factor / those that were given."""
+    return _times(sight, factor / np.square(sight.points[..., 2]))
+
+
+def _stretch(points: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    """Length of the ray to each point over its depth."""
+    return np.linalg.norm(points, axis=-1) / points[..., 2]

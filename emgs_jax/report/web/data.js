@@ -5,12 +5,13 @@ const ABOUT = JSON.parse(document.getElementById("about").textContent);
 const KINDS = { float32: Float32Array, float16: Uint16Array, uint8: Uint8Array, int8: Int8Array,
                 uint16: Uint16Array, int16: Int16Array, int32: Int32Array }; // float16: its bits
 
-async function readArrays() {
-  const text = document.getElementById("arrays").textContent;
+// The arrays of one block, by name.
+async function readArrays(id, arrays) {
+  const text = document.getElementById(id).textContent;
   const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   const buffer = new Uint8Array(await new Response(stream).arrayBuffer());
-  return Object.fromEntries(ABOUT.arrays.map((about) => [about.name, unpack(buffer, about)]));
+  return Object.fromEntries(arrays.map((about) => [about.name, unpack(buffer, about)]));
 }
 
 // Bytes lie by column, the first bytes of all numbers before their second ones; rows of numbers come back.
@@ -22,5 +23,20 @@ function unpack(buffer, { type, rows, columns, offset }) {
     for (let column = 0; column < columns; column++)
       for (let row = 0; row < rows; row++)
         out[(row * columns + column) * width + byte] = buffer[offset + byte * count + column * rows + row];
-  return new KINDS[type](out.buffer);
+  const numbers = new KINDS[type](out.buffer);
+  return type === "float16" ? Float32Array.from(numbers, half) : numbers;
+}
+
+function half(bits) {
+  const exponent = (bits >> 10) & 31, share = bits & 1023, sign = bits >> 15 ? -1 : 1;
+  return sign * (exponent ? 2 ** (exponent - 15) * (1 + share / 1024) : 2 ** -14 * (share / 1024));
+}
+
+// What is drawn: the Gaussians of the map, and the splats that were fitted to the images; null where there are none.
+async function readSets() {
+  const map = await readArrays("arrays", ABOUT.arrays), about = ABOUT.splats;
+  if (!about) return { gaussians: { ...map, render: ABOUT.render }, splats: null };
+  const splats = await readArrays("splats", about.arrays);
+  splats.mean = Float32Array.from(splats.mean, (value, at) => about.low[at % 3] + value * about.step[at % 3]);
+  return { gaussians: { ...map, render: ABOUT.render }, splats: { ...splats, render: about.render } };
 }

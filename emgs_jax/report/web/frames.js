@@ -58,37 +58,36 @@ function clicked(report, x, y) {
     report.moved();
     return;
   }
+  state.pivot = found.point;
   const { arrays } = report, row = found.row;
-  const label = arrays.label && arrays.label[row] >= 0 ? ABOUT.classes[arrays.label[row]] + " · " : "";
   const place = found.point.map((value) => value.toFixed(3)).join(", ");
+  if (report.shown === report.sets.splats) {
+    $("picked").textContent = `splat ${row}: at ${place}`;
+    return;
+  }
+  const label = arrays.label && arrays.label[row] >= 0 ? ABOUT.classes[arrays.label[row]] + " · " : "";
   const numbers = `certain by ${(arrays.existence[row] / 255).toFixed(2)} · ${arrays.updates[row]} updates`;
   $("picked").textContent = `Gaussian ${row}: ${label}at ${place} · ${numbers} · born at step ${arrays.birth[row]}`;
-  state.pivot = found.point;
 }
 
 // The nearest Gaussian whose ellipse holds the ray and whose plane it meets; x and y from the corner of the view.
 function pick(report, x, y) {
-  const { state, arrays, splats } = report, box = $("view"), { view } = state;
+  const { state, splats } = report, { mean: means, normal: normals, cov } = report.shown;
+  const box = $("view"), { view } = state;
   const lens = report.lens(box.clientWidth, box.clientHeight);
   const ray = [(x - 0.5 - lens.center[0]) / lens.focal[0], (y - 0.5 - lens.center[1]) / lens.focal[1], 1];
   const way = sub(toWorld(view, ray), view.position);
   let best = null;
   for (let row = 0; row < splats.count; row++) {
     if (splats.depths[row] <= 0 || (best && splats.depths[row] > 1.5 * best.depth)) continue;
-    const mean = arrays.mean.subarray(3 * row, 3 * row + 3), normal = arrays.normal.subarray(3 * row, 3 * row + 3);
+    const mean = means.subarray(3 * row, 3 * row + 3), normal = normals.subarray(3 * row, 3 * row + 3);
     const facing = dot(normal, way);
     if (Math.abs(facing) < 1) continue; // seen from the side; normals are of length 127
     const depth = dot(normal, sub(mean, view.position)) / facing;
     const point = add(view.position, mul(way, depth));
-    const c = arrays.cov.subarray(6 * row, 6 * row + 6);
-    const size = (half(c[0]) + half(c[3]) + half(c[5])) * ABOUT.covUnit; // its squared radius, at most
+    const size = (cov[6 * row] + cov[6 * row + 3] + cov[6 * row + 5]) * ABOUT.covUnit; // its squared radius, at most
     const isHit = depth > 0 && norm(sub(point, mean)) ** 2 < 1.5 * size;
     if (isHit && (!best || depth < best.depth)) best = { row, point, depth };
   }
   return best;
-}
-
-function half(bits) {
-  const exponent = (bits >> 10) & 31, share = bits & 1023, sign = bits >> 15 ? -1 : 1;
-  return sign * (exponent ? 2 ** (exponent - 15) * (1 + share / 1024) : 2 ** -14 * (share / 1024));
 }

@@ -9,19 +9,20 @@ const FOCAL = 0.9; // heights of the window, unless a frame is chosen
 const REST = 200; // ms without a move until it is drawn in full
 
 async function start() {
-  const arrays = await readArrays();
-  const state = { frame: 0, view: null, pivot: ABOUT.pivot, size: ABOUT.size, focal: FOCAL, flies: false,
+  const sets = await readSets(), arrays = sets.gaussians;
+  const first = Math.max(ABOUT.frames.status.findIndex((status) => status !== "lost"), 0);
+  const state = { frame: first, view: null, pivot: ABOUT.pivot, size: ABOUT.size, focal: FOCAL, flies: false,
                   atFrame: false, image: null, ruler: [], measures: false, paths: {}, seesThrough: true };
-  const report = { state, arrays, frameTime: 0 };
+  const report = { state, arrays, sets, shown: arrays, frameTime: 0 };
   window.report = report; // for the tests, and whoever is curious
   wireStrip(report);
   try {
-    report.splats = new SplatRenderer($("map"), arrays, ABOUT, BACKGROUND);
+    report.splats = new SplatRenderer($("map"), arrays, BACKGROUND);
   } catch (error) {
     $("message").textContent = `The map cannot be drawn: ${error.message}. Pictures and curves need no WebGL.`;
     report.draw = () => {};
     report.showFrame = (row) => showPictures(report, row);
-    report.showFrame(0);
+    report.showFrame(first);
     document.body.dataset.ready = "without WebGL";
     return;
   }
@@ -30,7 +31,7 @@ async function start() {
   wireDrawing(report);
   wireChoices(report);
   report.home();
-  report.showFrame(0, false);
+  report.showFrame(first, false);
   report.draw(1);
   document.body.dataset.ready = "yes";
 }
@@ -52,7 +53,7 @@ function wireDrawing(report) {
   };
   // From outside one sees through the backs of walls and ceilings.
   const facing = (row) => {
-    const { mean, normal } = arrays, p = state.view.position;
+    const { mean, normal } = report.shown, p = state.view.position;
     let sum = 0;
     for (let k = 0; k < 3; k++) sum += normal[3 * row + k] * (mean[3 * row + k] - p[k]);
     return sum <= 0;
@@ -119,13 +120,17 @@ function wireChoices(report) {
     const name = $("layer").value, word = Number($("word").value), hasWord = name === "similarity" || name === "class";
     $("wordBox").hidden = !hasWord;
     $("thresholdBox").hidden = name !== "similarity";
-    const chosen = name === "similarity" ? Math.max(word, 0) : word;
-    splats.recolor(layers.paint(name, chosen, Number($("threshold").value), Number($("existence").value)));
-    legend(layers, name, chosen);
+    const chosen = name === "similarity" ? Math.max(word, 0) : word, kind = $("kind").value;
+    if (report.shown !== report.sets[kind]) splats.load((report.shown = report.sets[kind]));
+    for (const id of ["layer", "word", "threshold", "existence"]) $(id).disabled = kind === "splats";
+    if (kind === "splats") splats.recolor(report.shown.color);
+    else splats.recolor(layers.paint(name, chosen, Number($("threshold").value), Number($("existence").value)));
+    if (kind === "splats") $("legend").replaceChildren();
+    else legend(layers, name, chosen);
     report.moved();
   };
   report.choose = choose;
-  for (const id of ["layer", "word", "threshold", "existence"]) $(id).addEventListener("input", choose);
+  for (const id of ["kind", "layer", "word", "threshold", "existence"]) $(id).addEventListener("input", choose);
   for (const box of document.querySelectorAll("[data-path]")) {
     const show = () => {
       state.paths[box.dataset.path] = box.checked;

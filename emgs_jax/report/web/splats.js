@@ -7,34 +7,44 @@ const NUM_BUCKETS = 1 << 16;
 
 class SplatRenderer {
   // Throws where there is no WebGL2. `background`: RGB in [0, 1].
-  constructor(canvas, arrays, settings, background) {
+  constructor(canvas, set, background) {
     this.canvas = canvas;
-    this.settings = settings;
     this.background = background;
-    this.count = arrays.mean.length / 3;
-    this.means = arrays.mean;
-    this.colors = new Uint8Array(4 * this.count).fill(255);
+    this.textures = [];
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error("this browser has no WebGL2");
     this.gl = gl;
     this.program = this.link(...["vertex", "fragment"].map((id) => document.getElementById(id).textContent));
     gl.useProgram(this.program);
-    this.textures = [
-      this.texture(gl.RGB32F, gl.RGB, gl.FLOAT, arrays.mean, 3, Float32Array),
-      this.texture(gl.RGB16F, gl.RGB, gl.HALF_FLOAT, arrays.cov, 3, Uint16Array),
-      this.texture(gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, this.colors, 4, Uint8Array),
-    ];
     ["means", "covs", "colors"].forEach((name, unit) => gl.uniform1i(this.place(name), unit));
     this.attribute("corner", CORNERS, (at) => gl.vertexAttribPointer(at, 2, gl.FLOAT, false, 0, 0));
-    this.order = new Uint32Array(this.count);
-    this.rows = this.attribute("row", this.order, (at) => {
+    this.rows = this.attribute("row", new Uint32Array(1), (at) => {
       gl.vertexAttribIPointer(at, 1, gl.UNSIGNED_INT, 0, 0);
       gl.vertexAttribDivisor(at, 1);
     });
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    this.load(set);
+  }
+
+  // Draw this set, one of `readSets`, from now on, in white until it is recoloured.
+  load(set) {
+    const gl = this.gl;
+    this.textures.forEach(({ texture }) => gl.deleteTexture(texture));
+    this.set = set;
+    this.means = set.mean;
+    this.count = set.mean.length / 3;
+    this.colors = new Uint8Array(4 * this.count).fill(255);
+    this.textures = [
+      this.texture(gl.RGB32F, gl.RGB, gl.FLOAT, set.mean, 3, Float32Array),
+      this.texture(gl.RGB32F, gl.RGB, gl.FLOAT, set.cov, 3, Float32Array),
+      this.texture(gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, this.colors, 4, Uint8Array),
+    ];
+    this.order = new Uint32Array(this.count);
     this.depths = new Float32Array(this.count);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.rows);
+    gl.bufferData(gl.ARRAY_BUFFER, this.order, gl.DYNAMIC_DRAW);
   }
 
   link(vertex, fragment) {
@@ -113,7 +123,7 @@ class SplatRenderer {
   // lens: focal [fx, fy] and center [cx, cy] in pixels of the canvas. isSeen(row): false leaves a Gaussian out.
   // step: only every step-th is drawn, as much larger.
   draw(view, lens, isSeen, step = 1) {
-    const gl = this.gl, { width, height } = this.canvas, { render, covUnit } = this.settings;
+    const gl = this.gl, { width, height } = this.canvas, { render } = this.set;
     const number = this.sort(view, isSeen, step);
     gl.viewport(0, 0, width, height);
     gl.clearColor(...this.background, 1);
@@ -131,7 +141,7 @@ class SplatRenderer {
     gl.uniform2fv(this.place("focal"), lens.focal);
     gl.uniform2fv(this.place("center"), lens.center);
     gl.uniform2f(this.place("size"), width, height);
-    gl.uniform1f(this.place("covScale"), covUnit * step);
+    gl.uniform1f(this.place("covScale"), ABOUT.covUnit * step);
     for (const name of ["blur", "radius", "opacity"]) gl.uniform1f(this.place(name), render[name]);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, number);
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits, so that time can be taken

@@ -3,8 +3,8 @@
 precision highp float;
 precision highp int;
 uniform sampler2D means; // RGB32F, m
-uniform sampler2D covs; // RGB16F, two texels each: xx xy xz, yy yz zz
-uniform sampler2D colors; // RGBA8; alpha 0: not drawn
+uniform sampler2D covs; // RGB32F, two texels each: xx xy xz, yy yz zz
+uniform sampler2D colors; // RGBA8; alpha: a factor on the opacity, 0 is not drawn
 uniform mat3 rotation; // world -> camera
 uniform vec3 position; // of the camera, m
 uniform vec2 focal; // pixels

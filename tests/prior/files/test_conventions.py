@@ -20,6 +20,14 @@ def sight(pose: np.ndarray, said: np.ndarray | None = None, noise: float = 0.0) 
     return Sight(backproject(depth, INTRINSICS), depth > 0, pose if said is None else said)
 
 
+def scalar_first(pose: np.ndarray) -> np.ndarray:
+    """What a reader of x y z w makes of the pose's quaternion, written w x y z."""
+    changed = pose.copy()
+    w_x_y_z = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
+    changed[:3, :3] = Rotation.from_quat(w_x_y_z).as_matrix()
+    return changed
+
+
 def pose(turn: float, x: float, z: float) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_rotvec([0.05, turn, 0.02]).as_matrix(), (x, 0, z)
@@ -51,9 +59,36 @@ def test_views_that_share_nothing_say_nothing():
         (np.linalg.inv, "as world -> camera:"),
         (lambda T: T * [1, -1, -1, 1], "as camera -> world of OpenGL's axes:"),
         (lambda T: np.linalg.inv(T * [1, -1, -1, 1]), "as world -> camera of OpenGL's axes:"),
-        (lambda T: T * np.where(np.eye(4)[3] > 0, [[1000]] * 3 + [[1]], 1), "as in millimetres:"),
+        (
+            lambda T: T * np.where(np.eye(4)[3] > 0, [[1000]] * 3 + [[1]], 1),
+            "by about 1000, or the positions by 0.001:",
+        ),
+        (lambda T: scalar_first(T), "as with quaternions w, x, y, z:"),
+        (lambda T: scalar_first(np.linalg.inv(T)), "as world -> camera with quaternions w, x, y, z:"),
+        (lambda T: T[:, [2, 0, 1, 3]] * [1, -1, -1, 1], "as of axes x ahead, y left, z up:"),
+        (lambda T: T[:, [2, 0, 1, 3]], "as of axes x ahead, y right, z down:"),
     ],
 )
 def test_a_pose_of_another_convention_is_named(said, words):
     with pytest.raises(ValueError, match=f"poses.txt: the depths .*{words}"):
         check_conventions([(sight(A, said(A)), sight(B, said(B)))], INTRINSICS, "poses.txt")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda points: points * np.linalg.norm(points / points[..., 2:], axis=-1, keepdims=True),
+            "lengths of the ray",
+        ),
+        (lambda points: points / points[..., 2:] ** 2, "1 / depth"),
+        (lambda points: 0.4 * points / points[..., 2:] ** 2, "0.398. / depth"),
+        (lambda points: points * 5, "multiplied by about 0.1995"),
+    ],
+)
+def test_depths_of_another_kind_are_named(change, words):
+    """Lengths of rays, disparities and sixteen-bit depths of another scale made a bent or flat map without a word."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        pair = [seen._replace(points=change(seen.points)) for seen in (sight(A), sight(B))]
+    with pytest.raises(ValueError, match=f"where the depths are .*{words}"):
+        check_conventions([(pair[0], pair[1])], INTRINSICS, "depths")

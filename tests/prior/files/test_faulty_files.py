@@ -31,11 +31,11 @@ FAULTS = {
     "no rotation": ({"T_world_camera": lambda f: matrix(f, turn=2)}, r"IMG_8.npz: T_world_camera is no rigid motion"),
     "poses in mm": (
         {"T_world_camera": lambda f: matrix(f, unit=1000)},
-        r"T_world_camera of .*own/\*\.npz: the depths of two views .* are taken as in mill",
+        r"T_world_camera of .*own/\*\.npz: the depths of two views .* by about 1000, or the positions by 0.001",
     ),
     "inverse": (
         {"T_world_camera": lambda f: np.linalg.inv(f.T_world_camera)},
-        "are taken as world -> camera: expected are camera -> world",
+        "are taken as world -> camera: expected are poses camera -> world",
     ),
     "OpenGL": (
         {"T_world_camera": lambda f: f.T_world_camera * [1, -1, -1, 1]},
