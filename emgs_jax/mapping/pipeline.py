@@ -4,45 +4,28 @@ import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
-import jaxlie
-
-from emgs_jax.back_end.loops import relocalize_frame
 from emgs_jax.data.base import Dataset
 from emgs_jax.device.clock import Timer
-from emgs_jax.mapping.capacity import advance, prepare_step, restart_map, start
+from emgs_jax.mapping.capacity import advance, prepare_step, start
 from emgs_jax.mapping.checkpoint import Checkpoint, Keeper
 from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.mapping.finalize import rescale_run, with_first_frame
 from emgs_jax.mapping.loop_closing import add_frames, finish_back_end, optimize_and_deform, verify_loops
-from emgs_jax.mapping.records import NEW_SUBMAP, RELOCALIZED, RESTARTED, FrameRecord
+from emgs_jax.mapping.records import NEW_SUBMAP, RELOCALIZED, FrameRecord
 from emgs_jax.mapping.relocalization import (
-    anchor_motion_of,
     as_step_prediction,
-    is_relocalization_due,
-    is_restart_due,
     move_prediction,
     not_found_message,
-    rejection,
-    relocalized_start,
-    replace_map,
+    reanchor_prior,
+    relocalize_lost,
     state_in_saved_map,
+    step_prediction,
+    with_saved_map,
 )
 from emgs_jax.mapping.run import MappingRun, TrackedFrame, record_lost, record_new_submap, record_start, record_step
-from emgs_jax.mapping.submaps import (
-    drop_unjoined_submaps,
-    enter_submap,
-    in_structure,
-    is_related,
-    join_submaps,
-    match_submap,
-    place_structure,
-    start_submap,
-    step_prediction,
-)
+from emgs_jax.mapping.submaps import drop_unjoined_submaps, enter_submap, join_submaps, match_submap, start_submap
 from emgs_jax.mapping.window_input import RawView, WindowInput, make_prior_query, window_inputs
-from emgs_jax.observation import Prediction
 from emgs_jax.prior.base import Prior
-from emgs_jax.slam import SlamState
 
 
 def map_frames(
@@ -107,79 +90,39 @@ def track(run: MappingRun, window: WindowInput) -> MappingRun:
     if window.prediction is None:
         return record_lost(run, window)
     if isinstance(window.prediction, FirstWindow):
-        prepare_step(window.prediction, run.camera, run.config)
+        run = start_map(run, window.prediction)
         if run.saved is None:
-            return record_start(start_map(run, window.prediction), window, seconds_of(window, timer))
+            return record_start(run, window, seconds_of(window, timer))
     submap = start_submap(run, window)
     if submap is not None:
         return record_new_submap(submap, window, seconds_of(window, timer))
-    run, frame = step_or_relocalize(run, window)
+    tracked, frame = step_frame(run, window)
+    tracked, frame = relocalize_lost(run, tracked, frame, window)
     if frame.info is None:
-        return record_lost(run, window, frame.location)
-    frame = match_submap(run, window, frame)
-    return reanchor_prior(record_step(run, window, frame, seconds_of(window, timer)), window)
+        return record_lost(tracked, window, frame.location)
+    if tracked.is_fixed:
+        tracked = with_saved_map(tracked)
+    frame = match_submap(tracked, window, frame)
+    return reanchor_prior(record_step(tracked, window, frame, seconds_of(window, timer)), window)
 
 
 def start_map(run: MappingRun, first: FirstWindow) -> MappingRun:
-    """Start the map of a run."""
+    """Prepare the step for the first window, and start the map of a run that continues in none."""
+    prepare_step(first, run.camera, run.config)
+    if run.saved is not None:
+        return run
     state, config = start(first, run.camera, run.config)
     return replace(run, state=state, config=config)
 
 
-def step_or_relocalize(run: MappingRun, window: WindowInput) -> tuple[MappingRun, TrackedFrame]:
-    """Run one step; a lost camera is relocalized first, and the step starts at the pose found.
-
-    Where relocalization fails for long the map restarts at the pose that the step has estimated.
-    """
-    before, frame = run, TrackedFrame(step_prediction(run, window))
-    if run.state is not None:
-        run, frame = step_from(run, run.state, move_prediction(frame.prediction, run.prior_motion), frame)
-    if is_relocalization_due(before, frame.info):
-        found, relocalized = step_relocalized(before, window, frame)
-        if relocalized.location == RELOCALIZED:
-            run, frame = found, relocalized
-        else:
-            frame = replace(frame, location=relocalized.location)
-            if frame.info is not None and is_restart_due(before, window, run.state, frame.info):
-                state, config = restart_map(run.state, run.camera, run.config)
-                run, frame = replace(run, state=state, config=config), replace(frame, location=RESTARTED)
-    if run.is_fixed and run.state is not None:
-        state = replace_map(run.state, run.saved.map, run.config.submap.map_capacity)
-        run = replace(run, state=state)
-    return run, frame
-
-
-def step_from(
-    run: MappingRun, state: SlamState, prediction: Prediction, frame: TrackedFrame
-) -> tuple[MappingRun, TrackedFrame]:
-    """Run one step from a state; capacities grow where they must."""
-    state, info, config = advance(state, prediction, run.camera, run.config)
+def step_frame(run: MappingRun, window: WindowInput) -> tuple[MappingRun, TrackedFrame]:
+    """Run one step; nothing happens where the camera has no pose yet."""
+    frame = TrackedFrame(step_prediction(run, window))
+    if run.state is None:
+        return run, frame
+    prediction = move_prediction(frame.prediction, run.prior_motion)
+    state, info, config = advance(run.state, prediction, run.camera, run.config)
     return replace(run, state=state, config=config), replace(frame, info=info)
-
-
-def step_relocalized(run: MappingRun, window: WindowInput, frame: TrackedFrame) -> tuple[MappingRun, TrackedFrame]:
-    """Relocalize a lost camera, and run the step from the pose found; `location` tells whether the map accepts it."""
-    place, failure = relocalize_frame(run.back_end, window.data[0])
-    if place is None:
-        return run, replace(frame, location=failure)
-    prediction, is_known = frame.prediction, is_related(run, window)
-    if not is_known:
-        prediction = in_structure(prediction, window, place_structure(window, place.T_world_camera))
-    state, again = relocalized_start(run, prediction, place, has_other_unit=not is_known)
-    found, frame = step_from(run, state, again, frame)
-    failure = rejection(frame.info, again, place, run.back_end.config.relocalization)
-    return found, replace(frame, location=failure or RELOCALIZED)
-
-
-def reanchor_prior(run: MappingRun, window: WindowInput) -> MappingRun:
-    """Anchor the prior's world at the last frame, if relocalization has found its pose."""
-    last = run.records[-1]
-    if last.location != RELOCALIZED:
-        return run
-    if is_related(run, window):
-        return replace(run, prior_motion=anchor_motion_of(last, step_prediction(run, window)))
-    # The prior continues in a world of its own, which moves with this frame.
-    return replace(run, structure=place_structure(window, last.pose), prior_motion=jaxlie.SE3.identity())
 
 
 def update_back_end(run: MappingRun, window: WindowInput) -> MappingRun:
@@ -202,9 +145,7 @@ def replay(
     Until then the back end deforms a map that the checkpoint's replaces.
     """
     if isinstance(window.prediction, FirstWindow):
-        prepare_step(window.prediction, run.camera, run.config)
-        if run.saved is None:
-            run = start_map(run, window.prediction)
+        run = start_map(run, window.prediction)
     first = len(run.records)
     records = tuple(checkpoint.records[first : first + len(window.frames)])
     run = replace(run, records=(*run.records, *records))

@@ -1,4 +1,7 @@
-"""Relocalization of a camera that is lost, or new in a saved map, and restart where that fails for long."""
+"""Relocalization of a camera that is lost, or new in a saved map, and restart where that fails for long.
+
+The prior's poses are in a world of its own, which a relocalized frame anchors in that of the map.
+"""
 
 from collections import Counter
 from dataclasses import replace
@@ -8,14 +11,16 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
+from emgs_jax.back_end.loops import relocalize_frame
 from emgs_jax.back_end.state import BackEnd
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import GaussianMap, grow
 from emgs_jax.loop_closure.relocalization import RelocalizationConfig, RelocalizedPose
+from emgs_jax.mapping.capacity import advance, restart_map
 from emgs_jax.mapping.convert import FirstWindow
-from emgs_jax.mapping.records import IN_MAP, FrameRecord
-from emgs_jax.mapping.run import MappingRun
-from emgs_jax.mapping.window_input import WindowInput
+from emgs_jax.mapping.records import IN_MAP, RELOCALIZED, RESTARTED, FrameRecord
+from emgs_jax.mapping.run import MappingRun, TrackedFrame
+from emgs_jax.mapping.window_input import PlacedStructure, WindowInput
 from emgs_jax.observation import Prediction, depth_in, transform
 from emgs_jax.pose_graph.factors import ODOMETRY
 from emgs_jax.registration.pose_estimate import exact_estimate
@@ -23,6 +28,45 @@ from emgs_jax.registration.rigid import pose_row, scale_translation
 from emgs_jax.slam import SlamState, StepInfo
 
 FINE_POSE = "fine_pose"  # reason of a rejection: at the relocalized pose the frame does not fit the map
+UNKNOWN = np.full((4, 4), np.nan)  # pose
+
+
+def relocalize_lost(
+    before: MappingRun, run: MappingRun, frame: TrackedFrame, window: WindowInput
+) -> tuple[MappingRun, TrackedFrame]:
+    """Relocalize a lost camera, and repeat its step at the pose found; restart the map where that fails for long.
+
+    `location` of the frame tells the outcome.
+
+    Args:
+        before: the run before the step.
+        run: after it, with the pose that it has estimated.
+        frame: likewise.
+        window: of the frame.
+    """
+    if not is_relocalization_due(before, frame.info):
+        return run, frame
+    found, relocalized = _step_relocalized(before, window, frame)
+    if relocalized.location == RELOCALIZED:
+        return found, relocalized
+    if frame.info is None or not is_restart_due(before, window, run.state, frame.info):
+        return run, replace(frame, location=relocalized.location)
+    state, config = restart_map(run.state, run.camera, run.config)
+    return replace(run, state=state, config=config), replace(frame, location=RESTARTED)
+
+
+def _step_relocalized(run: MappingRun, window: WindowInput, frame: TrackedFrame) -> tuple[MappingRun, TrackedFrame]:
+    """Relocalize a lost camera, and run the step from the pose found; `location` tells whether the map accepts it."""
+    place, failure = relocalize_frame(run.back_end, window.data[0])
+    if place is None:
+        return run, replace(frame, location=failure)
+    prediction, is_known = frame.prediction, is_related(run, window)
+    if not is_known:
+        prediction = in_structure(prediction, window, place_structure(window, place.T_world_camera))
+    state, again = relocalized_start(run, prediction, place, has_other_unit=not is_known)
+    state, info, config = advance(state, again, run.camera, run.config)
+    failure = rejection(info, again, place, run.back_end.config.relocalization)
+    return replace(run, state=state, config=config), replace(frame, info=info, location=failure or RELOCALIZED)
 
 
 def is_relocalization_due(run: MappingRun, info: StepInfo | None) -> bool:
@@ -75,6 +119,44 @@ def _num_untracked(run: MappingRun, info: StepInfo) -> int:
     """Count the last frames in a row that are not tracked, the one of `info` included."""
     placed = [row for row, record in enumerate(run.records) if record.status in IN_MAP]
     return 0 if info.localization.is_tracked else len(run.records) - (placed[-1] if placed else -1)
+
+
+def step_prediction(run: MappingRun, window: WindowInput) -> Prediction:
+    """Return a step's prediction in the world of the map; without poses where they are not related to it."""
+    prediction = as_step_prediction(window.prediction)
+    if run.structure is None or not is_related(run, window):
+        return prediction
+    return in_structure(prediction, window, run.structure)
+
+
+def in_structure(prediction: Prediction, window: WindowInput, placed: PlacedStructure) -> Prediction:
+    """Transform a step's input from the prior's own world to that of the map."""
+    here = window.frames[0].index
+    rows = here - 1, here, here + int(prediction.has_newest)
+    T_world_views = placed.T_world_structure @ np.stack([window.T_anchor_views.get(row, UNKNOWN) for row in rows])
+    return replace(prediction, T_world_views=to_se3(T_world_views), T_world_anchor=to_se3(placed.T_world_anchor))
+
+
+def is_related(run: MappingRun, window: WindowInput) -> bool:
+    """Test whether the predicted poses are in a world whose pose in the map is known."""
+    return window.structure == (0 if run.structure is None else run.structure.number)
+
+
+def place_structure(window: WindowInput, pose: np.ndarray) -> PlacedStructure:
+    """Place the prior's own world by the pose of the current frame in the map; lengths are scaled about that frame."""
+    own = window.T_anchor_views.get(window.frames[0].index, UNKNOWN)
+    return PlacedStructure(window.structure, pose @ np.linalg.inv(own), pose)
+
+
+def reanchor_prior(run: MappingRun, window: WindowInput) -> MappingRun:
+    """Anchor the prior's world at the last frame, if relocalization has found its pose."""
+    last = run.records[-1]
+    if last.location != RELOCALIZED:
+        return run
+    if is_related(run, window):
+        return replace(run, prior_motion=anchor_motion_of(last, step_prediction(run, window)))
+    # The prior continues in a world of its own, which moves with this frame.
+    return replace(run, structure=place_structure(window, last.pose), prior_motion=jaxlie.SE3.identity())
 
 
 def as_step_prediction(opening: FirstWindow | Prediction) -> Prediction:
@@ -172,6 +254,11 @@ def not_found_message(run: MappingRun) -> str:
         f"none of the {len(run.records)} frames is found in the saved map ({reasons or 'none has points and a pose'}): "
         "take images of the same place, or map it anew without map="
     )
+
+
+def with_saved_map(run: MappingRun) -> MappingRun:
+    """Restore the saved map of a run that keeps it as it is."""
+    return replace(run, state=replace_map(run.state, run.saved.map, run.config.submap.map_capacity))
 
 
 def replace_map(state: SlamState, map: GaussianMap, capacity: int) -> SlamState:

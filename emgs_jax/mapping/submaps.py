@@ -22,42 +22,20 @@ from emgs_jax.loop_closure.relocalization import RelocalizedPose
 from emgs_jax.mapping.capacity import add_map, advance, start
 from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.mapping.records import JOINED, UNJOINED, transform_record
-from emgs_jax.mapping.relocalization import anchor_motion_of, as_step_prediction, rejection, relocalized_start
+from emgs_jax.mapping.relocalization import (
+    anchor_motion_of,
+    as_step_prediction,
+    is_related,
+    place_structure,
+    rejection,
+    relocalized_start,
+    step_prediction,
+)
 from emgs_jax.mapping.run import MappingRun, TrackedFrame, row_of_first_node
-from emgs_jax.mapping.window_input import PlacedStructure, WindowInput
-from emgs_jax.observation import Prediction
+from emgs_jax.mapping.window_input import WindowInput
 from emgs_jax.pose_graph.factors import ODOMETRY
 from emgs_jax.registration.pose_estimate import rescale_estimate
 from emgs_jax.slam import StepInfo
-
-UNKNOWN = np.full((4, 4), np.nan)  # pose
-
-
-def step_prediction(run: MappingRun, window: WindowInput) -> Prediction:
-    """Return a step's prediction in the world of the map; without poses where they are not related to it."""
-    prediction = as_step_prediction(window.prediction)
-    if run.structure is None or not is_related(run, window):
-        return prediction
-    return in_structure(prediction, window, run.structure)
-
-
-def in_structure(prediction: Prediction, window: WindowInput, placed: PlacedStructure) -> Prediction:
-    """Transform a step's input from the prior's own world to that of the map."""
-    here = window.frames[0].index
-    rows = here - 1, here, here + int(prediction.has_newest)
-    T_world_views = placed.T_world_structure @ np.stack([window.T_anchor_views.get(row, UNKNOWN) for row in rows])
-    return replace(prediction, T_world_views=to_se3(T_world_views), T_world_anchor=to_se3(placed.T_world_anchor))
-
-
-def is_related(run: MappingRun, window: WindowInput) -> bool:
-    """Test whether the predicted poses are in a world whose pose in the map is known."""
-    return window.structure == (0 if run.structure is None else run.structure.number)
-
-
-def place_structure(window: WindowInput, pose: np.ndarray) -> PlacedStructure:
-    """Place the prior's own world by the pose of the current frame in the map; lengths are scaled about that frame."""
-    own = window.T_anchor_views.get(window.frames[0].index, UNKNOWN)
-    return PlacedStructure(window.structure, pose @ np.linalg.inv(own), pose)
 
 
 def start_submap(run: MappingRun, window: WindowInput) -> MappingRun | None:

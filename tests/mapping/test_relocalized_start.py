@@ -19,7 +19,6 @@ from emgs_jax.gaussian_map import new_map
 from emgs_jax.localization import localize_coarse
 from emgs_jax.loop_closure.relocalization import RelocalizedPose
 from emgs_jax.mapping.convert import FirstWindow
-from emgs_jax.mapping.pipeline import reanchor_prior
 from emgs_jax.mapping.records import RELOCALIZED, FrameRecord
 from emgs_jax.mapping.relocalization import (
     anchor_motion,
@@ -28,6 +27,7 @@ from emgs_jax.mapping.relocalization import (
     is_relocalization_due,
     is_restart_due,
     move_prediction,
+    reanchor_prior,
     rejection,
     relocalized_start,
     replace_map,
