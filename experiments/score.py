@@ -15,6 +15,7 @@ from emgs_jax.data.timestamps import in_seconds
 from emgs_jax.evaluation.clouds import PointCloud, read_cloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, compare_clouds
 from emgs_jax.evaluation.trajectory import associate, check_conventions, trajectory_metrics
+from emgs_jax.io.ply_reader import num_faces
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.ops.ranges import Range
 from emgs_jax.prior.base import Provenance
@@ -127,6 +128,11 @@ def main(config: DictConfig) -> None:
     metrics, path = score(config)
     print(full_table(average(estimates_of(path), each_sequence=True)))
     print(coverage(metrics, config.min_matched_percent))
+    if config.points is not None and num_faces(config.points):
+        print(
+            f"warning: {config.points} is a mesh, and its vertices are what was compared: where triangles are larger "
+            "than a centimetre or two give points that are sampled on them"
+        )
     print(f"everything is in {path}")
 
 
