@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 
+from .console import speak_on
 from .interrupt import clear_interrupt
 
 COMMANDS = {  # name: (what it does, an example)
@@ -47,6 +48,7 @@ def explained(name: str) -> Callable[[], None]:
 
 def main() -> None:
     """Hand the rest of the command line to a command."""
+    speak_on()
     name, *rest = sys.argv[1:] or ["--help"]
     if name in ("-h", "--help", "help"):
         print(usage())

@@ -24,6 +24,7 @@ from emgs_jax.config.configure import CONF, compose, first_of_sweep, message_of
 from emgs_jax.config.overrides import quoted, readable
 from emgs_jax.device.settings import leave_memory_to_torch, use_compilation_cache
 
+from .console import speak_on
 from .interrupt import clear_interrupt
 from .keys import check_keys
 
@@ -55,6 +56,7 @@ def command(
                 return task(config)
 
         def main() -> None:
+            speak_on()
             if name != RUN and {"-h", "--help"} & {*sys.argv[1:]}:
                 print(help_of(name))
                 return
@@ -137,10 +139,20 @@ def check_arguments(name: str, arguments: list[str]) -> None:
         raise ValueError(f"{str(error).splitlines()[0]}: write each as KEY=VALUE, in quotes: 'KEY=VALUE'") from error
     # Of Hydra's own keys one has options of the user in it: what emgs tune has found.
     own = [o for o in parsed if not o.key_or_group.startswith("hydra") or o.key_or_group == "hydra.searchpath"]
+    for override in parsed:
+        if override.key_or_group == "hydra.run.dir":
+            check_output(Path(str(override.value())))
     overrides = [first_of_sweep(override) for override in own]
     if folders and not any(o.key_or_group == "hydra.searchpath" for o in own):
         overrides.append(f"hydra.searchpath=[{','.join(quoted(f'file://{Path(f).resolve()}') for f in folders)}]")
     compose(*overrides, name=name)
+
+
+def check_output(folder: Path) -> None:
+    """Raise ValueError where the folder of a run cannot be made, which Hydra tells by a traceback."""
+    nearest = next((path for path in (folder, *folder.parents) if path.exists()), Path())
+    if "$" not in str(folder) and not (nearest.is_dir() and os.access(nearest, os.W_OK)):
+        raise ValueError(f"hydra.run.dir={folder}: {nearest} is no folder that can be written to")
 
 
 def check_words(name: str, arguments: list[str]) -> list[str]:

@@ -16,7 +16,8 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.timestamps import in_seconds
 from emgs_jax.evaluation.clouds import PointCloud, read_cloud
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, compare_clouds
-from emgs_jax.evaluation.trajectory import associate, trajectory_metrics
+from emgs_jax.evaluation.trajectory import associate, check_conventions, trajectory_metrics
+from emgs_jax.io.ply_reader import num_faces
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.ops.ranges import Range
 from emgs_jax.prior.base import Provenance
@@ -78,7 +79,21 @@ def matched_poses(
             "stop, stride) or raise max_time_difference"
         )
     truth = np.stack([known[row][1] for row in true_rows]).astype(np.float64)
+    _check_twice(times, poses, path)
+    check_conventions(poses[rows], truth, path)
     return poses[rows], truth, {"score/num_poses": len(times), "score/num_frames": len(known)}
+
+
+def _check_twice(times: np.ndarray, poses: np.ndarray, path: str) -> None:
+    """ValueError where two poses have one time: it is open which of them a score is about."""
+    order = np.argsort(times, kind="stable")
+    twice = np.flatnonzero(np.diff(times[order]) == 0)
+    differ = [row for row in twice if not np.array_equal(poses[order[row]], poses[order[row + 1]])]
+    if differ:
+        raise ValueError(
+            f"{path} has {len(differ)} poses at times at which it has another one, the first at "
+            f"{times[order[differ[0]]]:.6f} s: keep one path, with all digits of its times"
+        )
 
 
 def coverage(metrics: Metrics, min_percent: float) -> str:
@@ -113,6 +128,11 @@ def main(config: DictConfig) -> None:
     metrics, path = score(config)
     print(full_table(average(estimates_of(path), each_sequence=True)))
     print(coverage(metrics, config.min_matched_percent))
+    if config.points is not None and num_faces(config.points):
+        print(
+            f"warning: {config.points} is a mesh, and its vertices are what was compared: where triangles are larger "
+            "than a centimetre or two give points that are sampled on them"
+        )
     print(f"everything is in {path}")
 
 

@@ -142,6 +142,22 @@ def test_nothing_is_pickled():
         assert "allow_pickle=True" not in path.read_text(), path
 
 
+def test_text_is_utf_8_whatever_the_machine_speaks():
+    """In a container without a locale the first step of a run ended with "'ascii' codec can't decode byte"."""
+    for path in [*FILES, *sorted((PACKAGE.parent / "experiments").rglob("*.py"))]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call):
+                continue
+            named = {keyword.arg for keyword in node.keywords}
+            words = [argument.value for argument in node.args if isinstance(argument, ast.Constant)]
+            is_open = isinstance(node.func, ast.Name) and node.func.id == "open" and not {"rb", "wb"} & {*words}
+            is_text = isinstance(node.func, ast.Attribute) and node.func.attr in ("read_text", "write_text")
+            ours = ast.unparse(node.func) == "reading.read_text"
+            assert "encoding" in named or ours or not (is_open or is_text), f"{path}:{node.lineno}"
+            is_process = ast.unparse(node.func).startswith("subprocess.") and "text" in named
+            assert not is_process or "encoding" in named, f"{path}:{node.lineno}"
+
+
 def test_weights_are_loaded_as_tensors_only():
     for path in FILES:
         for call in re.findall(r"torch\.load\(.*?\)", path.read_text(), re.DOTALL):

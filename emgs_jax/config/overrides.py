@@ -10,6 +10,7 @@ from hydra.errors import HydraException
 
 KEY = re.compile(r"(?:\+{1,2}|~)?[A-Za-z_][\w./@:-]*=")
 NAMES = ("root", "sequence", "folder", "map", "out")  # keys whose values are names, though they may look like numbers
+HOME = re.compile(r"(?<![^,])~(?=/)")  # shells leave it, zsh always, others in quotes
 OPENS = {"[": "]", "{": "}"}
 
 
@@ -17,7 +18,7 @@ def readable(arguments: Sequence[str]) -> list[str]:
     """The words with every `key=value` quoted that means something else to Hydra, or nothing.
 
     A value is text where there is such a file or folder, and where the grammar has no place for its signs: spaces with
-    brackets, `=`, letters beyond ASCII. A list that a shell has cut at its spaces is put together.
+    brackets, `=`, letters beyond ASCII. A list that a shell has cut at its spaces is put together, `~/` is the home.
     """
     return [_readable(word) if KEY.match(word) else word for word in joined(arguments)]
 
@@ -53,7 +54,9 @@ def parsed(word: str) -> Override | None:
 
 def _readable(word: str) -> str:
     key = KEY.match(word)[0]
-    value, found = word[len(key) :], parsed(word)
+    value = HOME.sub(lambda _: str(Path.home()), word[len(key) :])
+    word = key + value
+    found = parsed(word)
     if found is None:
         items = value.split(",")
         if len(items) > 1 and not _is_there(value) and all(map(_is_there, items)):  # of a multirun

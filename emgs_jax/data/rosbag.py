@@ -23,6 +23,7 @@ TO_RGB |= {"rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB, "mono16": c
 # What OpenCV's programs publish where nobody says the encoding: its own order of colours.
 TO_RGB |= {"8UC1": cv2.COLOR_GRAY2RGB, "8UC3": cv2.COLOR_BGR2RGB, "8UC4": cv2.COLOR_BGRA2RGB}
 CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4, "mono16": 1, "8UC1": 1, "8UC3": 3, "8UC4": 4}
+DEPTHS = re.compile(r"(16|32|64)[USF]C[1-4]$")  # also where they are compressed, as if they were pictures
 STRAIGHT_MODELS = ("plumb_bob", "rational_polynomial", "")
 RECTIFIED = re.compile(r"(^|[/_])rect([/_]|$)")  # a topic, as image_proc and others name it
 
@@ -160,17 +161,20 @@ def to_rgb(message: Any, is_compressed: bool, label: str) -> np.ndarray:
     Raises:
         BadFrameError: it is damaged or of an encoding that is not read.
     """
+    encoding = str(message.format).partition(";")[0].strip() if is_compressed else str(message.encoding)
+    is_depth = DEPTHS.match(encoding) is not None or (is_compressed and "compressedDepth" in str(message.format))
+    if is_depth or (not is_compressed and encoding not in CHANNELS):
+        what = " (depths)" if is_depth else ""
+        raise BadFrameError(
+            f"{label} has the encoding {encoding[:40]!r}{what}, and read are {', '.join(CHANNELS)}: "
+            "choose another dataset.topic, such as the rectified one"
+        )
     if is_compressed:
         data = bytes(message.data)
         image = None if reading.damage(data) else cv2.imdecode(np.frombuffer(data, np.uint8), reading.OWN_BITS)
         if image is None:
             raise BadFrameError(f"{label} is damaged: record it again, or set on_bad_frame=skip")
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    if message.encoding not in CHANNELS:
-        raise BadFrameError(
-            f"{label} has the encoding {str(message.encoding)[:40]!r}, and read are {', '.join(CHANNELS)}: "
-            "choose another dataset.topic, such as the rectified one"
-        )
     dtype = np.dtype(np.uint16 if message.encoding == "mono16" else np.uint8)
     dtype = dtype.newbyteorder(">" if message.is_bigendian else "<")
     width = message.width * CHANNELS[message.encoding] * dtype.itemsize

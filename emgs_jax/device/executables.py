@@ -207,7 +207,8 @@ def _machine() -> tuple[str, ...]:
     """Describe the machine and versions that an executable is for; the number of threads decides how sums are split."""
     device = jax.devices()[0]
     cpu = Path("/proc/cpuinfo")
-    features = sorted(set(re.findall(r"^(?:flags|Features)\s*:.*", cpu.read_text(), re.M))) if cpu.exists() else []
+    text = cpu.read_text(encoding="utf-8") if cpu.exists() else ""
+    features = sorted(set(re.findall(r"^(?:flags|Features)\s*:.*", text, re.M)))
     versions = [f"{name} {version(name)}" for name in PACKAGES]
     about = platform.python_version(), platform.machine(), os.cpu_count(), os.environ.get("XLA_FLAGS")
     return *map(str, about), *versions, *features, device.device_kind, device.client.platform_version
@@ -221,7 +222,7 @@ def _source(module: str) -> list[str]:
         name = ahead.pop()
         path = ROOT.parent / (name.replace(".", "/") + ".py")
         if name not in found and path.exists():
-            found[name] = path.read_text()
+            found[name] = path.read_text(encoding="utf-8")
             ahead += re.findall(r"^\s*(?:from|import) (emgs_jax[\w.]*)", found[name], re.M)
     constants = {name: vars(sys.modules[name]) for name in found if name in sys.modules}
     said = [f"{name}.{key}={value}" for name in sorted(constants) for key, value in _numbers(constants[name])]

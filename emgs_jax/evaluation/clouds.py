@@ -62,14 +62,16 @@ def read_cloud(path: str | os.PathLike, normal_neighbours: int) -> PointCloud:
 
 
 def _columns(vertices: Mapping[str, np.ndarray], names: Sequence[str], path: object) -> np.ndarray:
-    """Properties (n, 3) as float64, those of integers (colours) as a fraction of the largest; all must be finite."""
+    """Properties (n, 3) as float64, colours as fractions of 1, 255 or 65535, by their largest; all must be finite."""
     rows = np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
     num_broken = int((~np.isfinite(rows).all(1)).sum())
     if num_broken:
         what = f"points are not finite in {', '.join(names)}"
         raise ValueError(f"{path}: {num_broken} of {len(rows)} {what}: leave them out of the file")
-    kind = vertices[names[0]].dtype
-    return rows / np.iinfo(kind).max if names == _COLORS and kind.kind in "iu" else rows
+    if names != _COLORS:
+        return rows
+    is_float = vertices[names[0]].dtype.kind == "f"  # programs write 0 … 255 in any kind
+    return rows / next((top for top in (1.0,) * is_float + (255.0, 65535.0) if rows.max(initial=0.0) <= top), np.inf)
 
 
 def _fitted_normals(points: np.ndarray, num_neighbours: int) -> np.ndarray:

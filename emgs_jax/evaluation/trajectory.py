@@ -5,9 +5,11 @@ All errors are root mean squares. Poses are `T_world_camera`, float (n, 4, 4), i
 
 import numpy as np
 
+from emgs_jax.data.pose_conventions import EXPECTED, READINGS
 from emgs_jax.data.timestamps import resolution
 from emgs_jax.geometry import Sim3
 
+MIN_ODD_DEG, MIN_GAIN = 1.0, 3.0  # rotation per motion, and by which factor another convention must fit better
 _MIN_SPREAD_M = 1e-6  # below this RMS distance from its centroid a path gives no direction and no scale
 
 
@@ -103,6 +105,20 @@ def trajectory_metrics(estimate: np.ndarray, truth: np.ndarray) -> dict[str, flo
     metrics["trajectory/scale"] = scale
     metrics["trajectory/scale_percent"] = 100.0 * min(scale, 1.0 / scale) if scale > 0 else 0.0
     return metrics
+
+
+def check_conventions(estimate: np.ndarray, truth: np.ndarray, source: str) -> None:
+    """ValueError where poses (n, 4, 4) turn as the true ones in another convention, and far from that as they are."""
+    if len(estimate) < 3:
+        return
+    own = rpe(estimate, truth)[1]
+    found = {words: rpe(np.stack([change(pose) for pose in estimate]), truth)[1] for words, change in READINGS.items()}
+    best = min(found, key=lambda words: found[words])
+    if own > MIN_ODD_DEG and found[best] < own / MIN_GAIN:
+        raise ValueError(
+            f"{source}: the motions from pose to pose turn by {own:.1f} degrees otherwise than the true ones, and by "
+            f"{found[best]:.1f} where the poses are taken as {best}: expected are {EXPECTED}"
+        )
 
 
 def _solve(

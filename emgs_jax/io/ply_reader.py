@@ -47,6 +47,12 @@ def read_vertices(path: str | os.PathLike) -> dict[str, np.ndarray]:
     return {name: rows[name].astype(rows.dtype[name].newbyteorder("=")) for name in vertex.properties}
 
 
+def num_faces(path: str | os.PathLike) -> int:
+    """How many faces a PLY announces."""
+    _, elements, _ = _header(Path(path).read_bytes(), path)
+    return sum(element.count for element in elements if element.name == "face")
+
+
 def scale_ply(path: str | os.PathLike, target: str | os.PathLike, factor: float) -> None:
     """Copy a PLY that begins with its vertices, in binary, with all lengths times `factor`.
 

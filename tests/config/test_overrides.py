@@ -1,5 +1,7 @@
 """What people call their files, for Hydra's grammar; oracle: what Hydra makes of the word."""
 
+from pathlib import Path
+
 import pytest
 
 from emgs_jax.config.configure import compose
@@ -26,7 +28,8 @@ NAMES = (
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_is_read_as_it_stands_whatever_signs_it_has(name):
     (word,) = readable([f"dataset.root={name}"])
-    assert parsed(word).value() == name or (name == "null" and parsed(word).value() is None)
+    meant = name.replace("~", str(Path.home()))
+    assert parsed(word).value() == meant or (name == "null" and parsed(word).value() is None)
     assert readable([word]) == [word] and parsed(f"x={quoted(name)}").value() == name
     if name in ("IMG (1).mp4", "2024"):
         assert compose("dataset=images", f"dataset.root={name}").dataset.root == name
@@ -61,3 +64,11 @@ def test_lists_that_a_shell_has_cut_are_put_together_and_their_items_are_text_wh
 def test_what_hydra_reads_stays_as_it_is():
     words = ["+a=1", "++a.b=[x,y]", "~a", "slam/em=paper", "a='x y'", "x=range(1,4)", "a=null", "seeds=[0,1]", "a=${b}"]
     assert readable(words) == words
+
+
+def test_the_home_is_written_out_in_every_key_and_choice():
+    """`trajectory=~/path.txt` of a zsh did not exist, although it did."""
+    home = str(Path.home())
+    assert parsed(readable(["trajectory=~/a b.txt"])[0]).value() == f"{home}/a b.txt"
+    assert readable(["map=~/a,~/b"]) == [f"map={home}/a,{home}/b"]
+    assert parsed(readable(["map=a~/b"])[0]).value() == "a~/b" and readable(["~features"]) == ["~features"]

@@ -1,6 +1,7 @@
 """Bags of ROS 1 and 2, written by rosbags' own writers; oracles: the pictures that were written, dataset=images."""
 
 import sys
+from types import SimpleNamespace
 from unittest.mock import ANY
 
 import cv2
@@ -128,3 +129,13 @@ def test_an_image_that_is_shorter_than_it_says_is_a_bad_frame(tmp_path):
     message = type("Message", (), values)()
     with pytest.raises(BadFrameError, match="is not as large as it says"):
         to_rgb(message, False, "here")
+
+
+@pytest.mark.parametrize("form", ["16UC1; compressedDepth png", "16UC1; jpeg compressed ", "32FC1; compressedDepth"])
+def test_depths_that_are_compressed_are_no_pictures(form):
+    """A bag with one compressed topic, the depths, was mapped from pictures of depths, or was called damaged."""
+    picture = SimpleNamespace(format=form, data=cv2.imencode(".png", np.zeros((4, 4), np.uint16))[1])
+    with pytest.raises(BadFrameError, match=r"one has the encoding '(16U|32F)C1' \(depths\), .*another dataset.topic"):
+        to_rgb(picture, True, "one")
+    picture.format = "bgr8; jpeg compressed bgr8"
+    assert to_rgb(picture, True, "one").shape == (4, 4, 3)

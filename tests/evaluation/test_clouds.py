@@ -161,3 +161,15 @@ def test_a_file_without_usable_points_is_named(tmp_path):
     o3d.io.write_point_cloud(str(tmp_path / "a.ply"), o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
     with pytest.raises(ValueError, match=r"a\.ply has a point 2e\+\d+ m away"):
         read_cloud(tmp_path / "a.ply", 12)
+
+
+@pytest.mark.parametrize(
+    ("kind", "top"), [("uchar", 255), ("int", 255), ("float", 255), ("float", 1), ("ushort", 65535)]
+)
+def test_colours_are_fractions_in_whatever_kind_a_program_writes_them(kind, top, tmp_path):
+    """Colours of int were nearly black, those of 0 … 255 in float came 255 times too bright."""
+    names = "".join(f"property float {name}\n" for name in "xyz")
+    names += "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
+    rows = "".join(f"{x} 0 {x * x} {top} 0 0\n" for x in range(5))
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 5\n{names}end_header\n{rows}")
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply", 4).colors, [[1.0, 0, 0]] * 5)

@@ -13,6 +13,7 @@ from emgs_jax.evaluation.trajectory import (
     align_poses,
     associate,
     ate,
+    check_conventions,
     rpe,
     trajectory_metrics,
 )
@@ -232,3 +233,31 @@ def test_pose_alignment_is_point_alignment_where_positions_suffice_and_aligned_p
     np.testing.assert_allclose(moved[:, :3, 3], made.apply(truth[:, :3, 3]), rtol=1e-12)
     np.testing.assert_allclose(moved[:, :3, :3], made.rotation @ truth[:, :3, :3], atol=1e-12)
     np.testing.assert_array_equal(moved[:, 3], truth[:, 3])
+
+
+def as_read(pose):
+    """What a reader of x y z w makes of the pose's quaternion, written w x y z."""
+    changed = pose.copy()
+    w_x_y_z = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
+    changed[:3, :3] = Rotation.from_quat(w_x_y_z).as_matrix()
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("written", "words"),
+    [
+        (np.linalg.inv, "world -> camera:"),
+        (lambda pose: pose * [1, -1, -1, 1], "camera -> world of OpenGL's axes:"),
+        (as_read, "with quaternions w, x, y, z:"),
+    ],
+)
+def test_an_estimate_in_another_convention_is_named(written, words):
+    """Quaternions w x y z left the ATE as it was and gave rotations of 10 degrees, without a word."""
+    rng = np.random.default_rng(5)
+    truth = random_poses(rng, 20)
+    estimate = noisy(rng, truth, 0.02)
+    check_conventions(estimate, truth, "path.txt")
+    with pytest.raises(ValueError, match=f"path.txt: the motions .* taken as {words}"):
+        check_conventions(np.stack([written(pose) for pose in estimate]), truth, "path.txt")
+    check_conventions(random_poses(rng, 20), truth, "nothing that is known")
+    check_conventions(estimate[:2], truth[:2], "two poses say little")

@@ -5,7 +5,7 @@ import pytest
 
 from emgs_jax.evaluation.clouds import read_cloud
 from emgs_jax.io.ply import save_points_ply
-from emgs_jax.io.ply_reader import read_vertices
+from emgs_jax.io.ply_reader import num_faces, read_vertices
 
 
 @pytest.fixture
@@ -53,6 +53,7 @@ def test_a_mesh_has_points_and_the_big_end_may_come_first(tmp_path, points):
         mesh.export(tmp_path / "mesh.ply", encoding=encoding)
         found = read_vertices(tmp_path / "mesh.ply")
         np.testing.assert_allclose(np.stack([found[name] for name in "xyz"], 1), mesh.vertices, atol=1e-6)
+        assert num_faces(tmp_path / "mesh.ply") == len(mesh.faces)
     header = "ply\nformat binary_big_endian 1.0\nelement vertex 40\n" + "".join(f"property double {n}\n" for n in "xyz")
     (tmp_path / "big.ply").write_bytes(header.encode() + b"end_header\n" + points.astype(">f8").tobytes())
     found = read_vertices(tmp_path / "big.ply")

@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import io
 import os
 import re
 import shlex
@@ -23,6 +24,7 @@ from emgs_jax.config.configure import compose, groups
 from emgs_jax.config.overrides import parsed, readable
 from experiments.cli import COMMANDS, main
 from experiments.command import check_arguments, check_missing, kept_words, nothing_left
+from experiments.console import speak_on
 from experiments.evaluate import delegated
 from experiments.interrupt import clear_interrupt
 from experiments.report import positional
@@ -119,6 +121,15 @@ def test_the_help_of_a_command_names_its_keys_and_its_examples_are_ones(name, mo
         check_arguments(name, rewritten(words))
 
 
+def test_a_console_without_a_sign_shows_another_and_goes_on(monkeypatch):
+    """Where the locale is not UTF-8 the "…" after the mapping ended the run."""
+    console = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", console)
+    speak_on()
+    print("writing …", flush=True)
+    assert console.buffer.getvalue() == b"writing ?\n"
+
+
 @pytest.mark.parametrize("error", [SystemExit("error: no such file"), ZeroDivisionError("division by zero"), None])
 def test_the_log_of_a_job_has_the_consoles_words_and_how_it_failed(error, tmp_path, capsys):
     logging = OmegaConf.create({"handlers": {"file": {"filename": str(tmp_path / "run.log")}}})
@@ -185,6 +196,14 @@ def test_a_folder_with_any_signs_is_the_first_word():
         (word, *rest) = readable(positional(readable([name, "port=1"])))
         assert parsed(word).key_or_group == "folder" and parsed(word).value() == name and rest == ["port=1"]
     assert positional(["folder=x"]) == ["folder=x"] and positional(["-m"]) == ["-m"]
+
+
+def test_a_folder_that_cannot_be_made_is_named_without_hydras_traceback(tmp_path):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(ValueError, match=r"hydra\.run\.dir=.*: .*file is no folder that can be written to"):
+            check_arguments("config", [f"hydra.run.dir={folder}"])
+    check_arguments("config", [f"hydra.run.dir={tmp_path / 'new' / 'run'}", "hydra.run.dir=${out}"])
 
 
 def test_options_of_a_folder_of_ones_own_are_options(tmp_path):

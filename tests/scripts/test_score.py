@@ -111,6 +111,15 @@ def times_of_another_clock(path, ply, truth):
     save_trajectory_tum(path, truth[0] + 1000.0, truth[1])
 
 
+def world_to_camera(path, ply, truth):
+    save_trajectory_tum(path, truth[0], np.linalg.inv(truth[1]))
+
+
+def two_paths(path, ply, truth):
+    """A file that was appended to."""
+    save_trajectory_tum(path, [*truth[0], *truth[0]], [*truth[1], *SIMILARITY.apply_to_poses(truth[1])])
+
+
 def no_points(path, ply, truth):
     save_points_ply(ply, truth[2].points[:0], truth[2].normals[:0], truth[2].colors[:0])
 
@@ -129,6 +138,8 @@ def points_that_are_not_finite(path, ply, truth):
             times_of_another_clock,
             r"no pose is within 0.01 s .* are 1000.000 to 1005.000, .* 0.000 to 5.000: .*max_time_difference",
         ),
+        (world_to_camera, "path.txt: the motions .* and by 0.0 where the poses are taken as world -> camera"),
+        (two_paths, "path.txt has 6 poses at times at which it has another one, the first at 0.000000 s"),
         (lambda path, *_: path.unlink(), "path.txt does not exist: give a file with"),
         (lambda path, *_: path.write_text("# nothing\n"), "no pose is within 0.01 s .* timestamps are none"),
         (lambda path, ply, _: ply.unlink(), "cloud.ply does not exist: give a PLY"),

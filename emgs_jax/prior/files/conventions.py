@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
-from emgs_jax.ops.axes import FLIP
+from emgs_jax.data.pose_conventions import EXPECTED, READINGS
 
 MAX_MISFIT = 0.02  # of the depth, median; below, all is right enough whatever else fits
 MIN_GAIN, GOOD_MISFIT = 3.0, 0.05  # by which another convention must fit better to be named, and how well at least
@@ -16,8 +15,6 @@ MIN_SHARED = 100  # points
 STEP = 4  # every fourth pixel of every fourth row
 FACTORS = np.geomspace(1e-3, 1e3, 241)  # of depths in another unit: 6 % apart
 MIN_FACTOR = 2.0  # what is nearer to 1 is a prediction's error
-AHEAD_LEFT_UP = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # OpenCV's axes in a robot's
-AHEAD_RIGHT_DOWN = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 
 
 class Sight(NamedTuple):
@@ -45,8 +42,8 @@ def check_conventions(pairs: Iterable[tuple[Sight, Sight]], intrinsics: Sequence
     if found[best] < min(own / MIN_GAIN, GOOD_MISFIT):
         raise ValueError(
             f"{source}: the depths of two views differ by {100 * own:.1f} % (inf: they share nothing), and by "
-            f"{100 * found[best]:.1f} % where {best}: expected are poses camera -> world, axes of OpenCV (x right, "
-            "y down, z ahead), depths along z, and one unit for poses and depths"
+            f"{100 * found[best]:.1f} % where {best}: expected are {EXPECTED}, depths along z, and one unit for "
+            "poses and depths"
         )
 
 
@@ -79,21 +76,8 @@ def misfit(a: Sight, b: Sight, T_a_b: Float[np.ndarray, "4 4"], intrinsics: Sequ
 
 def _readings() -> dict[str, Callable[[Sight], Sight]]:
     """What a sight is in other conventions, by words for each."""
-    inverse = np.linalg.inv
-    poses: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-        "world -> camera": inverse,
-        "camera -> world of OpenGL's axes": lambda pose: pose * FLIP,
-        "world -> camera of OpenGL's axes": lambda pose: inverse(pose) * FLIP,
-        "of axes x ahead, y left, z up": lambda pose: pose @ AHEAD_LEFT_UP,
-        "of axes x ahead, y right, z down": lambda pose: pose @ AHEAD_RIGHT_DOWN,
-        "with quaternions w, x, y, z": _scalar_first,
-        "world -> camera with quaternions w, x, y, z": lambda pose: inverse(_scalar_first(pose)),
-    }
-    found = {
-        f"the poses are taken as {words}": lambda sight, change=change: sight._replace(
-            T_world_camera=change(sight.T_world_camera)
-        )
-        for words, change in poses.items()
+    found: dict[str, Callable[[Sight], Sight]] = {
+        f"the poses are taken as {words}": partial(_posed, change=change) for words, change in READINGS.items()
     }
     found["the depths are taken as lengths of the rays"] = lambda sight: _times(sight, 1 / _stretch(sight.points))
     for factor in FACTORS:
@@ -105,11 +89,8 @@ def _readings() -> dict[str, Callable[[Sight], Sight]]:
     return found
 
 
-def _scalar_first(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The pose whose quaternion w, x, y, z was read as x, y, z, w."""
-    changed = pose.copy()
-    changed[:3, :3] = Rotation.from_quat(Rotation.from_matrix(pose[:3, :3]).as_quat()[[1, 2, 3, 0]]).as_matrix()
-    return changed
+def _posed(sight: Sight, change: Callable[[np.ndarray], np.ndarray]) -> Sight:
+    return sight._replace(T_world_camera=change(sight.T_world_camera))
 
 
 def _times(sight: Sight, factor: float | Float[np.ndarray, "h w"]) -> Sight:
