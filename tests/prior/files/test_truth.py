@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from emgs_jax.prior.files.truth import check_truth
 
 from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.prior.files.truth import check_truth
 from tests.data.written_scene import plane_depth, scene_pose
 
 INTRINSICS, SIZE = (60.0, 60.0, 31.5, 23.5), (64, 48)
