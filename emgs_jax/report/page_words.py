@@ -33,7 +33,7 @@ FILES = {
     "splats.ply": "splats fitted to the images (emgs polish), standard 3DGS; SuperSplat, gsplat, nerfstudio",
     "polish.png": "frames that were held out: image, map, splats; any viewer of images",
     "polish.json": "PSNR, SSIM and depth errors of those before and after; any editor",
-    "polish.txt": "poses as they moved with the splats (polish.poses=true), TUM format; evo",
+    "polish.txt": "poses as they moved with the splats, TUM format; evo",
     "cameras.ply": "every camera in the colour of its status, and the path, as a mesh; MeshLab, CloudCompare",
 }
 POLISHED = (  # key of polish.json, words, digits
