@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from emgs_jax.back_end.factors import FrameData
 from emgs_jax.back_end.loops import (
     consistent_loops,
     detect_loops,
@@ -17,19 +16,23 @@ from emgs_jax.back_end.loops import (
     violated,
 )
 from emgs_jax.back_end.optimization import close_loops, merge_duplicates_of_state, nodes_of
-from emgs_jax.back_end.state import BackEnd, add_node
+from emgs_jax.back_end.state import add_node
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.loop_closure.verification import LoopMeasurement
-from emgs_jax.mapping.records import IN_MAP, NEW_SUBMAP, RELOCALIZED, FrameRecord
+from emgs_jax.mapping.records import IN_MAP, NEW_SUBMAP, RELOCALIZED
 from emgs_jax.mapping.run import MappingRun, row_of_first_node
 from emgs_jax.mapping.window_input import WindowInput
 
 
 def add_frames(run: MappingRun, window: WindowInput) -> MappingRun:
-    """Add the recorded frames of an input to the pose graph."""
+    """Add the recorded frames of an input to the pose graph; relocalized ones and new submaps are not connected."""
     end = run.back_end
     for frame, record in zip(window.data, run.records[-len(window.frames) :], strict=True):
-        end = _with_frame(end, frame, record)
+        if record.location in (RELOCALIZED, NEW_SUBMAP):
+            end = replace(end, connected_since=len(end.poses))
+        frame = replace(frame, depth_noise=record.depth_noise if record.status == "tracked" else None)
+        is_placed = record.status in IN_MAP
+        end = add_node(end, frame, record.pose, record.scale or 1.0, record.origin, is_placed)
     return replace(run, back_end=end)
 
 
@@ -54,14 +57,6 @@ def optimize_and_deform(run: MappingRun, loops: Sequence[LoopMeasurement]) -> Ma
     """Close loops: optimize the poses, and deform map and records accordingly."""
     end, state = close_loops(run.back_end, run.state, loops)
     return _with_updated_records(replace(run, back_end=end, state=state))
-
-
-def _with_frame(end: BackEnd, frame: FrameData, record: FrameRecord) -> BackEnd:
-    """Add a frame with its record as a node; after relocalization and in a new submap it is not connected."""
-    if record.location in (RELOCALIZED, NEW_SUBMAP):
-        end = replace(end, connected_since=len(end.poses))
-    frame = replace(frame, depth_noise=record.depth_noise if record.status == "tracked" else None)
-    return add_node(end, frame, record.pose, record.scale or 1.0, record.origin, record.status in IN_MAP)
 
 
 def finish_back_end(run: MappingRun) -> MappingRun:

@@ -14,7 +14,7 @@ import numpy as np
 from emgs_jax.back_end.loops import relocalize_frame
 from emgs_jax.back_end.state import BackEnd
 from emgs_jax.device.arrays import to_se3
-from emgs_jax.gaussian_map import GaussianMap, grow
+from emgs_jax.gaussian_map import grow
 from emgs_jax.loop_closure.relocalization import RelocalizationConfig, RelocalizedPose
 from emgs_jax.mapping.capacity import advance, restart_map
 from emgs_jax.mapping.convert import FirstWindow
@@ -167,7 +167,7 @@ def as_step_prediction(opening: FirstWindow | Prediction) -> Prediction:
     return Prediction(
         current=view,
         previous=view,
-        T_world_views=_repeated(T, 3),
+        T_world_views=jaxlie.SE3(jnp.stack([T.wxyz_xyz] * 3)),
         T_world_anchor=T,
         has_newest=jnp.asarray(False),
         is_repeat=jnp.asarray(False),
@@ -185,7 +185,8 @@ def relocalized_start(
 ) -> tuple[SlamState, Prediction]:
     """Return a state and prediction whose step starts at the relocalized pose: this frame is its own previous one.
 
-    With `has_other_unit` the prior's lengths are no longer those of the steps before: this frame determines the unit.
+    This frame determines the prior's unit in a saved map, and with `has_other_unit`: the prior's lengths are no longer
+    those of the steps before.
 
     Raises:
         ValueError: the features of a saved map are not as wide as those of this run.
@@ -194,25 +195,21 @@ def relocalized_start(
     placed = move_prediction(prediction, anchor_motion(prediction, T, scale))
     views = placed.T_world_views.wxyz_xyz[jnp.array([1, 1, 2])]
     again = replace(placed, previous=placed.current, T_world_views=jaxlie.SE3(views), is_repeat=jnp.asarray(False))
-    covariance = jnp.asarray(location.covariance, jnp.float32)
+    covariance, log_scale = (jnp.asarray(x, jnp.float32) for x in (location.covariance, location.log_scale))
+    state = state_in_saved_map(run, prediction) if run.state is None else run.state
+    estimate = replace(state.estimate, covariance=covariance, world_covariance=covariance)
     if run.state is None:
-        map, time, saved = run.saved.map, len(run.saved.back_end.poses), run.saved
-        widths = map.gaussians.features.shape[-1], prediction.current.features.shape[-1]
+        widths = state.map.gaussians.features.shape[-1], prediction.current.features.shape[-1]
         if widths[0] != widths[1]:
             raise ValueError(
                 f"the features of the saved map have width {widths[0]} and those of this run {widths[1]}: use prior= "
                 "and features= that it was mapped with"
             )
-        # This frame determines the prior's unit in the map.
-        depth_noise, log_scale = (jnp.asarray(x, jnp.float32) for x in (saved.depth_noise, location.log_scale))
-        estimate = replace(exact_estimate(), depth_noise=depth_noise, log_scale=log_scale)
-        time = jnp.asarray(time, jnp.int32)
-    else:
-        map, estimate, time = run.state.map, run.state.estimate, run.state.time
-        if has_other_unit:
-            estimate = replace(estimate, log_scale=jnp.asarray(location.log_scale, jnp.float32))
-    estimate = replace(estimate, covariance=covariance, world_covariance=covariance)
-    return SlamState(map, transform(T, prediction.current, scale), T, estimate, time), again
+        estimate = replace(estimate, depth_noise=jnp.asarray(run.saved.depth_noise, jnp.float32))
+    if run.state is None or has_other_unit:
+        estimate = replace(estimate, log_scale=log_scale)
+    seen = transform(T, prediction.current, scale)
+    return replace(state, previous=seen, T_world_previous=T, estimate=estimate), again
 
 
 def anchor_motion(prediction: Prediction, T_world_camera: jaxlie.SE3, scale: jnp.ndarray) -> jaxlie.SE3:
@@ -257,14 +254,7 @@ def not_found_message(run: MappingRun) -> str:
 
 
 def with_saved_map(run: MappingRun) -> MappingRun:
-    """Restore the saved map of a run that keeps it as it is."""
-    return replace(run, state=replace_map(run.state, run.saved.map, run.config.submap.map_capacity))
-
-
-def replace_map(state: SlamState, map: GaussianMap, capacity: int) -> SlamState:
-    """Return the state with another map, grown to a capacity."""
-    return replace(state, map=grow(map, capacity) if capacity > map.weight.shape[0] else map)
-
-
-def _repeated(T: jaxlie.SE3, count: int) -> jaxlie.SE3:
-    return jaxlie.SE3(jnp.stack([T.wxyz_xyz] * count))
+    """Restore the saved map of a run that keeps it as it is, with the capacity that the step needs."""
+    map, capacity = run.saved.map, run.config.submap.map_capacity
+    map = grow(map, capacity) if capacity > map.weight.shape[0] else map
+    return replace(run, state=replace(run.state, map=map))

@@ -30,7 +30,7 @@ from emgs_jax.mapping.relocalization import (
     reanchor_prior,
     rejection,
     relocalized_start,
-    replace_map,
+    with_saved_map,
 )
 from emgs_jax.mapping.run import MappingRun, new_run
 from emgs_jax.observation import Prediction
@@ -237,8 +237,9 @@ def test_a_first_window_as_a_whole_has_no_place_in_a_saved_map():
 
 def test_a_map_that_stays_gets_the_room_of_the_others_and_keeps_its_rows():
     state = lost_state()
-    same = replace_map(state, state.map, 30)
-    assert_same(same.map, state.map)
-    larger = replace_map(state, state.map, 64).map
+    run = MappingRun(None, None, state=state, saved=SimpleNamespace(map=state.map))
+    configs = [SimpleNamespace(submap=SimpleNamespace(map_capacity=capacity)) for capacity in (30, 64)]
+    same, larger = (with_saved_map(replace(run, config=config)).map for config in configs)
+    assert_same(same, state.map)
     assert larger.weight.shape == (64,) and int(larger.gaussians.valid.sum()) == 30
     assert_same(jax.tree.map(lambda leaf: leaf[:30], larger), state.map)
