@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from emgs_jax.running.compilation import use_compilation_cache
 from emgs_jax.running.configure import CONF, compose, first_of_sweep, message_of
-from emgs_jax.running.gpu import leave_memory_to_torch
+from emgs_jax.running.gpu import check_platforms, leave_memory_to_torch
 from emgs_jax.running.overrides import quoted, readable
 
 from .console import speak_on
@@ -52,6 +52,7 @@ def command(
                 check_missing(name, config)
                 check_keys(name, config)
                 leave_memory_to_torch(config)
+                check_platforms()
                 if "compilation_cache" in config:
                     use_compilation_cache(config.compilation_cache)
                 return task(config)
