@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from emgs_jax.config.configure import CONF, compose, first_of_sweep, message_of
 from emgs_jax.config.overrides import quoted, readable
-from emgs_jax.device.settings import leave_memory_to_torch, use_compilation_cache
+from emgs_jax.device.settings import check_platforms, leave_memory_to_torch, use_compilation_cache
 
 from .console import speak_on
 from .interrupt import clear_interrupt
@@ -51,6 +51,7 @@ def command(
                 check_missing(name, config)
                 check_keys(name, config)
                 leave_memory_to_torch(config)
+                check_platforms()
                 if "compilation_cache" in config:
                     use_compilation_cache(config.compilation_cache)
                 return task(config)

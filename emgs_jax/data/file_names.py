@@ -1,5 +1,6 @@
 """Information in the names of image files: the file that a list means, the order of the files, and their times."""
 
+import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ DATE = re.compile(r"(?<!\d)(20\d\d)([-_.]?)(\d\d)\2(\d\d)[-_.T ]?(\d\d)([-_.:]?)
 PARTS = re.compile(r"(\d{10})[-_](\d{9})$")  # seconds since 1970 and nanoseconds, as drivers of ROS write them
 
 
+MAX_KINDS, MIN_NUMBERS = 4, 3  # of images in one folder that are told apart by their names
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 OTHER_SUFFIXES = (".heic", ".heif", ".avif", ".jxl", ".gif", ".exr", ".hdr", ".ppm", ".pgm", ".dng", ".cr2", ".cr3")
 OTHER_SUFFIXES += (".nef", ".arw", ".raf", ".orf", ".rw2", ".raw")
@@ -34,6 +36,19 @@ def find_image(folder: Path, name: str) -> Path:
                 if is_file(ended):
                     return ended
     return folder / name.replace("\\", "/")
+
+
+def check_one_kind(paths: Sequence[Path]) -> None:
+    """ValueError where images in their order are several of each number: colours and depths, images and masks."""
+    numbers = [tuple(re.findall(r"[0-9]+", path.stem)) for path in paths]
+    kinds = {re.sub(r"[0-9]+", "#", path.name): path for path in paths}
+    repeats = [row for row, pair in enumerate(itertools.pairwise(numbers)) if pair[0] and pair[0] == pair[1]]
+    if 2 <= len(kinds) <= MAX_KINDS and len({*numbers}) >= MIN_NUMBERS and len(repeats) >= 0.4 * (len(paths) - 1):
+        a, b = (paths[repeats[0] + place].name for place in (0, 1))
+        raise ValueError(
+            f"{paths[0].parent} has images of {len(kinds)} kinds that have the same numbers, such as {a} and {b}: a "
+            "sequence is of one kind, so move the others (depths, masks, a second camera) into another folder"
+        )
 
 
 def unread_note(folder: Path) -> str | None:

@@ -8,7 +8,7 @@ from jaxtyping import UInt8
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import Frame
-from emgs_jax.data.file_names import IMAGE_SUFFIXES, natural_key, times_of, unread_note
+from emgs_jax.data.file_names import IMAGE_SUFFIXES, check_one_kind, natural_key, times_of, unread_note
 from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens, with_notes
 from emgs_jax.data.reading import Size
 from emgs_jax.data.tones import Tones, read_shown, tones_of
@@ -106,6 +106,7 @@ class Folder:
         self.folder = folder
         self._paths = sorted(found, key=lambda p: (natural_key(p), p.name))
         self.count = len(self._paths)
+        check_one_kind(self._paths)
         self._times, note = times_of(self._paths)
         self.notes: list[str | None] = [note, unread_note(folder)]
         if not self._paths:

@@ -236,7 +236,8 @@ def transparency_note(path: Path) -> str | None:
         image = decode(path, cv2.IMREAD_UNCHANGED)
     except BadFrameError:
         return None
-    if image.ndim < 3 or image.shape[2] != 4 or image[..., 3].min() == np.iinfo(image.dtype).max:
+    opaque = np.iinfo(image.dtype).max if image.dtype.kind in "iu" else 1.0
+    if image.ndim < 3 or image.shape[2] != 4 or image[..., 3].min() >= opaque:
         return None
     return (
         f"{path.name} is transparent in places, and maybe others: what is there is mapped in the colour that the file "

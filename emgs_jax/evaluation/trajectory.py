@@ -10,6 +10,7 @@ from emgs_jax.data.timestamps import resolution
 from emgs_jax.geometry import Sim3
 
 MIN_ODD_DEG, MIN_GAIN = 1.0, 3.0  # rotation per motion, and by which factor another convention must fit better
+_MIN_WIDTH = 3.0  # times the residual: a path that is less wide beside its main direction holds no roll about it
 _MIN_SPREAD_M = 1e-6  # below this RMS distance from its centroid a path gives no direction and no scale
 
 
@@ -59,11 +60,13 @@ def align_poses(estimate: np.ndarray, truth: np.ndarray, with_scale: bool) -> tu
     covariance = (y - y.mean(0)).T @ (x - x.mean(0)) / len(x)
     if len(x) < 3 or min(_spread(x), _spread(y)) < _MIN_SPREAD_M:
         return _solve(x, y, orientations, False), f"{len(x)} poses without enough motion: aligned by orientation"
-    singular = np.linalg.svd(covariance, compute_uv=False)
-    if singular[1] > 1e-6 * singular[0]:
-        return _solve(x, y, covariance, with_scale), None
-    # A straight path: a term too small to turn the line itself, but the only one that sees the roll about it.
-    rotation = _solve(x, y, covariance + 1e-5 * singular[0] * orientations, False).rotation
+    u, singular, vt = np.linalg.svd(covariance)
+    found = _solve(x, y, covariance, with_scale)
+    if singular[1] > max(1e-6 * singular[0], (_MIN_WIDTH * ate(x, y, found)) ** 2):
+        return found, None
+    # What is beside the line is noise. A term too small to turn the line itself is the only one that sees the roll.
+    line = singular[0] * np.outer(u[:, 0], vt[0])
+    rotation = _solve(x, y, line + 1e-5 * singular[0] * orientations, False).rotation
     return _solve(x, y, covariance, with_scale, rotation), "straight path: roll about it aligned by orientation"
 
 

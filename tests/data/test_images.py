@@ -86,6 +86,26 @@ def test_pictures_that_are_not_read_and_folders_below_are_named(images_root, tmp
         load(tmp_path / "walk")
 
 
+@pytest.mark.parametrize("second", ["{}_mask.png", "{}.depth.png", "{}.jpg", "right_{}.png"])
+def test_two_images_of_each_number_are_no_sequence(second, tmp_path):
+    """Masks and depths beside images were every second frame of the walk."""
+    first = "left_{}.png" if "right" in second else "{}.png"
+    for number in ("003", "004", "005"):
+        for name in (first, second):
+            cv2.imwrite(str(tmp_path / name.format(number)), color_image(0, SIZE))
+    if "right" in second:  # as two clips, one after the other
+        assert len(load(tmp_path)) == 6
+    else:
+        with pytest.raises(ValueError, match=r"2 kinds that have the same numbers, such as 003\S+ and 003\S+: a seq"):
+            load(tmp_path)
+
+
+def test_names_whose_numbers_say_little_are_one_sequence(tmp_path):
+    for name in ("hall1_a", "hall1_b", "hall1_c", "hall1_d", "hall2_a"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), color_image(0, SIZE))
+    assert len(load(tmp_path)) == 5
+
+
 @pytest.mark.parametrize("suffix", [".webp", ".tif"])
 def test_formats_of_the_web_and_of_science_are_read(suffix, tmp_path):
     """No image of a folder of float TIFFs could be read, "fetch them again"."""

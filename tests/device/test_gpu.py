@@ -8,7 +8,7 @@ import pytest
 from tiny_run import CONF, compose
 
 from emgs_jax.config import configure
-from emgs_jax.device.settings import leave_memory_to_torch
+from emgs_jax.device.settings import check_platforms, leave_memory_to_torch
 
 KEY = "XLA_PYTHON_CLIENT_PREALLOCATE"
 
@@ -58,3 +58,29 @@ def test_a_command_says_it_before_its_task(tmp_path):
         [sys.executable, "-c", program, *words], capture_output=True, text=True, cwd=CONF.parent, check=True
     )
     assert "set false" in ran.stdout
+
+
+def test_a_device_that_jax_does_not_find_is_named():
+    """JAX_PLATFORMS=cuda without jax[cuda13] ended in "error: AssertionError"."""
+    code = "from emgs_jax.running.gpu import check_platforms; check_platforms()"
+    for platforms, words in (
+        ("cpu", ""),
+        ("nonsense", "ValueError: JAX_PLATFORMS=nonsense, and JAX finds no such dev"),
+    ):
+        environment = os.environ | {"JAX_PLATFORMS": platforms}
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+        )
+        assert words in done.stderr and bool(words) == bool(done.returncode)
+
+
+def test_a_backend_that_fails_without_a_word_is_named_too(monkeypatch):
+    import jax
+
+    def without_a_word():
+        raise AssertionError
+
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    monkeypatch.setattr(jax, "devices", without_a_word)
+    with pytest.raises(ValueError, match="JAX_PLATFORMS=cuda, and JAX finds no such device: install"):
+        check_platforms()
