@@ -62,7 +62,7 @@ def test_a_command_says_it_before_its_task(tmp_path):
 
 def test_a_device_that_jax_does_not_find_is_named():
     """JAX_PLATFORMS=cuda without jax[cuda13] ended in "error: AssertionError"."""
-    code = "from emgs_jax.running.gpu import check_platforms; check_platforms()"
+    code = "from emgs_jax.device.settings import check_platforms; check_platforms()"
     for platforms, words in (
         ("cpu", ""),
         ("nonsense", "ValueError: JAX_PLATFORMS=nonsense, and JAX finds no such dev"),
