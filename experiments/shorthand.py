@@ -64,8 +64,6 @@ def _look(path: Path) -> tuple[tuple[int, int], str]:
     if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
         return frame_size(*Video(path, 1).find_size(range(1))), "estimate"
     images = Folder(path)
-    if images.count == 0:
-        raise ValueError(f"{path} has no images, and is no video")
     size = images.find_size(range(images.count))
     try:
         has_exif = exif_focal_length(images.file(0), size) is not None
