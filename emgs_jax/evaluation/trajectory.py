@@ -10,7 +10,7 @@ from emgs_jax.data.timestamps import resolution
 from emgs_jax.geometry import Sim3
 
 MIN_ODD_DEG, MIN_GAIN = 1.0, 3.0  # rotation per motion, and by which factor another convention must fit better
-_MIN_WIDTH = 3.0  # times the residual: a path that is less wide beside its main direction holds no roll about it
+_MAX_ROLL_STD = 0.25  # rad, of the roll about a path by its positions, above which orientations know it better
 _MIN_SPREAD_M = 1e-6  # below this RMS distance from its centroid a path gives no direction and no scale
 
 
@@ -62,7 +62,9 @@ def align_poses(estimate: np.ndarray, truth: np.ndarray, with_scale: bool) -> tu
         return _solve(x, y, orientations, False), f"{len(x)} poses without enough motion: aligned by orientation"
     u, singular, vt = np.linalg.svd(covariance)
     found = _solve(x, y, covariance, with_scale)
-    if singular[1] > max(1e-6 * singular[0], (_MIN_WIDTH * ate(x, y, found)) ** 2):
+    # n positions of error σ hold the roll about their line to σ / (w √n), w being how wide they lie beside it.
+    least = ate(x, y, found) ** 2 / (len(x) * _MAX_ROLL_STD**2)
+    if singular[1] > max(1e-6 * singular[0], least):
         return found, None
     # What is beside the line is noise. A term too small to turn the line itself is the only one that sees the roll.
     line = singular[0] * np.outer(u[:, 0], vt[0])

@@ -27,10 +27,9 @@ def test_a_map_from_noisy_predictions_is_more_accurate_than_these_and_within_its
     def mean(key):
         return np.mean([metrics[key] for metrics in found])
 
-    assert mean("raw_prior/reconstruction/accuracy_m") > 0.05, "the input has to be noisy"
-    assert mean("reconstruction_icp/accuracy_m") < mean("raw_prior/reconstruction_icp/accuracy_m")
-    depth = "rendering/depth_within_5_percent"
-    assert mean(depth) > 10 + mean(f"raw_prior/{depth}")
+    assert mean("raw_prior/reconstruction/accuracy_m") > 0.1, "the input has to be noisy"
+    assert mean("reconstruction_icp/accuracy_m") < 0.8 * mean("raw_prior/reconstruction_icp/accuracy_m")
+    assert mean("reconstruction/accuracy_m") < mean("raw_prior/reconstruction/accuracy_m")
     assert mean("trajectory/ate_sim3_m") < mean("raw_prior/trajectory/ate_sim3_m")
     assert mean("frames/tracked") > 0.7 * 19
     for key, bound in BOUNDS.items() if seeds == (0,) else ():
