@@ -105,11 +105,13 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     metrics["provenance"] = origin
     write_metrics(folder / "metrics.json", metrics)
     keeper.drop()
+    with clock.phase("report"):
+        recorded = read_run(folder)
     if fitting is not None:
         with _said(clock, "polish", "fitting splats to the images"):
-            notes = [*notes, *polish_lines(polish(read_run(folder), dataset, fitting, densify))]
+            notes = [*notes, *polish_lines(polish(recorded, dataset, fitting, densify))]
     with _said(clock, "report", f"writing {REPORT_FILE}"):
-        write_report(read_run(folder), dataset)
+        write_report(recorded, dataset)
     if live is not None:
         notes = [*notes, f"the live view has ended; emgs view {folder} shows the finished run"]
     notes = [*notes, *revisit_note(session.back_end, prior.is_sequential)]

@@ -131,8 +131,13 @@ def fit(
     state = State(fitted, offsets, adam.init(fitted), jax.vmap(adam.init)(offsets))
 
     each = config.rates
-    rates = {"colors": each.colors, "logit": each.logit, "log_std": each.log_std}
-    rates |= {"turn": each.turn, "shift": each.shift}
+    rates = {
+        "colors": each.colors,
+        "logit": each.logit,
+        "log_std": each.log_std,
+        "turn": each.turn,
+        "shift": each.shift,
+    }
 
     @eqx.filter_jit
     def step(state: State, anchors: Anchors, view: View, decay: Array, terms: LossConfig):

@@ -34,10 +34,10 @@ def check_conventions(pairs: Iterable[tuple[Sight, Sight]], intrinsics: Sequence
         source: where poses and depths are from.
     """
     pairs = [*pairs]
-    own = _median_misfit(pairs, intrinsics, lambda sight: sight)
+    own = median_misfit(pairs, intrinsics, lambda sight: sight)
     if not own > MAX_MISFIT:
         return
-    found = {words: _median_misfit(pairs, intrinsics, read) for words, read in _readings().items()}
+    found = {words: median_misfit(pairs, intrinsics, read) for words, read in _readings().items()}
     best = min(found, key=lambda words: found[words])
     if found[best] < min(own / MIN_GAIN, GOOD_MISFIT):
         raise ValueError(
@@ -47,7 +47,7 @@ def check_conventions(pairs: Iterable[tuple[Sight, Sight]], intrinsics: Sequence
         )
 
 
-def _median_misfit(
+def median_misfit(
     pairs: Sequence[tuple[Sight, Sight]], intrinsics: Sequence[float], read: Callable[[Sight], Sight]
 ) -> float:
     """`misfit` of the pairs as `read` takes them, 0 without any."""
@@ -79,11 +79,11 @@ def _readings() -> dict[str, Callable[[Sight], Sight]]:
     found: dict[str, Callable[[Sight], Sight]] = {
         f"the poses are taken as {words}": partial(_posed, change=change) for words, change in READINGS.items()
     }
-    found["the depths are taken as lengths of the rays"] = lambda sight: _times(sight, 1 / _stretch(sight.points))
+    found["the depths are taken as lengths of the rays"] = lambda sight: times(sight, 1 / _stretch(sight.points))
     for factor in FACTORS:
         if abs(np.log(factor)) > np.log(MIN_FACTOR):
             found[f"the depths are multiplied by about {factor:.4g}, or the positions by {1 / factor:.4g}"] = partial(
-                _times, factor=factor
+                times, factor=factor
             )
         found[f"the depths are taken as {factor:.4g} / depth"] = partial(_inverse, factor=factor)
     return found
@@ -93,13 +93,14 @@ def _posed(sight: Sight, change: Callable[[np.ndarray], np.ndarray]) -> Sight:
     return sight._replace(T_world_camera=change(sight.T_world_camera))
 
 
-def _times(sight: Sight, factor: float | Float[np.ndarray, "h w"]) -> Sight:
+def times(sight: Sight, factor: float | Float[np.ndarray, "h w"]) -> Sight:
+    """The sight with its depths times a factor, for all or for each pixel."""
     return sight._replace(points=sight.points * np.asarray(factor)[..., None])
 
 
 def _inverse(sight: Sight, factor: float) -> Sight:
     """The sight whose depths are factor / those that were given."""
-    return _times(sight, factor / np.square(sight.points[..., 2]))
+    return times(sight, factor / np.square(sight.points[..., 2]))
 
 
 def _stretch(points: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:

@@ -2,13 +2,22 @@
 
 import contextlib
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import BadFrameError, Frame
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.prior.files.conventions import GOOD_MISFIT, MAX_MISFIT, MIN_GAIN, Sight, check_conventions, misfit
+from emgs_jax.prior.files.conventions import (
+    GOOD_MISFIT,
+    MAX_MISFIT,
+    MIN_GAIN,
+    Sight,
+    check_conventions,
+    median_misfit,
+    times,
+)
 
 KNOWN_SCALES = 256.0, 1000.0, 4000.0, 5000.0, 6553.5  # raw units a metre, of KITTI, most sensors, L515, TUM, Replica
 NUM_PAIRS, GAP = 4, 4  # of frames, and how far apart they are
@@ -33,7 +42,10 @@ def check_truth(dataset: ReadableFrames, depth_scale: float | None) -> None:
 def _check_depth_unit(
     pairs: list[tuple[Sight, Sight]], depth_scale: float, intrinsics: tuple[float, ...], name: str
 ) -> None:
-    fits = {scale: _misfit(pairs, depth_scale / scale, intrinsics) for scale in (depth_scale, *KNOWN_SCALES)}
+    fits = {
+        scale: median_misfit(pairs, intrinsics, partial(times, factor=depth_scale / scale))
+        for scale in (depth_scale, *KNOWN_SCALES)
+    }
     own, best = fits[depth_scale], min(fits, key=lambda scale: fits[scale])
     if own > MAX_MISFIT and fits[best] < min(own / MIN_GAIN, GOOD_MISFIT):
         raise ValueError(
@@ -57,12 +69,3 @@ def _sight(frame: Frame, intrinsics: tuple[float, ...]) -> Sight | None:
     if frame.depth is None or frame.T_world_camera is None:
         return None
     return Sight(backproject(frame.depth, intrinsics), frame.depth > 0, frame.T_world_camera)
-
-
-def _misfit(pairs: list[tuple[Sight, Sight]], factor: float, intrinsics: tuple[float, ...]) -> float:
-    """Median over the pairs, with depths times a factor; 0 without any."""
-    found = []
-    for a, b in pairs:
-        scaled = (sight._replace(points=factor * sight.points) for sight in (a, b))
-        found.append(misfit(*scaled, np.linalg.inv(a.T_world_camera) @ b.T_world_camera, intrinsics))
-    return float(np.median(found)) if found else 0.0

@@ -34,9 +34,10 @@ function half(bits) {
 
 // What is drawn: the Gaussians of the map, and the splats that were fitted to the images; null where there are none.
 async function readSets() {
-  const map = await readArrays("arrays", ABOUT.arrays), about = ABOUT.splats;
-  if (!about) return { gaussians: { ...map, render: ABOUT.render }, splats: null };
-  const splats = await readArrays("splats", about.arrays);
+  const about = ABOUT.splats;
+  const gaussians = { ...await readArrays("arrays", ABOUT.arrays), render: ABOUT.render };
+  if (!about) return { gaussians, splats: null };
+  const splats = { ...await readArrays("splats", about.arrays), render: about.render };
   splats.mean = Float32Array.from(splats.mean, (value, at) => about.low[at % 3] + value * about.step[at % 3]);
-  return { gaussians: { ...map, render: ABOUT.render }, splats: { ...splats, render: about.render } };
+  return { gaussians, splats };
 }

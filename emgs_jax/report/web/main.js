@@ -123,10 +123,13 @@ function wireChoices(report) {
     const chosen = name === "similarity" ? Math.max(word, 0) : word, kind = $("kind").value;
     if (report.shown !== report.sets[kind]) splats.load((report.shown = report.sets[kind]));
     for (const id of ["layer", "word", "threshold", "existence"]) $(id).disabled = kind === "splats";
-    if (kind === "splats") splats.recolor(report.shown.color);
-    else splats.recolor(layers.paint(name, chosen, Number($("threshold").value), Number($("existence").value)));
-    if (kind === "splats") $("legend").replaceChildren();
-    else legend(layers, name, chosen);
+    if (kind === "splats") {
+      splats.recolor(report.shown.color);
+      $("legend").replaceChildren();
+    } else {
+      splats.recolor(layers.paint(name, chosen, Number($("threshold").value), Number($("existence").value)));
+      legend(layers, name, chosen);
+    }
     report.moved();
   };
   report.choose = choose;
