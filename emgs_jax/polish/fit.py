@@ -20,21 +20,24 @@ from emgs_jax.io.files import atomic_write
 from emgs_jax.io.npz import read_npz
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
-from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, initial, loss
+from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, Shot, initial, loss
 
 POSE_RATE = 0.3  # Adam's for frames that are placed on finished splats, in standard deviations
 Result = TypeVar("Result")
+Fitted = TypeVar("Fitted", bound=eqx.Module)
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rate of each part of `Appearance`, and of the poses in standard deviations of each."""
+    """Adam's learning rate of each part of `Appearance`, of the frames' exposures (0: all have the same), and of their
+    poses in standard deviations of each."""
 
     colors: float = number(low=0, high=10)
     logit: float = number(low=0, high=10)
     log_std: float = number(low=0, high=10)
     turn: float = number(low=0, high=10)
     shift: float = number(low=0, high=10)
+    exposure: float = number(low=0, high=10)
     pose: float = number(low=0, high=10)
 
 
@@ -84,20 +87,34 @@ class Views(NamedTuple):
         targets: `loss`'s of each frame, (h, w, 4).
         poses: T_world_camera of each, (m, 4, 4).
         spreads: (m, 6, 6); a pose may become T Exp(spread u), 0 for one that stays.
+        exposures: `Shot`'s of each, (m, 3, 2), where a fit begins.
     """
 
     targets: Spool
     poses: np.ndarray
     spreads: np.ndarray
+    exposures: np.ndarray
+
+
+class FrameFit(eqx.Module):
+    """What is fitted of a frame, or of all.
+
+    Args:
+        pose: its offset, in spreads.
+        exposure: `Shot`'s.
+    """
+
+    pose: Float[Array, "*m 6"]
+    exposure: Float[Array, "*m 3 2"]
 
 
 class State(NamedTuple):
     """Where a fit is: what it has found, and Adam's moments."""
 
     fitted: Appearance
-    offsets: Float[Array, "m 6"]  # of the poses, in spreads
+    frames: FrameFit
     moments: Any
-    pose_moments: Any  # of each frame by itself, as one is seen in a step
+    frame_moments: Any  # of each frame by itself, as one is seen in a step
 
 
 def fit(
@@ -108,7 +125,7 @@ def fit(
     config: PolishConfig,
     path: Path,
     on_step: Callable[[int, float], None] = lambda step, psnr: None,
-) -> tuple[Appearance, np.ndarray]:
+) -> tuple[Appearance, Views]:
     """Fit the splats' appearance to frames; the same call goes on where one that was stopped had written `path`.
 
     Args:
@@ -121,53 +138,49 @@ def fit(
         on_step: told the number of each step, and the PSNR (dB) of its frame before it.
 
     Returns:
-        The splats' appearance, and T_world_camera of the frames, (m, 4, 4).
+        The splats' appearance, and the frames where they are now, with the exposures that they turned out to have.
     """
     import optax  # an extra
 
-    adam, count = optax.scale_by_adam(eps=1e-15), len(views.poses)  # as 3DGS
+    adam = optax.scale_by_adam(eps=1e-15)  # as 3DGS
     fitted = initial(jnp.asarray(colors, jnp.float32), jnp.float32(config.opacity))
-    offsets = jnp.zeros((count, 6))
-    state = State(fitted, offsets, adam.init(fitted), jax.vmap(adam.init)(offsets))
-
-    each = config.rates
-    rates = {
-        "colors": each.colors,
-        "logit": each.logit,
-        "log_std": each.log_std,
-        "turn": each.turn,
-        "shift": each.shift,
-    }
+    frames = FrameFit(jnp.zeros((len(views.poses), 6)), jnp.asarray(views.exposures, jnp.float32))
+    state = State(fitted, frames, adam.init(fitted), jax.vmap(adam.init)(frames))
 
     @eqx.filter_jit
     def step(state: State, anchors: Anchors, view: View, decay: Array, terms: LossConfig):
-        place = jax.tree.map(lambda x: x[view.row], (state.offsets, state.pose_moments))
+        frame, frame_moments = jax.tree.map(lambda x: x[view.row], (state.frames, state.frame_moments))
 
-        def total(fitted: Appearance, offset: Float[Array, "6"]):
-            return loss(fitted, anchors, view.target, moved(view, offset), camera, terms)
+        def total(fitted: Appearance, frame: FrameFit):
+            return loss(fitted, anchors, shot(view, frame), camera, terms)
 
-        (_, (error, overflow)), (slope, turn) = jax.value_and_grad(total, (0, 1), has_aux=True)(state.fitted, place[0])
+        (_, (error, overflow)), (slope, turn) = jax.value_and_grad(total, (0, 1), has_aux=True)(state.fitted, frame)
         change, moments = adam.update(slope, state.moments)
-        move, pose_moments = adam.update(turn, place[1])
-        place = place[0] - decay * config.rates.pose * move, pose_moments
-        parts = {
-            name: getattr(state.fitted, name) - decay * rate * getattr(change, name) for name, rate in rates.items()
-        }
-        places = jax.tree.map(lambda x, y: x.at[view.row].set(y), (state.offsets, state.pose_moments), place)
-        return (State(Appearance(**parts), places[0], moments, places[1]), error), overflow
+        move, frame_moments = adam.update(turn, frame_moments)
+        fitted = _descend(state.fitted, change, decay, config.rates)
+        places = _descend(frame, move, decay, config.rates), frame_moments
+        frames = jax.tree.map(lambda x, y: x.at[view.row].set(y), (state.frames, state.frame_moments), places)
+        return (State(fitted, frames[0], moments, frames[1]), error), overflow
 
     terms, signature = config.loss, _signature(anchors, colors, config)
     first, state = _read(path, state, signature)
     for number_ in range(first, config.steps):
-        epoch, place = divmod(number_, count)
-        row = int(np.random.default_rng((config.seed, epoch)).permutation(count)[place])
+        epoch, place = divmod(number_, len(views.poses))
+        row = int(np.random.default_rng((config.seed, epoch)).permutation(len(views.poses))[place])
         decay = jnp.float32(config.final_rate ** (number_ / max(config.steps - 1, 1)))
         (state, error), terms = with_room(partial(step, state, anchors, view_of(views, row), decay), terms)
         on_step(number_, -10.0 * float(np.log10(max(float(error), 1e-12))))
         if (number_ + 1) % config.every == 0:
             _write(path, number_ + 1, state, signature)
     path.unlink(missing_ok=True)
-    return state.fitted, placed(views, state.offsets)
+    found = placed(views, state.frames.pose), np.asarray(state.frames.exposure, np.float64)
+    return state.fitted, views._replace(poses=found[0], exposures=found[1])
+
+
+def _descend(at: Fitted, change: Fitted, decay: Array, rates: Rates) -> Fitted:
+    """One step of gradient descent, by each field's own rate."""
+    moved = {name: x - decay * getattr(rates, name) * getattr(change, name) for name, x in vars(at).items()}
+    return type(at)(**moved)
 
 
 def locate(anchors: Anchors, fitted: Appearance, views: Views, camera: Camera, config: PolishConfig) -> np.ndarray:
@@ -179,7 +192,7 @@ def locate(anchors: Anchors, fitted: Appearance, views: Views, camera: Camera, c
     @eqx.filter_jit
     def step(offset: Float[Array, "6"], moments: Any, view: View, rate: Array, splats: tuple, terms: LossConfig):
         def total(offset: Float[Array, "6"]):
-            return loss(*splats, view.target, moved(view, offset), camera, terms)
+            return loss(*splats, shot(view, FrameFit(offset, view.exposure)), camera, terms)
 
         slope, (_, overflow) = jax.grad(total, has_aux=True)(offset)
         move, moments = adam.update(slope, moments)
@@ -219,18 +232,20 @@ class View(NamedTuple):
     target: Float[Array, "h w 4"]
     pose: jaxlie.SE3
     spread: Float[Array, "6 6"]
+    exposure: Float[Array, "3 2"]
 
 
 def view_of(views: Views, row: int) -> View:
     """The frame of this row."""
     pose = jaxlie.SE3.from_matrix(jnp.asarray(views.poses[row], jnp.float32))
-    target, spread = (jnp.asarray(values[row], jnp.float32) for values in (views.targets, views.spreads))
-    return View(jnp.int32(row), target, pose, spread)
+    target, *others = (jnp.asarray(x[row], jnp.float32) for x in (views.targets, views.spreads, views.exposures))
+    return View(jnp.int32(row), target, pose, *others)
 
 
-def moved(view: View, offset: Float[Array, "6"]) -> jaxlie.SE3:
-    """The pose T Exp(spread u)."""
-    return view.pose @ jaxlie.SE3.exp(view.spread @ offset)
+def shot(view: View, frame: FrameFit) -> Shot:
+    """The frame at the pose T Exp(spread u), in that exposure."""
+    T = view.pose @ jaxlie.SE3.exp(view.spread @ frame.pose)
+    return Shot(view.target, T, frame.exposure)
 
 
 def placed(views: Views, offsets: Float[Array, "m 6"]) -> np.ndarray:

@@ -1,5 +1,7 @@
 """Flat splats on the map's surface, what of them is fitted, and by which loss."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -49,6 +51,20 @@ class Appearance(eqx.Module):
     shift: Float[Array, "n"]
 
 
+class Shot(NamedTuple):
+    """An image, from where it was taken, and how its exposure differs from the others'.
+
+    Args:
+        target: RGB of the image and the map's depth (m), 0 where it has none: such pixels count in no term.
+        T_world_camera: of the camera.
+        exposure: of each channel, logarithm of the gain and offset: the image is gain · colours + offset.
+    """
+
+    target: Float[Array, "h w 4"]
+    T_world_camera: jaxlie.SE3
+    exposure: Float[Array, "3 2"]
+
+
 class LossConfig(eqx.Module):
     """Weights of the loss, and how splats are drawn.
 
@@ -95,23 +111,25 @@ def draw(
     return render_splats(splats, gaussians.colors, camera, config)
 
 
+def exposed(colors: Float[Array, "*s 3"], exposure: Float[Array, "3 2"]) -> Float[Array, "*s 3"]:
+    """The colours as a frame of that exposure has them."""
+    return colors * jnp.exp(exposure[:, 0]) + exposure[:, 1]
+
+
 def loss(
-    fitted: Appearance, anchors: Anchors, target: Float[Array, "h w 4"], T: jaxlie.SE3, camera: Camera, c: LossConfig
+    fitted: Appearance, anchors: Anchors, shot: Shot, camera: Camera, c: LossConfig
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Int[Array, ""]]]:
     """Photometric loss of 3DGS with depth and normals of the map as terms.
-
-    Args:
-        target: RGB of the image and the map's depth (m), 0 where it has none: such pixels count in no term.
 
     Returns:
         The loss; the mean squared error of the colours, and how many splats had no room in the tiles' lists.
     """
     gaussians, opacity = gaussians_of(anchors, fitted)
-    drawn = draw(gaussians, opacity, T, camera, c.render)
-    image, depth = target[..., :3], target[..., 3]
+    drawn = draw(gaussians, opacity, shot.T_world_camera, camera, c.render)
+    image, depth = shot.target[..., :3], shot.target[..., 3]
     is_seen = depth > 0
     count = jnp.maximum(jnp.sum(is_seen), 1)
-    found = jnp.where(is_seen[..., None], drawn.values, image)
+    found = jnp.where(is_seen[..., None], exposed(drawn.values, shot.exposure), image)
     photometric = (1.0 - c.dssim) * jnp.sum(jnp.abs(found - image)) / (3 * count)
     photometric += c.dssim * 0.5 * (1.0 - ssim(found, image))
     has_both = is_seen & (drawn.depth > 0)

@@ -28,7 +28,7 @@ from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.fit import PolishConfig, Views, fit, is_held_out, locate, with_room, without_transparent
 from emgs_jax.polish.seeds import Seeds
-from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, draw, gaussians_of, ssim
+from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, draw, exposed, gaussians_of, ssim
 from emgs_jax.render.composite import Rendering
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.report.recorded_run import POLISH, SPLATS_FILE, RecordedRun
@@ -38,7 +38,7 @@ _, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE, PATH_FILE = POLISH
 MAX_PICTURES = 4
 Seen: TypeAlias = tuple[np.ndarray, DenseView]  # image (h, w, 3) in [0, 1] of a frame, and the map from its pose
 Nearest: TypeAlias = Callable[[np.ndarray], np.ndarray]
-_densify, _classify, _ssim = stored(densify), stored(classify), jax.jit(ssim)
+_densify, _classify, _ssim, _exposed = stored(densify), stored(classify), jax.jit(ssim), jax.jit(exposed)
 
 
 def polish(
@@ -81,22 +81,23 @@ def polish(
         view = seen(row)[1]
         seeds.add(view, view.colors, run.poses[row])
     anchors, colors = seeds.anchors(_map_noise(gaussians, nearest))
-    views = Views(targets, run.poses[fitted_rows], _spreads(run, fitted_rows, config))
-    fitted, moved = _fitted(anchors, colors, views, run, config)
+    same = np.zeros((len(fitted_rows), 3, 2))
+    views = Views(targets, run.poses[fitted_rows], _spreads(run, fitted_rows, config), same)
+    fitted, views = _fitted(anchors, colors, views, run, config)
     anchors, fitted = without_transparent(anchors, fitted, config.min_opacity)
-    poses = run.poses.copy()
-    poses[fitted_rows] = moved
+    poses, exposures = run.poses.copy(), _between(views.exposures, fitted_rows, len(run.poses))
+    poses[fitted_rows] = views.poses
     if config.poses:
         targets = Spool()
         for row in held:
             targets.append(_target(*seen(row)))
-        views = Views(targets, run.poses[held], _spreads(run, held, config))
+        views = Views(targets, run.poses[held], _spreads(run, held, config), exposures[held])
         poses[held] = locate(anchors, fitted, views, run.camera, config)
         save_trajectory_tum(run.folder / PATH_FILE, [line["timestamp"] for line in run.frames], poses)
     splats, opacity = gaussians_of(anchors, fitted)
     count = _save_splats(run, splats, opacity, nearest)
     metrics = {"polish/num_splats": count, "polish/num_fitted": len(fitted_rows), "polish/num_held_out": len(held)}
-    metrics |= _compare(run, dataset, held, seen, (splats, opacity, poses, config.loss))
+    metrics |= _compare(run, dataset, held, seen, (splats, opacity, poses, exposures, config.loss))
     write_json(run.folder / METRICS_FILE, metrics)
     return metrics
 
@@ -109,7 +110,7 @@ def require_optax() -> None:
 
 def _fitted(
     anchors: Anchors, colors: np.ndarray, views: Views, run: RecordedRun, config: PolishConfig
-) -> tuple[Appearance, np.ndarray]:
+) -> tuple[Appearance, Views]:
     """`fit` with a progress bar."""
     with tqdm(total=config.steps, desc="polishing", unit="step") as bar:
         recent: list[float] = []
@@ -120,6 +121,12 @@ def _fitted(
             bar.update(step + 1 - bar.n)
 
         return fit(anchors, colors, views, run.camera, config, run.folder / CHECKPOINT_FILE, on_step)
+
+
+def _between(exposures: np.ndarray, rows: list[int], count: int) -> np.ndarray:
+    """Exposures of all frames (count, 3, 2): those of others than `rows` lie between those of the two beside them."""
+    values = exposures.reshape(len(rows), 6).T
+    return np.stack([np.interp(np.arange(count), rows, column) for column in values], axis=1).reshape(count, 3, 2)
 
 
 def _save_splats(run: RecordedRun, splats: Gaussians, opacity: jax.Array, nearest: Nearest) -> int:
@@ -185,9 +192,9 @@ def _compare(
     """PSNR and SSIM over the pixels that the map covers, depth errors and ATE where the truth is known.
 
     Before is the map at the run's poses, after are the splats at theirs. Where the map covers nothing both pictures are
-    the image itself in SSIM, and do not count in PSNR.
+    the image itself in SSIM, and do not count in PSNR. No pixel of a held-out frame says what its exposure is.
     """
-    splats, opacity, poses, terms = drawn
+    splats, opacity, poses, exposures, terms = drawn
     known = run.has_truth & run.is_placed
     metrics: dict[str, Any] = {}
     scale = None
@@ -205,7 +212,7 @@ def _compare(
         after, terms = with_room(partial(_picture, splats, opacity, to_se3(poses[row]), run.camera), terms)
         pictures = {
             "before": (view.colors, np.where(view.valid, view.depth, 0.0)),
-            "after": (after.values, after.depth),
+            "after": (np.asarray(_exposed(after.values, np.float32(exposures[row]))), after.depth),
         }
         for name, (colors, depth) in pictures.items():
             shown = np.where(view.valid[..., None], np.clip(colors, 0, 1), image).astype(np.float32)
@@ -213,7 +220,7 @@ def _compare(
             similarity[name].append(float(_ssim(shown, image)))
             if scale is not None:
                 scores[name].append(score_view(dataset[row], depth, colors, scale, np.inf))
-        strips.append(np.concatenate([image, np.clip(view.colors, 0, 1), np.clip(after.values, 0, 1)], axis=1))
+        strips.append(np.concatenate([image, np.clip(view.colors, 0, 1), np.clip(pictures["after"][0], 0, 1)], axis=1))
     for name in scores:
         metrics[f"polish/{name}_psnr_db"] = float(-10 * np.log10(max(np.mean(psnr[name]), 1e-12)))
         metrics[f"polish/{name}_ssim"] = float(np.mean(similarity[name]))
