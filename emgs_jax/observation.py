@@ -177,6 +177,7 @@ def observe(
     return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), image)
 
 
+@full_precision
 def depth_in(T_world_camera: jaxlie.SE3, observation: Observation) -> Float[Array, "p"]:
     """Camera-space z (m) of world-frame points."""
     return ((observation.points - T_world_camera.translation()) @ T_world_camera.rotation().as_matrix())[:, 2]

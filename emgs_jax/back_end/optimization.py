@@ -14,6 +14,7 @@ from emgs_jax.back_end.state import BackEnd, Closure
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.existence import ExistenceConfig, merge_all_duplicates
 from emgs_jax.loop_closure.verification import LoopMeasurement
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.pose_graph.deform import DeformConfig, deform, deform_view
 from emgs_jax.pose_graph.factors import Nodes, PoseGraph
@@ -26,6 +27,7 @@ move_map, _move_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)  # a 
 _merge = eqx.filter_jit(merge_all_duplicates)
 
 
+@full_precision
 def close_loops(end: BackEnd, state: SlamState, loops: Sequence[LoopMeasurement] = ()) -> tuple[BackEnd, SlamState]:
     """Optimize with `loops` as further factors and deform the map; a refused solution moves nothing."""
     factors = [*end.factors, *map(loop_factor, loops)]

@@ -19,6 +19,7 @@ from emgs_jax.data.spool import Spool
 from emgs_jax.io.files import atomic_write
 from emgs_jax.io.npz import read_npz
 from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.ranges import number
 from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, Shot, initial, loss
 
@@ -148,6 +149,7 @@ def fit(
     state = State(fitted, frames, adam.init(fitted), jax.vmap(adam.init)(frames))
 
     @eqx.filter_jit
+    @full_precision
     def step(state: State, anchors: Anchors, view: View, decay: Array, terms: LossConfig):
         frame, frame_moments = jax.tree.map(lambda x: x[view.row], (state.frames, state.frame_moments))
 
@@ -190,6 +192,7 @@ def locate(anchors: Anchors, fitted: Appearance, views: Views, camera: Camera, c
     adam, terms = optax.scale_by_adam(eps=1e-15), config.loss
 
     @eqx.filter_jit
+    @full_precision
     def step(offset: Float[Array, "6"], moments: Any, view: View, rate: Array, splats: tuple, terms: LossConfig):
         def total(offset: Float[Array, "6"]):
             return loss(*splats, shot(view, FrameFit(offset, view.exposure)), camera, terms)
@@ -226,28 +229,28 @@ def with_room(call: Callable[[LossConfig], tuple[Result, Array | int]], terms: L
 
 
 class View(NamedTuple):
-    """One of `Views`, on the device."""
+    """One of `Views`, on the device; fields in its order."""
 
     row: Array
     target: Float[Array, "h w 4"]
-    pose: jaxlie.SE3
+    pose: Float[Array, "4 4"]
     spread: Float[Array, "6 6"]
     exposure: Float[Array, "3 2"]
 
 
 def view_of(views: Views, row: int) -> View:
     """The frame of this row."""
-    pose = jaxlie.SE3.from_matrix(jnp.asarray(views.poses[row], jnp.float32))
-    target, *others = (jnp.asarray(x[row], jnp.float32) for x in (views.targets, views.spreads, views.exposures))
-    return View(jnp.int32(row), target, pose, *others)
+    target, *others = (jnp.asarray(x[row], jnp.float32) for x in (views.targets, *views[1:]))
+    return View(jnp.int32(row), target, *others)
 
 
 def shot(view: View, frame: FrameFit) -> Shot:
     """The frame at the pose T Exp(spread u), in that exposure."""
-    T = view.pose @ jaxlie.SE3.exp(view.spread @ frame.pose)
+    T = jaxlie.SE3.from_matrix(view.pose) @ jaxlie.SE3.exp(view.spread @ frame.pose)
     return Shot(view.target, T, frame.exposure)
 
 
+@full_precision
 def placed(views: Views, offsets: Float[Array, "m 6"]) -> np.ndarray:
     """T_world_camera of all frames, moved: (m, 4, 4) float64; those without a spread stay to the bit."""
     xi = jnp.asarray(np.einsum("mij,mj->mi", views.spreads, np.asarray(offsets, np.float64)), jnp.float32)

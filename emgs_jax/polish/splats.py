@@ -88,6 +88,7 @@ def initial(colors: Float[Array, "n 3"], opacity: Float[Array, ""]) -> Appearanc
     return Appearance(colors, logit, jnp.zeros((count, 2)), jnp.zeros((count, 3)), jnp.zeros(count))
 
 
+@full_precision
 def gaussians_of(anchors: Anchors, fitted: Appearance) -> tuple[Gaussians, Float[Array, "n"]]:
     """Flat Gaussians of the world, without features, and their opacities in (0, 1)."""
     axes = anchors.axes @ jaxlie.SO3.exp(fitted.turn).as_matrix()
@@ -116,6 +117,7 @@ def exposed(colors: Float[Array, "*s 3"], exposure: Float[Array, "3 2"]) -> Floa
     return colors * jnp.exp(exposure[:, 0]) + exposure[:, 1]
 
 
+@full_precision
 def loss(
     fitted: Appearance, anchors: Anchors, shot: Shot, camera: Camera, c: LossConfig
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Int[Array, ""]]]:
@@ -139,6 +141,7 @@ def loss(
     return total, (jnp.sum((found - image) ** 2) / (3 * count), drawn.overflow)
 
 
+@full_precision
 def ssim(a: Float[Array, "h w c"], b: Float[Array, "h w c"]) -> Float[Array, ""]:
     """Mean structural similarity, window of 11 pixels with σ = 1.5, zero outside (Wang et al. 2004; as 3DGS)."""
     rows, columns = (_window(side) for side in a.shape[:2])

@@ -4,10 +4,12 @@ import jaxlie
 import numpy as np
 from jax import numpy as jnp
 
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.pose_graph.factors import Nodes, PoseGraph
 from emgs_jax.pose_graph.sparse import damped_step, normal_equations
 
 
+@full_precision
 def chordal_initialization(graph: PoseGraph, free: np.ndarray) -> Nodes | None:
     """The best poses where every error is quadratic: two linear problems, whatever the poses are now.
 

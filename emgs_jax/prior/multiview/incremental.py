@@ -13,6 +13,7 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.bundle_adjustment import BundleConfig, Tracks, Unknowns, adjust
 from emgs_jax.prior.multiview.keys import KeyConfig
@@ -127,6 +128,7 @@ def _largest_parallax(structure: Structure, config: StructureConfig) -> float:
     return largest
 
 
+@full_precision
 def _solve(
     structure: Structure,
     camera: Camera,
