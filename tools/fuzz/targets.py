@@ -336,7 +336,7 @@ def read_map(folder: Path) -> None:
 
 
 def write_places(folder: Path) -> None:
-    end, rng = BackEnd(load_config("graph=default").graph, (50.0, 50.0, 31.5, 23.5), 0.01), np.random.default_rng(0)
+    end, rng = empty_back_end(), np.random.default_rng(0)
     image, mask = np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), bool)
     for frame in range(3):
         end = add_node(end, FrameData(frame, image, np.zeros((48, 64, 3)), mask, {}), np.eye(4), 1.0, None)
@@ -347,9 +347,13 @@ def write_places(folder: Path) -> None:
     save_places(folder / "places.npz", end, 0.01)
 
 
+@cache
+def empty_back_end() -> BackEnd:
+    return BackEnd(load_config("graph=default").graph, (50.0, 50.0, 31.5, 23.5), 0.01)
+
+
 def read_places(folder: Path) -> None:
-    end = BackEnd(load_config("graph=default").graph, (50.0, 50.0, 31.5, 23.5), 0.01)
-    end, _ = load_places(folder / "places.npz", end)
+    end, _ = load_places(folder / "places.npz", empty_back_end())
     assert np.isfinite(end.poses).all() and len(end.poses) == len(end.is_placed) == end.first_node
     assert all(0 <= one.frame < len(end.poses) for one in end.database.keyframes)
 
