@@ -102,15 +102,17 @@ def run_cases(first: int, count: int, seed: int) -> Iterator[Case]:
     while position < end:
         command = [sys.executable, "-m", "tools.fuzz", "--inside", "--seed", str(seed)]
         command += ["--first", str(position), "--cases", str(end - position)]
-        child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for line in child.stdout:
-            if line.startswith("{"):
-                yield Case(**json.loads(line))
+        with tempfile.TemporaryFile("w+", errors="replace") as said:  # a pipe is full some day, and the child waits
+            child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=said, text=True)
+            for line in child.stdout:
+                if line.startswith("{"):
+                    yield Case(**json.loads(line))
+                    position += 1
+            code = child.wait()
+            if position < end:
+                said.seek(0)
+                yield Case(position, "?", "?", FAULT, f"the process ended with {code}: {said.read()[-2000:]}")
                 position += 1
-        said = child.communicate()[1]
-        if position < end:
-            yield Case(position, "?", "?", FAULT, f"the process ended with {child.returncode}: {said[-2000:]}")
-            position += 1
 
 
 def print_case(case: Case) -> None:
