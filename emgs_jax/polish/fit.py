@@ -25,20 +25,17 @@ from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, Shot, initia
 
 POSE_RATE = 0.3  # Adam's for frames that are placed on finished splats, in standard deviations
 Result = TypeVar("Result")
-Fitted = TypeVar("Fitted", bound=eqx.Module)
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rate of each part of `Appearance`, of the frames' exposures (0: all have the same), and of their
-    poses in standard deviations of each."""
+    """Adam's learning rate of each part of `Appearance`, and of the poses in standard deviations of each."""
 
     colors: float = number(low=0, high=10)
     logit: float = number(low=0, high=10)
     log_std: float = number(low=0, high=10)
     turn: float = number(low=0, high=10)
     shift: float = number(low=0, high=10)
-    exposure: float = number(low=0, high=10)
     pose: float = number(low=0, high=10)
 
 
@@ -55,6 +52,8 @@ class PolishConfig:
         min_opacity: what has less at the end is left out.
         every: steps after which a stopped fit goes on from there.
         seed: of the order of the frames.
+        exposures: share of a frame's brightness beside its splats' that is its own gain, in logarithms; 0: all frames
+            have the same. With all of it, gains and colours drift, one against the other.
         poses: whether the poses of the fitted frames are fitted, too; those of the others are then placed on the
             splats, which stay.
         pose_steps: of Adam, for each of these.
@@ -73,6 +72,7 @@ class PolishConfig:
     every: int = number(low=1, high=10_000_000)
     seed: int = number(low=0, high=2**31 - 1)
     pose_steps: int = number(low=0, high=10_000)
+    exposures: float = number(low=0, high=1)
     poses: bool
 
 
@@ -88,34 +88,23 @@ class Views(NamedTuple):
         targets: `loss`'s of each frame, (h, w, 4).
         poses: T_world_camera of each, (m, 4, 4).
         spreads: (m, 6, 6); a pose may become T Exp(spread u), 0 for one that stays.
-        exposures: `Shot`'s of each, (m, 3, 2), where a fit begins.
+        gains: `Shot`'s of each, (m, 3), where a fit begins.
     """
 
     targets: Spool
     poses: np.ndarray
     spreads: np.ndarray
-    exposures: np.ndarray
-
-
-class FrameFit(eqx.Module):
-    """What is fitted of a frame, or of all.
-
-    Args:
-        pose: its offset, in spreads.
-        exposure: `Shot`'s.
-    """
-
-    pose: Float[Array, "*m 6"]
-    exposure: Float[Array, "*m 3 2"]
+    gains: np.ndarray
 
 
 class State(NamedTuple):
     """Where a fit is: what it has found, and Adam's moments."""
 
     fitted: Appearance
-    frames: FrameFit
+    offsets: Float[Array, "m 6"]  # of the poses, in spreads
+    gains: Float[Array, "m 3"]  # of each frame, when it was last seen
     moments: Any
-    frame_moments: Any  # of each frame by itself, as one is seen in a step
+    pose_moments: Any  # of each frame by itself, as one is seen in a step
 
 
 def fit(
@@ -139,30 +128,35 @@ def fit(
         on_step: told the number of each step, and the PSNR (dB) of its frame before it.
 
     Returns:
-        The splats' appearance, and the frames where they are now, with the exposures that they turned out to have.
+        The splats' appearance, and the frames where they are now, with the gains that they turned out to have.
     """
     import optax  # an extra
 
     adam = optax.scale_by_adam(eps=1e-15)  # as 3DGS
     fitted = initial(jnp.asarray(colors, jnp.float32), jnp.float32(config.opacity))
-    frames = FrameFit(jnp.zeros((len(views.poses), 6)), jnp.asarray(views.exposures, jnp.float32))
-    state = State(fitted, frames, adam.init(fitted), jax.vmap(adam.init)(frames))
+    offsets, gains = jnp.zeros((len(views.poses), 6)), jnp.asarray(views.gains, jnp.float32)
+    state = State(fitted, offsets, gains, adam.init(fitted), jax.vmap(adam.init)(offsets))
 
     @eqx.filter_jit
     @full_precision
     def step(state: State, anchors: Anchors, view: View, decay: Array, terms: LossConfig):
-        frame, frame_moments = jax.tree.map(lambda x: x[view.row], (state.frames, state.frame_moments))
+        offset, pose_moments = jax.tree.map(lambda x: x[view.row], (state.offsets, state.pose_moments))
 
-        def total(fitted: Appearance, frame: FrameFit):
-            return loss(fitted, anchors, shot(view, frame), camera, terms)
+        def total(fitted: Appearance, offset: Float[Array, "6"]):
+            shot = Shot(view.target, moved(view, offset), state.gains[view.row])
+            return loss(fitted, anchors, shot, camera, terms)
 
-        (_, (error, overflow)), (slope, turn) = jax.value_and_grad(total, (0, 1), has_aux=True)(state.fitted, frame)
+        (_, misfit), (slope, turn) = jax.value_and_grad(total, (0, 1), has_aux=True)(state.fitted, offset)
         change, moments = adam.update(slope, state.moments)
-        move, frame_moments = adam.update(turn, frame_moments)
-        fitted = _descend(state.fitted, change, decay, config.rates)
-        places = _descend(frame, move, decay, config.rates), frame_moments
-        frames = jax.tree.map(lambda x, y: x.at[view.row].set(y), (state.frames, state.frame_moments), places)
-        return (State(fitted, frames[0], moments, frames[1]), error), overflow
+        move, pose_moments = adam.update(turn, pose_moments)
+        parts = {
+            name: x - decay * getattr(config.rates, name) * getattr(change, name)
+            for name, x in vars(state.fitted).items()
+        }
+        of_frame = offset - decay * config.rates.pose * move, misfit.gain**config.exposures, pose_moments
+        of_all = state.offsets, state.gains, state.pose_moments
+        offsets, gains, all_moments = jax.tree.map(lambda x, y: x.at[view.row].set(y), of_all, of_frame)
+        return (State(Appearance(**parts), offsets, gains, moments, all_moments), misfit.mean_sq), misfit.overflow
 
     terms, signature = config.loss, _signature(anchors, colors, config)
     first, state = _read(path, state, signature)
@@ -175,14 +169,8 @@ def fit(
         if (number_ + 1) % config.every == 0:
             _write(path, number_ + 1, state, signature)
     path.unlink(missing_ok=True)
-    found = placed(views, state.frames.pose), np.asarray(state.frames.exposure, np.float64)
-    return state.fitted, views._replace(poses=found[0], exposures=found[1])
-
-
-def _descend(at: Fitted, change: Fitted, decay: Array, rates: Rates) -> Fitted:
-    """One step of gradient descent, by each field's own rate."""
-    moved = {name: x - decay * getattr(rates, name) * getattr(change, name) for name, x in vars(at).items()}
-    return type(at)(**moved)
+    gains = np.asarray(state.gains, np.float64)
+    return state.fitted, views._replace(poses=placed(views, state.offsets), gains=gains)
 
 
 def locate(anchors: Anchors, fitted: Appearance, views: Views, camera: Camera, config: PolishConfig) -> np.ndarray:
@@ -195,11 +183,11 @@ def locate(anchors: Anchors, fitted: Appearance, views: Views, camera: Camera, c
     @full_precision
     def step(offset: Float[Array, "6"], moments: Any, view: View, rate: Array, splats: tuple, terms: LossConfig):
         def total(offset: Float[Array, "6"]):
-            return loss(*splats, shot(view, FrameFit(offset, view.exposure)), camera, terms)
+            return loss(*splats, Shot(view.target, moved(view, offset), view.gain), camera, terms)
 
-        slope, (_, overflow) = jax.grad(total, has_aux=True)(offset)
+        slope, misfit = jax.grad(total, has_aux=True)(offset)
         move, moments = adam.update(slope, moments)
-        return (offset - rate * move, moments), overflow
+        return (offset - rate * move, moments), misfit.overflow
 
     offsets = []
     for row in range(len(views.poses)):
@@ -235,7 +223,7 @@ class View(NamedTuple):
     target: Float[Array, "h w 4"]
     pose: Float[Array, "4 4"]
     spread: Float[Array, "6 6"]
-    exposure: Float[Array, "3 2"]
+    gain: Float[Array, "3"]
 
 
 def view_of(views: Views, row: int) -> View:
@@ -244,10 +232,9 @@ def view_of(views: Views, row: int) -> View:
     return View(jnp.int32(row), target, *others)
 
 
-def shot(view: View, frame: FrameFit) -> Shot:
-    """The frame at the pose T Exp(spread u), in that exposure."""
-    T = jaxlie.SE3.from_matrix(view.pose) @ jaxlie.SE3.exp(view.spread @ frame.pose)
-    return Shot(view.target, T, frame.exposure)
+def moved(view: View, offset: Float[Array, "6"]) -> jaxlie.SE3:
+    """The pose T Exp(spread u)."""
+    return jaxlie.SE3.from_matrix(view.pose) @ jaxlie.SE3.exp(view.spread @ offset)
 
 
 @full_precision

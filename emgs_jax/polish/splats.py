@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
@@ -57,12 +57,12 @@ class Shot(NamedTuple):
     Args:
         target: RGB of the image and the map's depth (m), 0 where it has none: such pixels count in no term.
         T_world_camera: of the camera.
-        exposure: of each channel, logarithm of the gain and offset: the image is gain · colours + offset.
+        gain: of each channel, by which the splats' colours become the image's.
     """
 
     target: Float[Array, "h w 4"]
     T_world_camera: jaxlie.SE3
-    exposure: Float[Array, "3 2"]
+    gain: Float[Array, "3"]
 
 
 class LossConfig(eqx.Module):
@@ -112,33 +112,51 @@ def draw(
     return render_splats(splats, gaussians.colors, camera, config)
 
 
-def exposed(colors: Float[Array, "*s 3"], exposure: Float[Array, "3 2"]) -> Float[Array, "*s 3"]:
-    """The colours as a frame of that exposure has them."""
-    return colors * jnp.exp(exposure[:, 0]) + exposure[:, 1]
+class Misfit(NamedTuple):
+    """What `loss` has seen.
+
+    Args:
+        mean_sq: squared error of the colours.
+        gain: with which the picture of the splats would be as bright as the image.
+        overflow: splats that had no room in the tiles' lists.
+    """
+
+    mean_sq: Float[Array, ""]
+    gain: Float[Array, "3"]
+    overflow: Int[Array, ""]
 
 
 @full_precision
 def loss(
     fitted: Appearance, anchors: Anchors, shot: Shot, camera: Camera, c: LossConfig
-) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Int[Array, ""]]]:
-    """Photometric loss of 3DGS with depth and normals of the map as terms.
-
-    Returns:
-        The loss; the mean squared error of the colours, and how many splats had no room in the tiles' lists.
-    """
+) -> tuple[Float[Array, ""], Misfit]:
+    """Photometric loss of 3DGS with depth and normals of the map as terms."""
     gaussians, opacity = gaussians_of(anchors, fitted)
     drawn = draw(gaussians, opacity, shot.T_world_camera, camera, c.render)
     image, depth = shot.target[..., :3], shot.target[..., 3]
     is_seen = depth > 0
     count = jnp.maximum(jnp.sum(is_seen), 1)
-    found = jnp.where(is_seen[..., None], exposed(drawn.values, shot.exposure), image)
+    found = jnp.where(is_seen[..., None], shot.gain * drawn.values, image)
     photometric = (1.0 - c.dssim) * jnp.sum(jnp.abs(found - image)) / (3 * count)
     photometric += c.dssim * 0.5 * (1.0 - ssim(found, image))
     has_both = is_seen & (drawn.depth > 0)
     off = jnp.where(has_both, jnp.abs(drawn.depth - depth) / jnp.where(is_seen, depth, 1.0), 0.0)
     tilt = 1.0 - jnp.sum(gaussians.normals * anchors.axes[..., 2], axis=-1)
     total = photometric + c.depth * jnp.sum(off) / count + c.normal * jnp.mean(tilt)
-    return total, (jnp.sum((found - image) ** 2) / (3 * count), drawn.overflow)
+    gain = relative_gain(drawn.values, image, is_seen)
+    return total, Misfit(jnp.sum((found - image) ** 2) / (3 * count), gain, drawn.overflow)
+
+
+def relative_gain(
+    picture: Float[Array, "h w 3"], image: Float[Array, "h w 3"], is_seen: Bool[Array, "h w"]
+) -> Float[Array, "3"]:
+    """Ratio of the channels' means over the pixels that are seen; 1 where all is black.
+
+    A regression would be the lower the more the picture is blurred or displaced.
+    """
+    of_image, of_picture = (jnp.sum(jnp.where(is_seen[..., None], x, 0.0), axis=(0, 1)) for x in (image, picture))
+    is_lit = (of_image > 0) & (of_picture > 0)
+    return jnp.where(is_lit, of_image / jnp.where(is_lit, of_picture, 1.0), 1.0)
 
 
 @full_precision

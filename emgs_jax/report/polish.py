@@ -28,7 +28,7 @@ from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.fit import PolishConfig, Views, fit, is_held_out, locate, with_room, without_transparent
 from emgs_jax.polish.seeds import Seeds
-from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, draw, exposed, gaussians_of, ssim
+from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, draw, gaussians_of, relative_gain, ssim
 from emgs_jax.render.composite import Rendering
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.report.recorded_run import POLISH, SPLATS_FILE, RecordedRun
@@ -38,7 +38,8 @@ _, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE, PATH_FILE = POLISH
 MAX_PICTURES = 4
 Seen: TypeAlias = tuple[np.ndarray, DenseView]  # image (h, w, 3) in [0, 1] of a frame, and the map from its pose
 Nearest: TypeAlias = Callable[[np.ndarray], np.ndarray]
-_densify, _classify, _ssim, _exposed = stored(densify), stored(classify), jax.jit(ssim), jax.jit(exposed)
+_densify, _classify = stored(densify), stored(classify)
+_ssim, _gain = jax.jit(ssim), jax.jit(relative_gain)
 
 
 def polish(
@@ -72,32 +73,32 @@ def polish(
         return dataset[row].image / np.float32(255), eqx.tree_at(lambda v: v.rendering, view, None)
 
     nearest = _nearest(gaussians)
-    seeds, targets = Seeds(run.camera, config.pixels_per_splat), Spool()
+    seeds, targets, gains = Seeds(run.camera, config.pixels_per_splat), Spool(), []
     for row in tqdm(fitted_rows, desc="splats", unit="frame"):
         image, view = seen(row)
         seeds.add(view, image, run.poses[row])
         targets.append(_target(image, view))
+        gains.append(np.asarray(_gain(view.colors, image, view.valid)) ** config.exposures)
     for row in held:  # what only these see is as the map has it: their images stay out
         view = seen(row)[1]
         seeds.add(view, view.colors, run.poses[row])
     anchors, colors = seeds.anchors(_map_noise(gaussians, nearest))
-    same = np.zeros((len(fitted_rows), 3, 2))
-    views = Views(targets, run.poses[fitted_rows], _spreads(run, fitted_rows, config), same)
+    views = Views(targets, run.poses[fitted_rows], _spreads(run, fitted_rows, config), np.stack(gains))
     fitted, views = _fitted(anchors, colors, views, run, config)
     anchors, fitted = without_transparent(anchors, fitted, config.min_opacity)
-    poses, exposures = run.poses.copy(), _between(views.exposures, fitted_rows, len(run.poses))
+    poses, all_gains = run.poses.copy(), _between(views.gains, fitted_rows, len(run.poses))
     poses[fitted_rows] = views.poses
     if config.poses:
         targets = Spool()
         for row in held:
             targets.append(_target(*seen(row)))
-        views = Views(targets, run.poses[held], _spreads(run, held, config), exposures[held])
+        views = Views(targets, run.poses[held], _spreads(run, held, config), all_gains[held])
         poses[held] = locate(anchors, fitted, views, run.camera, config)
         save_trajectory_tum(run.folder / PATH_FILE, [line["timestamp"] for line in run.frames], poses)
     splats, opacity = gaussians_of(anchors, fitted)
     count = _save_splats(run, splats, opacity, nearest)
     metrics = {"polish/num_splats": count, "polish/num_fitted": len(fitted_rows), "polish/num_held_out": len(held)}
-    metrics |= _compare(run, dataset, held, seen, (splats, opacity, poses, exposures, config.loss))
+    metrics |= _compare(run, dataset, held, seen, (splats, opacity, poses, all_gains, config.loss))
     write_json(run.folder / METRICS_FILE, metrics)
     return metrics
 
@@ -123,10 +124,9 @@ def _fitted(
         return fit(anchors, colors, views, run.camera, config, run.folder / CHECKPOINT_FILE, on_step)
 
 
-def _between(exposures: np.ndarray, rows: list[int], count: int) -> np.ndarray:
-    """Exposures of all frames (count, 3, 2): those of others than `rows` lie between those of the two beside them."""
-    values = exposures.reshape(len(rows), 6).T
-    return np.stack([np.interp(np.arange(count), rows, column) for column in values], axis=1).reshape(count, 3, 2)
+def _between(gains: np.ndarray, rows: list[int], count: int) -> np.ndarray:
+    """Gains of all frames (count, 3): those of others than `rows` lie between those of the two beside them."""
+    return np.stack([np.interp(np.arange(count), rows, channel) for channel in gains.T], axis=1)
 
 
 def _save_splats(run: RecordedRun, splats: Gaussians, opacity: jax.Array, nearest: Nearest) -> int:
@@ -192,9 +192,9 @@ def _compare(
     """PSNR and SSIM over the pixels that the map covers, depth errors and ATE where the truth is known.
 
     Before is the map at the run's poses, after are the splats at theirs. Where the map covers nothing both pictures are
-    the image itself in SSIM, and do not count in PSNR. No pixel of a held-out frame says what its exposure is.
+    the image itself in SSIM, and do not count in PSNR. No pixel of a held-out frame says how bright it is.
     """
-    splats, opacity, poses, exposures, terms = drawn
+    splats, opacity, poses, gains, terms = drawn
     known = run.has_truth & run.is_placed
     metrics: dict[str, Any] = {}
     scale = None
@@ -212,7 +212,7 @@ def _compare(
         after, terms = with_room(partial(_picture, splats, opacity, to_se3(poses[row]), run.camera), terms)
         pictures = {
             "before": (view.colors, np.where(view.valid, view.depth, 0.0)),
-            "after": (np.asarray(_exposed(after.values, np.float32(exposures[row]))), after.depth),
+            "after": (np.float32(gains[row]) * after.values, after.depth),
         }
         for name, (colors, depth) in pictures.items():
             shown = np.where(view.valid[..., None], np.clip(colors, 0, 1), image).astype(np.float32)
