@@ -16,13 +16,13 @@ from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report import page_words
 from emgs_jax.report.colors import NO_CLASS, PATHS, class_colors, rgb, to_bytes
 from emgs_jax.report.html import MAX_BYTES, POLICY, jpeg, page, picture, source, write_page
-from emgs_jax.report.layers import COV_UNIT, feature_layer, fitted, layers_of, map_layers
+from emgs_jax.report.layers import COV_UNIT, feature_layer, fitted, layers_of, map_layers, packed, thinned
 from emgs_jax.report.overview import view_from_above
 from emgs_jax.report.page_pictures import Views, draw_views
 from emgs_jax.report.page_strip import key_of, strip
 from emgs_jax.report.recorded_run import SPLATS_FILE, PlacedPaths, RecordedRun, placed_paths, render_config
 from emgs_jax.report.repeat import repeat
-from emgs_jax.report.splats import read_splats, splats_for_page
+from emgs_jax.report.splats import owners, read_splats, splats_for_page
 
 _MAP_BYTES = 2_800_000  # of base64; the rest is for pictures and words
 _SPLAT_BYTES = 2_400_000  # of these for the splats of emgs polish, where there are some
@@ -47,26 +47,30 @@ def write_report(run: RecordedRun, dataset: Dataset | None, note: str = "") -> P
     layers, config = map_layers(run.map, run.text) | feature_layer(run.map), render_config(run)
     rows = sorted({int(row) for row in np.linspace(0, len(run.poses) - 1, min(_MAX_PICTURES, len(run.poses)))})
     views = draw_views(run, rows, config, dataset)
-    splats, packed_splats, few_splats = _splats(run)
+    splats, packed_splats, few_splats, means = _splats(run)
     limit, num = _MAP_BYTES - len(packed_splats), len(layers["mean"])
     arrays, packed_map, shown = fitted(layers, _path_arrays(run, paths), layers["updates"], limit)
+    kept = thinned({"mean": layers["mean"]}, layers["updates"], shown)["mean"]
+    owned = {"owner": owners(means, kept)} if len(kept) else {}
+    about_owned, packed_owners = packed(owned)
     few = f"The page shows the {shown:,} of {num:,} Gaussians that most frames agree on; map.npz has all of them."
     about = _about(run, layers) | {"arrays": arrays, "render": _for_shader(config), "splats": splats}
+    about["owners"] = about_owned
     note = " ".join(filter(None, [note, few if shown < num else "", few_splats]))
-    return write_page(run.folder, _page(run, paths, views, about, (packed_map, packed_splats), note))
+    return write_page(run.folder, _page(run, paths, views, about, (packed_map, packed_splats, packed_owners), note))
 
 
 def _for_shader(config: RenderConfig) -> dict[str, float]:
     return {name: float(getattr(config, name)) for name in ("blur", "radius", "opacity")}
 
 
-def _splats(run: RecordedRun) -> tuple[dict[str, Any] | None, str, str]:
+def _splats(run: RecordedRun) -> tuple[dict[str, Any] | None, str, str, np.ndarray]:
     """`splats_for_page` of what `emgs polish` wrote into the run; None without."""
     splats = read_splats(run.folder / SPLATS_FILE)
     if splats is None or not len(splats.means):
-        return None, "", ""
-    about, packed, note = splats_for_page(splats, _SPLAT_BYTES)
-    return about | {"render": {"blur": 0.3, "radius": 3.0, "opacity": 1.0}}, packed, note  # as 3DGS draws
+        return None, "", "", np.zeros((0, 3))
+    about, *rest = splats_for_page(splats, _SPLAT_BYTES)
+    return about | {"render": {"blur": 0.3, "radius": 3.0, "opacity": 1.0}}, *rest  # as 3DGS draws
 
 
 def _path_arrays(run: RecordedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
@@ -115,7 +119,7 @@ def _page(
     paths: PlacedPaths,
     views: Views,
     about: Mapping[str, Any],
-    packed: tuple[str, str],
+    blocks: tuple[str, str, str],
     note: str,
 ) -> bytes:
     """Fill the page, with pictures of as many frames as fit."""
@@ -137,8 +141,9 @@ def _page(
         "settings": page_words.settings(again),
         "files": page_words.files(run),
         "note": note,
-        "arrays": Markup(packed[0]),
-        "splats": Markup(packed[1]),
+        "arrays": Markup(blocks[0]),
+        "splats": Markup(blocks[1]),
+        "owners": Markup(blocks[2]),
         "script": script,
         "vertex": source("splats.vert"),
         "fragment": source("splats.frag"),

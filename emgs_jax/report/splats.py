@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.evaluation.clouds import NearestPoints
 from emgs_jax.io.ply import SH_C0
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.report.colors import to_bytes
-from emgs_jax.report.layers import fitted, packed_covariances
+from emgs_jax.report.layers import fitted, packed_covariances, thinned
 
 _STEPS = 65535  # of a coordinate along the side of the box round all splats
 
@@ -60,12 +61,23 @@ def read_splats(path: Path) -> Splats | None:
     )
 
 
-def splats_for_page(splats: Splats, limit: int) -> tuple[dict[str, Any], str, str]:
+def owners(splats: np.ndarray, gaussians: np.ndarray) -> np.ndarray:
+    """Find for each splat's mean (n, 3) the row of the nearest Gaussian's (m, 3): of its class, feature and certainty.
+
+    Raises:
+        ValueError: there are splats and no Gaussian.
+    """
+    if len(splats) and not len(gaussians):
+        raise ValueError("the map has no Gaussian that splats could belong to: run emgs polish again")
+    return NearestPoints(gaussians).query(splats)[1].reshape(len(splats)).astype(np.int32)
+
+
+def splats_for_page(splats: Splats, limit: int) -> tuple[dict[str, Any], str, str, np.ndarray]:
     """Pack splats into at most `limit` characters, those that cover most if all of them are too many.
 
     Returns:
-        What the page's program must know (`arrays`, see `fitted`, and the box of the means), the packed arrays and a
-        note on what was left out.
+        What the page's program must know (`arrays`, see `fitted`, and the box of the means), the packed arrays, a note
+        on what was left out, and the means of what was not.
     """
     low, high = splats.means.min(0), splats.means.max(0)
     step = np.maximum(high - low, 1e-9) / _STEPS
@@ -80,4 +92,5 @@ def splats_for_page(splats: Splats, limit: int) -> tuple[dict[str, Any], str, st
     whole = len(splats.means)
     note = f"The page shows the {shown:,} of {whole:,} splats that cover most; splats.ply has all of them."
     box = {"low": low.tolist(), "step": step.tolist()}
-    return {"arrays": about, **box}, text, note if shown < whole else ""
+    means = thinned({"mean": splats.means}, covered, shown)["mean"]
+    return {"arrays": about, **box}, text, note if shown < whole else "", means

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from emgs_jax.report.colors import to_bytes
 from emgs_jax.report.layers import ALWAYS, layers_of, painted
 from emgs_jax.report.page_words import frame_facts
-from emgs_jax.report.viewer_answers import ask, find_words, highlighted, picked
+from emgs_jax.report.viewer_answers import Answer, ask, find_words, highlighted, picked
 from emgs_jax.report.viewer_scene import KINDS, Scene, Shown, field_of_view, wxyz
 
 if TYPE_CHECKING:
@@ -80,8 +81,9 @@ class Viewer:
         self._run, self.layers = run, run.layers
         if not run.frames:
             return
-        colors, message = self._colors()
+        colors, of_splats, message = self._colors()
         self.scene.draw(run, colors)
+        self.scene.recolor(colors, of_splats)
         self._show()
         self.answer.content = _shown(message)
         self.frame.max = max(len(run.frames) - 1, 1)
@@ -129,25 +131,31 @@ class Viewer:
         """Colour the map as the controls say."""
         if not self._run.frames:
             return
-        colors, message = self._colors()
+        colors, of_splats, message = self._colors()
         with self.server.atomic():
-            self.scene.recolor(colors)
+            self.scene.recolor(colors, of_splats)
         self.answer.content = _shown(message)
 
-    def _colors(self) -> tuple[np.ndarray, str]:
-        """Colour all Gaussians, (n, 3), and say what there is to say about the words."""
+    def _colors(self) -> tuple[np.ndarray, np.ndarray | None, str]:
+        """Colour all Gaussians, (n, 3), and splats, and say what there is to say about the words."""
         name = next(name for name, layer in layers_of(self.layers).items() if layer.title == self.layer.value)
         colors, message = painted(self.layers, name), self._known()
+        splats, rows = self._run.splats, self._run.owners
+        of_splats = None
+        if splats is not None:
+            of_splats = to_bytes(splats.colors[:, :3]) if name == "color" else colors[rows]
         if "label" not in self.layers or not self.words.value.strip():
-            return colors, message
+            return colors, of_splats, message
         (wanted, unknown), (against, more) = (find_words(box.value, self._names) for box in (self.words, self.against))
         if wanted:
             found = ask(self.layers, wanted, against, self.threshold.value)
             colors, words = highlighted(colors, found), escape(", ".join(self._names[row] for row in wanted))
+            if of_splats is not None:
+                of_splats = highlighted(of_splats, Answer(found.cosines[rows], found.is_found[rows]))
             message = f"{int(found.is_found.sum()):,} of {len(colors):,} Gaussians: {words}"
         if unknown + more:
             message += f"<br>{unknown + more} of the words are none of this run's. {self._known()}"
-        return colors, message
+        return colors, of_splats, message
 
     @_alone
     def pick(self, origin: Any, direction: Any) -> None:

@@ -13,7 +13,7 @@ from emgs_jax.report.colors import OURS, PATHS, STATUS_COLORS, rgb
 from emgs_jax.report.layers import covariances, feature_layer, map_layers
 from emgs_jax.report.overview import view_from_above
 from emgs_jax.report.recorded_run import SPLATS_FILE, RecordedRun, placed_paths, render_config
-from emgs_jax.report.splats import Splats, read_splats
+from emgs_jax.report.splats import Splats, owners, read_splats
 
 MAX_FRUSTUMS = 300  # more are a carpet; the chosen frame has its own
 KINDS = ("splats", "Gaussians", "points")  # as what a map is shown
@@ -31,6 +31,7 @@ class Shown:
         truth: true camera centres in the frame of the map, (n, 3); nan where unknown.
         image: of the last frame, uint8 (h, w, 3); None where nobody has it.
         splats: of `emgs polish`; None where it was not run.
+        owners: of `splats`, rows of `layers`.
     """
 
     layers: Mapping[str, np.ndarray]
@@ -42,6 +43,7 @@ class Shown:
     render: RenderConfig
     image: np.ndarray | None = None
     splats: Splats | None = None
+    owners: np.ndarray | None = None
 
     @property
     def is_placed(self) -> np.ndarray:
@@ -54,7 +56,9 @@ def shown(run: RecordedRun) -> Shown:
     layers, names = map_layers(run.map, run.text) | feature_layer(run.map), () if run.text is None else run.text.names
     truth = placed_paths(run).truth[:, :3, 3]
     splats = read_splats(run.folder / SPLATS_FILE)
-    return Shown(layers, names, run.frames, run.poses, truth, run.camera, render_config(run), splats=splats)
+    owned = None if splats is None else owners(splats.means, layers["mean"])
+    facts = layers, names, run.frames, run.poses, truth, run.camera, render_config(run)
+    return Shown(*facts, splats=splats, owners=owned)
 
 
 class Scene:
@@ -84,8 +88,10 @@ class Scene:
             self._scene.set_up_direction(view_from_above(run.poses)[2])
             self._place_views(run.poses[0])
 
-    def recolor(self, colors: np.ndarray) -> None:
-        """Give all Gaussians, if there are any, colours (n, 3)."""
+    def recolor(self, colors: np.ndarray, of_splats: np.ndarray | None) -> None:
+        """Give all Gaussians, if there are any, colours (n, 3), and likewise the splats."""
+        if self.sharp is not None:
+            self.sharp.rgbs = of_splats
         if self.splats is not None:
             self.splats.rgbs = colors
             self.points.colors = colors

@@ -100,7 +100,7 @@ def test_hostile_names_stay_text_and_loops_name_frames_as_the_rest_of_the_page_d
     write_report(read_run(hostile), None)
     elements = Elements(text_of(hostile))
     tags, plain = ([tag for tag, _ in page.found] for page in (elements, Elements(text_of(folder))))
-    assert tags.count("script") == plain.count("script") == 6 and "alert" not in elements.scripts[""]
+    assert tags.count("script") == plain.count("script") == 7 and "alert" not in elements.scripts[""]
     assert "<" not in elements.scripts["about"]  # an end of a script may have a space or a slash before its >
     assert json.loads(elements.scripts["about"])["frames"]["reason"][0] == HOSTILE
     assert not any(name.startswith("on") for _, attributes in elements.found for name in attributes)
@@ -149,9 +149,12 @@ def test_the_page_holds_the_splats_of_a_polished_run_and_of_too_many_those_that_
     np.testing.assert_allclose(variances, [[3e-3, 2.5e-3, 1e-4]] * len(means), rtol=1e-3)
     np.testing.assert_allclose(arrays["color"] / 255, np.c_[walls.colors, opacity], atol=0.5 / 255 + 1e-6)
     np.testing.assert_array_equal(arrays["normal"], 127 * np.asarray(walls.normals))
-    few, text, note = splats_for_page(read_splats(folder / "splats.ply"), 2_000)
+    owned = unpack_block(elements.scripts["owners"], json.loads(elements.scripts["about"])["owners"])["owner"]
+    np.testing.assert_array_equal(owned.ravel(), np.arange(len(means)), "splats where the Gaussians are")
+    few, text, note, kept = splats_for_page(read_splats(folder / "splats.ply"), 2_000)
     count = few["arrays"][0]["rows"]
     assert f"shows the {count:,} of {len(means):,} splats" in note and count < len(means) / 2
+    assert len(kept) == count
     assert len(text) <= 2_000 and (unpack_block(text, few["arrays"])["color"][:, 3] > 200).all()
     damaged = (folder / "splats.ply").read_bytes().replace(b"rot_3", b"turn3")
     (folder / "splats.ply").write_bytes(damaged)

@@ -126,6 +126,13 @@ def test_the_page_draws_what_our_renderer_draws(page, run):
     assert psnr(np.roll(theirs, 1, axis=1), ours) < psnr(theirs, ours) - 3  # half a pixel would be seen
 
 
+PAINTED = """
+const { splats, sets, arrays } = report, owner = Array.from(sets.splats.owner);
+const colors = owner.map((_, row) => Array.from(splats.colors.slice(4 * row, 4 * row + 3)));
+return [colors, owner.map((row) => arrays.label[row]), ABOUT];
+"""
+
+
 def test_the_page_draws_the_splats_of_a_polished_run_as_they_were_fitted(page, run):
     """The oracle is the drawing that `emgs polish` fits, each splat in its own opacity; then the map is back."""
     size, intrinsics = (3 * SIZE[0], 3 * SIZE[1]), [3 * value for value in INTRINSICS]
@@ -146,7 +153,17 @@ def test_the_page_draws_the_splats_of_a_polished_run_as_they_were_fitted(page, r
     )
     ours = np.asarray(drawn.values) + (1 - np.asarray(drawn.alpha)[..., None]) * BACKGROUND
     assert psnr(theirs, ours) > 35 and psnr(theirs, before) < 25
-    assert page.run("return document.getElementById('layer').disabled")
+    choose(page, "layer", "class")
+    choose(page, "word", "1")
+    colors, labels, about = page.run(PAINTED)
+    is_sofa = np.array(labels) == 1
+    assert is_sofa.any() and not is_sofa.all()
+    np.testing.assert_array_equal(np.array(colors)[is_sofa], [about["classColors"][1]] * is_sofa.sum())
+    greys = np.array(colors)[~is_sofa]
+    assert (greys[:, 0] == greys[:, 1]).all(), "what is not asked for fades"
+    choose(page, "word", "-1")
+    choose(page, "layer", "color")
+    np.testing.assert_array_equal(drawn_by_the_page(page, 5, size, intrinsics), theirs)
     choose(page, "kind", "gaussians")
     np.testing.assert_array_equal(drawn_by_the_page(page, 5, size, intrinsics), before)
 

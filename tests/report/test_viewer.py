@@ -147,6 +147,18 @@ def test_a_polished_run_can_be_shown_as_its_splats(tmp_path, viewer):
         assert (sharp.visible, gaussians.visible) == (True, False)
         np.testing.assert_allclose(sharp.centers, walls.means, atol=1e-6)
         np.testing.assert_allclose(np.ravel(sharp.opacities) / 255, 0.25, atol=0.01)
+        is_sofa, own = np.asarray(walls.features)[:, 1] > 0.5, np.array(sharp.rgbs)
+        polished.words.value = "sofa"
+        polished.recolor()
+        found = np.array(sharp.rgbs)
+        assert found[is_sofa].max(1).min() > 130 and found[~is_sofa].max() < 70
+        polished.words.value = ""
+        polished.layer.value = "normals"
+        polished.recolor()
+        np.testing.assert_array_equal(np.array(sharp.rgbs), painted(polished.layers, "normal"))
+        polished.layer.value = "colour"
+        polished.recolor()
+        np.testing.assert_array_equal(np.array(sharp.rgbs), own)
         polished.kind.value = "Gaussians"
         polished._show()
         assert (sharp.visible, gaussians.visible) == (False, True)

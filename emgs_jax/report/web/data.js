@@ -33,11 +33,13 @@ function half(bits) {
 }
 
 // What is drawn: the Gaussians of the map, and the splats that were fitted to the images; null where there are none.
+// A splat's `owner` is the row of the Gaussian whose class, feature and certainty it has.
 async function readSets() {
   const about = ABOUT.splats;
   const gaussians = { ...await readArrays("arrays", ABOUT.arrays), render: ABOUT.render };
-  if (!about) return { gaussians, splats: null };
+  if (!about || !ABOUT.owners.length) return { gaussians, splats: null };
   const splats = { ...await readArrays("splats", about.arrays), render: about.render };
   splats.mean = Float32Array.from(splats.mean, (value, at) => about.low[at % 3] + value * about.step[at % 3]);
+  splats.owner = (await readArrays("owners", ABOUT.owners)).owner;
   return { gaussians, splats };
 }

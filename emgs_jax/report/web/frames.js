@@ -59,15 +59,12 @@ function clicked(report, x, y) {
     return;
   }
   state.pivot = found.point;
-  const { arrays } = report, row = found.row;
+  const { arrays } = report, isSplat = report.shown === report.sets.splats;
+  const row = isSplat ? report.shown.owner[found.row] : found.row;
   const place = found.point.map((value) => value.toFixed(3)).join(", ");
-  if (report.shown === report.sets.splats) {
-    $("picked").textContent = `splat ${row}: at ${place}`;
-    return;
-  }
   const label = arrays.label && arrays.label[row] >= 0 ? ABOUT.classes[arrays.label[row]] + " · " : "";
   const numbers = `certain by ${(arrays.existence[row] / 255).toFixed(2)} · ${arrays.updates[row]} updates`;
-  $("picked").textContent = `Gaussian ${row}: ${label}at ${place} · ${numbers} · born at step ${arrays.birth[row]}`;
+  $("picked").textContent = `${isSplat ? `splat ${found.row} of ` : ""}Gaussian ${row}: ${label}at ${place} · ${numbers} · born at step ${arrays.birth[row]}`;
 }
 
 // The nearest Gaussian whose ellipse holds the ray and whose plane it meets; x and y from the corner of the view.

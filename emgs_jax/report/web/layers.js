@@ -41,13 +41,14 @@ class Layers {
     return Float32Array.from({ length: count }, (_, row) => SCALES[scale].of(at(row)));
   }
 
-  // RGBA of all Gaussians. word: number of a class, -1 = all. threshold: of a similarity, as a share of its range.
-  paint(name, word, threshold, minExistence) {
-    const { arrays, count } = this;
+  // RGBA of a set's rows, Gaussians or splats. word: number of a class, -1 = all. threshold: of a similarity, as a share
+  // of its range.
+  paint(set, name, word, threshold, minExistence) {
+    const { arrays } = this, count = set.mean.length / 3, width = set.color.length / count;
     const out = new Uint8Array(4 * count);
     const range = this.range(name, word), values = this.values(name, word);
-    for (let row = 0; row < count; row++) {
-      const own = arrays.color.subarray(3 * row, 3 * row + 3);
+    for (let at = 0; at < count; at++) {
+      const own = set.color.subarray(width * at, width * at + 3), row = set.owner ? set.owner[at] : at;
       let color = own;
       if (name === "class") {
         const label = arrays.label[row];
@@ -56,12 +57,13 @@ class Layers {
       } else if (name === "feature") {
         color = arrays.feature.subarray(3 * row, 3 * row + 3);
       } else if (name === "normal") {
-        color = [0, 1, 2].map((k) => 127.5 + arrays.normal[3 * row + k]);
+        color = [0, 1, 2].map((k) => 127.5 + set.normal[3 * at + k]);
       } else if (values) {
         const share = (values[row] - range[0]) / (range[1] - range[0]);
         color = name === "similarity" && share < threshold ? faded(own) : turbo(share);
       }
-      out.set([color[0], color[1], color[2], arrays.existence[row] >= 255 * minExistence ? 255 : 0], 4 * row);
+      const opacity = width === 4 ? set.color[4 * at + 3] : 255;
+      out.set([color[0], color[1], color[2], arrays.existence[row] >= 255 * minExistence ? opacity : 0], 4 * at);
     }
     return out;
   }

@@ -122,14 +122,9 @@ function wireChoices(report) {
     $("thresholdBox").hidden = name !== "similarity";
     const chosen = name === "similarity" ? Math.max(word, 0) : word, kind = $("kind").value;
     if (report.shown !== report.sets[kind]) splats.load((report.shown = report.sets[kind]));
-    for (const id of ["layer", "word", "threshold", "existence"]) $(id).disabled = kind === "splats";
-    if (kind === "splats") {
-      splats.recolor(report.shown.color);
-      $("legend").replaceChildren();
-    } else {
-      splats.recolor(layers.paint(name, chosen, Number($("threshold").value), Number($("existence").value)));
-      legend(layers, name, chosen);
-    }
+    const limits = [$("threshold"), $("existence")].map((slider) => Number(slider.value));
+    splats.recolor(layers.paint(report.shown, name, chosen, ...limits));
+    legend(layers, name, chosen);
     report.moved();
   };
   report.choose = choose;
