@@ -83,4 +83,8 @@ def polish_lines(found: Mapping[str, Any]) -> list[str]:
         before, after = (found.get(f"polish/{when}_{name}") for when in ("before", "after"))
         if before is not None and after is not None:
             lines.append(f"{name:24} {before:8.4g} → {after:.4g}")
+    if found["polish/after_psnr_db"] < found["polish/before_psnr_db"]:
+        lines.append(
+            "the splats show less than the map does: the frames are too few, or too far apart (dataset.stride=…)"
+        )
     return lines
