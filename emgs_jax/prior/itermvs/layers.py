@@ -43,7 +43,7 @@ def convolve(image: Float[Array, "*b h w i"], conv: Conv) -> Float[Array, "*b h2
     return found.reshape(*image.shape[:-3], *found.shape[1:]) + conv.bias
 
 
-def chain(image: Float[Array, "*b h w i"], convs: Sequence[Conv]) -> Float[Array, "*b h w o"]:
+def chain(image: Float[Array, "*b h w i"], convs: Sequence[Conv]) -> Float[Array, "*b h2 w2 o"]:
     """Apply one convolution after the other, with a ReLU between them."""
     for conv in convs[:-1]:
         image = jax.nn.relu(convolve(image, conv))

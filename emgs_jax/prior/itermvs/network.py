@@ -7,8 +7,7 @@ GRU sees how well depths around the present one fit, at three scales, and says a
 from 0 (farthest) to 1 (nearest), linear in 1/z, so the unit of poses and range does not matter.
 """
 
-from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,9 +18,14 @@ from jaxtyping import Array, Bool, Float
 from emgs_jax.ops.camera import Camera, downscale, pixel_grid, rays
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static
+from emgs_jax.ops.ranges import ranged
 from emgs_jax.prior.itermvs.layers import Conv, chain, convolve, resize, sample
 
 FINEST, MIDDLE, COARSEST = 2, 4, 8  # pixels of the image to one of the features
+
+
+def _steps() -> Any:
+    return eqx.field(static=True, converter=tuple, metadata=ranged(-256, 256))
 
 
 class IterMVSConfig(eqx.Module):
@@ -32,15 +36,18 @@ class IterMVSConfig(eqx.Module):
         num_groups: of channels that are compared by themselves.
         num_initial: depths all over the range with which it begins.
         window: bins on either side of the most probable one over which the depth is averaged.
-        steps: of the depths around the present one that are tried on the finest, middle and coarsest features, in
-            bins of 1/256 of the range.
+        finest_steps: of the depths around the present one that are tried on the finest features, in 1/256 of the range.
+        middle_steps: likewise.
+        coarsest_steps: likewise.
     """
 
     num_iterations: int = static(low=1, high=64)
     num_groups: int = static(low=1, high=16)
     num_initial: int = static(low=2, high=256)
     window: int = static(low=0, high=128)
-    steps: tuple[tuple[float, ...], ...] = eqx.field(static=True, converter=lambda steps: tuple(map(tuple, steps)))
+    finest_steps: tuple[float, ...] = _steps()
+    middle_steps: tuple[float, ...] = _steps()
+    coarsest_steps: tuple[float, ...] = _steps()
 
 
 class Residual(eqx.Module):
@@ -215,9 +222,9 @@ def _seen(points: Float[Array, "*b 3"], source: Sources) -> Float[Array, "*b 3"]
 
 def _around(
     network: IterMVS,
-    references: tuple[Array, Array, Array],
+    references: Features,
     sources: tuple[Sources, Float[Array, "s h w"]],
-    points: Float[Array, "n h w 3"],
+    points: tuple[Float[Array, "_ h w 3"], ...],
     camera: Camera,
     config: IterMVSConfig,
 ) -> Float[Array, "h w n"]:
@@ -227,24 +234,19 @@ def _around(
         network: weights.
         references: features of the view, all at a quarter of its size.
         sources: and how far each shows each pixel.
-        points: of the view's camera; those for the finest features first.
+        points: of the view's camera, for each scale.
         camera: of the images.
-        config: which are for which features.
+        config: sizes.
     """
-    ends = list(accumulate((len(steps) for steps in config.steps), initial=0))
+    cameras = [downscale(camera, scale) for scale in (FINEST, MIDDLE, COARSEST)]
 
     def add(total: tuple[Array, ...], given: tuple[Sources, Array]) -> tuple[tuple[Array, ...], None]:
         source, weight = given
-        seen = _seen(points, source)
-        found = [
-            _correlation(reference, feature, seen[start:end], downscale(camera, scale), config.num_groups)
-            for reference, feature, start, end, scale in zip(
-                references, source.features, ends, ends[1:], (FINEST, MIDDLE, COARSEST), strict=False
-            )
-        ]
+        scales = zip(references, source.features, points, cameras, strict=True)
+        found = (_correlation(r, s, _seen(p, source), c, config.num_groups) for r, s, p, c in scales)
         return tuple(t + weight[..., None] * f for t, f in zip(total, found, strict=True)), None
 
-    empty = tuple(jnp.zeros((len(steps), *points.shape[1:3], config.num_groups)) for steps in config.steps)
+    empty = tuple(jnp.zeros((*scale.shape[:3], config.num_groups)) for scale in points)
     total, _ = jax.lax.scan(add, empty, sources)
     weights = 1e-5 + jnp.sum(sources[1], axis=0)[..., None]
     return jnp.concatenate([_match(m, t / weights) for m, t in zip(network.matching, total, strict=True)], axis=-1)
@@ -275,14 +277,17 @@ def estimate(
     hidden = jnp.tanh(_double(chain(fits, network.hidden)))
     size = hidden.shape[:2]
     weights = jnp.moveaxis(_double(jnp.moveaxis(weights, 0, -1)), -1, 0)
-    references = tuple(resize(feature, size) for feature in reference)
+    references = Features(*(resize(feature, size) for feature in reference))
     directions = rays(camera, MIDDLE * pixel_grid(downscale(camera, MIDDLE)))
-    steps = jnp.asarray([step for steps in config.steps for step in steps]) / 256.0
+    all_steps = config.finest_steps, config.middle_steps, config.coarsest_steps
+
+    def points_around(unit: Array, steps: tuple[float, ...]) -> Array:
+        tried = jnp.clip(unit + jnp.asarray(steps)[:, None, None] / 256.0, 0.0, 1.0)
+        return _from_unit(tried, depth_range)[..., None] * directions
 
     def iterate(state: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         hidden, unit = state
-        tried = jnp.clip(unit + steps[:, None, None], 0.0, 1.0)
-        points = _from_unit(tried, depth_range)[..., None] * directions
+        points = tuple(points_around(unit, steps) for steps in all_steps)
         fits = _around(network, references, (sources, weights), points, camera, config)
         hidden = _turn(hidden, jnp.concatenate([unit[..., None], fits], axis=-1), network.gru)
         return (hidden, _regress(chain(hidden, network.depth), config.window)), None

@@ -6,17 +6,27 @@ import cv2
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.pytree import stack
 from emgs_jax.ops.ranges import number
-from emgs_jax.prior.itermvs.network import Features, IterMVSConfig, Sources, estimate, extract
+from emgs_jax.prior.itermvs.network import Features, IterMVS, IterMVSConfig, Sources, estimate, extract
 from emgs_jax.prior.itermvs.weights import load_weights
 from emgs_jax.prior.multiview.dense import DenseConfig, Matched, Stereo
 from emgs_jax.prior.multiview.lens import Lens, rectify
 
 MULTIPLE = 32  # of pixels; the network halves its images five times
-jitted_extract, jitted_estimate = eqx.filter_jit(extract), eqx.filter_jit(estimate)
+jitted_extract = eqx.filter_jit(extract)
+
+
+@eqx.filter_jit
+def jitted_estimate(
+    network: IterMVS, matched: Matched, grid: Camera, config: IterMVSConfig
+) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """`estimate` of what is matched, with images of another camera."""
+    sources = Sources(stack(matched.sources), matched.T_source_view, matched.is_used)
+    return estimate(network, matched.view, sources, matched.depth_range, grid, config)
 
 
 @dataclass(frozen=True)
@@ -56,14 +66,10 @@ def learned(config: LearnedConfig) -> Stereo:
         return jitted_extract(network.features, jnp.asarray(resized))
 
     def depth_of(matched: Matched) -> tuple[np.ndarray, np.ndarray]:
-        camera = matched.camera
-        sources = Sources(stack(matched.sources), matched.T_source_view, jnp.asarray(matched.is_used))
-        grid = grid_of(camera, config.magnification)
-        depth, confidence = jitted_estimate(
-            network, matched.view, sources, jnp.asarray(matched.depth_range), grid, config.network
-        )
-        size = camera.width, camera.height
-        inverse, confidence = (cv2.resize(np.asarray(found), size) for found in (1.0 / depth, confidence))
+        grid = grid_of(matched.camera, config.magnification)
+        depth, confidence = map(np.asarray, jitted_estimate(network, matched, grid, config.network))
+        size = matched.camera.width, matched.camera.height
+        inverse, confidence = (cv2.resize(values, size) for values in (1.0 / depth, confidence))
         return 1.0 / inverse, 1.0 - confidence
 
     return Stereo(prepare, depth_of)
