@@ -50,6 +50,7 @@ RENAMED = {  # keys of earlier versions; of two that fit the longer one counts
     "graph.revisit.num_asked": "graph.prior_query.max_queries",
     "graph.location": "graph.relocalization",
     "graph.max_known": "graph.min_violation",
+    "prior.dense.depth.depth_step": "prior.dense.depth_step",
 }
 NO_WORD = (ValueError, TypeError, AssertionError)  # what Hydra raises where an option of a group is no word
 

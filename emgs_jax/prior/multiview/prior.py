@@ -1,7 +1,7 @@
 """The prior `multiview_stereo`: classical geometry from calibrated images, without weights and without a GPU.
 
 Structure from motion of the window gives the poses, a plane sweep against some of the other views the depth, and the
-matches on a blank region its plane (`planar.py`). What was found for an image (keypoints, matches, depth) is kept while
+matches on a blank region its plane (`swept.py`); or a network whose weights the user has, the depth (`learned.py`). What was found for an image (keypoints, matches, depth) is kept while
 the image is in the window, so the windows of a sequence must be asked for in order. The current image is in the middle
 of its window, so its depth is matched, and compared with that of other views, on both sides. The confidence of a depth
 is 1 + the probability that it is right (`confidence.py`): 1 where nothing is known.
