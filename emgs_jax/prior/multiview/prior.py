@@ -1,10 +1,11 @@
 """The prior `multiview_stereo`: classical geometry from calibrated images, without weights and without a GPU.
 
-Structure from motion of the window gives the poses, a plane sweep against some of the other views the depth, and the
-matches on a blank region its plane (`swept.py`); or a network whose weights the user has, the depth (`learned.py`). What was found for an image (keypoints, matches, depth) is kept while
-the image is in the window, so the windows of a sequence must be asked for in order. The current image is in the middle
-of its window, so its depth is matched, and compared with that of other views, on both sides. The confidence of a depth
-is 1 + the probability that it is right (`confidence.py`): 1 where nothing is known.
+Structure from motion of the window gives the poses; a plane sweep against some of the other views the depth, and the
+matches on a blank region its plane (`swept.py`), or a network whose weights the user has the depth (`learned.py`). What
+was found for an image (keypoints, matches, depth) is kept while the image is in the window, so the windows of a
+sequence must be asked for in order. The current image is in the middle of its window, so its depth is matched, and
+compared with that of other views, on both sides. The confidence of a depth is 1 + the probability that it is right
+(`confidence.py`): 1 where nothing is known.
 
 The frame is that of the first image that could be placed (image 0, unless the camera rests at first), and the scale
 that of its window, which is fixed by `median_depth`; images alone do not tell it. The radial distortion of the lens is
@@ -67,7 +68,7 @@ def tried_depths(z: np.ndarray, margin: float) -> np.ndarray:
 
 
 class MultiviewStereo(Prior):
-    """Structure from motion and plane-sweep stereo of a sliding window.
+    """Structure from motion and stereo of a sliding window.
 
     Args:
         structure: poses and landmarks.
