@@ -124,6 +124,11 @@ def _explained(error: Exception, name: str, overrides: Sequence[str]) -> str:
     options = groups()
     if needed := re.match(r"You must specify '([\w/]+)'", str(error)):
         return f"{needed[1]} is not given: choose {needed[1]}= one of {', '.join(options.get(needed[1], ()))}"
+    if other := re.match(r"Could not override '(\w+)/(\w+)'", str(error)):
+        paths, needle = (CONF / other[1]).glob("*.yaml"), f"- {other[2]}:"
+        owners = [path.stem for path in paths if needle in path.read_text(encoding="utf-8")]
+        if owners:
+            return f"{other[1]}/{other[2]} is a choice of {other[1]}={', '.join(owners)} only"
     choices = [override for override in parsed if override.key_or_group.split("@")[0] in options]
     paths = [override for override in parsed if override.key_or_group == "hydra.searchpath"]  # of options beside ours
     for override in () if paths else choices:
