@@ -21,6 +21,7 @@ ROOT = CONF.parent
 UNTYPED = {CONF} | {CONF / name for name in ("densify_on", "experiment", "experiment_on", "suite", "sweep", "tune")}
 GATE = CONF / "baseline" / "smoke.yaml"  # results to compare with, no option
 OF_COMMANDS = {"protocol": "segment"}  # groups of another command than a run
+OF_PRIORS = {"prior/dense": "prior=multiview_stereo"}  # groups of one prior
 GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent not in UNTYPED and path != GATE)
 
 
@@ -37,13 +38,16 @@ OPTIONS = {
 @cache
 def together(number: int) -> dict:
     """The config of a run with each group's option of that number, counted round."""
-    chosen = {group: options[number % len(options)] for group, options in OPTIONS.items() if group not in OF_COMMANDS}
+    everywhere = OPTIONS.keys() - OF_COMMANDS.keys() - OF_PRIORS.keys()
+    chosen = {group: OPTIONS[group][number % len(OPTIONS[group])] for group in sorted(everywhere)}
     return OmegaConf.to_container(compose(*(f"{group}={option}" for group, option in chosen.items())), resolve=False)
 
 
 @cache
 def composed(group: str, option: str) -> dict:
     """The config of the command that has the group; options of several groups are composed together."""
+    if group in OF_PRIORS:
+        return OmegaConf.to_container(compose(OF_PRIORS[group], f"{group}={option}"), resolve=False)
     if group not in OF_COMMANDS:
         return together(OPTIONS[group].index(option))
     config = configure.compose(f"{group}={option}", name=OF_COMMANDS[group])

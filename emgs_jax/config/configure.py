@@ -50,6 +50,7 @@ RENAMED = {  # keys of earlier versions; of two that fit the longer one counts
     "graph.revisit.num_asked": "graph.prior_query.max_queries",
     "graph.location": "graph.relocalization",
     "graph.max_known": "graph.min_violation",
+    "prior.dense.depth.depth_step": "prior.dense.depth_step",
 }
 NO_WORD = (ValueError, TypeError, AssertionError)  # what Hydra raises where an option of a group is no word
 
@@ -123,6 +124,11 @@ def _explained(error: Exception, name: str, overrides: Sequence[str]) -> str:
     options = groups()
     if needed := re.match(r"You must specify '([\w/]+)'", str(error)):
         return f"{needed[1]} is not given: choose {needed[1]}= one of {', '.join(options.get(needed[1], ()))}"
+    if other := re.match(r"Could not override '(\w+)/(\w+)'", str(error)):
+        paths, needle = (CONF / other[1]).glob("*.yaml"), f"- {other[2]}:"
+        owners = [path.stem for path in paths if needle in path.read_text(encoding="utf-8")]
+        if owners:
+            return f"{other[1]}/{other[2]} is a choice of {other[1]}={', '.join(owners)} only"
     choices = [override for override in parsed if override.key_or_group.split("@")[0] in options]
     paths = [override for override in parsed if override.key_or_group == "hydra.searchpath"]  # of options beside ours
     for override in () if paths else choices:

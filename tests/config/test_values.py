@@ -32,7 +32,7 @@ def check_all(*overrides: str) -> None:
 
 def test_every_value_of_conf_is_in_its_range():
     """The first options of all groups together, then the second ones, …; what is wrong is named by its full key."""
-    others = ("suite", "sweep", "tune", "experiment", "experiment_on", "densify_on", "protocol")
+    others = ("suite", "sweep", "tune", "experiment", "experiment_on", "densify_on", "protocol", "prior/dense")
     options = {group: names for group, names in groups().items() if group not in others}
     options["baseline"] = [name for name in options["baseline"] if name != "smoke"]
     for place in range(max(map(len, options.values()))):
@@ -40,6 +40,8 @@ def test_every_value_of_conf_is_in_its_range():
         for part in PARTS:
             check_values(config, part)
     check_all("experiment=paper")
+    for option in groups()["prior/dense"]:
+        check_all("prior=multiview_stereo", f"prior/dense={option}")
 
 
 @pytest.mark.parametrize("option", ["conceptgraphs", "ovo", "rayfronts"])

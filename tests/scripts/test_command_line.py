@@ -69,8 +69,13 @@ def test_a_word_in_the_place_of_a_group_is_an_error_for_every_group():
     parts = [group for group in groups() if "/" in group]
     assert len(parts) > 5
     for group in parts:
-        with pytest.raises(ValueError, match=f"{group}=default"):
-            compose(f"{group.replace('/', '.')}=default")
+        with pytest.raises(ValueError, match=f"{group}=({'|'.join(groups()[group])})$"):
+            compose("prior=multiview_stereo", f"{group.replace('/', '.')}={groups()[group][0]}")
+
+
+def test_a_group_of_another_option_is_an_error_that_names_the_option():
+    with pytest.raises(ValueError, match="^prior/dense is a choice of prior=multiview_stereo only$"):
+        compose("prior=simulated", "prior/dense=itermvs")
 
 
 def test_the_arguments_of_a_multirun_are_checked_and_those_of_hydra_are_left_to_it():

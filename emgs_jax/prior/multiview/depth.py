@@ -25,7 +25,6 @@ class DepthConfig(eqx.Module):
         min_margin: by which the aggregated cost of any plane that is not next to the best must exceed the best's.
         temperature: aggregated cost above the best's at which a plane is 1/e as plausible.
         median_radius: half the side of the window whose median replaces a depth: removes speckle, keeps edges.
-        depth_step: of the depths of two views, as a fraction: where they differ by so much they agree by 1/e.
     """
 
     sweep: SweepConfig
@@ -34,7 +33,6 @@ class DepthConfig(eqx.Module):
     min_margin: Float[Array, "*b"] = traced(low=0)
     temperature: Float[Array, "*b"] = traced(low=1e-6)
     median_radius: int = static(low=0, high=32)
-    depth_step: Float[Array, "*b"] = traced(low=1e-6)
 
 
 def _between_planes(total: Float[Array, "h w d"], best: Array) -> Float[Array, "h w"]:
@@ -109,7 +107,7 @@ def agreement(
     others: Float[Array, "s h w"],
     T_other_reference: jaxlie.SE3,
     camera: Camera,
-    config: DepthConfig,
+    depth_step: Float[Array, ""],
 ) -> Float[Array, "h w"]:
     """Count the other depth maps that confirm each depth, each by exp(-difference / `depth_step`); 0 without a depth.
 
@@ -118,7 +116,7 @@ def agreement(
         others: of other views, likewise; a map of zeros confirms nothing.
         T_other_reference: view -> other view, batched like `others`.
         camera: of all views.
-        config: tolerance.
+        depth_step: tolerance, as a fraction.
     """
     points = unproject(camera, depth)
 
@@ -129,6 +127,6 @@ def agreement(
         there = other.reshape(-1)[index]
         is_seen = inside & (depth > 0) & (there > 0)
         difference = jnp.abs(seen_depth / jnp.where(is_seen, there, 1.0) - 1.0)
-        return jnp.where(is_seen, jnp.exp(-difference / config.depth_step), 0.0)
+        return jnp.where(is_seen, jnp.exp(-difference / depth_step), 0.0)
 
     return jnp.sum(jax.vmap(agrees)(T_other_reference.wxyz_xyz, others), axis=0)

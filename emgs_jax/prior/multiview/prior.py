@@ -1,10 +1,11 @@
 """The prior `multiview_stereo`: classical geometry from calibrated images, without weights and without a GPU.
 
-Structure from motion of the window gives the poses, a plane sweep against some of the other views the depth, and the
-matches on a blank region its plane (`planar.py`). What was found for an image (keypoints, matches, depth) is kept while
-the image is in the window, so the windows of a sequence must be asked for in order. The current image is in the middle
-of its window, so its depth is matched, and compared with that of other views, on both sides. The confidence of a depth
-is 1 + the probability that it is right (`confidence.py`): 1 where nothing is known.
+Structure from motion of the window gives the poses; a plane sweep against some of the other views the depth, and the
+matches on a blank region its plane (`swept.py`), or a network whose weights the user has the depth (`learned.py`). What
+was found for an image (keypoints, matches, depth) is kept while the image is in the window, so the windows of a
+sequence must be asked for in order. The current image is in the middle of its window, so its depth is matched, and
+compared with that of other views, on both sides. The confidence of a depth is 1 + the probability that it is right
+(`confidence.py`): 1 where nothing is known.
 
 The frame is that of the first image that could be placed (image 0, unless the camera rests at first), and the scale
 that of its window, which is fixed by `median_depth`; images alone do not tell it. The radial distortion of the lens is
@@ -15,7 +16,8 @@ its own. What is known of the views before is of no use then: they have no pose 
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from typing import Any
 
 import cv2
 import equinox as eqx
@@ -28,45 +30,25 @@ from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.io.files import jsonable
 from emgs_jax.keypoints.poses import calibration
 from emgs_jax.ops.camera import Camera
-from emgs_jax.ops.ranges import number
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
-from emgs_jax.prior.multiview.confidence import ConfidenceConfig, probability
-from emgs_jax.prior.multiview.depth import DepthConfig, agreement, estimate_depth
+from emgs_jax.prior.multiview.confidence import probability
+from emgs_jax.prior.multiview.dense import DenseConfig, Matched, Stereo
+from emgs_jax.prior.multiview.depth import agreement
 from emgs_jax.prior.multiview.incremental import StructureConfig, extend
 from emgs_jax.prior.multiview.initialization import begin_again, initialize
 from emgs_jax.prior.multiview.keys import kept, key_views
 from emgs_jax.prior.multiview.landmarks import Structure, confirmed, detect, forget, link
-from emgs_jax.prior.multiview.lens import as_shown, points_shown, rectify, straight
-from emgs_jax.prior.multiview.planar import PlanarConfig, fill_planes
+from emgs_jax.prior.multiview.learned import LearnedConfig, learned
+from emgs_jax.prior.multiview.lens import as_shown, points_shown, straight
 from emgs_jax.prior.multiview.sources import choose, parallax
+from emgs_jax.prior.multiview.swept import SweptConfig, swept
 
-jitted_depth = eqx.filter_jit(estimate_depth)
 jitted_agreement = eqx.filter_jit(agreement)
 
 
-@dataclass(frozen=True)
-class DenseConfig:
-    """Settings of a view's dense depth: its source views, matching and acceptance.
-
-    Args:
-        depth: matching and acceptance.
-        planar: blank regions that become planes.
-        confidence: probability that a depth is right.
-        num_sources: views that it is matched against.
-        best_parallax_rad: between the rays of a landmark, beyond which more is no better.
-        num_checks: views whose depth is compared with it.
-        min_probability: of a depth that is predicted.
-        depth_margin: the range of depths that is tried goes beyond the landmarks' by this factor.
-    """
-
-    depth: DepthConfig
-    planar: PlanarConfig
-    confidence: ConfidenceConfig
-    num_sources: int = number(low=1, high=64)
-    best_parallax_rad: float = number(low=1e-6, high=4)
-    num_checks: int = number(low=0, high=64)
-    min_probability: float = number(low=0, high=1)
-    depth_margin: float = number(low=1, high=1000)
+def stereo_of(config: SweptConfig | LearnedConfig) -> Stereo:
+    """The way to a view's depth that a config is for."""
+    return learned(config) if isinstance(config, LearnedConfig) else swept(config)
 
 
 def _values(config: StructureConfig | DenseConfig) -> dict:
@@ -86,7 +68,7 @@ def tried_depths(z: np.ndarray, margin: float) -> np.ndarray:
 
 
 class MultiviewStereo(Prior):
-    """Structure from motion and plane-sweep stereo of a sliding window.
+    """Structure from motion and stereo of a sliding window.
 
     Args:
         structure: poses and landmarks.
@@ -95,9 +77,10 @@ class MultiviewStereo(Prior):
 
     is_sequential = True  # a window needs those before it
 
-    def __init__(self, structure: StructureConfig, dense: DenseConfig) -> None:
-        self._structure_config, self._dense_config = structure, dense
+    def __init__(self, structure: StructureConfig, dense: SweptConfig | LearnedConfig) -> None:
+        self._structure_config, self._dense_config, self._stereo = structure, dense, stereo_of(dense)
         settings = {"structure": _values(structure), "dense": _values(dense)}
+        settings["dense"].pop("checkpoint", None)  # its digest says which it is, wherever it lies
         self.provenance = Provenance("multiview_stereo", {"version": 8} | settings)
         self._next = 0
         self._structure = Structure(np.eye(3))
@@ -142,8 +125,8 @@ class MultiviewStereo(Prior):
         self._structure = Structure(calibration(intrinsics))
         self._has_begun = False
         self._oldest = 0  # view of this structure
-        self._shown: dict[int, np.ndarray] = {}
-        self._grays: dict[int, np.ndarray] = {}
+        self._images: dict[int, np.ndarray] = {}
+        self._prepared: dict[int, Any] = {}
         self._depths: dict[int, np.ndarray] = {}
         self._spreads: dict[int, np.ndarray] = {}
         # A later window sees the anchor, the FIFO, the current and the newest image.
@@ -159,8 +142,7 @@ class MultiviewStereo(Prior):
         elif initialize(self._structure, *given):
             self._has_begun = True
         if self._structure.distortion != distortion:
-            grays = rectify(np.stack([*self._shown.values()]), self._structure.lens())
-            self._grays = dict(zip(self._shown, grays, strict=True))
+            self._prepared.clear()
 
     def _forget(self, window: Window) -> None:
         config = self._structure_config.keys
@@ -169,7 +151,7 @@ class MultiviewStereo(Prior):
         self._structure.is_lens_known |= len(keys) > config.max_keys
         gone = [frame for frame in self._structure.views if frame not in stays]
         forget(self._structure, gone, self._structure_config.matching)
-        for known in (self._shown, self._grays, self._depths, self._spreads):
+        for known in (self._images, self._prepared, self._depths, self._spreads):
             for frame in [frame for frame in known if frame not in stays]:
                 del known[frame]
 
@@ -182,8 +164,7 @@ class MultiviewStereo(Prior):
             )
         view, lens = detect(gray, self._structure_config.matching), self._structure.lens()
         view.pixels = straight(view.pixels, lens)
-        self._shown[frame.index] = np.float32(gray) / 255.0
-        self._grays[frame.index] = rectify(self._shown[frame.index], lens)
+        self._images[frame.index] = frame.image
         self._structure.views[frame.index] = view
         link(self._structure, frame.index, self._structure_config.matching)
 
@@ -209,7 +190,7 @@ class MultiviewStereo(Prior):
 
     def _depth(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Depth (h, w) of a view, 0 where it is not known, and its spread."""
-        view, nothing = self._structure.views[frame], np.zeros_like(self._grays[frame])
+        view, nothing = self._structure.views[frame], np.zeros(self._images[frame].shape[:2], np.float32)
         sources = self._sources(frame)
         if not sources:
             return nothing, nothing
@@ -220,22 +201,24 @@ class MultiviewStereo(Prior):
         z = z[z > 0]
         if not len(z):
             return nothing, nothing
-        depth_range = tried_depths(z, self._dense_config.depth_margin)
         count = self._dense_config.num_sources
         is_used = np.arange(count) < len(sources)
         sources = (sources * count)[:count]
-        depth, spread = jitted_depth(
-            jnp.asarray(self._grays[frame]),
-            jnp.asarray(np.stack([self._grays[other] for other in sources])),
+        matched = Matched(
+            self._view(frame),
+            [self._view(other) for other in sources],
             self._relative(sources, frame),
-            jnp.asarray(is_used),
-            jnp.asarray(depth_range),
+            is_used,
+            tried_depths(z, self._dense_config.depth_margin),
             self._camera,
-            self._dense_config.depth,
         )
-        spacing = (1.0 / depth_range[0] - 1.0 / depth_range[1]) / (self._dense_config.depth.sweep.num_planes - 1)
-        found = np.asarray(depth), np.asarray(spread)
-        return fill_planes(*found, self._grays[frame], spacing, self._dense_config.planar)
+        return self._stereo.estimate(matched)
+
+    def _view(self, frame: int) -> Any:
+        """What the way to a depth keeps of an image; made anew when the lens is known better."""
+        if frame not in self._prepared:
+            self._prepared[frame] = self._stereo.prepare(self._images[frame], self._structure.lens())
+        return self._prepared[frame]
 
     def _sources(self, frame: int) -> list[int]:
         """The placed views that together show the view's landmarks under most parallax, best first."""
@@ -267,7 +250,7 @@ class MultiviewStereo(Prior):
             jnp.asarray(maps),
             self._relative(others, frame),
             self._camera,
-            self._dense_config.depth,
+            jnp.float32(self._dense_config.depth_step),
         )
         return 1.0 + probability(self._spreads[frame], np.asarray(agreed), self._dense_config.confidence)
 

@@ -12,6 +12,7 @@ from emgs_jax.prior.multiview.depth import _between_planes, _median, _spread, ag
 
 POSES = [matrix(translation=t) for t in ((0.2, 0, 0), (-0.2, 0, 0), (0, 0.2, 0), (0, -0.2, 0))]
 INSIDE = np.s_[8:-8, 8:-8]
+DEPTH_STEP = np.float32(0.02)
 jitted_depth = eqx.filter_jit(estimate_depth)
 
 
@@ -102,7 +103,7 @@ def agreeing(depth, others, poses):
     more = 4 - len(others)
     maps = jnp.asarray(np.stack([*others, *[np.zeros_like(depth)] * more]))
     poses = relative([*poses, *[np.eye(4)] * more])
-    return np.asarray(jitted_agreement(jnp.asarray(depth), maps, poses, small_camera(), depth_config()))
+    return np.asarray(jitted_agreement(jnp.asarray(depth), maps, poses, small_camera(), DEPTH_STEP))
 
 
 def test_views_of_a_wall_confirm_it_in_full_and_no_depth_is_confirmed_by_nothing_and_confirms_nothing():
@@ -115,7 +116,7 @@ def test_views_of_a_wall_confirm_it_in_full_and_no_depth_is_confirmed_by_nothing
 
 
 def test_agreement_falls_with_the_difference_as_a_share_of_the_depth_whatever_its_unit_and_not_behind_or_beside():
-    step = float(depth_config().depth_step)
+    step = float(DEPTH_STEP)
     for size in (0.1, 1.0, 10.0):
         depth = size * plane_image(np.eye(4), 0.4)[1]
         for share in (-3.0, -0.5, 0.0, 1.0):

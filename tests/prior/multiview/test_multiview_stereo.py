@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import hydra
 import numpy as np
 import pytest
@@ -113,9 +114,11 @@ def test_all_depths_of_landmarks_are_tried_but_for_the_few_that_are_wrong():
 @pytest.mark.slow
 def test_views_that_leave_the_window_stay_as_keys_and_all_are_straightened_by_the_newest_lens(answered, answered_by):
     structure = answered_by._structure
-    assert set(answered[-1].window.views) < set(structure.views) == set(answered_by._grays), "all views are far apart"
-    for frame, gray in answered_by._grays.items():
-        expected = rectify(answered_by._shown[frame], structure.lens())
+    assert set(answered[-1].window.views) < set(structure.views) == set(answered_by._images), "all views are far apart"
+    assert answered_by._prepared
+    for frame, gray in answered_by._prepared.items():
+        shown = np.float32(cv2.cvtColor(answered_by._images[frame], cv2.COLOR_RGB2GRAY)) / 255.0
+        expected = rectify(shown, structure.lens())
         np.testing.assert_array_equal(gray, expected, err_msg=f"view {frame}")
 
 

@@ -1,0 +1,128 @@
+"""Tensors of a file that `torch.save` wrote before version 1.6: read without torch, and without running what is in it.
+
+Such a file is five pickles (magic number, version, the machine, what was saved, names of storages) and then every
+storage: its number of elements and its bytes. The instructions of the fourth are followed only as far as they make
+dictionaries, lists and numbers, and describe tensors; what else a pickle could ask for is refused.
+"""
+
+import math
+import pickletools
+from collections.abc import Mapping
+from io import BytesIO
+from typing import Any, NamedTuple
+
+import numpy as np
+
+MAGIC = 0x1950A86A20F9469CFC6C
+DTYPES = {"torch FloatStorage": "<f4", "torch LongStorage": "<i8"}
+_MARK = object()
+
+
+class _Tensor(NamedTuple):
+    storage: tuple  # ("storage", class, name, device, number of elements, …)
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]  # elements
+
+
+def read_tensors(content: bytes, key: str) -> dict[str, np.ndarray]:
+    """The tensors by name that stand under `key` of what was saved.
+
+    Raises:
+        ValueError: it is no such file, or damaged.
+    """
+    try:
+        stream = BytesIO(content)
+        if _value(stream) != MAGIC:
+            raise ValueError("not of torch.save before version 1.6")
+        _, _, saved, names = (_value(stream) for _ in range(4))
+        tensors: Mapping[str, _Tensor] = saved[key]
+        known = {tensor.storage[2]: tensor.storage for tensor in _tensors(saved)}
+        storages = {name: _storage(stream, known[name]) for name in names}
+        return {name: _array(storages[tensor.storage[2]], tensor) for name, tensor in tensors.items()}
+    except (LookupError, TypeError, AttributeError, UnicodeDecodeError) as error:
+        raise ValueError(f"damaged ({type(error).__name__}: {error})") from error
+
+
+def _storage(stream: BytesIO, described: tuple) -> np.ndarray:
+    """The next storage of the stream."""
+    dtype, count = np.dtype(DTYPES[described[1]]), described[4]
+    if int.from_bytes(stream.read(8), "little") != count:
+        raise ValueError("a storage has another number of elements than its tensor says")
+    content = stream.read(count * dtype.itemsize)
+    return np.frombuffer(content, dtype, count)
+
+
+def _array(storage: np.ndarray, tensor: _Tensor) -> np.ndarray:
+    """A tensor of its storage; only those that lie there row by row are known."""
+    steps = [math.prod(tensor.shape[axis + 1 :]) for axis in range(len(tensor.shape))]
+    if any(step != known and size > 1 for step, known, size in zip(steps, tensor.strides, tensor.shape, strict=True)):
+        raise ValueError("a tensor is no plain array")
+    return storage[tensor.offset :][: math.prod(tensor.shape)].reshape(tensor.shape)
+
+
+def _tensors(value: Any) -> list[_Tensor]:
+    """All tensors in dictionaries and lists."""
+    if isinstance(value, _Tensor):
+        return [value]
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return [tensor for item in inner for tensor in _tensors(item)]
+
+
+def _value(stream: BytesIO) -> Any:
+    """The value of the next pickle of a stream, of plain data and tensors."""
+    stack: list[Any] = []
+    memo: dict[int, Any] = {}
+
+    def since_mark() -> list:
+        start = len(stack) - 1 - stack[::-1].index(_MARK)
+        items = stack[start + 1 :]
+        del stack[start:]
+        return items
+
+    for code, argument, _ in pickletools.genops(stream):
+        match code.name:
+            case "PROTO" | "STOP":
+                pass
+            case "MARK":
+                stack.append(_MARK)
+            case "BINPUT" | "LONG_BINPUT":
+                memo[argument] = stack[-1]
+            case "BINGET" | "LONG_BINGET":
+                stack.append(memo[argument])
+            case "BINUNICODE" | "BININT" | "BININT1" | "BININT2" | "LONG1" | "BINFLOAT" | "GLOBAL":
+                stack.append(argument)
+            case "NONE" | "NEWTRUE" | "NEWFALSE":
+                stack.append({"NONE": None, "NEWTRUE": True, "NEWFALSE": False}[code.name])
+            case "EMPTY_DICT" | "EMPTY_LIST" | "EMPTY_TUPLE":
+                stack.append({"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple}[code.name]())
+            case "TUPLE":
+                stack.append(tuple(since_mark()))
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                count = int(code.name[-1])
+                stack[-count:] = [tuple(stack[-count:])]
+            case "SETITEMS" | "SETITEM":
+                items = since_mark() if code.name == "SETITEMS" else [stack.pop(-2), stack.pop()]
+                stack[-1].update(zip(items[::2], items[1::2], strict=True))
+            case "APPENDS" | "APPEND":
+                items = since_mark() if code.name == "APPENDS" else [stack.pop()]
+                stack[-1].extend(items)
+            case "BINPERSID":
+                pass  # a storage: the tuple that describes it
+            case "BUILD":
+                stack.pop()  # versions of layers, beside the dictionary of their tensors
+            case "REDUCE":
+                arguments, name = stack.pop(), stack.pop()
+                stack.append(_made(name, arguments))
+            case _:
+                raise ValueError(f"has more than tensors ({code.name})")
+    return stack[-1]
+
+
+def _made(name: str, arguments: tuple) -> Any:
+    """What a function that is named in the file would make."""
+    if name == "collections OrderedDict" and not arguments:
+        return {}
+    if name == "torch._utils _rebuild_tensor_v2":
+        return _Tensor(*arguments[:4])
+    raise ValueError(f"has more than tensors ({name})")

@@ -1,0 +1,80 @@
+"""Layers of convolutional networks as functions of (height, width, channels), as their weights were trained."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from emgs_jax.ops.pytree import static
+
+
+class Conv(eqx.Module):
+    """A convolution whose result is as large as the image, divided by `stride` or multiplied by `expansion`.
+
+    Args:
+        weight: rows, columns, channels of the input, channels of the output.
+        bias: of each channel of the output.
+        stride: of the result's pixels on the image.
+        dilation: pixels between those that are weighed.
+        expansion: of the image before: the transposed convolution with that stride.
+    """
+
+    weight: Float[Array, "kh kw i o"]
+    bias: Float[Array, "o"]
+    stride: int = static()
+    dilation: int = static()
+    expansion: int = static()
+
+
+def convolve(image: Float[Array, "*b h w i"], conv: Conv) -> Float[Array, "*b h2 w2 o"]:
+    """Apply a convolution; beyond the image there is zero."""
+    reach = conv.dilation * (conv.weight.shape[0] // 2)
+    found = jax.lax.conv_general_dilated(
+        image.reshape(-1, *image.shape[-3:]),
+        conv.weight,
+        (conv.stride,) * 2,
+        [(reach, reach + conv.expansion - 1)] * 2,
+        (conv.expansion,) * 2,
+        (conv.dilation,) * 2,
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+    )
+    return found.reshape(*image.shape[:-3], *found.shape[1:]) + conv.bias
+
+
+def chain(image: Float[Array, "*b h w i"], convs: Sequence[Conv]) -> Float[Array, "*b h2 w2 o"]:
+    """Apply one convolution after the other, with a ReLU between them."""
+    for conv in convs[:-1]:
+        image = jax.nn.relu(convolve(image, conv))
+    return convolve(image, convs[-1])
+
+
+def resize(image: Float[Array, "h w c"], size: tuple[int, int]) -> Float[Array, "h2 w2 c"]:
+    """The image at another (height, width), linearly between pixels and without smoothing; edges lie on edges."""
+    return jax.image.resize(image, (*size, image.shape[-1]), "linear", antialias=False)
+
+
+def sample(
+    image: Float[Array, "h w c"], pixels: Float[Array, "*b 2"], is_seen: Bool[Array, "*b"]
+) -> Float[Array, "*b c"]:
+    """Values linearly between the pixels; zero beyond the image, which falls off within a pixel of its edge.
+
+    Args:
+        image: where to look.
+        pixels: (x, y); pixel centres are whole numbers.
+        is_seen: elsewhere there is zero, too.
+    """
+    height, width, channels = image.shape
+    rows = image.reshape(-1, channels)
+    low = jnp.floor(jnp.clip(pixels, -2.0, jnp.asarray([width + 1.0, height + 1.0])))  # whole numbers that fit 32 bits
+    share = pixels - low
+
+    def corner(dx: int, dy: int) -> Array:
+        x, y = low[..., 0] + dx, low[..., 1] + dy
+        weight = jnp.abs(1 - dx - share[..., 0]) * jnp.abs(1 - dy - share[..., 1])
+        inside = is_seen & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        index = jnp.where(inside, y * width + x, 0.0).astype(jnp.int32)
+        return jnp.where(inside, weight, 0.0)[..., None] * rows[index]
+
+    return corner(0, 0) + corner(1, 0) + corner(0, 1) + corner(1, 1)

@@ -1,0 +1,51 @@
+"""Dense depth without weights: plane sweep, semi-global aggregation, and planes where texture is missing."""
+
+from dataclasses import dataclass
+
+import cv2
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from emgs_jax.prior.multiview.dense import DenseConfig, Matched, Stereo
+from emgs_jax.prior.multiview.depth import DepthConfig, estimate_depth
+from emgs_jax.prior.multiview.lens import Lens, rectify
+from emgs_jax.prior.multiview.planar import PlanarConfig, fill_planes
+
+jitted_depth = eqx.filter_jit(estimate_depth)
+
+
+@dataclass(frozen=True)
+class SweptConfig(DenseConfig):
+    """Depth by a plane sweep.
+
+    Args:
+        depth: matching and acceptance.
+        planar: blank regions that become planes.
+    """
+
+    depth: DepthConfig
+    planar: PlanarConfig
+
+
+def swept(config: SweptConfig) -> Stereo:
+    """Depth of grey images by a plane sweep; the spread is in planes."""
+
+    def prepare(image: np.ndarray, lens: Lens) -> np.ndarray:
+        return rectify(np.float32(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) / 255.0, lens)
+
+    def estimate(matched: Matched) -> tuple[np.ndarray, np.ndarray]:
+        near, far = matched.depth_range
+        depth, spread = jitted_depth(
+            jnp.asarray(matched.view),
+            jnp.asarray(np.stack(matched.sources)),
+            matched.T_source_view,
+            jnp.asarray(matched.is_used),
+            jnp.asarray(matched.depth_range),
+            matched.camera,
+            config.depth,
+        )
+        spacing = (1.0 / near - 1.0 / far) / (config.depth.sweep.num_planes - 1)
+        return fill_planes(np.asarray(depth), np.asarray(spread), matched.view, spacing, config.planar)
+
+    return Stereo(prepare, estimate)
