@@ -22,7 +22,7 @@ from tqdm import tqdm
 from emgs_jax.config.configure import compose, message_of
 from emgs_jax.config.overrides import quoted
 from emgs_jax.config.values import check_values
-from emgs_jax.io.files import atomic_write, write_json
+from emgs_jax.io.files import atomic_write, check_writable, write_json
 from emgs_jax.report.evaluation_page import Found, JobLine, write_evaluation_page
 from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
 from emgs_jax.report.results import is_finished, read_estimates, result_folder
@@ -95,6 +95,8 @@ def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
     if whole > 1 and (settings["gate"] or settings["write_gate"]):
         raise ValueError("a gate needs the results of all jobs: run once more without shard")
     baseline = read_gate(settings["gate"]) if settings["gate"] else {}
+    if settings["write_gate"]:
+        check_writable(Path(settings["write_gate"]).parent, f"write_gate={settings['write_gate']}")
     jobs = list(plan(settings))
     read_estimates(out)  # results that cannot be read end the evaluation before it begins
     ours = jobs[(part - 1) * len(jobs) // whole : part * len(jobs) // whole]  # neighbours share their executables

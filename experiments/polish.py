@@ -6,6 +6,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.configure import build
+from emgs_jax.io.files import check_writable, owned
 from emgs_jax.report.page import write_report
 from emgs_jax.report.polish import polish
 from emgs_jax.report.printout import polish_lines
@@ -21,9 +22,11 @@ def polish_run(config: DictConfig) -> dict[str, Any]:
     dataset, note = images_of(run)
     if dataset is None:
         raise ValueError(f"{note} They are what splats are fitted to.")
+    check_writable(run.folder, f"folder={run.folder}")
     settings = OmegaConf.create(dict(run.provenance["config"]))
-    found = polish(run, dataset, fitting, build(settings, "densify"))
-    write_report(run, dataset)
+    with owned(run.folder):
+        found = polish(run, dataset, fitting, build(settings, "densify"))
+        write_report(run, dataset)
     return found
 
 

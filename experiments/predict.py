@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from emgs_jax.config.configure import build_dataset, build_prior, graph_config
 from emgs_jax.data.base import Dataset
+from emgs_jax.io.files import owned
 from emgs_jax.prior.base import Prior, Window
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.recorded_visits import places_seen_twice, record_visits
@@ -30,9 +31,10 @@ def predict(config: DictConfig) -> Path:
         return tqdm(windows, unit="inference", desc=prior.provenance.name)
 
     folder = Path(config.out)
-    record(prior, dataset, config.slam.window_size, folder, progress)
-    if config.graph:
-        _record_visits(prior, dataset, config, folder)
+    with owned(folder):
+        record(prior, dataset, config.slam.window_size, folder, progress)
+        if config.graph:
+            _record_visits(prior, dataset, config, folder)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 2**20
     per_frame = f"{size / len(dataset):.2f} a frame"
     print(f"{folder}: {size:.1f} MiB, {per_frame}, {dataset.name} {dataset.sequence}, {len(dataset)} frames")

@@ -232,6 +232,8 @@ def attach_features(config: DictConfig, dataset: ReadableFrames, prior: Prior) -
 
 
 def message_of(error: Exception) -> str:
-    """Return the message of the original error, without Hydra's wrapping."""
+    """Return the message of the original error, without Hydra's wrapping and the number of a system's error."""
     cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
+    if isinstance(cause, OSError) and cause.filename is not None:
+        return f"{cause.filename}: {cause.strerror}"
     return str(cause) or type(cause).__name__
