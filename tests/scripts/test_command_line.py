@@ -125,9 +125,25 @@ def test_a_console_without_a_sign_shows_another_and_goes_on(monkeypatch):
     """Where the locale is not UTF-8 the "…" after the mapping ended the run."""
     console = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", console)
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
     speak_on()
     print("writing …", flush=True)
     assert console.buffer.getvalue() == b"writing ?\n"
+
+
+def test_a_program_whose_reader_has_gone_works_on(monkeypatch):
+    """`emgs run … | head` ended with "Broken pipe" when all was mapped, and nothing of it was written."""
+    for name in ("stdout", "stderr"):
+        reading, writing = os.pipe()
+        os.close(reading)
+        monkeypatch.setattr(sys, name, os.fdopen(writing, "w", buffering=1))
+    speak_on()
+    for _ in range(3):
+        print("a line", flush=True)
+        tqdm.write("another one")
+        print("an error", file=sys.stderr)
+    sys.stdout.close()
+    sys.stderr.close()
 
 
 @pytest.mark.parametrize("error", [SystemExit("error: no such file"), ZeroDivisionError("division by zero"), None])
