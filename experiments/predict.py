@@ -32,6 +32,7 @@ def predict(config: DictConfig) -> Path:
 
     folder = Path(config.out)
     with owned(folder):
+        _check_folder(folder)
         record(prior, dataset, config.slam.window_size, folder, progress)
         if config.graph:
             _record_visits(prior, dataset, config, folder)
@@ -42,6 +43,13 @@ def predict(config: DictConfig) -> Path:
     for key, value in prior.report().items():
         print(f"{key} {value:.4g}")
     return folder
+
+
+def _check_folder(folder: Path) -> None:
+    """Raise ValueError where a folder holds something else than a recording, such as a run: its files would mix."""
+    others = [path.name for path in sorted(folder.iterdir()) if not path.name.startswith(".") and path.suffix != ".npz"]
+    if others and "manifest.json" not in others:
+        raise ValueError(f"out={folder} holds {', '.join(others[:3])} and no recording: give a folder of its own")
 
 
 def _record_visits(prior: Prior, dataset: Dataset, config: DictConfig, folder: Path) -> None:

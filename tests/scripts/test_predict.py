@@ -63,6 +63,15 @@ def test_a_folder_that_another_program_writes_into_is_refused(tmp_path):
     assert not list((tmp_path / "out").iterdir())
 
 
+def test_a_folder_that_holds_a_run_is_refused(tmp_path):
+    """The recording lay among the files of a run, and its size was that of all of them."""
+    (tmp_path / "metrics.json").write_text("{}")
+    (tmp_path / "map.ply").write_text("")
+    with pytest.raises(ValueError, match=r"holds map.ply, metrics.json and no recording: give a folder of its own"):
+        record(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
 def test_what_a_prior_measures_of_itself_is_printed(tmp_path, capsys, monkeypatch):
     record(tmp_path / "silent")
     assert "prior/" not in capsys.readouterr().out
