@@ -41,6 +41,8 @@ def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
     how = Placement(config.alignment, config.with_scale, config.icp_distance_m, config.icp_max_steps)
     runs = [read_run(Path(str(folder))) for folder in (config.map if _is_list(config.map) else [config.map])]
     scenes = scene_names(config, runs)
+    if len({(run.folder.resolve(), scene) for run, scene in zip(runs, scenes, strict=True)}) < len(runs):
+        raise ValueError(f"map={config.map} names a folder twice, whose points would count twice: give each once")
     Path(config.out).mkdir(parents=True, exist_ok=True)
     results: list[SceneResult] = []
     classes: tuple[str, ...] = ()
