@@ -95,6 +95,11 @@ def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
     if whole > 1 and (settings["gate"] or settings["write_gate"]):
         raise ValueError("a gate needs the results of all jobs: run once more without shard")
     baseline = read_gate(settings["gate"]) if settings["gate"] else {}
+    if settings["rounded"] and not (settings["write_gate"] and read_estimates(Path(settings["rounded"]))):
+        raise ValueError(
+            f"rounded={settings['rounded']} must be a folder of results of the same jobs, for write_gate=FILE: "
+            "evaluate into it first, by other instructions of the processor"
+        )
     if settings["write_gate"]:
         check_writable(Path(settings["write_gate"]).parent, f"write_gate={settings['write_gate']}")
     jobs = list(plan(settings))

@@ -157,6 +157,14 @@ def test_the_gate_passes_with_the_same_results_and_names_what_is_worse(evaluate,
     assert "1 is worse than the gate allows" in page and "trajectory/ate_sim3_m is 0.0205, baseline 0.01" in page
 
 
+def test_a_folder_of_other_roundings_is_looked_for_before_the_runs(evaluate, tmp_path):
+    """That there is none was told after all of the runs."""
+    for words in ([f"rounded={tmp_path / 'none'}", f"write_gate={tmp_path / 'gate.yaml'}"], [f"rounded={tmp_path}"]):
+        with pytest.raises(ValueError, match=r"^rounded=.* must be a folder of results of the same jobs, for write_g"):
+            evaluate(*words)
+    assert evaluate.runs == []
+
+
 def test_a_prior_without_a_seed_is_evaluated_with_one(evaluate):
     recorded = 'overrides=["prior=recorded","prior.folder=predictions/\\${dataset.seed}"]'
     with pytest.raises(ValueError, match=r"prior.seed is no key of .*Recorded: give one seed, seeds=\[0\]"):
