@@ -21,12 +21,14 @@ def export_run(config: DictConfig) -> list[Path]:
     """Write what the config names; returns the files and folders."""
     for key, field in declared(ExportConfig).items():
         check_value(key, config[key], field)
-    formats, length = [str(name) for name in config.formats], config.length and [float(n) for n in config.length]
+    formats, length = list(dict.fromkeys(map(str, config.formats))), config.length and [float(n) for n in config.length]
     wanted = ExportConfig(formats, config.max_points, config.scale, length, str(config.images))
     run = read_run(Path(str(config.folder)))
     folder = run.folder if config.out is None else Path(str(config.out))
     check_writable(folder, f"{'folder' if config.out is None else 'out'}={folder}")
     factor = find_factor(run, wanted)
+    if factor is None and not formats:
+        raise ValueError("formats=[] without scale= or length= writes nothing: give colmap, nerfstudio or frustums")
     dataset = None
     if IMAGE_FORMATS & {*wanted.formats}:
         dataset, note = images_of(run)
