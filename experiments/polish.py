@@ -18,6 +18,8 @@ from .report import images_of, positional
 
 def polish_run(config: DictConfig) -> dict[str, Any]:
     """Fit splats to the images of `config.folder`; returns what polish.json says."""
+    if not config.polish:
+        raise ValueError("polish=none has no settings to fit splats by: choose polish=default")
     fitting, run = build(config, "polish"), read_run(Path(str(config.folder)))
     dataset, note = images_of(run)
     if dataset is None:

@@ -114,7 +114,7 @@ def given_views(config: DictConfig, run: RecordedRun) -> list[View] | None:
     if config.pose is None:
         return None
     if not Path(config.pose).is_file():
-        raise ValueError(f"pose={config.pose} does not exist: give lines `timestamp tx ty tz qx qy qz qw`")
+        raise ValueError(f"pose={config.pose} is no file: give lines `timestamp tx ty tz qx qy qz qw`")
     times, poses = load_trajectory_tum(config.pose)
     if not len(poses):
         raise ValueError(f"pose={config.pose} has no pose: give lines `timestamp tx ty tz qx qy qz qw`")

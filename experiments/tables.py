@@ -148,7 +148,7 @@ def _count(runs: Iterable[Mapping[str, Estimate]], kind: str, column: Column) ->
 def with_blocks(page: Path, blocks: Mapping[str, str]) -> str:
     """A page with other text between `<!-- table: NAME -->` and `<!-- end -->`; ValueError where a pair is missing."""
     if not page.is_file():
-        raise ValueError(f"{page} does not exist: give page=FILE and full_page=FILE with the places of the tables")
+        raise ValueError(f"{page} is no file: give page=FILE and full_page=FILE with the places of the tables")
     text = page.read_text(encoding="utf-8")
     for name, content in blocks.items():
         start = f"<!-- table: {name} -->"

@@ -171,7 +171,7 @@ def test_pictures_are_drawn_from_given_poses_or_frames(folder, tmp_path):
     for values, message in (
         ({"frame": 77}, "has no pose of frame=77: choose one from 0 to 5"),
         ({"frame": 1, "pose": str(tmp_path / "poses.txt")}, "give one of them"),
-        ({"pose": "nowhere.txt"}, "pose=.*nowhere.txt does not exist"),
+        ({"pose": "nowhere.txt"}, "pose=.*nowhere.txt is no file"),
     ):
         with pytest.raises(ValueError, match=message):
             given_views(asking(folder, **values), run)
@@ -191,7 +191,7 @@ def test_pictures_are_drawn_from_given_poses_or_frames(folder, tmp_path):
         ({"text": "sofa", "against": "lamp"}, "'lamp' is no word of"),
         ({"classes": "nowhere.txt"}, "class file nowhere.txt does not exist"),
         ({"text": "sofa", "instances__reach": 0}, "instances.reach must be a number"),
-        ({"text": "sofa", "features__text": "nowhere.npz"}, "nowhere.npz does not exist"),
+        ({"text": "sofa", "features__text": "nowhere.npz"}, "nowhere.npz is no file"),
     ],
 )
 def test_a_question_that_cannot_be_asked_is_named(folder, values, message):

@@ -161,7 +161,7 @@ def test_a_page_that_cannot_be_written_is_named_before_the_runs(settings, page, 
     """Elsewhere than in the clone there is no README.md, which was told after all evaluations."""
     monkeypatch.setattr(experiments.tables, "evaluate", None)
     Path(settings[page]).unlink()
-    with pytest.raises(ValueError, match=f"{settings[page]} does not exist: give page=FILE and full_page=FILE"):
+    with pytest.raises(ValueError, match=f"{settings[page]} is no file: give page=FILE and full_page=FILE"):
         tables(settings)
     Path(settings[page]).write_text("no place")
     with pytest.raises(ValueError, match="not one"):
