@@ -25,7 +25,8 @@ from emgs_jax.config.values import check_values
 from emgs_jax.io.files import atomic_write, check_writable, write_json
 from emgs_jax.report.evaluation_page import Found, JobLine, write_evaluation_page
 from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
-from emgs_jax.report.results import is_finished, read_estimates, result_folder
+from emgs_jax.report.provenance import is_of_this_code
+from emgs_jax.report.results import METRICS_FILE, is_finished, read_estimates, read_metrics, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
 
 from .command import command, overrides_of
@@ -106,6 +107,11 @@ def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
     read_estimates(out)  # results that cannot be read end the evaluation before it begins
     ours = jobs[(part - 1) * len(jobs) // whole : part * len(jobs) // whole]  # neighbours share their executables
     open_jobs = [job for job in ours if not _is_finished(job)]
+    if older := [job.name for job in jobs if _is_of_other_code(job)]:
+        said = f"results of other code are there, {len(older)} of {len(jobs)} ({older[0]}{', …' * (len(older) > 1)})"
+        if baseline:
+            raise ValueError(f"{said}, and a gate is about what runs now: choose another out=FOLDER, or move them away")
+        print(f"{said}: they are not made anew (move them away for that)")
     print(f"shard {part}/{whole}: {len(open_jobs)} of its {len(ours)} jobs to do, {len(jobs)} in all")
     failures: dict[str, str] = {}
     try:
@@ -142,6 +148,11 @@ def _run_all(jobs: Sequence[Job], failures: dict[str, str]) -> None:
 
 def _is_finished(job: Job) -> bool:
     return is_finished(job.folder, OmegaConf.to_container(job.config, resolve=True))
+
+
+def _is_of_other_code(job: Job) -> bool:
+    path = job.folder / METRICS_FILE
+    return path.is_file() and not is_of_this_code(read_metrics(path)["provenance"])
 
 
 def _shard(text: str) -> tuple[int, int]:
