@@ -50,6 +50,7 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
     for dataset, data in settings["suite"]["data"].items():
         for variant, changes in settings["variants"].items():
             own, changed = ([_override(*item) for item in some.items()] for some in (data["overrides"], changes))
+            _check_free([*settings["overrides"], *changed], dataset, data["key"])
             overrides = [f"dataset={dataset}", *own, *settings["overrides"], *changed]
             common = compose(*overrides)
             has_seed = "seed" in common.prior
@@ -65,6 +66,14 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
                         check_values(config, part)
                     folder = result_folder(Path(settings["out"]), dataset, sequence, variant, seed)
                     yield Job(f"{dataset}/{sequence}/{variant}/{seed}", dataset, config, folder)
+
+
+def _check_free(overrides: Sequence[str], dataset: str, key: str) -> None:
+    """Raise ValueError where an override names what the jobs differ in, which would write over it."""
+    taken = {"dataset": "suite=NAME", key: f"suite.data.{dataset}.sequences=[…]", "prior.seed": "seeds=[…]"}
+    for text in overrides:
+        if (name := text.lstrip("+~").partition("=")[0]) in taken:
+            raise ValueError(f"{text} would have no effect, because every job has its own {name}: give {taken[name]}")
 
 
 def _override(key: str, value: Any) -> str:

@@ -139,6 +139,10 @@ def test_an_interrupted_evaluation_has_the_tables_of_what_is_finished_and_resume
         ("+variants.wide={slam.window_size:2.5}", r"slam\.window_size must be a whole number from 1 to 1000, got 2\.5"),
         ("seeds=[0,1.5]", r"prior\.seed must be a whole number, got 1\.5"),
         ("+variants={../..:{}}", "variant or method must be a name"),
+        ("+variants.other={prior.seed:7}", r"prior.seed=7 would have no effect, .*: give seeds=\["),
+        ("overrides=[prior.seed=5]", r"prior.seed=5 would have no effect, .*: give seeds=\["),
+        ("overrides=[dataset.seed=3]", r"dataset.seed=3 would .*: give suite.data.synthetic.sequences=\["),
+        ("overrides=[dataset=tum]", "dataset=tum would have no effect, .* own dataset: give suite=NAME"),
     ],
 )
 def test_a_value_or_name_that_is_refused_ends_the_evaluation_before_it_begins(evaluate, override, message):
