@@ -13,6 +13,7 @@ import threading
 from pathlib import Path
 from types import SimpleNamespace
 
+import hydra
 import pytest
 from hydra.types import RunMode
 from omegaconf import OmegaConf
@@ -423,3 +424,11 @@ def test_a_signal_that_is_ignored_stays_so():
         assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("name", ["config", "sweep", "tune"])
+def test_the_folder_of_several_runs_is_known_before_the_first(name):
+    """`emgs run -m prior.seed=0,1` ended with "HydraConfig was not set": Hydra asks for it before there is a job."""
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF.resolve())):
+        config = hydra.compose(name, return_hydra_config=True)
+    assert re.fullmatch(rf"multirun/({name}/)?synthetic/[\d_-]+", config.hydra.sweep.dir)
