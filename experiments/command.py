@@ -23,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from emgs_jax.config.configure import CONF, compose, first_of_sweep, message_of
 from emgs_jax.config.overrides import quoted, readable
 from emgs_jax.device.settings import check_platforms, leave_memory_to_torch, use_compilation_cache
+from emgs_jax.io.files import check_writable
 
 from .console import speak_on
 from .interrupt import clear_interrupt
@@ -50,6 +51,7 @@ def command(
             with kept_words(HydraConfig.get().job_logging), clear_errors(), nothing_left():
                 check_missing(name, config)
                 check_keys(name, config)
+                check_out(config)
                 leave_memory_to_torch(config)
                 check_platforms()
                 if "compilation_cache" in config:
@@ -90,7 +92,7 @@ class Spoken:
 @contextlib.contextmanager
 def kept_words(logging: DictConfig) -> Iterator[None]:
     """Keep what a job says, how it failed included, in the file that Hydra has for its log; without one nowhere."""
-    path = OmegaConf.select(logging, "handlers.file.filename")
+    path = log_of(logging)
     if path is None:
         yield
         return
@@ -104,6 +106,12 @@ def kept_words(logging: DictConfig) -> Iterator[None]:
         except BaseException:
             file.write(traceback.format_exc())
             raise
+
+
+def log_of(logging: DictConfig) -> Path | None:
+    """The file of Hydra's log; None where it keeps none."""
+    path = OmegaConf.select(logging, "handlers.file.filename")
+    return None if path is None else Path(path)
 
 
 def help_of(name: str) -> str:
@@ -141,19 +149,13 @@ def check_arguments(name: str, arguments: list[str]) -> None:
     # Of Hydra's own keys one has options of the user in it: what emgs tune has found.
     own = [o for o in parsed if not o.key_or_group.startswith("hydra") or o.key_or_group == "hydra.searchpath"]
     for override in parsed:
-        if override.key_or_group == "hydra.run.dir":
-            check_output(Path(str(override.value())))
+        folder = str(override.value())
+        if override.key_or_group == "hydra.run.dir" and "$" not in folder:  # Hydra tells it by a traceback
+            check_writable(Path(folder), f"hydra.run.dir={folder}")
     overrides = [first_of_sweep(override) for override in own]
     if folders and not any(o.key_or_group == "hydra.searchpath" for o in own):
         overrides.append(f"hydra.searchpath=[{','.join(quoted(f'file://{Path(f).resolve()}') for f in folders)}]")
     compose(*overrides, name=name)
-
-
-def check_output(folder: Path) -> None:
-    """Raise ValueError where the folder of a run cannot be made, which Hydra tells by a traceback."""
-    nearest = next((path for path in (folder, *folder.parents) if path.exists()), Path())
-    if "$" not in str(folder) and not (nearest.is_dir() and os.access(nearest, os.W_OK)):
-        raise ValueError(f"hydra.run.dir={folder}: {nearest} is no folder that can be written to")
 
 
 def check_words(name: str, arguments: list[str]) -> list[str]:
@@ -191,20 +193,37 @@ def check_missing(name: str, config: DictConfig) -> None:
             raise ValueError(f"{found[1]} is not given{what}: emgs {name_of(name)} {found[1]}=…")
 
 
+def check_out(config: DictConfig) -> None:
+    """Raise ValueError where what `out` names could not be written in the end; it may be a file."""
+    if isinstance(out := config.get("out"), str):
+        is_file = Path(out).suffix == ".npz"
+        check_writable(Path(out).parent if is_file else Path(out), f"out={out}")
+
+
 @contextlib.contextmanager
 def nothing_left() -> Iterator[None]:
-    """Remove the folder that Hydra made where nothing came of the command: it has no result."""
+    """Remove the folder that Hydra made where nothing came of the command: it has no result.
+
+    Where it held anything before, or Hydra keeps no log and so made none, all of it stays.
+    """
+    hydra = HydraConfig.get()
+    folder, log = Path(hydra.runtime.output_dir), log_of(hydra.job_logging)
+
+    def is_bare() -> bool:
+        return log is not None and {path.name for path in folder.iterdir()} <= {log.name, ".hydra"}
+
+    # In a multirun Hydra writes there at the end.
+    is_new = hydra.mode != RunMode.MULTIRUN and is_bare() and not log.stat().st_size
     try:
         yield
     except (ValueError, OSError, InstantiationException, OmegaConfBaseException):
-        folder = Path(HydraConfig.get().runtime.output_dir)
         with contextlib.suppress(OSError):
-            is_multirun = HydraConfig.get().mode == RunMode.MULTIRUN  # Hydra writes there at the end
-            if not is_multirun and all(path.name == ".hydra" or path.suffix == ".log" for path in folder.iterdir()):
-                shutil.rmtree(folder)
-                below = [parent for parent in folder.parents if Path.cwd() in parent.parents]
-                for parent in below:
-                    parent.rmdir()  # ends at the first that has something else
+            if is_new and is_bare():
+                shutil.rmtree(folder / ".hydra", ignore_errors=True)
+                log.unlink()
+                for place in (folder, *(parent for parent in folder.parents if Path.cwd() in parent.parents)):
+                    if place != Path.cwd():
+                        place.rmdir()  # ends at the first that has something else
         raise
 
 

@@ -113,7 +113,7 @@ def _grouped(data: str, found: Iterable[tuple[str | None, Any, Any, dict[str, fl
         effect = effects.setdefault((key, value), Effect(data, key, value, own, defaultdict(list)))
         for name, number in metrics.items():
             effect.metrics[name].append(number)
-    yield from effects.values()
+    yield from sorted(effects.values(), key=lambda effect: effect.key is not None)  # the config itself first
 
 
 def spread(numbers: Sequence[float], factor: float, digits: int, is_difference: bool) -> str:

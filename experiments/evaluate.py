@@ -22,10 +22,11 @@ from tqdm import tqdm
 from emgs_jax.config.configure import compose, message_of
 from emgs_jax.config.overrides import quoted
 from emgs_jax.config.values import check_values
-from emgs_jax.io.files import atomic_write, write_json
+from emgs_jax.io.files import atomic_write, check_writable, write_json
 from emgs_jax.report.evaluation_page import Found, JobLine, write_evaluation_page
 from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
-from emgs_jax.report.results import is_finished, read_estimates, result_folder
+from emgs_jax.report.provenance import is_of_this_code
+from emgs_jax.report.results import METRICS_FILE, is_finished, read_estimates, read_metrics, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
 
 from .command import command, overrides_of
@@ -49,6 +50,7 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
     for dataset, data in settings["suite"]["data"].items():
         for variant, changes in settings["variants"].items():
             own, changed = ([_override(*item) for item in some.items()] for some in (data["overrides"], changes))
+            _check_free([*settings["overrides"], *changed], dataset, data["key"])
             overrides = [f"dataset={dataset}", *own, *settings["overrides"], *changed]
             common = compose(*overrides)
             has_seed = "seed" in common.prior
@@ -64,6 +66,14 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
                         check_values(config, part)
                     folder = result_folder(Path(settings["out"]), dataset, sequence, variant, seed)
                     yield Job(f"{dataset}/{sequence}/{variant}/{seed}", dataset, config, folder)
+
+
+def _check_free(overrides: Sequence[str], dataset: str, key: str) -> None:
+    """Raise ValueError where an override names what the jobs differ in, which would write over it."""
+    taken = {"dataset": "suite=NAME", key: f"suite.data.{dataset}.sequences=[…]", "prior.seed": "seeds=[…]"}
+    for text in overrides:
+        if (name := text.lstrip("+~").partition("=")[0]) in taken:
+            raise ValueError(f"{text} would have no effect, because every job has its own {name}: give {taken[name]}")
 
 
 def _override(key: str, value: Any) -> str:
@@ -95,10 +105,22 @@ def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
     if whole > 1 and (settings["gate"] or settings["write_gate"]):
         raise ValueError("a gate needs the results of all jobs: run once more without shard")
     baseline = read_gate(settings["gate"]) if settings["gate"] else {}
+    if settings["rounded"] and not (settings["write_gate"] and read_estimates(Path(settings["rounded"]))):
+        raise ValueError(
+            f"rounded={settings['rounded']} must be a folder of results of the same jobs, for write_gate=FILE: "
+            "evaluate into it first, by other instructions of the processor"
+        )
+    if settings["write_gate"]:
+        check_writable(Path(settings["write_gate"]).parent, f"write_gate={settings['write_gate']}")
     jobs = list(plan(settings))
     read_estimates(out)  # results that cannot be read end the evaluation before it begins
     ours = jobs[(part - 1) * len(jobs) // whole : part * len(jobs) // whole]  # neighbours share their executables
     open_jobs = [job for job in ours if not _is_finished(job)]
+    if older := [job.name for job in jobs if _is_of_other_code(job)]:
+        said = f"results of other code are there, {len(older)} of {len(jobs)} ({older[0]}{', …' * (len(older) > 1)})"
+        if baseline:
+            raise ValueError(f"{said}, and a gate is about what runs now: choose another out=FOLDER, or move them away")
+        print(f"{said}: they are not made anew (move them away for that)")
     print(f"shard {part}/{whole}: {len(open_jobs)} of its {len(ours)} jobs to do, {len(jobs)} in all")
     failures: dict[str, str] = {}
     try:
@@ -135,6 +157,11 @@ def _run_all(jobs: Sequence[Job], failures: dict[str, str]) -> None:
 
 def _is_finished(job: Job) -> bool:
     return is_finished(job.folder, OmegaConf.to_container(job.config, resolve=True))
+
+
+def _is_of_other_code(job: Job) -> bool:
+    path = job.folder / METRICS_FILE
+    return path.is_file() and not is_of_this_code(read_metrics(path)["provenance"])
 
 
 def _shard(text: str) -> tuple[int, int]:

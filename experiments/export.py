@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from emgs_jax.config.configure import build_dataset
 from emgs_jax.config.values import check_value, declared
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.io.files import new_folder
+from emgs_jax.io.files import check_writable, new_folder, owned
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report.export import IMAGE_FORMATS, ExportConfig, export, find_factor, write_scaled
 from emgs_jax.report.recorded_run import RecordedRun, read_run
@@ -21,10 +21,14 @@ def export_run(config: DictConfig) -> list[Path]:
     """Write what the config names; returns the files and folders."""
     for key, field in declared(ExportConfig).items():
         check_value(key, config[key], field)
-    formats, length = [str(name) for name in config.formats], config.length and [float(n) for n in config.length]
+    formats, length = list(dict.fromkeys(map(str, config.formats))), config.length and [float(n) for n in config.length]
     wanted = ExportConfig(formats, config.max_points, config.scale, length, str(config.images))
     run = read_run(Path(str(config.folder)))
+    folder = run.folder if config.out is None else Path(str(config.out))
+    check_writable(folder, f"{'folder' if config.out is None else 'out'}={folder}")
     factor = find_factor(run, wanted)
+    if factor is None and not formats:
+        raise ValueError("formats=[] without scale= or length= writes nothing: give colmap, nerfstudio or frustums")
     dataset = None
     if IMAGE_FORMATS & {*wanted.formats}:
         dataset, note = images_of(run)
@@ -33,12 +37,11 @@ def export_run(config: DictConfig) -> list[Path]:
         if wanted.images == "original":
             run, dataset = at_original_size(run)
     if factor is None:
-        folder = run.folder if config.out is None else Path(str(config.out))
-        folder.mkdir(parents=True, exist_ok=True)
-        return export(run, folder, wanted, dataset)
-    target = run.folder / "scaled" if config.out is None else Path(str(config.out))
-    with new_folder(target) as folder:
-        export(write_scaled(run, folder, factor), folder, wanted, dataset)
+        with owned(folder):
+            return export(run, folder, wanted, dataset)
+    target = folder / "scaled" if config.out is None else folder
+    with owned(target.parent), new_folder(target) as new:
+        export(write_scaled(run, new, factor), new, wanted, dataset)
     print(f"all lengths times {factor:.6g}")
     return sorted(target.iterdir())
 

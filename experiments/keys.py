@@ -60,13 +60,14 @@ OFFSET = Kind(
         _is_list(value) and len(value) == 2 and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
     ),
 )
+SEEDS = many("whole numbers", lambda value: _is_whole(value, 0))
 NAMES = many("names", _is_text)
 AT_ONCE = {"at_once": whole(1, or_null=True)}
 KEYS: dict[str, dict[str, Kind]] = {
     "sweep": AT_ONCE | {"chunk": whole(1)},
     "tune": AT_ONCE,  # the others it checks itself
     "evaluate": {
-        "seeds": many("whole numbers", lambda value: _is_whole(value, 0)),
+        "seeds": Kind(f"{SEEDS.words}, each once", lambda value: SEEDS.fits(value) and len(set(value)) == len(value)),
         "overrides": some("KEY=VALUE", _is_change),
         "variants": Kind(
             "NAME: {KEY: VALUE}, one or more", lambda value: isinstance(value, Mapping) and len(value) > 0

@@ -6,6 +6,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.configure import build
+from emgs_jax.io.files import check_writable, owned
 from emgs_jax.report.page import write_report
 from emgs_jax.report.polish import polish
 from emgs_jax.report.printout import polish_lines
@@ -17,13 +18,17 @@ from .report import images_of, positional
 
 def polish_run(config: DictConfig) -> dict[str, Any]:
     """Fit splats to the images of `config.folder`; returns what polish.json says."""
+    if not config.polish:
+        raise ValueError("polish=none has no settings to fit splats by: choose polish=default")
     fitting, run = build(config, "polish"), read_run(Path(str(config.folder)))
     dataset, note = images_of(run)
     if dataset is None:
         raise ValueError(f"{note} They are what splats are fitted to.")
+    check_writable(run.folder, f"folder={run.folder}")
     settings = OmegaConf.create(dict(run.provenance["config"]))
-    found = polish(run, dataset, fitting, build(settings, "densify"))
-    write_report(run, dataset)
+    with owned(run.folder):
+        found = polish(run, dataset, fitting, build(settings, "densify"))
+        write_report(run, dataset)
     return found
 
 

@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from emgs_jax.config.configure import build_dataset, build_prior, graph_config
 from emgs_jax.data.base import Dataset
+from emgs_jax.io.files import owned
 from emgs_jax.prior.base import Prior, Window
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.recorded_visits import places_seen_twice, record_visits
@@ -30,9 +31,11 @@ def predict(config: DictConfig) -> Path:
         return tqdm(windows, unit="inference", desc=prior.provenance.name)
 
     folder = Path(config.out)
-    record(prior, dataset, config.slam.window_size, folder, progress)
-    if config.graph:
-        _record_visits(prior, dataset, config, folder)
+    with owned(folder):
+        _check_folder(folder)
+        record(prior, dataset, config.slam.window_size, folder, progress)
+        if config.graph:
+            _record_visits(prior, dataset, config, folder)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 2**20
     per_frame = f"{size / len(dataset):.2f} a frame"
     print(f"{folder}: {size:.1f} MiB, {per_frame}, {dataset.name} {dataset.sequence}, {len(dataset)} frames")
@@ -40,6 +43,13 @@ def predict(config: DictConfig) -> Path:
     for key, value in prior.report().items():
         print(f"{key} {value:.4g}")
     return folder
+
+
+def _check_folder(folder: Path) -> None:
+    """Raise ValueError where a folder holds something else than a recording, such as a run: its files would mix."""
+    others = [path.name for path in sorted(folder.iterdir()) if not path.name.startswith(".") and path.suffix != ".npz"]
+    if others and "manifest.json" not in others:
+        raise ValueError(f"out={folder} holds {', '.join(others[:3])} and no recording: give a folder of its own")
 
 
 def _record_visits(prior: Prior, dataset: Dataset, config: DictConfig, folder: Path) -> None:

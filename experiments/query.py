@@ -15,6 +15,7 @@ from emgs_jax.config.configure import build
 from emgs_jax.config.values import Declared, check_value
 from emgs_jax.data.class_file import read_classes
 from emgs_jax.features.text import TextEmbeddings
+from emgs_jax.io.files import check_writable
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.ops.ranges import Range
 from emgs_jax.report.provenance import is_metric
@@ -32,7 +33,7 @@ from emgs_jax.report.query_pictures import (
     views_of,
 )
 from emgs_jax.report.recorded_run import RecordedRun, read_run
-from emgs_jax.report.vocabulary import Vocabulary, check_folder, feature_model, vocabulary, words_of
+from emgs_jax.report.vocabulary import Vocabulary, feature_model, vocabulary, words_of
 
 from .command import command
 
@@ -59,7 +60,8 @@ def query(config: DictConfig) -> dict[str, Any]:
     )
     views = given_views(config, run)
     folder = run.folder if config.out is None else Path(config.out)
-    check_folder(folder)
+    check_writable(folder, f"map={folder}")
+    folder.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     answer = ask(run, question)
     seconds = time.perf_counter() - start
@@ -112,7 +114,7 @@ def given_views(config: DictConfig, run: RecordedRun) -> list[View] | None:
     if config.pose is None:
         return None
     if not Path(config.pose).is_file():
-        raise ValueError(f"pose={config.pose} does not exist: give lines `timestamp tx ty tz qx qy qz qw`")
+        raise ValueError(f"pose={config.pose} is no file: give lines `timestamp tx ty tz qx qy qz qw`")
     times, poses = load_trajectory_tum(config.pose)
     if not len(poses):
         raise ValueError(f"pose={config.pose} has no pose: give lines `timestamp tx ty tz qx qy qz qw`")

@@ -8,6 +8,7 @@ from omegaconf.errors import OmegaConfBaseException
 from emgs_jax.config.configure import build_dataset, message_of
 from emgs_jax.config.overrides import KEY, quoted
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.io.files import check_writable
 from emgs_jax.report.page import write_report
 from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.repeat import check_targets
@@ -18,6 +19,7 @@ from .command import command
 def report(folder: Path) -> Path:
     """Write report.html into the folder of a finished run; without its images where they are gone."""
     run = read_run(folder)
+    check_writable(folder, f"folder={folder}")
     dataset, note = images_of(run)
     path = write_report(run, dataset, note)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB" + (f"\n{note}" if note else ""))

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from emgs_jax.back_end.saved_map import load_saved_map
 from emgs_jax.config.configure import baseline_configs, build, build_dataset, build_prior, graph_config
+from emgs_jax.config.values import check_values
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.device.clock import Clock
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
@@ -55,6 +56,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         raise ValueError(
             "baseline= fuses every frame where it was placed, and graph= moves poses afterwards: use graph=none with it"
         )
+    for part in config:  # before images are read
+        check_values(config, str(part))
     if config.map is not None and Path(config.map).resolve() == folder.resolve():
         raise ValueError(f"map={config.map} is the folder of this run, too: give hydra.run.dir=ANOTHER")
     with contextlib.ExitStack() as stack:

@@ -62,7 +62,7 @@ def matched_poses(
 ) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
     """Poses of the file and true poses of the same times (n, 4, 4), and how many of either there are in all."""
     if not Path(path).is_file():
-        raise FileNotFoundError(f"trajectory={path} does not exist: give a file with `timestamp tx ty tz qx qy qz qw`")
+        raise FileNotFoundError(f"trajectory={path} is no file: give a file with `timestamp tx ty tz qx qy qz qw`")
     times, poses = load_trajectory_tum(path)
     times = in_seconds(times)  # ORB-SLAM3 and others write the nanoseconds of EuRoC's clock into this format
     what = f"{dataset.name} {dataset.sequence}"

@@ -17,7 +17,7 @@ from emgs_jax.io.files import atomic_write, write_json
 from emgs_jax.ops.ranges import Range
 from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.segmentation_table import ALIGNMENTS, Placement, SceneResult, score_scene, summary, table
-from emgs_jax.report.vocabulary import check_folder, feature_model, vocabulary
+from emgs_jax.report.vocabulary import feature_model, vocabulary
 
 from .command import command
 from .report import images_of
@@ -41,7 +41,9 @@ def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
     how = Placement(config.alignment, config.with_scale, config.icp_distance_m, config.icp_max_steps)
     runs = [read_run(Path(str(folder))) for folder in (config.map if _is_list(config.map) else [config.map])]
     scenes = scene_names(config, runs)
-    check_folder(Path(config.out))
+    if len({(run.folder.resolve(), scene) for run, scene in zip(runs, scenes, strict=True)}) < len(runs):
+        raise ValueError(f"map={config.map} names a folder twice, whose points would count twice: give each once")
+    Path(config.out).mkdir(parents=True, exist_ok=True)
     results: list[SceneResult] = []
     classes: tuple[str, ...] = ()
     for run, scene in zip(runs, scenes, strict=True):

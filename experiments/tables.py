@@ -17,7 +17,8 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 import emgs_jax
-from emgs_jax.io.files import atomic_write
+from emgs_jax.config.overrides import quoted
+from emgs_jax.io.files import atomic_write, check_writable
 from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, Line, markdown, metric_table
 from emgs_jax.report.provenance import git_revision
 from emgs_jax.report.results import METRICS_FILE, Estimate, estimates_of, read_metrics
@@ -46,7 +47,7 @@ SHORT = tuple(column._replace(title=_SHORT[column.key]) for column in COLUMNS if
 def evaluations(config: Mapping[str, Any], table: str) -> Iterator[Settings]:
     """The settings of the evaluations of one table; `config` is a resolved conf/tables.yaml."""
     for entry in config["tables"][table]:
-        composed = hydra.compose("evaluate", [f"suite.root='{config['root']}'", "suite=slices"])
+        composed = hydra.compose("evaluate", [f"suite.root={quoted(config['root'])}", "suite=slices"])
         settings = OmegaConf.to_container(composed, resolve=True)
         data = {name: settings["suite"]["data"][name] for name in entry["data"]}
         out = str(Path(config["out"]) / table)
@@ -144,8 +145,10 @@ def _count(runs: Iterable[Mapping[str, Estimate]], kind: str, column: Column) ->
     return sum(sign * (ours - other) < 0 for ours, other in pairs) if pairs else None
 
 
-def write_blocks(page: Path, blocks: Mapping[str, str]) -> None:
-    """Replace what is between `<!-- table: NAME -->` and `<!-- end -->`; raises ValueError where a pair is missing."""
+def with_blocks(page: Path, blocks: Mapping[str, str]) -> str:
+    """A page with other text between `<!-- table: NAME -->` and `<!-- end -->`; ValueError where a pair is missing."""
+    if not page.is_file():
+        raise ValueError(f"{page} is no file: give page=FILE and full_page=FILE with the places of the tables")
     text = page.read_text(encoding="utf-8")
     for name, content in blocks.items():
         start = f"<!-- table: {name} -->"
@@ -153,12 +156,22 @@ def write_blocks(page: Path, blocks: Mapping[str, str]) -> None:
         text, count = place.subn(lambda _, new=f"{start}\n{content}": new, text)
         if count != 1:
             raise ValueError(f"{page} has {count} places {start} … <!-- end -->, not one: write the markers once")
+    return text
+
+
+def write_blocks(page: Path, blocks: Mapping[str, str]) -> None:
+    """Write a page with other text between its markers."""
+    text = with_blocks(page, blocks)
     with atomic_write(page, "w") as handle:
         handle.write(text)
 
 
 def tables(config: Mapping[str, Any]) -> None:
     """Run what is not finished and write all tables of both pages; `config` is a resolved conf/tables.yaml."""
+    pages = Path(config["page"]), Path(config["full_page"])
+    for page in pages:  # before the runs
+        check_writable(page.parent, str(page))
+        with_blocks(page, dict.fromkeys(config["tables"], ""))
     planned = {table: list(evaluations(config, table)) for table in config["tables"]}
     paths = {name: [_result(job) for settings in table for job in plan(settings)] for name, table in planned.items()}
     everything = [path for found in paths.values() for path in found]
@@ -171,8 +184,8 @@ def tables(config: Mapping[str, Any]) -> None:
         raise ValueError("\n       ".join([f"problems: {len(problems)}", *problems]))
     revision_of(_code_of(everything))
     titles, short = config["titles"], config["short"]
-    write_blocks(Path(config["page"]), {name: short_block(found, titles, short) for name, found in paths.items()})
-    write_blocks(Path(config["full_page"]), {name: block(found, titles) for name, found in paths.items()})
+    write_blocks(pages[0], {name: short_block(found, titles, short) for name, found in paths.items()})
+    write_blocks(pages[1], {name: block(found, titles) for name, found in paths.items()})
 
 
 def _result(job: Job) -> Path:

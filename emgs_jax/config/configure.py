@@ -20,6 +20,7 @@ from hydra.core.singleton import Singleton
 from hydra.errors import ConfigCompositionException, HydraException, InstantiationException, MissingConfigException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import MissingMandatoryValue
 from tqdm import tqdm
 
 from emgs_jax.config.overrides import readable
@@ -65,11 +66,18 @@ def build(config: DictConfig, key: str, **more: Any) -> Any:
 
     Raises:
         ValueError: a value is not of the kind or in the range that its field declares; the message has its full key.
+            Or a key is no parameter, or one is missing.
     """
     if not isinstance(OmegaConf.select(config, key), DictConfig):
         raise ValueError(f"{key}={OmegaConf.select(config, key)} would stand in the place of all its keys")
     check_values(config, key)
-    return instantiate(OmegaConf.select(config, key), **more)
+    node = OmegaConf.select(config, key)
+    try:
+        return instantiate(node, **more)
+    except InstantiationException as error:
+        if isinstance(error.__cause__, TypeError):  # of an earlier version, or added with +
+            raise ValueError(f"the keys of {key} are not those of {node.get('_target_')}: {error.__cause__}") from error
+        raise
 
 
 def graph_config(config: DictConfig) -> "BackEndConfig | None":
@@ -238,6 +246,10 @@ def attach_features(config: DictConfig, dataset: ReadableFrames, prior: Prior) -
 
 
 def message_of(error: Exception) -> str:
-    """Return the message of the original error, without Hydra's wrapping."""
+    """Return the message of the original error, without Hydra's wrapping and the number of a system's error."""
     cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
+    if isinstance(cause, MissingMandatoryValue) and cause.full_key:
+        return f"{cause.full_key} is not given: add {cause.full_key}=…"
+    if isinstance(cause, OSError) and cause.filename is not None:
+        return f"{cause.filename}: {cause.strerror}"
     return str(cause) or type(cause).__name__

@@ -10,7 +10,7 @@ from hydra.errors import HydraException
 
 KEY = re.compile(r"(?:\+{1,2}|~)?[A-Za-z_][\w./@:-]*=")
 NAMES = ("root", "sequence", "folder", "map", "out")  # keys whose values are names, though they may look like numbers
-HOME = re.compile(r"(?<![^,])~(?=/)")  # shells leave it, zsh always, others in quotes
+HOME = re.compile(r"(^|[,\[] ?)~(?=/)")  # shells leave it, zsh always, others in quotes
 OPENS = {"[": "]", "{": "}"}
 
 
@@ -54,7 +54,7 @@ def parsed(word: str) -> Override | None:
 
 def _readable(word: str) -> str:
     key = KEY.match(word)[0]
-    value = HOME.sub(lambda _: str(Path.home()), word[len(key) :])
+    value = HOME.sub(lambda found: f"{found[1]}{Path.home()}", word[len(key) :])
     word = key + value
     found = parsed(word)
     if found is None:

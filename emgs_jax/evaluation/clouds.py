@@ -44,7 +44,7 @@ def read_cloud(path: str | os.PathLike, normal_neighbours: int) -> PointCloud:
     Normals that are 0, as 3DGS writes them, are none; the others get length 1.
     """
     if not Path(path).is_file():
-        raise FileNotFoundError(f"{path} does not exist: give a PLY file with the points in the trajectory's frame")
+        raise FileNotFoundError(f"{path} is no file: give a PLY file with the points in the trajectory's frame")
     vertices = read_vertices(path)
     points = _columns(vertices, ("x", "y", "z"), path)
     far = np.abs(points).max(initial=0.0)

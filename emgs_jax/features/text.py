@@ -103,7 +103,7 @@ def read_text(path: Path | str) -> TextEmbeddings:
 def _read(path: Path) -> tuple[dict, np.ndarray]:
     """Return header and vectors of a file that is whole."""
     if not path.is_file():
-        raise ValueError(f"{path} does not exist: {REMEDY}")
+        raise ValueError(f"{path} is no file: {REMEDY}")
     try:
         arrays = read_npz(path.read_bytes(), ("header", "embeddings"))
         header, vectors = json.loads(str(arrays["header"])), arrays["embeddings"]

@@ -31,7 +31,8 @@ def atomic_write(path: str | os.PathLike, mode: str = "wb") -> Iterator[IO]:
     except OSError as error:
         raise _named(error, path) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # none is there, or nothing can be removed either
+            temporary.unlink()
 
 
 @contextlib.contextmanager
@@ -84,6 +85,13 @@ def owned(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def check_writable(path: Path, what: str) -> None:
+    """Raise ValueError where a folder neither is there to be written into nor can be made; makes none."""
+    nearest = next((place for place in (path, *path.parents) if place.exists()), Path())
+    if not (nearest.is_dir() and os.access(nearest, os.W_OK)):
+        raise ValueError(f"{what}: {nearest} is no folder that can be written to: choose another one")
 
 
 def remove_temporaries(folder: Path) -> list[str]:
@@ -174,4 +182,5 @@ class FrameLog:
 
 
 def _named(error: OSError, path: Path) -> OSError:
-    return OSError(error.errno, f"cannot write ({error.strerror or error})", str(path))
+    words = f"cannot write ({error.strerror or error})"
+    return OSError(f"{words}: {path}") if error.errno is None else OSError(error.errno, words, str(path))

@@ -76,7 +76,7 @@ def read_gate(path: str | os.PathLike) -> dict[str, Any]:
     """Read a baseline by name of its row, from YAML or JSON; raises ValueError where it cannot be compared with."""
     remedy = "write one with python -m experiments.evaluate … write_gate=FILE"
     if not Path(path).is_file():
-        raise ValueError(f"gate={path} does not exist: {remedy}")
+        raise ValueError(f"gate={path} is no file: {remedy}")
     try:
         content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         if content["format"] != GATE_FORMAT:

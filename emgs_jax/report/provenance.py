@@ -54,7 +54,7 @@ def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -
             "frames": {"size": [*dataset.size], "intrinsics": [*map(float, dataset.intrinsics)]},
         },
         "seed": prior.settings.get("seed", 0),
-        "git": git_revision(Path(__file__).resolve().parents[2]),
+        "git": git_now(),
         "versions": {"python": platform.python_version()} | {k: _version(names) for k, names in _PACKAGES.items()},
         "device": {"kind": device.device_kind, "backend": device.platform, "cpu_count": os.cpu_count()},
         "platform": platform.platform(),
@@ -66,6 +66,16 @@ def signature(block: Mapping[str, Any]) -> dict[str, Any]:
     """Return the part of a provenance that determines the bits of a result: no caches, checkpoints or views."""
     ignored = ("compilation_cache", "checkpoint", "checksums", "view")
     return {**block, "config": {key: value for key, value in block["config"].items() if key not in ignored}}
+
+
+def git_now() -> dict[str, Any] | None:
+    """The `git_revision` of this code."""
+    return git_revision(Path(__file__).resolve().parents[2])
+
+
+def is_of_this_code(block: Mapping[str, Any]) -> bool:
+    """Test whether a provenance names the commit and the version that run now; changes since a commit are not seen."""
+    return (block["git"], block.get("versions", {}).get("emgs_jax")) == (git_now(), _version(_PACKAGES["emgs_jax"]))
 
 
 def git_revision(folder: Path) -> dict[str, Any] | None:

@@ -115,7 +115,7 @@ def read_run(folder: Path) -> RecordedRun:
     ]
     if missing:
         raise ValueError(f"{folder} holds no finished run: it lacks {', '.join(missing)}; run it to its end")
-    metrics = read_metrics(folder / METRICS_FILE)
+    metrics = read_metrics(folder / METRICS_FILE, "run again")
     _check_metrics(folder / METRICS_FILE, metrics)
     lines = _lines(folder / FRAMES_FILE)
     frames = [line for line in lines if line.get("pose") is not None]

@@ -52,9 +52,8 @@ def result_folder(out: Path, dataset: str, sequence: str, variant: str, seed: in
     return out.joinpath(*parts.values(), str(seed))
 
 
-def read_metrics(path: Path) -> dict[str, Any]:
-    """Read a metrics.json of this version; any other raises ValueError."""
-    remedy = "move its folder away or choose another out=FOLDER"
+def read_metrics(path: Path, remedy: str = "move its folder away or choose another out=FOLDER") -> dict[str, Any]:
+    """Read a metrics.json of this version; any other raises ValueError, which says the remedy."""
     try:
         metrics = json.loads(path.read_text(encoding="utf-8"))
         found = metrics["provenance"].get("format")

@@ -3,7 +3,6 @@
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -106,16 +105,3 @@ def words_of(value: Any, key: str) -> tuple[str, ...]:
     if not all(isinstance(word, str) and word.strip() for word in words) or len(set(words)) < len(words):
         raise ValueError(f"{key} must be a word or a list of words, none empty and each once, got {value!r}")
     return tuple(word.strip() for word in words)
-
-
-def check_folder(folder: Path) -> None:
-    """Make the folder of outputs; raises ValueError where nothing can be written into it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".emgs-write-test"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ValueError(
-            f"nothing can be written into out={folder} ({error.strerror or error}): choose another out=FOLDER"
-        ) from error

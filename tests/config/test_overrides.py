@@ -71,4 +71,5 @@ def test_the_home_is_written_out_in_every_key_and_choice():
     home = str(Path.home())
     assert parsed(readable(["trajectory=~/a b.txt"])[0]).value() == f"{home}/a b.txt"
     assert readable(["map=~/a,~/b"]) == [f"map={home}/a,{home}/b"]
+    assert readable(["map=[~/a,~/b]", "map=[~/a, ~/b]"]) == [f"map=[{home}/a,{home}/b]", f"map=[{home}/a, {home}/b]"]
     assert parsed(readable(["map=a~/b"])[0]).value() == "a~/b" and readable(["~features"]) == ["~features"]

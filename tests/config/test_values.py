@@ -6,10 +6,11 @@ from collections.abc import Sequence
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
+from omegaconf.errors import MissingMandatoryValue
 from tiny_run import TINY, compose
 
 from emgs_jax.config import configure
-from emgs_jax.config.configure import build, groups
+from emgs_jax.config.configure import build, groups, message_of
 from emgs_jax.config.values import check_values, declared
 from emgs_jax.ops.pytree import choice, static, traced
 from emgs_jax.ops.ranges import number
@@ -158,3 +159,28 @@ def test_kinds_come_from_annotations_and_what_is_not_declared_is_left_alone():
 def test_the_makers_of_fields_keep_their_ranges():
     assert traced(low=0).metadata["range"] == (0, 1e6) and static(1, 5).metadata["range"] == (1, 5)
     assert "range" not in traced().metadata and choice("a", "b").metadata["choices"] == ("a", "b")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda node: OmegaConf.update(node, "gone", 1, force_add=True), "unexpected keyword argument 'gone'"),
+        (lambda node: dict.pop(node._content, "min_alpha"), "missing 1 required positional argument: 'min_alpha'"),
+    ],
+)
+def test_keys_of_another_version_are_said_to_be_that(change, message):
+    """A run of older code, or a key that was added with +, ended in Python's words about `__init__`."""
+    config = compose()
+    change(config.densify)
+    with pytest.raises(ValueError, match=rf"^the keys of densify are not those of .*DensifyConfig: .*{message}"):
+        build(config, "densify")
+
+
+def test_a_value_that_has_to_be_given_and_a_file_of_the_system_are_named_in_one_line(tmp_path):
+    config = compose("features=dinov3_text")
+    with pytest.raises(MissingMandatoryValue) as missing:
+        _ = config.features.checkpoint
+    assert message_of(missing.value) == "features.checkpoint is not given: add features.checkpoint=…"
+    with pytest.raises(OSError) as absent:
+        (tmp_path / "none").read_text()
+    assert message_of(absent.value) == f"{tmp_path}/none: No such file or directory"

@@ -145,7 +145,7 @@ def test_normals_of_length_0_are_none_and_others_get_length_1(tmp_path):
 
 
 def test_a_file_without_usable_points_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none\.ply does not exist"):
+    with pytest.raises(FileNotFoundError, match=r"none\.ply is no file"):
         read_cloud(tmp_path / "none.ply", 12)
     (tmp_path / "text.ply").write_text("no cloud")
     with pytest.raises(ValueError, match=r"text\.ply is no PLY file"):

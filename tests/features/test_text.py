@@ -41,7 +41,7 @@ def test_what_does_not_fit_and_a_newer_or_foreign_file_are_refused_with_the_reme
         load_text(path, MODEL, ["wall", "lamp"])
     with pytest.raises(ValueError, match="text.npz was embedded by .*'width': 3.*features are of .*'width': 4"):
         load_text(path, MODEL | {"width": 4})
-    with pytest.raises(ValueError, match="nowhere.npz does not exist.*experiments.embed"):
+    with pytest.raises(ValueError, match="nowhere.npz is no file.*experiments.embed"):
         load_text(path.parent / "nowhere.npz", MODEL)
     with np.load(path) as arrays:
         header, vectors = json.loads(str(arrays["header"])), arrays["embeddings"]

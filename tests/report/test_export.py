@@ -207,6 +207,15 @@ def test_the_command_writes_the_images_that_the_run_was_made_of(tmp_path):
     np.testing.assert_array_equal(image, dataset()[4].image)
 
 
+def test_a_format_that_is_named_twice_is_written_once_and_none_is_refused(tmp_path):
+    """The second one found the first one there, and an export of nothing said nothing."""
+    words = f"folder={written_run(tmp_path / 'run')}", f"out={tmp_path / 'there'}"
+    twice = export_run(configure.compose(*words, "formats=[frustums,frustums]", name="export"))
+    assert twice == [tmp_path / "there" / "cameras.ply"]
+    with pytest.raises(ValueError, match=r"formats=\[\] without scale= or length= writes nothing"):
+        export_run(configure.compose(*words, "formats=[]", name="export"))
+
+
 def test_images_in_their_own_size_come_with_the_intrinsics_of_that_size(tmp_path):
     """Twice as large as in the run: the same rays, and blocks of four pixels average to the image in use."""
     folder, used = written_run(tmp_path / "run"), dataset()

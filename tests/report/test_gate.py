@@ -86,7 +86,7 @@ def test_a_file_that_is_no_baseline_is_refused_with_a_remedy(tmp_path, content):
 
 
 def test_a_baseline_that_is_not_there_or_of_nothing_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"missing.yaml does not exist.*write_gate=FILE"):
+    with pytest.raises(ValueError, match=r"missing.yaml is no file.*write_gate=FILE"):
         read_gate(tmp_path / "missing.yaml")
     with pytest.raises(ValueError, match="no result of ours"):
         write_gate(tmp_path / "new.yaml", [], TOLERANCES)

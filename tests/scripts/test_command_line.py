@@ -13,6 +13,7 @@ import threading
 from pathlib import Path
 from types import SimpleNamespace
 
+import hydra
 import pytest
 from hydra.types import RunMode
 from omegaconf import OmegaConf
@@ -23,7 +24,7 @@ from tqdm import tqdm
 from emgs_jax.config.configure import compose, groups
 from emgs_jax.config.overrides import parsed, readable
 from experiments.cli import COMMANDS, main
-from experiments.command import check_arguments, check_missing, kept_words, nothing_left
+from experiments.command import check_arguments, check_missing, check_out, kept_words, nothing_left
 from experiments.console import speak_on
 from experiments.evaluate import delegated
 from experiments.interrupt import clear_interrupt
@@ -130,9 +131,25 @@ def test_a_console_without_a_sign_shows_another_and_goes_on(monkeypatch):
     """Where the locale is not UTF-8 the "…" after the mapping ended the run."""
     console = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", console)
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
     speak_on()
     print("writing …", flush=True)
     assert console.buffer.getvalue() == b"writing ?\n"
+
+
+def test_a_program_whose_reader_has_gone_works_on(monkeypatch):
+    """`emgs run … | head` ended with "Broken pipe" when all was mapped, and nothing of it was written."""
+    for name in ("stdout", "stderr"):
+        reading, writing = os.pipe()
+        os.close(reading)
+        monkeypatch.setattr(sys, name, os.fdopen(writing, "w", buffering=1))
+    speak_on()
+    for _ in range(3):
+        print("a line", flush=True)
+        tqdm.write("another one")
+        print("an error", file=sys.stderr)
+    sys.stdout.close()
+    sys.stderr.close()
 
 
 @pytest.mark.parametrize("error", [SystemExit("error: no such file"), ZeroDivisionError("division by zero"), None])
@@ -211,6 +228,17 @@ def test_a_folder_that_cannot_be_made_is_named_without_hydras_traceback(tmp_path
     check_arguments("config", [f"hydra.run.dir={tmp_path / 'new' / 'run'}", "hydra.run.dir=${out}"])
 
 
+def test_an_output_that_cannot_be_written_is_named_before_the_work(tmp_path):
+    """`emgs score … out=FILE` and `emgs predict` on a disk that is read-only said it after all of the work."""
+    (tmp_path / "file").write_text("")
+    for out in ("file", "file/below", "file/text.npz"):
+        with pytest.raises(ValueError, match=f"^out=.*{out}: .*file is no folder that can be written to"):
+            check_out(OmegaConf.create({"out": str(tmp_path / out)}))
+    for out in (None, "???", str(tmp_path / "new" / "folder"), str(tmp_path / "text.npz"), "relative"):
+        check_out(OmegaConf.create({"out": out}))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
 def test_options_of_a_folder_of_ones_own_are_options(tmp_path):
     """`--config-dir` is in Hydra's help, and what stood in that folder was refused."""
     (tmp_path / "dataset").mkdir()
@@ -231,17 +259,35 @@ def test_a_command_that_comes_to_nothing_leaves_nothing(tmp_path, monkeypatch):
     for kept in (None, "frames.jsonl"):
         (folder / ".hydra").mkdir(parents=True)
         (folder / "run.log").touch()
-        if kept:
-            (folder / kept).touch()
         with pytest.raises(ValueError, match="wrong"), nothing_left():
+            if kept:
+                (folder / kept).touch()
             raise ValueError("wrong")
         assert tmp_path.exists() and folder.exists() == (kept is not None)
         assert [path.name for path in tmp_path.iterdir()] == (["outputs"] if kept else [])
 
 
-def hydra_of(folder: Path) -> SimpleNamespace:
+@pytest.mark.parametrize("own", ["notes.log", "session.log/frames.csv", "run.log", None])
+@pytest.mark.parametrize("has_log", [True, False])
+def test_a_command_that_comes_to_nothing_removes_nothing_that_was_there(own, has_log, tmp_path, monkeypatch):
+    """`emgs report typo` in a folder of logs removed it with all of them, and an empty one where the user stood."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("experiments.command.HydraConfig", SimpleNamespace(get=lambda: hydra_of(tmp_path, has_log)))
+    if has_log:
+        (tmp_path / "run.log").touch()
+    if own is not None:
+        (tmp_path / own).parent.mkdir(exist_ok=True)
+        (tmp_path / own).write_text("mine")
+    with pytest.raises(ValueError, match="wrong"), nothing_left():
+        raise ValueError("wrong")
+    assert tmp_path.is_dir() and (own is None or (tmp_path / own).read_text() == "mine")
+
+
+def hydra_of(folder: Path, has_log: bool = True) -> SimpleNamespace:
     """What Hydra says of a run."""
-    return SimpleNamespace(runtime=SimpleNamespace(output_dir=str(folder)), mode=RunMode.RUN)
+    handlers = {"file": {"filename": str(folder / "run.log")}} if has_log else {"console": {}}
+    logging = OmegaConf.create({"handlers": handlers})
+    return SimpleNamespace(runtime=SimpleNamespace(output_dir=str(folder)), mode=RunMode.RUN, job_logging=logging)
 
 
 def test_a_name_with_any_signs_is_read_and_a_run_of_nothing_leaves_nothing(tmp_path):
@@ -383,3 +429,11 @@ def test_a_signal_that_is_ignored_stays_so():
         assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("name", ["config", "sweep", "tune"])
+def test_the_folder_of_several_runs_is_known_before_the_first(name):
+    """`emgs run -m prior.seed=0,1` ended with "HydraConfig was not set": Hydra asks for it before there is a job."""
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF.resolve())):
+        config = hydra.compose(name, return_hydra_config=True)
+    assert re.fullmatch(rf"multirun/({name}/)?synthetic/[\d_-]+", config.hydra.sweep.dir)

@@ -52,6 +52,12 @@ def test_sweeps_with_another_config_or_of_other_code_are_not_averaged_with_these
     assert effects[0].data != effects[2].data
 
 
+def test_the_config_itself_stands_first_wherever_a_grid_has_it(tmp_path):
+    """Its line stood below those of values that an axis names before the config's own."""
+    write_sweep(tmp_path / "0", 0, {(4.0, "inf"): 0.13, (8.0, 2.0): 0.09, (8.0, "inf"): 0.10})
+    assert [effect.key for effect in read_effects(tmp_path, REPETITIONS)] == [None, "em.near", "em.far"]
+
+
 def test_a_copy_of_a_sweep_is_no_repetition(tmp_path):
     """Symptom: the same seed three times was 'all of at least three agree', in bold."""
     for number in range(2):

@@ -1,6 +1,7 @@
 """The batch: what runs, what is skipped, what failures and interruptions leave; oracle: a run that is made up."""
 
 import csv
+import importlib.metadata
 import json
 import subprocess
 import sys
@@ -18,9 +19,11 @@ import experiments.evaluate
 from emgs_jax.config.configure import compose, groups
 from emgs_jax.io.files import write_json
 from emgs_jax.report.gate import read_gate
-from emgs_jax.report.provenance import RESULT_FORMAT
+from emgs_jax.report.provenance import RESULT_FORMAT, git_now
 from emgs_jax.report.results import METRICS_FILE
 from experiments.command import clear_errors
+
+THIS_CODE = {"git": git_now(), "versions": {"emgs_jax": importlib.metadata.version("emgs_jax")}}
 
 
 def composed(*words: str) -> dict:
@@ -42,7 +45,7 @@ def evaluate(tmp_path, monkeypatch):
         evaluation.runs.append((config.dataset.seed, config.prior.seed))
         if config.dataset.seed in evaluation.broken:
             raise evaluation.broken[config.dataset.seed]
-        block = {"format": RESULT_FORMAT, "protocol": config.evaluation.protocol, "simulated": True, "git": None}
+        block = {"format": RESULT_FORMAT, "protocol": config.evaluation.protocol, "simulated": True} | THIS_CODE
         block |= {"prior": {"name": "simulated"}, "config": OmegaConf.to_container(config, resolve=True)}
         block["data"] = {"name": "synthetic", "sequence": f"room{config.dataset.seed}"}
         ate = 0.01 * (1 + config.dataset.seed) + 0.001 * config.prior.seed
@@ -136,6 +139,10 @@ def test_an_interrupted_evaluation_has_the_tables_of_what_is_finished_and_resume
         ("+variants.wide={slam.window_size:2.5}", r"slam\.window_size must be a whole number from 1 to 1000, got 2\.5"),
         ("seeds=[0,1.5]", r"prior\.seed must be a whole number, got 1\.5"),
         ("+variants={../..:{}}", "variant or method must be a name"),
+        ("+variants.other={prior.seed:7}", r"prior.seed=7 would have no effect, .*: give seeds=\["),
+        ("overrides=[prior.seed=5]", r"prior.seed=5 would have no effect, .*: give seeds=\["),
+        ("overrides=[dataset.seed=3]", r"dataset.seed=3 would .*: give suite.data.synthetic.sequences=\["),
+        ("overrides=[dataset=tum]", "dataset=tum would have no effect, .* own dataset: give suite=NAME"),
     ],
 )
 def test_a_value_or_name_that_is_refused_ends_the_evaluation_before_it_begins(evaluate, override, message):
@@ -155,6 +162,32 @@ def test_the_gate_passes_with_the_same_results_and_names_what_is_worse(evaluate,
     assert problem.startswith("regression: synthetic/room1/default: trajectory/ate_sim3_m is 0.0205, baseline 0.01")
     page = (evaluate.out / "report.html").read_text()
     assert "1 is worse than the gate allows" in page and "trajectory/ate_sim3_m is 0.0205, baseline 0.01" in page
+
+
+@pytest.mark.parametrize(
+    "other", [{"git": {"revision": "f" * 40, "dirty": False}}, {"git": None, "versions": {"emgs_jax": "0.0.1"}}]
+)
+def test_results_of_other_code_are_named_and_pass_no_gate(evaluate, tmp_path, capsys, other):
+    """After an update the gate passed at once: with the results of before."""
+    gate = tmp_path / "gate.yaml"
+    assert evaluate(f"write_gate={gate}") == [] and "other code" not in capsys.readouterr().out
+    (path,) = evaluate.out.glob("synthetic/1/*/0/metrics.json")
+    metrics = json.loads(path.read_text())
+    metrics["provenance"] |= other
+    path.write_text(json.dumps(metrics))
+    with pytest.raises(ValueError, match=r"results of other code are there, 1 of 2 \(synthetic/1/default/0\), and a g"):
+        evaluate(f"gate={gate}")
+    assert evaluate() == [] and evaluate.runs == [] and "they are not made anew" in capsys.readouterr().out
+    path.unlink()
+    assert evaluate(f"gate={gate}") == [] and evaluate.runs == [(1, 0)]
+
+
+def test_a_folder_of_other_roundings_is_looked_for_before_the_runs(evaluate, tmp_path):
+    """That there is none was told after all of the runs."""
+    for words in ([f"rounded={tmp_path / 'none'}", f"write_gate={tmp_path / 'gate.yaml'}"], [f"rounded={tmp_path}"]):
+        with pytest.raises(ValueError, match=r"^rounded=.* must be a folder of results of the same jobs, for write_g"):
+            evaluate(*words)
+    assert evaluate.runs == []
 
 
 def test_a_prior_without_a_seed_is_evaluated_with_one(evaluate):

@@ -9,6 +9,7 @@ import pytest
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, compose, dataset
 
 import experiments.predict
+from emgs_jax.io.files import owned
 from emgs_jax.prior.base import windows
 from emgs_jax.prior.simulated.prior import Simulated
 from experiments.predict import predict
@@ -54,6 +55,21 @@ def test_recording_again_asks_only_for_what_is_missing(tmp_path):
     record(folder)
     assert (folder / "000002.npz").read_bytes() == content
     assert (folder / "000000.npz").stat().st_mtime_ns == kept
+
+
+def test_a_folder_that_another_program_writes_into_is_refused(tmp_path):
+    with owned(tmp_path / "out"), pytest.raises(ValueError, match="another program is writing into .*out"):
+        record(tmp_path / "out")
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_folder_that_holds_a_run_is_refused(tmp_path):
+    """The recording lay among the files of a run, and its size was that of all of them."""
+    (tmp_path / "metrics.json").write_text("{}")
+    (tmp_path / "map.ply").write_text("")
+    with pytest.raises(ValueError, match=r"holds map.ply, metrics.json and no recording: give a folder of its own"):
+        record(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_what_a_prior_measures_of_itself_is_printed(tmp_path, capsys, monkeypatch):

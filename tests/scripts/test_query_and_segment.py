@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import own_process
@@ -10,8 +11,12 @@ from tiny_run import dataset
 
 from emgs_jax.config import configure
 from emgs_jax.data.backprojection import backproject
+from emgs_jax.io.files import owned
 from emgs_jax.report.run_files import claim_folder
+from experiments.export import export_run
+from experiments.polish import polish_run
 from experiments.query import query
+from experiments.report import report
 from experiments.segment import segment
 
 pytestmark = pytest.mark.slow
@@ -75,6 +80,23 @@ def test_a_command_says_what_it_did_and_nothing_of_its_libraries(exact_run, tmp_
     shutil.copytree(exact_run[0], tmp_path / "run")
     done = own_process.run("experiments.cli", "report", str(tmp_path / "run"))
     assert done.stderr == "" and done.stdout.startswith(f"{tmp_path}/run/report.html") and done.stdout.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [("polish", polish_run), ("export", export_run), ("report", lambda config: report(Path(config.folder)))],
+)
+def test_a_run_that_cannot_be_written_into_is_named_before_the_work(name, write, exact_run, tmp_path, monkeypatch):
+    """Of a disk that is read-only `emgs polish` spoke after it had fitted the splats, and of a file that never was."""
+    folder = shutil.copytree(exact_run[0], tmp_path / "run")
+    config = configure.compose(f"folder={folder}", name=name)
+    if name != "report":  # which is one short write at the end
+        monkeypatch.setattr(f"experiments.{name}.images_of", lambda run: (list(run.poses), ""))
+        with owned(folder), pytest.raises(ValueError, match="another program is writing into .*run"):
+            write(config)
+    monkeypatch.setattr("os.access", lambda *_: False)
+    with pytest.raises(ValueError, match=f"^folder={folder}: {folder} is no folder that can be written to"):
+        write(config)
 
 
 def test_a_new_run_in_the_folder_moves_the_answer_away(tmp_path):

@@ -14,7 +14,7 @@ import experiments.tables
 from emgs_jax.io.files import write_json
 from emgs_jax.report.provenance import RAW_PRIOR, RESULT_FORMAT, prefixed
 from emgs_jax.report.results import METRICS_FILE
-from experiments.tables import COLUMNS, SHORT, block, short_block, tables, write_blocks
+from experiments.tables import COLUMNS, SHORT, block, evaluations, short_block, tables, write_blocks
 
 PAGE = "before\n<!-- table: some -->\nold\n<!-- end -->\nbetween\n<!-- table: other -->\n<!-- end -->\nafter\n"
 ONE_COMMIT = {"revision": "0123456789abcdef", "dirty": False}
@@ -154,6 +154,26 @@ def test_what_is_finished_is_not_run_again_and_the_page_is_written_when_all_is_t
     monkeypatch.setattr(experiments.tables, "git_revision", lambda folder: None)
     tables(settings)
     assert len(runs) == 5 and (page.read_text(), Path(settings["full_page"]).read_text()) == (text, full)
+
+
+@pytest.mark.parametrize("page", ["page", "full_page"])
+def test_a_page_that_cannot_be_written_is_named_before_the_runs(settings, page, monkeypatch):
+    """Elsewhere than in the clone there is no README.md, which was told after all evaluations."""
+    monkeypatch.setattr(experiments.tables, "evaluate", None)
+    Path(settings[page]).unlink()
+    with pytest.raises(ValueError, match=f"{settings[page]} is no file: give page=FILE and full_page=FILE"):
+        tables(settings)
+    Path(settings[page]).write_text("no place")
+    with pytest.raises(ValueError, match="not one"):
+        tables(settings)
+
+
+def test_the_data_of_the_tables_may_lie_anywhere(settings):
+    (found,) = evaluations(settings | {"root": "it's [mine], ü"}, "some")
+    assert "it's [mine], ü" not in str(found["suite"]["data"]["synthetic"])
+    config = settings | {"root": "it's [mine], ü", "tables": {"one": [{"data": ["tum"], "seeds": [0], "settings": {}}]}}
+    (found,) = evaluations(config, "one")
+    assert "it's [mine], ü/" in str(found["suite"]["data"]["tum"])
 
 
 def test_both_pages_have_the_places_of_all_tables_every_row_has_a_title_and_both_are_of_one_commit():
