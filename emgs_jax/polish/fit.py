@@ -137,6 +137,15 @@ def fit(
     offsets, gains = jnp.zeros((len(views.poses), 6)), jnp.asarray(views.gains, jnp.float32)
     state = State(fitted, offsets, gains, adam.init(fitted), jax.vmap(adam.init)(offsets))
 
+    each = config.rates
+    rates = (
+        ("colors", each.colors),
+        ("logit", each.logit),
+        ("log_std", each.log_std),
+        ("turn", each.turn),
+        ("shift", each.shift),
+    )
+
     @eqx.filter_jit
     @full_precision
     def step(state: State, anchors: Anchors, view: View, decay: Array, terms: LossConfig):
@@ -149,11 +158,8 @@ def fit(
         (_, misfit), (slope, turn) = jax.value_and_grad(total, (0, 1), has_aux=True)(state.fitted, offset)
         change, moments = adam.update(slope, state.moments)
         move, pose_moments = adam.update(turn, pose_moments)
-        parts = {
-            name: x - decay * getattr(config.rates, name) * getattr(change, name)
-            for name, x in vars(state.fitted).items()
-        }
-        of_frame = offset - decay * config.rates.pose * move, misfit.gain**config.exposures, pose_moments
+        parts = {name: getattr(state.fitted, name) - decay * rate * getattr(change, name) for name, rate in rates}
+        of_frame = offset - decay * each.pose * move, misfit.gain**config.exposures, pose_moments
         of_all = state.offsets, state.gains, state.pose_moments
         offsets, gains, all_moments = jax.tree.map(lambda x, y: x.at[view.row].set(y), of_all, of_frame)
         return (State(Appearance(**parts), offsets, gains, moments, all_moments), misfit.mean_sq), misfit.overflow
