@@ -127,7 +127,6 @@ def e_step(
         gaussians: n of them, world frame.
         points: m observed points, world frame.
         noise: m; standard deviation of every point along its viewing ray, as a vector.
-        config: gates and weights.
         white: `whitening` of the Gaussians' covariances; None makes it here.
         groups: `group_points` of the valid Gaussians' means; likewise.
     """

@@ -48,7 +48,6 @@ class FitConfig(eqx.Module):
         points_per_gaussian: λ, in pixels of an image of 518 × 392, the paper's; a new Gaussian stands for so many. An
             image of another size is cut into as many pieces, but none of fewer than MIN_ROWS points.
         num_fit_neighbours: M of eq. 1 (R10).
-        num_kmeans_iterations: of Lloyd's algorithm.
         min_std: m; floor of a Gaussian's standard deviation in every direction.
         feature: the `medoid` of the points' features (printed), or their sum, to which EM and refinement add what
             other frames say: `accumulated` evidence (R16).

@@ -59,7 +59,6 @@ class LocalizationConfig(eqx.Module):
             `pose_std`; 1: their differences are ignored, those of depths are used (printed).
         num_alike, num_shared: frames that see one part of the map, and whose windows share images: they err alike, see
             `correct_by_points` and `correct`.
-        icp: the fine step.
         min_inlier_fraction: of the points, below which the fine pose is not accepted.
         max_residual: root mean square distance to the map's planes, as a fraction of the depth.
         max_step: between the coarse and the fine pose, as a fraction of the mean depth.
@@ -86,7 +85,6 @@ class CoarsePose(eqx.Module):
     """Result of the coarse step.
 
     Args:
-        T_world_camera: of the current frame.
         T_world_newest: temporary pose of the newest image (the current one's where there is none).
         scale: by which this prediction is multiplied about its cameras' origins.
         repeat_rms: m; disagreement of the two predictions of the previous image, after alignment.
@@ -115,14 +113,11 @@ class LocalizationInfo(eqx.Module):
         is_tracked: the fine pose passed every check.
         is_lost: not even the coarse pose is known.
         reason: bits into `REASONS`; 0 for a tracked frame.
-        scale: of this prediction.
         repeat_rms: see `CoarsePose`.
         depth_noise: of the points, as a fraction of their depth: how much they differ from the map.
         noise: likewise of each point, as those of its level of confidence do, in the order of the rows.
         step_m: between the coarse and the fine pose.
-        step_rad: likewise.
         estimate: how well this frame is known.
-        icp: of the fine step.
     """
 
     is_tracked: Bool[Array, ""]
@@ -200,7 +195,6 @@ def _correct_by_prior(
         scale: likewise.
         anchored: the prior's own pose, and its standard deviations.
         estimate: uncertainty of the estimate.
-        config: readings.
     """
     pose, std = anchored
     apart = (T_world_camera.inverse() @ pose).log()
@@ -226,11 +220,8 @@ def localize_coarse(
     """Coarse registration through the previous frame, which was predicted twice, fused with the prior's own pose.
 
     Args:
-        prediction: of this call.
         previous: the previous frame as it was aligned with the map, world frame.
-        T_world_previous: its pose.
         camera: of the (thinned) rows.
-        config: readings.
         estimate: of the previous frame; None: its pose is exact.
     """
     now, estimate = prediction.previous, exact_estimate() if estimate is None else estimate
@@ -270,8 +261,6 @@ def localize_fine(
     Args:
         current: camera frame, unscaled.
         submap: Gaussians, world frame.
-        coarse: result of `localize_coarse`.
-        config: terms, gates and checks.
         white: `whitening` of the submap's covariances; None makes it here.
         groups: `group_points` of the valid Gaussians' means; likewise.
 

@@ -177,7 +177,6 @@ def refine(
         candidates: Gaussians of the points that EM did not fuse.
         T_world_camera: refined pose.
         camera: of the images that are rendered.
-        config: gates and margins.
 
     Returns:
         The submap with merged candidates, the candidates with only the fresh ones valid, and counts.

@@ -27,7 +27,6 @@ class RunConfig:
 
     Args:
         settings: everything, as plain values; what the next ones are made of.
-        slam: all stages.
         densify: what of a rendered view becomes a point.
         evaluation: the protocol of the comparison with the truth.
         graph: the back end; None with `graph=none`.
@@ -64,10 +63,6 @@ def load_config(*overrides: str, name: str = "config") -> RunConfig:
 
 def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
     """Map the sequence of a config; the run holds the map, and a record with a pose for every frame.
-
-    Args:
-        config: of `load_config`.
-        show_progress: draw a bar.
 
     Raises:
         ValueError: the data set, the prior or a frame cannot be used.

@@ -46,14 +46,10 @@ class SlamConfig(eqx.Module):
         window_size: |S|, images in the FIFO that the prior sees before the current one.
         initialization: `merged` (printed): all views of the first window are clustered together; `incremental`: the
             first view is, and the others are integrated one by one.
-        observation: point maps to observations.
         fit: points to Gaussians (eq. 1).
         submap: what a step works on, and capacities.
-        localization: coarse and fine.
-        em: E- and M-step.
         extrapolation: of depth errors to points that no Gaussian explains.
         splitting: of Gaussians that are too coarse for a nearer view.
-        refinement: on the image plane.
         existence: evidence of later frames for and against a Gaussian.
     """
 
@@ -87,9 +83,7 @@ class SlamState(eqx.Module):
     """State between two steps.
 
     Args:
-        map: all Gaussians.
         previous: the last frame as it was aligned, world frame.
-        T_world_previous: its pose.
         estimate: uncertainty of its pose and scale.
         time: frames so far, those that could not be placed included.
     """
@@ -126,7 +120,6 @@ class Submap(eqx.Module):
     """M*, the part of the map that a step works on, with what is found once for all stages.
 
     Args:
-        map: its Gaussians.
         rows: where they are in the whole map; its capacity where there is none.
         white: `whitening` of their covariances.
         groups: `group_points` of their means.
@@ -144,10 +137,7 @@ class Frame(eqx.Module):
     """A frame at its fine pose.
 
     Args:
-        T_world_camera: its pose.
         points: its observation, world frame.
-        localization: how it was found.
-        time: its number.
     """
 
     T_world_camera: jaxlie.SE3
@@ -170,7 +160,6 @@ class Fused(eqx.Module):
         halves: the second halves of what was split.
         unexplained: points that no Gaussian explains; their depth errors are extrapolated from the map's surfaces.
         origin: median birth of the Gaussians that explain the others; the frame's own time where none does.
-        em: counts.
     """
 
     map: GaussianMap
@@ -201,9 +190,7 @@ def init_state(
 
     Args:
         views: the window's observations, camera frames, oldest first.
-        T_world_views: their poses.
         camera: of the full images.
-        config: all stages.
 
     Returns:
         The state, and how many Gaussians did not fit into the map's capacity.
@@ -235,10 +222,7 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
     anew and not the work on the submap; inside another jit or vmap all of it is one, which rounds differently.
 
     Args:
-        state: of the last step.
-        prediction: of this one.
         camera: of the full images.
-        config: all stages.
     """
     view = downscale(camera, config.observation.thin)  # its pixels are an observation's rows
     num_rows = spacing(camera, config.observation.thin, config.fit)

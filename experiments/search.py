@@ -172,11 +172,7 @@ def ask(
     """Trials that are to be measured next: new ones until there are `end`, and those that were asked for before.
 
     Args:
-        study: that is extended.
-        space: to draw from.
         own: the config's values; the first trial, where they are in the space.
-        end: number of trials.
-        seed: of the search.
         startup: trials before the search learns.
     """
     optuna = _optuna()

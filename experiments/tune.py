@@ -37,14 +37,7 @@ Setting = Mapping[str, Any]
 
 
 class Measured:
-    """A sequence, and what settings came to on it: kept on disk after every chunk, measured once.
-
-    Args:
-        name: of the sequence.
-        config: composed for it.
-        folder: of its results.
-        clock: of the whole search.
-    """
+    """A sequence, and what settings came to on it: kept on disk after every chunk, measured once."""
 
     def __init__(self, name: str, config: DictConfig, folder: Path, clock: Clock) -> None:
         self.name, self.config, self._folder, self._clock = name, config, folder, clock
@@ -88,7 +81,6 @@ def tune(words: Sequence[str], folder: Path) -> list[dict[str, Any]]:
     """Search, and write what was found into `folder`.
 
     Args:
-        words: overrides of conf/tune.yaml.
         folder: of the results; one that holds a part of the same search is continued.
 
     Returns:

@@ -31,16 +31,13 @@ class BackEndConfig:
     Args:
         noise: of sequential and map factors.
         place_recognition: keyframes, and candidates by their appearance.
-        verification: of a candidate.
         consistency: spatial consistency of verified loops.
         prior_query: second measurement of loops by the prior.
         every: frames between keyframes.
         min_violation: χ² of a loop at the current poses beyond which it violates them: only such a loop starts a
             closure, and only for such a loop the prior is queried.
         min_frames: between two closures.
-        solver: of the pose graph.
         deform: of the map, to follow the optimized poses.
-        relocalization: of a lost camera.
     """
 
     noise: NoiseConfig
@@ -79,8 +76,6 @@ class BackEnd:
     """State of the back end: nodes, factors and loops of the pose graph so far. Nothing of it is ever changed in place.
 
     Args:
-        config: all settings.
-        intrinsics: of the images.
         min_std: floor of the map's covariances.
         poses: current T_world_camera (4, 4) of the nodes.
         log_scales: σ of their inferences, likewise.
@@ -88,7 +83,6 @@ class BackEnd:
         frames: index in the data set of every node.
         is_placed: True for nodes in the map: those that are neither degraded nor lost.
         submap_ids: disconnected submap of every node; the relative pose of two submaps is not known.
-        factors: of the pose graph.
         database: keyframes; their `frame` is the node.
         verified: loops that passed every gate of two keyframes.
         violating: loops with a free-space violation.

@@ -28,7 +28,6 @@ class Bonn(Tum):
     """One sequence of Bonn RGB-D Dynamic; what a list lacks is treated as in `Tum`.
 
     Args:
-        root: folder that holds the sequences.
         sequence: "rgbd_bonn_balloon".
         start, stop, stride: which of the images in rgb.txt, in order of time.
         size: (width, height) of the frames given out.

@@ -52,7 +52,6 @@ def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:
     """The images of a camera and its poses.
 
     Args:
-        folder: of the sequence.
         truth: poses of camera 0; a poses.txt in `folder` does as well, and without either there is none.
         camera: 0 to 3.
 

@@ -32,7 +32,6 @@ class RosBag:
     """The images of one topic.
 
     Args:
-        root: bag.
         sequence: bag below root; None = root itself.
         topic: of sensor_msgs/Image or CompressedImage; None = the only one.
         info_topic: of sensor_msgs/CameraInfo; None = camera_info beside the topic, or the only one.

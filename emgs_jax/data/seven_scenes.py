@@ -36,7 +36,6 @@ class SevenScenes:
     """One sequence of 7-Scenes.
 
     Args:
-        root: folder that holds the scenes.
         sequence: "SCENE/seq-XX".
         start, stop, stride: which of the images that are there, in order.
         size: (width, height) of the frames given out.
@@ -133,7 +132,6 @@ def read_poses(path: Path, sequence: str) -> dict[float, Float[np.ndarray, "4 4"
     qy qz tx ty tz focal", world -> colour camera; # begins a comment.
 
     Args:
-        path: the list.
         sequence: seq-XX; lines of other sequences are left out.
 
     Raises:

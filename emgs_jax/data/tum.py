@@ -43,7 +43,6 @@ class Tum:
     inf or nan, has none. A list that no image has anything of is an error.
 
     Args:
-        root: folder that holds the sequences.
         sequence: "rgbd_dataset_freiburg1_desk"; freiburg1, 2 and 3 in the name choose the calibration.
         start, stop, stride: which of the images in rgb.txt, in order of time.
         size: (width, height) of the frames given out.

@@ -64,7 +64,6 @@ class VoxelConfig:
     """The mean of all points of each voxel.
 
     Args:
-        voxel_m: its side.
         max_footprint_px: a point is drawn as the square that its voxel covers, but at most so far to each side: what
             lies just before the camera would fill the image.
         surface_depth: see `draw_voxels`.
@@ -92,7 +91,6 @@ class TsdfConfig:
     surfaces nearer to each other than that disturb each other.
 
     Args:
-        voxel_m: side of a voxel.
         truncation_m: distance at which the field ends; a few voxels, and more than the noise of the depth.
         min_views: that must have seen a place.
     """

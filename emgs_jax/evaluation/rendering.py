@@ -40,7 +40,6 @@ class Rendered:
     Args:
         dataset: with the images and the true depth.
         poses: of the estimate and the true ones (n, 4, 4), for the scale; None: nothing is compared.
-        config: the protocol.
         has_classes: each view comes with the classes of its pixels.
     """
 

@@ -55,7 +55,6 @@ class AlignmentConfig:
         min_extent: between the 5 % and the 95 % quantile along one of the axes.
         max_depth_scatter: standard deviation of the points' log depth ratio (from the MAD).
         scale_std: of the prior's log-scale; the ratio of two may be 3 √2 times that. Infinite without a metric prior.
-        refine: the final pose.
     """
 
     max_ratio: float = number(low=0, high=1)

@@ -84,7 +84,6 @@ def prepare_step(first: FirstWindow, camera: Camera, config: SlamConfig) -> None
     Args:
         first: whose shapes the observations of the sequence have.
         camera: of the full images.
-        config: all stages.
     """
     calls: list[tuple[Callable, tuple]] = []
 

@@ -44,9 +44,7 @@ class Checkpoint:
     """A run after some of its inputs.
 
     Args:
-        num_inputs: integrated so far.
         leaves: of the state, in the order of `jax.tree.leaves`; none before there is a map.
-        capacities: of map and submap.
         records: as the frames were placed.
         inactive: leaves of the states of the other disconnected submaps, by their number.
     """
@@ -134,7 +132,6 @@ class Keeper:
     """Owner of a run's checkpoint file: `found` is the checkpoint to resume from, None where there is none.
 
     Args:
-        path: of the file.
         config: when it is written; None = never.
         signature: settings that must match those of the checkpoint.
     """

@@ -70,10 +70,8 @@ def to_first_window(
     """Select the views that a map can start from: the dense ones, from the first with a pose and a valid point on.
 
     Args:
-        prediction: of a window.
         frames: by index; those of the window.
         T_world_anchor: known pose of the first frame, (4, 4).
-        config: normals and thinning.
         since: views of earlier frames are left out.
 
     Returns:
@@ -106,7 +104,6 @@ def to_prediction(
         prediction: dense in (previous, current).
         frames: by index; those of the window.
         T_world_anchor: known pose of the first frame, (4, 4).
-        config: normals and thinning.
 
     Raises:
         ValueError: a shape differs from the images'.

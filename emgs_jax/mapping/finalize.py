@@ -34,7 +34,6 @@ def own_covariance(state: SlamState, config: LocalizationConfig) -> np.ndarray:
 
     Args:
         state: after the last step; m of its map.
-        config: of the steps.
     """
     estimate, last = state.estimate, state.previous
     is_known = np.asarray(last.valid).any() and np.asarray(estimate.repeats.counts)[0] > 0

@@ -39,10 +39,7 @@ def relocalize_lost(
     `location` of the frame tells the outcome.
 
     Args:
-        before: the run before the step.
-        run: after it, with the pose that it has estimated.
-        frame: likewise.
-        window: of the frame.
+        run: after the step, with the pose that it has estimated.
     """
     if not is_relocalization_due(before, frame.info):
         return run, frame
@@ -84,9 +81,7 @@ def is_restart_due(run: MappingRun, window: WindowInput, state: SlamState, info:
 
     Args:
         run: before this frame.
-        window: this frame.
         state: after its step.
-        info: of its step.
     """
     count = _num_untracked(run, info)
     is_due = not run.is_fixed and count >= run.back_end.config.relocalization.max_patience

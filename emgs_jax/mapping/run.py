@@ -34,7 +34,6 @@ class MappingRun:
     """State of a run so far. Nothing of it is ever changed in place: each input makes a new one.
 
     Args:
-        camera: of the frames.
         config: all stages; capacities grow where they must.
         clock: counts load, predict and map.
         state: None before the first window.

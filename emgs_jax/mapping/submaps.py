@@ -74,8 +74,7 @@ def match_submap(run: MappingRun, window: WindowInput, frame: TrackedFrame) -> T
 
     Args:
         run: after the step of this frame, before its record.
-        window: this frame.
-        frame: likewise, in its own submap.
+        frame: of that step, in its own submap.
     """
     if not run.inactive or frame.location is not None or not bool(frame.info.localization.is_tracked):
         return frame

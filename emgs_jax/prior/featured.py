@@ -16,7 +16,6 @@ class Featured(Prior):
 
     Args:
         prior: for poses, points, confidence and mask, which are passed on unchanged.
-        model: for features and text embeddings.
     """
 
     def __init__(self, prior: Prior, model: FeatureModel) -> None:

@@ -149,7 +149,6 @@ def icp(
         T_world_coarse: where to start, and the mean of the prior.
         known: root of the information of the coarse pose and scale, (xi, log s), where there is a prior.
         noise: standard deviation of the points' depth as a fraction of it.
-        config: terms and gates.
         white: `whitening` of the target's covariances; None makes it here.
         groups: `group_points` of the valid Gaussians' means; None makes it here.
 

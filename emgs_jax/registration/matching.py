@@ -89,8 +89,6 @@ def match(
     Args:
         points: p of them, world frame.
         noise: m; standard deviation of every point along its viewing ray, as a vector.
-        candidates: Gaussians near every point.
-        surface: the Gaussians.
         gates: largest squared Mahalanobis distance and smallest cosine between the normals of an inlier.
     """
     (rows, found), gaussians = candidates, surface.gaussians

@@ -28,7 +28,6 @@ class IcpConfig(eqx.Module):
             "Colored point cloud registration revisited", ICCV 2017); `distribution`: offset from the mean, whitened by
             the Gaussian's covariance; `colored+distribution`: offset and intensity difference; or `colored+ray`: depth
             along the viewing ray over that of the Gaussian's plane, and intensity difference.
-        color_std: standard deviation of intensity.
         noise: factor on the points' noise along their viewing rays, which widens every Gaussian for them.
         max_misfit: fraction of the depth; a point farther from its Gaussian's plane shows something else, and says
             nothing of the noise; 0 takes the noise as it is given.
@@ -42,7 +41,6 @@ class IcpConfig(eqx.Module):
         num_searches: how often the Gaussians near every point are looked up, each time with a solve after it.
         num_neighbours: Gaussians near a point, which every step of a solve compares.
         num_color_neighbours: Gaussians from which a Gaussian's intensity gradient is fitted.
-        max_steps: of every solve.
         tolerance: relative and absolute, of the solver; float32 tells no smaller differences apart than the least.
     """
 

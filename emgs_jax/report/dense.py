@@ -55,9 +55,7 @@ def dense_map(
     """Render the map from the pose of every frame that is not lost.
 
     Args:
-        run: finished.
         dataset: for the images, and the truth.
-        config: what becomes a point.
         evaluation: points of one of its voxels, of the truth where that is known, are averaged, and views are
             compared with the truth under it.
         labelled: `labelled_map` of the run, which says the class of each point.
@@ -115,7 +113,6 @@ def uncontradicted(
         points: of the frame, camera frame, (h, w, 3) in the map's lengths; 0 where there is none. They need not lie on
             the rays of the camera.
         view: the map as it is drawn from the frame's pose, on the host.
-        camera: of the view.
         surface_depth: fraction of the map's depth by which a point may differ from it.
 
     Returns:

@@ -33,7 +33,6 @@ def rounding_tolerances(
         tolerances: the least ones, as for `write_gate`.
         estimates: of some seeds, better more than those of the baseline.
         rounded: of the same jobs, computed by other instructions of the processor.
-        num_seeds: of the baseline.
     """
     again = {_job(item): item.values for item in rounded if item.kind == "ours"}
     pairs = [(item.values, again[_job(item)]) for item in estimates if item.kind == "ours" and _job(item) in again]

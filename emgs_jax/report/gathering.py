@@ -51,7 +51,6 @@ class Baselines:
     is fused with (median), so that the prior's own unit does not matter; 1 m where it shows no true depth.
 
     Args:
-        configs: by name.
         observation: which points the map takes.
         dataset: for the camera and the truth.
     """
@@ -102,7 +101,6 @@ def gather(
         frames: records, which baselines need, and views of all frames.
         evaluation: how normals are fitted.
         keeps_points: the truth is known, or points are to lie at them.
-        baselines: that take the views, too.
         text: names of the classes that pixels are labelled with, and their embeddings; None: no labels.
     """
     cloud, kept, classes = SpooledCloud(), Spool(), Spool()

@@ -59,7 +59,6 @@ class Answer:
     Args:
         gaussians: the confirmed ones are valid; on the device.
         relevance: of all rows of the map, on the host.
-        rows: of the confirmed Gaussians.
         instances: objects of each word, rows of the map.
         reach: distance within which answers are one object, in the unit of the map.
     """

@@ -89,7 +89,6 @@ def draw_answer(path: Path, run: RecordedRun, answer: Answer, views: Sequence[Se
     """Draw a line for each word and view: the map in its colours, the word's relevance, the classes with a legend.
 
     Args:
-        views: of each word.
         max_words: those with the most answers.
 
     Returns:

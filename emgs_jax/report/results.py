@@ -23,7 +23,6 @@ class Estimate:
         kind: "ours", "raw prior", another one of `ROWS`, or "scored" for another system.
         prior: its name; None for another system.
         revision: of the code; None where unknown.
-        values: the metrics that are numbers.
     """
 
     folder: Path

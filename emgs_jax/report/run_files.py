@@ -127,7 +127,6 @@ def save_outputs(
     """Write the files that show the map; returns what could not be made, and why.
 
     Args:
-        title: of the picture.
         with_scale: the true path is drawn where it fits best by a similarity, not by a rigid motion, as it is scored.
         unit: of the map's lengths, as the picture says it.
     """

@@ -154,7 +154,6 @@ def table(found: Mapping[str, Any], published: Sequence[Mapping[str, Any]]) -> s
     """Write the mean or sum over the scenes, each scene, and quoted rows in Markdown.
 
     Args:
-        found: `summary`.
         published: method, source, protocol, and `values`: mIoU, f-mIoU, Acc and ATE [cm], null where unknown.
     """
     scenes = found["scenes"]
