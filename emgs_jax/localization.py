@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.gaussians import Gaussians
+from emgs_jax.gaussians import GaussianIndex, Gaussians
 from emgs_jax.observation import Observation, Prediction, transform
 from emgs_jax.ops.camera import Camera
-from emgs_jax.ops.linalg import Whitening, safe_normalize
-from emgs_jax.ops.neighbours import Groups
+from emgs_jax.ops.linalg import safe_normalize
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
 from emgs_jax.registration.icp import IcpInfo, icp
@@ -26,7 +25,7 @@ from emgs_jax.registration.pose_estimate import (
     root_information,
 )
 from emgs_jax.registration.pose_noise import LEAST_NOISE, NO_INFORMATION, axis_std, repeat_poses
-from emgs_jax.registration.problem import IcpConfig
+from emgs_jax.registration.problem import CoarseStart, IcpConfig
 from emgs_jax.registration.repeated_prediction import repeat_error, repeat_scale, through_previous
 from emgs_jax.registration.rigid import MIN_PAIRS, pose_row, scale_translation
 
@@ -253,23 +252,21 @@ def localize_fine(
     submap: Gaussians,
     coarse: CoarsePose,
     config: LocalizationConfig,
-    white: Whitening | None = None,
-    groups: Groups | None = None,
+    index: GaussianIndex | None = None,
 ) -> tuple[jaxlie.SE3, Observation, LocalizationInfo]:
     """Fine registration against the submap; the coarse pose and scale stay where a check fails.
 
     Args:
         current: camera frame, unscaled.
         submap: Gaussians, world frame.
-        white: `whitening` of the submap's covariances; None makes it here.
-        groups: `group_points` of the valid Gaussians' means; likewise.
+        index: of the submap; None makes it here.
 
     Returns:
         T_world_camera, the observation in the world frame, and the outcome.
     """
     scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
-    known = root_information(coarse.estimate.covariance)
-    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, known, coarse.depth_noise, config.icp, white, groups)
+    start = CoarseStart(coarse.T_world_camera, root_information(coarse.estimate.covariance), coarse.depth_noise)
+    fine, scale, info = icp(scaled, submap, start, config.icp, index)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     # The length has no gradient where a step is zero, which it is to the bit with an exact prior; this has.
     step_m, step_rad = (part @ safe_normalize(part) for part in (step[:3], step[3:]))

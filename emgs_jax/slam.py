@@ -21,15 +21,14 @@ from emgs_jax.gaussian_map import (
     select_submap,
     write_back,
 )
-from emgs_jax.gaussians import FitConfig, Gaussians, cluster, spacing
+from emgs_jax.gaussians import FitConfig, GaussianIndex, Gaussians, cluster, index_of, spacing
 from emgs_jax.initialization import initialize
 from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
 from emgs_jax.observation import Observation, ObservationConfig, Prediction, transform
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.executable import executable
-from emgs_jax.ops.linalg import Whitening, whitening
-from emgs_jax.ops.neighbours import Groups, group_points, order_of
+from emgs_jax.ops.neighbours import group_points, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, static_choice, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
@@ -121,15 +120,12 @@ class Submap(eqx.Module):
 
     Args:
         rows: where they are in the whole map; its capacity where there is none.
-        white: `whitening` of their covariances.
-        groups: `group_points` of their means.
         overflow: how many Gaussians did not fit.
     """
 
     map: GaussianMap
     rows: Int[Array, "s"]
-    white: Whitening
-    groups: Groups
+    index: GaussianIndex
     overflow: Int[Array, ""]
 
 
@@ -268,9 +264,7 @@ def _localize_coarse(
 @executable
 def _select(map: GaussianMap, previous: Observation, guess: Observation, config: SubmapConfig) -> Submap:
     submap, rows, overflow = select_submap(map, (previous, guess), config)
-    gaussians = submap.gaussians
-    white, groups = whitening(gaussians.covs), group_points(gaussians.means, gaussians.valid)
-    return Submap(submap, rows, white, groups, overflow)
+    return Submap(submap, rows, index_of(submap.gaussians), overflow)
 
 
 @executable
@@ -279,8 +273,9 @@ def _localize_fine(
 ) -> Frame:
     """The frame at its fine pose, against what is confirmed."""
     target = confirmed(submap.map)
-    groups = group_points(target.means, target.valid, order_of(submap.groups, target.valid.shape[0]))
-    T, aligned, localization = localize_fine(current, target, coarse, config, submap.white, groups)
+    groups = group_points(target.means, target.valid, order_of(submap.index.groups, target.valid.shape[0]))
+    index = GaussianIndex(submap.index.white, groups)
+    T, aligned, localization = localize_fine(current, target, coarse, config, index)
     return Frame(T, aligned, localization, time)
 
 
@@ -289,7 +284,7 @@ def _fuse(submap: Submap, frame: Frame, view: Camera, num_rows: int, config: Fus
     """Fuse the points of a frame that is tracked, and split what they show to be too coarse."""
     T, trusted = frame.T_world_camera, frame.trusted
     noise = frame.localization.noise[:, None] * (trusted.points - T.translation())
-    map, explained, info = em_update(submap.map, trusted, noise, config.em, submap.white, submap.groups)
+    map, explained, info = em_update(submap.map, trusted, noise, config.em, submap.index)
     owned = owners(explained, map.birth.shape[0])
     births = take_rows(map.birth, owned).astype(jnp.float32)
     origin = jnp.where(info.num_fused > 0, median(births, explained.is_fused), frame.time).astype(jnp.int32)

@@ -22,7 +22,7 @@ from emgs_jax.ops import clustering, linalg, neighbours
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.pose_graph import deform, factors
 from emgs_jax.refinement import refine
-from emgs_jax.registration import icp, noise, pose_estimate, pose_noise, rigid
+from emgs_jax.registration import icp, noise, pose_estimate, pose_noise, problem, rigid
 from emgs_jax.render import composite, densify, project
 
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
@@ -173,7 +173,9 @@ VERBS = {
         lambda s: (belief_of(s),),
     ),
     "icp": (
-        lambda o, g, T: icp.icp(o, g, T, jnp.diag(50.0 * jnp.ones(7)), ONE * 0.01, CONFIG.localization.icp),
+        lambda o, g, T: icp.icp(
+            o, g, problem.CoarseStart(T, jnp.diag(50.0 * jnp.ones(7)), ONE * 0.01), CONFIG.localization.icp
+        ),
         lambda s: (
             sc.moved_points(sc.pose_of(np.linalg.inv(sc.matrix_of(sc.path_pose(s)))), close(s)),
             sc.random_gaussians(32, s, 2),
