@@ -115,7 +115,7 @@ def graph_of(seed: int) -> factors.PoseGraph:
         *map(sc.device, (rng.normal(size=6), rng.normal(size=(6, 7, 7)))),
     )
     return factors.PoseGraph(
-        nodes, factors.Factors(*map(sc.device, (a, b)), *said, sc.device(a % 2), sc.device(np.arange(6) < 5))
+        nodes, factors.Factors(*map(sc.device, (a, b)), *said, sc.device(a % 2 == 1), sc.device(np.arange(6) < 5))
     )
 
 
@@ -257,7 +257,7 @@ VERBS = {
     "residuals": (factors.residuals, lambda s: (graph_of(s),)),
     "linearize": (factors.linearize, lambda s: (graph_of(s),)),
     "robust": (
-        lambda chi2, kernel: factors.robust(chi2, jnp.arange(6) % 2, kernel),
+        lambda chi2, kernel: factors.robust(chi2, jnp.arange(6) % 2 == 1, kernel),
         lambda s: (sc.device(np.linspace(0.0, 60.0 + s, 6)), sc.device(16.8)),
     ),
     "classify": (semantics.classify, lambda s: (sc.random_gaussians(9, s, 2), sc.device(np.eye(2)))),

@@ -20,7 +20,6 @@ from emgs_jax.loop_closure.relocalization import RelocalizationConfig
 from emgs_jax.loop_closure.verification import LoopMeasurement, VerificationConfig
 from emgs_jax.ops.ranges import number
 from emgs_jax.pose_graph.deform import DeformConfig
-from emgs_jax.pose_graph.factors import ODOMETRY
 from emgs_jax.pose_graph.optimize import PoseGraphConfig, PoseGraphInfo
 
 
@@ -150,8 +149,8 @@ def add_node(
 
 
 def _is_connected(end: BackEnd, row: int) -> bool:
-    """Test whether a node is in the map or has an odometry factor; False for nodes before the camera was found."""
-    has_factor = any(factor.a == row and factor.kind == ODOMETRY for factor in end.factors)
+    """Test whether a node is in the map or has a factor other than loops; False before the camera was found."""
+    has_factor = any(factor.a == row and not factor.is_loop for factor in end.factors)
     return row >= end.connected_since and (end.is_placed[row] or has_factor)
 
 
