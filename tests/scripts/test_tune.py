@@ -10,6 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 from tiny_run import TINY
 
+import experiments.together
 import experiments.tune
 from emgs_jax.config.configure import compose
 from experiments.command import check_arguments
@@ -46,9 +47,9 @@ def measured(monkeypatch):
         chunks.append((seed, [variant.setting for variant in chunk]))
         return [known_metrics(seed, variant.setting) for variant in chunk]
 
-    monkeypatch.setattr(experiments.tune, "map_and_score", measure)
-    monkeypatch.setattr(experiments.tune, "new_scorer", lambda *_: None)
-    monkeypatch.setattr(experiments.tune, "replayed", lambda prior, *_: prior)
+    monkeypatch.setattr(experiments.together, "map_and_score", measure)
+    monkeypatch.setattr(experiments.together, "new_scorer", lambda *_: None)
+    monkeypatch.setattr(experiments.together, "replayed", lambda prior, *_: prior)
     return chunks
 
 
@@ -151,13 +152,13 @@ def test_a_metric_that_is_none_is_named_and_a_trial_without_a_value_fails_and_th
 ):
     with pytest.raises(ValueError, match=f"trajectory/ate_sim_m of own is no metric; near names: {ATE}"):
         experiments.tune.tune([*WORDS, "objectives=[minimize trajectory/ate_sim_m]"], tmp_path / "other")
-    measure = experiments.tune.map_and_score
+    measure = experiments.together.map_and_score
 
     def lost(work, chunk, bar):
         found = measure(work, chunk, bar)
         return [m | {ATE: None} if v.setting[GAP] == 4.0 else m for m, v in zip(found, chunk, strict=True)]
 
-    monkeypatch.setattr(experiments.tune, "map_and_score", lost)
+    monkeypatch.setattr(experiments.together, "map_and_score", lost)
     rows = experiments.tune.tune([*WORDS, "trials=12"], tmp_path)
     missing = [row for row in rows if row[GAP] == 4.0]
     assert len(rows) == 12 and missing and all(row[ATE] is None for row in missing)
