@@ -150,7 +150,6 @@ def merge_duplicates(
     of the means along the surface only: a wall does not become thicker by being two layers.
 
     Args:
-        map: of which the submap is enough.
         is_seen: Gaussians that may be joined.
         origins: of the camera of the frame, world frame; one for all, or one for each.
         depth_noise: as a fraction of the depth.

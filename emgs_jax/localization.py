@@ -109,14 +109,11 @@ class LocalizationInfo(eqx.Module):
     """Outcome of one frame.
 
     Args:
-        is_tracked: the fine pose passed every check.
-        is_lost: not even the coarse pose is known.
         reason: bits into `REASONS`; 0 for a tracked frame.
         repeat_rms: see `CoarsePose`.
         depth_noise: of the points, as a fraction of their depth: how much they differ from the map.
         noise: likewise of each point, as those of its level of confidence do, in the order of the rows.
         step_m: between the coarse and the fine pose.
-        estimate: how well this frame is known.
     """
 
     is_tracked: Bool[Array, ""]
@@ -193,7 +190,6 @@ def _correct_by_prior(
         T_world_camera: estimate before the measurement.
         scale: likewise.
         anchored: the prior's own pose, and its standard deviations.
-        estimate: uncertainty of the estimate.
     """
     pose, std = anchored
     apart = (T_world_camera.inverse() @ pose).log()

@@ -34,9 +34,6 @@ class RefinementConfig(eqx.Module):
         cosine_weight: how much of ω is the features' cosine: 1 as printed; 0: features decide nothing here.
         max_splat_std: pixels of the rendered image; a wider candidate is scattered points, not a surface, and is
             dropped; `inf` as printed.
-        render: how both sets are drawn.
-        average: gain and blend, those of the EM step.
-        feature: likewise.
     """
 
     num_candidates: int = static(low=1, high=256)

@@ -29,7 +29,6 @@ class RunConfig:
         settings: everything, as plain values; what the next ones are made of.
         densify: what of a rendered view becomes a point.
         evaluation: the protocol of the comparison with the truth.
-        graph: the back end; None with `graph=none`.
     """
 
     settings: dict[str, Any]
@@ -44,7 +43,6 @@ def load_config(*overrides: str, name: str = "config") -> RunConfig:
 
     Args:
         overrides: as for `emgs run`; `emgs run --help` lists them.
-        name: of a file of conf/.
 
     Raises:
         ValueError: an override names no key or option; the message names near ones.

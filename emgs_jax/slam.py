@@ -45,8 +45,6 @@ class SlamConfig(eqx.Module):
         window_size: |S|, images in the FIFO that the prior sees before the current one.
         initialization: `merged` (printed): all views of the first window are clustered together; `incremental`: the
             first view is, and the others are integrated one by one.
-        fit: points to Gaussians (eq. 1).
-        submap: what a step works on, and capacities.
         extrapolation: of depth errors to points that no Gaussian explains.
         splitting: of Gaussians that are too coarse for a nearer view.
         existence: evidence of later frames for and against a Gaussian.
@@ -120,7 +118,6 @@ class Submap(eqx.Module):
 
     Args:
         rows: where they are in the whole map; its capacity where there is none.
-        overflow: how many Gaussians did not fit.
     """
 
     map: GaussianMap
@@ -152,8 +149,6 @@ class Fused(eqx.Module):
     """Submap after a frame's points are fused into it.
 
     Args:
-        map: the submap's Gaussians after EM and splitting.
-        halves: the second halves of what was split.
         unexplained: points that no Gaussian explains; their depth errors are extrapolated from the map's surfaces.
         origin: median birth of the Gaussians that explain the others; the frame's own time where none does.
     """

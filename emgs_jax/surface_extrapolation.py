@@ -79,7 +79,6 @@ def extrapolate(
     Args:
         aligned: the frame, world frame, one row a pixel of `camera`.
         explained_by: the Gaussian that explains each point best, as it was before this frame, and its weight W.
-        is_fused: where there is one.
         noise: of each point, as a fraction of its depth.
         camera: of the rows.
     """

@@ -26,7 +26,6 @@ class Euroc(PosedImages):
         sequence: "MH_01_easy".
         camera: "cam0" (left) or "cam1".
         start, stop, stride: which of the images in data.csv, in order of time.
-        size: (width, height) of the frames given out.
         max_time_difference: seconds between an image and its pose.
     """
 

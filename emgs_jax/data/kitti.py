@@ -26,7 +26,6 @@ class Kitti(PosedImages):
         sequence: "00"; of 7 the two digits 07.
         camera: 0 and 1 are grey, 2 and 3 in colour, left and right.
         start, stop, stride: which of the images, in order of their names.
-        size: (width, height) of the frames given out.
     """
 
     name = "kitti"

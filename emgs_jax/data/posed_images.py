@@ -120,7 +120,6 @@ class Colmap(PosedImages):
         model: folder of the model below that; None = the first of MODEL_FOLDERS that has one, of several the largest.
         images: folder of the images below that.
         start, stop, stride: which of the registered images, in natural order of their names.
-        size: (width, height) of the frames given out.
     """
 
     name = "colmap"
@@ -147,7 +146,6 @@ class Nerfstudio(PosedImages):
     Args:
         sequence: folder below root; None = root itself.
         start, stop, stride: which of its images, in natural order of their names.
-        size: (width, height) of the frames given out.
     """
 
     name = "nerfstudio"

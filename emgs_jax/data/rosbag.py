@@ -37,7 +37,6 @@ class RosBag:
         info_topic: of sensor_msgs/CameraInfo; None = camera_info beside the topic, or the only one.
         intrinsics: as `Images` takes them; None = those of the first CameraInfo.
         start, stop, stride: which of the images, in the order in which they were taken.
-        size: (width, height) of the frames given out.
     """
 
     name = "rosbag"

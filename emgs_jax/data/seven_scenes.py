@@ -38,7 +38,6 @@ class SevenScenes:
     Args:
         sequence: "SCENE/seq-XX".
         start, stop, stride: which of the images that are there, in order.
-        size: (width, height) of the frames given out.
         intrinsics: of the 640x480 colour images, as `Images` takes them; None = 525 when registered, else 585.
         depth_scale: raw units per metre.
         register_depth: warp depth into the colour camera and give its pose; else depth and pose are the depth camera's.

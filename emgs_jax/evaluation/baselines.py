@@ -26,7 +26,6 @@ class View:
     Args:
         depth: camera-space z (h, w), 0 where there is none.
         image: RGB, uint8 (h, w, 3).
-        cloud: the points with their normals.
     """
 
     depth: np.ndarray

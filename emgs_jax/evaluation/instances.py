@@ -26,9 +26,7 @@ class Instance:
     """One object, in the frame and unit of the map.
 
     Args:
-        center: mean of its Gaussians' means, (3,).
         low: lower corner of the box along the map's axes that holds its Gaussians' means with one standard deviation.
-        score: mean cosine of its Gaussians with the word.
     """
 
     center: np.ndarray

@@ -75,7 +75,6 @@ def give_classes(
 
     Args:
         cosines: of its feature with each class, (n, c).
-        is_known: (n,), whether it has a feature.
     """
     offered = np.ones(cosines.shape[1], bool)
     if p.offered != "all":

@@ -15,7 +15,6 @@ class RandomFeatures:
 
     Args:
         cell: pixels a side.
-        templates: prompts over which an embedding is the mean.
         text: file of `experiments.embed` to take the embeddings from; None makes them.
     """
 

@@ -66,7 +66,6 @@ class Keyframe:
         descriptors: RootSIFT as bytes; `unit_descriptors` decodes them.
         points: of the keypoints in the camera's own frame, units of its own inference; NaN without depth.
         intrinsics: fx, fy, cx, cy in pixels.
-        size: width and height of the image.
         depths: z at the centres of the cells of a regular grid over the image, units of the inference; 0 without depth.
     """
 

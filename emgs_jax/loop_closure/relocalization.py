@@ -54,7 +54,6 @@ class PosedKeyframes:
     Args:
         poses: T_world_camera (4, 4).
         log_scales: σ: a length of the inference times e^σ is one of the map.
-        is_placed: True where it is in the map.
     """
 
     database: Database
@@ -86,11 +85,7 @@ def relocalize(
     verification: VerificationConfig,
     config: RelocalizationConfig,
 ) -> tuple[RelocalizedPose | None, str | None]:
-    """Relocalize a keyframe among others: return its pose, or None and the gate or reason that rejected it.
-
-    Args:
-        query: described like the others.
-    """
+    """Relocalize a keyframe among others: return its pose, or None and the gate or reason that rejected it."""
     keyframes = known.database.keyframes
     rows = [row for row, one in enumerate(keyframes) if known.is_placed[one.frame]]
     candidates = most_similar(known.database, query, rows, config.num_candidates, appearance)

@@ -45,7 +45,6 @@ class AlignmentConfig:
         max_ratio: distance to the best descriptor over that to the second.
         max_epipolar_error: of a match that fits the essential matrix.
         min_matches: that fit it.
-        min_match_share: of all mutual matches.
         max_reprojection_error: of a point that fits a pose.
         min_pose_points: that fit, in either direction.
         max_pose_gap: between the poses of the two directions, times the median depth.

@@ -70,7 +70,6 @@ def to_first_window(
     """Select the views that a map can start from: the dense ones, from the first with a pose and a valid point on.
 
     Args:
-        frames: by index; those of the window.
         T_world_anchor: known pose of the first frame, (4, 4).
         since: views of earlier frames are left out.
 
@@ -102,7 +101,6 @@ def to_prediction(
 
     Args:
         prediction: dense in (previous, current).
-        frames: by index; those of the window.
         T_world_anchor: known pose of the first frame, (4, 4).
 
     Raises:

@@ -89,7 +89,6 @@ def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
     stays as it is.
 
     Args:
-        state: after the last step.
         origin: (3,) of the first camera.
     """
     return rescaled(state, np.exp(-float(state.estimate.log_scale)), origin) if state.estimate.log_scale else state

@@ -53,7 +53,6 @@ class PoseGraphInfo:
         reason: why the nodes stay where they were; empty: they moved, or there is nothing to gain.
         cost_before: Σρ over factors, and half the squared scale prior.
         cost: likewise, at the end.
-        converged: the last step gained next to nothing.
         factor_chi2: (e,) χ² of every factor at the end, unweighted; 0 where it is not in use.
         factor_weights: (e,) share of that χ² that counts: s² of dynamic covariance scaling, 1 for all but loops.
         loop_chi2: weighted sum over loops.

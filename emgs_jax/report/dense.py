@@ -33,7 +33,6 @@ class DenseMap:
     Args:
         cloud: a point per pixel of every frame whose pose is known, averaged per voxel, in the colours of the images.
         labels: class of each of its points; None without classes.
-        pictures: what the overview shows of some frames.
         rendering: `rendering_metrics` of the views that the cloud is made from; empty without truth.
     """
 
@@ -55,11 +54,9 @@ def dense_map(
     """Render the map from the pose of every frame that is not lost.
 
     Args:
-        dataset: for the images, and the truth.
         evaluation: points of one of its voxels, of the truth where that is known, are averaged, and views are
             compared with the truth under it.
         labelled: `labelled_map` of the run, which says the class of each point.
-        num_pictures: frames that are shown, evenly spread.
         own: what the prior says of every frame, camera-frame points (h, w, 3) in its own lengths, 0 where it says
             nothing; for `densify.points=own` only.
     """

@@ -102,9 +102,6 @@ def score_map(
 
     The dense map is compared as the protocol says, under the other alignment as `reconstruction_<alignment>/…`,
     placed by its points as `reconstruction_icp/…`, and the plain centres as `reconstruction_centers/…`.
-
-    Args:
-        labels: of the centres that have a class.
     """
     poses, truth, config = with_truth(run, run.poses), scorer.truth, scorer.evaluation
     if poses is None:
@@ -200,9 +197,7 @@ def score_settings(
     """The metrics.json of every finished run, without times.
 
     Args:
-        runs: that share data set, prior and protocol.
         raw: what the prior alone says, the same for all.
-        num_threads: runs that are scored side by side.
     """
 
     def score(run: MappingRun, config: DensifyConfig) -> Metrics:

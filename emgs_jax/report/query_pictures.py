@@ -88,9 +88,6 @@ def best_views(run: RecordedRun, answer: Answer, count: int) -> list[list[View]]
 def draw_answer(path: Path, run: RecordedRun, answer: Answer, views: Sequence[Sequence[View]], max_words: int) -> int:
     """Draw a line for each word and view: the map in its colours, the word's relevance, the classes with a legend.
 
-    Args:
-        max_words: those with the most answers.
-
     Returns:
         How many words are drawn.
     """

@@ -19,7 +19,6 @@ class Estimate:
     """Estimate of one run that was compared with the truth: the map, the raw predictions, or a baseline.
 
     Args:
-        variant: name of the overrides, or of another system.
         kind: "ours", "raw prior", another one of `ROWS`, or "scored" for another system.
         prior: its name; None for another system.
         revision: of the code; None where unknown.

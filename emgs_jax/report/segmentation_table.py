@@ -51,8 +51,6 @@ class SceneResult:
 
     Args:
         confusion: see `scene_confusion`.
-        about: how the map was placed, and counts.
-        ate_m: of the trajectory, Sim(3); None where unknown.
     """
 
     scene: str
