@@ -7,7 +7,7 @@ import math
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -134,6 +134,13 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in tree.items():
         values |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
     return values
+
+
+def changes(before: Mapping[str, Any], now: Mapping[str, Any], but: Collection[str] = ()) -> list[str]:
+    """Say each value in which two trees as JSON has them differ, with its dotted key; those of `but` may."""
+    before, now = flat(before), flat(now)
+    changed = (key for key in sorted({*before, *now} - {*but}) if before.get(key) != now.get(key))
+    return [f"{key} was {before.get(key)!r}, now it is {now.get(key)!r}" for key in changed]
 
 
 def write_json(path: str | os.PathLike, value: Any) -> None:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.data.base import Dataset
-from emgs_jax.device.arrays import to_se3
+from emgs_jax.device.arrays import fetched, to_se3
 from emgs_jax.device.executables import stored
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, own_voxel, posed_cloud
@@ -69,7 +69,7 @@ def dense_map(
     rendered = Rendered(dataset, with_truth(run, run.poses), evaluation, compares_classes)
 
     def clouds() -> Iterator[PointCloud]:
-        for row, view in zip(known, _drawn_ahead(run, known, config), strict=True):
+        for row, view in zip(known, _drawn(run, known, config), strict=True):
             is_shown = row in shown
             labels = _label_image(view, labelled) if is_shown or compares_classes else None
             if is_shown:
@@ -131,18 +131,11 @@ def _voxel(poses: tuple[np.ndarray, np.ndarray] | None, config: EvaluationConfig
     return min(config.voxel_m, own_voxel(align_poses(*poses, with_scale=True)[0], config))
 
 
-def _drawn_ahead(run: MappingRun, rows: list[int], config: DensifyConfig) -> Iterator[DenseView]:
-    """The views of frames on the host; the next is being drawn while one is looked at."""
-    pending: DenseView | None = None
+def _drawn(run: MappingRun, rows: list[int], config: DensifyConfig) -> Iterator[DenseView]:
     gaussians, poses = confirmed(run.state.map), run.poses
-    for row in rows:
-        view = _densify(gaussians, to_se3(poses[row]), run.camera, config)
-        drawing = eqx.tree_at(lambda view: view.rendering, view, None)  # nobody looks at it, so it is not fetched
-        if pending is not None:
-            yield jax.device_get(pending)
-        pending = drawing
-    if pending is not None:
-        yield jax.device_get(pending)
+    views = (_densify(gaussians, to_se3(poses[row]), run.camera, config) for row in rows)
+    # Nobody looks at the rendering, so it is not fetched.
+    return fetched(eqx.tree_at(lambda view: view.rendering, view, None) for view in views)
 
 
 def center_cloud(run: MappingRun) -> PointCloud:

@@ -69,7 +69,7 @@ def test_a_finished_setting_is_not_mapped_again_and_another_sweep_is_not_mixed_i
     subset = compose("axes={slam.em.max_mahalanobis_sq:[9.0],slam.em.average.gain:[count]}", name="sweep")
     (row,) = experiments.sweep.sweep(subset, tmp_path)
     assert row | {"setting": 2} == rows[2]
-    with pytest.raises(ValueError, match=r"em\.noise 1\.0, and this one has 0\.5: .*another folder"):
+    with pytest.raises(ValueError, match=r"em\.noise was 1\.0, now it is 0\.5\): .*another folder"):
         experiments.sweep.sweep(compose(AXES, "slam.em.noise=0.5", name="sweep"), tmp_path)
 
 

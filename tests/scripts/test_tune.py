@@ -143,7 +143,7 @@ def test_more_trials_go_on_another_search_is_not_mixed_in_and_one_that_was_told_
     assert all(1 <= row[GATE] <= 20 for row in rows) and measured[0][1][0][GATE] == measured[-1][1][0][GATE] == 40
     assert "| default |" in (tmp_path / "tune.md").read_text()
     assert experiments.tune.tune([*with_few, "trials=6"], tmp_path)[:4] == rows
-    with pytest.raises(ValueError, match=rf"holds a search with search.space.{GATE}.high 20.0, and this one has 10.0"):
+    with pytest.raises(ValueError, match=rf"holds another search \(space.{GATE}.high was 20.0, now it is 10.0"):
         experiments.tune.tune([*with_few, f"space={{{GATE}:{{low:1,high:10,log:true}}}}"], tmp_path)
 
 
