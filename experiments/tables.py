@@ -17,7 +17,7 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 import emgs_jax
-from emgs_jax.io.files import atomic_write
+from emgs_jax.io.files import write_file
 from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, Line, markdown, metric_table
 from emgs_jax.report.provenance import git_revision
 from emgs_jax.report.results import METRICS_FILE, Estimate, estimates_of, read_metrics
@@ -153,8 +153,7 @@ def write_blocks(page: Path, blocks: Mapping[str, str]) -> None:
         text, count = place.subn(lambda _, new=f"{start}\n{content}": new, text)
         if count != 1:
             raise ValueError(f"{page} has {count} places {start} … <!-- end -->, not one: write the markers once")
-    with atomic_write(page, "w") as handle:
-        handle.write(text)
+    write_file(page, text)
 
 
 def tables(config: Mapping[str, Any]) -> None:

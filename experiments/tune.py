@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from emgs_jax.config.configure import build_dataset, compose, near
 from emgs_jax.device.clock import Clock
-from emgs_jax.io.files import atomic_write, owned, remove_temporaries
+from emgs_jax.io.files import owned, remove_temporaries, write_file
 from emgs_jax.mapping.batch import programs
 from emgs_jax.report.repeat import written
 from emgs_jax.report.sweeps import write_csv
@@ -26,6 +26,7 @@ from emgs_jax.report.tuning import DEFAULT, SequenceResults, draw_trials, settin
 
 from .command import command
 from .grid import variant_of
+from .keys import check_keys
 from .search import Space, ask, front, open_study, own_setting, read_objectives, read_space, told
 from .together import Measured, refuse_other_maps
 
@@ -47,9 +48,7 @@ def tune(words: Sequence[str], folder: Path) -> list[dict[str, Any]]:
     config = compose(*words, name="tune")
     refuse_other_maps(config, "a search")
     space, objectives = read_space(config), read_objectives(config)
-    for key, least in (("trials", 1), ("chunk", 1), ("best", 1), ("startup", 0), ("search_seed", 0)):
-        if not isinstance(config[key], int) or config[key] < least:
-            raise ValueError(f"{key} must be a whole number from {least} on, got {config[key]!r}")
+    check_keys("tune", config)
     configs = {kind: _sequences(words, config, kind, space) for kind in ("tuned", "held_out")}
     _check_apart(configs["tuned"], configs["held_out"])
     own = own_setting(config, space)
@@ -191,8 +190,7 @@ def _write(
     lines = verdict(results, objectives)
     text = "\n".join([table(results, objectives), *(f"- {line}" for line in lines.values()), ""])
     write_csv(folder / "trials.csv", [{**row, "is_best": row["trial"] in best} for row in rows])
-    with atomic_write(folder / "tune.md", "w") as handle:
-        handle.write(text)
+    write_file(folder / "tune.md", text)
     _write_best(folder, best, lines)
     numbers = {row["trial"]: DEFAULT for row in rows if all(row[key] == own[key] for key in own)}
     marks = numbers | {number: f"trial {number}" for number in best}
@@ -212,8 +210,7 @@ def _write_best(folder: Path, best: Mapping[int, Setting], lines: Mapping[str, s
     for number, setting in best.items():
         path = folder / "best" / f"trial_{number}.yaml"
         command_line = shlex.join(["emgs", "run", f"hydra.searchpath=[{place}]", f"+best={path.stem}"])
-        with atomic_write(path, "w") as handle:
-            handle.write(settings_yaml(setting, [f"{command_line} …", lines[f"trial {number}"]]))
+        write_file(path, settings_yaml(setting, [f"{command_line} …", lines[f"trial {number}"]]))
 
 
 @command("tune")

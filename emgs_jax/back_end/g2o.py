@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from emgs_jax.io.files import atomic_write
+from emgs_jax.io.files import write_file
 from emgs_jax.pose_graph.factors import Factors, Nodes, PoseGraph
 
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
@@ -130,8 +130,7 @@ def save_graph_g2o(path: str | os.PathLike, graph: PoseGraph, half_angles: bool 
     values = np.concatenate([_to_g2o(edges.Z_a_b), upper], axis=1)
     for row in np.flatnonzero(np.asarray(edges.valid)):
         lines.append(f"{EDGE} {int(edges.a[row])} {int(edges.b[row])} {_numbers(values[row])}")
-    with atomic_write(path, "w") as handle:
-        handle.write("\n".join(lines) + "\n")
+    write_file(path, "\n".join(lines) + "\n")
 
 
 def _to_g2o(poses: jaxlie.SE3) -> np.ndarray:

@@ -34,6 +34,12 @@ def atomic_write(path: str | os.PathLike, mode: str = "wb") -> Iterator[IO]:
         temporary.unlink(missing_ok=True)
 
 
+def write_file(path: str | os.PathLike, content: str | bytes) -> None:
+    """Write a file, whole or not at all."""
+    with atomic_write(path, "w" if isinstance(content, str) else "wb") as handle:
+        handle.write(content)
+
+
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """A folder beside `path` that becomes `path` if the block succeeds, and is removed if it does not.
@@ -53,6 +59,18 @@ def new_folder(path: Path) -> Iterator[Path]:
         raise _named(error, path) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def problem_of(folder: Path) -> str | None:
+    """Say why nothing can be written into a folder, which is made where it is missing; None where all is well."""
+    probe = folder / f".{os.getpid()}.tmp"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
 
 
 @contextlib.contextmanager
@@ -145,8 +163,7 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any], but: Collection[s
 
 def write_json(path: str | os.PathLike, value: Any) -> None:
     """Write `value` as indented, strictly valid JSON."""
-    with atomic_write(path, "w") as handle:
-        handle.write(json.dumps(jsonable(value), indent=2, allow_nan=False) + "\n")
+    write_file(path, json.dumps(jsonable(value), indent=2, allow_nan=False) + "\n")
 
 
 class FrameLog:

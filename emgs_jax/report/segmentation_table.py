@@ -20,7 +20,6 @@ from emgs_jax.report.recorded_run import RecordedRun
 from emgs_jax.semantics import similarities
 
 FORMAT, VERSION = "emgs_jax.segmentation", 1
-ALIGNMENTS = ("trajectory", "points")
 _TITLES = ("method", "source", "protocol", "scenes", "placed by", "mIoU [%]", "f-mIoU [%]", "Acc [%]", "ATE [cm]")
 _NOTES = """
 Acc is the mean recall of the classes under ovo and conceptgraphs, the share of the points under rayfronts. Quoted rows

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from emgs_jax.io.files import atomic_write, changes, jsonable, write_json
+from emgs_jax.io.files import changes, jsonable, write_file, write_json
 from emgs_jax.report.columns import MAIN, Line, known, markdown, metric_table
 
 FORMAT, VERSION = "emgs_jax.running.stacked", 1
@@ -75,8 +75,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with atomic_write(path, "w") as handle:
-        handle.write(text.getvalue())
+    write_file(path, text.getvalue())
 
 
 def table(rows: Sequence[Mapping[str, Any]], axes: Sequence[str]) -> str:

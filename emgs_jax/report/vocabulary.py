@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from emgs_jax.config.configure import build
 from emgs_jax.features.base import FeatureModel
 from emgs_jax.features.text import TextEmbeddings, load_text
+from emgs_jax.io.files import problem_of
 from emgs_jax.report.recorded_run import TEXT_FILE, RecordedRun
 
 
@@ -108,12 +109,5 @@ def words_of(value: Any, key: str) -> tuple[str, ...]:
 
 def check_folder(folder: Path) -> None:
     """Make the folder of outputs; raises ValueError where nothing can be written into it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".emgs-write-test"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ValueError(
-            f"nothing can be written into out={folder} ({error.strerror or error}): choose another out=FOLDER"
-        ) from error
+    if (problem := problem_of(folder)) is not None:
+        raise ValueError(f"nothing can be written into out={folder} ({problem}): choose another out=FOLDER")
