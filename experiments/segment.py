@@ -50,8 +50,6 @@ def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
 
 def scene_names(config: DictConfig, runs: list[RecordedRun]) -> list[str]:
     """Names of the scenes: those of `scenes`, else the sequences that were mapped."""
-    if not runs:
-        raise ValueError("map names no folder: give map=[FOLDER,…] of finished runs")
     if config.scenes is None:
         return [str(run.provenance["data"]["sequence"]) for run in runs]
     names = [str(name) for name in (config.scenes if _is_list(config.scenes) else [config.scenes])]
