@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
-from emgs_jax.gaussians import Gaussians, gathered_features, has_feature
+from emgs_jax.gaussians import GaussianIndex, Gaussians, gathered_features, has_feature, index_of
 from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import (
     Entries,
@@ -22,9 +22,8 @@ from emgs_jax.ops.linalg import (
     safe_normalize,
     tangent_basis,
     whiten,
-    whitening,
 )
-from emgs_jax.ops.neighbours import Groups, Nearby, among_nearest, group_points, nearby, of_queries
+from emgs_jax.ops.neighbours import Nearby, among_nearest, nearby, of_queries
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, join_rows, split_rows, static, take_rows, traced, where_rows
 
@@ -118,8 +117,7 @@ def e_step(
     points: Observation,
     noise: Float[Array, "m 3"],
     config: EmConfig,
-    white: Whitening | None = None,
-    groups: Groups | None = None,
+    index: GaussianIndex | None = None,
 ) -> tuple[EStep, Float[Array, "m"]]:
     """Responsibilities of the K nearest Gaussians for every point (eq. 2 and 3), and each point's best log-joint.
 
@@ -127,14 +125,12 @@ def e_step(
         gaussians: n of them, world frame.
         points: m observed points, world frame.
         noise: m; standard deviation of every point along its viewing ray, as a vector.
-        config: gates and weights.
-        white: `whitening` of the Gaussians' covariances; None makes it here.
-        groups: `group_points` of the valid Gaussians' means; likewise.
+        index: of the Gaussians; None makes it here.
     """
-    groups = group_points(gaussians.means, gaussians.valid) if groups is None else groups
-    near = nearby(points.points, points.valid, groups, config.num_candidates, BLOCK)
+    index = index_of(gaussians) if index is None else index
+    near = nearby(points.points, points.valid, index.groups, config.num_candidates, BLOCK)
     meaning = eqx.tree_at(lambda g: g.features, gaussians, safe_normalize(gaussians.features))
-    table = meaning, whitening(gaussians.covs) if white is None else white
+    table = meaning, index.white
     blocks, noise = take_rows((points, noise), near.queries)
     # Where a block has room left there is no point.
     blocks = eqx.tree_at(lambda o: o.valid, blocks, blocks.valid & (near.queries < points.valid.shape[0]))
@@ -270,19 +266,18 @@ def em_update(
     aligned: Observation,
     noise: Float[Array, "m 3"],
     config: EmConfig,
-    white: Whitening | None = None,
-    groups: Groups | None = None,
+    index: GaussianIndex | None = None,
 ) -> tuple[GaussianMap, EStep, EmInfo]:
     """One incremental EM step: fuse the points of `aligned` (world frame) that the submap explains.
 
-    `noise` is the standard deviation of each point along its viewing ray, a vector in metres; `white` and
-    `groups` as in `e_step`.
+    `noise` is the standard deviation of each point along its viewing ray, a vector in metres;
+    `index` as in `e_step`.
 
     Returns:
         The updated submap, what explains which point, and counts. Without any fused point the submap is unchanged.
     """
     gaussians = submap.gaussians
-    step, best = e_step(gaussians, aligned, noise, config, white, groups)
+    step, best = e_step(gaussians, aligned, noise, config, index)
     new, total = m_step(gaussians, aligned, precision(noise, config), step, config)
     evidence = jnp.where(total > 0, support(gaussians, aligned, step, config), 0.0)
     updated, gain = update_average(submap, new, evidence, config.average)

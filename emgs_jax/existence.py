@@ -108,10 +108,8 @@ def update_existence(
         map: all Gaussians, world frame.
         use: evidence of this frame's points for each, see `fusion_evidence`.
         view: the frame as it was aligned, world frame; a frame that is not tracked has no valid row.
-        T_world_camera: its pose.
         camera: of its rows.
         depth_noise: of its points, as a fraction of their depth.
-        config: weights of the evidence.
 
     Returns:
         The map, and which Gaussians were seen.
@@ -152,11 +150,9 @@ def merge_duplicates(
     of the means along the surface only: a wall does not become thicker by being two layers.
 
     Args:
-        map: of which the submap is enough.
         is_seen: Gaussians that may be joined.
         origins: of the camera of the frame, world frame; one for all, or one for each.
         depth_noise: as a fraction of the depth.
-        config: gates.
     """
     partner, is_pair = nearest_duplicates(map, is_seen, origins, depth_noise, config)
     old, other, rows = map.gaussians, take_rows(map, partner), jnp.arange(partner.shape[0])

@@ -9,7 +9,16 @@ from emgs_jax.observation import Observation
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import kmeans, strided_seeds
 from emgs_jax.ops.executable import executable
-from emgs_jax.ops.linalg import dot, inverse_2x2, outer, safe_normalize, tangent_basis, whiten, whitening
+from emgs_jax.ops.linalg import (
+    Whitening,
+    dot,
+    inverse_2x2,
+    outer,
+    safe_normalize,
+    tangent_basis,
+    whiten,
+    whitening,
+)
 from emgs_jax.ops.neighbours import Groups, group_points, nearest, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, static, take_rows, traced, where_rows
@@ -27,6 +36,18 @@ class Gaussians(eqx.Module):
     normals: Float[Array, "*b n 3"]  # n̄, unit
     features: Float[Array, "*b n f"]  # f; its direction is the meaning; zero = unknown
     valid: Bool[Array, "*b n"]
+
+
+class GaussianIndex(eqx.Module):
+    """What it takes to search in Gaussians and to measure distances to them, made once for all stages."""
+
+    white: Whitening  # of the covariances
+    groups: Groups  # of the means of the valid ones
+
+
+def index_of(gaussians: Gaussians) -> GaussianIndex:
+    """Index the Gaussians of a submap."""
+    return GaussianIndex(whitening(gaussians.covs), group_points(gaussians.means, gaussians.valid))
 
 
 def empty_gaussians(capacity: int, num_features: int) -> Gaussians:
@@ -48,7 +69,6 @@ class FitConfig(eqx.Module):
         points_per_gaussian: λ, in pixels of an image of 518 × 392, the paper's; a new Gaussian stands for so many. An
             image of another size is cut into as many pieces, but none of fewer than MIN_ROWS points.
         num_fit_neighbours: M of eq. 1 (R10).
-        num_kmeans_iterations: of Lloyd's algorithm.
         min_std: m; floor of a Gaussian's standard deviation in every direction.
         feature: the `medoid` of the points' features (printed), or their sum, to which EM and refinement add what
             other frames say: `accumulated` evidence (R16).

@@ -40,7 +40,6 @@ def initialize(
         views: camera frames, v views of p points each.
         T_world_views: the prior's poses, which are the map's by construction.
         camera: of the full images.
-        thin: the observations' thinning.
         config: λ and how points become Gaussians.
 
     Returns:

@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.gaussians import Gaussians
+from emgs_jax.gaussians import GaussianIndex, Gaussians
 from emgs_jax.observation import Observation, Prediction, transform
 from emgs_jax.ops.camera import Camera
-from emgs_jax.ops.linalg import Whitening, safe_normalize
-from emgs_jax.ops.neighbours import Groups
+from emgs_jax.ops.linalg import safe_normalize
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
 from emgs_jax.registration.icp import IcpInfo, icp
@@ -26,7 +25,7 @@ from emgs_jax.registration.pose_estimate import (
     root_information,
 )
 from emgs_jax.registration.pose_noise import LEAST_NOISE, NO_INFORMATION, axis_std, repeat_poses
-from emgs_jax.registration.problem import IcpConfig
+from emgs_jax.registration.problem import CoarseStart, IcpConfig
 from emgs_jax.registration.repeated_prediction import repeat_error, repeat_scale, through_previous
 from emgs_jax.registration.rigid import MIN_PAIRS, pose_row, scale_translation
 
@@ -59,7 +58,6 @@ class LocalizationConfig(eqx.Module):
             `pose_std`; 1: their differences are ignored, those of depths are used (printed).
         num_alike, num_shared: frames that see one part of the map, and whose windows share images: they err alike, see
             `correct_by_points` and `correct`.
-        icp: the fine step.
         min_inlier_fraction: of the points, below which the fine pose is not accepted.
         max_residual: root mean square distance to the map's planes, as a fraction of the depth.
         max_step: between the coarse and the fine pose, as a fraction of the mean depth.
@@ -86,7 +84,6 @@ class CoarsePose(eqx.Module):
     """Result of the coarse step.
 
     Args:
-        T_world_camera: of the current frame.
         T_world_newest: temporary pose of the newest image (the current one's where there is none).
         scale: by which this prediction is multiplied about its cameras' origins.
         repeat_rms: m; disagreement of the two predictions of the previous image, after alignment.
@@ -112,17 +109,11 @@ class LocalizationInfo(eqx.Module):
     """Outcome of one frame.
 
     Args:
-        is_tracked: the fine pose passed every check.
-        is_lost: not even the coarse pose is known.
         reason: bits into `REASONS`; 0 for a tracked frame.
-        scale: of this prediction.
         repeat_rms: see `CoarsePose`.
         depth_noise: of the points, as a fraction of their depth: how much they differ from the map.
         noise: likewise of each point, as those of its level of confidence do, in the order of the rows.
         step_m: between the coarse and the fine pose.
-        step_rad: likewise.
-        estimate: how well this frame is known.
-        icp: of the fine step.
     """
 
     is_tracked: Bool[Array, ""]
@@ -199,8 +190,6 @@ def _correct_by_prior(
         T_world_camera: estimate before the measurement.
         scale: likewise.
         anchored: the prior's own pose, and its standard deviations.
-        estimate: uncertainty of the estimate.
-        config: readings.
     """
     pose, std = anchored
     apart = (T_world_camera.inverse() @ pose).log()
@@ -226,11 +215,8 @@ def localize_coarse(
     """Coarse registration through the previous frame, which was predicted twice, fused with the prior's own pose.
 
     Args:
-        prediction: of this call.
         previous: the previous frame as it was aligned with the map, world frame.
-        T_world_previous: its pose.
         camera: of the (thinned) rows.
-        config: readings.
         estimate: of the previous frame; None: its pose is exact.
     """
     now, estimate = prediction.previous, exact_estimate() if estimate is None else estimate
@@ -262,25 +248,21 @@ def localize_fine(
     submap: Gaussians,
     coarse: CoarsePose,
     config: LocalizationConfig,
-    white: Whitening | None = None,
-    groups: Groups | None = None,
+    index: GaussianIndex | None = None,
 ) -> tuple[jaxlie.SE3, Observation, LocalizationInfo]:
     """Fine registration against the submap; the coarse pose and scale stay where a check fails.
 
     Args:
         current: camera frame, unscaled.
         submap: Gaussians, world frame.
-        coarse: result of `localize_coarse`.
-        config: terms, gates and checks.
-        white: `whitening` of the submap's covariances; None makes it here.
-        groups: `group_points` of the valid Gaussians' means; likewise.
+        index: of the submap; None makes it here.
 
     Returns:
         T_world_camera, the observation in the world frame, and the outcome.
     """
     scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
-    known = root_information(coarse.estimate.covariance)
-    fine, scale, info = icp(scaled, submap, coarse.T_world_camera, known, coarse.depth_noise, config.icp, white, groups)
+    start = CoarseStart(coarse.T_world_camera, root_information(coarse.estimate.covariance), coarse.depth_noise)
+    fine, scale, info = icp(scaled, submap, start, config.icp, index)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     # The length has no gradient where a step is zero, which it is to the bit with an exact prior; this has.
     step_m, step_rad = (part @ safe_normalize(part) for part in (step[:3], step[3:]))

@@ -118,7 +118,6 @@ def sample_features(grid: Float[Array, "y x f"], size: tuple[int, int], thin: in
 
     Args:
         grid: unit features, zero where there is none.
-        size: (height, width) of the image.
         thin: step between the pixels.
     """
     if grid.shape[:2] == size:

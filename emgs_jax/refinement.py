@@ -34,9 +34,6 @@ class RefinementConfig(eqx.Module):
         cosine_weight: how much of ω is the features' cosine: 1 as printed; 0: features decide nothing here.
         max_splat_std: pixels of the rendered image; a wider candidate is scattered points, not a surface, and is
             dropped; `inf` as printed.
-        render: how both sets are drawn.
-        average: gain and blend, those of the EM step.
-        feature: likewise.
     """
 
     num_candidates: int = static(low=1, high=256)
@@ -177,7 +174,6 @@ def refine(
         candidates: Gaussians of the points that EM did not fuse.
         T_world_camera: refined pose.
         camera: of the images that are rendered.
-        config: gates and margins.
 
     Returns:
         The submap with merged candidates, the candidates with only the fresh ones valid, and counts.

@@ -27,10 +27,8 @@ class RunConfig:
 
     Args:
         settings: everything, as plain values; what the next ones are made of.
-        slam: all stages.
         densify: what of a rendered view becomes a point.
         evaluation: the protocol of the comparison with the truth.
-        graph: the back end; None with `graph=none`.
     """
 
     settings: dict[str, Any]
@@ -45,7 +43,6 @@ def load_config(*overrides: str, name: str = "config") -> RunConfig:
 
     Args:
         overrides: as for `emgs run`; `emgs run --help` lists them.
-        name: of a file of conf/.
 
     Raises:
         ValueError: an override names no key or option; the message names near ones.
@@ -64,10 +61,6 @@ def load_config(*overrides: str, name: str = "config") -> RunConfig:
 
 def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
     """Map the sequence of a config; the run holds the map, and a record with a pose for every frame.
-
-    Args:
-        config: of `load_config`.
-        show_progress: draw a bar.
 
     Raises:
         ValueError: the data set, the prior or a frame cannot be used.

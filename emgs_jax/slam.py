@@ -21,15 +21,14 @@ from emgs_jax.gaussian_map import (
     select_submap,
     write_back,
 )
-from emgs_jax.gaussians import FitConfig, Gaussians, cluster, spacing
+from emgs_jax.gaussians import FitConfig, GaussianIndex, Gaussians, cluster, index_of, spacing
 from emgs_jax.initialization import initialize
 from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
 from emgs_jax.observation import Observation, ObservationConfig, Prediction, transform
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.executable import executable
-from emgs_jax.ops.linalg import Whitening, whitening
-from emgs_jax.ops.neighbours import Groups, group_points, order_of
+from emgs_jax.ops.neighbours import group_points, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, static_choice, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
@@ -46,14 +45,8 @@ class SlamConfig(eqx.Module):
         window_size: |S|, images in the FIFO that the prior sees before the current one.
         initialization: `merged` (printed): all views of the first window are clustered together; `incremental`: the
             first view is, and the others are integrated one by one.
-        observation: point maps to observations.
-        fit: points to Gaussians (eq. 1).
-        submap: what a step works on, and capacities.
-        localization: coarse and fine.
-        em: E- and M-step.
         extrapolation: of depth errors to points that no Gaussian explains.
         splitting: of Gaussians that are too coarse for a nearer view.
-        refinement: on the image plane.
         existence: evidence of later frames for and against a Gaussian.
     """
 
@@ -87,9 +80,7 @@ class SlamState(eqx.Module):
     """State between two steps.
 
     Args:
-        map: all Gaussians.
         previous: the last frame as it was aligned, world frame.
-        T_world_previous: its pose.
         estimate: uncertainty of its pose and scale.
         time: frames so far, those that could not be placed included.
     """
@@ -126,17 +117,12 @@ class Submap(eqx.Module):
     """M*, the part of the map that a step works on, with what is found once for all stages.
 
     Args:
-        map: its Gaussians.
         rows: where they are in the whole map; its capacity where there is none.
-        white: `whitening` of their covariances.
-        groups: `group_points` of their means.
-        overflow: how many Gaussians did not fit.
     """
 
     map: GaussianMap
     rows: Int[Array, "s"]
-    white: Whitening
-    groups: Groups
+    index: GaussianIndex
     overflow: Int[Array, ""]
 
 
@@ -144,10 +130,7 @@ class Frame(eqx.Module):
     """A frame at its fine pose.
 
     Args:
-        T_world_camera: its pose.
         points: its observation, world frame.
-        localization: how it was found.
-        time: its number.
     """
 
     T_world_camera: jaxlie.SE3
@@ -166,11 +149,8 @@ class Fused(eqx.Module):
     """Submap after a frame's points are fused into it.
 
     Args:
-        map: the submap's Gaussians after EM and splitting.
-        halves: the second halves of what was split.
         unexplained: points that no Gaussian explains; their depth errors are extrapolated from the map's surfaces.
         origin: median birth of the Gaussians that explain the others; the frame's own time where none does.
-        em: counts.
     """
 
     map: GaussianMap
@@ -201,9 +181,7 @@ def init_state(
 
     Args:
         views: the window's observations, camera frames, oldest first.
-        T_world_views: their poses.
         camera: of the full images.
-        config: all stages.
 
     Returns:
         The state, and how many Gaussians did not fit into the map's capacity.
@@ -235,10 +213,7 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
     anew and not the work on the submap; inside another jit or vmap all of it is one, which rounds differently.
 
     Args:
-        state: of the last step.
-        prediction: of this one.
         camera: of the full images.
-        config: all stages.
     """
     view = downscale(camera, config.observation.thin)  # its pixels are an observation's rows
     num_rows = spacing(camera, config.observation.thin, config.fit)
@@ -284,9 +259,7 @@ def _localize_coarse(
 @executable
 def _select(map: GaussianMap, previous: Observation, guess: Observation, config: SubmapConfig) -> Submap:
     submap, rows, overflow = select_submap(map, (previous, guess), config)
-    gaussians = submap.gaussians
-    white, groups = whitening(gaussians.covs), group_points(gaussians.means, gaussians.valid)
-    return Submap(submap, rows, white, groups, overflow)
+    return Submap(submap, rows, index_of(submap.gaussians), overflow)
 
 
 @executable
@@ -295,8 +268,9 @@ def _localize_fine(
 ) -> Frame:
     """The frame at its fine pose, against what is confirmed."""
     target = confirmed(submap.map)
-    groups = group_points(target.means, target.valid, order_of(submap.groups, target.valid.shape[0]))
-    T, aligned, localization = localize_fine(current, target, coarse, config, submap.white, groups)
+    groups = group_points(target.means, target.valid, order_of(submap.index.groups, target.valid.shape[0]))
+    index = GaussianIndex(submap.index.white, groups)
+    T, aligned, localization = localize_fine(current, target, coarse, config, index)
     return Frame(T, aligned, localization, time)
 
 
@@ -305,7 +279,7 @@ def _fuse(submap: Submap, frame: Frame, view: Camera, num_rows: int, config: Fus
     """Fuse the points of a frame that is tracked, and split what they show to be too coarse."""
     T, trusted = frame.T_world_camera, frame.trusted
     noise = frame.localization.noise[:, None] * (trusted.points - T.translation())
-    map, explained, info = em_update(submap.map, trusted, noise, config.em, submap.white, submap.groups)
+    map, explained, info = em_update(submap.map, trusted, noise, config.em, submap.index)
     owned = owners(explained, map.birth.shape[0])
     births = take_rows(map.birth, owned).astype(jnp.float32)
     origin = jnp.where(info.num_fused > 0, median(births, explained.is_fused), frame.time).astype(jnp.int32)

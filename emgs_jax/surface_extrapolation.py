@@ -79,11 +79,8 @@ def extrapolate(
     Args:
         aligned: the frame, world frame, one row a pixel of `camera`.
         explained_by: the Gaussian that explains each point best, as it was before this frame, and its weight W.
-        is_fused: where there is one.
         noise: of each point, as a fraction of its depth.
-        T_world_camera: of the frame.
         camera: of the rows.
-        config: window and gates.
     """
     center = T_world_camera.translation()
     error, is_known = depth_error(aligned.points, explained_by, is_fused, center, config)

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.config.configure import build_dataset, build_prior
-from emgs_jax.io.files import atomic_write, write_json
+from emgs_jax.io.files import write_file, write_json
 from emgs_jax.report.provenance import provenance
 
 from .benchmarks.comparisons import time_em, time_icp, time_render
@@ -54,8 +54,7 @@ def benchmark(config: DictConfig, folder: Path) -> list[Timing]:
     for name in tqdm(config.parts, unit="part", desc="timing"):
         timings += known[name]()
         write_json(folder / "benchmark.json", {"provenance": about, "timings": timings})
-        with atomic_write(folder / "benchmark.md", "w") as handle:
-            handle.write(report(timings) + "\n")
+        write_file(folder / "benchmark.md", report(timings) + "\n")
     return timings
 
 

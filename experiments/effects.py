@@ -27,9 +27,7 @@ class Effect:
     """One changed value, or (key None) the unchanged config with the metrics themselves.
 
     Args:
-        data: data set, sequence and prior.
         key: that differs from the config; None for the config itself.
-        value: of it.
         own: the config's value.
         metrics: metric -> difference from the config, one for each repetition that has both.
     """

@@ -22,7 +22,7 @@ from tqdm import tqdm
 from emgs_jax.config.configure import compose, message_of
 from emgs_jax.config.overrides import quoted
 from emgs_jax.config.values import check_values
-from emgs_jax.io.files import atomic_write, check_writable, write_json
+from emgs_jax.io.files import check_writable, write_file, write_json
 from emgs_jax.report.evaluation_page import Found, JobLine, write_evaluation_page
 from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
 from emgs_jax.report.provenance import is_of_this_code
@@ -151,8 +151,8 @@ def _run_all(jobs: Sequence[Job], failures: dict[str, str]) -> None:
         except Exception as error:  # whatever it is, the other jobs go on
             failures[job.name] = message_of(error)
             tqdm.write(f"failed: {failures[job.name]}")
-            with contextlib.suppress(OSError), atomic_write(job.folder / ERROR_FILE, "w") as handle:
-                handle.write("".join(traceback.format_exception(error)))
+            with contextlib.suppress(OSError):
+                write_file(job.folder / ERROR_FILE, "".join(traceback.format_exception(error)))
 
 
 def _is_finished(job: Job) -> bool:
@@ -189,8 +189,7 @@ def _write_tables(
     text = "\n".join(part for part in parts if part)
     out.mkdir(parents=True, exist_ok=True)
     for name, content in (("results.csv", to_csv(estimates)), ("results.md", text)):
-        with atomic_write(out / name, "w") as handle:
-            handle.write(content)
+        write_file(out / name, content)
     write_json(out / "results.json", {"rows": rows, "totals": totals, "published": published, "missing": missing})
     print(text)
     lines = [JobLine(job.name, job.folder, missing.get(job.name, "")) for job in jobs]

@@ -26,8 +26,7 @@ class Variant:
 
     Args:
         setting: key -> value; infinities as text, as JSON has none.
-        slam: the config with it.
-        densify: likewise; what is drawn is shared with the refinement.
+        densify: what is drawn is shared with the refinement.
     """
 
     setting: dict[str, Value]

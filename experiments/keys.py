@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.configure import CONF
+from emgs_jax.config.values import Declared, check_value
+from emgs_jax.ops.ranges import Range
 
 
 class Kind(NamedTuple):
@@ -20,6 +22,11 @@ def whole(low: int, or_null: bool = False) -> Kind:
     """A whole number from `low` on."""
     words = f"a whole number from {low} on{' or null' * or_null}"
     return Kind(words, lambda value: (or_null and value is None) or _is_whole(value, low))
+
+
+def ranged(low: float, high: float, kind: type = float, or_null: bool = False) -> Declared:
+    """A number from `low` to `high`."""
+    return Declared(frozenset({kind, type(None)} if or_null else {kind}), range=Range(low, high))
 
 
 def some(words: str, fits: Callable[[Any], bool]) -> Kind:
@@ -63,9 +70,11 @@ OFFSET = Kind(
 SEEDS = many("whole numbers", lambda value: _is_whole(value, 0))
 NAMES = many("names", _is_text)
 AT_ONCE = {"at_once": whole(1, or_null=True)}
-KEYS: dict[str, dict[str, Kind]] = {
+KEYS: dict[str, dict[str, Kind | Declared]] = {
     "sweep": AT_ONCE | {"chunk": whole(1)},
-    "tune": AT_ONCE,  # the others it checks itself
+    "tune": AT_ONCE
+    | dict.fromkeys(("trials", "chunk", "best"), whole(1))
+    | {"startup": whole(0), "search_seed": whole(0)},
     "evaluate": {
         "seeds": Kind(f"{SEEDS.words}, each once", lambda value: SEEDS.fits(value) and len(set(value)) == len(value)),
         "overrides": some("KEY=VALUE", _is_change),
@@ -74,10 +83,31 @@ KEYS: dict[str, dict[str, Kind]] = {
         ),
         "shard": TEXT,
     },
-    "export": {"formats": some("names", _is_text), "max_points": whole(1)},
+    "export": {"formats": some("names", _is_text)},  # the others are those of ExportConfig
     "effects": {"repetitions": some("keys", _is_text)},
     "embed": {"classes": NAMES},
-    "segment": {"map": Kind("a folder or a list of folders", lambda value: _is_text(value) or NAMES.fits(value))},
+    "segment": {
+        "map": Kind("a folder or a list of folders", lambda value: _is_text(value) or NAMES.fits(value)),
+        "alignment": Declared(frozenset({str}), choices=("trajectory", "points")),
+        "with_scale": Declared(frozenset({bool})),
+        "icp_distance_m": ranged(1e-6, 1e6),
+        "icp_max_steps": ranged(0, 10000, int),
+        "voxel_m": ranged(1e-6, 1e6),
+        "max_depth_m": ranged(1e-6, math.inf),
+    },
+    "query": {
+        "margin": ranged(0, 2),
+        "min_cosine": ranged(-1, 1),
+        "num_views": ranged(1, 100, int),
+        "max_words": ranged(1, 1000, int),
+        "frame": ranged(0, 10**9, int, or_null=True),
+    },
+    "score": {
+        "max_time_difference": ranged(0, 1e6),
+        "min_matched_percent": ranged(0, 100),
+        "normal_neighbours": ranged(3, 1000, int),
+    },
+    "view": {"port": ranged(1, 65535, int)},
     "benchmark": {
         "parts": NAMES,
         "benchmark.repetitions": whole(1),
@@ -99,6 +129,8 @@ def check_keys(name: str, config: DictConfig) -> None:
         value = OmegaConf.select(config, key)
         if OmegaConf.is_config(value):
             value = OmegaConf.to_container(value)
-        if not kind.fits(value) and not (value is None and OmegaConf.is_missing(config, key)):
+        if isinstance(kind, Declared):
+            check_value(key, value, kind)
+        elif not kind.fits(value) and not (value is None and OmegaConf.is_missing(config, key)):
             shown = "null" if value is None else repr(value)
             raise ValueError(f"{key} must be {kind.words}, got {shown}: give such a value")

@@ -12,12 +12,10 @@ import numpy as np
 from omegaconf import DictConfig
 
 from emgs_jax.config.configure import build
-from emgs_jax.config.values import Declared, check_value
 from emgs_jax.data.class_file import read_classes
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.io.files import check_writable
 from emgs_jax.io.trajectory import load_trajectory_tum
-from emgs_jax.ops.ranges import Range
 from emgs_jax.report.provenance import is_metric
 from emgs_jax.report.query import Question, ask, write_answer
 from emgs_jax.report.query_pictures import (
@@ -36,21 +34,14 @@ from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.vocabulary import Vocabulary, feature_model, vocabulary, words_of
 
 from .command import command
+from .keys import check_keys
 
-LIMITS = {  # of the keys that are no parameter of a class
-    "margin": Declared(frozenset({float}), range=Range(0, 2)),
-    "min_cosine": Declared(frozenset({float}), range=Range(-1, 1)),
-    "num_views": Declared(frozenset({int}), range=Range(1, 100)),
-    "max_words": Declared(frozenset({int}), range=Range(1, 1000)),
-    "frame": Declared(frozenset({int, type(None)}), range=Range(0, 10**9)),
-}
 UNLIKE = ("object", "things", "stuff", "texture")  # LERF's canonical phrases: what anything is
 
 
 def query(config: DictConfig) -> dict[str, Any]:
     """Ask `config.map` and write the answer; returns what query.json says."""
-    for key, field in LIMITS.items():
-        check_value(key, config[key], field)
+    check_keys("query", config)
     instances = build(config, "instances")
     words = asked(config)
     run = read_run(Path(config.map))

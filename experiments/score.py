@@ -11,7 +11,6 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.configure import build, build_dataset
-from emgs_jax.config.values import Declared, check_value
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.timestamps import in_seconds
 from emgs_jax.evaluation.clouds import PointCloud, read_cloud
@@ -19,7 +18,6 @@ from emgs_jax.evaluation.reconstruction import EvaluationConfig, compare_clouds
 from emgs_jax.evaluation.trajectory import associate, check_conventions, trajectory_metrics
 from emgs_jax.io.ply_reader import num_faces
 from emgs_jax.io.trajectory import load_trajectory_tum
-from emgs_jax.ops.ranges import Range
 from emgs_jax.prior.base import Provenance
 from emgs_jax.report.metrics import true_cloud
 from emgs_jax.report.provenance import provenance, write_metrics
@@ -27,19 +25,14 @@ from emgs_jax.report.results import METRICS_FILE, estimates_of, is_finished, res
 from emgs_jax.report.tables import average, full_table
 
 from .command import command
+from .keys import check_keys
 
 Metrics = dict[str, Any]
-LIMITS = {  # of the keys that are no parameter of a class
-    "max_time_difference": Declared(frozenset({float}), range=Range(0, 1e6)),
-    "min_matched_percent": Declared(frozenset({float}), range=Range(0, 100)),
-    "normal_neighbours": Declared(frozenset({int}), range=Range(3, 1000)),
-}
 
 
 def score(config: DictConfig) -> tuple[Metrics, Path]:
     """Compare the trajectory and the cloud of `config` with its data set; returns the metrics and their file."""
-    for key, field in LIMITS.items():
-        check_value(key, config[key], field)
+    check_keys("score", config)
     evaluation = build(config, "evaluation")
     dataset = build_dataset(config)
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)

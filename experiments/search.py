@@ -17,8 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.configure import near
 from emgs_jax.config.values import Declared, check_value, field_of
-from emgs_jax.io.files import jsonable
-from emgs_jax.report.sweeps import difference
+from emgs_jax.io.files import changes, jsonable
 
 from .grid import Value, stage_keys
 
@@ -142,7 +141,7 @@ def open_study(path: Path, about: Mapping[str, Any], objectives: Mapping[str, st
     known = study.user_attrs.get("about", {})
     if known != about and told(study):
         raise ValueError(
-            f"{path} holds a search with {difference(known, about, 'search')}: go on with the same words, or search in "
+            f"{path} holds another search ({changes(known, about)[0]}): go on with the same words, or search in "
             "another folder (hydra.run.dir=…)"
         )
     if known != about:
@@ -172,11 +171,7 @@ def ask(
     """Trials that are to be measured next: new ones until there are `end`, and those that were asked for before.
 
     Args:
-        study: that is extended.
-        space: to draw from.
         own: the config's values; the first trial, where they are in the space.
-        end: number of trials.
-        seed: of the search.
         startup: trials before the search learns.
     """
     optuna = _optuna()

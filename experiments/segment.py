@@ -9,34 +9,24 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig
 
 from emgs_jax.config.configure import build
-from emgs_jax.config.values import Declared, check_value
 from emgs_jax.data.class_file import read_classes
 from emgs_jax.evaluation.labelled_mesh import read_labelled_mesh
 from emgs_jax.evaluation.segmentation import LabelledPoints, label_cells, true_labels
-from emgs_jax.io.files import atomic_write, write_json
-from emgs_jax.ops.ranges import Range
+from emgs_jax.io.files import write_file, write_json
 from emgs_jax.report.recorded_run import RecordedRun, read_run
-from emgs_jax.report.segmentation_table import ALIGNMENTS, Placement, SceneResult, score_scene, summary, table
+from emgs_jax.report.segmentation_table import Placement, SceneResult, score_scene, summary, table
 from emgs_jax.report.vocabulary import feature_model, vocabulary
 
 from .command import command
+from .keys import check_keys
 from .report import images_of
 
-LIMITS = {  # of the keys that are no parameter of a class
-    "alignment": Declared(frozenset({str}), choices=ALIGNMENTS),
-    "with_scale": Declared(frozenset({bool})),
-    "icp_distance_m": Declared(frozenset({float}), range=Range(1e-6, 1e6)),
-    "icp_max_steps": Declared(frozenset({int}), range=Range(0, 10000)),
-    "voxel_m": Declared(frozenset({float}), range=Range(1e-6, 1e6)),
-    "max_depth_m": Declared(frozenset({float}), range=Range(1e-6, float("inf"))),
-}
 FRAMES = "frames"  # the word that takes the labels of the data set's own frames for truth
 
 
 def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
     """Score the maps of `config` and write file and table; returns both."""
-    for key, field in LIMITS.items():
-        check_value(key, config[key], field)
+    check_keys("segment", config)
     protocol = build(config, "protocol", _convert_="all")
     how = Placement(config.alignment, config.with_scale, config.icp_distance_m, config.icp_max_steps)
     runs = [read_run(Path(str(folder))) for folder in (config.map if _is_list(config.map) else [config.map])]
@@ -56,15 +46,12 @@ def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
     found = summary(results, classes, protocol, how) | {"truth": str(config.truth), "templates": text.templates}
     said = table(found, config.table_iii)
     write_json(Path(config.out) / f"segmentation_{protocol.name}.json", found)
-    with atomic_write(Path(config.out) / f"segmentation_{protocol.name}.md", "w") as handle:
-        handle.write(said)
+    write_file(Path(config.out) / f"segmentation_{protocol.name}.md", said)
     return found, said
 
 
 def scene_names(config: DictConfig, runs: list[RecordedRun]) -> list[str]:
     """Names of the scenes: those of `scenes`, else the sequences that were mapped."""
-    if not runs:
-        raise ValueError("map names no folder: give map=[FOLDER,…] of finished runs")
     if config.scenes is None:
         return [str(run.provenance["data"]["sequence"]) for run in runs]
     names = [str(name) for name in (config.scenes if _is_list(config.scenes) else [config.scenes])]

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import emgs_jax
 from emgs_jax.config.overrides import quoted
-from emgs_jax.io.files import atomic_write, check_writable
+from emgs_jax.io.files import check_writable, write_file
 from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, Line, markdown, metric_table
 from emgs_jax.report.provenance import git_revision
 from emgs_jax.report.results import METRICS_FILE, Estimate, estimates_of, read_metrics
@@ -161,9 +161,7 @@ def with_blocks(page: Path, blocks: Mapping[str, str]) -> str:
 
 def write_blocks(page: Path, blocks: Mapping[str, str]) -> None:
     """Write a page with other text between its markers."""
-    text = with_blocks(page, blocks)
-    with atomic_write(page, "w") as handle:
-        handle.write(text)
+    write_file(page, with_blocks(page, blocks))
 
 
 def tables(config: Mapping[str, Any]) -> None:

@@ -1,8 +1,9 @@
 """Settings that are mapped and scored together on one sequence, for `sweep` and `tune`."""
 
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from emgs_jax.config.configure import build, build_dataset, build_prior
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.device.clock import Clock
-from emgs_jax.io.files import atomic_write
+from emgs_jax.io.files import atomic_write, remove_temporaries
 from emgs_jax.mapping.batch import finish_together, map_together, programs
 from emgs_jax.mapping.run import MappingRun, new_run
 from emgs_jax.mapping.window_input import RawView
@@ -21,30 +23,17 @@ from emgs_jax.prior.base import Prior
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.report.dense import center_cloud
 from emgs_jax.report.gathering import gather
-from emgs_jax.report.metrics import Metrics, Scorer, compared_text, score_settings
+from emgs_jax.report.metrics import Metrics, Scorer, compared_text, new_scorer, score_settings
 from emgs_jax.report.overview import thumbnail
 from emgs_jax.report.provenance import provenance
-from emgs_jax.report.sweeps import picture_path
+from emgs_jax.report.sweeps import SweepResults, picture_path
 
-from .grid import Variant
+from .grid import Variant, plain_setting
 
 NOT_OF_RESULTS = (  # keys that change no number of a setting
     *("axes", "grid", "chunk", "at_once", "compilation_cache", "checksums"),
     *("space", "objectives", "tuned", "held_out", "trials", "startup", "search_seed", "best"),
 )
-
-
-@dataclass(frozen=True)
-class Work:
-    """Common inputs of all settings; `at_once`, `num_threads` as in `map_together`; `folder`: for pictures of maps."""
-
-    dataset: ReadableFrames
-    prior: Prior
-    scorer: Scorer
-    clock: Clock
-    at_once: int
-    num_threads: int
-    folder: Path | None = None
 
 
 def refuse_other_maps(config: DictConfig, what: str) -> None:
@@ -65,11 +54,6 @@ def shared_settings(config: DictConfig) -> dict[str, Any]:
     """The values that decide what a setting comes to, beside its own."""
     plain = OmegaConf.to_container(config, resolve=True)
     return {key: value for key, value in plain.items() if key not in NOT_OF_RESULTS}
-
-
-def provenance_of(config: DictConfig, dataset: ReadableFrames, prior: Prior) -> dict[str, Any]:
-    """The provenance that all settings share."""
-    return provenance(shared_settings(config), dataset, prior.provenance)
 
 
 def chunks_of(grid: Sequence[Variant], size: int) -> list[list[Variant]]:
@@ -93,6 +77,78 @@ def side_by_side(config: DictConfig, size: int) -> tuple[int, int]:
     return config.at_once or (1 if is_cpu else size), os.cpu_count() if is_cpu else 1
 
 
+class Measured:
+    """A sequence, and what settings came to on it: kept on disk after every chunk, measured once.
+
+    Frames, predictions and the truth are made once for all settings. A prior that is asked again is replayed from a
+    recording, until `forget_predictions`.
+
+    Args:
+        name: for the progress bar.
+        clock: of all sequences.
+        has_pictures: draw every map from above.
+        is_asked_again: settings are measured in several calls.
+    """
+
+    def __init__(
+        self,
+        config: DictConfig,
+        folder: Path,
+        clock: Clock,
+        name: str = "mapping",
+        has_pictures: bool = False,
+        is_asked_again: bool = False,
+    ) -> None:
+        self.config, self.name, self.folder, self.clock = config, name, folder, clock
+        self.has_pictures, self._is_asked_again = has_pictures, is_asked_again
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_temporaries(folder)  # of writes that were killed
+        self.dataset = build_dataset(config)
+        self.prior = build_prior(config, self.dataset)
+        self.provenance = provenance(shared_settings(config), self.dataset, self.prior.provenance)
+        self._results = SweepResults(folder, self.provenance)
+        self._priors: dict[int, Prior] = {}
+
+    def __contains__(self, setting: Mapping[str, Any]) -> bool:
+        return plain_setting(setting) in self._results
+
+    @cached_property
+    def scorer(self) -> Scorer:
+        return new_scorer(self.dataset, build(self.config, "evaluation"), self.prior)
+
+    def measure(self, grid: Sequence[Variant]) -> int:
+        """Map and score those that are not there yet, in chunks of the whole grid, which a resumed one has to keep.
+
+        Returns:
+            How many that are.
+        """
+        chunks = [[one for one in chunk if one.setting not in self] for chunk in chunks_of(grid, self.config.chunk)]
+        chunks = [chunk for chunk in chunks if chunk]
+        sizes, num_left = [chunk[0].slam.window_size for chunk in chunks], sum(map(len, chunks))
+        for size in {*sizes} - {*self._priors}:
+            self.prior.check(self.dataset, size)
+            is_asked_again = self._is_asked_again or sizes.count(size) > 1
+            folder = self.folder / "predictions"
+            self._priors[size] = replayed(self.prior, self.dataset, size, folder) if is_asked_again else self.prior
+        total = len(self.dataset) * num_left
+        with tqdm(total=total, unit="frame", desc=self.name, disable=not chunks) as bar:
+            for chunk in chunks:
+                self._results.add([one.setting for one in chunk], map_and_score(self, chunk, bar))
+        return num_left
+
+    def rows(self, settings: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Return a flat row for each setting that was measured: its number, its values and its metrics."""
+        return self._results.rows([plain_setting(setting) for setting in settings])
+
+    def prior_of(self, chunk: Sequence[Variant]) -> Prior:
+        """The prior that is asked for settings that share a program."""
+        return self._priors[chunk[0].slam.window_size]
+
+    def forget_predictions(self) -> None:
+        """Remove what was recorded."""
+        shutil.rmtree(self.folder / "predictions", ignore_errors=True)
+
+
 def replayed(prior: Prior, dataset: ReadableFrames, window_size: int, folder: Path) -> Prior:
     """A prior that is asked more than once, as a recording in `folder`; what is recorded there already is kept."""
     if isinstance(prior, Recorded):
@@ -102,25 +158,27 @@ def replayed(prior: Prior, dataset: ReadableFrames, window_size: int, folder: Pa
     return Recorded(path)
 
 
-def map_and_score(work: Work, chunk: Sequence[Variant], bar: tqdm) -> list[Metrics]:
+def map_and_score(sequence: Measured, chunk: Sequence[Variant], bar: tqdm) -> list[Metrics]:
     """Map and score some settings that share a program; the metrics of each."""
-    groups = start = [new_run(work.dataset, variant.slam, work.clock) for variant in chunk]
+    dataset, scorer = sequence.dataset, sequence.scorer
+    groups = start = [new_run(dataset, variant.slam, sequence.clock) for variant in chunk]
+    at_once, num_threads = side_by_side(sequence.config, len(chunk))
 
     def frames() -> Iterator[tuple[None, RawView]]:
         nonlocal groups
-        for found in map_together(start, work.dataset, work.prior, work.at_once, work.num_threads):
+        for found in map_together(start, dataset, sequence.prior_of(chunk), at_once, num_threads):
             groups, views = found
             bar.update(len(views) * len(chunk))
             yield from ((None, view) for view in views)
 
-    text = compared_text(work.dataset, work.scorer.prior)
-    raw = gather(frames(), work.scorer.evaluation, work.dataset.has_ground_truth, text=text)
+    text = compared_text(dataset, scorer.prior)
+    raw = gather(frames(), scorer.evaluation, dataset.has_ground_truth, text=text)
     runs = finish_together(groups)
     densify = [variant.densify for variant in chunk]
-    metrics = score_settings(runs, raw, densify, work.scorer, work.num_threads)
-    if work.folder is not None:
+    metrics = score_settings(runs, raw, densify, scorer, num_threads)
+    if sequence.has_pictures:
         for variant, run in zip(chunk, runs, strict=True):
-            _draw(picture_path(work.folder, variant.setting), run)
+            _draw(picture_path(sequence.folder, variant.setting), run)
     return metrics
 
 

@@ -7,10 +7,8 @@ command with `hydra.run.dir=` its folder goes on where it was stopped, with the 
 
 import re
 import shlex
-import shutil
 import statistics
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,77 +16,27 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from emgs_jax.config.configure import build, build_dataset, build_prior, compose, near
+from emgs_jax.config.configure import build_dataset, compose, near
 from emgs_jax.device.clock import Clock
-from emgs_jax.io.files import atomic_write, owned, remove_temporaries
+from emgs_jax.io.files import owned, remove_temporaries, write_file
 from emgs_jax.mapping.batch import programs
-from emgs_jax.prior.base import Prior
-from emgs_jax.report.metrics import Scorer, new_scorer
 from emgs_jax.report.repeat import written
-from emgs_jax.report.sweeps import SweepResults, write_csv
+from emgs_jax.report.sweeps import write_csv
 from emgs_jax.report.tuning import DEFAULT, SequenceResults, draw_trials, settings_yaml, table, verdict
 
 from .command import command
-from .grid import plain_setting, variant_of
+from .grid import variant_of
+from .keys import check_keys
 from .search import Space, ask, front, open_study, own_setting, read_objectives, read_space, told
-from .together import Work, chunks_of, map_and_score, provenance_of, refuse_other_maps, replayed, side_by_side
+from .together import Measured, refuse_other_maps
 
 Setting = Mapping[str, Any]
-
-
-class Measured:
-    """A sequence, and what settings came to on it: kept on disk after every chunk, measured once.
-
-    Args:
-        name: of the sequence.
-        config: composed for it.
-        folder: of its results.
-        clock: of the whole search.
-    """
-
-    def __init__(self, name: str, config: DictConfig, folder: Path, clock: Clock) -> None:
-        self.name, self.config, self._folder, self._clock = name, config, folder, clock
-        folder.mkdir(parents=True, exist_ok=True)
-        remove_temporaries(folder)  # of writes that were killed
-        self.dataset = build_dataset(config)
-        self.prior = build_prior(config, self.dataset)
-        self._results = SweepResults(folder, provenance_of(config, self.dataset, self.prior))
-        self._priors: dict[int, Prior] = {}
-
-    @cached_property
-    def _scorer(self) -> Scorer:
-        return new_scorer(self.dataset, build(self.config, "evaluation"), self.prior)
-
-    def _prior_of(self, window_size: int) -> Prior:
-        if window_size not in self._priors:
-            self.prior.check(self.dataset, window_size)
-            self._priors[window_size] = replayed(self.prior, self.dataset, window_size, self._folder / "predictions")
-        return self._priors[window_size]
-
-    def measure(self, settings: Sequence[Setting]) -> None:
-        """Map and score those of the settings that are not there yet."""
-        new = {repr(setting): setting for setting in settings if plain_setting(setting) not in self._results}
-        left = [variant_of(self.config, setting) for setting in new.values()]
-        with tqdm(total=len(self.dataset) * len(left), unit="frame", desc=self.name, disable=not left) as bar:
-            for chunk in chunks_of(left, self.config.chunk):
-                prior, shared = self._prior_of(chunk[0].slam.window_size), side_by_side(self.config, len(chunk))
-                work = Work(self.dataset, prior, self._scorer, self._clock, *shared)
-                self._results.add([variant.setting for variant in chunk], map_and_score(work, chunk, bar))
-
-    def metrics(self, setting: Setting) -> dict[str, Any]:
-        """Of a setting that was measured."""
-        return self._results.rows([plain_setting(setting)])[0]
-
-    def forget_predictions(self) -> None:
-        """Remove what was recorded for the time of the search."""
-        shutil.rmtree(self._folder / "predictions", ignore_errors=True)
 
 
 def tune(words: Sequence[str], folder: Path) -> list[dict[str, Any]]:
     """Search, and write what was found into `folder`.
 
     Args:
-        words: overrides of conf/tune.yaml.
         folder: of the results; one that holds a part of the same search is continued.
 
     Returns:
@@ -100,9 +48,7 @@ def tune(words: Sequence[str], folder: Path) -> list[dict[str, Any]]:
     config = compose(*words, name="tune")
     refuse_other_maps(config, "a search")
     space, objectives = read_space(config), read_objectives(config)
-    for key, least in (("trials", 1), ("chunk", 1), ("best", 1), ("startup", 0), ("search_seed", 0)):
-        if not isinstance(config[key], int) or config[key] < least:
-            raise ValueError(f"{key} must be a whole number from {least} on, got {config[key]!r}")
+    check_keys("tune", config)
     configs = {kind: _sequences(words, config, kind, space) for kind in ("tuned", "held_out")}
     _check_apart(configs["tuned"], configs["held_out"])
     own = own_setting(config, space)
@@ -114,13 +60,13 @@ def tune(words: Sequence[str], folder: Path) -> list[dict[str, Any]]:
         remove_temporaries(folder)
         study = open_study(folder / "study.jsonl", about, objectives)
         sequences = {
-            kind: [Measured(name, one, folder / kind / name, clock) for name, one in some.items()]
+            kind: [Measured(one, folder / kind / name, clock, name, is_asked_again=True) for name, one in some.items()]
             for kind, some in configs.items()
         }
         _search(study, config, space, objectives, own, sequences["tuned"])
         best = front(study, config.best)
         for sequence in sequences["held_out"]:
-            sequence.measure([own, *(trial.params for trial in best)])
+            _measure(sequence, [own, *(trial.params for trial in best)])
     for sequence in (*sequences["tuned"], *sequences["held_out"]):
         sequence.forget_predictions()
     rows = [_row(trial, sequences["tuned"], objectives) for trial in told(study)]
@@ -181,7 +127,7 @@ def _search(
         if done:
             tqdm.write(f"{done} of {config.trials} trials are done")
         for sequence in sequences:
-            sequence.measure([own, *(trial.params for trial in batch)])
+            _measure(sequence, [own, *(trial.params for trial in batch)])
         _check_metrics(objectives, sequences, own)
         for trial in batch:
             row = _row(trial, sequences, objectives)
@@ -192,10 +138,16 @@ def _search(
                 study.tell(trial.number, values)
 
 
+def _measure(sequence: Measured, settings: Sequence[Setting]) -> None:
+    """Map and score those of the settings that are not there yet, all of them together."""
+    new = {repr(setting): setting for setting in settings if setting not in sequence}
+    sequence.measure([variant_of(sequence.config, setting) for setting in new.values()])
+
+
 def _check_metrics(objectives: Mapping[str, str], sequences: Sequence[Measured], own: Setting) -> None:
     """Raise ValueError where an objective is no number of the default on some sequence."""
     for sequence in sequences:
-        metrics = sequence.metrics(own)
+        (metrics,) = sequence.rows([own])
         numbers = {key for key, value in metrics.items() if isinstance(value, int | float)}
         for key in objectives:
             if key not in numbers:
@@ -209,7 +161,7 @@ def _near(key: str, known: set[str]) -> str:
 
 def _row(trial: Any, sequences: Sequence[Measured], objectives: Mapping[str, str]) -> dict[str, Any]:
     """Number, values and objectives of a trial: means over the sequences, None where one has no value."""
-    found = [sequence.metrics(trial.params) for sequence in sequences]
+    found = [sequence.rows([trial.params])[0] for sequence in sequences]
     values = {key: [metrics.get(key) for metrics in found] for key in objectives}
     means = {key: None if None in numbers else statistics.fmean(numbers) for key, numbers in values.items()}
     return {"trial": trial.number} | trial.params | means
@@ -230,7 +182,7 @@ def _write(
             sequence.name,
             kind == "held_out",
             sequence.prior.provenance.is_simulated,
-            {name: sequence.metrics(setting) for name, setting in named.items()},
+            dict(zip(named, sequence.rows(list(named.values())), strict=True)),
         )
         for kind, some in sequences.items()
         for sequence in some
@@ -238,8 +190,7 @@ def _write(
     lines = verdict(results, objectives)
     text = "\n".join([table(results, objectives), *(f"- {line}" for line in lines.values()), ""])
     write_csv(folder / "trials.csv", [{**row, "is_best": row["trial"] in best} for row in rows])
-    with atomic_write(folder / "tune.md", "w") as handle:
-        handle.write(text)
+    write_file(folder / "tune.md", text)
     _write_best(folder, best, lines)
     numbers = {row["trial"]: DEFAULT for row in rows if all(row[key] == own[key] for key in own)}
     marks = numbers | {number: f"trial {number}" for number in best}
@@ -259,8 +210,7 @@ def _write_best(folder: Path, best: Mapping[int, Setting], lines: Mapping[str, s
     for number, setting in best.items():
         path = folder / "best" / f"trial_{number}.yaml"
         command_line = shlex.join(["emgs", "run", f"hydra.searchpath=[{place}]", f"+best={path.stem}"])
-        with atomic_write(path, "w") as handle:
-            handle.write(settings_yaml(setting, [f"{command_line} …", lines[f"trial {number}"]]))
+        write_file(path, settings_yaml(setting, [f"{command_line} …", lines[f"trial {number}"]]))
 
 
 @command("tune")

@@ -4,19 +4,18 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from emgs_jax.config.values import Declared, check_value
-from emgs_jax.ops.ranges import Range
 from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.viewer import Viewer
 from emgs_jax.report.viewer_scene import shown
 
 from .command import command
+from .keys import check_keys
 from .report import positional
 
 
 def view(config: DictConfig) -> Viewer:
     """Serve the run of a config."""
-    check_value("port", config.port, Declared(frozenset({int}), range=Range(1, 65535)))
+    check_keys("view", config)
     return Viewer(shown(read_run(Path(str(config.folder)))), config.port)
 
 

@@ -13,6 +13,7 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.icp import icp
 from emgs_jax.registration.pose_estimate import exact_estimate, root_information
 from emgs_jax.registration.pose_noise import no_repeats
+from emgs_jax.registration.problem import CoarseStart
 from emgs_jax.registration.repeated_prediction import repeat_scale
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
@@ -352,8 +353,10 @@ def test_the_fine_step_is_icp_of_the_scaled_points_with_the_noise_of_the_coarse_
     current = small_prediction(camera).current
     T, aligned, info = fine_step(current, submap, coarse, settings)
     scaled = sc.replace(current, points=coarse_scale * np.asarray(current.points))
-    known = sc.on_host(root_information)(coarse.estimate.covariance)
-    expected, scale, found = solve(scaled, submap, coarse.T_world_camera, known, sc.device(depth_noise), settings.icp)
+    known = sc.device(sc.on_host(root_information)(coarse.estimate.covariance))
+    expected, scale, found = solve(
+        scaled, submap, CoarseStart(coarse.T_world_camera, known, sc.device(depth_noise)), settings.icp
+    )
     # Another program rounds in another order; the solver stops within its tolerance.
     assert max(sc.pose_error(T, expected)) < 1e-4
     np.testing.assert_allclose(info.scale, coarse_scale * scale, rtol=1e-4)

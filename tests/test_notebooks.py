@@ -97,7 +97,7 @@ def test_the_readings_are_compared_seed_by_seed_and_loaded_when_run_again(monkey
     assert changes == [(None, None), ("slam.em.support", "printed"), ("slam.em.noise", 0.0)]
     first, second = (rows[1]["trajectory/ate_sim3_m"] - rows[0]["trajectory/ate_sim3_m"] for rows in found["rows"])
     assert found["effects"][1].metrics["trajectory/ate_sim3_m"] == [first, second] and first != second
-    monkeypatch.setattr("emgs_jax.experiments.sweep.map_and_score", None)  # calling it would fail
+    monkeypatch.setattr("emgs_jax.experiments.together.map_and_score", None)  # calling it would fail
     assert table_of(execute(2, " ".join((*TINY, AXES)), monkeypatch, tmp_path)) == table_of(found)
 
 

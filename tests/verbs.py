@@ -22,7 +22,7 @@ from emgs_jax.ops import clustering, linalg, neighbours
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.pose_graph import deform, factors
 from emgs_jax.refinement import refine
-from emgs_jax.registration import icp, noise, pose_estimate, pose_noise, rigid
+from emgs_jax.registration import icp, noise, pose_estimate, pose_noise, problem, rigid
 from emgs_jax.render import composite, densify, project
 
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
@@ -115,7 +115,7 @@ def graph_of(seed: int) -> factors.PoseGraph:
         *map(sc.device, (rng.normal(size=6), rng.normal(size=(6, 7, 7)))),
     )
     return factors.PoseGraph(
-        nodes, factors.Factors(*map(sc.device, (a, b)), *said, sc.device(a % 2), sc.device(np.arange(6) < 5))
+        nodes, factors.Factors(*map(sc.device, (a, b)), *said, sc.device(a % 2 == 1), sc.device(np.arange(6) < 5))
     )
 
 
@@ -173,7 +173,9 @@ VERBS = {
         lambda s: (belief_of(s),),
     ),
     "icp": (
-        lambda o, g, T: icp.icp(o, g, T, jnp.diag(50.0 * jnp.ones(7)), ONE * 0.01, CONFIG.localization.icp),
+        lambda o, g, T: icp.icp(
+            o, g, problem.CoarseStart(T, jnp.diag(50.0 * jnp.ones(7)), ONE * 0.01), CONFIG.localization.icp
+        ),
         lambda s: (
             sc.moved_points(sc.pose_of(np.linalg.inv(sc.matrix_of(sc.path_pose(s)))), close(s)),
             sc.random_gaussians(32, s, 2),
@@ -255,7 +257,7 @@ VERBS = {
     "residuals": (factors.residuals, lambda s: (graph_of(s),)),
     "linearize": (factors.linearize, lambda s: (graph_of(s),)),
     "robust": (
-        lambda chi2, kernel: factors.robust(chi2, jnp.arange(6) % 2, kernel),
+        lambda chi2, kernel: factors.robust(chi2, jnp.arange(6) % 2 == 1, kernel),
         lambda s: (sc.device(np.linspace(0.0, 60.0 + s, 6)), sc.device(16.8)),
     ),
     "classify": (semantics.classify, lambda s: (sc.random_gaussians(9, s, 2), sc.device(np.eye(2)))),

@@ -11,7 +11,7 @@ from emgs_jax.device.arrays import to_se3
 from emgs_jax.geometry import scale_pose
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.ops.ranges import number
-from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Factors
+from emgs_jax.pose_graph.factors import Factors
 from emgs_jax.pose_graph.problem import bucket
 from emgs_jax.registration.pose_noise import LEAST_NOISE
 
@@ -71,7 +71,7 @@ class Factor(NamedTuple):
     Z_a_b: np.ndarray
     log_ratio: float
     sqrt_info: np.ndarray
-    kind: int
+    is_loop: bool
 
 
 def _weights(frame: FrameData, noise: NoiseConfig, angle: float, log_scale: float = np.inf) -> np.ndarray:
@@ -109,7 +109,7 @@ def sequential_factor(
     row, spread = time - offset, np.sqrt(offset)
     weights = _weights(frame, noise, spread * noise.pair, spread * noise.log_scale)
     return Factor(
-        time, row, _relative_pose(poses, log_scales, row), log_scales[row] - log_scales[time], weights, ODOMETRY
+        time, row, _relative_pose(poses, log_scales, row), log_scales[row] - log_scales[time], weights, is_loop=False
     )
 
 
@@ -118,7 +118,7 @@ def map_factor(
 ) -> Factor:
     """Build the map factor: the last frame's pose relative to the frame `origin` whose Gaussians it was fitted to."""
     measured = _relative_pose(poses, log_scales, origin)
-    return Factor(len(poses) - 1, origin, measured, 0.0, _weights(frame, noise, noise.map), ODOMETRY)
+    return Factor(len(poses) - 1, origin, measured, 0.0, _weights(frame, noise, noise.map), is_loop=False)
 
 
 def _relative_pose(poses: Sequence[np.ndarray], log_scales: Sequence[float], row: int) -> np.ndarray:
@@ -128,20 +128,20 @@ def _relative_pose(poses: Sequence[np.ndarray], log_scales: Sequence[float], row
 
 def loop_factor(loop: LoopMeasurement) -> Factor:
     """Build the loop factor of a verified loop."""
-    return Factor(loop.a, loop.b, loop.Z_a_b, loop.log_ratio, loop.sqrt_info, LOOP)
+    return Factor(loop.a, loop.b, loop.Z_a_b, loop.log_ratio, loop.sqrt_info, is_loop=True)
 
 
 def stack_factors(factors: Sequence[Factor]) -> Factors:
     """Stack factors as float32 arrays, padded to a power of two: a growing graph compiles rarely."""
     count = len(factors)
     size = bucket(count)
-    a, b, Z, ratios, weights, kinds = zip(*factors, *[factors[0]] * (size - count), strict=True)
+    a, b, Z, ratios, weights, is_loop = zip(*factors, *[factors[0]] * (size - count), strict=True)
     return Factors(
         a=jnp.asarray(a, jnp.int32),
         b=jnp.asarray(b, jnp.int32),
         Z_a_b=to_se3(np.stack(Z)),
         log_ratio=jnp.asarray(ratios, jnp.float32),
         sqrt_info=jnp.asarray(np.stack(weights), jnp.float32),
-        kind=jnp.asarray(kinds, jnp.int32),
+        is_loop=jnp.asarray(is_loop, bool),
         valid=jnp.asarray(np.arange(size) < count),
     )

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from emgs_jax.io.files import atomic_write
-from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Factors, Nodes, PoseGraph
+from emgs_jax.io.files import write_file
+from emgs_jax.pose_graph.factors import Factors, Nodes, PoseGraph
 
 VERTEX, EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 FORMS = {VERTEX: "id x y z qx qy qz qw", EDGE: "id id x y z qx qy qz qw and the 21 numbers of the upper triangle"}
@@ -20,7 +20,7 @@ ROUNDING = 1e-6
 
 
 def load_graph_g2o(path: str | os.PathLike, half_angles: bool = False) -> PoseGraph:
-    """Read nodes, in the order of the file, and edges; those between neighbours in it are ODOMETRY, all others LOOP.
+    """Read nodes, in the order of the file, and edges; those between neighbours in it are sequential, all others loops.
 
     Z of an edge `a b` is T_a⁻¹ T_b. Scales are not part of the format: log_scale is 0, the scale row not measured;
     solve with scale_std = 0. Lines that begin with # or FIX are read over (the first node is the gauge).
@@ -99,12 +99,12 @@ def _roots(upper: np.ndarray, half_angles: bool, places: list[str]) -> np.ndarra
 
 
 def _graph(vertices: np.ndarray, ends: np.ndarray, poses: np.ndarray, roots: np.ndarray) -> PoseGraph:
-    kind = np.where(np.abs(ends[:, 1] - ends[:, 0]) == 1, ODOMETRY, LOOP)
+    is_loop = np.abs(ends[:, 1] - ends[:, 0]) != 1
     with jax.enable_x64(True):
         a, b = jnp.asarray(ends, jnp.int32).T
         nodes = Nodes(_to_poses(vertices), jnp.zeros(len(vertices)), jnp.ones(len(vertices), bool))
         used, ratio = jnp.ones(len(ends), bool), jnp.zeros(len(ends))
-        edges = Factors(a, b, _to_poses(poses), ratio, jnp.asarray(roots), jnp.asarray(kind, jnp.int32), used)
+        edges = Factors(a, b, _to_poses(poses), ratio, jnp.asarray(roots), jnp.asarray(is_loop), used)
     return PoseGraph(nodes, edges)
 
 
@@ -130,8 +130,7 @@ def save_graph_g2o(path: str | os.PathLike, graph: PoseGraph, half_angles: bool 
     values = np.concatenate([_to_g2o(edges.Z_a_b), upper], axis=1)
     for row in np.flatnonzero(np.asarray(edges.valid)):
         lines.append(f"{EDGE} {int(edges.a[row])} {int(edges.b[row])} {_numbers(values[row])}")
-    with atomic_write(path, "w") as handle:
-        handle.write("\n".join(lines) + "\n")
+    write_file(path, "\n".join(lines) + "\n")
 
 
 def _to_g2o(poses: jaxlie.SE3) -> np.ndarray:

@@ -22,7 +22,6 @@ from emgs_jax.loop_closure.prior_query import PriorQuery, fuse_measurements, mea
 from emgs_jax.loop_closure.relocalization import NO_CANDIDATE, PosedKeyframes, RelocalizedPose, relocalize
 from emgs_jax.loop_closure.two_view_alignment import Gate
 from emgs_jax.loop_closure.verification import LoopMeasurement, VerificationConfig, neighbours_of, verify
-from emgs_jax.pose_graph.factors import LOOP
 
 # Outcomes of a query: a second measurement, no answer, or an answer without a pose or enough depths.
 MEASURED, SILENT, UNUSABLE = "measured", "silent", "unusable"
@@ -113,7 +112,7 @@ def remove_inconsistent(end: BackEnd) -> BackEnd:
     """Remove the factors of accepted loops that are not spatially consistent any more."""
     good = {(loop.a, loop.b) for loop in consistent_loops(end)}
     accepted = [loop for loop in end.accepted if (loop.a, loop.b) in good]
-    factors = [one for one in end.factors if one.kind != LOOP or (one.a, one.b) in good]
+    factors = [one for one in end.factors if not one.is_loop or (one.a, one.b) in good]
     return replace(end, accepted=accepted, factors=factors)
 
 

@@ -64,7 +64,8 @@ def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
     arrays |= {f"keyframes.{name}": np.stack([getattr(one, name) for one in keyframes]) for name in OF_KEYFRAMES}
     arrays |= {f"keyframes.{name}": np.concatenate([getattr(one, name) for one in keyframes]) for name in OF_POINTS}
     arrays["keyframes.num_points"] = np.array([len(one.pixels) for one in keyframes])
-    arrays |= _table("edges", end.factors, Factor.__annotations__)
+    edges = _table("edges", end.factors, Factor.__annotations__)
+    arrays |= edges | {"edges.kind": edges.pop("edges.is_loop").astype(int)}
     for name, field in LOOPS.items():
         arrays |= _table(name, getattr(end, field), LoopMeasurement.__annotations__)
     with atomic_write(path) as handle:
@@ -156,6 +157,7 @@ def _fields(arrays: Mapping[str, np.ndarray], num_trained: int) -> dict[str, Any
     if numbers != sorted(set(numbers)) or not 0 <= numbers[0] <= numbers[-1] < count:
         raise ValueError("keyframes are not nodes in their order")
     vectors = np.stack([vlad(unit_descriptors(one), words) for one in keyframes])
+    edges = {**arrays, "edges.is_loop": arrays["edges.kind"] == 1}
     is_kept = arrays.get("is_kept", np.ones(count, bool))  # older files do not have it
     loops = {
         field: [LoopMeasurement(**row) for row in _rows(name, arrays, LoopMeasurement.__annotations__, count)]
@@ -168,7 +170,7 @@ def _fields(arrays: Mapping[str, np.ndarray], num_trained: int) -> dict[str, Any
         "frames": frames.tolist(),
         "is_placed": is_placed.tolist(),
         "submap_ids": np.where(is_kept, 0, LEFT_OUT).tolist(),
-        "factors": [Factor(**row) for row in _rows("edges", arrays, Factor.__annotations__, count)],
+        "factors": [Factor(**row) for row in _rows("edges", edges, Factor.__annotations__, count)],
         "database": Database(keyframes, words, vectors, num_trained),
         "first_node": count,
         "connected_since": count,

@@ -20,7 +20,6 @@ from emgs_jax.loop_closure.relocalization import RelocalizationConfig
 from emgs_jax.loop_closure.verification import LoopMeasurement, VerificationConfig
 from emgs_jax.ops.ranges import number
 from emgs_jax.pose_graph.deform import DeformConfig
-from emgs_jax.pose_graph.factors import ODOMETRY
 from emgs_jax.pose_graph.optimize import PoseGraphConfig, PoseGraphInfo
 
 
@@ -31,16 +30,13 @@ class BackEndConfig:
     Args:
         noise: of sequential and map factors.
         place_recognition: keyframes, and candidates by their appearance.
-        verification: of a candidate.
         consistency: spatial consistency of verified loops.
         prior_query: second measurement of loops by the prior.
         every: frames between keyframes.
         min_violation: χ² of a loop at the current poses beyond which it violates them: only such a loop starts a
             closure, and only for such a loop the prior is queried.
         min_frames: between two closures.
-        solver: of the pose graph.
         deform: of the map, to follow the optimized poses.
-        relocalization: of a lost camera.
     """
 
     noise: NoiseConfig
@@ -79,8 +75,6 @@ class BackEnd:
     """State of the back end: nodes, factors and loops of the pose graph so far. Nothing of it is ever changed in place.
 
     Args:
-        config: all settings.
-        intrinsics: of the images.
         min_std: floor of the map's covariances.
         poses: current T_world_camera (4, 4) of the nodes.
         log_scales: σ of their inferences, likewise.
@@ -88,7 +82,6 @@ class BackEnd:
         frames: index in the data set of every node.
         is_placed: True for nodes in the map: those that are neither degraded nor lost.
         submap_ids: disconnected submap of every node; the relative pose of two submaps is not known.
-        factors: of the pose graph.
         database: keyframes; their `frame` is the node.
         verified: loops that passed every gate of two keyframes.
         violating: loops with a free-space violation.
@@ -156,8 +149,8 @@ def add_node(
 
 
 def _is_connected(end: BackEnd, row: int) -> bool:
-    """Test whether a node is in the map or has an odometry factor; False for nodes before the camera was found."""
-    has_factor = any(factor.a == row and factor.kind == ODOMETRY for factor in end.factors)
+    """Test whether a node is in the map or has a factor other than loops; False before the camera was found."""
+    has_factor = any(factor.a == row and not factor.is_loop for factor in end.factors)
     return row >= end.connected_since and (end.is_placed[row] or has_factor)
 
 

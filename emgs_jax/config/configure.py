@@ -60,7 +60,6 @@ def build(config: DictConfig, key: str, **more: Any) -> Any:
     """Instantiate the node at `key`, after all of its values are checked.
 
     Args:
-        config: composed.
         key: dotted, of a node with `_target_`.
         more: parameters that the config does not hold.
 

@@ -39,8 +39,6 @@ class Apartment(RayCast):
         walk: two_laps through four rooms; figure_of_eight through a doorway; out_and_back, which sees everything from
             the other side; twin_rooms, two that look alike; corridor, which looks the same every 3 m.
         num_frames: images along the walk, which stays the same; None = 7 cm apart, some 280 to 560.
-        start, stop, stride: which of these images.
-        size: (width, height).
         intrinsics: fx, fy, cx, cy at `size`; None = .82 times the width and the centre.
     """
 

@@ -28,10 +28,8 @@ class Bonn(Tum):
     """One sequence of Bonn RGB-D Dynamic; what a list lacks is treated as in `Tum`.
 
     Args:
-        root: folder that holds the sequences.
         sequence: "rgbd_bonn_balloon".
         start, stop, stride: which of the images in rgb.txt, in order of time.
-        size: (width, height) of the frames given out.
         intrinsics: of the images on disk, as `Images` takes them; None = the benchmark's calibration.
         depth_scale: raw units per metre of the motion capture.
         max_time_difference: seconds between a colour image and its depth image or pose.

@@ -22,7 +22,6 @@ class ClassFile:
     """Classes of a file.
 
     Args:
-        path: of the file.
         names: of the classes, each once.
         positions: by id of the data set, the position in `names`, -1 = no class; None where the file has no ids.
     """

@@ -30,9 +30,7 @@ class SparseModel:
     Args:
         cameras: by id the words MODEL WIDTH HEIGHT PARAMS… as in cameras.txt, in COLMAP's own pixels.
         names: of the image files, below the folder of images.
-        camera_ids: of each image.
         T_world_camera: (n, 4, 4), in the model's unit.
-        files: that were read.
     """
 
     cameras: dict[int, list[str]]

@@ -23,11 +23,9 @@ class Euroc(PosedImages):
     """One camera of one sequence of EuRoC, straightened; without state_groundtruth_estimate0 there are no poses.
 
     Args:
-        root: folder that holds the sequences.
         sequence: "MH_01_easy".
         camera: "cam0" (left) or "cam1".
         start, stop, stride: which of the images in data.csv, in order of time.
-        size: (width, height) of the frames given out.
         max_time_difference: seconds between an image and its pose.
     """
 

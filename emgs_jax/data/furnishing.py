@@ -23,7 +23,6 @@ def furnish(
     """Place pieces of furniture at random along the walls, around what stands in the middle; return all parts.
 
     Args:
-        area: the room.
         pieces: placed in this order; one without a free place after TRIES draws is left out.
         middle: parts in the world, which stay.
         lanes: points (x, y) of the routes through the room.

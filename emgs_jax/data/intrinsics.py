@@ -37,7 +37,6 @@ class Pictures:
 
     Args:
         size: (width, height) on disk.
-        count: how many.
         read: RGB image 0..count-1 as it is on disk; raises BadFrameError.
         files: their files; empty for a video.
         name: of them all, for messages.
@@ -107,7 +106,6 @@ def to_lens(camera: Calibration, size: Size, what: str, about: Mapping[str, Any]
     """The lens of a calibration.
 
     Args:
-        camera: calibrated.
         size: (width, height) of the images on disk.
         what: names the calibration in errors.
         about: where it comes from; size, intrinsics and distortion are added.

@@ -26,7 +26,6 @@ class Kitti(PosedImages):
         sequence: "00"; of 7 the two digits 07.
         camera: 0 and 1 are grey, 2 and 3 in colour, left and right.
         start, stop, stride: which of the images, in order of their names.
-        size: (width, height) of the frames given out.
     """
 
     name = "kitti"
@@ -52,7 +51,6 @@ def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:
     """The images of a camera and its poses.
 
     Args:
-        folder: of the sequence.
         truth: poses of camera 0; a poses.txt in `folder` does as well, and without either there is none.
         camera: 0 to 3.
 

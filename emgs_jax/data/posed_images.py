@@ -33,13 +33,10 @@ class Solved:
     """Images of one camera with the poses and the calibration that another program solved for.
 
     Args:
-        images: files.
         poses: T_world_camera of each, in the program's unit; None where there is none.
         camera: of all of them.
         source: the file that poses and camera come from.
-        files: all that were read.
         times: seconds of each, where the images stand in order of time; None = from their names.
-        note: what is odd.
     """
 
     images: list[Path]
@@ -119,12 +116,10 @@ class Colmap(PosedImages):
     """A project of COLMAP: the images that are registered in a sparse model, of one camera.
 
     Args:
-        root: folder of the project.
         sequence: folder below root; None = root itself.
         model: folder of the model below that; None = the first of MODEL_FOLDERS that has one, of several the largest.
         images: folder of the images below that.
         start, stop, stride: which of the registered images, in natural order of their names.
-        size: (width, height) of the frames given out.
     """
 
     name = "colmap"
@@ -149,10 +144,8 @@ class Nerfstudio(PosedImages):
     """A folder with nerfstudio's transforms.json, of one camera.
 
     Args:
-        root: folder with transforms.json.
         sequence: folder below root; None = root itself.
         start, stop, stride: which of its images, in natural order of their names.
-        size: (width, height) of the frames given out.
     """
 
     name = "nerfstudio"

@@ -26,7 +26,6 @@ class Replica:
         root: folder that holds cam_params.json and the scenes.
         sequence: "office0".
         start, stop, stride: which of the images that are there, in order.
-        size: (width, height) of the frames given out.
         intrinsics: of the images on disk, as `Images` takes them; None = those of cam_params.json.
         depth_scale: raw units per metre; None = that of cam_params.json.
     """

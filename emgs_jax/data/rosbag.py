@@ -32,13 +32,11 @@ class RosBag:
     """The images of one topic.
 
     Args:
-        root: bag.
         sequence: bag below root; None = root itself.
         topic: of sensor_msgs/Image or CompressedImage; None = the only one.
         info_topic: of sensor_msgs/CameraInfo; None = camera_info beside the topic, or the only one.
         intrinsics: as `Images` takes them; None = those of the first CameraInfo.
         start, stop, stride: which of the images, in the order in which they were taken.
-        size: (width, height) of the frames given out.
     """
 
     name = "rosbag"

@@ -36,10 +36,8 @@ class SevenScenes:
     """One sequence of 7-Scenes.
 
     Args:
-        root: folder that holds the scenes.
         sequence: "SCENE/seq-XX".
         start, stop, stride: which of the images that are there, in order.
-        size: (width, height) of the frames given out.
         intrinsics: of the 640x480 colour images, as `Images` takes them; None = 525 when registered, else 585.
         depth_scale: raw units per metre.
         register_depth: warp depth into the colour camera and give its pose; else depth and pose are the depth camera's.
@@ -133,7 +131,6 @@ def read_poses(path: Path, sequence: str) -> dict[float, Float[np.ndarray, "4 4"
     qy qz tx ty tz focal", world -> colour camera; # begins a comment.
 
     Args:
-        path: the list.
         sequence: seq-XX; lines of other sequences are left out.
 
     Raises:

@@ -19,8 +19,6 @@ class Synthetic(RayCast):
     Args:
         seed: room, furniture, colours and path.
         num_frames: images along the path, which stays the same: more frames are nearer to each other.
-        start, stop, stride: which of these images.
-        size: (width, height).
         intrinsics: fx, fy, cx, cy at `size`; None = .82 times the width and the centre.
     """
 

@@ -43,7 +43,6 @@ def find_tones(read: Callable[[int], np.ndarray], count: int) -> Tones | None:
 
     Args:
         read: image 0..count-1 in its own bits; raises BadFrameError.
-        count: number of images.
 
     Returns:
         None for images of 8 bits, for 16 bits of which more than MIN_SPAN is used, and where no image can be read.

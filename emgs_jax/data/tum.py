@@ -43,10 +43,8 @@ class Tum:
     inf or nan, has none. A list that no image has anything of is an error.
 
     Args:
-        root: folder that holds the sequences.
         sequence: "rgbd_dataset_freiburg1_desk"; freiburg1, 2 and 3 in the name choose the calibration.
         start, stop, stride: which of the images in rgb.txt, in order of time.
-        size: (width, height) of the frames given out.
         intrinsics: of the images on disk, as `Images` takes them; None = the benchmark's calibration.
         distortion: k1, k2, p1, p2, k3 that goes with four numbers of `intrinsics`; None = what those say themselves.
         depth_scale: raw units per metre.

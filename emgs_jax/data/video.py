@@ -17,7 +17,6 @@ class Video:
     """A video, read from its beginning: seeking lands on a key frame nearby with many codecs, counting never does.
 
     Args:
-        path: of the file.
         stop: frames from there on are not wanted, and not counted; None = all.
 
     Attributes:

@@ -1,5 +1,6 @@
 """Arrays of NumPy on the device, and poses as both sides have them."""
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import jax
@@ -19,6 +20,17 @@ def on_device(tree: Any) -> Any:
 @stored
 def _poses(matrices: jax.Array, is_finite: jax.Array) -> jaxlie.SE3:
     return jaxlie.SE3(jnp.where(is_finite[..., None], jaxlie.SE3.from_matrix(matrices).wxyz_xyz, jnp.nan))
+
+
+def fetched(trees: Iterable[Any]) -> Iterator[Any]:
+    """Trees of arrays on the host, one after the other; the next is being computed while one is looked at."""
+    pending = None
+    for tree in trees:
+        if pending is not None:
+            yield jax.device_get(pending)
+        pending = tree
+    if pending is not None:
+        yield jax.device_get(pending)
 
 
 def to_se3(matrices: np.ndarray) -> jaxlie.SE3:

@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 
-from emgs_jax.io.files import atomic_write
+from emgs_jax.io.files import write_file
 
 TRUSTED = ("emgs_jax.", "jaxlie.")  # whose classes a description may name
 
@@ -44,8 +44,7 @@ def write(folder: Path, name: str, content: bytes) -> None:
     data = zlib.compress(content, 1)
     with contextlib.suppress(OSError):  # a full disk keeps nothing, and is no failure
         used.write_bytes(time.time_ns().to_bytes(8, "little"))
-        with atomic_write(path) as file:
-            file.write(hashlib.sha256(data).digest() + data)
+        write_file(path, hashlib.sha256(data).digest() + data)
 
 
 def remove(folder: Path, name: str, error: Exception) -> None:

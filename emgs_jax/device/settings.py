@@ -7,6 +7,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from emgs_jax.io.files import problem_of
+
 MAX_BYTES = 2 * 2**30  # what was not used for longest goes first
 # Where a config says so, and where it has the words that will.
 IN_TORCH = re.compile(
@@ -35,25 +37,13 @@ def use_compilation_cache(folder: str | None = "auto") -> None:
     if str(folder) == "auto" and jax.config.jax_compilation_cache_dir is not None:
         return
     path = cache_folder() if str(folder) == "auto" else Path(folder).expanduser()
-    if (problem := _problem_of(path)) is not None:
+    if (problem := problem_of(path)) is not None:
         print(f"warning: nothing is kept of what JAX compiles, {path}: {problem}", file=sys.stderr)
         return
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
-def _problem_of(path: Path) -> str | None:
-    """Why nothing can be written into a folder, which is made where it is missing; None where all is well."""
-    probe = path / f".{os.getpid()}.tmp"
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        return error.strerror or str(error)
-    return None
 
 
 def leave_memory_to_torch(config: DictConfig) -> None:

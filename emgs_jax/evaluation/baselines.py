@@ -26,7 +26,6 @@ class View:
     Args:
         depth: camera-space z (h, w), 0 where there is none.
         image: RGB, uint8 (h, w, 3).
-        cloud: the points with their normals.
     """
 
     depth: np.ndarray
@@ -64,7 +63,6 @@ class VoxelConfig:
     """The mean of all points of each voxel.
 
     Args:
-        voxel_m: its side.
         max_footprint_px: a point is drawn as the square that its voxel covers, but at most so far to each side: what
             lies just before the camera would fill the image.
         surface_depth: see `draw_voxels`.
@@ -92,7 +90,6 @@ class TsdfConfig:
     surfaces nearer to each other than that disturb each other.
 
     Args:
-        voxel_m: side of a voxel.
         truncation_m: distance at which the field ends; a few voxels, and more than the noise of the depth.
         min_views: that must have seen a place.
     """

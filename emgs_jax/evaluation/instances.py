@@ -26,12 +26,7 @@ class Instance:
     """One object, in the frame and unit of the map.
 
     Args:
-        center: mean of its Gaussians' means, (3,).
         low: lower corner of the box along the map's axes that holds its Gaussians' means with one standard deviation.
-        high: upper corner.
-        score: mean cosine of its Gaussians with the word.
-        lead: mean lead over everything else.
-        rows: of its Gaussians.
     """
 
     center: np.ndarray
@@ -72,8 +67,6 @@ def find_instances(
         answers: rows of the Gaussians that answer to the word.
         shape: means (n, 3) and covariances (n, 3, 3) of all.
         strength: cosine and lead (n,) of all with this word.
-        reach: see `reach_of`.
-        min_gaussians: see `InstanceConfig`.
     """
     means, covs = (np.asarray(values, np.float64) for values in shape)
     cosines, leads = (np.asarray(values, np.float64) for values in strength)

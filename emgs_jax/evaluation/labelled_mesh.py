@@ -12,11 +12,6 @@ from emgs_jax.io.ply_reader import read_vertices
 def read_labelled_mesh(folder: Path, scene: str, classes: ClassFile) -> LabelledPoints:
     """The vertices of a scene with their classes, -1 = none.
 
-    Args:
-        folder: of the files.
-        scene: for example office0.
-        classes: of the ids.
-
     Raises:
         ValueError: a file is missing or damaged, the ids are not as many as the vertices, or one has no name.
     """

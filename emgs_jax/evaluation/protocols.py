@@ -20,7 +20,6 @@ class SegmentationProtocol:
     """Protocol by which labels of a map are compared with the truth. Values: conf/protocol.
 
     Args:
-        name: of the protocol.
         compared_at: `truth`: each true point takes the most frequent class of the map's nearest points; or `map`: each
             point of the map is compared with the nearest true point.
         num_neighbours: of the map, that vote for a true point; not used at `map`.
@@ -76,10 +75,6 @@ def give_classes(
 
     Args:
         cosines: of its feature with each class, (n, c).
-        is_known: (n,), whether it has a feature.
-        true_labels: of the scene.
-        ignored: positions of classes.
-        p: the protocol.
     """
     offered = np.ones(cosines.shape[1], bool)
     if p.offered != "all":

@@ -121,8 +121,6 @@ class Reference:
 
     Args:
         cloud: averaged per voxel.
-        points: to search its points.
-        icp_points: those that ICP takes.
     """
 
     cloud: PointCloud

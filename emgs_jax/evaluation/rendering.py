@@ -38,9 +38,7 @@ class Rendered:
     """Compares what is rendered of one estimate with the frames of a data set, one view after the other.
 
     Args:
-        dataset: with the images and the true depth.
         poses: of the estimate and the true ones (n, 4, 4), for the scale; None: nothing is compared.
-        config: the protocol.
         has_classes: each view comes with the classes of its pixels.
     """
 

@@ -27,7 +27,6 @@ class LabelledPoints:
     Args:
         points: (n, 3), metres.
         labels: (n,), position in `classes`; any other number is no class.
-        classes: their names.
     """
 
     points: np.ndarray

@@ -20,7 +20,6 @@ class DinoFiles:
         vision_head: weights of dino.txt.
         text_encoder: weights of dino.txt, perhaps the same file.
         vocabulary: of CLIP.
-        source: where they are published, for messages.
     """
 
     vision_head: str

@@ -34,7 +34,6 @@ class DinoText:
         checkpoint: folder of the weights.
         files: names of the files in it.
         num_registers: of the backbone, which dino.txt was trained on.
-        image: how images are resized and normalised.
         num_text_heads: of the text encoder's attention.
         device: of PyTorch; None = a GPU if there is one.
         classes: names to embed, or to choose from `text`.
@@ -158,7 +157,6 @@ def read_backbone(folder: Path, source: str) -> Any:
 
     Args:
         folder: has config.json and model.safetensors.
-        source: where they are published, for messages.
 
     Raises:
         ValueError: the files are damaged or not of one model, or transformers cannot be imported.

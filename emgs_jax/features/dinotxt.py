@@ -18,7 +18,6 @@ def vision_head(tokens: "Tensor", weights: Weights, num_heads: int) -> "Tensor":
     Args:
         tokens: class token, registers and patches after the backbone's norm (b, n, d).
         weights: `blocks.{i}.{norm1, attn, ls1, norm2, mlp, ls2}…` and `ln_final…`.
-        num_heads: of the attention.
     """
     from torch.nn.functional import silu
 
@@ -38,7 +37,6 @@ def text_tower(tokens: "Tensor", weights: Weights, num_heads: int) -> "Tensor":
         tokens: of `Tokenizer`.
         weights: `backbone.{token_embedding, positional_embedding, blocks.{i}…, ln_final}…` and
             `head.linear_projection.weight`.
-        num_heads: of the attention.
     """
     from torch.nn.functional import gelu
 

@@ -16,7 +16,6 @@ class ImageConfig:
     Args:
         long_side: pixels to which the longer side is resized, a multiple of the patch.
         mean: of RGB in [0, 1], subtracted.
-        std: of RGB, divided by.
     """
 
     long_side: int = number(low=1, high=65536)
@@ -41,7 +40,6 @@ def network_input(image: np.ndarray, grid: tuple[int, int], patch: int, config: 
         image: RGB.
         grid: (columns, rows) of patches.
         patch: pixels a side.
-        config: mean and standard deviation.
     """
     size = (grid[0] * patch, grid[1] * patch)
     is_smaller = size[0] < image.shape[1]

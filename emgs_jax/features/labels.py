@@ -26,7 +26,6 @@ class LabelFeatures:
     Args:
         folder: STEM.png with class ids (see `LabelFolder`), or STEM.npy with scores (h, w, classes), at least 0, in
             the order of `names`, for every image STEM.* of the data set.
-        names: file of the classes.
         unknown: ids that mean no class, see `LabelFolder`.
         text: file of `experiments.embed` with the names' embeddings; None = the axes.
     """

@@ -14,11 +14,7 @@ class RandomFeatures:
     """Project the mean colour of each cell (implements `FeatureModel`). The text embeddings say nothing of colours.
 
     Args:
-        width: f.
         cell: pixels a side.
-        seed: of the projection.
-        classes: names to embed.
-        templates: prompts over which an embedding is the mean.
         text: file of `experiments.embed` to take the embeddings from; None makes them.
     """
 

@@ -25,10 +25,8 @@ class TextEmbeddings:
     """Classes as vectors.
 
     Args:
-        names: of the classes.
         vectors: unit, float32 (classes, f).
         templates: prompts over which each vector is the mean.
-        model: identity of the model.
     """
 
     names: tuple[str, ...]
@@ -43,7 +41,6 @@ def average_over_templates(
     """Return one unit vector per name, float32 (classes, f): the mean of its prompts' unit vectors, unit again.
 
     Args:
-        names: of the classes.
         templates: each has one {} for the name.
         encode: prompts -> vectors (prompts, f).
     """
@@ -78,7 +75,6 @@ def load_text(path: Path | str, model: dict, names: Sequence[str] = ()) -> TextE
     Args:
         path: a file of `experiments.embed`.
         model: identity of the model whose features they will be compared with.
-        names: classes to choose.
 
     Raises:
         ValueError: the file is damaged, foreign, newer, of another model, or lacks a name.

@@ -27,7 +27,6 @@ class Tokenizer:
     Args:
         path: CLIP's `bpe_simple_vocab_16e6.txt.gz`: after its first line, one pair a line, most frequent first.
         num_tokens: size of the text model's table; it says how many pairs of the file are in use.
-        length: tokens per text.
     """
 
     def __init__(self, path: Path, num_tokens: int, length: int) -> None:

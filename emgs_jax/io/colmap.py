@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.io.files import atomic_write
+from emgs_jax.io.files import write_file
 from emgs_jax.ops.camera import Camera
 
 
@@ -49,5 +49,4 @@ def _words(values: Sequence[float]) -> str:
 
 
 def _write(path: Path, lines: list[str]) -> None:
-    with atomic_write(path, "w") as handle:
-        handle.write("\n".join(lines) + "\n")
+    write_file(path, "\n".join(lines) + "\n")

@@ -7,7 +7,7 @@ import math
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -35,6 +35,12 @@ def atomic_write(path: str | os.PathLike, mode: str = "wb") -> Iterator[IO]:
             temporary.unlink()
 
 
+def write_file(path: str | os.PathLike, content: str | bytes) -> None:
+    """Write a file, whole or not at all."""
+    with atomic_write(path, "w" if isinstance(content, str) else "wb") as handle:
+        handle.write(content)
+
+
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """A folder beside `path` that becomes `path` if the block succeeds, and is removed if it does not.
@@ -54,6 +60,18 @@ def new_folder(path: Path) -> Iterator[Path]:
         raise _named(error, path) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def problem_of(folder: Path) -> str | None:
+    """Say why nothing can be written into a folder, which is made where it is missing; None where all is well."""
+    probe = folder / f".{os.getpid()}.tmp"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
 
 
 @contextlib.contextmanager
@@ -144,10 +162,16 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return values
 
 
+def changes(before: Mapping[str, Any], now: Mapping[str, Any], but: Collection[str] = ()) -> list[str]:
+    """Say each value in which two trees as JSON has them differ, with its dotted key; those of `but` may."""
+    before, now = flat(before), flat(now)
+    changed = (key for key in sorted({*before, *now} - {*but}) if before.get(key) != now.get(key))
+    return [f"{key} was {before.get(key)!r}, now it is {now.get(key)!r}" for key in changed]
+
+
 def write_json(path: str | os.PathLike, value: Any) -> None:
     """Write `value` as indented, strictly valid JSON."""
-    with atomic_write(path, "w") as handle:
-        handle.write(json.dumps(jsonable(value), indent=2, allow_nan=False) + "\n")
+    write_file(path, json.dumps(jsonable(value), indent=2, allow_nan=False) + "\n")
 
 
 class FrameLog:

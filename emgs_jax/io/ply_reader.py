@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emgs_jax.io.files import atomic_write
+from emgs_jax.io.files import write_file
 
 REMEDY = "write the file again"
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
@@ -74,8 +74,7 @@ def scale_ply(path: str | os.PathLike, target: str | os.PathLike, factor: float)
         rows[name] *= factor
     for name in {"scale_0", "scale_1", "scale_2"} & {*elements[0].properties}:
         rows[name] += math.log(factor)
-    with atomic_write(target) as handle:
-        handle.write(content[:start] + rows.tobytes() + content[end:])
+    write_file(target, content[:start] + rows.tobytes() + content[end:])
 
 
 def _header(content: bytes, path: object) -> tuple[str, list[Element], int]:

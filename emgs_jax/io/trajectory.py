@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.io.files import atomic_write
+from emgs_jax.io.files import write_file
 
 MAX_VALUE, MAX_NORM_ERROR = 1e9, 1e-2  # of other systems, whose units are their own and whose digits may be few
 
@@ -20,8 +20,7 @@ def save_trajectory_tum(path: str | os.PathLike, timestamps: Any, T_world_camera
     lines = ["# timestamp tx ty tz qx qy qz qw"]
     for time, pose in zip(timestamps, poses, strict=True):
         lines.append(" ".join([f"{time:.6f}", *(f"{value:.9f}" for value in to_tum(pose))]))
-    with atomic_write(path, "w") as handle:
-        handle.write("\n".join(lines) + "\n")
+    write_file(path, "\n".join(lines) + "\n")
 
 
 def to_tum(pose: np.ndarray) -> tuple[float, ...]:

@@ -14,8 +14,6 @@ def detect(
 
     Args:
         gray: uint8 (h, w).
-        num_features: at most, the strongest.
-        min_contrast: of a keypoint.
         magnification: of the image that is searched: more finds what is small or faint.
 
     Returns:

@@ -27,7 +27,6 @@ class ConsistencyConfig:
     Args:
         max_query_gap, max_candidate_gap: between the queries and between the candidates of two loops.
         max_distance: between the positions that they imply for one query.
-        max_turn_deg: likewise.
         min_others: loops, each of another query, that a loop needs.
         max_violating_queries: queries of loops with a free-space violation, in a chain of consistent loops.
     """
@@ -61,7 +60,6 @@ def spatially_consistent(
         violating: `VerifyInfo.violation` of loops that were rejected for a free-space violation.
         poses: current T_world_camera of every frame of a loop.
         log_scales: σ of these: a length of the inference times e^σ is one of the map.
-        config: thresholds.
     """
     every = [*loops, *violating]
     if not every:

@@ -26,17 +26,12 @@ class PlaceRecognitionConfig:
 
     Args:
         num_features: keypoints of one image, at most.
-        min_contrast: of a keypoint (SIFT).
         max_depth_step: between the depths of the four pixels around a keypoint, relative to the smallest; where it is
             larger a depth between them would lie on no surface.
         grid: columns and rows of the depths that are kept.
-        num_words: of the vocabulary.
         max_training: descriptors that it is trained on.
-        num_iterations: of k-means.
-        seed: of its start.
         min_gap: between the query and a candidate.
         suppressed_gap: around a candidate, in which a less similar one is left out.
-        num_candidates: at most.
         num_neighbours: keyframes before the query, whose similarities to it give the threshold.
         quantile: of these similarities, which a candidate must reach.
     """
@@ -67,12 +62,10 @@ class Keyframe:
     """Description of an image for place recognition; some 85 kB with 500 keypoints and 80 by 60 depths.
 
     Args:
-        frame: its number.
         pixels: of the keypoints, centres at integers.
         descriptors: RootSIFT as bytes; `unit_descriptors` decodes them.
         points: of the keypoints in the camera's own frame, units of its own inference; NaN without depth.
         intrinsics: fx, fy, cx, cy in pixels.
-        size: width and height of the image.
         depths: z at the centres of the cells of a regular grid over the image, units of the inference; 0 without depth.
     """
 

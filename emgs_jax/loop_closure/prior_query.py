@@ -53,7 +53,6 @@ class JointPrediction:
     Args:
         T_a_b: camera b -> camera a; not finite where it is not predicted.
         points: of a and of b, each in its own camera's frame.
-        masks: of these.
     """
 
     T_a_b: Float[np.ndarray, "4 4"]

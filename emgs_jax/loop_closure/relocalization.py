@@ -31,11 +31,9 @@ class RelocalizationConfig:
         num_candidates: keyframes that are verified, each of another time span.
         max_distance: between the positions that two candidates imply, times the distance of the points that the camera
             sees.
-        max_turn_deg: likewise between orientations.
         min_inliers: of the best candidate.
         min_inlier_fraction: of the points that fit the map when the pose is refined in it.
         max_step: between the pose by the keyframe and that by the map, times the mean depth.
-        max_step_deg: likewise.
     """
 
     patience: int = number(low=1)
@@ -54,10 +52,8 @@ class PosedKeyframes:
     """Keyframes with their poses; poses and the rest are indexed by the keyframes' numbers.
 
     Args:
-        database: of keyframes.
         poses: T_world_camera (4, 4).
         log_scales: σ: a length of the inference times e^σ is one of the map.
-        is_placed: True where it is in the map.
     """
 
     database: Database
@@ -71,7 +67,6 @@ class RelocalizedPose:
     """Pose of a camera as found by relocalization.
 
     Args:
-        T_world_camera: camera -> world.
         log_scale: σ of its inference.
         covariance: of (translation, rotation, σ) where the truth is T Exp(·), lengths of the map.
         keyframe: number of the keyframe by which it was found.
@@ -90,15 +85,7 @@ def relocalize(
     verification: VerificationConfig,
     config: RelocalizationConfig,
 ) -> tuple[RelocalizedPose | None, str | None]:
-    """Relocalize a keyframe among others: return its pose, or None and the gate or reason that rejected it.
-
-    Args:
-        query: described like the others.
-        known: keyframes with their poses.
-        appearance: of the keyframes.
-        verification: of query and candidate.
-        config: acceptance.
-    """
+    """Relocalize a keyframe among others: return its pose, or None and the gate or reason that rejected it."""
     keyframes = known.database.keyframes
     rows = [row for row, one in enumerate(keyframes) if known.is_placed[one.frame]]
     candidates = most_similar(known.database, query, rows, config.num_candidates, appearance)

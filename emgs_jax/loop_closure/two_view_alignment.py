@@ -45,7 +45,6 @@ class AlignmentConfig:
         max_ratio: distance to the best descriptor over that to the second.
         max_epipolar_error: of a match that fits the essential matrix.
         min_matches: that fit it.
-        min_match_share: of all mutual matches.
         max_reprojection_error: of a point that fits a pose.
         min_pose_points: that fit, in either direction.
         max_pose_gap: between the poses of the two directions, times the median depth.
@@ -55,7 +54,6 @@ class AlignmentConfig:
         min_extent: between the 5 % and the 95 % quantile along one of the axes.
         max_depth_scatter: standard deviation of the points' log depth ratio (from the MAD).
         scale_std: of the prior's log-scale; the ratio of two may be 3 √2 times that. Infinite without a metric prior.
-        refine: the final pose.
     """
 
     max_ratio: float = number(low=0, high=1)

@@ -45,9 +45,7 @@ class Pairs:
     """The same points in two keyframes, row by row: where each shows them and where each takes them to be.
 
     Args:
-        pixels_a, pixels_b: in either image.
         points_a, points_b: in either camera's frame and units; NaN without depth.
-        K_a, K_b: calibration of either.
     """
 
     pixels_a: Float[np.ndarray, "n 2"]

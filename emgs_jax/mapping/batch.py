@@ -56,8 +56,6 @@ def map_together(
 
     Args:
         runs: before their first frame, with one clock; their configs share a program.
-        dataset: of all of them.
-        prior: likewise.
         at_once: runs that vmap steps together, which keeps an accelerator busy. With 1 every run takes the very
             executable of `map_frames`, so its result does not depend on the others, bit for bit.
         num_threads: runs, or stacks of them, that are stepped side by side, which keeps the cores of a CPU busy.

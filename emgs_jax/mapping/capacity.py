@@ -34,7 +34,6 @@ def start(
     """Make the map of the first window; return the state, and the config with the capacity that it needs.
 
     Args:
-        first: views that the map is made from.
         camera: of the full images.
         config: all stages; capacities are where to start.
         init: `init_state`, or its form for stacked configs.
@@ -84,7 +83,6 @@ def prepare_step(first: FirstWindow, camera: Camera, config: SlamConfig) -> None
     Args:
         first: whose shapes the observations of the sequence have.
         camera: of the full images.
-        config: all stages.
     """
     calls: list[tuple[Callable, tuple]] = []
 

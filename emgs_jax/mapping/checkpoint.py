@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.io.files import atomic_write, flat, jsonable
+from emgs_jax.io.files import atomic_write, changes, jsonable
 from emgs_jax.io.npz import read_npz
 from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.mapping.run import MappingRun
@@ -44,9 +44,7 @@ class Checkpoint:
     """A run after some of its inputs.
 
     Args:
-        num_inputs: integrated so far.
         leaves: of the state, in the order of `jax.tree.leaves`; none before there is a map.
-        capacities: of map and submap.
         records: as the frames were placed.
         inactive: leaves of the states of the other disconnected submaps, by their number.
     """
@@ -105,9 +103,8 @@ def load_checkpoint(path: Path, signature: Mapping[str, Any]) -> Checkpoint:
         header = json.loads(str(arrays["__header__"]))
         if (header["format"], header["version"]) != (FORMAT, VERSION):
             raise ValueError(f"it is of version {header['version']}, this code reads {VERSION}")
-        other = difference(header["signature"], jsonable(signature))
-        if other is not None:
-            raise ValueError(f"it is of another run: {other}")
+        if changed := changes(header["signature"], jsonable(signature)):
+            raise ValueError(f"it is of another run: {changed[0]}")
         matrices = [{name: arrays[name][row] for name in MATRICES} for row in range(len(header["records"]))]
         records = [
             FrameRecord(**line, **{name: None if np.isnan(rows).any() else rows for name, rows in found.items()})
@@ -123,18 +120,10 @@ def load_checkpoint(path: Path, signature: Mapping[str, Any]) -> Checkpoint:
         raise ValueError(f"{path} cannot be resumed: {error}") from error
 
 
-def difference(one: Mapping[str, Any], other: Mapping[str, Any]) -> str | None:
-    """Return the first key in which two trees as JSON has them differ, and both values; None where they are equal."""
-    before, now = flat(one), flat(other)
-    changed = (key for key in sorted({*before, *now}) if before.get(key) != now.get(key))
-    return next((f"{key} was {before.get(key)!r}, now it is {now.get(key)!r}" for key in changed), None)
-
-
 class Keeper:
     """Owner of a run's checkpoint file: `found` is the checkpoint to resume from, None where there is none.
 
     Args:
-        path: of the file.
         config: when it is written; None = never.
         signature: settings that must match those of the checkpoint.
     """

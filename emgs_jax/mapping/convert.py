@@ -70,10 +70,7 @@ def to_first_window(
     """Select the views that a map can start from: the dense ones, from the first with a pose and a valid point on.
 
     Args:
-        prediction: of a window.
-        frames: by index; those of the window.
         T_world_anchor: known pose of the first frame, (4, 4).
-        config: normals and thinning.
         since: views of earlier frames are left out.
 
     Returns:
@@ -104,9 +101,7 @@ def to_prediction(
 
     Args:
         prediction: dense in (previous, current).
-        frames: by index; those of the window.
         T_world_anchor: known pose of the first frame, (4, 4).
-        config: normals and thinning.
 
     Raises:
         ValueError: a shape differs from the images'.

@@ -34,7 +34,6 @@ def own_covariance(state: SlamState, config: LocalizationConfig) -> np.ndarray:
 
     Args:
         state: after the last step; m of its map.
-        config: of the steps.
     """
     estimate, last = state.estimate, state.previous
     is_known = np.asarray(last.valid).any() and np.asarray(estimate.repeats.counts)[0] > 0
@@ -90,7 +89,6 @@ def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
     stays as it is.
 
     Args:
-        state: after the last step.
         origin: (3,) of the first camera.
     """
     return rescaled(state, np.exp(-float(state.estimate.log_scale)), origin) if state.estimate.log_scale else state

@@ -34,9 +34,6 @@ def map_frames(
     """Map a sequence, input by input; `finish_run` completes the last run.
 
     Args:
-        run: before its first frame.
-        dataset: of the frames.
-        prior: of the predictions.
         keeper: of the run's checkpoint, from which it resumes where there is one.
 
     Yields:

@@ -49,12 +49,8 @@ class FrameRecord:
     """Outcome of one frame: a line of frames.jsonl. None where a frame was not a step.
 
     Args:
-        index: position in the data set.
-        name: of the image.
-        timestamp: of the data set.
         status: tracked, degraded (the coarse pose stays, nothing is fused), lost (not even that is known),
             initialization (the map was made from it) or skipped (it cannot be read).
-        reason: why it is not tracked.
         location: outcome of relocalization: `found`, and the run continues from there; `anew`, and the map restarts
             from its coarse pose; or the reason of the failure. `segment`: a disconnected submap starts; `joined`: this
             frame connects it.
@@ -69,7 +65,6 @@ class FrameRecord:
         scale: factor on the prediction's lengths; the frames that a map is made from give it its unit.
         depth_noise: how much the points differ from the map, as a fraction of their depth; None where none agrees.
         step_m: between the coarse and the fine pose.
-        step_rad: likewise.
         similarity: where it is `joined`, the motion of its submap into the other: (4, 4) with e^σ R in the place of R.
         origin: frame whose Gaussians it was registered to (median of their births), counted from the map's first one.
         repeat_rms: robust standard deviation between the two predictions of the previous image, m.

@@ -22,7 +22,6 @@ from emgs_jax.mapping.records import IN_MAP, RELOCALIZED, RESTARTED, FrameRecord
 from emgs_jax.mapping.run import MappingRun, TrackedFrame
 from emgs_jax.mapping.window_input import PlacedStructure, WindowInput
 from emgs_jax.observation import Prediction, depth_in, transform
-from emgs_jax.pose_graph.factors import ODOMETRY
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.registration.rigid import pose_row, scale_translation
 from emgs_jax.slam import SlamState, StepInfo
@@ -39,10 +38,7 @@ def relocalize_lost(
     `location` of the frame tells the outcome.
 
     Args:
-        before: the run before the step.
-        run: after it, with the pose that it has estimated.
-        frame: likewise.
-        window: of the frame.
+        run: after the step, with the pose that it has estimated.
     """
     if not is_relocalization_due(before, frame.info):
         return run, frame
@@ -84,9 +80,7 @@ def is_restart_due(run: MappingRun, window: WindowInput, state: SlamState, info:
 
     Args:
         run: before this frame.
-        window: this frame.
         state: after its step.
-        info: of its step.
     """
     count = _num_untracked(run, info)
     is_due = not run.is_fixed and count >= run.back_end.config.relocalization.max_patience
@@ -106,7 +100,7 @@ def _is_connected(end: BackEnd, window: WindowInput) -> bool:
     here, before = (window.T_anchor_views.get(window.frames[0].index - offset) for offset in (0, 1))
     if here is None or before is None or not np.isfinite([here, before]).all():
         return False
-    parents = {e.a: e.b for e in end.factors if e.kind == ODOMETRY and (e.b > end.first_node or e.a == e.b + 1)}
+    parents = {e.a: e.b for e in end.factors if not e.is_loop and (e.b > end.first_node or e.a == e.b + 1)}
     node = len(end.poses) - 1
     while not end.is_placed[node]:
         if node not in parents:

@@ -34,11 +34,8 @@ class MappingRun:
     """State of a run so far. Nothing of it is ever changed in place: each input makes a new one.
 
     Args:
-        camera: of the frames.
-        config: all stages; capacities grow where they must.
         clock: counts load, predict and map.
         state: None before the first window.
-        records: of the frames in use, in order.
         back_end: optimizes poses and deforms the map; None: poses stay as first estimated.
         saved: map of an earlier run that this one continues; None: it makes its own map.
         prior_motion: of the prior's world since relocalization; None: the identity.
@@ -114,7 +111,6 @@ class TrackedFrame:
     """What is known of a frame after its step.
 
     Args:
-        prediction: its input, in the world of the map.
         info: result of the step; None where the camera has no pose yet.
         location: outcome of relocalization, see `FrameRecord`; None without one.
         similarity: from its submap to the one that it joins, likewise.

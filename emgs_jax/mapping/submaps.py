@@ -33,7 +33,6 @@ from emgs_jax.mapping.relocalization import (
 )
 from emgs_jax.mapping.run import MappingRun, TrackedFrame, row_of_first_node
 from emgs_jax.mapping.window_input import WindowInput
-from emgs_jax.pose_graph.factors import ODOMETRY
 from emgs_jax.registration.pose_estimate import rescale_estimate
 from emgs_jax.slam import StepInfo
 
@@ -74,8 +73,7 @@ def match_submap(run: MappingRun, window: WindowInput, frame: TrackedFrame) -> T
 
     Args:
         run: after the step of this frame, before its record.
-        window: this frame.
-        frame: likewise, in its own submap.
+        frame: of that step, in its own submap.
     """
     if not run.inactive or frame.location is not None or not bool(frame.info.localization.is_tracked):
         return frame
@@ -145,7 +143,7 @@ def join_factor(end: BackEnd, place: RelocalizedPose, unit: float) -> Factor:
     information = np.linalg.inv(scale_covariance(place.covariance, 1.0 / unit))
     measured = scale_pose(np.linalg.inv(end.poses[a]) @ end.poses[b], 1.0 / scale)
     ratio = end.log_scales[b] - end.log_scales[a]
-    return Factor(a, b, measured, ratio, np.linalg.cholesky(information).T, ODOMETRY)
+    return Factor(a, b, measured, ratio, np.linalg.cholesky(information).T, is_loop=False)
 
 
 def drop_unjoined_submaps(run: MappingRun) -> MappingRun:

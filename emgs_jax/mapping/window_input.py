@@ -36,7 +36,6 @@ class WindowInput:
 
     Args:
         frames: one; several where the map is made from all of them.
-        raw: raw prediction of each.
         prediction: views that the map starts from, or the prediction of a step; None where no map can start yet.
         T_world_anchor: known pose of the first frame; NaN where the inference is not related to it.
         T_anchor_views: predicted pose of every view of the window, by frame index.
@@ -68,7 +67,6 @@ class PlacedStructure:
 
     Args:
         number: `WindowInput.structure`.
-        T_world_structure: (4, 4).
         T_world_anchor: (4, 4), of the frame with which the submap started.
     """
 

@@ -15,8 +15,6 @@ class Camera(eqx.Module):
     Args:
         focal: fx, fy in pixels.
         center: cx, cy in pixels.
-        width: columns.
-        height: rows.
     """
 
     focal: Float[Array, "2"] = traced()

@@ -88,9 +88,7 @@ def nearby(
     """The `count` points nearest to any query of each block, of those in the groups whose boxes are nearest to it.
 
     Args:
-        queries: m positions.
         asked: those that count; one that is not finite never does.
-        groups: of the points.
         count: length of the list, static; not more than NUM_GROUPS groups hold.
         size: queries of a block, static.
         order: of the queries, `size` consecutive ones are a block; None: along the curve.
@@ -168,11 +166,7 @@ def nearest(
     For positions on surfaces that is nearly always those of `knn`: the farthest of the k may be missed.
 
     Args:
-        queries: m positions.
         asked: those that count; the others may have any answer or none.
-        points: n positions.
-        groups: of those that count.
-        k: number of neighbours, static.
         size: queries of a block, static.
         count: length of a block's list; by default 6 k, at least 32.
         order: of the queries; None: along the curve.
@@ -196,9 +190,6 @@ def knn(
     As `nearest`, but a block whose list may lack one of them is compared with all points, one block after the other.
 
     Args:
-        queries: m positions.
-        points: n positions.
-        valid: which points count.
         k: number of neighbours, static; at most n.
         asked: queries that need an answer, None for all.
 

@@ -64,7 +64,6 @@ def deform(
         before: the nodes that the map conforms to.
         after: the same, where they are to be.
         min_std: m; the floor of the covariances, which is no length of the scene.
-        config: which neighbours count.
 
     Returns:
         The map; a Gaussian of whose neighbours no node moved is the same bit for bit.

@@ -10,7 +10,6 @@ from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.registration.rigid import pose_row, scale_translation
 
-ODOMETRY, LOOP = 0, 1  # kinds of factors: only those of loops may be outliers
 DEGREES = 7  # of a node: translation, rotation (jaxlie's order), log-scale
 
 
@@ -37,7 +36,7 @@ class Factors(eqx.Module):
         Z_a_b: T_a⁻¹ T_b, its translation in the units of a's inference (the map's, times e^{−σ_a}).
         log_ratio: measured σ_b − σ_a: log of the median ratio of the same points' depths in a's inference and in b's.
         sqrt_info: W, with WᵀW the information of (translation, rotation, log-scale); a zero row is not measured.
-        kind: ODOMETRY (where frames were placed) or LOOP.
+        is_loop: measured by a loop closure, which may be an outlier; sequential, map and join factors are none.
         valid: rows in use; the others may hold anything. A factor with a node that is not in use is not either.
     """
 
@@ -46,7 +45,7 @@ class Factors(eqx.Module):
     Z_a_b: jaxlie.SE3
     log_ratio: Float[Array, "e"]
     sqrt_info: Float[Array, "e 7 7"]
-    kind: Int[Array, "e"]
+    is_loop: Bool[Array, "e"]
     valid: Bool[Array, "e"]
 
 
@@ -121,7 +120,7 @@ def linearize(graph: PoseGraph) -> tuple[Float[Array, "e 7"], Float[Array, "e 7 
 
 
 def robust(
-    chi2: Float[Array, "e"], kind: Int[Array, "e"], kernel: Float[Array, ""]
+    chi2: Float[Array, "e"], is_loop: Bool[Array, "e"], kernel: Float[Array, ""]
 ) -> tuple[Float[Array, "e"], Float[Array, "e"]]:
     """Cost of every factor and the weight of its χ² in the quadratic model: dynamic covariance scaling on loops.
 
@@ -131,9 +130,9 @@ def robust(
 
     Args:
         chi2: squared norm of the residuals.
-        kind: ODOMETRY or LOOP; odometry is quadratic.
+        is_loop: the others are quadratic.
         kernel: φ > 0; inf: quadratic.
     """
-    excess = jnp.where(kind == LOOP, chi2 / kernel, 0.0)
+    excess = jnp.where(is_loop, chi2 / kernel, 0.0)
     scale = jnp.minimum(1.0, 2.0 / (1.0 + excess))
     return jnp.where(excess <= 1.0, 0.5 * chi2, scale * chi2 - 0.5 * kernel), scale**2

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from emgs_jax.ops.pytree import static, static_choice, traced
 from emgs_jax.pose_graph.chordal import chordal_initialization
-from emgs_jax.pose_graph.factors import DEGREES, LOOP, ODOMETRY, Nodes, PoseGraph
+from emgs_jax.pose_graph.factors import DEGREES, Nodes, PoseGraph
 from emgs_jax.pose_graph.problem import Linear, Problem, linear, moved, num_rows, problem_of
 from emgs_jax.pose_graph.sparse import damped_step
 
@@ -32,7 +32,8 @@ class PoseGraphConfig(eqx.Module):
         max_iterations: of Levenberg and Marquardt; 0: nothing moves.
         damping: λ at the start, times the Hessian's diagonal.
         min_decrease: relative, of the cost; less has converged.
-        max_misfit: χ² per measured row of the odometry: a result that bends it more, and more than it was, is refused.
+        max_misfit: χ² per measured row of all but loops: a result that bends these more than that, and than they were,
+            is refused.
     """
 
     scale_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
@@ -52,14 +53,11 @@ class PoseGraphInfo:
         reason: why the nodes stay where they were; empty: they moved, or there is nothing to gain.
         cost_before: Σρ over factors, and half the squared scale prior.
         cost: likewise, at the end.
-        num_iterations: tried steps.
-        converged: the last step gained next to nothing.
         factor_chi2: (e,) χ² of every factor at the end, unweighted; 0 where it is not in use.
-        factor_weights: (e,) share of that χ² that counts: s² of dynamic covariance scaling, 1 for odometry.
-        odometry_chi2: sum over the odometry.
+        factor_weights: (e,) share of that χ² that counts: s² of dynamic covariance scaling, 1 for all but loops.
         loop_chi2: weighted sum over loops.
-        num_odometry_rows: measured rows of the odometry.
-        num_loop_rows: likewise of loops.
+        other_chi2: sum over all other factors.
+        num_loop_rows: measured rows of loops.
         dof: measured rows, those of the scale prior included, minus free unknowns.
         num_disconnected: nodes without a path to the gauge, which stay where they are.
     """
@@ -71,10 +69,10 @@ class PoseGraphInfo:
     converged: bool
     factor_chi2: np.ndarray
     factor_weights: np.ndarray
-    odometry_chi2: float
     loop_chi2: float
-    num_odometry_rows: int
+    other_chi2: float
     num_loop_rows: int
+    num_other_rows: int
     dof: int
     num_disconnected: int
 
@@ -82,7 +80,7 @@ class PoseGraphInfo:
 def _minimize(problem: Problem, now: Linear, config: PoseGraphConfig) -> tuple[Linear, int, bool]:
     """Levenberg and Marquardt: the best that was found, the number of tried steps, and whether it converged."""
     damping, kernel = float(config.damping), float(config.kernel)
-    floor = NOTHING_TO_GAIN * num_rows(problem.graph.factors)
+    floor = NOTHING_TO_GAIN * sum(num_rows(problem.graph.factors))
     for iteration in range(config.max_iterations):
         enough = float(config.min_decrease) * (now.cost + floor)
         step = damped_step(now.equations, damping)
@@ -109,8 +107,7 @@ def _info(
     factors, count = problem.graph.factors, int(problem.used.sum())
     edge_chi2, edge_weights = np.zeros(num_edges), np.ones(num_edges)
     edge_chi2[problem.used], edge_weights[problem.used] = end.chi2[:count], end.weights[:count]
-    is_loop = np.asarray(factors.kind) == LOOP
-    num_odometry_rows, num_loop_rows = num_rows(factors, ODOMETRY), num_rows(factors, LOOP)
+    is_loop, (num_loop_rows, num_other_rows) = np.asarray(factors.is_loop), num_rows(factors)
     num_prior = int(np.sum(problem.free[:, 6])) if problem.scale_information > 0 else 0
     return PoseGraphInfo(
         reason=reason,
@@ -120,11 +117,11 @@ def _info(
         converged=tried[1],
         factor_chi2=edge_chi2,
         factor_weights=edge_weights,
-        odometry_chi2=float(np.sum(end.chi2[~is_loop])),
         loop_chi2=float(np.sum((end.weights * end.chi2)[is_loop])),
-        num_odometry_rows=num_odometry_rows,
+        other_chi2=float(np.sum(end.chi2[~is_loop])),
         num_loop_rows=num_loop_rows,
-        dof=num_odometry_rows + num_loop_rows + num_prior - int(np.sum(end.equations.measured)),
+        num_other_rows=num_other_rows,
+        dof=num_loop_rows + num_other_rows + num_prior - int(np.sum(end.equations.measured)),
         num_disconnected=problem.num_disconnected,
     )
 
@@ -151,7 +148,7 @@ def _solve(problem: Problem, initial: Linear, config: PoseGraphConfig) -> tuple[
     The cost of a loop is bounded, so a loop that is violated too much at the start stays an outlier.
     """
     found = _minimize(problem, _start(problem, initial, config), config)
-    is_loop = np.asarray(problem.graph.factors.kind) == LOOP
+    is_loop = np.asarray(problem.graph.factors.is_loop)
     if config.start == "current" or not np.any(found[0].weights[is_loop] < 1):
         return found
     full = eqx.tree_at(lambda c: c.kernel, config, np.inf)
@@ -165,11 +162,12 @@ def _rejection(problem: Problem, initial: Linear, end: Linear, converged: bool, 
     """Return why a solution is rejected; empty where it is accepted."""
     if end is initial and not converged:
         return "no step lowers the cost"
-    is_odometry = np.asarray(problem.graph.factors.kind) == ODOMETRY
-    allowed = float(config.max_misfit) * num_rows(problem.graph.factors, ODOMETRY)
-    bent = float(np.sum(end.chi2[is_odometry]))
-    if bent > max(allowed, float(np.sum(initial.chi2[is_odometry]))):
-        return f"the loops contradict the odometry: their χ² would be {bent:.4g}, more than {allowed:.4g}"
+    factors = problem.graph.factors
+    is_other = ~np.asarray(factors.is_loop)
+    allowed = float(config.max_misfit) * num_rows(factors)[1]
+    bent = float(np.sum(end.chi2[is_other]))
+    if bent > max(allowed, float(np.sum(initial.chi2[is_other]))):
+        return f"the loops contradict the other factors: their χ² would be {bent:.4g}, more than {allowed:.4g}"
     return ""
 
 
@@ -199,7 +197,7 @@ def optimize(graph: PoseGraph, config: PoseGraphConfig) -> tuple[Nodes, PoseGrap
         initial = linear(problem, problem.graph.nodes, float(config.kernel))
         if not np.isfinite(initial.cost):
             return graph.nodes, _refused(graph, "the cost is not finite")
-        is_settled = initial.cost <= NOTHING_TO_GAIN * num_rows(problem.graph.factors)
+        is_settled = initial.cost <= NOTHING_TO_GAIN * sum(num_rows(problem.graph.factors))
         if is_settled or config.max_iterations == 0:
             return graph.nodes, _info(problem, initial.cost, initial, (0, is_settled), num_edges)
         end, num_iterations, converged = _solve(problem, initial, config)

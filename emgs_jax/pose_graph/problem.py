@@ -111,7 +111,7 @@ def linear(problem: Problem, nodes: Nodes, kernel: float) -> Linear:
     factors = problem.graph.factors
     residuals, jacobians = map(np.asarray, _linearize(PoseGraph(nodes, factors)))
     chi2 = np.sum(residuals**2, axis=1)
-    costs, weights = map(np.asarray, _robust(chi2, factors.kind, kernel))
+    costs, weights = map(np.asarray, _robust(chi2, factors.is_loop, kernel))
     root = np.sqrt(weights)[:, None, None]
     prior = np.zeros((*problem.free.shape, 2))
     prior[:, 6, 0] = problem.scale_information
@@ -122,7 +122,8 @@ def linear(problem: Problem, nodes: Nodes, kernel: float) -> Linear:
     return Linear(nodes, float(np.sum(costs) + held), chi2, weights, equations)
 
 
-def num_rows(factors: Factors, kind: int | None = None) -> int:
-    """Measured rows of all factors in use, or of one kind."""
+def num_rows(factors: Factors) -> tuple[int, int]:
+    """Measured rows of the factors in use: of loops, and of all others."""
     counts = np.any(np.asarray(factors.sqrt_info) != 0, axis=2).sum(axis=1) * np.asarray(factors.valid)
-    return int(np.sum(counts if kind is None else counts * (np.asarray(factors.kind) == kind)))
+    is_loop = np.asarray(factors.is_loop)
+    return int(np.sum(counts[is_loop])), int(np.sum(counts[~is_loop]))

@@ -36,7 +36,6 @@ class PriorPrediction:
     without any pose left out) have a pose for the same view.
 
     Args:
-        window: the question.
         T_anchor_view: camera -> camera of view 0, OpenCV axes, metres, float64 (v, 4, 4), NaN where it is not known;
             the first is the identity, or NaN: then the others are camera -> a frame of their own.
         points: camera-frame points, metres, float32 (d, h, w, 3), rows as in `window.dense`; 0 where the mask is off.

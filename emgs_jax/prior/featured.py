@@ -11,17 +11,40 @@ from emgs_jax.features.text import load_text
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 
 
-class Featured(Prior):
+class Wrapped(Prior):
+    """A prior that answers as another one does, but for what a subclass changes."""
+
+    def __init__(self, prior: Prior) -> None:
+        self._prior, self.is_sequential = prior, prior.is_sequential
+
+    def num_newer(self, window_size: int) -> int:
+        return self._prior.num_newer(window_size)
+
+    def check(self, dataset: Dataset, window_size: int) -> None:
+        self._prior.check(dataset, window_size)
+
+    def report(self) -> dict[str, float]:
+        return self._prior.report()
+
+    def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
+        return self._prior.predict(window, frames, intrinsics)
+
+    def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
+        return self._prior.revisit(window, frames, intrinsics)
+
+
+class Featured(Wrapped):
     """A prior whose predictions have the features of a feature model in place of their own.
+
+    Predictions of two visits keep the prior's own features: only geometry is needed there.
 
     Args:
         prior: for poses, points, confidence and mask, which are passed on unchanged.
-        model: for features and text embeddings.
     """
 
     def __init__(self, prior: Prior, model: FeatureModel) -> None:
-        self._prior, self._model = prior, model
-        self.is_sequential = prior.is_sequential
+        super().__init__(prior)
+        self._model = model
         self._known: list[tuple[Frame, np.ndarray]] = []  # features of the window before
         features = {**model.settings, "model": model.identity}  # before the text: names all missing files
         self.feature_names, self.text_features = model.text.names, model.text.vectors
@@ -33,30 +56,17 @@ class Featured(Prior):
             geometry.is_simulated,
         )
 
-    def num_newer(self, window_size: int) -> int:
-        """Those that the prior asks for."""
-        return self._prior.num_newer(window_size)
-
     def check(self, dataset: Dataset, window_size: int) -> None:
-        """Raise ValueError where prior or model cannot answer for the data set."""
-        self._prior.check(dataset, window_size)
+        super().check(dataset, window_size)
         self._model.check(dataset)
-
-    def report(self) -> dict[str, float]:
-        """Return the statistics of the wrapped prior."""
-        return self._prior.report()
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Predict geometry, and describe the dense images; an image of the window before is not described again."""
-        prediction = self._prior.predict(window, frames, intrinsics)
+        prediction = super().predict(window, frames, intrinsics)
         by_index = {frame.index: frame for frame in frames}
         known = [(by_index[index], self._features(by_index[index])) for index in window.dense]
         self._known = known
         return replace(prediction, features=np.stack([features for _, features in known]))
-
-    def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
-        """Return the wrapped prior's prediction of two visits, with its own features: only geometry is needed."""
-        return self._prior.revisit(window, frames, intrinsics)
 
     def _features(self, frame: Frame) -> np.ndarray:
         for known, features in self._known:
@@ -66,7 +76,7 @@ class Featured(Prior):
         return self._model.extract(frame)
 
 
-class Requeried(Prior):
+class Requeried(Wrapped):
     """A prior with its own features and the text embeddings of a file.
 
     Args:
@@ -75,6 +85,7 @@ class Requeried(Prior):
     """
 
     def __init__(self, prior: Prior, path: str) -> None:
+        super().__init__(prior)
         features = prior.provenance.settings.get("features")
         if features is None:
             raise ValueError(
@@ -82,28 +93,6 @@ class Requeried(Prior):
                 "choose features=… or a recording that was made with it"
             )
         text = load_text(path, features["model"])
-        self._prior = prior
-        self.is_sequential = prior.is_sequential
         self.feature_names, self.text_features = text.names, text.vectors
         settings = prior.provenance.settings | {"features": features | {"templates": [*text.templates]}}
         self.provenance = replace(prior.provenance, settings=settings)
-
-    def num_newer(self, window_size: int) -> int:
-        """Those that the prior asks for."""
-        return self._prior.num_newer(window_size)
-
-    def check(self, dataset: Dataset, window_size: int) -> None:
-        """Raise ValueError where the prior cannot answer for the data set."""
-        self._prior.check(dataset, window_size)
-
-    def report(self) -> dict[str, float]:
-        """Return the statistics of the wrapped prior."""
-        return self._prior.report()
-
-    def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """Return the wrapped prior's prediction."""
-        return self._prior.predict(window, frames, intrinsics)
-
-    def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
-        """Return the wrapped prior's prediction of two visits."""
-        return self._prior.revisit(window, frames, intrinsics)

@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
-from emgs_jax.io.files import atomic_write, remove_temporaries
+from emgs_jax.io.files import remove_temporaries, write_file
 from emgs_jax.io.npz import read_npz
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, check_unit, windows, with_frames
 from emgs_jax.prior.recorded_checks import (
@@ -244,8 +244,7 @@ def _write_manifest(folder: Path, header: dict, files: dict[str, str]) -> None:
 
 def _write(path: Path, content: bytes) -> str:
     """Write `path` whole or not at all; return the SHA-256 of the content."""
-    with atomic_write(path) as handle:
-        handle.write(content)
+    write_file(path, content)
     return hashlib.sha256(content).hexdigest()
 
 

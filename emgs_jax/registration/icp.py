@@ -12,15 +12,14 @@ import lineax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.gaussians import Gaussians
+from emgs_jax.gaussians import GaussianIndex, Gaussians
 from emgs_jax.observation import Observation
-from emgs_jax.ops.linalg import Whitening
-from emgs_jax.ops.neighbours import Groups
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.matching import Candidates, Matches, surface_of
 from emgs_jax.registration.noise import level_edges, levels_of, noise_of_levels, num_independent
 from emgs_jax.registration.problem import (
     DISTRIBUTION,
+    CoarseStart,
     IcpConfig,
     Problem,
     Uncertainty,
@@ -125,44 +124,36 @@ def _search_and_solve(
 def icp(
     source: Observation,
     target: Gaussians,
-    T_world_coarse: jaxlie.SE3,
-    known: Float[Array, "7 7"],
-    noise: Float[Array, ""],
+    start: CoarseStart,
     config: IcpConfig,
-    white: Whitening | None = None,
-    groups: Groups | None = None,
+    index: GaussianIndex | None = None,
 ) -> tuple[jaxlie.SE3, Float[Array, ""], IcpInfo]:
     """Place camera-frame `source` on `target`: argmin over xi and s of data + prior, T = T_world_coarse exp(xi).
 
     The data term is a truncated least-squares sum over the points, scaled so that all of them together weigh as much
     as `num_effective` independent ones. The prior holds xi at 0 and the scale s of the points about the camera at 1 by
-    what is `known`: the predictions of one call share an error of scale, and only the map remembers the scale of the
+    what `start` knows: the predictions of one call share an error of scale, and only the map remembers the scale of the
     calls before.
 
-    `noise` is a lower bound. Where the points do not fit the map at the coarse pose as well as that, the coarse pose is
-    worth no more than they fit there, and the depths no more than they fit where they are looked up: a prior may repeat
-    itself exactly and still err.
+    Its noise is a lower bound. Where the points do not fit the map at the coarse pose as well as that, the coarse pose
+    is worth no more than they fit there, and the depths no more than they fit where they are looked up: a prior may
+    repeat itself exactly and still err.
 
     Args:
         source: points to align, camera frame.
         target: Gaussians of the submap, world frame.
-        T_world_coarse: where to start, and the mean of the prior.
-        known: root of the information of the coarse pose and scale, (xi, log s), where there is a prior.
-        noise: standard deviation of the points' depth as a fraction of it.
-        config: terms and gates.
-        white: `whitening` of the target's covariances; None makes it here.
-        groups: `group_points` of the valid Gaussians' means; None makes it here.
+        index: of the target; None makes it here.
 
     Returns:
         T_world_camera, the scale, and what the solve found.
     """
     source = jax.tree.map(lambda leaf: leaf[:: max(leaf.shape[0] // config.num_points, 1)], source)
-    surface = surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, white, groups)
+    surface = surface_of(target, config.residual != DISTRIBUTION, config.num_color_neighbours, index)
 
     def problem_of(uncertainty: Uncertainty) -> Problem:
-        return pose_problem(source, surface, T_world_coarse, noise, uncertainty, config, known)
+        return pose_problem(source, surface, start, uncertainty, config)
 
-    edges = level_edges(source.confidence, source.valid)
+    noise, edges = start.noise, level_edges(source.confidence, source.valid)
     levels = levels_of(source.confidence, edges)
     step = partial(_search_and_solve, problem_of=problem_of, levels=levels, noise=noise, config=config)
     given = Uncertainty(common=noise, depth=jnp.full(source.valid.shape, noise), num_effective=jnp.ones(()))

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.gaussians import Gaussians, color_gradients, intensity
+from emgs_jax.gaussians import GaussianIndex, Gaussians, color_gradients, index_of, intensity
 from emgs_jax.observation import Observation
-from emgs_jax.ops.linalg import Whitening, dot, gather_entries, gather_offsets, mahalanobis_sq, whiten, whitening, widen
-from emgs_jax.ops.neighbours import Groups, group_points
+from emgs_jax.ops.linalg import dot, gather_entries, gather_offsets, mahalanobis_sq, whiten, widen
+from emgs_jax.ops.neighbours import Groups
 
 Candidates: TypeAlias = tuple[Int[Array, "p k"], Bool[Array, "p k"]]  # of `nearest`: rows of the Gaussians, which exist
 
@@ -56,21 +56,20 @@ def surface_of(
     gaussians: Gaussians,
     has_color: Bool[Array, ""],
     num_color_neighbours: int,
-    white: Whitening | None = None,
-    groups: Groups | None = None,
+    index: GaussianIndex | None = None,
 ) -> Surface:
-    """Whitening, groups (made here where they are None), thickness and colour gradients, zero unless `has_color`."""
-    groups = group_points(gaussians.means, gaussians.valid) if groups is None else groups
+    """Index (made here where it is None), thickness and colour gradients, which are zero unless `has_color`."""
+    index = index_of(gaussians) if index is None else index
     # Only where colour counts: the gradients cost a neighbour search over the submap.
     gradients = jax.lax.cond(
         has_color,
-        lambda: color_gradients(gaussians, num_color_neighbours, groups),
+        lambda: color_gradients(gaussians, num_color_neighbours, index.groups),
         lambda: jnp.zeros_like(gaussians.means),
     )
     return Surface(
         gaussians=gaussians,
-        groups=groups,
-        triangles=(whitening(gaussians.covs) if white is None else white)[0],
+        groups=index.groups,
+        triangles=index.white[0],
         plane_vars=mahalanobis_sq(gaussians.normals, gaussians.covs),  # n' Σ n
         light=intensity(gaussians.colors),
         gradients=gradients,
@@ -89,8 +88,6 @@ def match(
     Args:
         points: p of them, world frame.
         noise: m; standard deviation of every point along its viewing ray, as a vector.
-        candidates: Gaussians near every point.
-        surface: the Gaussians.
         gates: largest squared Mahalanobis distance and smallest cosine between the normals of an inlier.
     """
     (rows, found), gaussians = candidates, surface.gaussians

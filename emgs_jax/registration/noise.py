@@ -59,7 +59,6 @@ def num_independent(
     Args:
         errors: in standard deviations.
         points: camera frame.
-        valid: which count.
     """
     plane = points[:, :2] / jnp.where(valid, points[:, 2], 1.0)[:, None]
     low = jnp.min(jnp.where(valid[:, None], plane, jnp.inf), axis=0)

@@ -26,7 +26,6 @@ class PoseEstimate(eqx.Module):
         world_covariance: P relative to the first frame.
         depth_noise: how much its points differ from the map, as a fraction of their depth.
         log_scale: mean logarithm of the scales of the tracked frames: the prior's own unit, in that of the map.
-        num_scales: number of these scales.
         repeats: differences between repeated predictions of one pose.
     """
 
@@ -134,12 +133,9 @@ def correct_by_points(
     """Correct the estimate by the points of a frame; it stays as it is where the frame is not tracked.
 
     Args:
-        estimate: estimate at the frame's coarse pose.
         found: result of ICP. Where the points fit worse than `depth_noise`, the coarse pose is less certain by the same
             factor.
         depth_noise: expected, as a fraction of the depth.
-        scale: of its prediction.
-        is_tracked: the fine pose was accepted.
         num_alike: frames that see one part of the map, which is wrong for all of them in the same way: the information
             of one frame's points about the scale, and about the pose in the world, is divided by it.
     """

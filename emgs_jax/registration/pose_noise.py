@@ -61,7 +61,6 @@ def repeat_poses(
     """Add the differences of this repeated prediction; return also their mean squares, 0 without new ones.
 
     Args:
-        prediction: the current one.
         before: differences until the last frame.
         scale: of this prediction. The poses returned are in its own unit: `rescale_repeats` when the scale is final.
         mean_depth: of the previous frame, m of the map.
@@ -97,7 +96,6 @@ def pose_std(
     nor a first guess that is far off holds it. A pose whose own repeat differs by more is as uncertain as that.
 
     Args:
-        repeats: so far.
         latest: of this answer alone, see `repeat_poses`.
         otherwise: of both and each, without any repeat and for `shared` = 1.
         shared: c.
@@ -121,7 +119,6 @@ def axis_std(
     """`pose_std` of each axis, m and rad, in the order of ξ.
 
     Args:
-        repeats: so far.
         latest: of this answer alone.
         depth_noise: as a fraction of the depth.
         mean_depth: m of the map.

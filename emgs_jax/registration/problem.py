@@ -28,7 +28,6 @@ class IcpConfig(eqx.Module):
             "Colored point cloud registration revisited", ICCV 2017); `distribution`: offset from the mean, whitened by
             the Gaussian's covariance; `colored+distribution`: offset and intensity difference; or `colored+ray`: depth
             along the viewing ray over that of the Gaussian's plane, and intensity difference.
-        color_std: standard deviation of intensity.
         noise: factor on the points' noise along their viewing rays, which widens every Gaussian for them.
         max_misfit: fraction of the depth; a point farther from its Gaussian's plane shows something else, and says
             nothing of the noise; 0 takes the noise as it is given.
@@ -42,7 +41,6 @@ class IcpConfig(eqx.Module):
         num_searches: how often the Gaussians near every point are looked up, each time with a solve after it.
         num_neighbours: Gaussians near a point, which every step of a solve compares.
         num_color_neighbours: Gaussians from which a Gaussian's intensity gradient is fitted.
-        max_steps: of every solve.
         tolerance: relative and absolute, of the solver; float32 tells no smaller differences apart than the least.
     """
 
@@ -70,6 +68,20 @@ class Uncertainty(eqx.Module):
     num_effective: Float[Array, ""]
 
 
+class CoarseStart(eqx.Module):
+    """Where ICP starts, and how much of that is known before it looks at the points.
+
+    Args:
+        T_world_coarse: also the mean of the pose.
+        root_information: root of the information of (xi, log s) where the points fit as well as they should.
+        noise: least standard deviation of the points' depth, as a fraction of it.
+    """
+
+    T_world_coarse: jaxlie.SE3
+    root_information: Float[Array, "7 7"]
+    noise: Float[Array, ""]
+
+
 class Problem(eqx.Module):
     """Constants of the ICP problem while the pose moves; lengths in metres."""
 
@@ -85,25 +97,20 @@ class Problem(eqx.Module):
 def pose_problem(
     source: Observation,
     surface: Surface,
-    T_world_coarse: jaxlie.SE3,
-    scale_unit: Float[Array, ""],
+    start: CoarseStart,
     uncertainty: Uncertainty,
     config: IcpConfig,
-    known: Float[Array, "7 7"],
 ) -> Problem:
-    """Build the ICP problem of points and map; `scale_unit` is the depth noise in which the seventh unknown counts.
-
-    `known` is the root of the information of (xi, log s) where the points fit as well as they should.
-    """
-    units = jnp.ones(7).at[6].set(config.scale_noise * scale_unit)
-    prior = (config.prior_information > 0) * known * units * (scale_unit / uncertainty.common)
+    """Build the ICP problem of points and map; the seventh unknown counts in the depth noise."""
+    units = jnp.ones(7).at[6].set(config.scale_noise * start.noise)
+    prior = (config.prior_information > 0) * start.root_information * units * (start.noise / uncertainty.common)
     prior = prior.at[6, 6].set(jnp.where(units[6] * prior[6, 6] > 0, prior[6, 6], 1.0))  # a scale that stays
     return Problem(
         source=source,
         surface=surface,
-        T_world_coarse=T_world_coarse,
+        T_world_coarse=start.T_world_coarse,
         depth_noise=config.noise * uncertainty.depth,
-        scale_unit=config.scale_noise * scale_unit,
+        scale_unit=config.scale_noise * start.noise,
         prior=prior,
         weight=uncertainty.num_effective / jnp.maximum(jnp.sum(source.valid), 1),
     )

@@ -30,7 +30,6 @@ def repeat_scale(
     Args:
         now: its prediction of this call, camera frame.
         before: that of the call before as it was aligned with the map, world frame.
-        T_world_previous: its pose.
         otherwise: scale where there are too few pairs.
         reading: row of `LocalizationConfig.coarse_scale`: 0 (1, as printed), 1 (median ratio of depths) or 2 (of the
             similarity that fits best).
@@ -79,11 +78,8 @@ def through_previous(
     """The current pose through the points of the previous image (R7): `via_previous` and `same_image`.
 
     Args:
-        prediction: of this call.
         previous: the previous frame as it was aligned with the map, world frame.
-        T_world_previous: its pose.
         T_previous_current: the prior's motion, scaled.
-        scale: of this prediction.
         camera: of the rows.
         max_pair_distance: fraction of the depth; farther points are no pair.
     """

@@ -35,7 +35,6 @@ class DensifyConfig(eqx.Module):
         surface_depth: fraction of the depth; splats within it of the front belong to one surface.
         min_alpha: a pixel with less coverage has no depth.
         min_std: m; the floor of the covariances, which is not drawn along the surface, see `without_floor`.
-        render: how the front is found.
         points: those of the `map` (the paper's rule), or the frames' `own` that the map does not contradict, see
             `emgs_jax.report.dense.uncontradicted`.
     """

@@ -35,7 +35,6 @@ class Chunks(eqx.Module):
         tiles: to which they belong; past the last tile where there is none.
         positions: in the lists.
         rows: of the splats; those of the first in the lists where there is none.
-        exists: which there are.
     """
 
     tiles: Int[Array, "c"]
@@ -62,8 +61,6 @@ def list_splats(splats: Splats, camera: Camera, tile_size: int, capacity: int, r
     the copies are sorted by tile and depth, and a tile's list is a range of them.
 
     Args:
-        splats: on the image plane.
-        camera: of the image.
         tile_size: pixels along a tile's side.
         capacity: splats of a tile for which there is room, on average over the tiles; the nearest of all come first.
         radius: standard deviations.

@@ -60,7 +60,6 @@ class Line(NamedTuple):
     Args:
         labels: its first cells.
         values: by key; None where there is none.
-        spreads: standard deviations by key.
         rivals: the same of all lines that it competes with; None: with none.
     """
 

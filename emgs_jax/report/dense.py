@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.data.base import Dataset
-from emgs_jax.device.arrays import to_se3
+from emgs_jax.device.arrays import fetched, to_se3
 from emgs_jax.device.executables import stored
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, own_voxel, posed_cloud
@@ -33,7 +33,6 @@ class DenseMap:
     Args:
         cloud: a point per pixel of every frame whose pose is known, averaged per voxel, in the colours of the images.
         labels: class of each of its points; None without classes.
-        pictures: what the overview shows of some frames.
         rendering: `rendering_metrics` of the views that the cloud is made from; empty without truth.
     """
 
@@ -55,13 +54,9 @@ def dense_map(
     """Render the map from the pose of every frame that is not lost.
 
     Args:
-        run: finished.
-        dataset: for the images, and the truth.
-        config: what becomes a point.
         evaluation: points of one of its voxels, of the truth where that is known, are averaged, and views are
             compared with the truth under it.
         labelled: `labelled_map` of the run, which says the class of each point.
-        num_pictures: frames that are shown, evenly spread.
         own: what the prior says of every frame, camera-frame points (h, w, 3) in its own lengths, 0 where it says
             nothing; for `densify.points=own` only.
     """
@@ -74,7 +69,7 @@ def dense_map(
     rendered = Rendered(dataset, with_truth(run, run.poses), evaluation, compares_classes)
 
     def clouds() -> Iterator[PointCloud]:
-        for row, view in zip(known, _drawn_ahead(run, known, config), strict=True):
+        for row, view in zip(known, _drawn(run, known, config), strict=True):
             is_shown = row in shown
             labels = _label_image(view, labelled) if is_shown or compares_classes else None
             if is_shown:
@@ -115,7 +110,6 @@ def uncontradicted(
         points: of the frame, camera frame, (h, w, 3) in the map's lengths; 0 where there is none. They need not lie on
             the rays of the camera.
         view: the map as it is drawn from the frame's pose, on the host.
-        camera: of the view.
         surface_depth: fraction of the map's depth by which a point may differ from it.
 
     Returns:
@@ -137,18 +131,11 @@ def _voxel(poses: tuple[np.ndarray, np.ndarray] | None, config: EvaluationConfig
     return min(config.voxel_m, own_voxel(align_poses(*poses, with_scale=True)[0], config))
 
 
-def _drawn_ahead(run: MappingRun, rows: list[int], config: DensifyConfig) -> Iterator[DenseView]:
-    """The views of frames on the host; the next is being drawn while one is looked at."""
-    pending: DenseView | None = None
+def _drawn(run: MappingRun, rows: list[int], config: DensifyConfig) -> Iterator[DenseView]:
     gaussians, poses = confirmed(run.state.map), run.poses
-    for row in rows:
-        view = _densify(gaussians, to_se3(poses[row]), run.camera, config)
-        drawing = eqx.tree_at(lambda view: view.rendering, view, None)  # nobody looks at it, so it is not fetched
-        if pending is not None:
-            yield jax.device_get(pending)
-        pending = drawing
-    if pending is not None:
-        yield jax.device_get(pending)
+    views = (_densify(gaussians, to_se3(poses[row]), run.camera, config) for row in rows)
+    # Nobody looks at the rendering, so it is not fetched.
+    return fetched(eqx.tree_at(lambda view: view.rendering, view, None) for view in views)
 
 
 def center_cloud(run: MappingRun) -> PointCloud:

@@ -26,7 +26,6 @@ class Found(NamedTuple):
     """Outcome of an evaluation.
 
     Args:
-        estimates: that the rows are made from.
         gate: the file that was compared with; None without one.
         regressions: metrics that are worse than the gate allows, a line each.
     """

@@ -36,8 +36,6 @@ class ExportConfig:
     """Settings of an export of a run: formats, size and scale.
 
     Args:
-        formats: names of FORMATS.
-        max_points: of the dense cloud, drawn evenly.
         scale: factor on all lengths; None = 1.
         length: instead of it two frames and the metres between their cameras, see `factor_of`.
         images: as `used` in the run, or in the `original` size on disk; either way without distortion.

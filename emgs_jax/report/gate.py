@@ -30,10 +30,8 @@ def rounding_tolerances(
     compared with the same seeds: so it is the differences, job by job, whose root mean square counts.
 
     Args:
-        tolerances: the least ones, as for `write_gate`.
         estimates: of some seeds, better more than those of the baseline.
         rounded: of the same jobs, computed by other instructions of the processor.
-        num_seeds: of the baseline.
     """
     again = {_job(item): item.values for item in rounded if item.kind == "ours"}
     pairs = [(item.values, again[_job(item)]) for item in estimates if item.kind == "ours" and _job(item) in again]
@@ -55,7 +53,6 @@ def write_gate(path: str | os.PathLike, rows: Sequence[Row], tolerances: Mapping
     """Write the mean of each metric of `tolerances` for our own rows; comments above those of before stay.
 
     Args:
-        rows: one for each sequence and variant.
         tolerances: metric -> {direction: lower or higher is better, tolerance: by which it may get worse}.
     """
     baseline = {}

@@ -49,11 +49,6 @@ class Baselines:
 
     Sizes in metres become lengths of the poses by the first view: a unit is what its true depths are of those that it
     is fused with (median), so that the prior's own unit does not matter; 1 m where it shows no true depth.
-
-    Args:
-        configs: by name.
-        observation: which points the map takes.
-        dataset: for the camera and the truth.
     """
 
     def __init__(self, configs: Mapping[str, BaselineConfig], observation: ObservationConfig, dataset: Dataset) -> None:
@@ -100,9 +95,7 @@ def gather(
 
     Args:
         frames: records, which baselines need, and views of all frames.
-        evaluation: how normals are fitted.
         keeps_points: the truth is known, or points are to lie at them.
-        baselines: that take the views, too.
         text: names of the classes that pixels are labelled with, and their embeddings; None: no labels.
     """
     cloud, kept, classes = SpooledCloud(), Spool(), Spool()

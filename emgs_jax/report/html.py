@@ -16,7 +16,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
-from emgs_jax.io.files import atomic_write
+from emgs_jax.io.files import write_file
 from emgs_jax.report.colors import STATUS_COLORS
 from emgs_jax.report.recorded_run import REPORT_FILE
 
@@ -76,8 +76,7 @@ def page(template: str, head: Head, policy: str = POLICY, **values: Any) -> byte
 
 def write_page(folder: Path, content: bytes) -> Path:
     """Write report.html into a folder; returns its path."""
-    with atomic_write(folder / REPORT_FILE) as handle:
-        handle.write(content)
+    write_file(folder / REPORT_FILE, content)
     return folder / REPORT_FILE
 
 

@@ -28,10 +28,8 @@ class LabelledMap:
     Args:
         means: (n, 3), m.
         whiten: (n, 3, 3), inverse of the Cholesky factors of the covariances.
-        log_dets: (n,), of the covariances.
         evidence: (n, c), the feature's projection on the text of each class. Features are sums over the points of all
             views (R16), so its size says how much is known.
-        classes: names of the c.
     """
 
     means: np.ndarray

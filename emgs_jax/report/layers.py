@@ -28,7 +28,6 @@ class Layer(NamedTuple):
     """A layer that a viewer can show.
 
     Args:
-        title: for people.
         array: of `map_layers` or `feature_layer`, which it shows.
         scale: of numbers that get their colour from their place between the 1st and the 99th percentile: `share` of
             255, `count` (its logarithm) or `number`; "" where the array has colours of its own.

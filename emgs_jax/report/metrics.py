@@ -57,8 +57,6 @@ class Scorer:
     """References that all maps of one data set are compared with, made once.
 
     Args:
-        dataset: in use.
-        evaluation: the protocol.
         truth: the true cloud, empty without ground truth.
         labels: the true classes; None where data set or prior have none.
         prior: its text embeddings are the classes of a map.
@@ -104,13 +102,6 @@ def score_map(
 
     The dense map is compared as the protocol says, under the other alignment as `reconstruction_<alignment>/…`,
     placed by its points as `reconstruction_icp/…`, and the plain centres as `reconstruction_centers/…`.
-
-    Args:
-        run: finished.
-        dense: the map, densified.
-        centers: the Gaussians' means.
-        labels: of the centres that have a class.
-        scorer: the truth.
     """
     poses, truth, config = with_truth(run, run.poses), scorer.truth, scorer.evaluation
     if poses is None:
@@ -206,11 +197,7 @@ def score_settings(
     """The metrics.json of every finished run, without times.
 
     Args:
-        runs: that share data set, prior and protocol.
         raw: what the prior alone says, the same for all.
-        densify: of each run.
-        scorer: the truth.
-        num_threads: runs that are scored side by side.
     """
 
     def score(run: MappingRun, config: DensifyConfig) -> Metrics:

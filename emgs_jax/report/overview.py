@@ -52,8 +52,6 @@ def draw_overview(
     """Draw the picture and write it as PNG.
 
     Args:
-        cloud: in the frame of the paths.
-        paths: estimated, true, before poses moved, and loops.
         frames: about four, each with `image` uint8 (h, w, 3), `rendered_color` float (h, w, 3), `rendered_depth`
             float (h, w) in the unit of the paths, `valid` bool (h, w), where it is known, `title`, and with classes
             `labels`, int (h, w), -1 = none.

@@ -1,6 +1,6 @@
 """Small pictures for the page: what the camera saw, what the map shows from there, and how far away it is."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from emgs_jax.data.base import BadFrameError, Dataset
-from emgs_jax.device.arrays import to_se3
+from emgs_jax.device.arrays import fetched, to_se3
 from emgs_jax.device.executables import stored
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
@@ -57,10 +57,12 @@ def draw_views(run: RecordedRun, rows: Sequence[int], config: RenderConfig, data
     """
     small, placed = downscale(run.camera, -(-run.camera.width // WIDTH)), run.is_placed
     gaussians = closed(confirmed(run.map))
-    drawn = dict(_draw_all(gaussians, run.poses, [row for row in rows if placed[row]], small, config))
+    known = [row for row in rows if placed[row]]
+    drawings = fetched(_drawn(gaussians, to_se3(run.poses[row]), small, config) for row in known)
+    drawn = dict(zip(known, drawings, strict=True))
     depths = [depth[depth > 0] for _, depth in drawn.values()]
-    known = np.concatenate(depths) if depths else np.zeros(0)
-    near, far = (float(value) for value in np.percentile(known, [1, 99])) if len(known) else (0.0, 1.0)
+    seen = np.concatenate(depths) if depths else np.zeros(0)
+    near, far = (float(value) for value in np.percentile(seen, [1, 99])) if len(seen) else (0.0, 1.0)
     pictures = []
     for row in rows:
         color, depth = drawn.get(row, (None, None))
@@ -69,20 +71,6 @@ def draw_views(run: RecordedRun, rows: Sequence[int], config: RenderConfig, data
             Picture(row, _seen(dataset, row), rendered, "" if depth is None else jpeg(_painted(depth, near, far)))
         )
     return Views(pictures, near, far)
-
-
-def _draw_all(
-    gaussians: Gaussians, poses: np.ndarray, rows: Sequence[int], camera: Camera, config: RenderConfig
-) -> Iterator[tuple[int, tuple[np.ndarray, np.ndarray]]]:
-    """Yield colour (h, w, 3) and depth (h, w) of rows; the next is being drawn while one is fetched."""
-    pending = None
-    for row in rows:
-        drawing = row, _drawn(gaussians, to_se3(poses[row]), camera, config)
-        if pending is not None:
-            yield jax.device_get(pending)
-        pending = drawing
-    if pending is not None:
-        yield jax.device_get(pending)
 
 
 def _seen(dataset: Dataset | None, row: int) -> str:

@@ -16,9 +16,6 @@ def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
     """One line of counts; where many frames are degraded or lost, one more with the most frequent reason and a remedy.
 
     Many are a tenth of all, or `MANY_IN_A_ROW`; these are named, too.
-
-    Args:
-        num_skipped: frames that could not be read.
     """
     counts = Counter(record.status for record in records) | Counter(skipped=num_skipped)
     words = ("tracked", "degraded", "lost", "initialization", "skipped")

@@ -41,8 +41,6 @@ class Question:
 
     Args:
         against: rivals, which are not asked for, in the same space; may be empty.
-        margin: the lead that an answer needs.
-        min_cosine: the cosine that an answer needs.
     """
 
     words: TextEmbeddings
@@ -59,8 +57,6 @@ class Answer:
     Args:
         gaussians: the confirmed ones are valid; on the device.
         relevance: of all rows of the map, on the host.
-        rows: of the confirmed Gaussians.
-        instances: objects of each word, rows of the map.
         reach: distance within which answers are one object, in the unit of the map.
     """
 

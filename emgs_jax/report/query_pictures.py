@@ -17,7 +17,7 @@ from matplotlib.patches import Patch
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.io.files import atomic_write
+from emgs_jax.io.files import atomic_write, write_file
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
 from emgs_jax.report.colors import class_colors
@@ -88,10 +88,6 @@ def best_views(run: RecordedRun, answer: Answer, count: int) -> list[list[View]]
 def draw_answer(path: Path, run: RecordedRun, answer: Answer, views: Sequence[Sequence[View]], max_words: int) -> int:
     """Draw a line for each word and view: the map in its colours, the word's relevance, the classes with a legend.
 
-    Args:
-        views: of each word.
-        max_words: those with the most answers.
-
     Returns:
         How many words are drawn.
     """
@@ -119,10 +115,8 @@ def save_labels(folder: Path, run: RecordedRun, answer: Answer, views: Mapping[s
     names = answer.question.words.names
     for name, view in views.items():
         labels = label_image(run, answer, view)
-        with atomic_write(folder / f"{name}.png") as handle:
-            handle.write(cv2.imencode(".png", labels.astype(np.uint16))[1].tobytes())
-    with atomic_write(folder / CLASSES_FILE) as handle:
-        handle.write("".join(f"{number} {name}\n" for number, name in enumerate(names, start=1)).encode())
+        write_file(folder / f"{name}.png", cv2.imencode(".png", labels.astype(np.uint16))[1].tobytes())
+    write_file(folder / CLASSES_FILE, "".join(f"{number} {name}\n" for number, name in enumerate(names, start=1)))
 
 
 def label_image(run: RecordedRun, answer: Answer, view: View) -> np.ndarray:

@@ -57,12 +57,10 @@ class RecordedRun:
     """Outputs of a finished run, as read from its folder.
 
     Args:
-        metrics: of metrics.json.
         frames: lines of frames.jsonl that have a pose, in order.
         skipped: the other lines.
         poses: T_world_camera of `frames`, (n, 4, 4) float64: the final ones.
         online: the same as first estimated, before the back end moved them; nan before it begins, None without one.
-        raw: the raw predictions' poses.
         truth: (n, 4, 4), nan where unknown.
         text: classes that the map's features are compared with; None without.
         loops: lines of loops.json; empty without a back end.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from emgs_jax.io.files import flat, jsonable
+from emgs_jax.io.files import changes, jsonable
 from emgs_jax.report.provenance import RESULT_FORMAT, ROWS, prefix_of
 
 METRICS_FILE = "metrics.json"
@@ -19,11 +19,9 @@ class Estimate:
     """Estimate of one run that was compared with the truth: the map, the raw predictions, or a baseline.
 
     Args:
-        variant: name of the overrides, or of another system.
         kind: "ours", "raw prior", another one of `ROWS`, or "scored" for another system.
         prior: its name; None for another system.
         revision: of the code; None where unknown.
-        values: the metrics that are numbers.
     """
 
     folder: Path
@@ -69,15 +67,9 @@ def is_finished(folder: Path, config: Mapping[str, Any]) -> bool:
     path = folder / METRICS_FILE
     if not path.exists():
         return False
-    made, wanted = flat(read_metrics(path)["provenance"]["config"]), flat(jsonable(config))
-    changes = [
-        f"{key} was {made.get(key)}, now {wanted.get(key)}"
-        for key in sorted({*made, *wanted} - set(_PLACES))
-        if made.get(key) != wanted.get(key)
-    ]
-    if changes:
+    if changed := changes(read_metrics(path)["provenance"]["config"], jsonable(config), _PLACES):
         raise ValueError(
-            f"{path} was made with other settings ({'; '.join(changes[:3])}{'; …' * (len(changes) > 3)}): "
+            f"{path} was made with other settings ({'; '.join(changed[:3])}{'; …' * (len(changed) > 3)}): "
             "give these settings another name (+variants.NAME=[…], method=NAME), choose another out=FOLDER or move the "
             "folder away"
         )

@@ -15,7 +15,7 @@ from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import atomic_write, remove_temporaries, write_json
-from emgs_jax.io.map_file import save_map_npz
+from emgs_jax.io.map_file import save_map
 from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import from_tum, save_trajectory_tum
@@ -69,7 +69,7 @@ def save_progress(folder: Path, run: MappingRun) -> None:
         save_trajectory_tum(
             folder / "trajectory.txt", [record.timestamp for record in run.records], np.stack(run.poses)
         )
-        save_map_npz(folder / "map.npz", run.state.map)
+        save_map(folder / "map.npz", run.state.map)
     end = run.back_end
     if end is not None and end.database.keyframes and run.state is not None:
         save_places(folder / "places.npz", end, float(run.state.estimate.depth_noise))
@@ -127,7 +127,6 @@ def save_outputs(
     """Write the files that show the map; returns what could not be made, and why.
 
     Args:
-        title: of the picture.
         with_scale: the true path is drawn where it fits best by a similarity, not by a rigid motion, as it is scored.
         unit: of the map's lengths, as the picture says it.
     """

@@ -20,7 +20,6 @@ from emgs_jax.report.recorded_run import RecordedRun
 from emgs_jax.semantics import similarities
 
 FORMAT, VERSION = "emgs_jax.segmentation", 1
-ALIGNMENTS = ("trajectory", "points")
 _TITLES = ("method", "source", "protocol", "scenes", "placed by", "mIoU [%]", "f-mIoU [%]", "Acc [%]", "ATE [cm]")
 _NOTES = """
 Acc is the mean recall of the classes under ovo and conceptgraphs, the share of the points under rayfronts. Quoted rows
@@ -51,8 +50,6 @@ class SceneResult:
 
     Args:
         confusion: see `scene_confusion`.
-        about: how the map was placed, and counts.
-        ate_m: of the trajectory, Sim(3); None where unknown.
     """
 
     scene: str
@@ -154,7 +151,6 @@ def table(found: Mapping[str, Any], published: Sequence[Mapping[str, Any]]) -> s
     """Write the mean or sum over the scenes, each scene, and quoted rows in Markdown.
 
     Args:
-        found: `summary`.
         published: method, source, protocol, and `values`: mIoU, f-mIoU, Acc and ATE [cm], null where unknown.
     """
     scenes = found["scenes"]

@@ -20,7 +20,6 @@ def write_sweep_page(folder: Path, block: Mapping[str, Any], rows: Rows, axes: S
 
     Args:
         folder: of the sweep, with heat_map.png and pictures where there are any.
-        block: the provenance that all settings share.
         rows: a flat row for each setting, at least one.
         command: that repeats the sweep; "" where nobody knows.
     """

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from emgs_jax.io.files import atomic_write, jsonable, write_json
+from emgs_jax.io.files import changes, jsonable, write_file, write_json
 from emgs_jax.report.columns import MAIN, Line, known, markdown, metric_table
 
 FORMAT, VERSION = "emgs_jax.running.stacked", 1
@@ -38,10 +38,10 @@ class SweepResults:
         self.path = folder / "sweep.json"
         self._header = jsonable({"format": FORMAT, "version": VERSION, "provenance": provenance})
         old = read_sweep(self.path) if self.path.exists() else self._header | {"settings": []}
-        for key in ("data", "prior", "config", "git", "versions"):
-            before, now = (sweep["provenance"].get(key) for sweep in (old, self._header))
-            if before != now:
-                raise ValueError(f"{self.path} holds a sweep with {difference(before, now, key)}: {_REMEDY}")
+        keys = ("data", "prior", "config", "git", "versions")
+        before, now = ({key: sweep["provenance"].get(key) for key in keys} for sweep in (old, self._header))
+        if changed := changes(before, now):
+            raise ValueError(f"{self.path} holds another sweep ({changed[0]}): {_REMEDY}")
         self._rows: dict[str, dict[str, Any]] = {_key(row["setting"]): row for row in old["settings"]}
 
     def __contains__(self, setting: Mapping[str, Any]) -> bool:
@@ -68,15 +68,6 @@ def picture_path(folder: Path, setting: Mapping[str, Any]) -> Path:
     return folder / "pictures" / f"{hashlib.sha256(_key(setting).encode()).hexdigest()[:16]}.jpg"
 
 
-def difference(old: Any, new: Any, path: str) -> str:
-    """Say the first value that differs, with its path, in words."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        for name in [*old, *new]:
-            if old.get(name) != new.get(name):
-                return difference(old.get(name), new.get(name), f"{path}.{name}")
-    return f"{path} {old!r}, and this one has {new!r}"
-
-
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write one line for each row; a metric that a setting does not have is empty."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
@@ -84,8 +75,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with atomic_write(path, "w") as handle:
-        handle.write(text.getvalue())
+    write_file(path, text.getvalue())
 
 
 def table(rows: Sequence[Mapping[str, Any]], axes: Sequence[str]) -> str:

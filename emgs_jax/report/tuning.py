@@ -22,7 +22,6 @@ class SequenceResults:
     """Metrics of the settings of a search on one sequence.
 
     Args:
-        is_held_out: the search did not use it.
         metrics: of DEFAULT and of trials, by name.
     """
 

@@ -51,7 +51,6 @@ def ask(layers: Layers, wanted: Sequence[int], against: Sequence[int], min_cosin
         layers: with classes.
         wanted: rows of the words that are asked for, at least one.
         against: rows of words that are not.
-        min_cosine: that an answer needs.
     """
     count = len(layers["label"])
     fill = (0, (1 << (count - 1).bit_length()) - count)  # few sizes, as each compiles once
@@ -75,9 +74,6 @@ def picked(means: np.ndarray, covs: np.ndarray, origin: Sequence[float], directi
     """Find the Gaussian that a ray meets nearest to its centre on the first surface; None where there is none.
 
     Args:
-        means: (n, 3).
-        covs: (n, 3, 3).
-        origin: of the ray.
         direction: of the ray; what lies behind the origin is not met.
     """
     ray, offsets = np.asarray(direction, np.float64), np.asarray(means, np.float64) - np.asarray(origin, np.float64)

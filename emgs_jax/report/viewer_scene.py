@@ -26,7 +26,6 @@ class Shown:
     Args:
         layers: of the confirmed Gaussians, as `map_layers` and `feature_layer` make them; empty before there is a map.
         names: of the classes; none without.
-        frames: what is known of each, as in frames.jsonl.
         poses: T_world_camera of `frames`, (n, 4, 4).
         truth: true camera centres in the frame of the map, (n, 3); nan where unknown.
         image: of the last frame, uint8 (h, w, 3); None where nobody has it.

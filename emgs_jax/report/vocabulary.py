@@ -19,8 +19,6 @@ class Vocabulary:
     """Texts that a map can be queried for.
 
     Args:
-        source: where vectors come from, for people.
-        width: of the map's features.
         known: texts with their vectors; None where `model` embeds any text.
         model: embeds; None where the texts are those of `known`.
     """

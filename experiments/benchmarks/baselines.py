@@ -24,10 +24,8 @@ def em(gaussians: Arrays, points: Arrays, noise: np.ndarray, config: Any) -> Upd
     """E-step and M-step of eq. 2 to 4 with NumPy, SciPy's k-d tree and a sparse matrix product.
 
     Args:
-        gaussians: n of them.
         points: m of them, in the same frame.
         noise: (m, 3), as in `emgs_jax.em.e_step`.
-        config: EmConfig.
     """
     tree = cKDTree(gaussians["means"])
     _, rows = tree.query(points["points"], config.num_neighbours, workers=-1)
@@ -81,7 +79,6 @@ def colored_icp(source: Arrays, target: Arrays, start: np.ndarray, reach: float,
         target: points, normals and colors.
         start: T_target_source (4, 4).
         reach: m; farther points are no pair.
-        num_steps: iterations.
     """
     import open3d
 
@@ -104,10 +101,7 @@ def render(
 
     Args:
         splats: means (n, 2), precisions (n, 2, 2), depth (n,): those in front of the camera.
-        values: of each splat.
-        width: of the image.
         lines: of the image that are drawn.
-        config: RenderConfig.
         xp: numpy, or torch with tensors.
     """
     order = xp.argsort(splats["depth"])

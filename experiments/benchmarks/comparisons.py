@@ -18,6 +18,7 @@ from emgs_jax.ops.camera import downscale
 from emgs_jax.ops.neighbours import of_queries
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.registration.icp import icp
+from emgs_jax.registration.problem import CoarseStart
 from emgs_jax.render.composite import render
 from emgs_jax.render.project import project_gaussians
 
@@ -82,7 +83,8 @@ def time_icp(data: Data, offset: tuple[float, float], repetitions: int) -> list[
     target = gaussians_of(data, 3 * count // 4)
     stride = max(reference.valid.shape[0] // config.num_points, 1)
     cases = [_icp_case(data, row, offset) for row in range(1, len(data.true_poses))]
-    arguments = [(points, target, start, jnp.eye(7), jnp.asarray(0.01), config) for points, start, _ in cases]
+    starts = [CoarseStart(start, jnp.eye(7), jnp.asarray(0.01)) for _, start, _ in cases]
+    arguments = [(case[0], target, start, config) for case, start in zip(cases, starts, strict=True)]
     ours = executable(icp, *arguments[0])
     clouds = [
         (_host(jax.tree.map(lambda leaf: leaf[::stride], points)), start.as_matrix()) for points, start, _ in cases

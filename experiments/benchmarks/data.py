@@ -31,11 +31,8 @@ class Data:
 
     Args:
         camera: of the full images.
-        config: all stages.
         raw: the prior's answer to the first window.
         images: (views, h, w, 3), of the first window.
-        first: the first window.
-        prediction: of the frame after it.
         true_poses: T_world_camera (views, 4, 4) of the first window.
     """
 

@@ -15,9 +15,6 @@ class Timing:
     """One row of a table.
 
     Args:
-        part: which comparison it belongs to.
-        name: what ran.
-        seconds: of every repetition.
         compile_seconds: of tracing and compiling; None where nothing is compiled.
         facts: what else was found, for example errors, sizes and ratios.
     """
@@ -36,7 +33,6 @@ class Candidate:
     Args:
         call: returns when its result is there.
         compile_seconds: as in `Timing`; likewise
-        facts: what is known of it.
         verb: what `call` calls, for other arguments of the same shapes.
     """
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.back_end.g2o import load_graph_g2o, save_graph_g2o
-from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, residuals
+from emgs_jax.pose_graph.factors import residuals
 
 RNG = np.random.default_rng(0)
 ROOT = RNG.normal(size=(6, 6))
@@ -41,7 +41,7 @@ def test_vertices_and_edges_are_what_the_lines_say(tmp_path):
     np.testing.assert_array_equal([graph.factors.a, graph.factors.b], [[0, 2], [1, 0]])
     turned = matrix([1, 0, 0], [0, 0, 0.6, 0.8])
     np.testing.assert_allclose(graph.factors.Z_a_b.as_matrix(), [matrix([1, 2, 3], [0, 0, 0, 1]), turned], atol=1e-6)
-    np.testing.assert_array_equal(graph.factors.kind, [ODOMETRY, LOOP])
+    np.testing.assert_array_equal(graph.factors.is_loop, [False, True])
     roots = np.asarray(graph.factors.sqrt_info)
     np.testing.assert_allclose((roots.transpose(0, 2, 1) @ roots)[:, :6, :6], [INFORMATION] * 2, atol=1e-9)
     assert not roots[:, 6].any() and not roots[:, :, 6].any()

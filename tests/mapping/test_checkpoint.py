@@ -15,6 +15,7 @@ from own_process import begin, ended, wait_for
 from tiny_run import NUM_FRAMES, TINY, compose
 
 import experiments.run
+from emgs_jax.io.files import changes
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.mapping import pipeline
 from emgs_jax.mapping.checkpoint import (
@@ -22,7 +23,6 @@ from emgs_jax.mapping.checkpoint import (
     Checkpoint,
     CheckpointConfig,
     Keeper,
-    difference,
     load_checkpoint,
     save_checkpoint,
 )
@@ -211,8 +211,9 @@ def test_without_a_number_of_frames_nothing_is_written_or_read(tmp_path):
     assert keeper.found is None and keeper.note is None
 
 
-def test_the_first_difference_is_named():
+def test_differences_are_named_by_their_keys():
     one = {"config": {"slam": {"a": 1, "b": 2}}, "git": None}
-    assert difference(one, one) is None
-    assert difference(one, {"config": {"slam": {"a": 1, "b": 3}}, "git": "x"}) == "config.slam.b was 2, now it is 3"
-    assert difference({}, {"git": "x"}) == "git was None, now it is 'x'"
+    assert changes(one, one) == []
+    other = {"config": {"slam": {"a": 1, "b": 3}}, "git": "x"}
+    assert changes(one, other) == ["config.slam.b was 2, now it is 3", "git was None, now it is 'x'"]
+    assert changes({}, {"git": "x"}) == ["git was None, now it is 'x'"] and not changes({}, {"git": "x"}, ("git",))

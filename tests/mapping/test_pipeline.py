@@ -14,7 +14,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
 from emgs_jax.device.clock import Clock
 from emgs_jax.evaluation.reconstruction import ground_truth_cloud
-from emgs_jax.io.map_file import load_map_npz
+from emgs_jax.io.map_file import load_map
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.mapping import pipeline
 from emgs_jax.mapping.pipeline import finish_run, map_frames
@@ -186,7 +186,7 @@ def test_the_merged_initialization_makes_the_map_from_the_whole_window(monkeypat
 def test_what_is_saved_reloads_to_the_state_and_to_the_poses_at_the_data_sets_times(tmp_path):
     session, _ = exact()
     save_progress(tmp_path, session)
-    assert same_bits(load_map_npz(tmp_path / "map.npz", type(session.state.map)), session.state.map)
+    assert same_bits(load_map(tmp_path / "map.npz"), session.state.map)
     times, poses = load_trajectory_tum(tmp_path / "trajectory.txt")
     assert times.tolist() == [dataset()[i].timestamp for i in range(NUM_FRAMES)]
     np.testing.assert_allclose(poses, session.poses, atol=1e-8)  # nine digits are written

@@ -35,7 +35,6 @@ from emgs_jax.mapping.relocalization import (
 from emgs_jax.mapping.run import MappingRun, new_run
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
-from emgs_jax.pose_graph.factors import ODOMETRY
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.slam import SlamState
 
@@ -174,7 +173,7 @@ def begins_anew(
     config = load_config("graph=default", f"graph.relocalization.max_patience={patience}")
     poses = np.stack([matrix((0, 0, 0), (0.1 * k, 0, 0)) for k in range(8)])
     end = SimpleNamespace(poses=list(poses[:7]), config=config.graph)
-    end.factors = [SimpleNamespace(a=a, b=b, kind=ODOMETRY) for a, b in chain]
+    end.factors = [SimpleNamespace(a=a, b=b, is_loop=False) for a, b in chain]
     end.is_placed, end.first_node = [True] * 3 + [False] * 4, 0
     statuses = ["initialization", "tracked", "tracked", *["degraded"] * 4]
     records = [FrameRecord(row, None, None, status) for row, status in enumerate(statuses)]

@@ -7,7 +7,7 @@ import jaxlie
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Factors, Nodes, PoseGraph
+from emgs_jax.pose_graph.factors import Factors, Nodes, PoseGraph
 from emgs_jax.pose_graph.optimize import PoseGraphConfig
 
 OFFSETS = (1, 2, 3, 5, 8)
@@ -84,7 +84,7 @@ def walk(num_nodes: int, laps: float = 2.0, radius: float = 4.0, scale_std: floa
     return Nodes(poses_of(motions(turns, centers)), jnp.asarray(scales), jnp.asarray(np.ones(num_nodes, bool)))
 
 
-def measure(nodes: Nodes, pairs, kind=ODOMETRY, std=STD, rng=None) -> Factors:
+def measure(nodes: Nodes, pairs, std=STD, rng=None, is_loop=False) -> Factors:
     """Edges of pairs (e, 2), exact without `rng`; the information is that of `std`."""
     a, b = np.asarray(pairs).T
     count = len(a)
@@ -93,9 +93,14 @@ def measure(nodes: Nodes, pairs, kind=ODOMETRY, std=STD, rng=None) -> Factors:
     Z[:, :3, 3] *= np.exp(-scale[a])[:, None]
     noise = np.zeros((count, 7)) if rng is None else rng.normal(size=(count, 7)) * std
     roots = np.tile(np.diag(1.0 / np.asarray(std)), (count, 1, 1))
-    arrays = scale[b] - scale[a] + noise[:, 6], roots, np.full(count, kind, np.int32), np.ones(count, bool)
+    arrays = scale[b] - scale[a] + noise[:, 6], roots, np.full(count, is_loop), np.ones(count, bool)
     ends = (jnp.asarray(x.astype(np.int32)) for x in (a, b))
     return Factors(*ends, poses_of(Z @ exp(noise[:, :6])), *map(jnp.asarray, arrays))
+
+
+def measure_loops(nodes: Nodes, pairs, std=STD, rng=None) -> Factors:
+    """The same, as loop factors."""
+    return measure(nodes, pairs, std, rng, is_loop=True)
 
 
 def join(*edges):
@@ -135,8 +140,8 @@ def chain(nodes: Nodes, edges: Factors) -> Nodes:
 def noisy_laps(num_nodes: int, num_loops: int, seed: int, std=STD) -> tuple[Nodes, PoseGraph]:
     """Truth, and the graph of two laps as it stands before a closure: the chain of its odometry. SE(3)."""
     rng, truth = np.random.default_rng(seed), walk(num_nodes)
-    edges = measure(truth, window_pairs(num_nodes), ODOMETRY, std, rng)
-    loops = measure(truth, loop_pairs(num_nodes, num_loops), LOOP, std, rng)
+    edges = measure(truth, window_pairs(num_nodes), std, rng)
+    loops = measure_loops(truth, loop_pairs(num_nodes, num_loops), std, rng)
     edges = without_scale(join(edges, loops))
     return truth, PoseGraph(chain(truth, edges), edges)
 

@@ -8,7 +8,7 @@ from rings import disturb, join, log, matrices_of, measure, motions, poses_of, p
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.pose_graph import factors
-from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Factors, Nodes, PoseGraph
+from emgs_jax.pose_graph.factors import Factors, Nodes, PoseGraph
 
 residuals, linearize, move, robust = (
     jax.jit(f) for f in (factors.residuals, factors.linearize, factors.move, factors.robust)
@@ -112,17 +112,17 @@ def test_what_is_not_in_use_is_zero_with_finite_derivatives(double):
 
 def test_the_kernel_s_weight_is_the_derivative_of_its_cost(double):
     chi2 = np.array([0.0, 1.0, 16.7, 16.9, 40.0, 1e4, 1e8])
-    kind, phi = np.full(7, LOOP), 16.8
-    slope = jax.jit(jax.grad(lambda chi2: jnp.sum(robust(chi2, kind, phi)[0])))(chi2)  # each cost has its own chi2
-    cost, weight = (np.asarray(x) for x in robust(chi2, kind, phi))
+    is_loop, phi = np.ones(7, bool), 16.8
+    slope = jax.jit(jax.grad(lambda chi2: jnp.sum(robust(chi2, is_loop, phi)[0])))(chi2)  # each cost has its own chi2
+    cost, weight = (np.asarray(x) for x in robust(chi2, is_loop, phi))
     np.testing.assert_allclose(2.0 * np.asarray(slope), weight, rtol=1e-9)
     assert (cost[:3] == 0.5 * chi2[:3]).all() and (cost <= 1.5 * phi).all() and (np.diff(cost) > 0).all()
 
 
 def test_a_window_s_edges_and_an_infinite_kernel_are_quadratic(double):
     chi2 = np.array([0.0, 1.0, 16.7, 16.9, 40.0, 1e4, 1e8])
-    for kind, phi in ((ODOMETRY, 16.8), (LOOP, np.inf)):
-        cost, weight = robust(chi2, np.full(7, kind), phi)
+    for is_loop, phi in ((False, 16.8), (True, np.inf)):
+        cost, weight = robust(chi2, np.full(7, is_loop), phi)
         np.testing.assert_array_equal(cost, 0.5 * chi2)
         np.testing.assert_array_equal(weight, 1.0)
 
@@ -140,4 +140,4 @@ def test_edges_are_typed_by_rows():
     edges = measure(walk(3), [(0, 1)])
     roots = jnp.asarray(np.ones((1, 6, 7)))
     with pytest.raises(Exception, match="sqrt_info|7"):
-        Factors(edges.a, edges.b, edges.Z_a_b, edges.log_ratio, roots, edges.kind, edges.valid)
+        Factors(edges.a, edges.b, edges.Z_a_b, edges.log_ratio, roots, edges.is_loop, edges.valid)

@@ -22,6 +22,7 @@ from rings import (
     loop_pairs,
     matrices_of,
     measure,
+    measure_loops,
     noisy_laps,
     poses_of,
     put,
@@ -35,7 +36,7 @@ from scipy import stats
 
 from emgs_jax.back_end.g2o import load_graph_g2o
 from emgs_jax.pose_graph.chordal import chordal_initialization
-from emgs_jax.pose_graph.factors import LOOP, ODOMETRY, Nodes, PoseGraph
+from emgs_jax.pose_graph.factors import Nodes, PoseGraph
 from emgs_jax.pose_graph.optimize import PoseGraphConfig, optimize
 from emgs_jax.pose_graph.problem import problem_of
 
@@ -81,7 +82,7 @@ def test_known_optima_are_reached(name, optimum, start):
 def test_exact_measurements_give_the_truth(start, scale_std):
     """From poses off by .3 m and .3 rad, and scales by e^{±.3}."""
     truth = walk(30, laps=1.0, scale_std=0.3 * (scale_std > 0))
-    edges = join(measure(truth, window_pairs(30)), measure(truth, [(0, 29), (2, 28)], LOOP))
+    edges = join(measure(truth, window_pairs(30)), measure_loops(truth, [(0, 29), (2, 28)]))
     given = disturb(truth, np.random.default_rng(1), np.array([0.3] * 6 + [0.3 * (scale_std > 0)]))
     nodes, info = optimize(PoseGraph(given, edges), config(scale_std=scale_std, start=start, kernel=np.inf))
     assert not info.reason and info.converged
@@ -91,7 +92,7 @@ def test_exact_measurements_give_the_truth(start, scale_std):
 def test_where_the_solver_starts_exact_measurements_have_no_error_left():
     """Rotations first, then positions, from any: two linear problems."""
     truth = walk(30, laps=1.0)
-    edges = join(measure(truth, window_pairs(30)), measure(truth, [(0, 29), (2, 28)], LOOP))
+    edges = join(measure(truth, window_pairs(30)), measure_loops(truth, [(0, 29), (2, 28)]))
     given = disturb(truth, np.random.default_rng(1), np.array([0.3] * 6 + [0.0]))
     problem = problem_of(PoseGraph(given, edges), 0.0)
     nodes = rows_of(chordal_initialization(problem.graph, problem.free), np.arange(30))
@@ -101,7 +102,7 @@ def test_where_the_solver_starts_exact_measurements_have_no_error_left():
 def test_a_loop_of_scale_alone_spreads_linearly():
     """Steps measure equal scales, the loop a ratio of e^{.3}, as exact as each of the ten steps: a share of 1/11."""
     nodes = walk(11)
-    edges = join(measure(nodes, window_pairs(11, (1,))), measure(nodes, [(0, 10)], LOOP))
+    edges = join(measure(nodes, window_pairs(11, (1,))), measure_loops(nodes, [(0, 10)]))
     edges = put(edges, log_ratio=np.r_[np.zeros(10), 0.3], sqrt_info=lambda roots: roots * (np.arange(7) == 6)[:, None])
     found, info = optimize(PoseGraph(nodes, edges), config(scale_std=np.inf, kernel=np.inf))
     np.testing.assert_allclose(found.log_scale, 0.3 / 11 * np.arange(11), atol=1e-9)
@@ -128,7 +129,7 @@ def test_scales_that_may_not_move_cost_nothing_wherever_they_are():
 def test_a_tight_scale_prior_is_the_solution_without_scales():
     truth = walk(24)
     edges = join(
-        measure(truth, window_pairs(24), rng=np.random.default_rng(0)), measure(truth, loop_pairs(24, 6), LOOP)
+        measure(truth, window_pairs(24), rng=np.random.default_rng(0)), measure_loops(truth, loop_pairs(24, 6))
     )
     graph = PoseGraph(chain(truth, edges), edges)
     rigid, tight = (optimize(graph, config(scale_std=s))[0] for s in (0.0, 1e-7))
@@ -140,7 +141,7 @@ def laps():
     """Truth, a noisy graph of two laps with free scales, its solution, and what was found."""
     with jax.enable_x64(True):
         rng, truth = np.random.default_rng(3), walk(40, scale_std=0.05)
-        loops = measure(truth, loop_pairs(40, 8), LOOP, rng=rng)
+        loops = measure_loops(truth, loop_pairs(40, 8), rng=rng)
         edges = join(measure(truth, window_pairs(40), rng=rng), loops)
         graph = PoseGraph(chain(truth, edges), edges)
         return truth, graph, *optimize(graph, config(scale_std=0.05))
@@ -242,7 +243,7 @@ def test_float32_poses_are_solved_in_float64(laps):
 def test_a_triangle_closes_in_the_direction_of_its_edges():
     """Z_a_b = T_a⁻¹ T_b: the third side, told from its end, agrees with the first two; the other way it does not."""
     truth = walk(3, laps=1.0)
-    edges = without_scale(join(measure(truth, [(0, 1), (1, 2)]), measure(truth, [(2, 0)], LOOP)))
+    edges = without_scale(join(measure(truth, [(0, 1), (1, 2)]), measure_loops(truth, [(2, 0)])))
     given = disturb(truth, np.random.default_rng(0), 0.2 * (np.arange(7) < 6))
     found, info = optimize(PoseGraph(given, edges), config(kernel=np.inf))
     np.testing.assert_allclose(error(found, truth), 0.0, atol=1e-6)
@@ -253,14 +254,14 @@ def test_a_triangle_closes_in_the_direction_of_its_edges():
 def test_chi2_of_noisy_measurements_has_its_distribution():
     """Within the 99 % interval of its degrees of freedom, for the whole graph with scales and their prior."""
     rng, truth = np.random.default_rng(5), walk(60, scale_std=0.03)
-    loops = measure(truth, loop_pairs(60, 10), LOOP, rng=rng)
+    loops = measure_loops(truth, loop_pairs(60, 10), rng=rng)
     edges = join(measure(truth, window_pairs(60), rng=rng), loops)
     _, info = optimize(PoseGraph(chain(truth, edges), edges), config(scale_std=0.03, kernel=np.inf))
     low, high = stats.chi2.interval(0.99, info.dof)
     assert low < 2 * info.cost < high
     assert info.dof == 7 * edges.a.shape[0] + 59 - 7 * 59
-    assert (info.num_odometry_rows, info.num_loop_rows) == (7 * (edges.a.shape[0] - 10), 70)
-    assert info.odometry_chi2 + info.loop_chi2 == pytest.approx(np.sum(info.factor_chi2))
+    assert (info.num_other_rows, info.num_loop_rows) == (7 * (edges.a.shape[0] - 10), 70)
+    assert info.other_chi2 + info.loop_chi2 == pytest.approx(np.sum(info.factor_chi2))
 
 
 @pytest.fixture(scope="module")
@@ -273,7 +274,7 @@ def closures():
             rng = np.random.default_rng(100 + seed)
             false = rng.integers(0, 80, (40, 2))
             false = false[np.abs((false[:, 0] - false[:, 1] + 20) % 40 - 20) > 8][:10]  # of places far apart
-            wrong = measure(truth, false, LOOP)
+            wrong = measure_loops(truth, false)
             at_once = poses_of(exp(rng.normal(size=(len(false), 6)) * 0.05))
             wrong = without_scale(put(wrong, Z_a_b=at_once))
             clean, _ = optimize(graph, config())
@@ -293,8 +294,8 @@ def test_ten_false_loops_among_thirty_hardly_matter(closures):
 def drifted(num_nodes: int, seed: int) -> tuple[Nodes, PoseGraph]:
     """Odometry five times as noisy as its loops, of which there are three: metres of drift."""
     rng, truth = np.random.default_rng(seed), walk(num_nodes)
-    window = measure(truth, window_pairs(num_nodes), ODOMETRY, 5 * STD, rng)
-    edges = without_scale(join(window, measure(truth, loop_pairs(num_nodes, 3), LOOP, STD, rng)))
+    window = measure(truth, window_pairs(num_nodes), 5 * STD, rng)
+    edges = without_scale(join(window, measure_loops(truth, loop_pairs(num_nodes, 3), STD, rng)))
     return truth, PoseGraph(chain(truth, edges), edges)
 
 
@@ -313,9 +314,9 @@ def stretched(num_nodes: int, seed: int) -> tuple[Nodes, PoseGraph]:
     rng, truth = np.random.default_rng(seed), walk(num_nodes)
     scales = np.concatenate([[0.0], np.cumsum(0.02 * rng.normal(size=num_nodes - 1))])
     truth = put(truth, log_scale=scales)
-    window = measure(truth, window_pairs(num_nodes), ODOMETRY, STD * np.where(np.arange(7) == 6, 2.0, 1.0), rng)
+    window = measure(truth, window_pairs(num_nodes), STD * np.where(np.arange(7) == 6, 2.0, 1.0), rng)
     window = put(window, log_ratio=lambda ratio: 0 * ratio)
-    edges = join(window, measure(truth, loop_pairs(num_nodes, 3), LOOP, STD, rng))
+    edges = join(window, measure_loops(truth, loop_pairs(num_nodes, 3), STD, rng))
     return truth, PoseGraph(chain(truth, edges), edges)
 
 
@@ -349,7 +350,7 @@ def test_parts_without_a_path_to_the_first_node_stay():
     given = disturb(truth, np.random.default_rng(0), 0.1 * (np.arange(7) < 6))
     both = join(graph.nodes, given)
     there = put(graph.factors, a=lambda a: a + 24, b=lambda b: b + 24)
-    bridge = put(measure(both, [(3, 30)], LOOP), sqrt_info=np.zeros((1, 7, 7)))  # measures nothing
+    bridge = put(measure_loops(both, [(3, 30)]), sqrt_info=np.zeros((1, 7, 7)))  # measures nothing
     nodes, info = optimize(PoseGraph(both, join(graph.factors, there, bridge)), config())
     alone, _ = optimize(graph, config())
     assert info.num_disconnected == 24
@@ -385,7 +386,7 @@ def test_loops_that_contradict_the_window_are_refused_or_given_no_weight():
     """Two loops between the same poses, metres apart: the kernel lets neither count; without it nothing moves."""
     truth = walk(24)
     window = measure(truth, window_pairs(24), rng=np.random.default_rng(0))
-    loops = measure(truth, [(0, 12), (0, 12)], LOOP)
+    loops = measure_loops(truth, [(0, 12), (0, 12)])
     apart = matrices_of(loops.Z_a_b) @ exp([[3.0, 0, 0, 0, 0, 0], [-3.0, 0, 0, 0, 0, 0]])
     loops = put(loops, Z_a_b=poses_of(apart))
     graph = PoseGraph(chain(truth, window), without_scale(join(window, loops)))

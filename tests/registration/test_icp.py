@@ -10,6 +10,7 @@ from emgs_jax.gaussians import Gaussians, color_gradients, fit_to_points
 from emgs_jax.observation import Observation
 from emgs_jax.registration.icp import icp
 from emgs_jax.registration.noise import NUM_CELLS
+from emgs_jax.registration.problem import CoarseStart
 
 pytestmark = pytest.mark.slow  # the solver compiles for 10 s; the quick subset has test_localization
 RESIDUALS = {"colored": 0, "distribution": 1, "colored+distribution": 2, "colored+ray": 3}
@@ -22,11 +23,11 @@ STARTS = [
 ]
 
 
-def known_of(settings, pose_std=NOISE[0], depth_noise=NOISE[1]):
-    """Root of what `prior_information` points so noisy say of the pose, and `scale_noise` of the scale; their noise."""
+def start_at(T, settings, pose_std=NOISE[0], depth_noise=NOISE[1]):
+    """Known: what `prior_information` points so noisy say of the pose, and `scale_noise` of the scale."""
     pose = np.sqrt(float(settings.prior_information)) / np.repeat([pose_std, depth_noise], 3)
     scale = 1.0 / (max(float(settings.scale_noise), 1e-3) * depth_noise)
-    return sc.device(np.diag(np.append(pose, scale))), sc.device(np.float32(depth_noise))
+    return CoarseStart(T, sc.device(np.diag(np.append(pose, scale))), sc.device(np.float32(depth_noise)))
 
 
 solve, gradients_of = sc.on_host(icp), sc.on_host(color_gradients)
@@ -94,8 +95,8 @@ def points_of(points, normals=TOWARDS, light=0.5, valid=True) -> Observation:
 
 def solved(points, gaussians, settings, pose_std=POSE_STD, depth_noise=STIFF):
     """xi of T = COARSE exp(xi), the scale and the info."""
-    given = known_of(settings, pose_std, depth_noise)
-    T, scale, info = solve(points, sc.move_gaussians(COARSE, gaussians), COARSE, *given, settings)
+    start = start_at(COARSE, settings, pose_std, depth_noise)
+    T, scale, info = solve(points, sc.move_gaussians(COARSE, gaussians), start, settings)
     return step_to(T).astype(float), float(scale), info
 
 
@@ -301,7 +302,7 @@ def settings(exactly):
 
 
 def errors(target, source, config, starts):
-    poses = [solve(source, target, sc.product(TRUTH, start), *known_of(config), config)[0] for start in starts]
+    poses = [solve(source, target, start_at(sc.product(TRUTH, start), config), config)[0] for start in starts]
     return np.array([sc.pose_error(T, TRUTH) for T in poses])
 
 
@@ -344,18 +345,18 @@ def test_the_error_is_no_larger_than_open3ds_from_the_same_starts(source, target
 def test_an_overwhelming_prior_holds_the_coarse_pose(source, target, settings):
     start = sc.product(TRUTH, STARTS[0])
     firm = sc.at(settings, "prior_information", 1e9)
-    held, _, _ = solve(source, target, start, *known_of(firm), firm)
-    free, _, _ = solve(source, target, start, *known_of(settings), settings)
+    held, _, _ = solve(source, target, start_at(start, firm), firm)
+    free, _, _ = solve(source, target, start_at(start, settings), settings)
     assert max(sc.pose_error(held, start)) < 1e-4 < 0.02 < sc.pose_error(free, start)[0]
 
 
 def test_the_info_counts_inliers_and_measures_their_planes(source, target, settings):
-    T, _, info = solve(source, target, sc.product(TRUTH, STARTS[0]), *known_of(settings), settings)
+    T, _, info = solve(source, target, start_at(sc.product(TRUTH, STARTS[0]), settings), settings)
     assert 0.5 * 768 < info.num_inliers <= 768
     assert info.inlier_fraction == pytest.approx(float(info.num_inliers) / 768)
     assert info.residual < 0.02 and info.misfit < 0.02  # exact points: only edges are off their planes
     assert info.min_eigenvalue > 0 and info.num_steps > 0
-    _, _, strict = solve(source, target, TRUTH, *known_of(settings), sc.at(settings, "min_normal_cos", 1.1))
+    _, _, strict = solve(source, target, start_at(TRUTH, settings), sc.at(settings, "min_normal_cos", 1.1))
     assert strict.num_inliers == 0 and strict.inlier_fraction == 0 and strict.residual == 0
 
 
@@ -365,8 +366,8 @@ def test_a_single_plane_does_not_determine_the_pose(source, target, settings, re
     plain = sc.replace(target, valid=wall, colors=np.full((384, 3), 0.5))
     facing = sc.replace(source, colors=np.full((2 * NUM_POINTS, 3), 0.5))
     config = sc.at(settings, "residual", RESIDUALS[residual])
-    _, _, whole = solve(source, target, TRUTH, *known_of(config), config)
-    _, _, flat = solve(facing, plain, TRUTH, *known_of(config), config)
+    _, _, whole = solve(source, target, start_at(TRUTH, config), config)
+    _, _, flat = solve(facing, plain, start_at(TRUTH, config), config)
     assert wall.sum() > 30 and flat.num_inliers > 50
     assert flat.min_eigenvalue < 1e-3 * whole.min_eigenvalue
 
@@ -375,8 +376,8 @@ def test_a_single_plane_does_not_determine_the_pose(source, target, settings, re
 def test_the_pose_moves_with_a_rigid_motion_of_the_world(source, target, settings, residual):
     config, motion = sc.at(settings, "residual", RESIDUALS[residual]), sc.pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
     start = sc.product(TRUTH, STARTS[0])
-    still, _, _ = solve(source, target, start, *known_of(config), config)
-    moved, _, _ = solve(source, sc.move_gaussians(motion, target), sc.product(motion, start), *known_of(config), config)
+    still, _, _ = solve(source, target, start_at(start, config), config)
+    moved, _, _ = solve(source, sc.move_gaussians(motion, target), start_at(sc.product(motion, start), config), config)
     # The solver stops where a step changes the cost by 1e-4 of it; both stop near the same minimum.
     assert max(sc.pose_error(moved, sc.product(motion, still))) < 2e-3
 
@@ -387,7 +388,7 @@ def test_without_any_gaussian_or_point_the_coarse_pose_stays(source, target, set
         sc.replace(source, valid=np.zeros(2 * NUM_POINTS, bool)),
     )
     for points, gaussians in ((source, empty), (blind, target)):
-        T, _, info = solve(points, gaussians, TRUTH, *known_of(settings), settings)
+        T, _, info = solve(points, gaussians, start_at(TRUTH, settings), settings)
         assert info.num_inliers == 0
         assert max(sc.pose_error(T, TRUTH)) < 1e-6
 
@@ -400,9 +401,9 @@ def test_invalid_points_and_gaussians_change_nothing(source, target, settings, p
         sc.replace(target, valid=known),
         sc.product(TRUTH, STARTS[1]),
     )
-    clean = solve(points, gaussians, start, *known_of(settings), settings)
+    clean = solve(points, gaussians, start_at(start, settings), settings)
     wild = sc.poisoned(points, seen, poison), sc.poisoned(gaussians, known, poison)
-    sc.assert_same(solve(*wild, start, *known_of(settings), settings), clean)
+    sc.assert_same(solve(*wild, start_at(start, settings), settings), clean)
 
 
 def test_the_order_of_points_and_gaussians_does_not_matter(source, target, settings):
@@ -411,14 +412,14 @@ def test_the_order_of_points_and_gaussians_does_not_matter(source, target, setti
     looked_at = 2 * np.repeat(rng.permutation(NUM_POINTS), 2)
     points, gaussians = sc.rows_of(source, looked_at), sc.rows_of(target, rng.permutation(NUM_GAUSSIANS))
     start = sc.product(TRUTH, STARTS[2])
-    T, _, info = solve(points, gaussians, start, *known_of(settings), settings)
-    expected, _, said = solve(source, target, start, *known_of(settings), settings)
+    T, _, info = solve(points, gaussians, start_at(start, settings), settings)
+    expected, _, said = solve(source, target, start_at(start, settings), settings)
     assert max(sc.pose_error(T, expected)) < 1e-4 and abs(int(info.num_inliers) - int(said.num_inliers)) <= 4
 
 
 def test_a_common_error_of_scale_is_found_only_where_it_may_be(source, target, settings):
     small = sc.replace(source, points=np.asarray(source.points) / 1.03)
-    _, none, _ = solve(small, target, TRUTH, *known_of(settings), sc.at(settings, "scale_noise", 0.0))
-    _, found, _ = solve(small, target, TRUTH, *known_of(settings), sc.at(settings, "scale_noise", 10.0))
+    _, none, _ = solve(small, target, start_at(TRUTH, settings), sc.at(settings, "scale_noise", 0.0))
+    _, found, _ = solve(small, target, start_at(TRUTH, settings), sc.at(settings, "scale_noise", 10.0))
     assert none == 1.0
     assert found == pytest.approx(1.03, abs=0.01)  # points are matched with the centres of sparse Gaussians

@@ -11,7 +11,15 @@ from scene import at, device, matrix_of, on_host
 from emgs_jax.ops.linalg import whitening
 from emgs_jax.registration import problem as problems
 from emgs_jax.registration.pose_estimate import root_information
-from emgs_jax.registration.problem import COLORED, COLORED_RAY, IcpConfig, Problem, Uncertainty, pose_problem
+from emgs_jax.registration.problem import (
+    COLORED,
+    COLORED_RAY,
+    CoarseStart,
+    IcpConfig,
+    Problem,
+    Uncertainty,
+    pose_problem,
+)
 
 data_information, rows_of = on_host(problems.data_information), on_host(problems.rows_of)
 jacobian_of = on_host(jax.jacfwd(problems.rows_of))
@@ -98,8 +106,8 @@ def test_what_is_known_is_the_prior_of_the_unknowns_and_worth_less_where_the_poi
     @on_host
     def problem_of(noise, depth, known, settings: IcpConfig) -> Problem:
         uncertainty = Uncertainty(noise, depth, jnp.ones(()))
-        given = problem.source, problem.surface, problem.T_world_coarse, jnp.asarray(0.02)
-        return pose_problem(*given, uncertainty, settings, known)
+        start = CoarseStart(problem.T_world_coarse, known, jnp.asarray(0.02))
+        return pose_problem(problem.source, problem.surface, start, uncertainty, settings)
 
     y, depth = np.linspace(-1.0, 1.0, 7), np.full(problem.source.valid.shape, 0.02, np.float32)
     prior = lambda worse, chosen: problem_of(np.float32(0.02 * worse), depth, known, chosen).prior  # noqa: E731

@@ -137,9 +137,11 @@ def test_a_result_is_finished_if_it_was_made_with_the_same_settings_wherever_the
     assert not is_finished(tmp_path, config)
     folder = write_result(tmp_path, 0.5)
     assert is_finished(folder, config)
-    with pytest.raises(ValueError, match=r"metrics.json was made with other settings \(em.noise was 1.0, now 2.0\)"):
+    with pytest.raises(
+        ValueError, match=r"metrics.json was made with other settings \(em.noise was 1.0, now it is 2.0\)"
+    ):
         is_finished(folder, config | {"em": {"noise": 2.0}})
-    with pytest.raises(ValueError, match=r"em.window was None, now 3"):
+    with pytest.raises(ValueError, match=r"em.window was None, now it is 3"):
         is_finished(folder, config | {"em": {"noise": 1.0, "window": 3}})
 
 

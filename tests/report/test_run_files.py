@@ -10,7 +10,7 @@ from hand_run import STATUSES, densify_config, hand_run, poses_along, random_pos
 
 from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.evaluation.segmentation import LabelledPoints
-from emgs_jax.io.map_file import load_map_npz
+from emgs_jax.io.map_file import load_map
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.report.dense import DenseMap
 from emgs_jax.report.display import closing_covariances
@@ -55,7 +55,7 @@ def test_the_progress_is_the_map_bit_for_bit_and_our_poses_at_the_frames_times(t
     times, poses = load_trajectory_tum(tmp_path / "trajectory.txt")
     np.testing.assert_array_equal(times, [record.timestamp for record in run.records])
     np.testing.assert_allclose(poses, np.stack(run.poses), atol=5e-9)  # nine digits are written
-    loaded = load_map_npz(tmp_path / "map.npz", type(run.state.map))
+    loaded = load_map(tmp_path / "map.npz")
     for name in ("means", "covs", "colors", "normals", "features", "valid"):
         np.testing.assert_array_equal(getattr(loaded.gaussians, name), getattr(run.state.map.gaussians, name))
 

@@ -131,7 +131,7 @@ def test_what_is_missing_or_does_not_fit_is_named(run, tmp_path):
     refused("class file .*nowhere.yaml does not exist", classes="nowhere.yaml")
     refused("lacks attic_mesh.ply, attic.txt", scenes="attic")
     refused("alignment must be one of trajectory, points; got 'guess'", alignment="guess")
-    refused("map names no folder", map=[])
+    refused(r"map must be a folder or a list of folders, got \[\]", map=[])
     refused("scenes has 1 names and map 2 folders", map=[str(run), str(blind)], scenes=["room"])
     refused("names a folder twice, whose points would count twice", map=[str(run), f"{run}/../{run.name}"])
     refused("truth=frames has the data set's names: leave it out", truth="frames")

@@ -94,7 +94,7 @@ def test_sweeps_of_other_data_priors_or_settings_are_not_mixed(key, tmp_path):
     SweepResults(tmp_path, PROVENANCE).add([{"a": 1}], [{ATE: 0.1}])
     changed = json.loads(json.dumps(PROVENANCE))
     changed[key] |= {"more": 7}
-    with pytest.raises(ValueError, match=rf"sweep.json holds a sweep with {key}.more None, and this one has 7"):
+    with pytest.raises(ValueError, match=rf"sweep.json holds another sweep \({key}.more was None, now it is 7"):
         SweepResults(tmp_path, changed)
 
 

@@ -82,7 +82,7 @@ def test_every_sequence_is_run_with_every_seed_and_variant_and_what_is_finished_
     assert evaluate("seeds=[0,1]") == [] and evaluate.runs == [(0, 1), (1, 1)] and kept.read_bytes() == before
     lines = list(csv.DictReader((evaluate.out / "results.csv").open()))
     assert {(line["seed"], line["variant"]) for line in lines} == {("0", "default"), ("1", "default")}
-    with pytest.raises(ValueError, match=r"window_size was 4, now 7.*\+variants.NAME"):
+    with pytest.raises(ValueError, match=r"window_size was 4, now it is 7.*\+variants.NAME"):
         evaluate("seeds=[0,3]", 'overrides=["slam.window_size=7"]')
     assert evaluate.runs == []
     kept.write_bytes(before.replace(b'"format": %d' % RESULT_FORMAT, b'"format": -1'))

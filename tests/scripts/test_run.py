@@ -16,8 +16,8 @@ import experiments.run
 from emgs_jax.config.configure import compose as compose_as_typed
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.synthetic import Synthetic
-from emgs_jax.gaussian_map import GaussianMap, confirmed
-from emgs_jax.io.map_file import load_map_npz
+from emgs_jax.gaussian_map import confirmed
+from emgs_jax.io.map_file import load_map
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.io.trajectory import load_trajectory_tum
 from experiments.command import clear_errors
@@ -154,7 +154,7 @@ def test_every_file_is_there_and_the_trajectory_has_every_frame_at_its_time(exac
     assert times.tolist() == [dataset()[i].timestamp for i in range(NUM_FRAMES)]
     truth = np.stack([dataset()[i].T_world_camera for i in range(NUM_FRAMES)])
     np.testing.assert_allclose(poses, truth, atol=1e-3)
-    map = load_map_npz(folder / "map.npz", GaussianMap)
+    map = load_map(folder / "map.npz")
     num_confirmed, num_all = int(confirmed(map).valid.sum()), int(map.gaussians.valid.sum())
     assert num_confirmed == metrics["map/num_gaussians"] > 0 and num_all == read_log(folder)[-1]["num_gaussians"]
     assert num_all - num_confirmed == metrics["map/num_tentative"] > 0  # what only the last frame has seen
@@ -180,7 +180,7 @@ def test_an_interrupted_run_leaves_what_it_has(tmp_path, monkeypatch, exact_run)
     np.testing.assert_allclose(poses[:, :3, :3], same[:, :3, :3], atol=1e-12)
     factor = np.linalg.norm(poses[-1, :3, 3] - first) / np.linalg.norm(same[-1, :3, 3] - first)  # each in its own unit
     np.testing.assert_allclose(poses[:, :3, 3], first + factor * (same[:, :3, 3] - first), atol=1e-6)
-    map = load_map_npz(tmp_path / "map.npz", GaussianMap)
+    map = load_map(tmp_path / "map.npz")
     assert int(map.gaussians.valid.sum()) == records[-1]["num_gaussians"]
 
 

@@ -10,6 +10,7 @@ from tiny_run import compose
 
 import experiments.run
 import experiments.sweep
+import experiments.together
 from emgs_jax.config import configure
 from emgs_jax.config.configure import groups
 from experiments.grid import notes, read_axes, variants
@@ -64,11 +65,11 @@ def test_the_files_hold_every_row_and_the_recorded_predictions_are_removed(swept
 def test_a_finished_setting_is_not_mapped_again_and_another_sweep_is_not_mixed_in(swept, monkeypatch, tmp_path):
     folder, rows = swept
     (tmp_path / "sweep.json").write_bytes((folder / "sweep.json").read_bytes())
-    monkeypatch.setattr(experiments.sweep, "map_and_score", None)  # calling it would fail
+    monkeypatch.setattr(experiments.together, "map_and_score", None)  # calling it would fail
     subset = compose("axes={slam.em.max_mahalanobis_sq:[9.0],slam.em.average.gain:[count]}", name="sweep")
     (row,) = experiments.sweep.sweep(subset, tmp_path)
     assert row | {"setting": 2} == rows[2]
-    with pytest.raises(ValueError, match=r"em\.noise 1\.0, and this one has 0\.5: .*another folder"):
+    with pytest.raises(ValueError, match=r"em\.noise was 1\.0, now it is 0\.5\): .*another folder"):
         experiments.sweep.sweep(compose(AXES, "slam.em.noise=0.5", name="sweep"), tmp_path)
 
 
@@ -86,7 +87,7 @@ def test_a_sweep_that_is_stopped_keeps_its_chunks_and_goes_on_with_those_of_the_
         return [{"map/num_gaussians": 1}] * len(chunk)
 
     config = compose(AXES.replace("9.0]", "4.0,9.0]"), "chunk=2", name="sweep")
-    monkeypatch.setattr(experiments.sweep, "map_and_score", stopped)
+    monkeypatch.setattr(experiments.together, "map_and_score", stopped)
     with pytest.raises(KeyboardInterrupt):
         experiments.sweep.sweep(config, tmp_path)
     kept = json.loads((tmp_path / "sweep.json").read_text())["settings"]

@@ -10,6 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 from tiny_run import TINY
 
+import experiments.together
 import experiments.tune
 from emgs_jax.config.configure import compose
 from experiments.command import check_arguments
@@ -46,9 +47,9 @@ def measured(monkeypatch):
         chunks.append((seed, [variant.setting for variant in chunk]))
         return [known_metrics(seed, variant.setting) for variant in chunk]
 
-    monkeypatch.setattr(experiments.tune, "map_and_score", measure)
-    monkeypatch.setattr(experiments.tune, "new_scorer", lambda *_: None)
-    monkeypatch.setattr(experiments.tune, "replayed", lambda prior, *_: prior)
+    monkeypatch.setattr(experiments.together, "map_and_score", measure)
+    monkeypatch.setattr(experiments.together, "new_scorer", lambda *_: None)
+    monkeypatch.setattr(experiments.together, "replayed", lambda prior, *_: prior)
     return chunks
 
 
@@ -142,7 +143,7 @@ def test_more_trials_go_on_another_search_is_not_mixed_in_and_one_that_was_told_
     assert all(1 <= row[GATE] <= 20 for row in rows) and measured[0][1][0][GATE] == measured[-1][1][0][GATE] == 40
     assert "| default |" in (tmp_path / "tune.md").read_text()
     assert experiments.tune.tune([*with_few, "trials=6"], tmp_path)[:4] == rows
-    with pytest.raises(ValueError, match=rf"holds a search with search.space.{GATE}.high 20.0, and this one has 10.0"):
+    with pytest.raises(ValueError, match=rf"holds another search \(space.{GATE}.high was 20.0, now it is 10.0"):
         experiments.tune.tune([*with_few, f"space={{{GATE}:{{low:1,high:10,log:true}}}}"], tmp_path)
 
 
@@ -151,13 +152,13 @@ def test_a_metric_that_is_none_is_named_and_a_trial_without_a_value_fails_and_th
 ):
     with pytest.raises(ValueError, match=f"trajectory/ate_sim_m of own is no metric; near names: {ATE}"):
         experiments.tune.tune([*WORDS, "objectives=[minimize trajectory/ate_sim_m]"], tmp_path / "other")
-    measure = experiments.tune.map_and_score
+    measure = experiments.together.map_and_score
 
     def lost(work, chunk, bar):
         found = measure(work, chunk, bar)
         return [m | {ATE: None} if v.setting[GAP] == 4.0 else m for m, v in zip(found, chunk, strict=True)]
 
-    monkeypatch.setattr(experiments.tune, "map_and_score", lost)
+    monkeypatch.setattr(experiments.together, "map_and_score", lost)
     rows = experiments.tune.tune([*WORDS, "trials=12"], tmp_path)
     missing = [row for row in rows if row[GAP] == 4.0]
     assert len(rows) == 12 and missing and all(row[ATE] is None for row in missing)

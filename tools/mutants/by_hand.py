@@ -9,8 +9,8 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
     ),
     (
         "registration/problem",
-        "scale_unit / uncertainty.common",
-        "uncertainty.common / scale_unit",
+        "start.noise / uncertainty.common",
+        "uncertainty.common / start.noise",
         "worse is worth more",
     ),
     ("registration/problem", "rays @ T.rotation().as_matrix().T", "rays", "rays stay in the camera's frame"),

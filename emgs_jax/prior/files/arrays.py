@@ -128,7 +128,6 @@ def as_view(
     """A view, checked.
 
     Args:
-        source: file, for messages.
         geometry: depths (h, w) or (h, w, 1), or points (h, w, 3).
         confidence: (h, w) or (h, w, 1), at least 1 where there is a depth.
         intrinsics: of this grid.

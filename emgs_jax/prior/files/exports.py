@@ -28,12 +28,10 @@ class Export:
     """An .npz that holds all images of one inference.
 
     Args:
-        layout: name, for people.
         depth, poses, intrinsics: names of the arrays (n, h, w) or (n, h, w, 1), (n, 3 or 4, 4) and (n, 3, 3).
         confidence, mask: likewise (n, h, w); they may be missing.
         needs: further arrays that tell it from others.
         is_inverted: poses are world -> camera.
-        is_metric: lengths are metres.
         place: what of the image the network sees.
     """
 

@@ -23,7 +23,6 @@ class View:
     """Prediction of one frame as its file holds it, on a grid (gh, gw) of its own.
 
     Args:
-        source: the file, for messages.
         geometry: depths (camera-space z) (gh, gw), or points (gh, gw, 3) of the camera; 0 or not finite = no value.
         confidence: (gh, gw), at least 1; None = all alike.
         intrinsics: fx, fy, cx, cy of the grid; None = those of the frames.
@@ -68,13 +67,9 @@ class Predictions:
     """Predictions that a folder holds.
 
     Args:
-        layout: its name, for people.
         names: of each view: the stem of its image's name, or its own.
         poses: T_world_camera (n, 4, 4), NaN where it is not known.
         pose_source: file and key of the poses, for messages.
-        read: the view of a row.
-        files: all that is read.
-        is_metric: lengths are metres.
         may_lack: a frame without a view is one that the program could not solve.
         place: what the grids show of the image.
     """

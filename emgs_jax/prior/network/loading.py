@@ -101,7 +101,6 @@ def whole_weights(torch: ModuleType, source: str, remedy: str, is_exact: bool = 
     """Refuse weights that leave a parameter as it was drawn, however little strict the framework is.
 
     Args:
-        torch: the package.
         source: of the weights, for the message.
         remedy: what to do about it.
         is_exact: names that the network does not have are refused as well; MASt3R's file has more than what the

@@ -54,8 +54,6 @@ class MapAnything(Prior):
         anchor_is_metric: call that pose metric; the paper does not say.
         anchor_depth_m: median depth of the anchor, for networks of arbitrary scale.
         max_depth_step: relative depth difference across which nothing is interpolated.
-        compute: how the network runs.
-        masks: which pixels can be used.
         load: makes the network; tests put another one here.
     """
 

@@ -117,7 +117,6 @@ def usable(
         points: camera frame, metres.
         confidence: higher is better.
         is_clear: what the network does not call ambiguous.
-        config: what makes a pixel unusable.
     """
     valid = jnp.all(jnp.isfinite(points), axis=-1) & (points[..., 2] > 0) & jnp.isfinite(confidence)
     confidence = jnp.where(jnp.isfinite(confidence), confidence, 0.0)
@@ -142,7 +141,6 @@ def consistent_share(
         depths: camera-space z in metres of all views; 0 where there is none.
         intrinsics: of all views, pixel centres at integers.
         T_anchor_view: camera -> any common frame.
-        config: how far depths may differ.
 
     Returns:
         The share, 0 where no view sees the point; and how many views see it and have a depth there.

@@ -61,7 +61,6 @@ class Resize:
     """Mapping of frames of one size onto a network's grid: scaling, then a crop.
 
     Args:
-        frame: size of the frames.
         grid: size of what the network sees.
         scaled: size of the frame before the crop.
         corner: (left, top) pixel of the crop in the scaled frame.

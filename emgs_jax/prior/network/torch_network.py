@@ -29,8 +29,6 @@ class TorchNetwork:
 
     Args:
         call: from the views as tensors to the framework's outputs as tensors.
-        device: where the model is.
-        described: as in `Network`.
     """
 
     def __init__(self, call: Call, device: str, described: dict[str, Any]) -> None:

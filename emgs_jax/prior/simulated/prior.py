@@ -175,8 +175,7 @@ class Simulated(Prior):
         """Return the disturbed camera -> anchor poses (v, 4, 4), before the scale.
 
         Args:
-            window: the question.
-            truth: T_world_camera of its views.
+            truth: T_world_camera of the window's views.
             drift: (6,), of unit variance: the window's pose error.
             is_held: by the anchor.
             draw: number of its noise.

@@ -16,8 +16,6 @@ def check_frames(window: Window, frames: Sequence[Frame], needed: Collection[int
     """Return the frames by index; raise ValueError naming the first one whose truth cannot be used.
 
     Args:
-        window: the question.
-        frames: of its views.
         needed: indices of the frames whose depth is looked at.
     """
     indices = tuple(frame.index for frame in frames)
