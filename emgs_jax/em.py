@@ -203,6 +203,7 @@ def precision(noise: Float[Array, "m 3"], config: EmConfig) -> Float[Array, "m"]
     return config.min_std**2 / (config.min_std**2 + config.noise**2 * jnp.sum(noise**2, axis=-1))
 
 
+@full_precision
 def m_step(
     gaussians: Gaussians, points: Observation, weights: Float[Array, "m"], step: EStep, config: EmConfig
 ) -> tuple[Gaussians, Float[Array, "n"]]:

@@ -165,7 +165,7 @@ def test_the_makers_of_fields_keep_their_ranges():
     ("change", "message"),
     [
         (lambda node: OmegaConf.update(node, "gone", 1, force_add=True), "unexpected keyword argument 'gone'"),
-        (lambda node: dict.pop(node._content, "min_alpha"), "missing 1 required positional argument: 'min_alpha'"),
+        (lambda node: dict.pop(node._content, "min_alpha"), "missing .* required .*argument: 'min_alpha'"),
     ],
 )
 def test_keys_of_another_version_are_said_to_be_that(change, message):

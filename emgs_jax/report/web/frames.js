@@ -64,7 +64,8 @@ function clicked(report, x, y) {
   const place = found.point.map((value) => value.toFixed(3)).join(", ");
   const label = arrays.label && arrays.label[row] >= 0 ? ABOUT.classes[arrays.label[row]] + " · " : "";
   const numbers = `certain by ${(arrays.existence[row] / 255).toFixed(2)} · ${arrays.updates[row]} updates`;
-  $("picked").textContent = `${isSplat ? `splat ${found.row} of ` : ""}Gaussian ${row}: ${label}at ${place} · ${numbers} · born at step ${arrays.birth[row]}`;
+  const what = `${isSplat ? `splat ${found.row} of ` : ""}Gaussian ${row}`;
+  $("picked").textContent = `${what}: ${label}at ${place} · ${numbers} · born at step ${arrays.birth[row]}`;
 }
 
 // The nearest Gaussian whose ellipse holds the ray and whose plane it meets; x and y from the corner of the view.

@@ -41,8 +41,8 @@ class Layers {
     return Float32Array.from({ length: count }, (_, row) => SCALES[scale].of(at(row)));
   }
 
-  // RGBA of a set's rows, Gaussians or splats. word: number of a class, -1 = all. threshold: of a similarity, as a share
-  // of its range.
+  // RGBA of a set's rows, Gaussians or splats. word: number of a class, -1 = all. threshold: of a similarity, as a
+  // share of its range.
   paint(set, name, word, threshold, minExistence) {
     const { arrays } = this, count = set.mean.length / 3, width = set.color.length / count;
     const out = new Uint8Array(4 * count);
