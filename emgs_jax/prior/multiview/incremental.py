@@ -5,7 +5,7 @@ structure still has every view that tells something, it also measures the lens.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -65,6 +65,22 @@ class StructureConfig:
     min_lens_parallax_rad: float = number(low=0, high=3)
     median_depth: float = number(low=1e-6)
     max_lost: float = number(low=3, high=math.inf)  # fewer are no structure
+
+
+def at_size(config: StructureConfig, width: int, height: int) -> StructureConfig:
+    """Settings with errors in pixels of images of this size: in larger ones than `full_size` they grow in proportion.
+
+    Before the lens is measured its distortion is most of an error (k = .03: 7 pixels in a corner of 640x480), and so
+    may blur be: both grow with the image.
+    """
+    matching, times = config.matching, max(max(width, height) / config.matching.full_size, 1.0)
+    grown = replace(
+        matching,
+        max_epipolar_error=matching.max_epipolar_error * times,
+        max_reprojection_error=matching.max_reprojection_error * times,
+        min_parallax=matching.min_parallax * times,
+    )
+    return replace(config, matching=grown, bundle=replace(config.bundle, pixel_std=config.bundle.pixel_std * times))
 
 
 def extend(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> None:

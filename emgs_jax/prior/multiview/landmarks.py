@@ -17,12 +17,14 @@ NONE = -1  # a keypoint without a landmark
 
 @dataclass(frozen=True)
 class MatchingConfig:
-    """Detection, matching and acceptance; errors in pixels.
+    """Detection, matching and acceptance; errors in pixels of an image up to `full_size`.
 
     Args:
         num_features: at most, in one image.
         min_contrast: of a keypoint (SIFT).
         magnification: of the image before its keypoints are looked for.
+        full_size: pixels of an image's longer side; in larger images errors, here and of the bundle adjustment, and
+            parallax count in proportion.
         max_ratio: distance to the best descriptor over that to the second (Lowe, IJCV 2004).
         max_epipolar_error: of a match that fits the essential matrix.
         max_reprojection_error: of an observation that fits its landmark.
@@ -36,6 +38,7 @@ class MatchingConfig:
     num_features: int = number(low=1)
     min_contrast: float = number(low=0, high=1)
     magnification: int = number(low=1, high=8)
+    full_size: int = number(low=1)
     max_ratio: float = number(low=0, high=1)
     max_epipolar_error: float = number(low=0, high=1000)
     max_reprojection_error: float = number(low=0, high=1000)

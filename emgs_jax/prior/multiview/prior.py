@@ -34,7 +34,7 @@ from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.multiview.confidence import probability
 from emgs_jax.prior.multiview.dense import DenseConfig, Matched, Stereo
 from emgs_jax.prior.multiview.depth import agreement
-from emgs_jax.prior.multiview.incremental import StructureConfig, extend
+from emgs_jax.prior.multiview.incremental import StructureConfig, at_size, extend
 from emgs_jax.prior.multiview.initialization import begin_again, initialize
 from emgs_jax.prior.multiview.keys import kept, key_views
 from emgs_jax.prior.multiview.landmarks import Structure, confirmed, detect, forget, link
@@ -78,7 +78,7 @@ class MultiviewStereo(Prior):
     is_sequential = True  # a window needs those before it
 
     def __init__(self, structure: StructureConfig, dense: SweptConfig | LearnedConfig) -> None:
-        self._structure_config, self._dense_config, self._stereo = structure, dense, stereo_of(dense)
+        self._given, self._dense_config, self._stereo = structure, dense, stereo_of(dense)
         settings = {"structure": _values(structure), "dense": _values(dense)}
         settings["dense"].pop("checkpoint", None)  # its digest says which it is, wherever it lies
         self.provenance = Provenance("multiview_stereo", {"version": 8} | settings)
@@ -122,6 +122,7 @@ class MultiviewStereo(Prior):
         height, width = frames[0].image.shape[:2]
         focal, center = np.float32(intrinsics[:2]), np.float32(intrinsics[2:])
         self._camera = Camera(focal, center, width, height)
+        self._structure_config = at_size(self._given, width, height)
         self._structure = Structure(calibration(intrinsics))
         self._has_begun = False
         self._oldest = 0  # view of this structure

@@ -5,6 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from stereo_scene import (
+    CENTER,
+    FOCAL,
+    SIZE,
     arc,
     cloud,
     matrix,
@@ -16,7 +19,8 @@ from stereo_scene import (
     views_of,
 )
 
-from emgs_jax.prior.multiview.incremental import _drop, _tracks, extend
+from emgs_jax.ops.camera import Camera
+from emgs_jax.prior.multiview.incremental import _drop, _tracks, at_size, extend
 from emgs_jax.prior.multiview.initialization import initialize
 from emgs_jax.prior.multiview.landmarks import NONE, forget, link, straighten
 from emgs_jax.prior.multiview.lens import distort
@@ -59,6 +63,38 @@ def test_the_first_window_has_the_true_poses_up_to_a_similarity(started):
     np.testing.assert_allclose(first.T_ref_view, np.eye(4), atol=1e-9)
     depth = structure.points[first.landmark[structure.known(first)], 2]
     assert np.median(depth) == pytest.approx(CONFIG.median_depth)
+
+
+def begun_in_images(times):
+    """Poses of the first window in images `times` as large, in which every error is, too."""
+    size = [times * side for side in SIZE]
+    config = at_size(CONFIG, *size)
+    views = views_of(cloud(NUM_POINTS), arc(NUM_VIEWS), noise=0.08)
+    structure = structure_of(views[:1])
+    structure.K = np.diag([times, times, 1]) @ structure.K
+    for frame, view in enumerate(views):
+        view.pixels = times * view.pixels
+        structure.views[frame] = view
+        link(structure, frame, config.matching)
+    camera = Camera(times * np.float32(FOCAL), times * np.float32(CENTER), *SIZE)  # one compilation: size is static
+    assert initialize(structure, camera, MOST_VIEWS, config)
+    return np.stack([structure.views[frame].T_ref_view for frame in range(NUM_VIEWS)])
+
+
+def test_larger_images_of_the_same_give_the_same_structure():
+    """Symptom: 7-Scenes at 640x480: lens and blur went beyond the limits, and the first pair was off by 17 degrees."""
+    expected = begun_in_images(5)  # 320x240
+    np.testing.assert_allclose(begun_in_images(20), expected, atol=1e-3)  # float32 in the solver
+
+
+def test_limits_are_those_of_the_config_up_to_its_size_and_grow_with_the_longer_side():
+    size = CONFIG.matching.full_size
+    for width, height, times in ((size, size // 2, 1), (size // 2, size // 4, 1), (size, 2 * size, 2)):
+        found = at_size(CONFIG, width, height)
+        assert found.matching.max_epipolar_error == times * CONFIG.matching.max_epipolar_error
+        assert found.matching.max_reprojection_error == times * CONFIG.matching.max_reprojection_error
+        assert found.matching.min_parallax == times * CONFIG.matching.min_parallax
+        assert found.bundle.pixel_std == times * CONFIG.bundle.pixel_std
 
 
 def distorted(distortion, step):
