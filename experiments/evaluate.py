@@ -25,7 +25,7 @@ from emgs_jax.config.values import check_values
 from emgs_jax.io.files import check_writable, write_file, write_json
 from emgs_jax.report.evaluation_page import Found, JobLine, write_evaluation_page
 from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
-from emgs_jax.report.provenance import is_of_this_code
+from emgs_jax.report.provenance import code_now, code_of
 from emgs_jax.report.results import METRICS_FILE, is_finished, read_estimates, read_metrics, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
 
@@ -116,7 +116,8 @@ def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
     read_estimates(out)  # results that cannot be read end the evaluation before it begins
     ours = jobs[(part - 1) * len(jobs) // whole : part * len(jobs) // whole]  # neighbours share their executables
     open_jobs = [job for job in ours if not _is_finished(job)]
-    if older := [job.name for job in jobs if _is_of_other_code(job)]:
+    finished, now = [job for job in jobs if (job.folder / METRICS_FILE).is_file()], code_now()
+    if older := [job.name for job in finished if code_of(read_metrics(job.folder / METRICS_FILE)["provenance"]) != now]:
         said = f"results of other code are there, {len(older)} of {len(jobs)} ({older[0]}{', …' * (len(older) > 1)})"
         if baseline:
             raise ValueError(f"{said}, and a gate is about what runs now: choose another out=FOLDER, or move them away")
@@ -157,11 +158,6 @@ def _run_all(jobs: Sequence[Job], failures: dict[str, str]) -> None:
 
 def _is_finished(job: Job) -> bool:
     return is_finished(job.folder, OmegaConf.to_container(job.config, resolve=True))
-
-
-def _is_of_other_code(job: Job) -> bool:
-    path = job.folder / METRICS_FILE
-    return path.is_file() and not is_of_this_code(read_metrics(path)["provenance"])
 
 
 def _shard(text: str) -> tuple[int, int]:

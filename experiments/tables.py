@@ -16,11 +16,10 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-import emgs_jax
 from emgs_jax.config.overrides import quoted
 from emgs_jax.io.files import check_writable, write_file
 from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, Line, markdown, metric_table
-from emgs_jax.report.provenance import git_revision
+from emgs_jax.report.provenance import git_now
 from emgs_jax.report.results import METRICS_FILE, Estimate, estimates_of, read_metrics
 from emgs_jax.report.tables import average
 
@@ -175,7 +174,7 @@ def tables(config: Mapping[str, Any]) -> None:
     everything = [path for found in paths.values() for path in found]
     finished = [path for path in everything if path.is_file()]
     if len(finished) < len(everything):  # in half an hour it would be too late to learn that the code has changes
-        revision_of([git_revision(Path(emgs_jax.__file__).resolve().parents[1]), *_code_of(finished)])
+        revision_of([git_now(), *_code_of(finished)])
     again = shlex.join(["emgs", "tables", f"root={config['root']}"])
     problems = [line for table in planned.values() for settings in table for line in evaluate(settings, again)]
     if problems:

@@ -73,9 +73,14 @@ def git_now() -> dict[str, Any] | None:
     return git_revision(Path(__file__).resolve().parents[2])
 
 
-def is_of_this_code(block: Mapping[str, Any]) -> bool:
-    """Test whether a provenance names the commit and the version that run now; changes since a commit are not seen."""
-    return (block["git"], block.get("versions", {}).get("emgs_jax")) == (git_now(), _version(_PACKAGES["emgs_jax"]))
+def code_of(block: Mapping[str, Any]) -> tuple[dict[str, Any] | None, str | None]:
+    """The commit and the version that a provenance names; changes since a commit are not seen."""
+    return block["git"], block.get("versions", {}).get("emgs_jax")
+
+
+def code_now() -> tuple[dict[str, Any] | None, str | None]:
+    """`code_of` a provenance of this code."""
+    return git_now(), _version(_PACKAGES["emgs_jax"])
 
 
 def git_revision(folder: Path) -> dict[str, Any] | None:

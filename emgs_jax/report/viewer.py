@@ -81,9 +81,8 @@ class Viewer:
         self._run, self.layers = run, run.layers
         if not run.frames:
             return
-        colors, of_splats, message = self._colors()
+        colors, _, message = self._colors()
         self.scene.draw(run, colors)
-        self.scene.recolor(colors, of_splats)
         self._show()
         self.answer.content = _shown(message)
         self.frame.max = max(len(run.frames) - 1, 1)

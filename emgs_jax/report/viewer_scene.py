@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import RenderConfig
-from emgs_jax.report.colors import OURS, PATHS, STATUS_COLORS, rgb
+from emgs_jax.report.colors import OURS, PATHS, STATUS_COLORS, rgb, to_bytes
 from emgs_jax.report.layers import covariances, feature_layer, map_layers
 from emgs_jax.report.overview import view_from_above
 from emgs_jax.report.recorded_run import SPLATS_FILE, RecordedRun, placed_paths, render_config
@@ -121,8 +121,8 @@ class Scene:
             self.splats.set_gaussians(means, self.covs, colors, opacities)
         if run.splats is not None and self.sharp is None:
             places = (values.astype(np.float32) for values in (run.splats.means, run.splats.covs))
-            shades = run.splats.colors[:, :3], run.splats.colors[:, 3:]
-            self.sharp = self._scene.add_gaussian_splats("/splats", *places, *(x.astype(np.float32) for x in shades))
+            look = to_bytes(run.splats.colors[:, :3]), run.splats.colors[:, 3:].astype(np.float32)
+            self.sharp = self._scene.add_gaussian_splats("/splats", *places, *look)
         self.points = self._scene.add_point_cloud("/points", means, colors, point_size=0.01, precision="float32")
 
     def _draw_cameras(self, run: Shown) -> None:

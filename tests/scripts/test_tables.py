@@ -137,11 +137,11 @@ def test_what_is_finished_is_not_run_again_and_the_page_is_written_when_all_is_t
         write_json(path, metrics)
 
     monkeypatch.setattr(experiments.evaluate, "run", run)
-    monkeypatch.setattr(experiments.tables, "git_revision", lambda folder: ONE_COMMIT | {"dirty": True})
+    monkeypatch.setattr(experiments.tables, "git_now", lambda: ONE_COMMIT | {"dirty": True})
     with pytest.raises(ValueError, match="of one commit without changes"):
         tables(settings)
     assert not runs
-    monkeypatch.setattr(experiments.tables, "git_revision", lambda folder: ONE_COMMIT)
+    monkeypatch.setattr(experiments.tables, "git_now", lambda: ONE_COMMIT)
     with pytest.raises(ValueError, match="the disk is full"):
         tables(settings)
     assert page.read_text() == PAGE
@@ -151,7 +151,7 @@ def test_what_is_finished_is_not_run_again_and_the_page_is_written_when_all_is_t
     assert "Runs of 2" in full and "(default):" in full and "(level 2):" in full and "old" not in full
     assert "| room | ours |" in text and "level 2" not in text and "Runs of" not in text and "old" not in text
     # What is there can be written again by other code, which did not make it.
-    monkeypatch.setattr(experiments.tables, "git_revision", lambda folder: None)
+    monkeypatch.setattr(experiments.tables, "git_now", lambda: None)
     tables(settings)
     assert len(runs) == 5 and (page.read_text(), Path(settings["full_page"]).read_text()) == (text, full)
 
