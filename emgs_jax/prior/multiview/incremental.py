@@ -91,7 +91,7 @@ def extend(structure: Structure, camera: Camera, num_views: int, config: Structu
     for find in (place, refind):
         for view in structure.views.values():
             if view.T_ref_view is None and find(structure, view, config.matching):
-                triangulate(structure, config.matching)
+                triangulate(structure, structure.unknown(), config.matching)
     frames = sorted(structure.placed())
     measure_lens(structure, camera, num_views, config)
     # A short window refines its two newest views too; it takes two others to hold the scale.
@@ -119,7 +119,10 @@ def measure_lens(structure: Structure, camera: Camera, num_views: int, config: S
 
 
 def refine(structure: Structure, camera: Camera, num_views: int, fixed: list[int], config: StructureConfig) -> None:
-    """Bundle adjustment of all placed views; drops what does not fit and triangulates what now does."""
+    """Bundle adjustment of all placed views; drops what does not fit, and triangulates all other tracks anew.
+
+    Those were triangulated by poses as they were then, and by the first views that showed them, the nearest.
+    """
     for _ in range(config.num_rounds):
         frames = sorted(structure.placed())
         ids, poses, points, _, error = _solve(structure, camera, num_views, fixed, config)
@@ -128,7 +131,9 @@ def refine(structure: Structure, camera: Camera, num_views: int, fixed: list[int
             if frame not in fixed:
                 structure.views[frame].T_ref_view = poses[row]
         _drop(structure, frames, fixed, ids, error, config)
-        triangulate(structure, config.matching)
+        others = np.ones(len(structure.points), bool)
+        others[ids] = structure.unknown()[ids]
+        triangulate(structure, others, config.matching)
 
 
 def _largest_parallax(structure: Structure, config: StructureConfig) -> float:

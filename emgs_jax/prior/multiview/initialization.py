@@ -20,7 +20,7 @@ def initialize(structure: Structure, camera: Camera, num_views: int, config: Str
     for a, b, T_a_b in pairs[:3]:
         _reset(structure)
         structure.views[a].T_ref_view, structure.views[b].T_ref_view = np.eye(4), T_a_b
-        triangulate(structure, config.matching)
+        triangulate(structure, structure.unknown(), config.matching)
         _grow(structure, camera, num_views, a, config)
         placed = structure.placed()
         reference = placed[min(placed)]
@@ -85,7 +85,7 @@ def _grow(structure: Structure, camera: Camera, num_views: int, origin: int, con
         waiting.sort(key=lambda view: -structure.known(view).sum())
         if not any(place(structure, view, config.matching) for view in waiting):
             return
-        triangulate(structure, config.matching)
+        triangulate(structure, structure.unknown(), config.matching)
 
 
 def _reset(structure: Structure) -> None:

@@ -93,6 +93,10 @@ class Structure:
         """The views that have a pose, by frame."""
         return {frame: view for frame, view in self.views.items() if view.T_ref_view is not None}
 
+    def unknown(self) -> np.ndarray:
+        """Mark the landmarks (l,) without a position."""
+        return np.isnan(self.points[:, 0])
+
     def known(self, view: View) -> np.ndarray:
         """Mark the keypoints (n,) of a view that have a landmark with a position."""
         has = view.landmark >= 0
@@ -257,15 +261,22 @@ def refind(structure: Structure, view: View, config: MatchingConfig) -> bool:
     return True
 
 
-def triangulate(structure: Structure, config: MatchingConfig) -> None:
-    """Give every track without a position the point nearest to its rays, where they have parallax and agree."""
+def triangulate(structure: Structure, wanted: np.ndarray, config: MatchingConfig) -> None:
+    """Give tracks the point nearest to their rays where these have parallax; else the point that they had stays.
+
+    Of a track whose point does not fit every placed view that shows it, the position is no longer known.
+
+    Args:
+        structure: with placed views.
+        wanted: mark the tracks (l,) that are triangulated; the others stay.
+        config: how much parallax, which error.
+    """
     placed = list(structure.placed().values())
     landmark = np.concatenate([view.landmark for view in placed])
     views = np.repeat(np.arange(len(placed)), [len(view.landmark) for view in placed])
     pixels = np.concatenate([view.pixels for view in placed])
-    wanted = landmark >= 0
-    wanted[wanted] = np.isnan(structure.points[landmark[wanted], 0])
-    landmark, views, pixels = landmark[wanted], views[wanted], pixels[wanted]
+    shown = np.append(wanted, False)[landmark]  # NONE, the last, is never wanted
+    landmark, views, pixels = landmark[shown], views[shown], pixels[shown]
     if not len(landmark):
         return
     ids, track = np.unique(landmark, return_inverse=True)
@@ -276,12 +287,12 @@ def triangulate(structure: Structure, config: MatchingConfig) -> None:
     np.add.at(hessian, track, across)
     np.add.at(right, track, np.einsum("nij,nj->ni", across, poses[views, :3, 3]))
     parallax_sq = np.linalg.eigvalsh(hessian)[:, 0] / count
-    good = (count >= 2) & (parallax_sq > (config.min_parallax / structure.K[0, 0]) ** 2)
-    points = np.full((len(ids), 3), np.nan)
-    points[good] = np.linalg.solve(hessian[good], right[good][..., None])[..., 0]
+    apart = (count >= 2) & (parallax_sq > (config.min_parallax / structure.K[0, 0]) ** 2)
+    points = structure.points[ids]
+    points[apart] = np.linalg.solve(hessian[apart], right[apart][..., None])[..., 0]
     local = np.einsum("nji,nj->ni", poses[views, :3, :3], points[track] - poses[views, :3, 3])
     with np.errstate(invalid="ignore", divide="ignore"):
         error = np.linalg.norm((local @ structure.K.T)[:, :2] / local[:, 2:] - pixels, axis=1)
         fits = (local[:, 2] > 0) & (error < config.max_reprojection_error)
-    good &= np.bincount(track, ~fits) == 0
-    structure.points[ids[good]] = points[good]
+    points[np.bincount(track, ~fits) > 0] = np.nan
+    structure.points[ids] = points

@@ -81,7 +81,7 @@ class MultiviewStereo(Prior):
         self._given, self._dense_config, self._stereo = structure, dense, stereo_of(dense)
         settings = {"structure": _values(structure), "dense": _values(dense)}
         settings["dense"].pop("checkpoint", None)  # its digest says which it is, wherever it lies
-        self.provenance = Provenance("multiview_stereo", {"version": 8} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 9} | settings)
         self._next = 0
         self._structure = Structure(np.eye(3))
 

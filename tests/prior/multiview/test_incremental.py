@@ -1,5 +1,6 @@
 """Poses of a window from noisy points: right up to a similarity, of a given scale, refused where not known."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -217,6 +218,21 @@ def seen_by(*counts):
     structure = structure_of(views)
     structure.points = np.arange(len(counts))[:, None] + np.zeros(3)
     return structure
+
+
+def test_landmarks_beyond_those_of_the_adjustment_follow_the_poses(started):
+    """They were triangulated by poses as they were then, and by the two views nearest to each other."""
+    structure = copy.deepcopy(started[0])
+    config, reference = (
+        structure_config("prior.structure.num_fixed=3", "prior.structure.max_landmarks=40"),
+        structure.views[0],
+    )
+    before = structure.points.copy()
+    structure.points *= 1.1  # about the first view, which shows no error then
+    extend(structure, small_camera(), MOST_VIEWS, config)
+    shown = reference.landmark[structure.known(reference)]
+    assert len(shown) > 60
+    np.testing.assert_allclose(structure.points[shown, 2] / before[shown, 2], 1.0, atol=0.04)
 
 
 def test_the_landmarks_that_most_views_see_take_part_in_the_refinement():

@@ -65,7 +65,7 @@ def test_a_camera_that_turns_back_shows_the_landmarks_of_a_key_again():
             forget(structure, [one for one in structure.views if one not in stays], config)
             structure.views[frame] = seen_from(T, points, descriptors)
             link(structure, frame, config)
-            triangulate(structure, config)
+            triangulate(structure, structure.unknown(), config)
         last = structure.views[frame]
         first = structure.views.get(0, View(*3 * (np.zeros(0),)))
         known[max_keys] = np.isin(last.landmark[structure.known(last)], first.landmark).sum()

@@ -240,8 +240,8 @@ def test_exact_rays_meet_in_the_point_and_one_ray_or_none_gives_none():
     seen_by = np.ones((3, 12), bool)
     seen_by[1:, 0] = False
     structure = placed_structure(poses, points, seen_by)
-    structure.points[1] = 7.0  # it has a position, which is not for triangulation to change
-    triangulate(structure, CONFIG)
+    structure.points[1] = 7.0  # it has a position, and is not asked for
+    triangulate(structure, structure.unknown(), CONFIG)
     assert np.isnan(structure.points[0]).all()
     np.testing.assert_array_equal(structure.points[1], 7.0)
     np.testing.assert_allclose(structure.points[2:], points[2:], atol=1e-9)
@@ -256,7 +256,7 @@ def test_two_skew_rays_give_the_middle_of_their_common_perpendicular():
         ray = view.T_ref_view[:3, :3] @ np.linalg.inv(calibration()) @ [*view.pixels[0], 1]
         rays.append(ray / np.linalg.norm(ray))
     s, t = np.linalg.lstsq(np.stack([rays[0], -rays[1]], axis=1), origins[1] - origins[0], rcond=None)[0]
-    triangulate(structure, CONFIG)
+    triangulate(structure, structure.unknown(), CONFIG)
     np.testing.assert_allclose(structure.points[0], 0.5 * (origins[0] + s * rays[0] + origins[1] + t * rays[1]))
 
 
@@ -264,12 +264,35 @@ def test_rays_without_parallax_or_that_do_not_meet_give_no_point():
     points = cloud(6)
     still = np.stack([arc(1)[0]] * 3)
     structure = placed_structure(still, points, np.ones((3, 6), bool))
-    triangulate(structure, CONFIG)
+    triangulate(structure, structure.unknown(), CONFIG)
     assert np.isnan(structure.points).all()
     structure = placed_structure(arc(3), points, np.ones((3, 6), bool))
     structure.views[2].pixels += (0.0, 4 * CONFIG.max_reprojection_error)
-    triangulate(structure, CONFIG)
+    triangulate(structure, structure.unknown(), CONFIG)
     assert np.isnan(structure.points).all()
+
+
+def test_a_track_is_triangulated_anew_by_what_shows_it_today_and_keeps_its_point_where_that_tells_no_depth():
+    points = cloud(5)
+    structure = placed_structure(
+        arc(3, step=0.2), points, np.array([[1, 1, 1, 1, 1], [1, 0, 1, 1, 0], [1, 0, 1, 1, 1]]) > 0
+    )
+    known = points.copy()
+    known[0] *= 1.02  # of poses as they were then
+    known[1] *= 1.02  # one view alone shows it, and it lies on its ray
+    known[4] = points[4] + 1.0  # likewise, where its views do not show it
+    structure.points = known.copy()
+    structure.views[2].pixels[3] += 4 * CONFIG.max_reprojection_error  # a wrong match
+    triangulate(structure, np.arange(5) != 2, CONFIG)
+    np.testing.assert_allclose(structure.points[[0, 4]], points[[0, 4]], atol=1e-9)
+    np.testing.assert_array_equal(structure.points[[1, 2]], known[[1, 2]])
+    assert np.isnan(structure.points[3]).all()
+    near = placed_structure(np.stack([arc(1)[0]] * 3), points, np.ones((3, 5), bool))
+    near.points = 1.02 * points
+    near.points[0] += (0.0, 1.0, 0.0)
+    triangulate(near, np.ones(5, bool), CONFIG)
+    np.testing.assert_array_equal(near.points[1:], 1.02 * points[1:])
+    assert np.isnan(near.points[0]).all()
 
 
 def test_a_wrong_match_of_a_camera_that_turns_on_the_spot_is_confirmed_by_no_view_from_elsewhere():

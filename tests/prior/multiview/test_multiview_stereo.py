@@ -334,5 +334,5 @@ def test_the_provenance_holds_every_value_of_the_config_as_json_writes_it():
     def without_targets(node):
         return {k: without_targets(v) for k, v in node.items() if k != "_target_"} if hasattr(node, "items") else node
 
-    assert settings == {"version": 8} | jsonable(without_targets(config.prior))
+    assert settings == {"version": 9} | jsonable(without_targets(config.prior))
     assert settings != make_prior("prior.dense.depth.max_cost=0.11").provenance.settings
