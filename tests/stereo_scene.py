@@ -137,3 +137,15 @@ def similarity_error(estimate: np.ndarray, truth: np.ndarray) -> float:
     sign = np.array([1, 1, np.linalg.det(U @ Vt)])
     scale = (S * sign).sum() / (a**2).sum()
     return float(np.sqrt(((scale * a @ (U * sign @ Vt).T - b) ** 2).sum(1).mean()))
+
+
+def placed_structure(poses, points, seen_by):
+    """All points are landmark = row; views hold their true poses."""
+    views = [
+        View(projected(T, points), np.zeros((len(points), 128), np.float32), np.arange(len(points)), T) for T in poses
+    ]
+    for frame, view in enumerate(views):
+        view.landmark[~seen_by[frame]] = NONE
+    structure = structure_of(views)
+    structure.points = np.full((len(points), 3), np.nan)
+    return structure

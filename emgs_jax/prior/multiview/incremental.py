@@ -5,6 +5,7 @@ structure still has every view that tells something, it also measures the lens.
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -22,12 +23,11 @@ from emgs_jax.prior.multiview.landmarks import (
     MatchingConfig,
     Structure,
     known_common,
-    place,
-    refind,
     straighten,
     triangulate,
 )
 from emgs_jax.prior.multiview.lens import distort
+from emgs_jax.prior.multiview.placement import place, refind, turn
 from emgs_jax.prior.multiview.sources import parallax
 
 jitted_adjust = eqx.filter_jit(adjust)
@@ -86,9 +86,9 @@ def at_size(config: StructureConfig, width: int, height: int) -> StructureConfig
 def extend(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> None:
     """Place the views that are not placed yet, as far as they can be, and refine the window.
 
-    What shows none of the window's landmarks is looked for among those that were left behind.
+    What shows too few of the window's landmarks stands where another view does, or shows some that were left behind.
     """
-    for find in (place, refind):
+    for find in (place, turn, refind):
         for view in structure.views.values():
             if view.T_ref_view is None and find(structure, view, config.matching):
                 triangulate(structure, structure.unknown(), config.matching)
@@ -118,19 +118,22 @@ def measure_lens(structure: Structure, camera: Camera, num_views: int, config: S
     straighten(structure, structure.distortion + share * (distortion - structure.distortion))
 
 
-def refine(structure: Structure, camera: Camera, num_views: int, fixed: list[int], config: StructureConfig) -> None:
+def refine(
+    structure: Structure, camera: Camera, num_views: int, fixed: Collection[int], config: StructureConfig
+) -> None:
     """Bundle adjustment of all placed views; drops what does not fit, and triangulates all other tracks anew.
 
     Those were triangulated by poses as they were then, and by the first views that showed them, the nearest.
     """
     for _ in range(config.num_rounds):
-        frames = sorted(structure.placed())
-        ids, poses, points, _, error = _solve(structure, camera, num_views, fixed, config)
+        placed = structure.placed()
+        frames, held = sorted(placed), {*fixed, *(frame for frame in placed if placed[frame].is_held)}
+        ids, poses, points, _, error = _solve(structure, camera, num_views, held, config)
         structure.points[ids] = points
         for row, frame in enumerate(frames):
-            if frame not in fixed:
+            if frame not in held:
                 structure.views[frame].T_ref_view = poses[row]
-        _drop(structure, frames, fixed, ids, error, config)
+        _drop(structure, frames, held, ids, error, config)
         others = np.ones(len(structure.points), bool)
         others[ids] = structure.unknown()[ids]
         triangulate(structure, others, config.matching)
@@ -154,7 +157,7 @@ def _solve(
     structure: Structure,
     camera: Camera,
     num_views: int,
-    fixed: list[int],
+    fixed: Collection[int],
     config: StructureConfig,
     measures: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray]:
@@ -213,7 +216,7 @@ def _tracks(
 def _drop(
     structure: Structure,
     frames: list[int],
-    fixed: list[int],
+    fixed: Collection[int],
     ids: np.ndarray,
     error: np.ndarray,
     config: StructureConfig,

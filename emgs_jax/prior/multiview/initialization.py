@@ -10,8 +10,9 @@ import numpy as np
 
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.multiview.incremental import StructureConfig, measure_lens, refine
-from emgs_jax.prior.multiview.landmarks import Structure, View, place, relative_pose, triangulate
+from emgs_jax.prior.multiview.landmarks import Structure, View, triangulate
 from emgs_jax.prior.multiview.memory import Memory
+from emgs_jax.prior.multiview.placement import place, relative_pose
 
 
 def initialize(structure: Structure, camera: Camera, num_views: int, config: StructureConfig) -> bool:
@@ -71,7 +72,7 @@ def _ranked_pairs(structure: Structure, config: StructureConfig) -> list[tuple[i
     for i, a in enumerate(frames):
         for b in frames[i + 1 :]:
             result = relative_pose(structure.views[a], structure.views[b], structure.K, config.matching)
-            if result is not None and result[2] >= config.min_first_parallax_rad:
+            if result is not None and result.parallax >= config.min_first_parallax_rad:
                 T_a_b, count, parallax = result
                 found.append((count * parallax, a, b, T_a_b))
     return [item[1:] for item in sorted(found, key=lambda item: -item[0])]

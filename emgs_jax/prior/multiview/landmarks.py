@@ -1,16 +1,15 @@
-"""Points of the scene that several images show: verified matches, tracks, poses from them (OpenCV)."""
+"""Points of the scene that several images show: verified matches, tracks and where they lie."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from emgs_jax.keypoints import sift
-from emgs_jax.keypoints.poses import essential, pose_of, unit_rays
+from emgs_jax.keypoints.poses import essential, unit_rays
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.lens import Lens, distort, straight
-from emgs_jax.prior.multiview.memory import Memory, remember, without
+from emgs_jax.prior.multiview.memory import Memory, remember
 
 NONE = -1  # a keypoint without a landmark
 
@@ -31,6 +30,7 @@ class MatchingConfig:
         min_matches: that a pair of images, or an image and the landmarks, must have.
         min_parallax: pixels between the rays of a landmark, as the root of the rays' smallest variance. A landmark with
             little has an uncertain depth, but it holds a camera that turns where it stands.
+        min_turned: share of the tracks of two views that one rotation must explain where the camera turns on the spot.
         min_refound: landmarks that a view which shows none of its neighbours' must find again to be placed by them.
         max_remembered: landmarks that no view of the window shows any more; the oldest go.
     """
@@ -44,6 +44,7 @@ class MatchingConfig:
     max_reprojection_error: float = number(low=0, high=1000)
     min_matches: int = number(low=1)
     min_parallax: float = number(low=0, high=1000)
+    min_turned: float = number(low=0, high=1)
     min_refound: int = number(low=6)  # a pose needs as many
     max_remembered: int = number(low=0, high=1e8)
 
@@ -61,12 +62,14 @@ class View:
         descriptors: (n, 128) float32, unit.
         landmark: (n,) the landmark of each keypoint, or NONE.
         T_ref_view: camera -> reference (4, 4); None while it is not placed.
+        is_held: landmarks do not tie the pose to those before; the bundle adjustment leaves it as it is.
     """
 
     pixels: np.ndarray
     descriptors: np.ndarray
     landmark: np.ndarray
     T_ref_view: np.ndarray | None = None
+    is_held: bool = False
 
 
 @dataclass
@@ -207,58 +210,6 @@ def confirmed(structure: Structure, view: View, others: Sequence[View], max_erro
         error = np.linalg.norm(local[:, :2] / local[:, 2:] - pixels, axis=1)
         marked[ids[error < max_error]] = True
     return marked
-
-
-def relative_pose(a: View, b: View, K: np.ndarray, config: MatchingConfig) -> tuple[np.ndarray, int, float] | None:
-    """T_a_b with a unit baseline from the landmarks that two views share; None without enough of them.
-
-    Returns:
-        The pose, the number of matches in front of both cameras, and the sine of their median parallax.
-    """
-    rows_a, rows_b = common(a, b)
-    pixels_a, pixels_b = a.pixels[rows_a], b.pixels[rows_b]
-    if len(pixels_a) < config.min_matches:
-        return None
-    E, mask = essential(pixels_a, pixels_b, K, config.max_epipolar_error)
-    if E is None or E.shape != (3, 3):
-        return None
-    inliers = mask.ravel() > 0  # before those that are so far away that they tell nothing of the baseline are left out
-    count, R, t, _ = cv2.recoverPose(E, pixels_a, pixels_b, K, mask=mask)
-    if count < config.min_matches:
-        return None
-    rays_a, rays_b = unit_rays(pixels_a[inliers], K), unit_rays(pixels_b[inliers], K)
-    parallax = np.linalg.norm(np.cross(rays_a @ R.T, rays_b), axis=1)
-    T_b_a = np.eye(4)
-    T_b_a[:3, :3], T_b_a[:3, 3] = R, t.ravel()
-    return np.linalg.inv(T_b_a), count, float(np.median(parallax))
-
-
-def place(structure: Structure, view: View, config: MatchingConfig) -> bool:
-    """Give a view the pose that fits the landmarks which it sees; False without enough of them."""
-    known = structure.known(view)
-    points, pixels = structure.points[view.landmark[known]], view.pixels[known]
-    found = pose_of(points, pixels, structure.K, config.min_matches, config.max_reprojection_error)
-    if found is not None:
-        view.T_ref_view = found[0]
-    return found is not None
-
-
-def refind(structure: Structure, view: View, config: MatchingConfig) -> bool:
-    """Likewise with landmarks of the memory, which become landmarks of the view again."""
-    # In the memory a point may be there twice, so a match is distinct among the view's keypoints only.
-    rows, keypoints = sift.mutual(structure.memory.descriptors, view.descriptors, config.max_ratio)
-    points = structure.memory.points[rows]
-    found = pose_of(points, view.pixels[keypoints], structure.K, config.min_refound, config.max_reprojection_error)
-    if found is None:
-        return False
-    view.T_ref_view, inliers = found
-    rows, keypoints, points = rows[inliers], keypoints[inliers], points[inliers]
-    is_new = view.landmark[keypoints] == NONE
-    view.landmark[keypoints[is_new]] = len(structure.points) + np.arange(is_new.sum())
-    structure.points = np.concatenate([structure.points, np.full((is_new.sum(), 3), np.nan)])
-    structure.points[view.landmark[keypoints]] = points
-    structure.memory = without(structure.memory, rows)
-    return True
 
 
 def triangulate(structure: Structure, wanted: np.ndarray, config: MatchingConfig) -> None:

@@ -198,6 +198,16 @@ def test_the_two_newest_views_are_refined_in_a_window_shorter_than_what_is_fixed
     np.testing.assert_allclose(structure.views[3].T_ref_view, before[3], atol=3e-3)
 
 
+def test_a_view_that_is_held_stays_where_it_is(started):
+    structure = copy.deepcopy(started[0])
+    held = structure.views[NUM_VIEWS - 1]
+    held.is_held, held.T_ref_view = True, held.T_ref_view @ matrix(translation=(0.01, 0.0, 0.0))
+    before = {frame: view.T_ref_view.copy() for frame, view in structure.views.items()}
+    extend(structure, small_camera(), MOST_VIEWS, CONFIG)
+    np.testing.assert_array_equal(held.T_ref_view, before[NUM_VIEWS - 1])
+    assert np.abs(structure.views[NUM_VIEWS - 2].T_ref_view - before[NUM_VIEWS - 2]).max() > 1e-5
+
+
 def test_a_view_without_landmarks_is_left_out_and_the_others_are_not_changed_by_it():
     poses = arc(NUM_VIEWS)
     structure = linked(poses)

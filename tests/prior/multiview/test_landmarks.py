@@ -1,8 +1,18 @@
-"""Keypoints, matches, tracks and poses from points whose projections are known."""
+"""Keypoints, matches and tracks from points whose projections are known."""
 
 import numpy as np
 import pytest
-from stereo_scene import arc, calibration, cloud, matrix, projected, structure_config, structure_of, views_of, whose
+from stereo_scene import (
+    arc,
+    calibration,
+    cloud,
+    matrix,
+    placed_structure,
+    structure_config,
+    structure_of,
+    views_of,
+    whose,
+)
 
 from emgs_jax.keypoints.sift import mutual
 from emgs_jax.prior.multiview.landmarks import (
@@ -13,9 +23,6 @@ from emgs_jax.prior.multiview.landmarks import (
     forget,
     link,
     match,
-    place,
-    refind,
-    relative_pose,
     triangulate,
 )
 from emgs_jax.prior.multiview.memory import Memory, remember
@@ -168,71 +175,12 @@ def test_every_point_is_one_landmark_in_all_views_and_forgetting_views_keeps_tho
     np.testing.assert_array_equal(structure.points[view.landmark[has], 0], before[has])
 
 
-def after_a_loss(num_known=NUM_POINTS):
-    """A structure whose placed views were forgotten with `num_known` landmarks, and the true poses."""
-    poses, points = arc(4), cloud(NUM_POINTS)
-    structure = structure_of(views_of(points, poses))
-    for frame in (0, 1):
-        view = structure.views[frame]
-        order = whose(view, structure.views[0])
-        view.landmark, view.T_ref_view = np.where(order < num_known, order, NONE), poses[frame]
-    # Landmark i is keypoint i of view 0.
-    seen = projected(poses[0], points)
-    structure.points = points[np.linalg.norm(seen - structure.views[0].pixels[:, None], axis=2).argmin(axis=1)]
-    forget(structure, [0, 1], CONFIG)
-    return structure, poses
-
-
-def test_a_view_after_a_loss_is_placed_by_what_was_left_behind_and_shows_it_again():
-    """Symptom: on a walk of 187 frames the first 68 were mapped, the last 119 lost."""
-    structure, poses = after_a_loss()
-    view = structure.views[2]
-    assert not structure.placed() and len(structure.memory.points) == NUM_POINTS
-    assert not place(structure, view, CONFIG) and refind(structure, view, CONFIG)
-    np.testing.assert_allclose(view.T_ref_view, poses[2], atol=1e-4)
-    known = structure.known(view)
-    assert known.sum() + len(structure.memory.points) == NUM_POINTS and known.mean() > 0.9
-    shown = projected(poses[2], structure.points[view.landmark[known]])
-    np.testing.assert_allclose(shown, view.pixels[known], atol=1e-3)
-
-
-def test_tracks_of_other_lost_views_get_the_points_that_one_finds_again():
-    structure, poses = after_a_loss()
-    link(structure, 3, CONFIG)  # views 2 and 3 see each other, without a position
-    assert not place(structure, structure.views[3], CONFIG)
-    assert refind(structure, structure.views[2], CONFIG) and place(structure, structure.views[3], CONFIG)
-    np.testing.assert_allclose(structure.views[3].T_ref_view, poses[3], atol=1e-3)
-
-
-def test_an_unknown_place_or_too_few_landmarks_place_nothing():
-    for num_known in (CONFIG.min_refound - 1, NUM_POINTS):
-        structure, _ = after_a_loss(num_known)
-        view = structure.views[2]
-        if num_known == NUM_POINTS:  # looks alike, lies elsewhere
-            view.pixels[:] = np.random.default_rng(0).permutation(view.pixels)
-        before = view.landmark.copy()
-        assert not refind(structure, view, CONFIG) and view.T_ref_view is None
-        np.testing.assert_array_equal(view.landmark, before)
-
-
 def test_the_memory_is_bounded_and_keeps_the_newest():
     descriptors, memory = np.eye(128, dtype=np.float32), Memory()
     for step in range(3):
         memory = remember(memory, np.full((50, 3), step), descriptors[:50], 120)
     np.testing.assert_array_equal(memory.points[:, 0], np.repeat([0, 1, 2], [20, 50, 50]))
     assert len(memory.descriptors) == 120
-
-
-def placed_structure(poses, points, seen_by):
-    """All points are landmark = row; views hold their true poses."""
-    views = [
-        View(projected(T, points), np.zeros((len(points), 128), np.float32), np.arange(len(points)), T) for T in poses
-    ]
-    for frame, view in enumerate(views):
-        view.landmark[~seen_by[frame]] = NONE
-    structure = structure_of(views)
-    structure.points = np.full((len(points), 3), np.nan)
-    return structure
 
 
 def test_exact_rays_meet_in_the_point_and_one_ray_or_none_gives_none():
@@ -310,30 +258,3 @@ def test_a_wrong_match_of_a_camera_that_turns_on_the_spot_is_confirmed_by_no_vie
     )
     far.T_ref_view = matrix((0.0, np.pi, 0.0))  # all are behind it
     assert not confirmed(structure, view, [far], np.inf).any()
-
-
-def test_a_view_is_placed_where_it_is_despite_wrong_landmarks_and_with_too_few_it_is_not():
-    poses, points, seen_by = arc(4), cloud(NUM_POINTS), np.ones((4, NUM_POINTS), bool)
-    for count in (NUM_POINTS, CONFIG.min_matches - 1):
-        seen_by[3, count:] = False
-        structure = placed_structure(poses, points, seen_by)
-        structure.points, view = points.copy(), structure.views[3]
-        view.T_ref_view = None
-        view.pixels[:15] += (15.0, -9.0) if count == NUM_POINTS else 0.0
-        assert place(structure, view, CONFIG) == (count == NUM_POINTS)
-        if count == NUM_POINTS:
-            np.testing.assert_allclose(view.T_ref_view, poses[3], atol=1e-5)
-    assert view.T_ref_view is None
-
-
-def test_the_relative_pose_is_the_true_one_up_to_the_length_of_the_baseline():
-    poses = arc(3)
-    structure = placed_structure(poses, cloud(NUM_POINTS), np.ones((3, NUM_POINTS), bool))
-    near, far = (relative_pose(structure.views[0], structure.views[b], calibration(), CONFIG) for b in (1, 2))
-    expected = np.linalg.inv(poses[0]) @ poses[2]
-    expected[:3, 3] /= np.linalg.norm(expected[:3, 3])
-    np.testing.assert_allclose(far[0], expected, atol=1e-4)
-    assert far[1] == near[1] == NUM_POINTS
-    assert far[2] > 1.5 * near[2]  # twice the parallax
-    with pytest.raises(Exception, match="at least 6"):  # fewer matches than a pose needs
-        structure_config("prior.structure.matching.min_matches=5")
