@@ -437,3 +437,21 @@ def test_the_folder_of_several_runs_is_known_before_the_first(name):
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF.resolve())):
         config = hydra.compose(name, return_hydra_config=True)
     assert re.fullmatch(rf"multirun/({name}/)?synthetic/[\d_-]+", config.hydra.sweep.dir)
+
+
+def test_executables_from_the_cache_are_loaded_without_a_word(tmp_path):
+    """Symptom: the second `emgs predict prior=multiview_stereo` printed 48 errors of three thousand characters."""
+    script = (
+        "import logging, emgs_jax; from experiments.command import TALKATIVE\n"
+        "for library in TALKATIVE: logging.getLogger(library).setLevel(logging.WARNING)\n"
+        "import jax, jax.numpy as jnp\n"
+        "jax.jit(lambda x: jnp.sum(x[jnp.argsort(x)]))(jnp.arange(100.0))\n"
+    )
+    kept = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    environment = {k: v for k, v in os.environ.items() if k != "TF_CPP_MIN_LOG_LEVEL"} | kept
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", script], env=environment, cwd=CONF.parent, capture_output=True, text=True, check=True
+        )
+        assert "cpu_aot_loader" not in done.stderr
+    assert any(tmp_path.iterdir())
