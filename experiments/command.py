@@ -34,7 +34,7 @@ OPTIONS_WITH_A_VALUE = {
     "--experimental-rerun",
 }
 RUN = "config"  # conf/config.yaml, whose help lists every choice, by Hydra
-# Libraries that log at INFO which accelerators and threads are not there. A level of the logger "jax" itself that is set
+# Libraries that log at INFO which accelerators and threads are not there. A level of the logger "jax" that is set
 # before JAX is imported becomes the level of jaxlib, too, which then logs an error for each executable from the cache.
 TALKATIVE = ("jax._src", "numexpr", "websockets")
 
