@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.data.calibration_files import colmap_camera
 from emgs_jax.data.posed_images import find_model
 from emgs_jax.data.reading import resize_intrinsics
-from emgs_jax.ops.axes import FLIP
+from emgs_jax.ops.constants import FLIP
 from emgs_jax.prior.files.arrays import (
     as_intrinsics,
     as_poses,
