@@ -53,6 +53,10 @@ def test_what_does_not_fit_and_a_newer_or_foreign_file_are_refused_with_the_reme
         np.savez(path, header=np.array(json.dumps(header | change)), embeddings=vectors)
         with pytest.raises(ValueError, match=message):
             load_text(path, MODEL)
+    for wrong in (vectors[0], np.where(vectors > 0, np.nan, vectors), vectors.astype(np.float64)):
+        np.savez(path, header=np.array(json.dumps(header)), embeddings=wrong)
+        with pytest.raises(ValueError, match="its embeddings are not those of its header"):
+            load_text(path, MODEL)
 
 
 def test_a_damaged_file_is_refused_or_says_the_same(path):
