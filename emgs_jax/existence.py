@@ -1,6 +1,7 @@
 """Existence: evidence of later frames for and against a Gaussian, and merging of duplicate surfaces."""
 
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -57,6 +58,22 @@ class ExistenceConfig(eqx.Module):
     feature: Float[Array, "*b"] = choice("medoid", "accumulated")
 
 
+class Look(NamedTuple):
+    """A frame as evidence.
+
+    Args:
+        view: as it was aligned, world frame; a frame that is not tracked has no valid row.
+        T_world_camera: from where it was seen.
+        camera: of its rows.
+        depth_noise: of its points, as a fraction of their depth.
+    """
+
+    view: Observation
+    T_world_camera: jaxlie.SE3
+    camera: Camera
+    depth_noise: Float[Array, ""]
+
+
 def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -> Float[Array, "2 p"]:
     """Nearest and farthest depth z (m) among each pixel and its eight neighbours; NaN where the pixel itself has none.
 
@@ -86,10 +103,7 @@ def fusion_evidence(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]
 def update_existence(
     map: GaussianMap,
     use: Int[Array, "n"],
-    view: Observation,
-    T_world_camera: jaxlie.SE3,
-    camera: Camera,
-    depth_noise: Float[Array, ""],
+    look: Look,
     config: ExistenceConfig,
 ) -> tuple[GaussianMap, Bool[Array, "n"]]:
     """Update the existence (log-odds) of every Gaussian by one more frame; refuted Gaussians become free rows.
@@ -107,13 +121,12 @@ def update_existence(
     Args:
         map: all Gaussians, world frame.
         use: evidence of this frame's points for each, see `fusion_evidence`.
-        view: the frame as it was aligned, world frame; a frame that is not tracked has no valid row.
-        camera: of its rows.
-        depth_noise: of its points, as a fraction of their depth.
+        look: the frame.
 
     Returns:
         The map, and which Gaussians were seen.
     """
+    view, T_world_camera, camera, depth_noise = look
     gaussians, rotation = map.gaussians, T_world_camera.rotation().as_matrix()
     rays = gaussians.means - T_world_camera.translation()
     pixels, depth = project(camera, rays @ rotation)

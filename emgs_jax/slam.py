@@ -9,7 +9,7 @@ import jaxlie
 from jaxtyping import Array, Float, Int
 
 from emgs_jax.em import EmConfig, EmInfo, em_update, owners
-from emgs_jax.existence import ExistenceConfig, fusion_evidence, merge_duplicates, update_existence
+from emgs_jax.existence import ExistenceConfig, Look, fusion_evidence, merge_duplicates, update_existence
 from emgs_jax.gaussian_map import (
     AverageConfig,
     GaussianMap,
@@ -314,7 +314,7 @@ def _store(
     """
     rows, T, noise = submap.rows, frame.T_world_camera, frame.localization.depth_noise
     evidence, map = fusion_evidence(map, submap.map, rows), write_back(map, submap.map, rows)
-    map, is_seen = update_existence(map, evidence, frame.trusted, T, view, noise, config.existence)
+    map, is_seen = update_existence(map, evidence, Look(frame.trusted, T, view, noise), config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
     merged = merge_duplicates(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
     born = new_map(new.gaussians, _first_weight(new.weight, config.em.average), config.existence.birth, frame.time)

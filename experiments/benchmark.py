@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from emgs_jax.config.configure import build_dataset, build_prior
 from emgs_jax.io.files import write_file, write_json
+from emgs_jax.report.columns import Table, markdown
 from emgs_jax.report.provenance import provenance
 
 from .benchmarks.comparisons import time_em, time_icp, time_render
@@ -63,19 +64,19 @@ def report(timings: Sequence[Timing]) -> str:
     device = jax.devices()[0]
     lines = [f"{device.device_kind} ({device.platform}), {os.cpu_count()} CPU cores, jax {jax.__version__}"]
     for part, rows in groupby(timings, lambda timing: timing.part):
-        lines += ["", f"| {part} | compile [s] | run [ms] | faster by | |", "|---|---|---|---|---|"]
-        lines += [_line(timing) for timing in rows]
+        titles = [part, "compile [s]", "run [ms]", "faster by", ""]
+        lines += ["", markdown(Table(titles, [_cells(timing) for timing in rows])).rstrip()]
     return "\n".join(lines)
 
 
-def _line(timing: Timing) -> str:
+def _cells(timing: Timing) -> list[str]:
     facts = dict(timing.facts)
     ratios = facts.pop("times_faster_than", {})
     compile_seconds = "–" if timing.compile_seconds is None else f"{timing.compile_seconds:.1f}"
     run = _text(spread([1e3 * seconds for seconds in timing.seconds]))
     faster = "; ".join(f"{_text(ratio)} × {name}" for name, ratio in ratios.items()) or "–"
     rest = ", ".join(f"{name} {_text(value)}" for name, value in facts.items())
-    return f"| {timing.name} | {compile_seconds} | {run} | {faster} | {rest} |"
+    return [timing.name, compile_seconds, run, faster, rest]
 
 
 def _text(value: Any) -> str:

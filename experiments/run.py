@@ -18,6 +18,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.device.clock import Clock
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog, owned
+from emgs_jax.io.packages import extra
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.mapping.pipeline import finish_run, map_frames
 from emgs_jax.mapping.records import FrameRecord, show_records, to_line
@@ -40,7 +41,7 @@ from emgs_jax.report.metrics import (
     spent,
 )
 from emgs_jax.report.page import write_report
-from emgs_jax.report.polish import polish, require_optax
+from emgs_jax.report.polish import OPTAX, polish
 from emgs_jax.report.printout import frame_lines, last_words, metrics_table, polish_lines, time_words
 from emgs_jax.report.provenance import is_metric, provenance, signature, write_metrics
 from emgs_jax.report.recorded_run import REPORT_FILE, read_run
@@ -73,7 +74,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             watched = build(config, "view") if config.view else None
             fitting = build(config, "polish") if config.polish else None
             if fitting is not None:
-                require_optax()
+                extra(*OPTAX)
             live = stack.enter_context(live_view(watched, session, densify.render, prior, dataset.kept))
             baselines = Baselines(fused, slam.observation, dataset)
             settings = OmegaConf.to_container(config, resolve=True)

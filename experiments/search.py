@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from emgs_jax.config.configure import near
 from emgs_jax.config.values import Declared, check_value, field_of
 from emgs_jax.io.files import changes, jsonable
+from emgs_jax.io.packages import extra
 
 from .grid import Value, stage_keys
 
@@ -152,10 +153,7 @@ def open_study(path: Path, about: Mapping[str, Any], objectives: Mapping[str, st
 
 
 def _optuna() -> ModuleType:
-    try:
-        import optuna
-    except ImportError as error:
-        raise ValueError('the search needs Optuna: pip install "emgs_jax[tune]"') from error
+    optuna = extra("optuna", "the search needs Optuna", "tune")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna
 

@@ -10,8 +10,7 @@ from omegaconf import DictConfig, ListConfig
 
 from emgs_jax.config.configure import build
 from emgs_jax.data.class_file import read_classes
-from emgs_jax.evaluation.labelled_mesh import read_labelled_mesh
-from emgs_jax.evaluation.segmentation import LabelledPoints, label_cells, true_labels
+from emgs_jax.evaluation.segmentation import LabelledPoints, label_cells, read_labelled_mesh, true_labels
 from emgs_jax.io.files import write_file, write_json
 from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.segmentation_table import Placement, SceneResult, score_scene, summary, table

@@ -283,29 +283,6 @@ def test_many_points_are_taken_in_parts_which_changes_no_average(opened):
     sc.assert_rows_near(updated.gaussians, expected.gaussians, atol=1e-4)
 
 
-def test_the_update_does_not_depend_on_the_order_of_points_and_gaussians(opened):
-    config, rng = sc.changed(opened, max_mahalanobis_sq=9.0, noise=1.0), np.random.default_rng(0)
-    order, rows = rng.permutation(M), rng.permutation(N)
-    updated, is_fused, info = em(MAP, POINTS, NOISE, config)
-    turned, turned_fused, said = em(sc.rows_of(MAP, rows), sc.rows_of(POINTS, order), NOISE[order], config)
-    np.testing.assert_array_equal(turned_fused, is_fused[order])
-    assert 0 < info.num_fused == said.num_fused < M
-    sc.assert_rows_near(turned.gaussians, sc.rows_of(updated.gaussians, rows), atol=1e-5)  # sums in another order
-
-
-def test_the_update_moves_with_a_rigid_motion(opened):
-    T = sc.pose((0.4, -0.9, 0.3), (0.5, 1.0, -0.7))
-    config = sc.changed(opened, max_mahalanobis_sq=9.0, noise=1.0)
-    updated, is_fused, _ = em(MAP, POINTS, NOISE, config)
-    turned_noise = np.float32(NOISE @ sc.matrix_of(T)[:3, :3].T)
-    moved, moved_fused, _ = em(
-        sc.fresh_map(sc.move_gaussians(T, GAUSSIANS)), sc.moved_points(T, POINTS), turned_noise, config
-    )
-    np.testing.assert_array_equal(moved_fused, is_fused)
-    # float32 exponents of d² up to some hundred, through shares into means of some decimetres
-    sc.assert_rows_near(moved.gaussians, sc.move_gaussians(T, updated.gaussians), atol=5e-4)
-
-
 @pytest.mark.parametrize("poison", [1e6, -1e6])
 def test_invalid_rows_of_map_and_observation_change_no_valid_output(paper, poison):
     known, valid = np.arange(N) % 4 > 0, np.arange(M) % 5 > 0

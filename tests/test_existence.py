@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 from scene import assert_same, at, device, flat_gaussians, fresh_map, join, on_host, pose, replace, rows_of
 
-from emgs_jax.existence import depth_range, fusion_evidence, merge_all_duplicates, merge_duplicates, update_existence
+from emgs_jax.existence import (
+    Look,
+    depth_range,
+    fusion_evidence,
+    merge_all_duplicates,
+    merge_duplicates,
+    update_existence,
+)
 from emgs_jax.gaussian_map import GaussianMap, confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
@@ -44,10 +51,11 @@ def filled(map: GaussianMap) -> GaussianMap:
     return eqx.tree_at(lambda m: m.gaussians.valid, more, more.gaussians.valid & (rows < count))
 
 
-def judged(map: GaussianMap, use, *arguments):
+def judged(map: GaussianMap, use, *look_and_settings):
     """The rows of the map after a look that fused something into some of them, and which it sees."""
     count = map.weight.shape[0]
-    after, is_seen = judged_map(filled(map), np.resize(np.int32(use), NUM_ROWS), *arguments)
+    *given, settings = look_and_settings
+    after, is_seen = judged_map(filled(map), np.resize(np.int32(use), NUM_ROWS), Look(*given), settings)
     return rows_of(after, slice(count)), is_seen[:count]
 
 

@@ -105,17 +105,6 @@ def test_invalid_points_change_no_gaussian(fit_config, poison):
     sc.assert_same(fitted_at(centers, wild, fit_config), fitted_at(centers, points, fit_config))
 
 
-def test_fitting_moves_with_a_rigid_motion(fit_config):
-    T, points = sc.pose((0.4, -0.9, 0.3), (0.5, 1.0, -0.7)), some_points()
-    still = fitted_at(np.asarray(points.points)[:20], points, fit_config)
-    moved_to = sc.moved_points(T, points)
-    moved = fitted_at(np.asarray(moved_to.points)[:20], moved_to, fit_config)
-    # float32 inverses of covariances; coordinates of 2 m
-    sc.assert_rows_near(
-        moved, sc.move_gaussians(T, still), atol=3e-4, names=("means", "covs", "normals", "colors", "features")
-    )
-
-
 def test_an_image_is_cut_into_as_many_pieces_whatever_its_size(config):
     chosen = config("slam.fit.points_per_gaussian=128").fit
     for width, height, thin, expected in (

@@ -266,16 +266,6 @@ def test_an_empty_map_makes_every_candidate_fresh(settings, camera):
     sc.assert_same(merged, map_of(empty))
 
 
-def test_merging_moves_with_a_rigid_motion(settings, camera):
-    motion, candidates = sc.pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5)), random_candidates()
-    merged, fresh, _ = run(settings, camera, candidates)
-    given = sc.move_gaussians(motion, candidates), sc.move_gaussians(motion, discs(GRID))
-    moved, moved_fresh, _ = run(settings, camera, *given, T=sc.product(motion, CAMERA_POSE))
-    np.testing.assert_array_equal(moved_fresh.valid, fresh.valid)
-    # float32 coordinates of 3 m, through 2D distances in pixels into weights
-    sc.assert_rows_near(moved.gaussians, sc.move_gaussians(motion, merged.gaussians), atol=2e-4)
-
-
 @pytest.mark.parametrize("poison", [1e6, np.nan])
 def test_invalid_candidates_and_map_rows_change_nothing(settings, camera, poison):
     seen, candidates = sc.replace(discs(GRID), valid=np.arange(25) % 6 > 0), random_candidates()

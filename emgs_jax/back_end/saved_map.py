@@ -3,7 +3,6 @@
 Keyframes, poses and factors. The other run's frames are further nodes of the same pose graph.
 """
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,15 +14,14 @@ from emgs_jax.back_end.factors import Factor
 from emgs_jax.back_end.state import BackEnd, BackEndConfig
 from emgs_jax.data.reading import fingerprint
 from emgs_jax.gaussian_map import GaussianMap
-from emgs_jax.io.files import atomic_write
 from emgs_jax.io.map_file import load_map
-from emgs_jax.io.npz import read_npz
+from emgs_jax.io.npz import load_headed, save_headed
 from emgs_jax.keypoints.sift import DESCRIPTOR_SIZE
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe, unit_descriptors, vlad
 from emgs_jax.loop_closure.verification import LoopMeasurement
 
 PLACES_FILE, MAP_FILE, METRICS_FILE = "places.npz", "map.npz", "metrics.json"
-FORMAT, VERSION, DESCRIPTORS = "emgs_jax.places", 1, "rootsift"
+HEADER = {"format": "emgs_jax.places", "version": 1, "descriptors": "rootsift"}
 MODES = ("extend", "localize")
 LEFT_OUT = -1  # submap of nodes that were never joined with the map
 NODES = ("poses", "log_scales", "frames", "is_placed")
@@ -57,8 +55,12 @@ class SavedMap:
 
 def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
     """Write what `load_places` reads."""
-    keyframes, header = end.database.keyframes, {"format": FORMAT, "version": VERSION, "descriptors": DESCRIPTORS}
-    header |= {"depth_noise": depth_noise, "num_trained": end.database.num_trained, "has_one_unit": end.has_one_unit}
+    keyframes = end.database.keyframes
+    header = HEADER | {
+        "depth_noise": depth_noise,
+        "num_trained": end.database.num_trained,
+        "has_one_unit": end.has_one_unit,
+    }
     arrays = {name: np.asarray(getattr(end, name)) for name in NODES} | {"words": end.database.words}
     arrays["is_kept"] = np.array(end.submap_ids) == end.submap_id
     arrays |= {f"keyframes.{name}": np.stack([getattr(one, name) for one in keyframes]) for name in OF_KEYFRAMES}
@@ -68,8 +70,7 @@ def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
     arrays |= edges | {"edges.kind": edges.pop("edges.is_loop").astype(int)}
     for name, field in LOOPS.items():
         arrays |= _table(name, getattr(end, field), LoopMeasurement.__annotations__)
-    with atomic_write(path) as handle:
-        np.savez(handle, __header__=np.array(json.dumps(header)), **arrays)
+    save_headed(path, header, arrays)
 
 
 def load_places(path: Path, end: BackEnd) -> tuple[BackEnd, float]:
@@ -79,12 +80,7 @@ def load_places(path: Path, end: BackEnd) -> tuple[BackEnd, float]:
         ValueError: the file is damaged, of another version, or its descriptors are of another kind.
     """
     try:
-        with open(path, "rb") as handle:
-            arrays = read_npz(handle)
-        header = json.loads(str(arrays["__header__"]))
-        for name, ours in (("format", FORMAT), ("version", VERSION), ("descriptors", DESCRIPTORS)):
-            if header.get(name) != ours:
-                raise ValueError(f"its {name} is {header.get(name)!r}, this code reads {ours!r}")
+        header, arrays = load_headed(path, HEADER)
         for name, array in arrays.items():
             if array.dtype.kind == "f" and name != "keyframes.points" and not np.isfinite(array).all():
                 raise ValueError(f"{name} is not finite")

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from jaxtyping import Float
 
-from emgs_jax.ops.axes import FLIP
+from emgs_jax.ops.constants import FLIP
 
 EXPECTED = "poses camera -> world, quaternions x, y, z, w, axes of OpenCV (x right, y down, z ahead)"
 AHEAD_LEFT_UP = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # OpenCV's axes in a robot's

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from emgs_jax.data import reading
 from emgs_jax.data.base import Frame
 from emgs_jax.data.calibration_files import Calibration, colmap_camera, read_calibration
-from emgs_jax.data.colmap_model import BINARY, TEXT, load_colmap
+from emgs_jax.data.colmap_model import BINARY, TEXT, SparseModel, load_colmap
 from emgs_jax.data.file_names import IMAGE_SUFFIXES, find_image, natural_key, times_of
 from emgs_jax.data.intrinsics import to_lens, with_notes
 from emgs_jax.data.tones import read_shown, tones_of
@@ -169,13 +169,13 @@ def _name(folder: Path, sequence: str | None) -> str:
     return folder.resolve().name if sequence is None else str(sequence)
 
 
-def find_model(folder: Path, model: str | None) -> Path:
-    """The folder of a sparse model, or an error that names where one was looked for."""
+def find_model(folder: Path, model: str | None) -> SparseModel:
+    """Read a sparse model, of several the largest, or raise an error that names where one was looked for."""
     places = [folder / name for name in (MODEL_FOLDERS if model is None else (model,))]
     for place in places:
         beside = [place] if model is not None or place.name != "0" else _numbered(place.parent)
         if there := [other for other in beside if _has_model(other)]:
-            return max(there, key=lambda other: len(load_colmap(other).names)) if len(there) > 1 else there[0]
+            return max(map(load_colmap, there), key=lambda found: len(found.names))
     looked = ", ".join(str(place) for place in places)
     raise FileNotFoundError(f"no cameras and images (.txt or .bin) in {looked}; expected the layout {COLMAP_LAYOUT}")
 
@@ -190,13 +190,12 @@ def _numbered(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: int(path.name))
 
 
-def read_colmap(model: Path, folder: Path) -> Solved:
+def read_colmap(found: SparseModel, folder: Path) -> Solved:
     """The images of a sparse model, which are in `folder`.
 
     Raises:
         ValueError: no image, images of several cameras, a camera that is not read, a damaged file.
     """
-    found = load_colmap(model)
     used = {tuple(found.cameras[camera_id]) for camera_id in found.camera_ids}
     if len(used) > 1:
         raise ValueError(

@@ -10,7 +10,7 @@ import numpy as np
 
 from emgs_jax.data import reading
 from emgs_jax.data.file_names import find_image
-from emgs_jax.ops.axes import FLIP
+from emgs_jax.ops.constants import FLIP
 
 
 def load_transforms(path: Path) -> tuple[list[str], list[list[float]]]:

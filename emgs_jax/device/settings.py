@@ -7,7 +7,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from emgs_jax.io.files import problem_of
+from emgs_jax.io.files import check_writable
 
 MAX_BYTES = 2 * 2**30  # what was not used for longest goes first
 # Where a config says so, and where it has the words that will.
@@ -37,8 +37,10 @@ def use_compilation_cache(folder: str | None = "auto") -> None:
     if str(folder) == "auto" and jax.config.jax_compilation_cache_dir is not None:
         return
     path = cache_folder() if str(folder) == "auto" else Path(folder).expanduser()
-    if (problem := problem_of(path)) is not None:
-        print(f"warning: nothing is kept of what JAX compiles, {path}: {problem}", file=sys.stderr)
+    try:
+        check_writable(path, str(path))
+    except ValueError as error:
+        print(f"warning: nothing is kept of what JAX compiles, {error}", file=sys.stderr)
         return
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)

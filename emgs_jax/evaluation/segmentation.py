@@ -6,16 +6,19 @@ columns predicted ones, and the last column counts points without an answer. Mat
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.data.class_file import ClassFile
 from emgs_jax.data.spool import Spool
 from emgs_jax.evaluation.clouds import NearestPoints, PointCloud, cell_centers, cell_numbers
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, Reference, align_cloud, own_voxel
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.geometry import rotated
+from emgs_jax.io.ply_reader import read_vertices
 
 _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
 
@@ -207,3 +210,34 @@ def _distinct(rows: np.ndarray) -> np.ndarray:
 def _changes(rows: np.ndarray) -> np.ndarray:
     """Positions of the rows (n, 2) of numbers from 0 on that differ from the row before."""
     return np.flatnonzero((np.diff(rows, axis=0, prepend=-1) != 0).any(1))
+
+
+def read_labelled_mesh(folder: Path, scene: str, classes: ClassFile) -> LabelledPoints:
+    """The vertices of a scene with their classes, -1 = none.
+
+    Raises:
+        ValueError: a file is missing or damaged, the ids are not as many as the vertices, or one has no name.
+    """
+    mesh, labels = folder / f"{scene}_mesh.ply", folder / f"{scene}.txt"
+    missing = [path.name for path in (mesh, labels) if not path.is_file()]
+    if missing:
+        raise ValueError(
+            f"truth={folder} lacks {', '.join(missing)}: give the folder with SCENE_mesh.ply and SCENE.txt (an id a "
+            "vertex) of Replica, or name the scenes (scenes=[office0])"
+        )
+    vertices = read_vertices(mesh)
+    points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    ids = _ids(labels)
+    if len(ids) != len(points):
+        raise ValueError(
+            f"{labels} has {len(ids)} labels and {mesh} {len(points)} vertices: fetch both files of the same mesh"
+        )
+    return LabelledPoints(points, classes.positions_of(ids, labels), classes.names)
+
+
+def _ids(path: Path) -> np.ndarray:
+    words = path.read_bytes().split()
+    try:
+        return np.array(words, dtype=f"S{max(map(len, words), default=1)}").astype(np.int64)
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"{path} is no list of whole numbers, one a vertex ({error}): fetch it again") from error

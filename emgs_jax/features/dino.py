@@ -20,7 +20,7 @@ from emgs_jax.features.dinotxt import text_tower, vision_head
 from emgs_jax.features.images import ImageConfig, grid_size, network_input
 from emgs_jax.features.text import TextEmbeddings, average_over_templates, check_templates, load_text
 from emgs_jax.features.tokens import Tokenizer
-from emgs_jax.io.torch_packages import best_device, companion_problem, first_line
+from emgs_jax.io.packages import best_device, companion_problem, first_line
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -6,15 +6,13 @@ features the embeddings can be compared with).
 """
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from emgs_jax.io.files import atomic_write
-from emgs_jax.io.npz import read_npz
+from emgs_jax.io.npz import load_headed, save_headed
 
 FORMAT, VERSION = "emgs_jax.text", 1
 REMEDY = "write it with `python -m experiments.embed`"
@@ -65,8 +63,7 @@ def save_text(path: Path | str, text: TextEmbeddings) -> None:
     """Write the embeddings, whole or not at all."""
     header = {"format": FORMAT, "version": VERSION, "names": text.names, "templates": text.templates}
     header |= {"model": text.model}
-    with atomic_write(path) as handle:
-        np.savez(handle, header=np.array(json.dumps(header)), embeddings=np.asarray(text.vectors, np.float32))
+    save_headed(path, header, {"embeddings": np.asarray(text.vectors, np.float32)}, "header")
 
 
 def load_text(path: Path | str, model: dict, names: Sequence[str] = ()) -> TextEmbeddings:
@@ -101,14 +98,10 @@ def _read(path: Path) -> tuple[dict, np.ndarray]:
     if not path.is_file():
         raise ValueError(f"{path} is no file: {REMEDY}")
     try:
-        arrays = read_npz(path.read_bytes(), ("header", "embeddings"))
-        header, vectors = json.loads(str(arrays["header"])), arrays["embeddings"]
-    except (ValueError, RecursionError) as error:
+        header, arrays = load_headed(path, {"format": FORMAT, "version": VERSION}, "header")
+        vectors = arrays["embeddings"]
+    except (ValueError, KeyError) as error:
         raise ValueError(f"{path} is no file of text embeddings, or damaged ({error}): {REMEDY}") from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise ValueError(f"{path} is not of the format {FORMAT}: {REMEDY}")
-    if header.get("version") != VERSION:
-        raise ValueError(f"{path} has version {header.get('version')}, this program reads {VERSION}: {REMEDY}")
     is_whole = {"names", "templates", "model"} <= header.keys() and vectors.ndim == 2
     is_whole = is_whole and vectors.dtype == np.float32 and bool(np.isfinite(vectors).all())
     if not is_whole or len(vectors) != len(header["names"]):

@@ -62,18 +62,6 @@ def new_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def problem_of(folder: Path) -> str | None:
-    """Say why nothing can be written into a folder, which is made where it is missing; None where all is well."""
-    probe = folder / f".{os.getpid()}.tmp"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        return error.strerror or str(error)
-    return None
-
-
 @contextlib.contextmanager
 def owned(folder: Path) -> Iterator[None]:
     """Hold a folder, made here, for this process: of two programs that write into one folder the second is refused.

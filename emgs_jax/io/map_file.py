@@ -1,14 +1,12 @@
 """The map's file: every leaf under its field path, bit for bit, and a header that says what it is."""
 
-import json
 import os
 
 import jax
 import numpy as np
 
 from emgs_jax.gaussian_map import GaussianMap, empty_map
-from emgs_jax.io.files import atomic_write
-from emgs_jax.io.npz import read_npz
+from emgs_jax.io.npz import load_headed, save_headed
 from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 MAP_FORMAT, MAP_VERSION, CLASS = "emgs_jax.map", 3, GaussianMap.__name__
@@ -18,29 +16,21 @@ def save_map(path: str | os.PathLike, map: GaussianMap) -> None:
     """Write a map as .npz: each array under its field path, and a header; `load_map` reads the same bits."""
     arrays = {_name(key): np.asarray(leaf) for key, leaf in jax.tree_util.tree_flatten_with_path(map)[0]}
     header = {"format": MAP_FORMAT, "version": MAP_VERSION, "class": CLASS, "leaves": sorted(arrays), "static": {}}
-    with atomic_write(path) as handle:
-        np.savez(handle, __header__=np.array(json.dumps(header)), **arrays)
+    save_headed(path, header, arrays)
 
 
 def load_map(path: str | os.PathLike) -> GaussianMap:
     """Read the map.npz of a run; raises ValueError for a file that is no complete, finite map of this version."""
     try:
-        with open(path, "rb") as handle:
-            arrays = read_npz(handle)
-        header = json.loads(str(arrays.pop("__header__", "{}")))
-        header = header if isinstance(header, dict) else {}
+        _, arrays = load_headed(path, {"format": MAP_FORMAT, "version": MAP_VERSION, "class": CLASS})
     except FileNotFoundError:
         raise
-    except Exception as error:  # a broken zip raises a dozen types
-        raise ValueError(f"{path} is not a readable map ({error}): it is truncated or damaged, map again") from error
-    if header.get("format") != MAP_FORMAT:
-        raise ValueError(f"{path} is not a map of emgs_jax: give the map.npz of a run")
-    if header.get("version") != MAP_VERSION:
-        raise ValueError(f"{path} has map version {header.get('version')}, this code reads {MAP_VERSION}: map again")
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} is no map.npz of a run that can be read ({error}): map again") from error
     fields, structure = jax.tree_util.tree_flatten_with_path(jax.eval_shape(lambda: empty_map(1, 1)))
     names = [_name(key) for key, _ in fields]
-    if header.get("class") != CLASS or sorted(arrays) != sorted(names):
-        raise ValueError(f"{path} holds a {header.get('class')}, expected {CLASS} with all its arrays: map again")
+    if sorted(arrays) != sorted(names):
+        raise ValueError(f"{path} holds other arrays than those of a {CLASS}: map again")
     map = jax.tree.unflatten(structure, [arrays[name] for name in names])
     check_map(path, map)  # before JAX, which would cast what is of another type
     return jax.device_put(map)

@@ -1,13 +1,20 @@
-"""Reading .npz files of anyone: nothing is unpickled, and nothing is allocated that the file does not hold."""
+"""Reading .npz files of anyone: nothing is unpickled, and nothing is allocated that the file does not hold.
+
+Those of this program have a header beside their arrays, an object of JSON.
+"""
 
 import io
+import json
 import math
+import os
 import zipfile
-from collections.abc import Sequence
-from typing import IO
+from collections.abc import Mapping, Sequence
+from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy
+
+from emgs_jax.io.files import atomic_write
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 MAX_INFLATED = 2**33  # bytes of an array that is compressed; more is no array of anyone's
@@ -42,6 +49,40 @@ def read_npz(
         raise
     except Exception as error:  # a broken zip raises a dozen types
         raise ValueError(repr(error)) from error
+
+
+def save_headed(
+    path: str | os.PathLike, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], key: str = "__header__"
+) -> None:
+    """Write a header and arrays, whole or not at all; `key` names the header among the arrays."""
+    content = json.dumps(header, default=lambda value: value.item())
+    with atomic_write(path) as handle:
+        np.savez(handle, **{key: np.array(content)}, **arrays)
+
+
+def load_headed(
+    path: str | os.PathLike, ours: Mapping[str, Any], key: str = "__header__"
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Read header and arrays of `save_headed`.
+
+    Args:
+        ours: what the header must say: format, version and the like.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is damaged, or its header says something else; the message does not name it.
+    """
+    with open(path, "rb") as handle:
+        arrays = read_npz(handle)
+    try:
+        header = json.loads(str(arrays.pop(key)))
+    except (KeyError, RecursionError) as error:
+        raise ValueError("it has no header") from error
+    for name, value in ours.items():
+        found = header.get(name) if isinstance(header, dict) else None
+        if found != value:
+            raise ValueError(f"its {name} is {found!r}, this code reads {value!r}")
+    return header, arrays
 
 
 def npz_names(content: IO[bytes]) -> list[str]:

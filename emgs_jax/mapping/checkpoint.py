@@ -5,7 +5,6 @@ predictions' points, keyframes) follows from that alone, the same every time. Th
 records come from the file, so that the result has the same bits as that of an uninterrupted run.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -15,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.io.files import atomic_write, changes, jsonable
-from emgs_jax.io.npz import read_npz
+from emgs_jax.io.files import changes, jsonable
+from emgs_jax.io.npz import load_headed, save_headed
 from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.ops.ranges import number
@@ -87,8 +86,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, signature: Mapping[str, 
         nothing = np.full((size, size), np.nan)  # stands for None
         found = [nothing if getattr(r, name) is None else getattr(r, name) for r in checkpoint.records]
         arrays[name] = np.asarray(found, np.float64).reshape(-1, size, size)
-    with atomic_write(path) as handle:
-        np.savez(handle, __header__=np.array(json.dumps(header, default=lambda value: value.item())), **arrays)
+    save_headed(path, header, arrays)
 
 
 def load_checkpoint(path: Path, signature: Mapping[str, Any]) -> Checkpoint:
@@ -98,11 +96,7 @@ def load_checkpoint(path: Path, signature: Mapping[str, Any]) -> Checkpoint:
         ValueError: there is none, it is damaged, or it is of another run; the message names what is different.
     """
     try:
-        with open(path, "rb") as handle:
-            arrays = read_npz(handle)
-        header = json.loads(str(arrays["__header__"]))
-        if (header["format"], header["version"]) != (FORMAT, VERSION):
-            raise ValueError(f"it is of version {header['version']}, this code reads {VERSION}")
+        header, arrays = load_headed(path, {"format": FORMAT, "version": VERSION})
         if changed := changes(header["signature"], jsonable(signature)):
             raise ValueError(f"it is of another run: {changed[0]}")
         matrices = [{name: arrays[name][row] for name in MATRICES} for row in range(len(header["records"]))]

@@ -1,8 +1,12 @@
-"""Colours of all that is drawn: statuses of frames, paths, classes."""
+"""Colours of all that is drawn: statuses of frames, paths, classes; how a picture becomes a file."""
 
+import os
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
+
+from emgs_jax.io.files import atomic_write
 
 STATUS_COLORS = {
     "tracked": "#2f9e6e",
@@ -49,3 +53,9 @@ def class_colors(count: int) -> np.ndarray:
 def to_bytes(values: np.ndarray) -> np.ndarray:
     """Convert values in [0, 1] to uint8; what is outside is clipped, nan becomes 0."""
     return np.rint(255 * np.nan_to_num(values).clip(0.0, 1.0)).astype(np.uint8)
+
+
+def save_figure(path: str | os.PathLike, figure: Figure) -> None:
+    """Write a figure as PNG, whole or not at all."""
+    with atomic_write(path) as handle:
+        figure.savefig(handle, format="png", dpi=110)

@@ -12,11 +12,9 @@ import numpy as np
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.geometry import Sim3
-from emgs_jax.io.colmap import save_colmap
+from emgs_jax.io.cameras import save_colmap, save_frustums, save_transforms
 from emgs_jax.io.files import new_folder, write_json
-from emgs_jax.io.frustums import save_frustums
 from emgs_jax.io.map_file import save_map
-from emgs_jax.io.nerfstudio import save_transforms
 from emgs_jax.io.ply import with_colors, write_ply
 from emgs_jax.io.ply_reader import read_vertices, scale_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from emgs_jax.io.files import atomic_write
+from emgs_jax.report.colors import save_figure
 from emgs_jax.report.columns import MAIN, Column, Line, known
 
 Axis = tuple[str, list[str]]  # its name and its tick labels
@@ -60,8 +60,7 @@ def draw_heat_maps(
         panel.set_yticks(range(len(down[1])), down[1], fontsize=8)
         panel.set_xlabel(across[0], fontsize=8)
         panel.set_ylabel(down[0], fontsize=8)
-    with atomic_write(path) as handle:
-        figure.savefig(handle, format="png", dpi=110)
+    save_figure(path, figure)
 
 
 def _draw(axes: Axes, column: Column, values: np.ndarray) -> None:

@@ -13,8 +13,7 @@ from emgs_jax.data.base import Frame
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.device.clock import Clock, peak_memory_mb
 from emgs_jax.evaluation.clouds import PointCloud, SpooledCloud
-from emgs_jax.evaluation.layers import double_wall_share
-from emgs_jax.evaluation.loops import loop_metrics
+from emgs_jax.evaluation.loops import double_wall_share, loop_metrics
 from emgs_jax.evaluation.reconstruction import (
     EvaluationConfig,
     Reference,

@@ -14,8 +14,7 @@ from PIL import Image, ImageDraw
 
 from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.geometry import rotated
-from emgs_jax.io.files import atomic_write
-from emgs_jax.report.colors import OURS, PATHS, class_colors, to_bytes
+from emgs_jax.report.colors import OURS, PATHS, class_colors, save_figure, to_bytes
 
 _INK, _PAPER = "#333333", "#e3e6ea"
 
@@ -69,8 +68,7 @@ def draw_overview(
         _draw_frames(grid[:, [0, 1, -1]], frames, paths.unit)
         if classes:
             _draw_labels(grid[:, 2], frames, classes)
-    with atomic_write(path) as handle:
-        figure.savefig(handle, format="png", dpi=110)
+    save_figure(path, figure)
 
 
 def view_from_above(poses: np.ndarray) -> np.ndarray:

@@ -1,6 +1,5 @@
 """A finished run polished: its frames and map in, splats.ply, polish.json and pictures of held-out frames out."""
 
-import importlib.util
 from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeAlias
@@ -17,12 +16,12 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
 from emgs_jax.device.arrays import on_device, to_se3
 from emgs_jax.device.executables import stored
-from emgs_jax.evaluation.clouds import NearestPoints
 from emgs_jax.evaluation.rendering import rendering_metrics, score_view
 from emgs_jax.evaluation.trajectory import align_poses, ate
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import write_json
+from emgs_jax.io.packages import extra
 from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.ops.camera import Camera
@@ -32,9 +31,11 @@ from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, draw, gaussi
 from emgs_jax.render.composite import Rendering
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.report.recorded_run import POLISH, SPLATS_FILE, RecordedRun
+from emgs_jax.report.splats import owners
 from emgs_jax.semantics import classify
 
 _, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE, PATH_FILE = POLISH
+OPTAX = "optax", "splats are fitted by optax (polish=none fits none)", "polish"  # as `extra` takes it
 MAX_PICTURES = 4
 Seen: TypeAlias = tuple[np.ndarray, DenseView]  # image (h, w, 3) in [0, 1] of a frame, and the map from its pose
 Nearest: TypeAlias = Callable[[np.ndarray], np.ndarray]
@@ -59,7 +60,7 @@ def polish(
     Raises:
         ValueError: the map is empty, there is no frame to fit or to compare with, or optax is not installed.
     """
-    require_optax()
+    extra(*OPTAX)
     gaussians = confirmed(run.map)
     if not np.asarray(gaussians.valid).any():
         raise ValueError(f"{run.folder}: the map has no Gaussian to begin with: run again")
@@ -101,12 +102,6 @@ def polish(
     metrics |= _compare(run, dataset, held, seen, (splats, opacity, poses, all_gains, config.loss))
     write_json(run.folder / METRICS_FILE, metrics)
     return metrics
-
-
-def require_optax() -> None:
-    """Raise ValueError where the extra is not installed."""
-    if importlib.util.find_spec("optax") is None:
-        raise ValueError('splats are fitted by optax: pip install "emgs_jax[polish]", or polish=none')
 
 
 def _fitted(
@@ -161,8 +156,8 @@ def _spreads(run: RecordedRun, rows: list[int], config: PolishConfig) -> np.ndar
 def _nearest(gaussians: Gaussians) -> Nearest:
     """A function from points (n, 3) to rows of the Gaussians with the nearest means."""
     rows = np.flatnonzero(np.asarray(gaussians.valid))
-    means = NearestPoints(np.asarray(gaussians.means)[rows])
-    return lambda points: rows[means.query(points)[1][:, 0]]
+    means = np.asarray(gaussians.means)[rows]
+    return lambda points: rows[owners(points, means)]
 
 
 def _map_noise(gaussians: Gaussians, nearest: Nearest) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:

@@ -7,7 +7,6 @@ unit or zero; `cosines` and `leads` (n, c) float16; `labels` (n,) int16, the wor
 `version`, `words`, `against`, `margin`, `min_cosine` and `model`.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,8 @@ from emgs_jax.evaluation.instances import Instance, InstanceConfig, find_instanc
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.io.files import atomic_write, write_json
+from emgs_jax.io.files import write_json
+from emgs_jax.io.npz import save_headed
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.ops.linalg import safe_normalize
 from emgs_jax.report.colors import class_colors
@@ -172,15 +172,13 @@ def _save_semantic(path: Path, answer: Answer) -> None:
     for instances in answer.instances:
         for number, instance in enumerate(instances):
             numbers[instance.rows] = number
-    with atomic_write(path) as handle:
-        np.savez(
-            handle,
-            header=np.array(json.dumps(header)),
-            rows=rows.astype(np.int32),
-            means=np.asarray(answer.gaussians.means, np.float32)[rows],
-            features=np.asarray(safe_normalize(answer.gaussians.features[rows])).astype(np.float16),
-            cosines=found.cosines[rows].astype(np.float16),
-            leads=found.leads[rows].astype(np.float16),
-            labels=found.labels[rows].astype(np.int16),
-            instances=numbers[rows].astype(np.int32),
-        )
+    arrays = {
+        "rows": rows.astype(np.int32),
+        "means": np.asarray(answer.gaussians.means, np.float32)[rows],
+        "features": np.asarray(safe_normalize(answer.gaussians.features[rows])).astype(np.float16),
+        "cosines": found.cosines[rows].astype(np.float16),
+        "leads": found.leads[rows].astype(np.float16),
+        "labels": found.labels[rows].astype(np.int16),
+        "instances": numbers[rows].astype(np.int32),
+    }
+    save_headed(path, header, arrays, "header")

@@ -17,10 +17,10 @@ from matplotlib.patches import Patch
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.io.files import atomic_write, write_file
+from emgs_jax.io.files import write_file
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
-from emgs_jax.report.colors import class_colors
+from emgs_jax.report.colors import class_colors, save_figure
 from emgs_jax.report.query import GREY, Answer, heat, hot, painted
 from emgs_jax.report.recorded_run import RecordedRun, render_config
 from emgs_jax.semantics import principal_colors
@@ -164,5 +164,4 @@ def _save(
         axes.set_axis_off()
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=KEYS_PER_LINE, fontsize=9, frameon=False)
-    with atomic_write(path) as handle:
-        figure.savefig(handle, format="png", dpi=110)
+    save_figure(path, figure)

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 from matplotlib.figure import Figure
 
-from emgs_jax.io.files import atomic_write
+from emgs_jax.report.colors import save_figure
 from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, Line, markdown, metric_table
 from emgs_jax.report.provenance import RAW_PRIOR
 
@@ -138,6 +138,5 @@ def draw_trials(
     axes.set_ylabel(shown[0].title)
     axes.set_xlabel(shown[1].title if len(shown) > 1 else "trial")
     axes.set_title(title, fontsize=10)
-    with atomic_write(path) as handle:
-        figure.savefig(handle, format="png", dpi=110)
+    save_figure(path, figure)
     return None

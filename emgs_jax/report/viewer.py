@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from emgs_jax.io.packages import extra
 from emgs_jax.report.colors import to_bytes
 from emgs_jax.report.layers import ALWAYS, layers_of, painted
 from emgs_jax.report.page_words import frame_facts
@@ -45,7 +46,7 @@ class Viewer:
     """
 
     def __init__(self, run: Shown, port: int) -> None:
-        viser = _viser()
+        viser = extra("viser", "the viewer needs viser", "viewer")
         check_port(port)
         self.server = viser.ViserServer(host=HOST, port=port, label="emgs_jax", verbose=False)
         if self.server.get_port() != port:  # taken since, by another program
@@ -217,14 +218,6 @@ def check_port(port: int) -> None:
 
 def _taken(port: int) -> str:
     return f"port={port} is taken by another program, or not allowed: give another one, such as port={port + 1}"
-
-
-def _viser() -> Any:
-    try:
-        import viser
-    except ImportError as error:
-        raise ValueError('the viewer needs viser: pip install "emgs_jax[viewer]"') from error
-    return viser
 
 
 def _shown(words: str) -> str:

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from emgs_jax.em import e_step, m_step, owners, precision
-from emgs_jax.existence import fusion_evidence, merge_duplicates, update_existence
+from emgs_jax.existence import Look, fusion_evidence, merge_duplicates, update_existence
 from emgs_jax.gaussian_map import confirmed, insert, new_map, select_submap, write_back
 from emgs_jax.gaussians import cluster, spacing
 from emgs_jax.localization import localize_coarse, localize_fine
@@ -57,8 +57,8 @@ def time_stages(data: Data, repetitions: int) -> list[Timing]:
     submap, fresh, _ = stage("refine", refine, submap, candidates_new, T, camera, config.refinement)
     drawn = submap.gaussians, submap.gaussians.colors, T, camera, config.refinement.render
     stage("render", render, *drawn)
-    look = T, camera, localization.depth_noise, config.existence
-    _, is_seen = stage("judge", update_existence, state.map, fusion_evidence(state.map, submap, rows), aligned, *look)
+    look = Look(aligned, T, camera, localization.depth_noise), config.existence
+    _, is_seen = stage("judge", update_existence, state.map, fusion_evidence(state.map, submap, rows), *look)
     seen = is_seen[jnp.minimum(rows, is_seen.shape[0] - 1)]
     stage("join layers", merge_duplicates, submap, seen, T.translation(), localization.depth_noise, config.existence)
     add = lambda m, s, r, f, w: insert(write_back(m, s, r), new_map(f, w, jnp.zeros(()), jnp.asarray(0)))  # noqa: E731

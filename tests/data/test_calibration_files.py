@@ -124,7 +124,7 @@ WRONG = [
     (
         "transforms.json",
         json.dumps(TRANSFORMS | {"frames": [{}, {}, {"cx": 3}]}),
-        "different cameras: cx is .* in frame 0 and 3 in frame 2",
+        "different cameras: cx is .* in frame 0 and 3 in frame 2.*dataset=images",
     ),
     ("transforms.json", json.dumps(TRANSFORMS | {"fl_x": True}), "fl_x must be a finite number"),
     ("info.yaml", ROS.replace("image_height: 480\n", ""), "has no image_height: add"),

@@ -48,8 +48,6 @@ def test_without_the_truths_folder_there_are_no_poses(euroc_root):
         ("[160, 120]", "[752, 480]", r"data.csv is for images of 752x480, but the images are 160x120"),
         ("[160, 120]", "752", "sensor.yaml: .* resolution width, height: fetch it again"),
         ("T_BS:", "T_SB:", "sensor.yaml has no T_BS, which a camera of EuRoC has"),
-        ("[130.0", "[x", "sensor.yaml: intrinsics must be a finite number, got 'x'"),
-        ("cols: 4", "cols: [", "sensor.yaml is damaged or no yaml"),
     ],
 )
 def test_a_camera_that_is_not_read_is_refused_with_its_file(euroc_root, old, new, said):

@@ -46,12 +46,16 @@ def test_what_does_not_fit_and_a_newer_or_foreign_file_are_refused_with_the_reme
     with np.load(path) as arrays:
         header, vectors = json.loads(str(arrays["header"])), arrays["embeddings"]
     for change, message in (
-        ({"version": 2}, "version 2, this program reads 1"),
-        ({"format": "other"}, "not of the format"),
+        ({"version": 2}, "version is 2, this code reads 1"),
+        ({"format": "other"}, "format is 'other', this code reads 'emgs_jax.text'"),
         ({"names": ["wall"]}, "damaged"),
     ):
         np.savez(path, header=np.array(json.dumps(header | change)), embeddings=vectors)
         with pytest.raises(ValueError, match=message):
+            load_text(path, MODEL)
+    for wrong in (vectors[0], np.where(vectors > 0, np.nan, vectors), vectors.astype(np.float64)):
+        np.savez(path, header=np.array(json.dumps(header)), embeddings=wrong)
+        with pytest.raises(ValueError, match="its embeddings are not those of its header"):
             load_text(path, MODEL)
 
 

@@ -26,11 +26,10 @@ from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.plan import APART
 from emgs_jax.geometry import pose_difference, scale_pose
 from emgs_jax.loop_closure.consistency import pairs_within, spatially_consistent
-from emgs_jax.loop_closure.free_space import free_space_violation
 from emgs_jax.loop_closure.place_recognition import Keyframe, make_keyframe
 from emgs_jax.loop_closure.two_view_alignment import Gate
 from emgs_jax.loop_closure.two_view_refinement import Similarity
-from emgs_jax.loop_closure.verification import LoopMeasurement, Neighbour, verify
+from emgs_jax.loop_closure.verification import LoopMeasurement, Neighbour, free_space_violation, verify
 
 CANDIDATE = matrix((0, 10, 0), (0.1, 0.0, 0.2))
 QUERY = matrix((3, -4, 2), (0.4, 0.1, -0.1))

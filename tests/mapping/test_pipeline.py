@@ -14,8 +14,6 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
 from emgs_jax.device.clock import Clock
 from emgs_jax.evaluation.reconstruction import ground_truth_cloud
-from emgs_jax.io.map_file import load_map
-from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.mapping import pipeline
 from emgs_jax.mapping.pipeline import finish_run, map_frames
 from emgs_jax.mapping.run import new_run
@@ -24,7 +22,7 @@ from emgs_jax.prior.base import Prior
 from emgs_jax.report.dense import dense_map
 from emgs_jax.report.gathering import RawPrior
 from emgs_jax.report.metrics import new_scorer, score_map, score_prior
-from emgs_jax.report.run_files import save_outputs, save_progress
+from emgs_jax.report.run_files import save_outputs
 
 
 def same_bits(tree, other) -> bool:
@@ -180,21 +178,6 @@ def test_the_merged_initialization_makes_the_map_from_the_whole_window(monkeypat
     truth = np.stack([frame.T_world_camera for frame in map(dataset().__getitem__, range(WINDOW_SIZE))])
     np.testing.assert_allclose(session.poses, truth, atol=1e-5)
     assert len(maps) == WINDOW_SIZE and maps[0].gaussians.valid.sum() == session.records[-1].num_gaussians > 100
-
-
-@pytest.mark.slow
-def test_what_is_saved_reloads_to_the_state_and_to_the_poses_at_the_data_sets_times(tmp_path):
-    session, _ = exact()
-    save_progress(tmp_path, session)
-    assert same_bits(load_map(tmp_path / "map.npz"), session.state.map)
-    times, poses = load_trajectory_tum(tmp_path / "trajectory.txt")
-    assert times.tolist() == [dataset()[i].timestamp for i in range(NUM_FRAMES)]
-    np.testing.assert_allclose(poses, session.poses, atol=1e-8)  # nine digits are written
-
-
-def test_before_the_first_map_nothing_is_saved(tmp_path):
-    save_progress(tmp_path, new_run(dataset(), hydra.utils.instantiate(compose().slam)))
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

@@ -113,12 +113,6 @@ def test_far_from_the_origin_the_nearest_is_still_found():
     np.testing.assert_array_equal(distances, 0)
 
 
-def test_the_nearest_comes_first():
-    points = filled(np.float32([[3, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0], [5, 0, 0]]), NUM_POINTS)
-    rows, _ = search(np.zeros((NUM_QUERIES, 3), np.float32), points, np.arange(NUM_POINTS) < 5, 5)
-    np.testing.assert_array_equal(rows, np.tile([1, 2, 0, 4, 3], (NUM_QUERIES, 1)))
-
-
 @pytest.mark.parametrize("poison", [np.nan, np.inf, 1e6])
 def test_invalid_points_and_wild_queries_change_nothing(poison):
     points, queries = uniform(5, NUM_POINTS, 3), uniform(7, NUM_QUERIES, 3)
@@ -129,17 +123,6 @@ def test_invalid_points_and_wild_queries_change_nothing(poison):
     for a, b, c in zip(clean, with_points, with_queries, strict=True):
         np.testing.assert_array_equal(b, a)
         np.testing.assert_array_equal(c[~is_wild], a[~is_wild])
-
-
-def test_the_order_of_points_and_queries_does_not_matter():
-    rng, valid = np.random.default_rng(0), np.arange(NUM_POINTS) % 7 > 0
-    points, queries = uniform(5, NUM_POINTS, 3), uniform(7, NUM_QUERIES, 3)
-    rows, order = rng.permutation(NUM_POINTS), rng.permutation(NUM_QUERIES)
-    turned, found = search(queries[order], points[rows], valid[rows], 5)
-    expected, _ = search(queries, points, valid, 5)
-    assert (
-        found.all() and (rows[turned] == expected[order]).mean() > 0.999
-    )  # but for distances that are as good as equal
 
 
 def test_the_curve_goes_from_each_cube_to_one_that_touches_it_and_what_does_not_count_comes_last():

@@ -16,8 +16,7 @@ from emgs_jax.config import configure
 from emgs_jax.data.calibration_files import read_calibration
 from emgs_jax.data.colmap_model import load_colmap
 from emgs_jax.data.transforms_json import load_transforms
-from emgs_jax.io.colmap import save_colmap
-from emgs_jax.io.frustums import save_frustums
+from emgs_jax.io.cameras import save_colmap, save_frustums
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.ops.camera import Camera

@@ -42,12 +42,11 @@ from emgs_jax.data.seven_scenes import SevenScenes
 from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.data.tum import Tum
 from emgs_jax.evaluation.clouds import read_cloud
-from emgs_jax.evaluation.labelled_mesh import read_labelled_mesh
+from emgs_jax.evaluation.segmentation import read_labelled_mesh
 from emgs_jax.features.text import TextEmbeddings, load_text, save_text
 from emgs_jax.gaussian_map import empty_map
-from emgs_jax.io.colmap import save_colmap
+from emgs_jax.io.cameras import save_colmap, save_transforms
 from emgs_jax.io.map_file import load_map, save_map
-from emgs_jax.io.nerfstudio import save_transforms
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.loop_closure.place_recognition import Keyframe, add_keyframe

@@ -11,6 +11,7 @@ import numpy as np
 from emgs_jax.data.file_names import natural_key
 from emgs_jax.data.reading import decode, is_rigid
 from emgs_jax.io.npz import npz_names, read_npz
+from emgs_jax.io.packages import extra
 from emgs_jax.prior.files.view import Intrinsics, View, usable
 
 MAX_POSITION = 1e6  # in the unit of the file
@@ -59,12 +60,9 @@ def load_png(path: Path, units_per_metre: float) -> np.ndarray:
 
 def load_exr(path: Path) -> np.ndarray:
     """Depths of an OpenEXR file; needs the package OpenEXR."""
+    exr = extra("OpenEXR", f"{path}: EXR needs the package OpenEXR", "exr")
     try:
-        import OpenEXR  # noqa: PLC0415 (an extra)
-    except ImportError as error:
-        raise ValueError(f'{path}: EXR needs the package OpenEXR: pip install "emgs_jax[exr]"') from error
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with exr.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except Exception as error:  # the library raises what it likes
         raise ValueError(f"{path} is no EXR that can be read ({error}): write it again") from error

@@ -6,10 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.calibration_files import colmap_camera
-from emgs_jax.data.colmap_model import load_colmap
 from emgs_jax.data.posed_images import find_model
 from emgs_jax.data.reading import resize_intrinsics
-from emgs_jax.ops.axes import FLIP
+from emgs_jax.ops.constants import FLIP
 from emgs_jax.prior.files.arrays import (
     as_intrinsics,
     as_poses,
@@ -29,7 +28,7 @@ COLMAP_KINDS = (".geometric.bin", ".photometric.bin")  # the first that is there
 
 def read_colmap_workspace(folder: Path) -> Predictions:
     """`dense/` of `colmap patch_match_stereo`: stereo/depth_maps/IMAGE.geometric.bin and the sparse model."""
-    model = load_colmap(find_model(folder, None))
+    model = find_model(folder, None)
     maps = folder / DEPTH_MAPS
     kind = next((kind for kind in COLMAP_KINDS if any(maps.rglob(f"*{kind}"))), COLMAP_KINDS[0])
     paths = [maps / f"{name}{kind}" for name in model.names]

@@ -14,7 +14,7 @@ from typing import Any
 
 from omegaconf.errors import OmegaConfBaseException
 
-from emgs_jax.io.torch_packages import companion_problem, first_line
+from emgs_jax.io.packages import companion_problem, first_line
 from emgs_jax.prior.network.framework import CHECKPOINT_FILES, DOWNLOAD, MODELS
 
 CLONE = "the clone of facebookresearch/map-anything"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from emgs_jax.io.torch_packages import best_device
+from emgs_jax.io.packages import best_device
 from emgs_jax.prior.network.framework import (
     MODELS,
     USED_OUTPUTS,

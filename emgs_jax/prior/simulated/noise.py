@@ -1,4 +1,4 @@
-"""Seeded random numbers, fields and motions that the `simulated` prior is made of.
+"""Seeded random numbers, fields, motions and mistaken classes that the `simulated` prior is made of.
 
 A `key` is (seed, stream, inference, frames…): what is drawn depends on it only, never on earlier calls.
 """
@@ -8,7 +8,12 @@ from enum import IntEnum
 
 import cv2
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
+
+CELL = 2.0  # m between places from which it errs differently
+SECTORS = 2.0  # steps of the viewing direction's coordinates in a unit: about 30° apart
+OFFSET = 2**20  # random streams have no negative keys
 
 
 class Stream(IntEnum):
@@ -100,3 +105,23 @@ def edge_band(depth: np.ndarray, step: float) -> np.ndarray:
         beside[a] |= is_step
         beside[b] |= is_step
     return (cv2.dilate(beside, np.ones((3, 3), np.uint8)) > 0) & (depth > 0)
+
+
+def confused(
+    labels: Int[np.ndarray, "h w"], T_world_camera: Float[np.ndarray, "4 4"], num_classes: int, share: float, seed: int
+) -> Int[np.ndarray, "h w"]:
+    """The labels as seen from one place in one direction, where each class is another one with probability `share`.
+
+    All pixels of a class err together, and so do all frames of one cell and sector, so more frames from there are no
+    more evidence; another view errs independently. A pixel without a class (-1) has none.
+    """
+    if share <= 0:
+        return labels
+    place = np.rint(T_world_camera[:3, 3] / CELL)
+    view = np.rint(SECTORS * T_world_camera[:3, 2])
+    key = (np.concatenate([place, view]) + OFFSET).astype(int).tolist()
+    rng = np.random.default_rng((seed, Stream.CONFUSION, *key))
+    taken_for = np.where(
+        rng.random(num_classes) < share, rng.integers(num_classes, size=num_classes), range(num_classes)
+    )
+    return np.append(taken_for, -1)[labels].astype(labels.dtype)

@@ -32,11 +32,10 @@ from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.features.text import random_embeddings
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
-from emgs_jax.prior.simulated.confusion import confused
-from emgs_jax.prior.simulated.covisibility import shared_points
 from emgs_jax.prior.simulated.noise import (
     Stream,
     autoregressive,
+    confused,
     edge_band,
     normals,
     random_walk,
@@ -44,7 +43,7 @@ from emgs_jax.prior.simulated.noise import (
     shared_normals,
     smooth_field,
 )
-from emgs_jax.prior.simulated.truth import check_frames, no_truth
+from emgs_jax.prior.simulated.truth import check_frames, no_truth, shared_points
 
 VERSIONS = (1, 2)
 REVISITS = 2**24  # more than any sequence has inferences

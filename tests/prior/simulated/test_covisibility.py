@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from emgs_jax.data.base import Frame
-from emgs_jax.prior.simulated.covisibility import shared_points
+from emgs_jax.prior.simulated.truth import shared_points
 
 WIDTH, HEIGHT = 80, 60
 INTRINSICS = (40.0, 40.0, 39.5, 29.5)  # at 2 m the image is 4 m wide

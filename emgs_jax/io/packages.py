@@ -1,4 +1,4 @@
-"""Packages that are compiled for one version of PyTorch: which of those installed was compiled for another."""
+"""Packages that need not be there, and those that are compiled for another version of PyTorch."""
 
 import importlib
 import importlib.util
@@ -10,6 +10,23 @@ REMEDIES = {
     "torchaudio": "nothing here uses it: pip uninstall torchaudio",
     "torchvision": "pip install --force-reinstall torch torchvision, both from the package index that torch is from",
 }
+
+
+def extra(module: str, words: str, name: str) -> ModuleType:
+    """Import a module that one of the extras of this package brings.
+
+    Args:
+        module: to import.
+        words: what needs it, for the message.
+        name: of the extra.
+
+    Raises:
+        ValueError: it is not installed; the message says how it would be.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ValueError(f'{words}: pip install "emgs_jax[{name}]"') from error
 
 
 def companion_problem() -> str | None:

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from emgs_jax.io.torch_packages import REMEDIES, companion_problem, first_line
+from emgs_jax.io.packages import REMEDIES, companion_problem, first_line
 
 
 @pytest.fixture
