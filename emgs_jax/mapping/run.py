@@ -168,7 +168,7 @@ def record_step(run: MappingRun, window: WindowInput, frame: TrackedFrame, secon
 
 
 def covariance_of_map(run: MappingRun, pose: np.ndarray, origin: int | None) -> np.ndarray:
-    """Covariance (6, 6), at a pose, of the part of the map to which a frame was registered, relative to the first frame.
+    """Covariance (6, 6), seen from a pose, of the part of the map it was registered to, relative to the first frame.
 
     That part errs as a whole by what the frame erred that it was made of, the origin: on a way out errors add up from
     one origin to the next, and where a place is seen again they are what they were. A frame that nothing in the map

@@ -94,7 +94,7 @@ def propagate(estimate: PoseEstimate, T_previous_current: jaxlie.SE3, noise: Flo
 def correct(
     estimate: PoseEstimate, difference: Float[Array, "7"], information: Float[Array, "7 7"]
 ) -> tuple[Float[Array, "7"], PoseEstimate]:
-    """Correct the pose estimate by a measurement: return the step of the mean, and the estimate; see `kalman_update`."""
+    """Correct the estimate by a measurement: return the step of the mean, and the estimate; see `kalman_update`."""
     step, covariance = kalman_update(estimate.covariance, difference, information)
     return step, eqx.tree_at(lambda b: b.covariance, estimate, covariance)
 
