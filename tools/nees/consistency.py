@@ -22,7 +22,7 @@ class Consistency(NamedTuple):
 
     Args:
         directions: (6,), by the principal axes of the correlations, the best known first.
-        quarters: (4,), of the path.
+        quarters: (4,), of the path; fewer where there are fewer frames.
     """
 
     mean: float
@@ -48,7 +48,7 @@ def consistency(errors: np.ndarray, covariances: np.ndarray) -> Consistency:
         float(nees(errors[:, :3], covariances[:, :3, :3]).mean()),
         float(nees(errors[:, 3:], covariances[:, 3:, 3:]).mean()),
         np.mean(np.einsum("nij,ni->nj", axes, errors / std) ** 2 / variances, axis=0),
-        np.array([part.mean() for part in np.array_split(of_frames, 4)]),
+        np.array([part.mean() for part in np.array_split(of_frames, min(4, len(of_frames)))]),
     )
 
 
