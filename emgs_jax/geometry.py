@@ -65,6 +65,16 @@ def scale_covariance(covariance: np.ndarray, scale: float) -> np.ndarray:
     return units[:, None] * covariance * units
 
 
+def seen_from(
+    covariance: Float[np.ndarray, "6 6"], T_world_there: Float[np.ndarray, "4 4"], T_world: Float[np.ndarray, "n 4 4"]
+) -> Float[np.ndarray, "n 6 6"]:
+    """Covariances of other poses that err with the one there as one rigid body: Ad Σ Adᵀ, each in its own axes."""
+    T = np.linalg.inv(T_world) @ T_world_there
+    rotations, across = T[:, :3, :3], np.cross(T[:, None, :3, 3], T[:, :3, :3], axisb=1, axisc=1)
+    adjoints = np.block([[rotations, across], [np.zeros_like(rotations), rotations]])
+    return adjoints @ covariance @ adjoints.transpose(0, 2, 1)
+
+
 def scale_pose(T: Float[np.ndarray, "4 4"], scale: float) -> Float[np.ndarray, "4 4"]:
     """Return a pose with its translation in other units."""
     return np.block([[T[:3, :3], scale * T[:3, 3:]], [T[3:]]])

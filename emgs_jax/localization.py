@@ -56,8 +56,9 @@ class LocalizationConfig(eqx.Module):
         max_pair_distance: fraction of the depth; farther points are no pair.
         pose_shared: part of the variance of the prior's poses that two of its answers about one have in common, see
             `pose_std`; 1: their differences are ignored, those of depths are used (printed).
-        num_alike, num_shared: frames that see one part of the map, and whose windows share images: they err alike, see
-            `correct_by_points` and `correct`.
+        num_alike: frames that see one part of the map and err alike, see `correct_by_points`.
+        num_shared: frames whose windows share images: so many differences of repeats count, see `repeat_poses`, and the
+            first frame is half as many motions from the middle of its window, see `own_covariance`.
         min_inlier_fraction: of the points, below which the fine pose is not accepted.
         max_residual: root mean square distance to the map's planes, as a fraction of the depth.
         max_step: between the coarse and the fine pose, as a fraction of the mean depth.
@@ -199,7 +200,7 @@ def _correct_by_prior(
     weights = is_used / (std**2 * (1.0 + chi_sq / apart.shape[0]))
     difference = jnp.append(apart, estimate.log_scale - jnp.log(scale))
     weights = jnp.append(weights, config.scale_std**-2)
-    step, estimate = correct(estimate, difference, jnp.diag(weights), config.num_shared)
+    step, estimate = correct(estimate, difference, jnp.diag(weights))
     return T_world_camera @ jaxlie.SE3.exp(step[:-1]), scale * jnp.exp(step[-1]), estimate
 
 

@@ -67,9 +67,7 @@ def image_of(seed: int):
 
 def belief_of(seed: int) -> pose_estimate.PoseEstimate:
     covariance = sc.device(np.diag([4e-4] * 3 + [1e-4] * 4) * (1.0 + seed))
-    return pose_estimate.PoseEstimate(
-        covariance, covariance, *map(sc.device, (0.01, 0.02, 3.0)), pose_noise.no_repeats()
-    )
+    return pose_estimate.PoseEstimate(covariance, *map(sc.device, (0.01, 0.02, 3.0)), pose_noise.no_repeats())
 
 
 def coarse_of(seed: int) -> localization.CoarsePose:

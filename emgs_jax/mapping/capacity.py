@@ -49,7 +49,7 @@ def restart_map(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[S
     """Restart the map from its last frame, at that frame's pose, as from a first window of this one view.
 
     For a camera that no longer fits the map and cannot be relocalized in it. All Gaussians of the map stay. Relative to
-    the new ones the frame's pose is exact, relative to the first frame it is as uncertain as it was.
+    the new ones the frame's pose is exact.
 
     Args:
         state: after the step of that frame, which has points.

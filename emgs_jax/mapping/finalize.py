@@ -16,7 +16,7 @@ from emgs_jax.back_end.state import transform_nodes
 from emgs_jax.device.arrays import on_device
 from emgs_jax.device.executables import stored
 from emgs_jax.gaussian_map import GaussianMap
-from emgs_jax.geometry import Sim3
+from emgs_jax.geometry import Sim3, seen_from
 from emgs_jax.localization import LocalizationConfig
 from emgs_jax.mapping.records import transform_record
 from emgs_jax.mapping.run import MappingRun
@@ -29,8 +29,10 @@ from emgs_jax.slam import SlamState
 def own_covariance(state: SlamState, config: LocalizationConfig) -> np.ndarray:
     """Estimate the covariance (6, 6) of the first frame's pose, in its own axes, from repeated predictions.
 
-    The error of the first pose is in all later ones. It is not known when the map starts: only the repeated predictions
-    of the whole run show how noisy the prior's poses are. 0 where no prediction has repeated another.
+    The first frame is at the end of its window, and the map is held by those in the middle: half a window of motions
+    lies between, each with an error of its own, and what these sum up to is in all later poses. It is not known when
+    the map starts: only the repeated predictions of the whole run show how noisy the motions are. 0 where no prediction
+    has repeated another.
 
     Args:
         state: after the last step; m of its map.
@@ -40,7 +42,7 @@ def own_covariance(state: SlamState, config: LocalizationConfig) -> np.ndarray:
     if not is_known or float(config.pose_shared) >= 1:
         return np.zeros((6, 6))
     std = _own_std(estimate, last, state.T_world_previous, (config.icp.prior_information, config.pose_shared))
-    return np.diag(np.asarray(std, np.float64) ** 2)
+    return np.diag(0.5 * float(config.num_shared) * np.asarray(std, np.float64) ** 2)
 
 
 @stored
@@ -69,16 +71,6 @@ def with_first_frame(run: MappingRun) -> MappingRun:
     for row, covariance in zip(rows, added, strict=True):
         records[row] = replace(records[row], covariance=records[row].covariance + covariance)
     return replace(run, records=tuple(records), first_covariance=own)
-
-
-def seen_from(
-    own: Float[np.ndarray, "6 6"], T_world_first: Float[np.ndarray, "4 4"], T_world_cameras: Float[np.ndarray, "n 4 4"]
-) -> Float[np.ndarray, "n 6 6"]:
-    """Propagate the first frame's covariance to other poses: Ad own Adᵀ, each in its own axes."""
-    T = np.linalg.inv(T_world_cameras) @ T_world_first
-    rotations, across = T[:, :3, :3], np.cross(T[:, None, :3, 3], T[:, :3, :3], axisb=1, axisc=1)
-    adjoints = np.block([[rotations, across], [np.zeros_like(rotations), rotations]])
-    return adjoints @ own @ adjoints.transpose(0, 2, 1)
 
 
 def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:

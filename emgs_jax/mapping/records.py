@@ -59,7 +59,7 @@ class FrameRecord:
         true_pose: None where unknown.
         newest_pose: temporary pose of the next frame.
         covariance: (6, 6) of ξ where the true pose is T Exp(ξ), translation (m), rotation (rad); of the pose as first
-            estimated, relative to the first frame.
+            estimated, relative to the first frame (to a saved map in one).
         inliers: points that agree with the map.
         residual: of these to the map's planes, as a fraction of their depth.
         scale: factor on the prediction's lengths; the frames that a map is made from give it its unit.

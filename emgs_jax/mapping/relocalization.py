@@ -191,7 +191,7 @@ def relocalized_start(
     again = replace(placed, previous=placed.current, T_world_views=jaxlie.SE3(views), is_repeat=jnp.asarray(False))
     covariance, log_scale = (jnp.asarray(x, jnp.float32) for x in (location.covariance, location.log_scale))
     state = state_in_saved_map(run, prediction) if run.state is None else run.state
-    estimate = replace(state.estimate, covariance=covariance, world_covariance=covariance)
+    estimate = replace(state.estimate, covariance=covariance)
     if run.state is None:
         widths = state.map.gaussians.features.shape[-1], prediction.current.features.shape[-1]
         if widths[0] != widths[1]:

@@ -17,6 +17,7 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.device.arrays import to_matrix
 from emgs_jax.device.clock import Clock
 from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.geometry import seen_from
 from emgs_jax.localization import REASONS
 from emgs_jax.loop_closure.prior_query import PriorQuery
 from emgs_jax.mapping.convert import to_camera
@@ -161,7 +162,33 @@ def record_step(run: MappingRun, window: WindowInput, frame: TrackedFrame, secon
         count = int(np.asarray(run.map.gaussians.valid).sum())
         kept = {"status": "initialization", "new": count - int(info.num_gaussians), "num_gaussians": count}
     outcome = {"location": frame.location, "similarity": frame.similarity}
-    return _add(run, window, 0, **_step_fields(info) | kept | outcome, **seconds)
+    fields = _step_fields(info)
+    fields["covariance"] = fields["covariance"] + covariance_of_map(run, fields["pose"], fields["origin"])
+    return _add(run, window, 0, **fields | kept | outcome, **seconds)
+
+
+def covariance_of_map(run: MappingRun, pose: np.ndarray, origin: int | None) -> np.ndarray:
+    """Covariance (6, 6), seen from a pose, of the part of the map it was registered to, relative to the first frame.
+
+    That part errs as a whole by what the frame erred that it was made of, the origin: on a way out errors add up from
+    one origin to the next, and where a place is seen again they are what they were. A frame that nothing in the map
+    explains has the origin of the frame before. A saved map is exact.
+    """
+    rows = (_row_of_node(run, one) for one in (origin, *(record.origin for record in reversed(run.records))))
+    row = next((row for row in rows if row is not None and row < len(run.records)), None)
+    there = None if row is None else run.records[row]
+    if there is None or there.covariance is None:
+        return np.zeros((6, 6))
+    return seen_from(there.covariance, there.pose, pose[None])[0]
+
+
+def _row_of_node(run: MappingRun, node: int | None) -> int | None:
+    """Return the row of the record of a frame that is counted from the map's first one; None of one in a saved map."""
+    if run.saved is None:
+        first = next(row for row, record in enumerate(run.records) if record.status == "initialization")
+        return None if node is None else first + node
+    first_node = run.back_end.first_node
+    return None if node is None or node < first_node else row_of_first_node(run) + node - first_node
 
 
 def _add(run: MappingRun, window: WindowInput, row: int, **described: Any) -> MappingRun:
@@ -187,7 +214,7 @@ def _step_fields(info: StepInfo) -> dict[str, Any]:
         "reason": "; ".join(reasons) or None,
         "pose": to_matrix(info.T_world_camera.wxyz_xyz),
         "newest_pose": to_matrix(info.T_world_newest.wxyz_xyz),
-        "covariance": np.asarray(localization.estimate.world_covariance, np.float64)[:-1, :-1],
+        "covariance": np.asarray(localization.estimate.covariance, np.float64)[:-1, :-1],
         "inliers": int(localization.icp.num_inliers),
         "residual": float(localization.icp.residual),
         "scale": float(localization.scale),

@@ -1,8 +1,8 @@
 """Estimate of a frame's pose and scale: prediction and correction of a Kalman filter from frame to frame.
 
-The error of a pose T and a scale s is T Exp(ξ) and s e^σ with (ξ, σ) ~ N(0, P), in the order translation (m), rotation
-(rad), logarithm of the scale. There are two P. One is relative to the map, into which a frame is fitted. The other is
-relative to the first frame, and includes the errors of the map: it is for the user, and no pose depends on it.
+The error of a pose T and a scale s, relative to the map, is T Exp(ξ) and s e^σ with (ξ, σ) ~ N(0, P), in the order
+translation (m), rotation (rad), logarithm of the scale. The errors of the map itself are no part of it; where a frame
+is relative to the first one, `mapping/run.py` says.
 """
 
 import equinox as eqx
@@ -23,14 +23,12 @@ class PoseEstimate(eqx.Module):
 
     Args:
         covariance: P of its pose and scale, relative to the map.
-        world_covariance: P relative to the first frame.
         depth_noise: how much its points differ from the map, as a fraction of their depth.
         log_scale: mean logarithm of the scales of the tracked frames: the prior's own unit, in that of the map.
         repeats: differences between repeated predictions of one pose.
     """
 
     covariance: Float[Array, "*b 7 7"]
-    world_covariance: Float[Array, "*b 7 7"]
     depth_noise: Float[Array, "*b"]
     log_scale: Float[Array, "*b"]
     num_scales: Float[Array, "*b"]
@@ -39,8 +37,7 @@ class PoseEstimate(eqx.Module):
 
 def exact_estimate() -> PoseEstimate:
     """Return the estimate of the frame that the map is made of: its pose is exact, and its scale is the unit."""
-    exact = jnp.zeros((DEGREES, DEGREES))
-    return PoseEstimate(exact, exact, jnp.zeros(()), jnp.zeros(()), jnp.ones(()), no_repeats())
+    return PoseEstimate(jnp.zeros((DEGREES, DEGREES)), jnp.zeros(()), jnp.zeros(()), jnp.ones(()), no_repeats())
 
 
 @full_precision
@@ -78,11 +75,10 @@ def rescale_estimate(estimate: PoseEstimate, factor: Float[Array, ""]) -> PoseEs
     """Return the estimate after all lengths of the map are multiplied by `factor`."""
     units = jnp.ones(DEGREES).at[:3].set(factor)
     return eqx.tree_at(
-        lambda b: (b.covariance, b.world_covariance, b.log_scale, b.repeats),
+        lambda b: (b.covariance, b.log_scale, b.repeats),
         estimate,
         (
             units[:, None] * estimate.covariance * units,
-            units[:, None] * estimate.world_covariance * units,
             estimate.log_scale + jnp.log(factor),
             rescale_repeats(estimate.repeats, factor),
         ),
@@ -91,26 +87,16 @@ def rescale_estimate(estimate: PoseEstimate, factor: Float[Array, ""]) -> PoseEs
 
 def propagate(estimate: PoseEstimate, T_previous_current: jaxlie.SE3, noise: Float[Array, "7"]) -> PoseEstimate:
     """Propagate the estimate to the current frame, before any measurement; see `propagate_covariance`."""
-    found = (
-        propagate_covariance(P, T_previous_current, noise) for P in (estimate.covariance, estimate.world_covariance)
-    )
-    return eqx.tree_at(lambda b: (b.covariance, b.world_covariance), estimate, tuple(found))
+    covariance = propagate_covariance(estimate.covariance, T_previous_current, noise)
+    return eqx.tree_at(lambda b: b.covariance, estimate, covariance)
 
 
 def correct(
-    estimate: PoseEstimate,
-    difference: Float[Array, "7"],
-    information: Float[Array, "7 7"],
-    num_shared: Float[Array, ""],
+    estimate: PoseEstimate, difference: Float[Array, "7"], information: Float[Array, "7 7"]
 ) -> tuple[Float[Array, "7"], PoseEstimate]:
-    """Correct the pose estimate by a measurement: return the step of the mean, and the estimate; see `kalman_update`.
-
-    The errors of a prior's own poses are alike in all frames whose windows share images: about the pose in the world
-    each of these `num_shared` frames has only that part of the information.
-    """
+    """Correct the estimate by a measurement: return the step of the mean, and the estimate; see `kalman_update`."""
     step, covariance = kalman_update(estimate.covariance, difference, information)
-    _, world = kalman_update(estimate.world_covariance, difference, information / num_shared)
-    return step, eqx.tree_at(lambda b: (b.covariance, b.world_covariance), estimate, (covariance, world))
+    return step, eqx.tree_at(lambda b: b.covariance, estimate, covariance)
 
 
 @full_precision
@@ -137,15 +123,14 @@ def correct_by_points(
             factor.
         depth_noise: expected, as a fraction of the depth.
         num_alike: frames that see one part of the map, which is wrong for all of them in the same way: the information
-            of one frame's points about the scale, and about the pose in the world, is divided by it.
+            of one frame's points about the scale is divided by it.
     """
     worth, nothing = jnp.maximum(found.misfit / depth_noise, 1.0) ** 2, jnp.zeros(DEGREES)
     units = jnp.ones(DEGREES).at[-1].set(num_alike**-0.5)
     _, covariance = kalman_update(worth * estimate.covariance, nothing, units[:, None] * found.information * units)
-    _, world = kalman_update(worth * estimate.world_covariance, nothing, found.information / num_alike)
     num_scales = estimate.num_scales + 1.0
     log_scale = estimate.log_scale + (jnp.log(scale) - estimate.log_scale) / num_scales
     # Predicted poses are repeated predictions of the next frame, whether the points fit or not.
     estimate = eqx.tree_at(lambda b: b.repeats, estimate, rescale_repeats(estimate.repeats, scale))
-    after = PoseEstimate(covariance, world, found.misfit, log_scale, num_scales, estimate.repeats)
+    after = PoseEstimate(covariance, found.misfit, log_scale, num_scales, estimate.repeats)
     return jax.tree.map(lambda new, old: jnp.where(is_tracked, new, old), after, estimate)

@@ -14,13 +14,13 @@ from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
+from emgs_jax.geometry import seen_from
 from emgs_jax.io.files import atomic_write, remove_temporaries, write_json
 from emgs_jax.io.map_file import save_map
 from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import from_tum, save_trajectory_tum
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE
-from emgs_jax.mapping.finalize import seen_from
 from emgs_jax.mapping.records import NEW_SUBMAP, UNJOINED
 from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior

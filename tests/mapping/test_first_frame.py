@@ -38,12 +38,12 @@ def a_run(count: float = COUNT, shared: float = 0.75) -> MappingRun:
     return MappingRun(None, slam_config(f"slam.localization.pose_shared={shared}"), state=state, records=records)
 
 
-def test_the_first_frame_is_as_uncertain_as_the_motions_turned_out_to_be():
+def test_the_first_frame_is_as_uncertain_as_half_a_window_of_motions_turned_out_to_be():
     run = a_run()
-    expected = DIFFERENCE / np.sqrt(2 * 0.25)  # two answers differ by the variance 2 (1 - c) v
+    of_motion = DIFFERENCE / np.sqrt(2 * 0.25)  # two answers differ by the variance 2 (1 - c) v
     depth = np.mean(np.asarray(random_observation(20).points)[:, 2])
     own = own_covariance(run.state, run.config.localization)
-    std = np.repeat(expected * [depth, 1.0], 3)
+    std = np.sqrt(run.config.window_size / 2) * np.repeat(of_motion * [depth, 1.0], 3)
     np.testing.assert_allclose(own, np.diag(std**2), rtol=1e-3)
 
 

@@ -33,8 +33,8 @@ def covariance(seed: int = 0) -> np.ndarray:
     return np.float32(factor @ factor.T + 1e-5 * np.eye(7))
 
 
-def both_known():
-    return replace(exact_estimate(), covariance=covariance(), world_covariance=covariance(2))
+def known():
+    return replace(exact_estimate(), covariance=covariance())
 
 
 def test_the_errors_of_the_next_pose_are_distributed_as_predicted():
@@ -63,13 +63,10 @@ def test_in_another_unit_of_length_all_is_known_as_well_as_before():
     """Of which a metre has three times as many: motion, noise and errors of the pose are three times as long."""
     factor, units = np.float32(3.0), np.float32([3.0] * 3 + [1.0] * 4)
     longer = jaxlie.SE3(MOTION.wxyz_xyz * np.float32([1.0] * 4 + [3.0] * 3))
-    found = moved(rescaled(both_known(), factor), longer, units * NOISE)
-    expected = rescaled(moved(both_known(), MOTION, NOISE), factor)
-    for name in ("covariance", "world_covariance"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-4, atol=1e-9)
-        np.testing.assert_array_equal(
-            getattr(rescaled(both_known(), factor), name)[3:, 3:], getattr(both_known(), name)[3:, 3:]
-        )
+    found = moved(rescaled(known(), factor), longer, units * NOISE)
+    expected = rescaled(moved(known(), MOTION, NOISE), factor)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-4, atol=1e-9)
+    np.testing.assert_array_equal(rescaled(known(), factor).covariance[3:, 3:], covariance()[3:, 3:])
     assert expected.log_scale == pytest.approx(np.log(3.0))
 
 
@@ -90,14 +87,12 @@ def test_what_is_certain_stays_and_what_is_not_measured_says_nothing():
     np.testing.assert_allclose(after, covariance(), rtol=1e-4, atol=1e-8)
 
 
-def test_both_covariances_take_motion_and_measurement_and_the_step_is_that_in_the_map():
+def test_the_estimate_takes_motion_and_measurement():
     W = np.linalg.inv(covariance(1))
-    step, after = measured(moved(both_known(), MOTION, NOISE), STEP, W, np.float32(4.0))
+    step, after = measured(moved(known(), MOTION, NOISE), STEP, W)
     expected_step, expected = update(predict(covariance(), MOTION, NOISE), STEP, W)
     np.testing.assert_allclose(step, expected_step, rtol=1e-5)
     np.testing.assert_allclose(after.covariance, expected, rtol=1e-5)
-    _, expected = update(predict(covariance(2), MOTION, NOISE), STEP, W / 4.0)  # four frames err alike in the world
-    np.testing.assert_allclose(after.world_covariance, expected, rtol=1e-5)
 
 
 def test_the_root_measures_the_mahalanobis_distance():
@@ -108,7 +103,7 @@ def test_the_root_measures_the_mahalanobis_distance():
 
 def test_a_frame_that_is_tracked_is_known_as_its_points_say_and_another_as_before():
     twice = jaxlie.SE3(device(np.tile(MOTION.wxyz_xyz, (2, 1))))
-    before = jax.device_get(eqx.tree_at(lambda b: b.repeats.predicted, both_known(), twice))
+    before = jax.device_get(eqx.tree_at(lambda b: b.repeats.predicted, known(), twice))
     zero, one, information = device(0.0), device(np.int32(1)), 1e4 * np.eye(7)
     numbers = zero, zero, device(0.04), device(np.zeros(8)), device(np.zeros(7)), device(information), zero, zero
     found = IcpInfo(one, *numbers, one, device(True))
@@ -118,15 +113,12 @@ def test_a_frame_that_is_tracked_is_known_as_its_points_say_and_another_as_befor
     nothing, said = np.zeros(7, np.float32), np.float32(np.diag([1e4] * 6 + [2e3]))
     _, expected = update(4.0 * covariance(), nothing, said)
     np.testing.assert_allclose(after.covariance, expected, rtol=1e-5)
-    # And so of the place in the world.
-    _, expected = update(4.0 * covariance(2), nothing, np.float32(information / 5.0))
-    np.testing.assert_allclose(after.world_covariance, expected, rtol=1e-5)
     np.testing.assert_allclose(after.log_scale, np.log(1.1) / 2, rtol=1e-5)
     assert after.num_scales == 2 and after.depth_noise == pytest.approx(0.04)
     same = next_belief(*arguments, np.array(False), np.float32(5.0))
     # What the prior said of the poses is said, whether its points fit or not: in the unit of its final scale.
-    for known in (after, same):
-        said = known.repeats.predicted.wxyz_xyz[:, 4:]
+    for one in (after, same):
+        said = one.repeats.predicted.wxyz_xyz[:, 4:]
         np.testing.assert_allclose(said, 1.1 * before.repeats.predicted.wxyz_xyz[:, 4:], rtol=1e-6)
     same = eqx.tree_at(lambda b: b.repeats, same, before.repeats)
     for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(before), strict=True):

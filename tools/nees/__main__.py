@@ -12,7 +12,7 @@ import numpy as np
 
 import emgs_jax
 
-from .consistency import band, nees_of_run
+from .consistency import band, consistency_of_run
 
 
 def main() -> int:
@@ -24,8 +24,14 @@ def main() -> int:
     for run in range(given.runs):  # the defaults were chosen with the prior's seeds 0, 1 and 2
         words = given.words or (f"dataset.seed={run}",)
         config = emgs_jax.load_config(f"prior.seed={run + 3}", "dataset.size=[160,120]", *words)
-        found.append(nees_of_run(emgs_jax.map_sequence(config)))
-        print(f"run {run}: NEES / 6 = {found[-1]:.2f}", flush=True)
+        said = consistency_of_run(emgs_jax.map_sequence(config))
+        found.append(said.mean)
+        print(
+            f"run {run}: NEES / 6 = {said.mean:.2f}, median {said.median:.2f}; translation {said.translation:.2f}, "
+            f"rotation {said.rotation:.2f}; by direction {said.directions.round(2)}, by quarter of the path "
+            f"{said.quarters.round(2)}",
+            flush=True,
+        )
     low, high = band(len(found))
     print(f"mean {np.mean(found):.2f}; 95 % of such means lie between {low:.2f} and {high:.2f}")
     return int(not low <= np.mean(found) <= high)
