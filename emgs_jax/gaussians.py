@@ -39,7 +39,7 @@ class Gaussians(eqx.Module):
 
 
 class GaussianIndex(eqx.Module):
-    """What it takes to search in Gaussians and to measure distances to them, made once for all stages."""
+    """Index of Gaussians: what a search in them and their distances to them, made once for all stages."""
 
     white: Whitening  # of the covariances
     groups: Groups  # of the means of the valid ones

@@ -48,7 +48,7 @@ def read_vertices(path: str | os.PathLike) -> dict[str, np.ndarray]:
 
 
 def num_faces(path: str | os.PathLike) -> int:
-    """How many faces a PLY announces."""
+    """Count the faces that a PLY announces."""
     with Path(path).open("rb") as file:
         _, elements, _ = _header(file.read(_MAX_HEADER_BYTES + len("\r\n")), path)
     return sum(element.count for element in elements if element.name == "face")

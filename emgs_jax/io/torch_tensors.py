@@ -120,7 +120,7 @@ def _value(stream: BytesIO) -> Any:
 
 
 def _made(name: str, arguments: tuple) -> Any:
-    """What a function that is named in the file would make."""
+    """Stand-in for what a function that is named in the file would make."""
     if name == "collections OrderedDict" and not arguments:
         return {}
     if name == "torch._utils _rebuild_tensor_v2":

@@ -109,7 +109,7 @@ def new_run(
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """What is known of a frame after its step.
+    """A frame after its step.
 
     Args:
         info: result of the step; None where the camera has no pose yet.

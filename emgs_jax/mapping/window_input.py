@@ -54,7 +54,7 @@ class WindowInput:
 
     @property
     def data(self) -> list[FrameData]:
-        """What the back end needs of each frame."""
+        """Parts of a frame that the back end needs."""
         return [
             FrameData(frame.index, frame.image, raw.points, raw.mask, self.T_anchor_views)
             for frame, raw in zip(self.frames, self.raw, strict=True)

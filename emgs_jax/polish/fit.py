@@ -41,7 +41,7 @@ class Rates:
 
 @dataclass(frozen=True)
 class PolishConfig:
-    """How splats are made and fitted.
+    """Settings of splats: how they are made and fitted.
 
     Args:
         pixels_per_splat: of the frame that makes it.
@@ -98,7 +98,7 @@ class Views(NamedTuple):
 
 
 class State(NamedTuple):
-    """Where a fit is: what it has found, and Adam's moments."""
+    """State of a fit: what it has found, and Adam's moments."""
 
     fitted: Appearance
     offsets: Float[Array, "m 6"]  # of the poses, in spreads

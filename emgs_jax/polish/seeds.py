@@ -1,4 +1,4 @@
-"""Where splats begin: on the surface that the map shows in the frames, in the colours of their images."""
+"""Start splats on the surface that the map shows in the frames, in the colours of their images."""
 
 from collections.abc import Callable, Sequence
 

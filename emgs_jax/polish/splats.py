@@ -18,7 +18,7 @@ FLATNESS = 0.1  # thickness of a splat as a share of its smaller width where it 
 
 
 class Anchors(eqx.Module):
-    """Where splats begin, which is not fitted.
+    """Places where splats begin, which are not fitted.
 
     Args:
         means: m, world.
@@ -34,7 +34,7 @@ class Anchors(eqx.Module):
 
 
 class Appearance(eqx.Module):
-    """What is fitted of every splat.
+    """Parameters of every splat that are fitted.
 
     Args:
         colors: RGB.
@@ -113,7 +113,7 @@ def draw(
 
 
 class Misfit(NamedTuple):
-    """What `loss` has seen.
+    """Errors that `loss` has seen.
 
     Args:
         mean_sq: squared error of the colours.

@@ -69,7 +69,7 @@ class Uncertainty(eqx.Module):
 
 
 class CoarseStart(eqx.Module):
-    """Where ICP starts, and how much of that is known before it looks at the points.
+    """Start of ICP, and how much of that is known before it looks at the points.
 
     Args:
         T_world_coarse: also the mean of the pose.

@@ -135,7 +135,7 @@ def _save_splats(run: RecordedRun, splats: Gaussians, opacity: jax.Array, neares
 
 
 def _target(image: np.ndarray, view: DenseView) -> np.ndarray:
-    """What `loss` compares with, (h, w, 4)."""
+    """Target of `loss`, (h, w, 4)."""
     return np.concatenate([image, np.where(view.valid, view.depth, 0.0)[..., None]], axis=-1).astype(np.float16)
 
 

@@ -74,7 +74,7 @@ def _label(block: Mapping[str, Any]) -> str:
 
 
 def polish_lines(found: Mapping[str, Any]) -> list[str]:
-    """What polish.json says of the frames that were held out, in lines."""
+    """Lines of what polish.json says of the frames that were held out."""
     lines = [f"{found['polish/num_splats']:,} splats; of {found['polish/num_held_out']} frames that were not fitted:"]
     for name in ("psnr_db", "ssim", "depth_within_5_percent", "depth_l1_m", "ate_m"):
         before, after = (found.get(f"polish/{when}_{name}") for when in ("before", "after"))

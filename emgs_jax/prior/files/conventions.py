@@ -75,7 +75,7 @@ def misfit(a: Sight, b: Sight, T_a_b: Float[np.ndarray, "4 4"], intrinsics: Sequ
 
 
 def _readings() -> dict[str, Callable[[Sight], Sight]]:
-    """What a sight is in other conventions, by words for each."""
+    """Convert a sight to other conventions, by words for each."""
     found: dict[str, Callable[[Sight], Sight]] = {
         f"the poses are taken as {words}": partial(_posed, change=change) for words, change in READINGS.items()
     }

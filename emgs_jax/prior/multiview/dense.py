@@ -1,4 +1,4 @@
-"""What every way to a view's dense depth has in common: which views it is matched with, and what is accepted."""
+"""Common parts of the ways to a view's dense depth: which views it is matched with, and what is accepted."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

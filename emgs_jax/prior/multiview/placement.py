@@ -1,4 +1,4 @@
-"""Where a view is: by landmarks of the structure, by a rotation alone, by landmarks that were left behind (OpenCV)."""
+"""Placing a view: by landmarks of the structure, by a rotation alone, by landmarks that were left behind (OpenCV)."""
 
 from typing import NamedTuple
 

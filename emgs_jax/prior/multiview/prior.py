@@ -216,7 +216,7 @@ class MultiviewStereo(Prior):
         return self._stereo.estimate(matched)
 
     def _view(self, frame: int) -> Any:
-        """What the way to a depth keeps of an image; made anew when the lens is known better."""
+        """Return what the way to a depth keeps of an image; made anew when the lens is known better."""
         if frame not in self._prepared:
             self._prepared[frame] = self._stereo.prepare(self._images[frame], self._structure.lens())
         return self._prepared[frame]
