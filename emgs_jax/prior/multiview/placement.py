@@ -148,12 +148,14 @@ def _beside(
     # turned + length · direction lies on the ray: least squares of each point, and their weighted median.
     across, along = np.cross(rays, turned), np.cross(rays, T[:3, 3])
     weights = (along**2).sum(axis=1)
-    length = -(across * along).sum(axis=1) / weights
+    with np.errstate(invalid="ignore", divide="ignore"):  # nan, the last, along the baseline: it weighs nothing
+        length = -(across * along).sum(axis=1) / weights
     order = np.argsort(length)
     middle = np.searchsorted(np.cumsum(weights[order]), 0.5 * weights.sum())
     T[:3, 3] *= length[order][middle]
     projected = (turned + T[:3, 3]) @ structure.K.T
-    error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - other.pixels[rows_other], axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - other.pixels[rows_other], axis=1)
     num_fits = np.sum((projected[:, 2] > 0) & (error < config.max_reprojection_error))
     is_found = length[order][middle] > 0 and num_fits >= max(MIN_SCALED, 0.5 * len(rows))
     return other.T_ref_view @ T if is_found else None
