@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from emgs_jax.keypoints import sift
-from emgs_jax.keypoints.poses import essential, unit_rays
+from emgs_jax.keypoints.poses import essential, fits, unit_rays
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.lens import Lens, distort, straight
 from emgs_jax.prior.multiview.memory import Memory, remember
@@ -205,10 +205,7 @@ def confirmed(structure: Structure, view: View, others: Sequence[View], max_erro
         _, rows = known_common(structure, view, other)
         ids = other.landmark[rows]
         local = (structure.points[ids] - other.T_ref_view[:3, 3]) @ other.T_ref_view[:3, :3]
-        seen = local[:, 2] > 0
-        ids, pixels, local = ids[seen], other.pixels[rows[seen]], local[seen] @ structure.K.T
-        error = np.linalg.norm(local[:, :2] / local[:, 2:] - pixels, axis=1)
-        marked[ids[error < max_error]] = True
+        marked[ids[fits(local, other.pixels[rows], structure.K, max_error)]] = True
     return marked
 
 
@@ -242,8 +239,6 @@ def triangulate(structure: Structure, wanted: np.ndarray, config: MatchingConfig
     points = structure.points[ids]
     points[apart] = np.linalg.solve(hessian[apart], right[apart][..., None])[..., 0]
     local = np.einsum("nji,nj->ni", poses[views, :3, :3], points[track] - poses[views, :3, 3])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        error = np.linalg.norm((local @ structure.K.T)[:, :2] / local[:, 2:] - pixels, axis=1)
-        fits = (local[:, 2] > 0) & (error < config.max_reprojection_error)
-    points[np.bincount(track, ~fits) > 0] = np.nan
+    is_there = fits(local, pixels, structure.K, config.max_reprojection_error)
+    points[np.bincount(track, ~is_there) > 0] = np.nan
     structure.points[ids] = points

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.keypoints import sift
-from emgs_jax.keypoints.poses import essential, pose_of, unit_rays
+from emgs_jax.keypoints.poses import essential, fits, pose_of, unit_rays
 from emgs_jax.prior.multiview.landmarks import NONE, MatchingConfig, Structure, View, common
 from emgs_jax.prior.multiview.memory import without
 
@@ -73,11 +73,11 @@ def turn(structure: Structure, view: View, config: MatchingConfig) -> bool:
         return False
     other, (rows_other, rows_view) = held[np.argmax(count)], shared[np.argmax(count)]
     rays, seen = unit_rays(other.pixels[rows_other], structure.K), unit_rays(view.pixels[rows_view], structure.K)
-    fits = np.ones(len(rays), bool)
+    is_near = np.ones(len(rays), bool)
     for _ in range(NUM_TURN_STEPS):
-        rotation = Rotation.align_vectors(rays[fits], seen[fits])[0]
+        rotation = Rotation.align_vectors(rays[is_near], seen[is_near])[0]
         error = structure.K[0, 0] * np.linalg.norm(rays - rotation.apply(seen), axis=1)
-        fits = error <= max(config.max_epipolar_error, np.median(error))
+        is_near = error <= max(config.max_epipolar_error, np.median(error))
     if np.sum(error <= config.max_epipolar_error) < max(config.min_turned * len(rays), config.min_matches):
         return False
     view.T_ref_view, view.is_held = other.T_ref_view.copy(), True
@@ -131,18 +131,16 @@ def _beside(
         beside: placed views and how it lies to them.
         config: which error.
     """
-
-    def shared(other: View) -> tuple[np.ndarray, np.ndarray]:
+    shared = []
+    for other, relative in beside:
         rows_other, rows = common(other, view)
         has = np.isfinite(local[rows, 0])
-        return rows_other[has], rows[has]
-
-    telling = [pair for pair in beside if len(shared(pair[0])[0]) >= MIN_SCALED]
-    if not telling:
+        if has.sum() >= MIN_SCALED:
+            shared.append((other, relative, rows_other[has], rows[has]))
+    if not shared:
         return None
     # The length is as certain as points and parallax make it.
-    other, relative = max(telling, key=lambda pair: len(shared(pair[0])[0]) * pair[1].parallax)
-    rows_other, rows = shared(other)
+    other, relative, rows_other, rows = max(shared, key=lambda entry: len(entry[3]) * entry[1].parallax)
     T = relative.T_a_b.copy()
     turned, rays = local[rows] @ T[:3, :3].T, unit_rays(other.pixels[rows_other], structure.K)
     # turned + length · direction lies on the ray: least squares of each point, and their weighted median.
@@ -153,9 +151,6 @@ def _beside(
     order = np.argsort(length)
     middle = np.searchsorted(np.cumsum(weights[order]), 0.5 * weights.sum())
     T[:3, 3] *= length[order][middle]
-    projected = (turned + T[:3, 3]) @ structure.K.T
-    with np.errstate(invalid="ignore", divide="ignore"):
-        error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - other.pixels[rows_other], axis=1)
-    num_fits = np.sum((projected[:, 2] > 0) & (error < config.max_reprojection_error))
+    num_fits = fits(turned + T[:3, 3], other.pixels[rows_other], structure.K, config.max_reprojection_error).sum()
     is_found = length[order][middle] > 0 and num_fits >= max(MIN_SCALED, 0.5 * len(rows))
     return other.T_ref_view @ T if is_found else None
