@@ -1,6 +1,7 @@
 """Localization (Method C): where the current frame is, first through the previous frame, then against the map."""
 
 import math
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -24,7 +25,15 @@ from emgs_jax.registration.pose_estimate import (
     propagate,
     root_information,
 )
-from emgs_jax.registration.pose_noise import LEAST_NOISE, NO_INFORMATION, axis_std, repeat_poses
+from emgs_jax.registration.pose_noise import (
+    LEAST_NOISE,
+    NO_INFORMATION,
+    axis_std,
+    is_given_pose,
+    no_repeats,
+    pose_covariances,
+    repeat_poses,
+)
 from emgs_jax.registration.problem import CoarseStart, IcpConfig
 from emgs_jax.registration.repeated_prediction import repeat_error, repeat_scale, through_previous
 from emgs_jax.registration.rigid import MIN_PAIRS, pose_row, scale_translation
@@ -48,7 +57,8 @@ class LocalizationConfig(eqx.Module):
     Args:
         coarse: `via_previous` (printed): closest points in the previous image carry over to its earlier prediction;
             `same_image`: the two predictions of the previous image directly; `anchored`: the prior's own pose;
-            `fused`: the previous pose and the prior's motion from it, and `anchored`, by their uncertainties.
+            `fused`: the previous pose and the prior's motion from it, and `anchored`, by their uncertainties. Where
+            the prior says itself how sure it is of its poses, these are they; else they are estimated.
         coarse_scale: `none` (printed), `ratio` (median ratio of the depths that were predicted twice) or
             `estimated` (similarity fit).
         scale_std: of the logarithm of a scale about the mean of those before it, if it erred anew with every frame: the
@@ -63,7 +73,7 @@ class LocalizationConfig(eqx.Module):
         max_residual: root mean square distance to the map's planes, as a fraction of the depth.
         max_step: between the coarse and the fine pose, as a fraction of the mean depth.
         max_step_rad: likewise, rad.
-        min_eigenvalue: of the Hessian, see `IcpInfo`.
+        max_pose_std: of the pose in its least certain direction, see `IcpInfo.pose_std`.
     """
 
     coarse: Float[Array, "*b"] = choice(*COARSE)
@@ -78,7 +88,7 @@ class LocalizationConfig(eqx.Module):
     max_residual: Float[Array, "*b"] = traced(low=0, high=math.inf)
     max_step: Float[Array, "*b"] = traced(low=0, high=math.inf)
     max_step_rad: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    min_eigenvalue: Float[Array, "*b"] = traced(low=0, high=1e9)
+    max_pose_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
 
 
 class CoarsePose(eqx.Module):
@@ -115,6 +125,7 @@ class LocalizationInfo(eqx.Module):
         depth_noise: of the points, as a fraction of their depth: how much they differ from the map.
         noise: likewise of each point, as those of its level of confidence do, in the order of the rows.
         step_m: between the coarse and the fine pose.
+        by_map: part of an error of the map that is in the pose, see `correct_by_points`.
     """
 
     is_tracked: Bool[Array, ""]
@@ -127,19 +138,20 @@ class LocalizationInfo(eqx.Module):
     step_m: Float[Array, ""]
     step_rad: Float[Array, ""]
     estimate: PoseEstimate
+    by_map: Float[Array, "6 6"]
     icp: IcpInfo
 
 
 def _ratio_noise(
     depth_noise: Float[Array, ""], ratio_std: Float[Array, ""], config: LocalizationConfig
 ) -> Float[Array, ""]:
-    """Standard deviation of the logarithm of the ratio of two frames' scales."""
+    """Variance of the logarithm of the ratio of two frames' scales."""
     ratio = jnp.where(config.coarse_scale > 0, ratio_std, depth_noise * config.icp.scale_noise)
-    return jnp.maximum(jnp.where(config.icp.scale_noise > 0, ratio, 0.0), NO_INFORMATION)
+    return jnp.maximum(jnp.where(config.icp.scale_noise > 0, ratio, 0.0), NO_INFORMATION) ** 2
 
 
 def _no_motion(mean_depth: Float[Array, ""], config: LocalizationConfig) -> Float[Array, "7"]:
-    """The same where nothing is known of the motion: as far as a fine step may go, at most a depth, a radian and e."""
+    """Standard deviations where nothing is known of the motion: as far as a fine step may go, at most a depth, a radian and e."""
     step = jnp.stack([config.max_step, config.max_step_rad, config.scale_std])
     return jnp.minimum(step, 1.0)[jnp.array([0, 0, 0, 1, 1, 1, 2])] * jnp.ones(7).at[:3].set(mean_depth)
 
@@ -148,18 +160,22 @@ def _readings(
     prediction: Prediction,
     previous: Observation,
     T_world_previous: jaxlie.SE3,
-    scale: Float[Array, ""],
+    scales: tuple[Float[Array, ""], Float[Array, ""]],
     camera: Camera,
     config: LocalizationConfig,
 ) -> tuple[jaxlie.SE3, jaxlie.SE3, jaxlie.SE3, Bool[Array, ""]]:
     """The prior's motion from the previous frame, its own pose of the current one, and where each reading begins (R7).
 
     Last, True if the prior connects the previous frame with this one. If not, its own pose replaces the broken chain.
+
+    Args:
+        scales: of the prediction's depths, and of its poses.
     """
+    scale, unit = scales
     anchor, paired = prediction.T_world_anchor, prediction.previous.valid & previous.valid
     raw_previous, raw_current = pose_row(prediction.T_world_views, 0), pose_row(prediction.T_world_views, 1)
-    motion = scale_translation(raw_previous.inverse() @ raw_current, scale)
-    anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, scale)
+    motion = scale_translation(raw_previous.inverse() @ raw_current, unit)
+    anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, unit)
     chain = T_world_previous @ motion
     # Only where it is read: two robust fits over all points.
     via_previous, same_image = jax.lax.cond(
@@ -178,7 +194,7 @@ def _readings(
 def _correct_by_prior(
     T_world_camera: jaxlie.SE3,
     scale: Float[Array, ""],
-    anchored: tuple[jaxlie.SE3, Float[Array, "6"]],
+    anchored: tuple[jaxlie.SE3, Float[Array, "6 6"]],
     estimate: PoseEstimate,
     config: LocalizationConfig,
 ) -> tuple[jaxlie.SE3, Float[Array, ""], PoseEstimate]:
@@ -190,17 +206,17 @@ def _correct_by_prior(
     Args:
         T_world_camera: estimate before the measurement.
         scale: likewise.
-        anchored: the prior's own pose, and its standard deviations.
+        anchored: the prior's own pose, and its covariance.
     """
-    pose, std = anchored
+    pose, covariance = anchored
     apart = (T_world_camera.inverse() @ pose).log()
-    is_used = (config.coarse == FUSED) & jnp.all(jnp.isfinite(apart)) & jnp.all(jnp.isfinite(std))
-    apart, std = jnp.where(is_used, apart, 0.0), jnp.where(is_used, std, 1.0)
-    chi_sq = apart @ jnp.linalg.solve(estimate.covariance[:-1, :-1] + jnp.diag(std**2), apart)
-    weights = is_used / (std**2 * (1.0 + chi_sq / apart.shape[0]))
+    is_used = (config.coarse == FUSED) & jnp.all(jnp.isfinite(apart)) & jnp.all(jnp.isfinite(covariance))
+    apart, covariance = jnp.where(is_used, apart, 0.0), jnp.where(is_used, covariance, jnp.eye(6))
+    innovation, root = (root_information(P) for P in (estimate.covariance[:-1, :-1] + covariance, covariance))
+    weight = is_used / (1.0 + jnp.sum((innovation @ apart) ** 2) / apart.shape[0])
     difference = jnp.append(apart, estimate.log_scale - jnp.log(scale))
-    weights = jnp.append(weights, config.scale_std**-2)
-    step, estimate = correct(estimate, difference, jnp.diag(weights))
+    information = jnp.zeros((7, 7)).at[:6, :6].set(weight * root.T @ root).at[6, 6].set(config.scale_std**-2)
+    step, estimate = correct(estimate, difference, information)
     return T_world_camera @ jaxlie.SE3.exp(step[:-1]), scale * jnp.exp(step[-1]), estimate
 
 
@@ -224,19 +240,27 @@ def localize_coarse(
     scale, ratio_std = repeat_scale(now, previous, T_world_previous, jnp.exp(estimate.log_scale), config.coarse_scale)
     repeat_rms, mean_depth = repeat_error(now, previous, T_world_previous, scale, config.max_pair_distance)
     depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, estimate.depth_noise), LEAST_NOISE)
-    motion, anchored, forms, is_linked = _readings(prediction, previous, T_world_previous, scale, camera, config)
+    is_given, own_unit = is_given_pose(prediction), jnp.exp(estimate.log_scale)
+    unit = jnp.where(is_given, own_unit, scale)
+    motion, anchored, forms, is_linked = _readings(
+        prediction, previous, T_world_previous, (scale, unit), camera, config
+    )
     repeats, latest = repeat_poses(prediction, estimate.repeats, scale, mean_depth, config.num_shared)
-    guess = depth_noise, mean_depth, config.icp.prior_information
-    of_motion, of_pose = axis_std(repeats, latest, *guess, config.pose_shared)
-    noise = jnp.append(of_motion, _ratio_noise(depth_noise, ratio_std, config))
-    estimate = propagate(estimate, motion, jnp.where(is_linked, noise, _no_motion(mean_depth, config)))
-    estimate = eqx.tree_at(lambda b: b.repeats, estimate, repeats)
+    guess = axis_std(repeats, latest, depth_noise, mean_depth, config.icp.prior_information, config.pose_shared)
+    of_motion, of_pose = pose_covariances(prediction.pose_covariance, guess, mean_depth, unit)
+    noise = jnp.zeros((7, 7)).at[:6, :6].set(of_motion).at[6, 6].set(_ratio_noise(depth_noise, ratio_std, config))
+    noise = jnp.where(is_linked, noise, jnp.diag(_no_motion(mean_depth, config) ** 2))
+    estimate = propagate(estimate, motion, noise)
+    # A pose that is given with its uncertainty needs no other evidence of it.
+    repeats = jax.tree.map(partial(jnp.where, is_given), no_repeats(), repeats)
+    estimate = eqx.tree_at(lambda b: (b.repeats, b.is_given), estimate, (repeats, is_given))
     known = pose_row(forms, config.coarse.astype(jnp.int32)), scale
     coarse, scale, estimate = _correct_by_prior(*known, (anchored, of_pose), estimate, config)
+    unit = jnp.where(is_given, own_unit, scale)
     is_finite = jnp.all(jnp.isfinite(coarse.wxyz_xyz))
     coarse = jaxlie.SE3(jnp.where(is_finite, coarse.wxyz_xyz, T_world_previous.wxyz_xyz))
     raw_current, raw_newest = pose_row(prediction.T_world_views, 1), pose_row(prediction.T_world_views, 2)
-    newest = coarse @ scale_translation(raw_current.inverse() @ raw_newest, scale)
+    newest = coarse @ scale_translation(raw_current.inverse() @ raw_newest, unit)
     has_newest = prediction.has_newest & is_finite & jnp.all(jnp.isfinite(newest.wxyz_xyz))
     newest = jaxlie.SE3(jnp.where(has_newest, newest.wxyz_xyz, coarse.wxyz_xyz))
     is_usable = is_finite & (jnp.sum(prediction.current.valid) >= MIN_PAIRS)
@@ -262,7 +286,8 @@ def localize_fine(
         T_world_camera, the observation in the world frame, and the outcome.
     """
     scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
-    start = CoarseStart(coarse.T_world_camera, root_information(coarse.estimate.covariance), coarse.depth_noise)
+    known = root_information(coarse.estimate.covariance), coarse.estimate.is_given
+    start = CoarseStart(coarse.T_world_camera, *known, coarse.depth_noise)
     fine, scale, info = icp(scaled, submap, start, config.icp, index)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     # The length has no gradient where a step is zero, which it is to the bit with an exact prior; this has.
@@ -273,7 +298,7 @@ def localize_fine(
             ~(info.inlier_fraction >= config.min_inlier_fraction),
             ~(info.residual <= config.max_residual),
             ~((step_m <= config.max_step * coarse.mean_depth) & (step_rad <= config.max_step_rad)),
-            ~(info.min_eigenvalue >= config.min_eigenvalue),
+            ~(info.pose_std <= config.max_pose_std),
         ]
     )
     is_tracked = ~jnp.any(failed)
@@ -282,7 +307,7 @@ def localize_fine(
     aligned = transform(T, current, scale)
     aligned = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & coarse.is_usable)
     bits = jnp.sum(failed * 2 ** jnp.arange(failed.shape[0]))
-    estimate = correct_by_points(coarse.estimate, info, coarse.depth_noise, scale, is_tracked, config.num_alike)
+    estimate, by_map = correct_by_points(coarse.estimate, info, coarse.depth_noise, scale, is_tracked, config.num_alike)
     outcome = LocalizationInfo(
         is_tracked=is_tracked,
         is_lost=~coarse.is_known,
@@ -294,6 +319,7 @@ def localize_fine(
         step_m=step_m,
         step_rad=step_rad,
         estimate=estimate,
+        by_map=by_map,
         icp=info,
     )
     return T, aligned, outcome

@@ -35,6 +35,8 @@ class Prediction(eqx.Module):
         previous: the frame before it, in its own camera frame; row by row the same pixels as last time.
         T_world_views: the prior's own poses, composed with the anchor; rows: previous, current, newest.
         T_world_anchor: pose of the anchor, about which the scale of this call acts.
+        pose_covariance: of ξ where the true pose is T Exp(ξ), translation (unit of the prediction), rotation (rad);
+            rows: motion from the previous frame, own pose. NaN where the prior does not say how sure it is.
         has_newest: False at the end of a sequence, where there is no newer image.
         is_repeat: False where the frame before is of the same call, so that nothing of it is said twice.
     """
@@ -43,8 +45,14 @@ class Prediction(eqx.Module):
     previous: Observation
     T_world_views: jaxlie.SE3
     T_world_anchor: jaxlie.SE3
+    pose_covariance: Float[Array, "*b 2 6 6"]
     has_newest: Bool[Array, "*b"]
     is_repeat: Bool[Array, "*b"]
+
+
+def no_covariance() -> Float[Array, "2 6 6"]:
+    """`Prediction.pose_covariance` where the prior does not say how sure it is."""
+    return jnp.full((2, 6, 6), jnp.nan)
 
 
 class ObservationConfig(eqx.Module):

@@ -41,6 +41,7 @@ CONF = next(
 
 RENAMED = {  # keys of earlier versions; of two that fit the longer one counts
     "slam.continuation": "slam.extrapolation",
+    "slam.localization.min_eigenvalue": "slam.localization.max_pose_std",
     "graph.appearance": "graph.place_recognition",
     "graph.agreement": "graph.consistency",
     "graph.agreement.max_contradicted": "graph.consistency.max_violating_queries",

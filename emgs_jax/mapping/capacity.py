@@ -16,7 +16,7 @@ from emgs_jax.device.arrays import on_device
 from emgs_jax.device.executables import call, outputs, ready
 from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert
 from emgs_jax.mapping.convert import FirstWindow
-from emgs_jax.observation import Prediction, transform
+from emgs_jax.observation import Prediction, no_covariance, transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
 from emgs_jax.ops.precision import full_precision
@@ -58,7 +58,7 @@ def restart_map(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[S
     """
     T = state.T_world_previous
     view = transform(T.inverse(), state.previous, jnp.ones(()))
-    first = FirstWindow(*jax.tree.map(lambda leaf: leaf[None], (view, T)))
+    first = FirstWindow(*jax.tree.map(lambda leaf: leaf[None], (view, T, no_covariance())))
     alone, _ = start(first, camera, config)
     new = replace(alone.map, birth=jnp.full_like(alone.map.birth, state.time - 1))
     map, config = add_map(state.map, new, config)
@@ -94,7 +94,13 @@ def prepare_step(first: FirstWindow, camera: Camera, config: SlamConfig) -> None
     pose, poses = (jaxlie.SE3(on_device(np.eye(1, 7, dtype=np.float32).repeat(n, 0).squeeze())) for n in (1, 3))
     unknown = on_device(np.bool_(False))
     prediction = Prediction(
-        current=view, previous=view, T_world_views=poses, T_world_anchor=pose, has_newest=unknown, is_repeat=unknown
+        current=view,
+        previous=view,
+        T_world_views=poses,
+        T_world_anchor=pose,
+        pose_covariance=no_covariance(),
+        has_newest=unknown,
+        is_repeat=unknown,
     )
     map = _zeros(jax.eval_shape(lambda: empty_map(config.submap.map_capacity, view.features.shape[-1])))
     key = jax.tree.structure((map, view, config)), tuple(leaf.shape for leaf in jax.tree.leaves((map, view)))

@@ -6,10 +6,12 @@ import equinox as eqx
 import jax
 import jaxlie
 import numpy as np
+from jaxtyping import Array, Float
 
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.device.arrays import on_device, to_se3
 from emgs_jax.device.executables import stored
+from emgs_jax.geometry import seen_from
 from emgs_jax.observation import Observation, ObservationConfig, Prediction, observe
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import PriorPrediction
@@ -19,10 +21,15 @@ _observe = stored(observe)
 
 
 class FirstWindow(eqx.Module):
-    """The first prediction of a sequence: all views, camera frames, oldest first, with the prior's poses."""
+    """The first prediction of a sequence: all views, camera frames, oldest first, with the prior's poses.
+
+    Args:
+        pose_covariance: see `Prediction`.
+    """
 
     views: Observation
     T_world_views: jaxlie.SE3
+    pose_covariance: Float[Array, "n 2 6 6"]
 
 
 def to_camera(dataset: Dataset) -> Camera:
@@ -44,6 +51,15 @@ def _check(prediction: PriorPrediction, frames: Mapping[int, Frame]) -> None:
                 f"the prior's {name} have shape {got} at frame {prediction.window.current}, expected {expected} "
                 "(dense views, height, width): predict at the data set's size"
             )
+    covariance, count = prediction.pose_covariance, len(prediction.window.views)
+    if covariance is not None:
+        known = covariance[np.isfinite(covariance).all((-2, -1))]
+        is_sound = covariance.shape == (count, 6, 6) and np.allclose(known, known.swapaxes(-2, -1), rtol=1e-4)
+        if not is_sound or (np.diagonal(known, 0, -2, -1) < 0).any():
+            raise ValueError(
+                f"the prior's pose_covariance at frame {prediction.window.current} has shape {covariance.shape}, expected "
+                f"are symmetric matrices ({count}, 6, 6) without negative variances, NaN where nothing is known"
+            )
     if prediction.features.ndim != 4 or len(prediction.features) != expected[0]:
         raise ValueError(
             f"the prior's features have shape {prediction.features.shape} at frame {prediction.window.current}, "
@@ -58,6 +74,18 @@ def _observation(prediction: PriorPrediction, view: int, frame: Frame, config: O
         for values in (prediction.points, prediction.features, prediction.confidence)
     )
     return _observe(*on_device((points, image, features, confidence, mask)), config)
+
+
+def _pose_covariance(prediction: PriorPrediction, previous: int, current: int) -> np.ndarray:
+    """Covariances (2, 6, 6) of the motion between two views, and of the second one's pose; NaN where not known.
+
+    Errors of neighbours are alike: the motion is at least as sure as the two poses together.
+    """
+    if prediction.pose_covariance is None:
+        return np.full((2, 6, 6), np.nan)
+    before, here = prediction.pose_covariance[[previous, current]]
+    T_previous, T_current = prediction.T_anchor_view[[previous, current]]
+    return np.stack([here + seen_from(before, T_previous, T_current[None])[0], here])
 
 
 def to_first_window(
@@ -84,14 +112,17 @@ def to_first_window(
     rows = [row for row, index in enumerate(prediction.window.dense) if index >= since]
     dense = [prediction.window.dense[row] for row in rows]
     views = [_observation(prediction, row, frames[index], config) for row, index in zip(rows, dense, strict=True)]
-    poses = np.asarray(T_world_anchor) @ prediction.T_anchor_view[[prediction.window.views.index(i) for i in dense]]
+    places = [prediction.window.views.index(i) for i in dense]
+    poses = np.asarray(T_world_anchor) @ prediction.T_anchor_view[places]
     has_points = [np.asarray(view.valid).any() for view in views]
     usable = [bool(known) and np.isfinite(pose).all() for known, pose in zip(has_points, poses, strict=True)]
     if not any(usable):
         return None, ()
     first = usable.index(True)
     together = jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(views[first:]))
-    return FirstWindow(on_device(together), to_se3(poses[first:])), tuple(dense[first:])
+    pairs = zip(places[first:][:1] + places[first:], places[first:], strict=False)
+    covariances = np.stack([_pose_covariance(prediction, *pair) for pair in pairs]).astype(np.float32)
+    return FirstWindow(on_device(together), to_se3(poses[first:]), on_device(covariances)), tuple(dense[first:])
 
 
 def to_prediction(
@@ -115,6 +146,7 @@ def to_prediction(
         previous=_observation(prediction, 0, frames[previous], config),
         T_world_views=to_se3(np.asarray(T_world_anchor) @ prediction.T_anchor_view[rows]),
         T_world_anchor=to_se3(T_world_anchor),
+        pose_covariance=on_device(_pose_covariance(prediction, *rows[:2]).astype(np.float32)),
         has_newest=on_device(np.bool_(has_newest)),
         is_repeat=on_device(np.bool_(True)),
     )
@@ -146,6 +178,7 @@ def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[
             previous=views[i - 1],
             T_world_views=jaxlie.SE3(on_device(poses[[i - 1, i, min(i + 1, num_views - 1)]])),
             T_world_anchor=jaxlie.SE3(on_device(poses[0])),
+            pose_covariance=on_device(found.pose_covariance[i]),
             has_newest=on_device(np.bool_(i + 1 < num_views)),
             is_repeat=on_device(np.bool_(False)),
         )

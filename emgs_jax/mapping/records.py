@@ -34,7 +34,8 @@ REMEDIES = dict(
             "(slam.localization.max_residual=…)",
             "take frames closer together (dataset.stride=…), or trust the prior's pose less "
             "(slam.localization.icp.prior_information=…, slam.localization.max_step=…)",
-            "the images show too little, such as one wall; take frames with more of the scene in view",
+            "the images show too little, such as one wall; take frames with more of the scene in view, or say how sure "
+            "the prior's poses are (prior.pose_std=[metres, degrees], of prior=files and prior=recorded)",
         ),
         strict=True,
     )

@@ -163,6 +163,7 @@ def as_step_prediction(opening: FirstWindow | Prediction) -> Prediction:
         previous=view,
         T_world_views=jaxlie.SE3(jnp.stack([T.wxyz_xyz] * 3)),
         T_world_anchor=T,
+        pose_covariance=opening.pose_covariance[0],
         has_newest=jnp.asarray(False),
         is_repeat=jnp.asarray(False),
     )
@@ -218,12 +219,17 @@ def anchor_motion_of(record: FrameRecord, prediction: Prediction) -> jaxlie.SE3:
 
 
 def move_prediction(prediction: Prediction, motion: jaxlie.SE3 | None) -> Prediction:
-    """Apply a motion of the prior's world to a prediction; None changes nothing."""
+    """Apply a motion of the prior's world to a prediction; None changes nothing.
+
+    It comes of relocalization, so that how sure the prior is of its poses in its own world says little of them here.
+    """
     if motion is None:
         return prediction
     views = [motion @ pose_row(prediction.T_world_views, row) for row in range(3)]
     views = jaxlie.SE3(jnp.stack([view.wxyz_xyz for view in views]))
-    return replace(prediction, T_world_views=views, T_world_anchor=motion @ prediction.T_world_anchor)
+    unknown = jnp.full_like(prediction.pose_covariance, jnp.nan)
+    anchor = motion @ prediction.T_world_anchor
+    return replace(prediction, T_world_views=views, T_world_anchor=anchor, pose_covariance=unknown)
 
 
 def rejection(

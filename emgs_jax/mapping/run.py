@@ -163,7 +163,8 @@ def record_step(run: MappingRun, window: WindowInput, frame: TrackedFrame, secon
         kept = {"status": "initialization", "new": count - int(info.num_gaussians), "num_gaussians": count}
     outcome = {"location": frame.location, "similarity": frame.similarity}
     fields = _step_fields(info)
-    fields["covariance"] = fields["covariance"] + covariance_of_map(run, fields["pose"], fields["origin"])
+    of_map, by_map = covariance_of_map(run, fields["pose"], fields["origin"]), info.localization.by_map
+    fields["covariance"] = fields["covariance"] + by_map @ of_map @ by_map.T
     return _add(run, window, 0, **fields | kept | outcome, **seconds)
 
 

@@ -43,6 +43,11 @@ class PriorPrediction:
         mask: bool (d, h, w), True where the point can be used.
         features: text-aligned unit features (d, y, x, f), float16, on a grid of y by x cells that cover the image, from
             one cell per patch of a network to one per pixel; 0 where there is none, f = 0 without features.
+        pose_covariance: how sure the poses are: float64 (v, 6, 6), of ξ where the true T_anchor_view is
+            T_anchor_view Exp(ξ), translation (unit of the prediction) before rotation (rad), in the axes of the view.
+            What all views err alike counts for nothing. NaN for a view of which nothing is known, None where the prior
+            does not say: then the map finds out. Poses that are known lie in one world: the scale of a frame's depths
+            does not move them.
     """
 
     window: Window
@@ -51,6 +56,7 @@ class PriorPrediction:
     confidence: np.ndarray
     mask: np.ndarray
     features: np.ndarray
+    pose_covariance: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -159,6 +165,30 @@ def with_frames(calls: Iterable[Window], dataset: Dataset) -> Iterator[tuple[Win
     for window in calls:
         frames = {index: frames[index] if index in frames else dataset[index] for index in window.views}
         yield window, frames
+
+
+def equal_covariances(pose_std: Sequence[float] | None, T_anchor_view: np.ndarray) -> np.ndarray | None:
+    """Covariances of poses of which each errs by `pose_std`, a length and degrees, along every axis; None for none."""
+    if pose_std is None:
+        return None
+    length, degrees = pose_std
+    covariance = np.diag(np.repeat([float(length), np.radians(degrees)], 3) ** 2)
+    is_known = np.isfinite(T_anchor_view).all((1, 2))[:, None, None]
+    return np.where(is_known, covariance, np.nan)
+
+
+def check_pose_std(pose_std: Sequence[float] | None) -> tuple[float, float] | None:
+    """The key `prior.pose_std` as numbers; ValueError where it is no length and angle."""
+    if pose_std is None:
+        return None
+    values = [*pose_std] if isinstance(pose_std, Sequence) and not isinstance(pose_std, str) else [pose_std]
+    try:
+        length, degrees = (float(value) for value in values)
+    except (TypeError, ValueError):
+        length = degrees = np.nan
+    if not (0 <= length < np.inf and 0 <= degrees <= 180):
+        raise ValueError(f"prior.pose_std must be [length, degrees], both 0 or more, or null, got {pose_std}")
+    return length, degrees
 
 
 def relative_poses(T_reference_view: Sequence[np.ndarray]) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Predictions written to disk once and replayed bit for bit.
 
-The format `emgs_jax.predictions`, version 2, is a folder; nothing in it is ever unpickled:
+The format `emgs_jax.predictions`, version 3, is a folder; nothing in it is ever unpickled:
 
 - `manifest.json`: UTF-8 JSON object with `format`, `version`, `dataset` (name, sequence, fingerprint, num_frames, size,
   intrinsics), `window_size`, `provenance` (name, settings, is_simulated), `feature_names`, `num_inferences`,
@@ -10,8 +10,8 @@ The format `emgs_jax.predictions`, version 2, is a folder; nothing in it is ever
 - `visits_A_…_B.npz`, for pairs of frames that show one place twice, named by all its views: as below, of one more
   inference with views of both visits (`recorded_visits`). A folder may have none.
 - `000000.npz`, …, one file per inference: `inference` (), `views` (v,), `dense` (d,), `current` () and the arrays of
-  `PriorPrediction` in the dtypes stated there: about d·(17·h·w + 2·y·x·f) bytes. Features are float16; points are
-  not, because a float16 step is 2 mm at 2 to 4 m. Version 1, whose features have one cell per pixel, is read as well.
+  `PriorPrediction` in the dtypes stated there, `pose_covariance` only where the prior gives it: about d·(17·h·w + 2·y·x·f) bytes. Features are float16; points are
+  not, because a float16 step is 2 mm at 2 to 4 m. Version 1, whose features have one cell per pixel, and 2, which has no covariances, are read as well.
 
 Each file is written under a temporary name and then renamed, data before the manifest: a full disk or an interrupted
 run leaves a valid folder, which `record` completes.
@@ -21,7 +21,7 @@ import hashlib
 import io
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,9 +29,20 @@ import numpy as np
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.io.files import remove_temporaries, write_file
 from emgs_jax.io.npz import read_npz
-from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, check_unit, windows, with_frames
+from emgs_jax.prior.base import (
+    Prior,
+    PriorPrediction,
+    Provenance,
+    Window,
+    check_pose_std,
+    check_unit,
+    equal_covariances,
+    windows,
+    with_frames,
+)
 from emgs_jax.prior.recorded_checks import (
     FIELDS,
+    OPTIONAL,
     REMEDY,
     check_arrays,
     check_manifest,
@@ -39,8 +50,8 @@ from emgs_jax.prior.recorded_checks import (
     check_text,
 )
 
-FORMAT, VERSION = "emgs_jax.predictions", 2
-READABLE = (1, 2)
+FORMAT, VERSION = "emgs_jax.predictions", 3
+READABLE = (1, 2, 3)
 
 
 def record(
@@ -93,16 +104,20 @@ class Recorded(Prior):
 
     Args:
         folder: the recording; it must be complete.
+        pose_std: of every pose, a length in the recording's unit and degrees, in place of what is recorded; None: that.
     """
 
-    def __init__(self, folder: Path | str) -> None:
-        self.folder = Path(folder)
+    def __init__(self, folder: Path | str, pose_std: Sequence[float] | None) -> None:
+        self.folder, self._pose_std = Path(folder), check_pose_std(pose_std)
         self._manifest = _read_manifest(self.folder)
         if not self._manifest["complete"]:
             total = self._manifest["num_inferences"]
             done = sum(self.has_whole(f"{number:06d}.npz") for number in range(total))
             raise ValueError(f"{self.folder} holds {done} of {total} inferences: finish it, {REMEDY}")
         self.provenance = Provenance(**self._manifest["provenance"])
+        if self._pose_std is not None:
+            settings = self.provenance.settings | {"pose_std": [*self._pose_std]}
+            self.provenance = replace(self.provenance, settings=settings)
         self.feature_names = tuple(self._manifest["feature_names"])
         self.text_features = self._load("text_features.npz", ("text_features",))["text_features"]
         check_text(self.folder / "text_features.npz", self.text_features, self.feature_names)
@@ -146,16 +161,18 @@ class Recorded(Prior):
                 f"{self.folder} was recorded at size {size} with intrinsics {data['intrinsics']}; asked for are "
                 f"{len(frames)} frames of {shape[::-1]} with {[*intrinsics]} as {len(window.views)} views: {REMEDY}"
             )
-        arrays = self._load(name, ("inference", "views", "dense", "current", *FIELDS))
+        arrays = self._load(name, ("inference", "views", "dense", "current", *FIELDS), (*OPTIONAL,))
         recorded = [arrays[key].tolist() for key in ("inference", "views", "dense", "current")]
         if recorded != [window.inference, list(window.views), list(window.dense), window.current]:
             raise ValueError(f"{self.folder / name} answers another window ({recorded[1]}) than {window}: {REMEDY}")
         sizes = {"v": len(window.views), "d": len(window.dense), "h": shape[0], "w": shape[1]}
         check_arrays(self.folder / name, arrays, sizes)
         check_numbers(self.folder / name, arrays)
-        return PriorPrediction(window, *(arrays[key] for key in FIELDS))
+        given = equal_covariances(self._pose_std, arrays["T_anchor_view"])
+        covariance = arrays.get("pose_covariance") if given is None else given
+        return PriorPrediction(window, *(arrays[key] for key in FIELDS), covariance)
 
-    def _load(self, name: str, keys: Sequence[str]) -> dict[str, np.ndarray]:
+    def _load(self, name: str, keys: Sequence[str], optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
         """Read and verify one file of the recording."""
         path = self.folder / name
         if not path.is_file():
@@ -164,7 +181,7 @@ class Recorded(Prior):
         if hashlib.sha256(content).hexdigest() != self._manifest["files"].get(name):
             raise ValueError(f"{path} is damaged (its SHA-256 is not the manifest's): delete it and {REMEDY}")
         try:
-            return read_npz(content, keys)
+            return read_npz(content, keys, optional)
         except ValueError as error:
             raise ValueError(f"{path} is no file of this format ({error}): {REMEDY}") from error
 
@@ -263,7 +280,8 @@ def _arrays(prediction: PriorPrediction) -> dict[str, np.ndarray]:
         "dense": np.asarray(window.dense),
         "current": np.asarray(window.current),
     }
-    for key, (dtype, _) in FIELDS.items():
+    given = OPTIONAL if prediction.pose_covariance is not None else {}
+    for key, (dtype, _) in (FIELDS | given).items():
         arrays[key] = getattr(prediction, key)
         if arrays[key].dtype != dtype:
             # A conversion would make the replay differ from the live run.

@@ -8,13 +8,14 @@ import numpy as np
 from emgs_jax.data.reading import is_rigid
 
 REMEDY = "record it again with `python -m experiments.predict`"
-FIELDS = {  # array -> dtype and the axes that it has; d, v, h, w, i, j, c have one length each, y, x, f are free
+FIELDS = {  # array -> dtype and the axes that it has; d, v, h, w, i, j, c, k, l have one length each, y, x, f are free
     "T_anchor_view": (np.float64, "vij"),
     "points": (np.float32, "dhwc"),
     "confidence": (np.float32, "dhw"),
     "mask": (np.bool_, "dhw"),
     "features": (np.float16, "dyxf"),
 }
+OPTIONAL = {"pose_covariance": (np.float64, "vkl")}
 MAX_LENGTH = 1e6  # of positions, in the prior's unit: more is no room
 MANIFEST = {
     "dataset": dict,
@@ -52,8 +53,8 @@ def check_text(path: object, vectors: np.ndarray, names: Sequence[str]) -> None:
 
 def check_arrays(path: object, arrays: Mapping[str, np.ndarray], sizes: Mapping[str, int]) -> None:
     """Raise ValueError where an array has not the dtype and shape of the format."""
-    sizes = {**sizes, "i": 4, "j": 4, "c": 3}
-    for key, (dtype, axes) in FIELDS.items():
+    sizes = {**sizes, "i": 4, "j": 4, "c": 3, "k": 6, "l": 6}
+    for key, (dtype, axes) in (FIELDS | {key: OPTIONAL[key] for key in OPTIONAL if key in arrays}).items():
         got = arrays[key]
         expected = tuple(sizes.get(axis, got.shape[k] if k < got.ndim else 0) for k, axis in enumerate(axes))
         if got.dtype != dtype or got.shape != expected:

@@ -27,6 +27,7 @@ from emgs_jax.registration.problem import (
     data_information,
     distances,
     information,
+    largest_std,
     matches_at,
     pose_of,
     pose_problem,
@@ -49,8 +50,8 @@ class IcpInfo(eqx.Module):
         level_edges: where these levels end.
         information: of the points alone, of (xi, log s).
         num_effective: how many independent measurements the points are worth, see `num_independent`.
-        min_eigenvalue: smallest eigenvalue of the pose's information by planes and colours, per effective point (1/m²,
-            1/rad²). Offsets from means do not count: the mean of a Gaussian is no landmark of its surface.
+        pose_std: of the pose in its least certain direction, by the prior and by planes and colours together:
+            translation in median depths, rotation in rad; inf where nothing determines it.
         num_steps: of all solves.
         is_converged: False where the last solve reached `max_steps` or failed.
     """
@@ -63,7 +64,7 @@ class IcpInfo(eqx.Module):
     level_edges: Float[Array, "e"]
     information: Float[Array, "7 7"]
     num_effective: Float[Array, ""]
-    min_eigenvalue: Float[Array, ""]
+    pose_std: Float[Array, ""]
     num_steps: Int[Array, ""]
     is_converged: Bool[Array, ""]
 
@@ -173,7 +174,7 @@ def icp(
         level_edges=edges,
         information=data_information(y, matches, problem, config),
         num_effective=seen.num_effective,
-        min_eigenvalue=jnp.linalg.eigvalsh(information(T, scale, matches, problem, config))[0],
+        pose_std=largest_std(information(T, scale, matches, problem, config), problem),
         num_steps=jnp.sum(rounds[1]),
         is_converged=is_converged,
     )

@@ -12,6 +12,7 @@ from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import dot, gather_entries, gather_offsets, mahalanobis_sq, whiten, widen
 from emgs_jax.ops.neighbours import Groups
 
+LEAST_VARIANCE = 1e-30  # m²; no Gaussian is so thin, and float32 divides by its root
 Candidates: TypeAlias = tuple[Int[Array, "p k"], Bool[Array, "p k"]]  # of `nearest`: rows of the Gaussians, which exist
 
 
@@ -107,7 +108,9 @@ def match(
         triangle=triangle,
         noise=jnp.stack(white_noise, axis=-1),
         plane_vars=surface.plane_vars[row],
-        plane_std=jnp.sqrt(surface.plane_vars[row] + jnp.sum(normals * noise, axis=-1) ** 2 + 1e-12),
+        plane_std=jnp.sqrt(
+            jnp.maximum(surface.plane_vars[row] + jnp.sum(normals * noise, axis=-1) ** 2, LEAST_VARIANCE)
+        ),
         light=surface.light[row],
         gradients=surface.gradients[row],
         is_inlier=points.valid & is_near & is_alike,

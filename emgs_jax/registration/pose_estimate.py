@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.icp import IcpInfo
 from emgs_jax.registration.pose_noise import Repeats, no_repeats, rescale_repeats
+from emgs_jax.registration.problem import pose_worth
 
 DEGREES = 7
 
@@ -26,6 +27,8 @@ class PoseEstimate(eqx.Module):
         depth_noise: how much its points differ from the map, as a fraction of their depth.
         log_scale: mean logarithm of the scales of the tracked frames: the prior's own unit, in that of the map.
         repeats: differences between repeated predictions of one pose.
+        is_given: the prior says itself how sure it is of this frame's pose. Then its poses lie in one world, whose unit
+            is theirs, and how well points fit says nothing of them.
     """
 
     covariance: Float[Array, "*b 7 7"]
@@ -33,18 +36,19 @@ class PoseEstimate(eqx.Module):
     log_scale: Float[Array, "*b"]
     num_scales: Float[Array, "*b"]
     repeats: Repeats
+    is_given: Bool[Array, "*b"]
 
 
 def exact_estimate() -> PoseEstimate:
     """Return the estimate of the frame that the map is made of: its pose is exact, and its scale is the unit."""
-    return PoseEstimate(jnp.zeros((DEGREES, DEGREES)), jnp.zeros(()), jnp.zeros(()), jnp.ones(()), no_repeats())
+    return PoseEstimate(jnp.zeros((DEGREES, DEGREES)), *jnp.zeros((2,)), jnp.ones(()), no_repeats(), jnp.asarray(False))
 
 
 @full_precision
 def propagate_covariance(
-    covariance: Float[Array, "7 7"], T_previous_current: jaxlie.SE3, noise: Float[Array, "7"]
+    covariance: Float[Array, "7 7"], T_previous_current: jaxlie.SE3, noise: Float[Array, "7 7"]
 ) -> Float[Array, "7 7"]:
-    """P of the current frame: A P A' + Q, with A the adjoint of the motion's inverse, and Q = diag(noise²).
+    """P of the current frame: A P A' + Q, with A the adjoint of the motion's inverse, and Q the covariance `noise`.
 
     What the scale's error does to the length of the motion is left out: it is small against `noise`.
     A motion that is not finite counts as none.
@@ -52,7 +56,7 @@ def propagate_covariance(
     adjoint = T_previous_current.inverse().adjoint()
     adjoint = jnp.where(jnp.all(jnp.isfinite(adjoint)), adjoint, jnp.eye(DEGREES - 1))
     A = jnp.eye(DEGREES).at[:-1, :-1].set(adjoint)
-    return A @ covariance @ A.T + jnp.diag(noise**2)
+    return A @ covariance @ A.T + noise
 
 
 @full_precision
@@ -85,7 +89,7 @@ def rescale_estimate(estimate: PoseEstimate, factor: Float[Array, ""]) -> PoseEs
     )
 
 
-def propagate(estimate: PoseEstimate, T_previous_current: jaxlie.SE3, noise: Float[Array, "7"]) -> PoseEstimate:
+def propagate(estimate: PoseEstimate, T_previous_current: jaxlie.SE3, noise: Float[Array, "7 7"]) -> PoseEstimate:
     """Propagate the estimate to the current frame, before any measurement; see `propagate_covariance`."""
     covariance = propagate_covariance(estimate.covariance, T_previous_current, noise)
     return eqx.tree_at(lambda b: b.covariance, estimate, covariance)
@@ -100,7 +104,7 @@ def correct(
 
 
 @full_precision
-def root_information(covariance: Float[Array, "7 7"]) -> Float[Array, "7 7"]:
+def root_information(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """L⁻¹ of P = L L': |L⁻¹ x|² is the squared Mahalanobis distance of x. P must be positive definite."""
     std = jnp.sqrt(jnp.diagonal(covariance))
     correlation = covariance / std / std[:, None]
@@ -115,22 +119,30 @@ def correct_by_points(
     scale: Float[Array, ""],
     is_tracked: Bool[Array, ""],
     num_alike: Float[Array, ""],
-) -> PoseEstimate:
+) -> tuple[PoseEstimate, Float[Array, "6 6"]]:
     """Correct the estimate by the points of a frame; it stays as it is where the frame is not tracked.
 
     Args:
-        found: result of ICP. Where the points fit worse than `depth_noise`, the coarse pose is less certain by the same
-            factor.
-        depth_noise: expected, as a fraction of the depth.
+        found: result of ICP.
+        depth_noise: expected, as a fraction of the depth, see `pose_worth`.
         num_alike: frames that see one part of the map, which is wrong for all of them in the same way: the information
             of one frame's points about the scale is divided by it.
+
+    Returns:
+        The estimate, and the part of an error of the map that is in the pose: the gain of the points where the prior
+        knows the pose by itself, and else all of it, for the estimate is relative to the map.
     """
-    worth, nothing = jnp.maximum(found.misfit / depth_noise, 1.0) ** 2, jnp.zeros(DEGREES)
+    worth, nothing = pose_worth(estimate.is_given, found.misfit, depth_noise), jnp.zeros(DEGREES)
     units = jnp.ones(DEGREES).at[-1].set(num_alike**-0.5)
-    _, covariance = kalman_update(worth * estimate.covariance, nothing, units[:, None] * found.information * units)
-    num_scales = estimate.num_scales + 1.0
-    log_scale = estimate.log_scale + (jnp.log(scale) - estimate.log_scale) / num_scales
+    information = units[:, None] * found.information * units
+    _, covariance = kalman_update(worth[:, None] * estimate.covariance * worth, nothing, information)
+    gain = jnp.where(is_tracked, (covariance @ information)[:-1, :-1], 0.0)
+    # Of given poses the unit is known, whatever the scales of the depths.
+    num_scales = estimate.num_scales + jnp.where(estimate.is_given, 0.0, 1.0)
+    change = jnp.where(estimate.is_given, 0.0, jnp.log(scale) - estimate.log_scale)
+    log_scale = estimate.log_scale + change / num_scales
     # Predicted poses are repeated predictions of the next frame, whether the points fit or not.
     estimate = eqx.tree_at(lambda b: b.repeats, estimate, rescale_repeats(estimate.repeats, scale))
-    after = PoseEstimate(covariance, found.misfit, log_scale, num_scales, estimate.repeats)
-    return jax.tree.map(lambda new, old: jnp.where(is_tracked, new, old), after, estimate)
+    after = PoseEstimate(covariance, found.misfit, log_scale, num_scales, estimate.repeats, estimate.is_given)
+    after = jax.tree.map(lambda new, old: jnp.where(is_tracked, new, old), after, estimate)
+    return after, jnp.where(estimate.is_given, gain, jnp.eye(DEGREES - 1))

@@ -8,6 +8,7 @@ its consistency is no evidence of its error, and the pose is as uncertain as wit
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
@@ -105,6 +106,34 @@ def pose_std(
     mean = (counts * of_repeats + 2.0 * jnp.log(otherwise)) / (counts + 1.0)
     found = jnp.sqrt(jnp.maximum(jnp.exp(mean), latest / differing))
     return jnp.where(shared < 1.0, found, otherwise)
+
+
+def is_given_pose(prediction: Prediction) -> Bool[Array, ""]:
+    """True where the prior has a pose of the current frame and says how sure it is of it."""
+    pose = pose_row(prediction.T_world_views, 1).wxyz_xyz
+    return jnp.all(jnp.isfinite(prediction.pose_covariance[1])) & jnp.all(jnp.isfinite(pose))
+
+
+def pose_covariances(
+    given: Float[Array, "2 6 6"],
+    otherwise: Float[Array, "2 6"],
+    mean_depth: Float[Array, ""],
+    unit: Float[Array, ""],
+) -> Float[Array, "2 6 6"]:
+    """Covariances of the prior's motion and of its own pose, m and rad of the map.
+
+    What is given is no more certain than `LEAST_NOISE` of the depth, which keeps it regular.
+
+    Args:
+        given: see `Prediction.pose_covariance`.
+        otherwise: standard deviations of each axis, m of the map and rad, where nothing is given.
+        mean_depth: m of the map.
+        unit: of the prediction's poses, m of the map.
+    """
+    units, lengths = (jnp.ones(6).at[:3].set(length) for length in (unit, mean_depth))
+    is_given = jnp.all(jnp.isfinite(given), axis=(-2, -1), keepdims=True)
+    given = units[:, None] * jnp.where(is_given, given, 0.0) * units + jnp.diag((LEAST_NOISE * lengths) ** 2)
+    return jnp.where(is_given, given, jax.vmap(jnp.diag)(otherwise**2))
 
 
 @full_precision

@@ -14,9 +14,11 @@ from emgs_jax.ops.linalg import whiten, widen
 from emgs_jax.ops.neighbours import nearest
 from emgs_jax.ops.pytree import choice, static, traced
 from emgs_jax.registration.matching import Candidates, Matches, Surface, match
+from emgs_jax.registration.rigid import median
 
 RESIDUALS = ("colored", "distribution", "colored+distribution", "colored+ray")
 COLORED, DISTRIBUTION, _, COLORED_RAY = range(len(RESIDUALS))
+LEAST_PLANE = 1e-6  # distance of a plane from the camera, of that of the point before it
 LEAST_RATIO = 1e-3  # of a point's depth over that of a plane; less is behind the camera
 
 
@@ -63,7 +65,7 @@ class IcpConfig(eqx.Module):
 class Uncertainty(eqx.Module):
     """Uncertainty of the coarse pose and of the points' depths, and the effective number of points."""
 
-    common: Float[Array, ""]  # depth noise of all; the coarse pose is less certain by its ratio to the expected one
+    common: Float[Array, ""]  # depth noise of all, see `pose_worth`
     depth: Float[Array, "p"]  # noise of each, as a fraction
     num_effective: Float[Array, ""]
 
@@ -74,24 +76,40 @@ class CoarseStart(eqx.Module):
     Args:
         T_world_coarse: also the mean of the pose.
         root_information: root of the information of (xi, log s) where the points fit as well as they should.
+        is_given: the prior itself says how sure it is of the pose, see `pose_worth`.
         noise: least standard deviation of the points' depth, as a fraction of it.
     """
 
     T_world_coarse: jaxlie.SE3
     root_information: Float[Array, "7 7"]
+    is_given: Bool[Array, ""]
     noise: Float[Array, ""]
 
 
 class Problem(eqx.Module):
-    """Constants of the ICP problem while the pose moves; lengths in metres."""
+    """Constants of the ICP problem while the pose moves; lengths in metres, unknowns in units of their own."""
 
     source: Observation  # camera frame
     surface: Surface
     T_world_coarse: jaxlie.SE3
     depth_noise: Float[Array, "p"]  # of every point along its viewing ray, as a fraction
-    scale_unit: Float[Array, ""]  # of the scale's logarithm, which is the seventh unknown
-    prior: Float[Array, "7 7"]  # root of the information of the coarse pose and scale
+    units: Float[Array, "7"]  # of (xi, log s) for one of the unknowns; 0 for a scale that stays
+    prior: Float[Array, "7 7"]  # root of the information of the coarse pose and scale, by the unknowns
     weight: Float[Array, ""]  # of a point
+
+
+def pose_worth(is_given: Bool[Array, ""], misfit: Float[Array, ""], depth_noise: Float[Array, ""]) -> Float[Array, "7"]:
+    """Return the factors on the standard deviations of a coarse pose and scale whose points do not fit as they should.
+
+    Of a pose that comes with its uncertainty the points' misfit says nothing.
+
+    Args:
+        is_given: the prior itself says how sure it is of the pose.
+        misfit: of the points, as a fraction of the depth.
+        depth_noise: expected, likewise.
+    """
+    worse = jnp.maximum(misfit / depth_noise, 1.0)
+    return jnp.full(7, jnp.where(is_given, 1.0, worse)).at[6].set(worse)
 
 
 def pose_problem(
@@ -101,24 +119,31 @@ def pose_problem(
     uncertainty: Uncertainty,
     config: IcpConfig,
 ) -> Problem:
-    """Build the ICP problem of points and map; the seventh unknown counts in the depth noise."""
-    units = jnp.ones(7).at[6].set(config.scale_noise * start.noise)
-    prior = (config.prior_information > 0) * start.root_information * units * (start.noise / uncertainty.common)
+    """Build the ICP problem of points and map.
+
+    Translation counts in the median depth, so that the solver's damping and tolerance mean the same in every unit of
+    length, and the seventh unknown in the depth noise.
+    """
+    depth = median(source.points[:, 2], source.valid)
+    units = jnp.ones(7).at[:3].set(depth).at[6].set(config.scale_noise * start.noise)
+    worth = pose_worth(start.is_given, uncertainty.common, start.noise)
+    prior = (config.prior_information > 0) * start.root_information * units / worth
     prior = prior.at[6, 6].set(jnp.where(units[6] * prior[6, 6] > 0, prior[6, 6], 1.0))  # a scale that stays
     return Problem(
         source=source,
         surface=surface,
         T_world_coarse=start.T_world_coarse,
         depth_noise=config.noise * uncertainty.depth,
-        scale_unit=config.scale_noise * start.noise,
+        units=units,
         prior=prior,
         weight=uncertainty.num_effective / jnp.maximum(jnp.sum(source.valid), 1),
     )
 
 
 def pose_of(y: Float[Array, "7"], problem: Problem) -> tuple[jaxlie.SE3, Float[Array, ""]]:
-    """T_world_coarse exp(xi), and the scale exp(scale_unit · y_6)."""
-    return problem.T_world_coarse @ jaxlie.SE3.exp(y[:6]), jnp.exp(problem.scale_unit * y[6])
+    """T_world_coarse exp(xi), and the scale, for the unknowns y."""
+    step = problem.units * y
+    return problem.T_world_coarse @ jaxlie.SE3.exp(step[:6]), jnp.exp(step[6])
 
 
 def candidates_at(y: Float[Array, "7"], problem: Problem, config: IcpConfig) -> Candidates:
@@ -202,7 +227,8 @@ def _along_ray(distance: Float[Array, "p"], T: jaxlie.SE3, matches: Matches, pro
     variables).
     """
     depth = jnp.sum((matches.means - T.translation()) * matches.normals, axis=-1)  # of the plane, along its normal
-    depth = jnp.where(jnp.abs(depth) > 1e-6, depth, 1e-6)
+    least = jnp.maximum(LEAST_PLANE * problem.source.points[:, 2], jnp.finfo(depth.dtype).tiny)
+    depth = jnp.where(jnp.abs(depth) > least, depth, least)
     std = jnp.sqrt(problem.depth_noise**2 + matches.plane_vars / depth**2)
     return jnp.log(jnp.maximum(1.0 + distance / depth, LEAST_RATIO)) / std
 
@@ -211,7 +237,7 @@ def data_information(
     y: Float[Array, "7"], matches: Matches, problem: Problem, config: IcpConfig
 ) -> Float[Array, "7 7"]:
     """J'J of the points' rows by (xi, log s) about y; 0 for the scale where it is no unknown."""
-    units = jnp.ones(7).at[6].set(problem.scale_unit)
+    units = problem.units
     jacobian = jax.jacfwd(rows_of)(y, matches, problem, config).reshape(-1, 7)
     jacobian = jnp.where(units > 0, jacobian / jnp.where(units > 0, units, 1.0), 0.0)
     return jacobian.T @ jacobian
@@ -220,9 +246,9 @@ def data_information(
 def information(
     T: jaxlie.SE3, scale: Float[Array, ""], matches: Matches, problem: Problem, config: IcpConfig
 ) -> Float[Array, "6 6"]:
-    """Compute the inliers' information about the pose, per point: Σ j j' / p with j = (a, x × a) / std.
+    """Compute the inliers' information about xi by planes and colours: w Σ j j' with j = (a, x × a) / std.
 
-    a is the normal, or the gradient of the intensity, and x the point, both in the camera's axes.
+    Offsets from means do not count: the mean of a Gaussian is no landmark of its surface. w is the weight of a point, a is the normal, or the gradient of the intensity, and x the point, both in the camera's axes.
     """
     points, to_camera = scale * problem.source.points, T.rotation().as_matrix()
     normals, gradients = matches.normals @ to_camera, matches.gradients @ to_camera
@@ -230,4 +256,15 @@ def information(
     axes = jnp.concatenate([normals / matches.plane_std[:, None], has_color * gradients / config.color_std])
     rows = jnp.concatenate([axes, jnp.cross(jnp.concatenate([points, points]), axes)], axis=-1)
     rows = jnp.where(jnp.concatenate([matches.is_inlier] * 2)[:, None], rows, 0.0)
-    return rows.T @ rows / jnp.maximum(jnp.sum(problem.source.valid), 1)
+    return problem.weight * rows.T @ rows
+
+
+def largest_std(points: Float[Array, "6 6"], problem: Problem) -> Float[Array, ""]:
+    """Standard deviation of the pose in its least certain direction, in the units of the unknowns; inf for none.
+
+    Args:
+        points: their information about xi, to which that of the prior is added.
+    """
+    units, prior = problem.units[:6], problem.prior[:, :6]
+    least = jnp.linalg.eigvalsh(units[:, None] * points * units + prior.T @ prior)[0]
+    return jnp.where(least > 0, 1.0 / jnp.sqrt(jnp.where(least > 0, least, 1.0)), jnp.inf)

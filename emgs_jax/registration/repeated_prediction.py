@@ -13,6 +13,8 @@ from emgs_jax.ops.pytree import stack
 from emgs_jax.registration.noise import num_independent, robust_std
 from emgs_jax.registration.rigid import MIN_PAIRS, fit_rigid, fit_rigid_robust, median, pose_row
 
+LEAST_RATIO = 1e-6  # of a pixel's ratio of depths over their median; less is behind the camera
+
 
 @full_precision
 def repeat_scale(
@@ -37,12 +39,14 @@ def repeat_scale(
     paired, depth_now = now.valid & before.valid, now.points[:, 2]
     ratios = depth_in(T_world_previous, before) / jnp.where(paired, depth_now, 1.0)
     ratio = median(ratios, paired)
-    errors = jnp.where(paired, jnp.log(jnp.maximum(ratios, 1e-6) / jnp.maximum(ratio, 1e-6)), 0.0)
+    is_positive = ratio > 0
+    ratio = jnp.where(is_positive, ratio, 1.0)
+    errors = jnp.where(paired, jnp.log(jnp.maximum(ratios / ratio, LEAST_RATIO)), 0.0)
     scatter = robust_std(errors, paired)
     count = num_independent(errors / jnp.maximum(scatter, 1e-6), now.points, paired)
     _, similarity = fit_rigid(now.points, before.points, paired.astype(jnp.float32))
-    scale = jnp.where(reading == 1, ratio, similarity)
-    is_found = (jnp.sum(paired) >= MIN_PAIRS) & jnp.isfinite(scale) & (scale > 0.1)
+    scale = jnp.where(reading == 1, jnp.where(is_positive, ratio, 0.0), similarity)
+    is_found = (jnp.sum(paired) >= MIN_PAIRS) & jnp.isfinite(scale) & (scale > 0)
     scale = jnp.where(reading > 0, jnp.where(is_found, scale, otherwise), 1.0)
     return scale, jnp.sqrt(0.5 * jnp.pi / count) * scatter
 

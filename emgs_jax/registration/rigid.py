@@ -56,12 +56,13 @@ def fit_rigid_robust(
     source: Float[Array, "p 3"], target: Float[Array, "p 3"], paired: Bool[Array, "p"], start: jaxlie.SE3
 ) -> jaxlie.SE3:
     """Rigid fit of pairs, robust by three reweightings around the median distance; `start` with too few pairs."""
+    size = median(jnp.sqrt(jnp.sum(source**2, axis=-1)), paired)
 
     def reweight(T: jaxlie.SE3, _: None) -> tuple[jaxlie.SE3, None]:
         difference = source @ T.rotation().as_matrix().T + T.translation() - target
         # Exact pairs: the square root has no gradient at 0.
-        distance = jnp.sqrt(jnp.sum(difference**2, axis=-1) + SMALLEST_LENGTH**2)
-        spread = jnp.maximum(median(distance, paired), 1e-6)
+        distance = jnp.sqrt(jnp.sum(difference**2, axis=-1) + (SMALLEST_LENGTH * size) ** 2)
+        spread = jnp.maximum(median(distance, paired), 1e-6 * size)
         weights = jnp.where(paired, 1.0 / (1.0 + (distance / (2.0 * spread)) ** 2), 0.0)
         return fit_rigid(source, target, weights)[0], None
 

@@ -19,13 +19,23 @@ from tqdm import tqdm
 
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.reading import check_depth_scale, fingerprint
-from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, relative_poses
+from emgs_jax.prior.base import (
+    Prior,
+    PriorPrediction,
+    Provenance,
+    Window,
+    check_pose_std,
+    equal_covariances,
+    relative_poses,
+)
 from emgs_jax.prior.files.conventions import Sight, check_conventions
 from emgs_jax.prior.files.exports import find_export, read_cut3r, read_export
 from emgs_jax.prior.files.own import GIVES_POSES, read_own
+from emgs_jax.prior.files.pose_error import pose_angle
 from emgs_jax.prior.files.scans import DEPTH_MAPS, read_colmap_workspace, read_record3d, read_scannet
 from emgs_jax.prior.files.view import Camera, Predictions, View, at_frame, grid_intrinsics, usable
 
+AUTO = "auto"
 SCALES = ("auto", "metric", "arbitrary")
 ROOM = (0.05, 100.0)  # m, median depth of a view that is metric
 FOCAL_NOTE, FOCAL_ERROR = 1.03, 1.5  # ratio of the files' focal length and the data set's
@@ -41,10 +51,18 @@ class Files(Prior):
         median_depth: m, of the first view where the scale is arbitrary.
         depth_scale: units of a metre in 16-bit .png files.
         max_depth_step: relative depth difference across which nothing is interpolated.
+        pose_std: of every pose, a length in the files' unit and degrees; None: not known; `auto`: as the images say,
+            see `pose_angle`.
     """
 
     def __init__(
-        self, folder: Path | str, scale: str, median_depth: float, depth_scale: float, max_depth_step: float
+        self,
+        folder: Path | str,
+        scale: str,
+        median_depth: float,
+        depth_scale: float,
+        max_depth_step: float,
+        pose_std: Sequence[float] | str | None,
     ) -> None:
         if scale not in SCALES:
             raise ValueError(f"prior.scale must be one of {', '.join(SCALES)}, got {scale!r}")
@@ -57,11 +75,14 @@ class Files(Prior):
         self._max_depth_step = float(max_depth_step)
         self._is_metric = self._found.is_metric if scale == "auto" else scale == "metric"
         self._factor = 1.0 if self._is_metric else median_depth / self._first_depth()[1]
+        self._pose_std = None if pose_std == AUTO else check_pose_std(pose_std)
+        self._is_measured = pose_std == AUTO
         self._rows: list[int | None] = []  # of the frames
         self._points: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}  # of the last window, by frame
         settings = {"layout": self._found.layout, "scale": "metric" if self._is_metric else "arbitrary"}
         settings |= {} if self._is_metric else {"median_depth": float(median_depth)}
         settings |= {"depth_scale": float(depth_scale), "max_depth_step": self._max_depth_step}
+        settings |= {"pose_std": AUTO if self._is_measured else self._pose_std and [*self._pose_std]}
         settings |= {"fingerprint": fingerprint(self.folder, self._found.files, {})}
         self.provenance = Provenance("files", settings)
 
@@ -77,10 +98,15 @@ class Files(Prior):
                 f"{view.source} has a median of {depth:.4g}, which is no depth in metres: write metres, give "
                 "prior.depth_scale (units of a metre in .png files; 1000: mm), or prior.scale=arbitrary"
             )
+        if self._is_measured:
+            poses = {index: self._pose(index) for index in known}
+            angle = pose_angle(dataset, {i: T for i, T in poses.items() if np.isfinite(T).all()})
+            self._pose_std = None if angle is None else (angle * depth, float(np.degrees(angle)))
         scale = "metres" if self._is_metric else f"up to scale, times {self._factor:.4g}"
         lacking = f", {len(self._rows) - len(known)} frames have none" if len(known) < len(self._rows) else ""
         tqdm.write(
-            f"prior=files: {self.folder}, layout {found.layout}, {scale}{lacking}{_focal_note(view, camera, found)}"
+            f"prior=files: {self.folder}, layout {found.layout}, {scale}{lacking}, "
+            f"{_pose_note(self._pose_std)}{_focal_note(view, camera, found)}"
         )
         check_conventions(self._pairs(known, camera), dataset.intrinsics, found.pose_source)
 
@@ -96,7 +122,10 @@ class Files(Prior):
         for index in window.dense:
             self._points[index] = before.get(index) or self._at_frame(index, camera)
         points, confidence, mask = (np.stack(parts) for parts in zip(*self._points.values(), strict=True))
-        return PriorPrediction(window, T_anchor_view, points, confidence, mask, np.zeros((*mask.shape, 0), np.float16))
+        features = np.zeros((*mask.shape, 0), np.float16)
+        std = self._pose_std and (self._pose_std[0] * self._factor, self._pose_std[1])
+        covariance = equal_covariances(std, T_anchor_view)
+        return PriorPrediction(window, T_anchor_view, points, confidence, mask, features, covariance)
 
     def _pose(self, index: int) -> np.ndarray:
         """T_world_camera of a frame, NaN where it has none."""
@@ -179,6 +208,12 @@ def rows_of(dataset: Dataset, found: Predictions, folder: Path) -> list[int | No
             "as the images, or choose the frames that were predicted (dataset.start, stop, stride)"
         )
     return list(range(len(dataset)))
+
+
+def _pose_note(pose_std: tuple[float, float] | None) -> str:
+    if pose_std is None:
+        return "how sure the poses are is not known (prior.pose_std)"
+    return f"prior.pose_std=[{pose_std[0]:.2g},{pose_std[1]:.2g}]"
 
 
 def _focal_note(view: View, camera: Camera, found: Predictions) -> str:
