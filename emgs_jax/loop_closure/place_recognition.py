@@ -183,14 +183,26 @@ def add_keyframe(database: Database, keyframe: Keyframe, config: PlaceRecognitio
 def train_vocabulary(
     descriptors: Float32[np.ndarray, "n 128"], config: PlaceRecognitionConfig
 ) -> Float32[np.ndarray, "k 128"]:
-    """Train words, the centres of k-means over evenly chosen descriptors; none with fewer descriptors than words."""
-    if len(descriptors) < config.num_words:
-        return np.zeros((0, sift.DESCRIPTOR_SIZE), np.float32)
-    count = min(len(descriptors), config.max_training)
+    """`train_words` with the settings of place recognition."""
+    return train_words(descriptors, (config.num_words, config.max_training, config.num_iterations), config.seed)
+
+
+def train_words(
+    descriptors: Float32[np.ndarray, "n d"], sizes: tuple[int, int, int], seed: int
+) -> Float32[np.ndarray, "k d"]:
+    """Train words, the centres of k-means over evenly chosen descriptors; none with fewer descriptors than words.
+
+    Args:
+        sizes: number of words, of descriptors at most, and of iterations.
+    """
+    num_words, max_training, num_iterations = sizes
+    if len(descriptors) < num_words:
+        return np.zeros((0, descriptors.shape[1]), np.float32)
+    count = min(len(descriptors), max_training)
     chosen = descriptors[np.linspace(0, len(descriptors) - 1, count).astype(int)]
-    cv2.setRNGSeed(config.seed)
-    stop = (cv2.TERM_CRITERIA_MAX_ITER, config.num_iterations, 0.0)
-    return cv2.kmeans(chosen, config.num_words, None, stop, 1, cv2.KMEANS_PP_CENTERS)[2]
+    cv2.setRNGSeed(seed)
+    stop = (cv2.TERM_CRITERIA_MAX_ITER, num_iterations, 0.0)
+    return cv2.kmeans(chosen, num_words, None, stop, 1, cv2.KMEANS_PP_CENTERS)[2]
 
 
 def vlad(descriptors: Float32[np.ndarray, "n 128"], words: Float32[np.ndarray, "k 128"]) -> Float32[np.ndarray, " v"]:

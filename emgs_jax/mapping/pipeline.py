@@ -23,7 +23,14 @@ from emgs_jax.mapping.relocalization import (
     with_saved_map,
 )
 from emgs_jax.mapping.run import MappingRun, TrackedFrame, record_lost, record_new_submap, record_start, record_step
-from emgs_jax.mapping.submaps import drop_unjoined_submaps, enter_submap, join_submaps, match_submap, start_submap
+from emgs_jax.mapping.submaps import (
+    drop_unjoined_submaps,
+    enter_submap,
+    join_submaps,
+    match_submap,
+    return_to_world,
+    start_submap,
+)
 from emgs_jax.mapping.window_input import RawView, WindowInput, make_prior_query, window_inputs
 from emgs_jax.prior.base import Prior
 
@@ -90,6 +97,7 @@ def track(run: MappingRun, window: WindowInput) -> MappingRun:
         run = start_map(run, window.prediction)
         if run.saved is None:
             return record_start(run, window, seconds_of(window, timer))
+    run = return_to_world(run, window)
     submap = start_submap(run, window)
     if submap is not None:
         return record_new_submap(submap, window, seconds_of(window, timer))
@@ -145,7 +153,7 @@ def replay(
         run = start_map(run, window.prediction)
     first = len(run.records)
     records = tuple(checkpoint.records[first : first + len(window.frames)])
-    run = replace(run, records=(*run.records, *records))
+    run = replace(return_to_world(run, window), records=(*run.records, *records))
     if records[-1].location == NEW_SUBMAP:
         run = enter_submap(run, window)
     run = reanchor_prior(run, window)

@@ -31,6 +31,15 @@ Seconds = Mapping[str, float]  # as a `Timer` reads
 
 
 @dataclass(frozen=True)
+class LeftWorld:
+    """A world of the prior when the run went on in another: `structure` and `prior_motion` then, and its submap."""
+
+    structure: PlacedStructure | None
+    prior_motion: jaxlie.SE3 | None
+    submap_id: int
+
+
+@dataclass(frozen=True)
 class MappingRun:
     """State of a run so far. Nothing of it is ever changed in place: each input makes a new one.
 
@@ -42,6 +51,7 @@ class MappingRun:
         prior_motion: of the prior's world since relocalization; None: the identity.
         structure: pose of the prior's own world, if it is not related to the first frame any more.
         inactive: states of the other disconnected submaps, by their number.
+        worlds: other worlds of the prior that the run has been in, by their number.
         prior_query: predicts both visits of a loop, see `prior_queries`.
         first_covariance: (6, 6) of the first frame, as frames were placed, when the run has ended (`first_frame.py`).
     """
@@ -56,6 +66,7 @@ class MappingRun:
     prior_motion: jaxlie.SE3 | None = None
     structure: PlacedStructure | None = None
     inactive: Mapping[int, SlamState] = field(default_factory=dict)
+    worlds: Mapping[int, LeftWorld] = field(default_factory=dict)
     prior_query: PriorQuery = lambda a, b: None
     first_covariance: np.ndarray | None = None
 

@@ -31,7 +31,7 @@ from emgs_jax.mapping.relocalization import (
     relocalized_start,
     step_prediction,
 )
-from emgs_jax.mapping.run import MappingRun, TrackedFrame, row_of_first_node
+from emgs_jax.mapping.run import LeftWorld, MappingRun, TrackedFrame, row_of_first_node
 from emgs_jax.mapping.window_input import WindowInput
 from emgs_jax.observation import no_covariance
 from emgs_jax.registration.pose_estimate import rescale_estimate
@@ -62,9 +62,39 @@ def enter_submap(run: MappingRun, window: WindowInput) -> MappingRun:
     return replace(
         run,
         inactive={**run.inactive, run.back_end.submap_id: run.state},
+        worlds=_with_world_left(run),
         back_end=replace(run.back_end, submap_id=window.structure),
         structure=place_structure(window, run.records[-1].pose),
         prior_motion=None,
+    )
+
+
+def _with_world_left(run: MappingRun) -> dict[int, LeftWorld]:
+    number = 0 if run.structure is None else run.structure.number
+    return {**run.worlds, number: LeftWorld(run.structure, run.prior_motion, run.back_end.submap_id)}
+
+
+def return_to_world(run: MappingRun, window: WindowInput) -> MappingRun:
+    """Switch to the world of this frame where the run has been in it before, and to its submap.
+
+    Nothing of the frame before is known there: the step starts at the pose that the prior predicts.
+    """
+    before = run.worlds.get(window.structure)
+    if before is None or run.back_end is None or run.state is None or is_related(run, window):
+        return run
+    states = {**run.inactive, run.back_end.submap_id: run.state}
+    if before.submap_id not in states:
+        return run
+    state = states.pop(before.submap_id)
+    previous = replace(state.previous, valid=jnp.zeros_like(state.previous.valid))
+    return replace(
+        run,
+        state=replace(state, previous=previous, time=run.state.time),
+        inactive=states,
+        worlds=_with_world_left(run),
+        back_end=replace(run.back_end, submap_id=before.submap_id),
+        structure=before.structure,
+        prior_motion=before.prior_motion,
     )
 
 
@@ -131,6 +161,9 @@ def join_submaps(run: MappingRun, window: WindowInput) -> MappingRun:
         state = replace(state, estimate=rescale_estimate(state.estimate, scale))
         motion = anchor_motion_of(records[-1], step_prediction(run, window))
     inactive = {one: state for one, state in run.inactive.items() if one != there}
+    # Where another world of the prior lies in a submap that moves is not known any more.
+    worlds = {number: left for number, left in run.worlds.items() if left.submap_id != newer}
+    run = replace(run, worlds=worlds)
     changed = {"state": state, "config": config, "records": tuple(records), "inactive": inactive}
     return replace(run, back_end=end, prior_motion=motion, **changed)
 

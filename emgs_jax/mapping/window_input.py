@@ -93,6 +93,7 @@ def window_inputs(
         here = {index for index, pose in _poses(prediction).items() if np.isfinite(pose).all()}
         structure += bool(is_started and known and here and not here & known)
         known = here or known
+        structure = structure if prediction.world is None else prediction.world
         with clock.phase("map"):
             anchor = first_pose(frames)
             raw = _raw_views(prediction, frames, anchor, structure, done, config)

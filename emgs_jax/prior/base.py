@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -48,6 +49,8 @@ class PriorPrediction:
             What all views err alike counts for nothing. NaN for a view of which nothing is known, None where the prior
             does not say: then the map finds out. Poses that are known lie in one world: the scale of a frame's depths
             does not move them.
+        world: number of the frame of reference that the poses are in, of a prior that tells: 0 is that of the first
+            frames with a pose, and it may come back. None: a new one begins where no view has a pose as before.
     """
 
     window: Window
@@ -57,6 +60,7 @@ class PriorPrediction:
     mask: np.ndarray
     features: np.ndarray
     pose_covariance: np.ndarray | None = None
+    world: int | None = None
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,9 @@ class Prior(ABC):
 
     def check(self, dataset: Dataset, window_size: int) -> None:  # noqa: B027 (most can answer for any data set)
         """Raise ValueError where the prior cannot answer for the data set."""
+
+    def keep(self, folder: Path) -> None:  # noqa: B027 (most have nothing to keep)
+        """Keep in the folder of a run what the predictions rest on, and take it from there where it is."""
 
     def report(self) -> dict[str, float]:
         """Return the prior's own statistics of its predictions so far, as keys `prior/…`."""

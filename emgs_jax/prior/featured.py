@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -22,6 +23,9 @@ class Wrapped(Prior):
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         self._prior.check(dataset, window_size)
+
+    def keep(self, folder: Path) -> None:
+        self._prior.keep(folder)
 
     def report(self) -> dict[str, float]:
         return self._prior.report()

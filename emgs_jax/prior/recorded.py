@@ -10,8 +10,9 @@ The format `emgs_jax.predictions`, version 3, is a folder; nothing in it is ever
 - `visits_A_…_B.npz`, for pairs of frames that show one place twice, named by all its views: as below, of one more
   inference with views of both visits (`recorded_visits`). A folder may have none.
 - `000000.npz`, …, one file per inference: `inference` (), `views` (v,), `dense` (d,), `current` () and the arrays of
-  `PriorPrediction` in the dtypes stated there, `pose_covariance` only where the prior gives it: about d·(17·h·w + 2·y·x·f) bytes. Features are float16; points are
-  not, because a float16 step is 2 mm at 2 to 4 m. Version 1, whose features have one cell per pixel, and 2, which has no covariances, are read as well.
+  `PriorPrediction` in the dtypes stated there, `pose_covariance` and `world` only
+  where the prior gives them: about d·(17·h·w + 2·y·x·f) bytes. Features are float16; points are not, because a float16
+  step is 2 mm at 2 to 4 m. Versions 1, whose features have one cell per pixel, and 2, without the two, are read as well.
 
 Each file is written under a temporary name and then renamed, data before the manifest: a full disk or an interrupted
 run leaves a valid folder, which `record` completes.
@@ -170,7 +171,8 @@ class Recorded(Prior):
         check_numbers(self.folder / name, arrays)
         given = equal_covariances(self._pose_std, arrays["T_anchor_view"])
         covariance = arrays.get("pose_covariance") if given is None else given
-        return PriorPrediction(window, *(arrays[key] for key in FIELDS), covariance)
+        world = int(arrays["world"]) if "world" in arrays else None
+        return PriorPrediction(window, *(arrays[key] for key in FIELDS), covariance, world)
 
     def _load(self, name: str, keys: Sequence[str], optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
         """Read and verify one file of the recording."""
@@ -280,9 +282,9 @@ def _arrays(prediction: PriorPrediction) -> dict[str, np.ndarray]:
         "dense": np.asarray(window.dense),
         "current": np.asarray(window.current),
     }
-    given = OPTIONAL if prediction.pose_covariance is not None else {}
+    given = {key: OPTIONAL[key] for key in OPTIONAL if getattr(prediction, key) is not None}
     for key, (dtype, _) in (FIELDS | given).items():
-        arrays[key] = getattr(prediction, key)
+        arrays[key] = np.asarray(getattr(prediction, key))
         if arrays[key].dtype != dtype:
             # A conversion would make the replay differ from the live run.
             raise ValueError(f"the prior's {key} must be {np.dtype(dtype)}, got {arrays[key].dtype}")

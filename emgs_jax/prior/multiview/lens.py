@@ -1,74 +1,65 @@
-"""The radial distortion of a lens, one number k: a pinhole camera sees at x (1 + k |x|²) what the lens shows at x.
-
-x is a pixel's place on the plane z = 1. Most cameras have |k| < .1, negative where straight lines bulge inwards.
-"""
+"""The lens that the images were taken with, between their pixels and those of a pinhole camera that sees the same."""
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any
 
 import cv2
-import jax
 import numpy as np
 from jaxtyping import Float
-
-Pixels = TypeVar("Pixels", np.ndarray, jax.Array)
-NUM_STEPS = 10  # of the inversion; each leaves 3 k |x|², well below 1, of the error
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera whose lens is not a pinhole.
+    """A pinhole camera, and what of it the images show.
 
     Args:
-        focal: fx, fy in pixels.
-        center: cx, cy in pixels.
-        distortion: k; 0 is a pinhole camera.
+        focal: fx, fy of the pinhole camera in pixels.
+        center: cx, cy likewise.
+        shown: (h, w, 2) float32, the image's pixel that shows what each pixel of the pinhole camera sees; None: its own.
+        straight: (h, w, 2) float32, the inverse.
     """
 
     focal: np.ndarray
     center: np.ndarray
-    distortion: float = 0.0
+    shown: np.ndarray | None = None
+    straight: np.ndarray | None = None
 
 
-def undistort(pixels: Pixels, distortion: float | jax.Array, focal: Pixels, center: Pixels) -> Pixels:
-    """Map pixels (…, 2) of the lens to those of a pinhole camera that sees the same; NumPy or JAX."""
-    away = pixels - center
-    return pixels + distortion * ((away / focal) ** 2).sum(-1)[..., None] * away
+def lens_of(camera: Any, intrinsics: tuple[float, ...], size: tuple[int, int]) -> Lens:
+    """The lens of images of this (width, height), from pycolmap's camera of the same images in any size.
+
+    Args:
+        intrinsics: fx, fy, cx, cy of the pinhole camera at `size`.
+    """
+    focal, center = np.float64(intrinsics[:2]), np.float64(intrinsics[2:])
+    ratio = np.array(size) / (camera.width, camera.height)  # borders lie on borders; COLMAP counts from them
+    pixels = np.stack(np.meshgrid(*map(np.arange, size)), axis=-1).reshape(-1, 2).astype(float)
+    on_plane = np.column_stack([(pixels - center) / focal, np.ones(len(pixels))])
+    shown = camera.img_from_cam(on_plane) * ratio - 0.5
+    straight = focal * camera.cam_from_img((pixels + 0.5) / ratio) + center
+    if max(np.abs(shown - pixels).max(), np.abs(straight - pixels).max()) < 0.01:
+        return Lens(np.float32(focal), np.float32(center))
+    shown, straight = (np.float32(found).reshape(size[1], size[0], 2) for found in (shown, straight))
+    return Lens(np.float32(focal), np.float32(center), shown, straight)
 
 
-def straight(pixels: Float[np.ndarray, "*b 2"], lens: Lens) -> Float[np.ndarray, "*b 2"]:
-    """`undistort` of a lens."""
-    return undistort(pixels, lens.distortion, lens.focal, lens.center)
-
-
-def distort(pixels: Float[np.ndarray, "*b 2"], lens: Lens) -> Float[np.ndarray, "*b 2"]:
-    """Map pixels of a pinhole camera to those of the lens that show the same: the inverse of `straight`."""
-    shown = pixels
-    for _ in range(NUM_STEPS):
-        shown = shown - (straight(shown, lens) - pixels)
-    return shown
-
-
-def grid(height: int, width: int) -> Float[np.ndarray, "h w 2"]:
-    """(x, y) of every pixel."""
-    return np.stack(np.meshgrid(np.arange(float(width)), np.arange(float(height))), axis=-1)
-
-
-def rectify(images: Float[np.ndarray, "*b h w"], lens: Lens) -> Float[np.ndarray, "*b h w"]:
-    """Images as a pinhole camera sees them; their border goes on where the lens shows nothing."""
-    x, y = np.moveaxis(np.float32(distort(grid(*images.shape[-2:]), lens)), -1, 0)
-    single = images.reshape(-1, *x.shape)
-    found = [cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for image in single]
-    return np.stack(found).reshape(images.shape)
+def rectify(image: np.ndarray, lens: Lens) -> np.ndarray:
+    """An image (h, w) or (h, w, c) as the pinhole camera sees it; its border goes on where the lens shows nothing."""
+    if lens.shown is None:
+        return image
+    return cv2.remap(image, lens.shown, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def as_shown(values: Float[np.ndarray, "h w"], lens: Lens) -> Float[np.ndarray, "h w"]:
-    """Resample an image of a pinhole camera at the pixels of the lens: the nearest value, 0 where there is none."""
-    x, y = np.moveaxis(np.float32(straight(grid(*values.shape), lens)), -1, 0)
-    return cv2.remap(values, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    """Values of the pinhole camera at the pixels of the images: the nearest, 0 where there is none."""
+    if lens.straight is None:
+        return values
+    return cv2.remap(values, lens.straight, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
 
 
-def points_shown(depth: Float[np.ndarray, "*b h w"], lens: Lens) -> Float[np.ndarray, "*b h w 3"]:
-    """Camera-frame points at the depths z of the lens's pixels; 0 where the depth is."""
-    on_plane = (straight(grid(*depth.shape[-2:]), lens) - lens.center) / lens.focal
-    return depth[..., None] * np.concatenate([on_plane, np.ones((*on_plane.shape[:-1], 1))], axis=-1)
+def points_shown(depth: Float[np.ndarray, "h w"], lens: Lens) -> Float[np.ndarray, "h w 3"]:
+    """Camera-frame points at the depths z of the images' pixels; 0 where the depth is."""
+    height, width = depth.shape
+    pixels = lens.straight if lens.straight is not None else np.stack(np.meshgrid(*map(np.arange, (width, height))), -1)
+    on_plane = (pixels - lens.center) / lens.focal
+    return np.float32(depth[..., None] * np.concatenate([on_plane, np.ones((height, width, 1))], axis=-1))

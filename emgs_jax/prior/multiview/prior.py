@@ -1,25 +1,20 @@
-"""The prior `multiview_stereo`: classical geometry from calibrated images, without weights and without a GPU.
+"""The prior `multiview_stereo`: classical geometry from the images alone, without weights and without a GPU.
 
-Structure from motion of the window gives the poses; a plane sweep against some of the other views the depth, and the
-matches on a blank region its plane (`swept.py`), or a network whose weights the user has the depth (`learned.py`). What
-was found for an image (keypoints, matches, depth) is kept while the image is in the window, so the windows of a
-sequence must be asked for in order. The current image is in the middle of its window, so its depth is matched, and
-compared with that of other views, on both sides. The confidence of a depth is 1 + the probability that it is right
-(`confidence.py`): 1 where nothing is known.
+COLMAP finds the poses of all images at once (`structure/`); a plane sweep against some of the other views the depth of
+each, and the matches on a blank region its plane (`swept.py`), or a network whose weights the user has (`learned.py`).
+The confidence of a depth is 1 + the probability that it is right (`confidence.py`): 1 where nothing is known.
 
-The frame is that of the first image that could be placed (image 0, unless the camera rests at first), and the scale
-that of its window, which is fixed by `median_depth`; images alone do not tell it. The radial distortion of the lens is
-measured until the first key view goes: points lie on the rays of the lens as it is known, not on those of the pinhole.
-
-Where the camera has lost all that the structure knows, the newest views begin another one, with a frame and a scale of
-its own. What is known of the views before is of no use then: they have no pose any more, the anchor included.
+Every model of COLMAP is a world with a frame and a unit of its own: images do not tell the scale, so its landmarks get
+the median depth `median_depth`. An answer has the poses of its current frame's world. A frame between two of one world
+may have a pose that is a guess: it has no points, so it is never fused.
 """
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
-import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,22 +23,21 @@ import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.io.files import jsonable
-from emgs_jax.keypoints.poses import calibration
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
 from emgs_jax.prior.multiview.confidence import probability
 from emgs_jax.prior.multiview.dense import DenseConfig, Matched, Stereo
 from emgs_jax.prior.multiview.depth import agreement
-from emgs_jax.prior.multiview.incremental import StructureConfig, at_size, extend
-from emgs_jax.prior.multiview.initialization import begin_again, initialize
-from emgs_jax.prior.multiview.keys import kept, key_views
-from emgs_jax.prior.multiview.landmarks import Structure, confirmed, detect, forget, link
 from emgs_jax.prior.multiview.learned import LearnedConfig, learned
-from emgs_jax.prior.multiview.lens import as_shown, points_shown, straight
+from emgs_jax.prior.multiview.lens import Lens, as_shown, lens_of, points_shown
 from emgs_jax.prior.multiview.sources import choose, parallax
 from emgs_jax.prior.multiview.swept import SweptConfig, swept
+from emgs_jax.structure.config import StructureConfig
+from emgs_jax.structure.model import NONE, Structure
+from emgs_jax.structure.sequence import structure_of
 
 jitted_agreement = eqx.filter_jit(agreement)
+NUM_KEPT = 64  # frames whose images, depths and features are at hand
 
 
 def stereo_of(config: SweptConfig | LearnedConfig) -> Stereo:
@@ -68,139 +62,105 @@ def tried_depths(z: np.ndarray, margin: float) -> np.ndarray:
 
 
 class MultiviewStereo(Prior):
-    """Structure from motion and stereo of a sliding window.
+    """Structure from motion of all images, and stereo of each with others.
 
     Args:
         structure: poses and landmarks.
         dense: depth.
     """
 
-    is_sequential = True  # a window needs those before it
-
     def __init__(self, structure: StructureConfig, dense: SweptConfig | LearnedConfig) -> None:
-        self._given, self._dense_config, self._stereo = structure, dense, stereo_of(dense)
+        self._config, self._dense_config, self._stereo = structure, dense, stereo_of(dense)
         settings = {"structure": _values(structure), "dense": _values(dense)}
         settings["dense"].pop("checkpoint", None)  # its digest says which it is, wherever it lies
-        self.provenance = Provenance("multiview_stereo", {"version": 9} | settings)
-        self._next = 0
-        self._structure = Structure(np.eye(3))
+        self.provenance = Provenance("multiview_stereo", {"version": 10} | settings)
+        self._dataset: Dataset | None = None
+        self._folder: Path | None = None
+        self._found: Structure | None = None
+        # What was made of a frame last is asked for again by its neighbours.
+        self._view, self._depth = lru_cache(NUM_KEPT)(self._make_view), lru_cache(NUM_KEPT)(self._make_depth)
 
     def num_newer(self, window_size: int) -> int:
-        """Half of the window, so that a depth is matched with views on both sides: a third of it and what checks it."""
-        return max(window_size // 2, 1)
+        """All but one: a structure knows all images, so the first frame alone begins the map."""
+        return window_size
 
     def check(self, dataset: Dataset, window_size: int) -> None:
-        """Raise ValueError where a window has too few images to confirm a depth."""
-        confidence = self._dense_config.confidence
-        best = max(confidence.photo) * np.array(confidence.geo)
-        least = 1 + max(int(np.sum(best < self._dense_config.min_probability)), 1)
-        if window_size < least:
-            raise ValueError(f"multiview_stereo compares at least {least} images, got slam.window_size={window_size}")
+        """Take the data set whose images the structure is made of.
+
+        Raises:
+            ValueError: it has fewer than three images.
+        """
+        if len(dataset) < 3:
+            raise ValueError(
+                f"prior=multiview_stereo needs three images or more of one place, {dataset.name} {dataset.sequence} has "
+                f"{len(dataset)} in use: give more (dataset.stop, dataset.stride)"
+            )
+        self._dataset = dataset
+
+    def keep(self, folder: Path) -> None:
+        """Keep the structure in `folder`/structure, and take it from there."""
+        self._folder = folder / "structure"
 
     def report(self) -> dict[str, float]:
-        """`prior/distortion`: k of the lens, as it was measured."""
-        return {"prior/distortion": self._structure.distortion}
+        """`prior/placed_percent`: frames with a pose in a model; `prior/num_worlds`: models that hold them."""
+        if self._found is None:
+            return {}
+        is_placed = (self._found.world != NONE) & ~self._found.is_interpolated
+        return {"prior/placed_percent": 100 * float(is_placed.mean()), "prior/num_worlds": len(self._found.worlds)}
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """Poses of all views and depth of `window.dense`; a view that cannot be placed has NaN and no valid point."""
-        if window.inference == 0:
-            self._begin(frames, intrinsics)
-        elif window.inference != self._next:
-            raise ValueError(
-                f"multiview_stereo carries its landmarks from window to window: expected window {self._next}, got "
-                f"{window.inference}; ask for all windows in order"
-            )
-        self._next = window.inference + 1
-        self._forget(window)
-        for frame in frames:
-            if frame.index >= self._oldest and frame.index not in self._structure.views:
-                self._add(frame)
-        self._place_views(window.current)
-        return self._answer(window)
-
-    def _begin(self, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
-        height, width = frames[0].image.shape[:2]
-        focal, center = np.float32(intrinsics[:2]), np.float32(intrinsics[2:])
-        self._camera = Camera(focal, center, width, height)
-        self._structure_config = at_size(self._given, width, height)
-        self._structure = Structure(calibration(intrinsics))
-        self._has_begun = False
-        self._oldest = 0  # view of this structure
-        self._images: dict[int, np.ndarray] = {}
-        self._prepared: dict[int, Any] = {}
-        self._depths: dict[int, np.ndarray] = {}
-        self._spreads: dict[int, np.ndarray] = {}
-        # A later window sees the anchor, the FIFO, the current and the newest image.
-        self._num_views = len(frames) + 3
-
-    def _place_views(self, current: int) -> None:
-        given, distortion = (self._camera, self._num_views, self._structure_config), self._structure.distortion
-        if self._has_begun:
-            extend(self._structure, *given)
-            other = begin_again(self._structure, current, *given)
-            if other is not None:
-                self._structure, self._oldest = other, min(other.views)
-        elif initialize(self._structure, *given):
-            self._has_begun = True
-        if self._structure.distortion != distortion:
-            self._prepared.clear()
-
-    def _forget(self, window: Window) -> None:
-        config = self._structure_config.keys
-        keys = key_views(self._structure, window.views, self._camera.width, config)
-        stays = {*window.views, *kept(self._structure, keys, config)}
-        self._structure.is_lens_known |= len(keys) > config.max_keys
-        gone = [frame for frame in self._structure.views if frame not in stays]
-        forget(self._structure, gone, self._structure_config.matching)
-        for known in (self._images, self._prepared, self._depths, self._spreads):
-            for frame in [frame for frame in known if frame not in stays]:
-                del known[frame]
-
-    def _add(self, frame: Frame) -> None:
-        gray = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
-        if gray.shape != (self._camera.height, self._camera.width):
-            raise ValueError(
-                f"{frame.name} has size {gray.shape[::-1]}, the window's first image "
-                f"{(self._camera.width, self._camera.height)}: give dataset.size=[width,height]"
-            )
-        view, lens = detect(gray, self._structure_config.matching), self._structure.lens()
-        view.pixels = straight(view.pixels, lens)
-        self._images[frame.index] = frame.image
-        self._structure.views[frame.index] = view
-        link(self._structure, frame.index, self._structure_config.matching)
-
-    def _answer(self, window: Window) -> PriorPrediction:
-        placed, lens = self._structure.placed(), self._structure.lens()
-        ahead = range(window.current + 1, (window.current + window.views[-1]) // 2 + 1)  # which confirm it
-        for frame in (*window.dense, *ahead):
-            if frame not in self._depths or not self._depths[frame].any():  # it may have been placed since
-                self._depths[frame], self._spreads[frame] = self._depth(frame)
-        confidence = np.stack([as_shown(self._confidence(frame), lens) for frame in window.dense])
-        confidence = np.maximum(confidence, 1.0)
-        depth = np.stack([as_shown(self._depths[frame], lens) for frame in window.dense])
-        mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_probability)
-        points = points_shown(np.where(mask, depth, 0.0), lens).astype(np.float32)
+        """Poses of all views and depth of `window.dense`; a view that no model holds has NaN and no valid point."""
+        self._prepare(frames, intrinsics)
+        structure, world = self._found, self._found.world[window.current]
+        depths = [self._answer(frame) for frame in window.dense]
+        points, confidence, mask = (np.stack(found) for found in zip(*depths, strict=True))
+        T, spread = np.full((len(window.views), 4, 4), np.nan), np.full((len(window.views), 6, 6), np.nan)
+        anchor = window.views[0]
+        if world != NONE:
+            is_same = structure.world[anchor] == world
+            T_anchor_world = np.linalg.inv(structure.T_world_camera[anchor]) if is_same else np.eye(4)
+            for row, frame in enumerate(window.views):
+                if structure.world[frame] == world:
+                    T[row] = np.eye(4) if frame == anchor else T_anchor_world @ structure.T_world_camera[frame]
+                    spread[row] = structure.covariance[frame]
         features = np.zeros((*mask.shape, 0), np.float16)
-        T_anchor_view = np.full((len(window.views), 4, 4), np.nan)
-        if self._oldest <= window.views[0]:
-            T_anchor_view[0] = np.eye(4)  # also where it is not known
-        for row, frame in enumerate(window.views[1:], start=1):
-            if frame in placed:
-                T_anchor_view[row] = placed[frame].T_ref_view
-        return PriorPrediction(window, T_anchor_view, points, confidence, mask, features)
+        return PriorPrediction(
+            window, T, points, confidence, mask, features, pose_covariance=spread, world=max(int(world), 0)
+        )
 
-    def _depth(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    def _prepare(self, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
+        """Make the structure before the first answer."""
+        if self._found is not None:
+            return
+        if self._dataset is None:
+            raise ValueError("multiview_stereo makes a structure of a data set: call check(dataset, window_size) first")
+        height, width = frames[0].image.shape[:2]
+        self._camera = Camera(np.float32(intrinsics[:2]), np.float32(intrinsics[2:]), width, height)
+        self._found, is_straight = structure_of(self._dataset, self._config, self._folder)
+        pinhole = Lens(self._camera.focal, self._camera.center)
+        self._lenses = [
+            pinhole if is_straight else lens_of(world.camera, tuple(intrinsics), (width, height))
+            for world in self._found.worlds
+        ]
+
+    def _answer(self, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points (h, w, 3), confidence and mask of a frame's pixels."""
+        world, (height, width) = self._found.world[frame], (self._camera.height, self._camera.width)
+        if world == NONE or self._found.is_interpolated[frame]:
+            nothing = np.zeros((height, width), np.float32)
+            return np.zeros((height, width, 3), np.float32), nothing + 1, nothing > 0
+        lens = self._lenses[world]
+        confidence = np.maximum(as_shown(self._confidence(frame), lens), np.float32(1.0))
+        depth = as_shown(self._depth(frame)[0], lens)
+        mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_probability)
+        return points_shown(np.where(mask, depth, 0.0), lens), confidence, mask
+
+    def _make_depth(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Depth (h, w) of a view, 0 where it is not known, and its spread."""
-        view, nothing = self._structure.views[frame], np.zeros(self._images[frame].shape[:2], np.float32)
-        sources = self._sources(frame)
-        if not sources:
-            return nothing, nothing
-        max_error = self._structure_config.matching.max_reprojection_error
-        views = [self._structure.views[other] for other in sources]
-        points = self._structure.points[confirmed(self._structure, view, views, max_error)]
-        z = (points - view.T_ref_view[:3, 3]) @ view.T_ref_view[:3, 2]
+        nothing = np.zeros((self._camera.height, self._camera.width), np.float32)
+        sources, z = self._sources(frame), self._found.depths(frame)
         z = z[z > 0]
-        if not len(z):
+        if not sources or not len(z):
             return nothing, nothing
         count = self._dense_config.num_sources
         is_used = np.arange(count) < len(sources)
@@ -215,48 +175,51 @@ class MultiviewStereo(Prior):
         )
         return self._stereo.estimate(matched)
 
-    def _view(self, frame: int) -> Any:
-        """Return what the way to a depth keeps of an image; made anew when the lens is known better."""
-        if frame not in self._prepared:
-            self._prepared[frame] = self._stereo.prepare(self._images[frame], self._structure.lens())
-        return self._prepared[frame]
+    def _make_view(self, frame: int) -> Any:
+        """Return what the way to a depth keeps of an image."""
+        return self._stereo.prepare(self._dataset[frame].image, self._lenses[self._found.world[frame]])
+
+    def _placed_beside(self, frame: int) -> np.ndarray:
+        """Frames of the same world that show landmarks, without this one, the nearest in time first."""
+        found = self._found
+        others = np.flatnonzero((found.world == found.world[frame]) & ~found.is_interpolated)
+        others = others[others != frame]
+        return others[np.argsort(np.abs(others - frame), kind="stable")]
 
     def _sources(self, frame: int) -> list[int]:
-        """The placed views that together show the view's landmarks under most parallax, best first."""
-        view, placed = self._structure.views[frame], self._structure.placed()
-        if frame not in placed:
-            return []
-        landmarks = view.landmark[self._structure.known(view)]
-        points, center = self._structure.points[landmarks], view.T_ref_view[:3, 3]
+        """The views that together show the view's landmarks under most parallax, best first."""
+        found, landmarks = self._found, self._found.landmarks[frame]
+        points, center = found.shown(frame), found.T_world_camera[frame, :3, 3]
         best = self._dense_config.best_parallax_rad
-        worth = {
-            index: np.isin(landmarks, other.landmark)
-            * np.minimum(parallax(points, center, other.T_ref_view[:3, 3]) / best, 1.0)
-            for index, other in placed.items()
-            if index != frame
-        }
+        worth = {}
+        for other in self._placed_beside(frame):
+            is_shown = np.isin(landmarks, found.landmarks[other], assume_unique=True)
+            if is_shown.any():
+                angle = parallax(points, center, found.T_world_camera[other, :3, 3])
+                worth[int(other)] = is_shown * np.minimum(angle / best, 1.0)
         return choose(worth, self._dense_config.num_sources)
 
     def _confidence(self, frame: int) -> np.ndarray:
         """One more than the probability that each depth is right."""
-        placed, count = self._structure.placed(), self._dense_config.num_checks
-        others = sorted((o for o in self._depths if o in placed and o != frame), key=lambda o: abs(o - frame))[:count]
-        if frame not in placed or not others:
-            return np.ones_like(self._depths[frame])
-        maps = np.zeros((count, *self._depths[frame].shape), np.float32)
-        maps[: len(others)] = [self._depths[other] for other in others]
+        depth, spread = self._depth(frame)
+        count = self._dense_config.num_checks
+        others = [int(other) for other in self._placed_beside(frame)[:count]]
+        if not others:
+            return np.ones_like(depth)
+        maps = np.zeros((count, *depth.shape), np.float32)
+        maps[: len(others)] = [self._depth(other)[0] for other in others]
         others = (others * count)[:count]
         agreed = jitted_agreement(
-            jnp.asarray(self._depths[frame]),
+            jnp.asarray(depth),
             jnp.asarray(maps),
             self._relative(others, frame),
             self._camera,
             jnp.float32(self._dense_config.depth_step),
         )
-        return 1.0 + probability(self._spreads[frame], np.asarray(agreed), self._dense_config.confidence)
+        return 1.0 + probability(spread, np.asarray(agreed), self._dense_config.confidence)
 
     def _relative(self, others: Sequence[int], frame: int) -> jaxlie.SE3:
         """T_other_frame of several views."""
-        views = self._structure.views
-        T = [np.linalg.inv(views[other].T_ref_view) @ views[frame].T_ref_view for other in others]
+        poses = self._found.T_world_camera
+        T = [np.linalg.inv(poses[other]) @ poses[frame] for other in others]
         return jaxlie.SE3.from_matrix(jnp.asarray(np.stack(T), jnp.float32))

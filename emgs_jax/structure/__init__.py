@@ -1,0 +1,1 @@
+"""Structure from motion of all images at once, by COLMAP."""

@@ -1,0 +1,328 @@
+"""From images to models: COLMAP's features, matches and mapper, in a folder that an interrupted call goes on in."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.structure.config import StructureConfig
+from emgs_jax.structure.pairs import choose_pairs
+
+BATCH = 8  # images of one call of COLMAP, so that the bar moves
+PAIRS = 400  # likewise
+DATABASE, IMAGES = "database.db", "images"
+SECONDS = 0.5, 0.05, 0.6  # of two cores: features of a 640x480 image, a pair, an image mapped
+
+
+class Shots(NamedTuple):
+    """Images of one camera.
+
+    Args:
+        names: of each, once.
+        read: RGB uint8 (h, w, 3) of image 0 .. n-1; raises BadFrameError.
+        size: (width, height).
+        camera: COLMAP's model and its parameters in COLMAP's pixels, "PINHOLE", (fx, fy, cx, cy); no parameters: its
+            default focal length is where the calibration begins.
+        is_calibrated: True where only the distortion may still change.
+    """
+
+    names: Sequence[str]
+    read: Any
+    size: tuple[int, int]
+    camera: tuple[str, tuple[float, ...]]
+    is_calibrated: bool
+
+
+def options_of(cls: type, *given: Mapping[str, Any]) -> Any:
+    """An options object of pycolmap with values put into it, the last ones win.
+
+    Raises:
+        ValueError: COLMAP knows no such option, or not this value; the message names those that there are.
+    """
+    options = cls()
+    for values in given:
+        try:
+            options.mergedict(_plain(values))
+        except (AttributeError, TypeError, ValueError, RuntimeError) as error:
+            known = ", ".join(sorted(options.todict()))
+            raise ValueError(
+                f"prior.structure.options: {cls.__name__} of pycolmap does not take {dict(values)} "
+                f"({str(error).splitlines()[0]}): its options are {known}"
+            ) from error
+    return options
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: _plain(value) if isinstance(value, Mapping) else value for key, value in values.items()}
+
+
+def map_images(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]:
+    """COLMAP's models of the images, the one of most images first.
+
+    Args:
+        folder: for the database, from which a call that was interrupted goes on.
+
+    Raises:
+        ValueError: the images do not determine a structure; with the reason and a remedy.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with quiet():
+        _say(shots, config)
+        detect(shots, config, folder)
+        match(shots, config, folder)
+    return map_database(shots, config, folder)
+
+
+def map_database(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]:
+    """COLMAP's models of the matches in a folder's database; frames that none holds are tried once more.
+
+    Raises:
+        ValueError: it cannot be read, or there is no model; with the reason and a remedy.
+    """
+    with quiet():
+        found = find_models(shots, config, folder)
+        check_found(found, shots, config, folder)
+        register_rest(found, config, folder)
+    return found
+
+
+def _say(shots: Shots, config: StructureConfig) -> None:
+    """What many images will cost, before it is spent."""
+    count, per_image = len(shots.names), 2 * (config.overlap + config.num_similar)
+    pairs = count * (count - 1) // 2 if count <= config.max_exhaustive else count * per_image // 2
+    features, pair, mapped = SECONDS
+    minutes = (count * (features + mapped) + pairs * pair) / 60
+    if minutes > 5:
+        tqdm.write(
+            f"structure of {count} images: some {minutes:.0f} minutes on two cores and {count * 1.5 / 1024:.1f} GB of "
+            "disk while it lasts; prior.structure.mapper=global is faster, prior.structure.model=DIR takes a finished one"
+        )
+
+
+def detect(shots: Shots, config: StructureConfig, folder: Path) -> None:
+    """Find the features of all images that the database lacks."""
+    import pycolmap
+
+    database, images = folder / DATABASE, folder / IMAGES
+    images.mkdir(exist_ok=True)
+    with pycolmap.Database.open(database) as opened:
+        done = {image.name for image in opened.read_all_images()}
+    extraction = options_of(
+        pycolmap.FeatureExtractionOptions,
+        {"num_threads": config.num_threads, "max_image_size": config.max_image_size, "use_gpu": False},
+        config.options.get("extraction", {}),
+    )
+    extraction.type = _member(pycolmap.FeatureExtractorType, config.features, "features")
+    model, parameters = shots.camera
+    reader = pycolmap.ImageReaderOptions(
+        camera_model=model, camera_params=",".join(map(repr, parameters)), mask_path=_masks(shots, config, folder)
+    )
+    names = [name for name in shots.names if f"{name}.png" not in done]
+    number = {name: index for index, name in enumerate(shots.names)}
+    with tqdm(total=len(shots.names), initial=len(shots.names) - len(names), unit="image", desc="features") as bar:
+        for start in range(0, len(names), BATCH):
+            batch = [name for name in names[start : start + BATCH] if _write(shots, number[name], images)]
+            if not batch:
+                continue
+            with pycolmap.Database.open(database) as opened:
+                cameras = opened.read_all_cameras()
+            reader.existing_camera_id = cameras[0].camera_id if cameras else -1
+            pycolmap.extract_features(
+                database,
+                images,
+                image_names=[f"{name}.png" for name in batch],
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=extraction,
+                device=pycolmap.Device.cpu,
+            )
+            bar.update(len(batch))
+
+
+def _write(shots: Shots, index: int, images: Path) -> bool:
+    """Write an image for COLMAP; False where it cannot be read: its frame has no pose, and the run says why."""
+    try:
+        image = shots.read(index)
+    except BadFrameError:
+        return False
+    path = images / f"{shots.names[index]}.png"
+    return image.shape[1::-1] == tuple(shots.size) and cv2.imwrite(str(path), image[..., ::-1], [1, 1])
+
+
+def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
+    """The folder of masks under the names that COLMAP looks for; '' without any.
+
+    Raises:
+        ValueError: there are none, or one has another size than its image.
+    """
+    if config.masks is None:
+        return ""
+    given, own = Path(config.masks).expanduser(), folder / "masks"
+    found = {path.stem: path for path in given.iterdir()} if given.is_dir() else {}
+    missing = [name for name in shots.names if name not in found and f"{name}.png" not in found]
+    if missing:
+        raise ValueError(
+            f"prior.structure.masks={config.masks} has no mask for {missing[0]} (and {len(missing) - 1} more): give a "
+            f"folder with one image for each frame, {missing[0]}.png"
+        )
+    own.mkdir(exist_ok=True)
+    for name in shots.names:
+        path = found.get(name, found.get(f"{name}.png"))
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if mask is None or mask.shape[::-1] != tuple(shots.size):
+            size = "unreadable" if mask is None else f"{mask.shape[1]}x{mask.shape[0]}"
+            raise ValueError(f"{path} is {size}, but its image is {shots.size[0]}x{shots.size[1]}: make it of that size")
+        cv2.imwrite(str(own / f"{name}.png.png"), mask)
+    return str(own)
+
+
+def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
+    """Match and verify the pairs that `choose_pairs` names; those that are in the database stay."""
+    import pycolmap
+
+    database, listed = folder / DATABASE, folder / "pairs.txt"
+    matching = options_of(
+        pycolmap.FeatureMatchingOptions,
+        {"num_threads": config.num_threads, "guided_matching": True, "use_gpu": False},
+        config.options.get("matching", {}),
+    )
+    if config.matcher is not None:
+        matching.type = _member(pycolmap.FeatureMatcherType, config.matcher, "matcher")
+    elif config.features != "sift":
+        kind = {"aliked": "aliked_lightglue", "loma": config.features}[config.features.split("_")[0]]
+        matching.type = _member(pycolmap.FeatureMatcherType, kind, "matcher")
+    verification = options_of(
+        pycolmap.TwoViewGeometryOptions,
+        {"ransac": {"random_seed": config.seed}},
+        config.options.get("verification", {}),
+    )
+    with pycolmap.Database.open(database) as opened:
+        pairs = choose_pairs(opened, [f"{name}.png" for name in shots.names], config)
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
+    with tqdm(total=len(pairs), unit="pair", desc="matches") as bar:
+        for start in range(0, len(pairs), PAIRS):
+            some = pairs[start : start + PAIRS]
+            listed.write_text("\n".join(f"{a} {b}" for a, b in some))
+            pycolmap.match_image_pairs(
+                database,
+                matching_options=matching,
+                pairing_options=pairing,
+                verification_options=verification,
+                device=pycolmap.Device.cpu,
+            )
+            bar.update(len(some))
+
+
+def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]:
+    """Run the mapper; models in the order of their numbers of images."""
+    import pycolmap
+
+    is_free = not shots.is_calibrated
+    common = {"num_threads": config.num_threads, "random_seed": config.seed}
+    given = config.options.get("mapping", {})
+    output = folder / "models"
+    output.mkdir(exist_ok=True)
+    if config.mapper == "global":
+        refined = {"refine_focal_length": is_free, "refine_extra_params": is_free or config.refine_distortion}
+        options = options_of(
+            pycolmap.GlobalPipelineOptions, common, {"mapper": {**common, "bundle_adjustment": refined}}, given
+        )
+        found = pycolmap.global_mapping(folder / DATABASE, folder / IMAGES, output, options)
+    else:
+        refined = {
+            "ba_refine_focal_length": is_free,
+            "ba_refine_extra_params": is_free or config.refine_distortion,
+            "mapper": {
+                **common,
+                "abs_pose_refine_focal_length": is_free,
+                "abs_pose_refine_extra_params": is_free or config.refine_distortion,
+            },
+            "triangulation": {"random_seed": config.seed},
+        }
+        options = options_of(pycolmap.IncrementalPipelineOptions, common, refined, given)
+        with tqdm(total=len(shots.names), unit="image", desc="structure") as bar:
+            found = pycolmap.incremental_mapping(
+                folder / DATABASE, folder / IMAGES, output, options, next_image_callback=lambda: bar.update()
+            )
+    return sorted(found.values(), key=lambda model: -model.num_reg_images())
+
+
+def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) -> None:
+    """Register images that no model holds with fewer inliers, in the model that shows most of what they show."""
+    import pycolmap
+
+    with pycolmap.Database.open(folder / DATABASE) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions(min_num_matches=config.min_inliers))
+    placed = {image for model in models for image in model.reg_image_ids()}
+    options = pycolmap.IncrementalMapperOptions(
+        abs_pose_min_num_inliers=config.min_inliers,
+        abs_pose_refine_focal_length=False,
+        abs_pose_refine_extra_params=False,
+        random_seed=config.seed,
+    )
+    for model in models:
+        mapper = pycolmap.IncrementalMapper(cache)
+        mapper.begin_reconstruction(model)
+        rest = [image for image in sorted(names) if image not in placed and cache.exists_image(image)]
+        new = [image for image in rest if mapper.register_next_image(options, image)]
+        for image in new:
+            mapper.triangulate_image(pycolmap.IncrementalTriangulatorOptions(random_seed=config.seed), image)
+        placed.update(new)
+        mapper.end_reconstruction(False)
+
+
+def check_found(found: Sequence[Any], shots: Shots, config: StructureConfig, folder: Path) -> None:
+    """Raise ValueError where no model was found, with the likeliest reason."""
+    import pycolmap
+
+    if found:
+        return
+    count = len(shots.names)
+    with pycolmap.Database.open(folder / DATABASE) as opened:
+        keypoints = [opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()]
+        _, geometries = opened.read_two_view_geometries()
+    few = sum(number < 50 for number in keypoints)
+    kinds = [int(geometry.config) for geometry in geometries]
+    turned = sum(kind in (4, 5, 6) for kind in kinds)  # planar or a rotation alone
+    if count < 3:
+        reason = f"{count} images are too few: give 3 or more of one place (dataset.stop, dataset.stride)"
+    elif few > count / 2:
+        masked = " and prior.structure.masks" if config.masks is not None else ""
+        reason = f"{few} of {len(keypoints)} images show hardly anything to recognise: check the images{masked}"
+    elif not geometries:
+        reason = "no two images share enough: take them closer together (dataset.stride)"
+    elif turned > len(kinds) / 2:
+        reason = (
+            f"{turned} of {len(kinds)} pairs of images differ by a rotation or show one plane, which tells no depth: "
+            "move the camera sideways, or take images farther apart (dataset.stride)"
+        )
+    else:
+        reason = "no pair of images has parallax to begin with: take images farther apart (dataset.stride)"
+    raise ValueError(f"prior=multiview_stereo finds no structure: {reason}; or bring predictions (prior=files)")
+
+
+def _member(kinds: Any, name: str, key: str) -> Any:
+    """The value of one of pycolmap's enumerations by its name in any case."""
+    members = {member.lower(): value for member, value in kinds.__members__.items() if member != "UNDEFINED"}
+    if name.lower() not in members:
+        raise ValueError(f"prior.structure.{key}={name} is unknown: pycolmap has {', '.join(members)}")
+    return members[name.lower()]
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """COLMAP logs its errors only."""
+    import pycolmap
+
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before

@@ -1,0 +1,156 @@
+"""Where a structure is kept: in the run's folder and in a cache, under a key of what it was made from."""
+
+import hashlib
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.io.files import write_file
+from emgs_jax.structure.config import StructureConfig
+from emgs_jax.structure.model import stem
+from emgs_jax.structure.reconstruct import DATABASE, Shots, map_database, map_images
+
+ABOUT = "structure.json"
+NOT_OF_MODELS = ("model", "median_depth", "pixel_std", "max_gap")  # settings of what is made of the models
+PARTS = ("cameras", "images")
+CACHE = Path("~/.cache/emgs_jax/structure")
+
+
+def key_of(shots: Shots, config: StructureConfig) -> str:
+    """Hex digest of the images' pixels, the camera, the settings and COLMAP's version."""
+    settings = {name: value for name, value in asdict(config).items() if name not in NOT_OF_MODELS}
+    about = [settings, shots.camera, shots.is_calibrated, [*shots.names], version("pycolmap")]
+    digest = hashlib.blake2b(json.dumps(about, sort_keys=True, default=str).encode(), digest_size=16)
+    for index in range(len(shots.names)):
+        try:
+            digest.update(np.ascontiguousarray(shots.read(index)).data)
+        except BadFrameError:
+            digest.update(b"none")
+    return digest.hexdigest()
+
+
+def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> tuple[str, list[Any]]:
+    """The key and pycolmap's models of images, the largest first: made before, or made here and kept.
+
+    Args:
+        folder: `structure/` of a run; None: the cache alone keeps them.
+
+    Raises:
+        ValueError: the images do not determine a structure, or `config.model` is none of theirs.
+    """
+    if config.model is not None:
+        models = given_models(Path(config.model).expanduser(), shots, config)
+        key = hashlib.blake2b(repr([stems_of(model) for model in models]).encode(), digest_size=16).hexdigest()
+        if folder is not None:
+            write_models(models, key, folder)
+        return key, models
+    key = key_of(shots, config)
+    cached = CACHE.expanduser() / key
+    places = [place for place in (folder, cached) if place is not None]
+    there = next((place for place in places if is_of(place, key)), None)
+    if there is None:
+        there = _made(shots, config, key, places)
+    models = read_models(there)
+    for place in places:
+        if not is_of(place, key):
+            try:
+                write_models(models, key, place)
+            except OSError as error:
+                tqdm.write(f"{place} cannot keep the structure ({error.strerror}): the next run makes it again")
+    return key, models
+
+
+def _made(shots: Shots, config: StructureConfig, key: str, places: Sequence[Path]) -> Path:
+    """Make the models in the first of these folders that can be written, where an interrupted call has begun."""
+    for place in [*places, Path(tempfile.gettempdir()) / f"emgs_structure_{key}"]:
+        work = place.with_name(f".{place.name}_{key}")
+        try:
+            work.mkdir(parents=True, exist_ok=True)
+            (work / "is_writable").touch()
+        except OSError:
+            continue
+        write_models(map_images(shots, config, work), key, place)
+        shutil.rmtree(work, ignore_errors=True)
+        return place
+    raise ValueError(f"no folder can be written: {', '.join(map(str, places))}; give hydra.run.dir=DIR")
+
+
+def is_of(place: Path, key: str) -> bool:
+    """True if a folder holds the models of this key."""
+    try:
+        return json.loads((place / ABOUT).read_text())["key"] == key
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def write_models(models: Sequence[Any], key: str, place: Path) -> None:
+    """Write models as COLMAP reads them, one folder each, and last what they are of."""
+    place.mkdir(parents=True, exist_ok=True)
+    for number, model in enumerate(models):
+        folder = place / str(number)
+        folder.mkdir(exist_ok=True)
+        model.write_binary(folder)
+    about = {"key": key, "pycolmap": version("pycolmap"), "images": [model.num_reg_images() for model in models]}
+    write_file(place / ABOUT, json.dumps(about, indent=1).encode())
+
+
+def read_models(place: Path) -> list[Any]:
+    """Read the models of a folder: itself, or those that are numbered below it, the largest first.
+
+    Raises:
+        ValueError: there is none, or one is damaged.
+    """
+    import pycolmap
+
+    below = [place, *sorted((path for path in place.glob("*") if path.name.isdecimal()), key=lambda p: int(p.name))]
+    found = [folder for folder in below if all(any(folder.glob(f"{part}.*")) for part in PARTS)]
+    if not found:
+        raise ValueError(f"{place} holds no model of COLMAP (cameras, images, points3D as .bin or .txt)")
+    models = []
+    for folder in found:
+        try:
+            models.append(pycolmap.Reconstruction(folder))
+        except (RuntimeError, ValueError, IndexError, MemoryError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"{folder} is damaged ({reason}): export the model again, or delete the folder") from error
+    return sorted(models, key=lambda model: -model.num_reg_images())
+
+
+def stems_of(model: Any) -> list[str]:
+    """Names of a model's images that have a pose."""
+    return sorted(stem(image.name) for image in model.images.values() if image.has_pose)
+
+
+def given_models(place: Path, shots: Shots, config: StructureConfig) -> list[Any]:
+    """The models of `prior.structure.model`: a folder of models, or a database that is mapped in a copy.
+
+    Raises:
+        ValueError: it is of other images, none, or damaged.
+    """
+    database = place if place.suffix == ".db" else place / DATABASE
+    key = f"prior.structure.model={config.model}"
+    if not place.exists():
+        raise ValueError(f"{key} does not exist: give the folder of a COLMAP model, or a database")
+    is_model = any(any(folder.glob("cameras.*")) for folder in (place, *place.glob("[0-9]*")) if folder.is_dir())
+    if is_model or not database.is_file():
+        models = read_models(place)
+    else:
+        with tempfile.TemporaryDirectory() as work:
+            shutil.copy(database, Path(work) / DATABASE)
+            models = map_database(shots, config, Path(work))
+    named = {name for model in models for name in stems_of(model)}
+    if not named & {*shots.names}:
+        raise ValueError(
+            f"{key} is of other images: it has {', '.join(sorted(named)[:3])}, …, this run {', '.join(shots.names[:3])}, "
+            "…; names count without folder and suffix"
+        )
+    return models
