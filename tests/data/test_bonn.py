@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.bonn import CALIBRATION, T_M, Bonn
 from emgs_jax.data.camera_models import Calibration
-from emgs_jax.data.undistortion import undistortion
 from emgs_jax.data.reading import is_rigid
+from emgs_jax.data.undistortion import undistortion
 
 SEQUENCE = "rgbd_bonn_plane"
 HALF_TURN = np.diag([-1.0, 1.0, 1.0, 1.0])[[0, 2, 1, 3]]  # x' = -x, y' = z, z' = y

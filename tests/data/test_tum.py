@@ -9,10 +9,10 @@ from written_scene import plane_depth, scene_pose
 
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.camera_models import Calibration
-from emgs_jax.data.undistortion import undistortion
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.timestamps import nearest_rows
 from emgs_jax.data.tum import CALIBRATIONS, Tum, read_list
+from emgs_jax.data.undistortion import undistortion
 
 SEQUENCE = "rgbd_dataset_freiburg3_plane"
 LISTS = ("rgb", "depth", "groundtruth")
