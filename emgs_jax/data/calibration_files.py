@@ -1,12 +1,10 @@
-"""Calibration files of other programs: what camera a file is of, in OpenCV's terms and pixels.
+"""Calibration files of other programs: what camera a file is of, pixel centres at integers.
 
-Our pixel centres are at integers, as OpenCV's; COLMAP and nerfstudio count from the corner, so .5 is taken off.
+COLMAP and nerfstudio count from the image's corner, so .5 is taken off.
 """
 
 import json
-import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +12,17 @@ import yaml
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.data.reading import Intrinsics, Size
+from emgs_jax.data.camera_models import Calibration, as_number, lens_of, named_lens, refuse_model, size_of
+from emgs_jax.data.colmap_model import load_cameras
 from emgs_jax.data.transforms_json import with_angle_of_view, with_frames_camera
 
 KNOWN_FILES = (
-    "COLMAP cameras.txt, nerfstudio transforms.json, OpenCV or ROS YAML (camera_matrix), ORB-SLAM YAML (Camera.fx), "
-    "MASt3R-SLAM intrinsics.yaml (width, height, calibration) or JSON with width, height, fx, fy, cx, cy"
+    "COLMAP cameras.txt or .bin, nerfstudio transforms.json, OpenCV or ROS YAML (camera_matrix), ORB-SLAM YAML "
+    "(Camera.fx), Kalibr's camchain.yaml or EuRoC's sensor.yaml (distortion_model, resolution), MASt3R-SLAM "
+    "intrinsics.yaml (width, height, calibration) or JSON with width, height, fx, fy, cx, cy"
 )
-DISTORTION = ("k1", "k2", "p1", "p2", "k3")  # OpenCV's order
-# Parameters of COLMAP's models: f is both focal lengths, k is k1.
-COLMAP_MODELS = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-}
+COEFFICIENTS = {"OPENCV": ("k1", "k2", "p1", "p2", "k3"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4")  # keys of both
 # What stands in such files beside the camera.
 TRANSFORMS_KEYS = {
     *("frames", "ply_file_path", "applied_transform", "applied_scale", "orientation_override", "aabb_scale", "aabb"),
@@ -46,22 +39,11 @@ ORB_SECTIONS = (
     *("Camera", "ORBextractor", "Viewer", "File", "System", "IMU", "Stereo", "RGBD", "loopClosing"),
     *("DepthMapFactor", "ThDepth", "Feature", "Mapping", "PangolinViewer", "Tracking"),
 )
-TRANSFORMS_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """A camera.
-
-    Args:
-        intrinsics: fx, fy, cx, cy of the images on disk, pixel centres at integers.
-        distortion: k1, k2, p1, p2 and maybe k3 (OpenCV's model); empty for a pinhole camera.
-        size: (width, height) of the images that it is for; None where nothing says.
-    """
-
-    intrinsics: Intrinsics
-    distortion: tuple[float, ...] = ()
-    size: Size | None = None
+ORB_MODELS = {
+    **dict.fromkeys(("pinhole", "perspective"), "OPENCV"),
+    **dict.fromkeys(("kannalabrandt8", "fisheye"), "OPENCV_FISHEYE"),
+}
+TRANSFORMS_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "OPENCV_FISHEYE")
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -69,20 +51,17 @@ def read_calibration(path: Path) -> Calibration:
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: another format, a model without an OpenCV equivalent here, an unknown, missing or senseless value.
+        ValueError: another format, a model that is not read, an unknown, missing or senseless value.
     """
     suffix = path.suffix.lower()
-    if suffix == ".bin":
-        raise ValueError(f"{path} is binary: colmap model_converter --output_type TXT writes cameras.txt")
-    if suffix not in (".txt", ".json", ".yaml", ".yml"):
+    if suffix not in (".txt", ".bin", ".json", ".yaml", ".yml"):
         raise ValueError(f"{path} is none of the calibration files that are known: {KNOWN_FILES}")
     try:
-        text = reading.read_text(path)
+        if suffix in (".txt", ".bin"):
+            return _only([*load_cameras(path).values()], path)
+        values = parse_keys(reading.read_text(path), path)
     except BadFrameError as error:
         raise FileNotFoundError(f"dataset.intrinsics: {path} cannot be read; it may be {KNOWN_FILES}") from error
-    if suffix == ".txt":
-        return _colmap(text, path)
-    values = parse_keys(text, path)
     if "fl_x" in values or "frames" in values:
         return _transforms(values, path)
     if "camera_matrix" in values:
@@ -93,7 +72,19 @@ def read_calibration(path: Path) -> Calibration:
         return _orb_slam(values, path)
     if "fx" in values:
         return _plain(values, path)
+    chain = [camera for key, camera in values.items() if str(key).startswith("cam") and isinstance(camera, dict)]
+    if chain or "distortion_model" in values:
+        return _only([kalibr_camera(camera, path) for camera in chain or [values]], path)
     raise ValueError(f"{path} has none of the keys fl_x, camera_matrix, calibration, Camera.fx, fx: give {KNOWN_FILES}")
+
+
+def _only(cameras: list[Calibration], path: Path) -> Calibration:
+    """The camera of a file with one, which it may list several times."""
+    if not cameras:
+        raise ValueError(f"{path} must have lines CAMERA_ID MODEL WIDTH HEIGHT PARAMS, as COLMAP's cameras.txt")
+    if len({*cameras}) > 1:
+        raise ValueError(f"{path} has {len({*cameras})} different cameras: leave that of the one that took the images")
+    return cameras[0]
 
 
 class _Loader(yaml.SafeLoader):
@@ -120,23 +111,12 @@ def parse_keys(text: str, path: Path) -> dict[str, Any]:
     return values
 
 
-def _number(value: Any, key: str, path: Path) -> float:
-    """A finite number, which YAML may have left as text (1e-3 without a point)."""
-    try:
-        number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise ValueError(f"{path}: {key} must be a finite number, got {str(value)[:80]!r}: correct it")
-    return number
-
-
 def needed(values: Mapping[str, Any], keys: Collection[str], path: Path) -> list[float]:
     """The numbers at `keys`, which must be there."""
     missing = [key for key in keys if key not in values]
     if missing:
         raise ValueError(f"{path} has no {', '.join(missing)}: add what is missing, in pixels of the images on disk")
-    return [_number(values[key], key, path) for key in keys]
+    return [as_number(values[key], key, path) for key in keys]
 
 
 def _check_known(values: Mapping[str, Any], known: Collection[str], path: Path) -> None:
@@ -149,89 +129,34 @@ def _check_known(values: Mapping[str, Any], known: Collection[str], path: Path) 
         )
 
 
-def size_of(width: float, height: float, path: Path) -> Size:
-    if min(width, height) < 1 or width != int(width) or height != int(height):
-        raise ValueError(f"{path}: width and height must be pixels, got {width:g} and {height:g}: correct them")
-    return int(width), int(height)
-
-
-def lens_of(coefficients: list[float], path: Path) -> tuple[float, ...]:
-    """k1, k2, p1, p2 and maybe k3; empty where all are 0. What OpenCV's longer models add must be 0."""
-    if len(coefficients) not in (0, 4, 5, 8, 12, 14) or any(coefficients[5:]):
-        raise ValueError(
-            f"{path}: {len(coefficients)} distortion coefficients are no k1, k2, p1, p2(, k3): calibrate with these"
-        )
-    return tuple(coefficients[:5]) if any(coefficients) else ()
-
-
-def refuse_model(model: object, known: Collection[str], path: Path) -> None:
-    raise ValueError(
-        f"{path}: the camera model {model} is not read, only {', '.join(known)}: undistort the images with the program "
-        "that calibrated them (colmap image_undistorter) and give the new calibration"
-    )
-
-
-def _colmap(text: str, path: Path) -> Calibration:
-    """CAMERA_ID MODEL WIDTH HEIGHT PARAMS[], one line a camera; several lines must be of the same camera."""
-    lines = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    if not lines or min(map(len, lines)) < 5:
-        raise ValueError(f"{path} must have lines CAMERA_ID MODEL WIDTH HEIGHT PARAMS, as COLMAP's cameras.txt")
-    if len({tuple(line[1:]) for line in lines}) > 1:
-        raise ValueError(f"{path} has {len(lines)} different cameras: leave the line of the one that took the images")
-    return colmap_camera(lines[0][1:], path)
-
-
-def colmap_camera(words: list[str], path: Path) -> Calibration:
-    """The camera of the words MODEL WIDTH HEIGHT PARAMS; raises ValueError where they are of another model."""
-    model, *words = words
-    if model not in COLMAP_MODELS:
-        refuse_model(model, COLMAP_MODELS, path)
-    names = COLMAP_MODELS[model]
-    if len(words) != 2 + len(names):
-        raise ValueError(f"{path}: {model} has the parameters {', '.join(names)}, got {len(words) - 2}: correct them")
-    width, height, *numbers = (
-        _number(word, name, path) for word, name in zip(words, ("width", "height", *names), strict=True)
-    )
-    values = dict(zip(names, numbers, strict=True))
-    intrinsics = _from_corner(values.get("fx", values.get("f")), values.get("fy", values.get("f")), values)
-    bent = [values.get(key, 0.0) for key in DISTORTION[:4]]
-    return Calibration(intrinsics, lens_of(bent, path), size_of(width, height, path))
-
-
-def _from_corner(fx: float, fy: float, values: Mapping[str, float]) -> Intrinsics:
-    """Intrinsics of a program for which the corner of the image is 0, 0."""
-    return fx, fy, values["cx"] - 0.5, values["cy"] - 0.5
+def _lens(values: Mapping[str, Any], model: str, path: Path, before: str = "") -> tuple[float, ...]:
+    """The distortion at the keys k1, k2, …, 0 where one is missing; ValueError where one is of another model."""
+    found = {key: as_number(values.get(before + key, 0), before + key, path) for key in DISTORTION}
+    if foreign := [key for key in found if found[key] and key not in COEFFICIENTS[model]]:
+        refuse_model(f"{model} with {', '.join(foreign)}", [*COEFFICIENTS], path)
+    bent = [found[key] for key in COEFFICIENTS[model]]
+    return lens_of(model, bent if model != "OPENCV" or bent[4] else bent[:4], path)
 
 
 def _transforms(values: Mapping[str, Any], path: Path) -> Calibration:
     """nerfstudio: one camera for all frames."""
-    camera = {"fl_x", "fl_y", "cx", "cy", "w", "h", *DISTORTION, "k4"}
-    values = with_angle_of_view(with_frames_camera(values, camera | {"camera_model"}, path), path)
+    camera = {"fl_x", "fl_y", "cx", "cy", "w", "h", *DISTORTION}
+    values = with_frames_camera(values, camera | {"camera_model", "is_fisheye"}, path)
+    values = with_angle_of_view(values, path)
     _check_known(values, camera | TRANSFORMS_KEYS, path)
-    model = values.get("camera_model", "OPENCV")
-    if model not in TRANSFORMS_MODELS or values.get("is_fisheye"):
-        refuse_model("OPENCV_FISHEYE" if values.get("is_fisheye") else model, TRANSFORMS_MODELS, path)
+    model = "OPENCV_FISHEYE" if values.get("is_fisheye") else values.get("camera_model", "OPENCV")
+    if model not in TRANSFORMS_MODELS:
+        refuse_model(model, TRANSFORMS_MODELS, path)
+    model = model if model in COEFFICIENTS else "OPENCV"
     fx, fy, cx, cy, width, height = needed(values, ("fl_x", "fl_y", "cx", "cy", "w", "h"), path)
-    bent = [_number(values.get(key, 0), key, path) for key in DISTORTION]
-    if _number(values.get("k4", 0), "k4", path) != 0:
-        refuse_model("with k4", TRANSFORMS_MODELS, path)
-    return Calibration(
-        _from_corner(fx, fy, {"cx": cx, "cy": cy}), lens_of(_short(bent), path), size_of(width, height, path)
-    )
-
-
-def _short(coefficients: list[float]) -> list[float]:
-    """Without a k3 of 0."""
-    return coefficients if coefficients[4] else coefficients[:4]
+    return Calibration((fx, fy, cx - 0.5, cy - 0.5), _lens(values, model, path), size_of(width, height, path), model)
 
 
 def _opencv(values: Mapping[str, Any], path: Path) -> Calibration:
     """OpenCV's calibration sample and ROS' camera_info."""
     known = {"image_width", "image_height", "camera_matrix", "distortion_coefficients"}
     _check_known(values, known | OPENCV_KEYS, path)
-    model = str(values.get("distortion_model", "plumb_bob"))
-    if model not in ("plumb_bob", "radtan") or values.get("fisheye_model"):
-        refuse_model("fisheye" if values.get("fisheye_model") else model, ("plumb_bob", "radtan"), path)
+    model = "fisheye" if values.get("fisheye_model") else values.get("distortion_model", "plumb_bob")
     width, height = needed(values, ("image_width", "image_height"), path)
     K = numbers_of(values["camera_matrix"], "camera_matrix", path)
     if len(K) != 9 or any(K[i] != 0 for i in (1, 3, 6, 7)) or K[8] != 1:
@@ -239,7 +164,23 @@ def _opencv(values: Mapping[str, Any], path: Path) -> Calibration:
     if "distortion_coefficients" not in values:
         raise ValueError(f"{path} has no distortion_coefficients: add them, data: [0, 0, 0, 0] for straight images")
     bent = numbers_of(values["distortion_coefficients"], "distortion_coefficients", path)
-    return Calibration((K[0], K[4], K[2], K[5]), lens_of(bent, path), size_of(width, height, path))
+    lens, model = named_lens(model, bent, path)
+    return Calibration((K[0], K[4], K[2], K[5]), lens, size_of(width, height, path), model)
+
+
+def kalibr_camera(values: Mapping[str, Any], path: Path) -> Calibration:
+    """A camera of Kalibr's camchain.yaml, or EuRoC's sensor.yaml: a pinhole camera behind a lens."""
+    key = next((key for key in ("distortion_coeffs", "distortion_coefficients") if key in values), None)
+    if missing := [name for name in ("intrinsics", "resolution", "distortion_model") if name not in values]:
+        raise ValueError(f"{path} has no {', '.join(missing)}: add what is missing, in pixels of the images on disk")
+    if values.get("camera_model", "pinhole") != "pinhole":
+        refuse_model(values["camera_model"], ("pinhole",), path)
+    intrinsics, size = (numbers_of(values[name], name, path) for name in ("intrinsics", "resolution"))
+    if len(intrinsics) != 4 or len(size) != 2:
+        raise ValueError(f"{path}: intrinsics must be fx, fy, cx, cy and resolution width, height: correct them")
+    bent = [] if key is None else numbers_of(values[key], key, path)
+    lens, model = named_lens(values["distortion_model"], bent, path)
+    return Calibration((*intrinsics,), lens, size_of(*size, path), model)
 
 
 def numbers_of(value: Any, key: str, path: Path) -> list[float]:
@@ -248,11 +189,11 @@ def numbers_of(value: Any, key: str, path: Path) -> list[float]:
     if not isinstance(data, list):
         raise ValueError(f"{path}: {key} must have data: [numbers]: correct it")
     rows = [item if isinstance(item, list) else [item] for item in data]
-    return [_number(item, key, path) for row in rows for item in row]
+    return [as_number(item, key, path) for row in rows for item in row]
 
 
 def _mast3r_slam(values: Mapping[str, Any], path: Path) -> Calibration:
-    """width, height, calibration: [fx, fy, cx, cy(, k1, k2, p1, p2(, k3))]."""
+    """width, height, calibration: [fx, fy, cx, cy(, k1, k2, p1, p2(, k3))], as OpenCV takes them."""
     _check_known(values, {"width", "height", "calibration"}, path)
     width, height = needed(values, ("width", "height"), path)
     numbers = numbers_of(values["calibration"], "calibration", path)
@@ -261,7 +202,7 @@ def _mast3r_slam(values: Mapping[str, Any], path: Path) -> Calibration:
             f"{path}: calibration must be fx, fy, cx, cy(, k1, k2, p1, p2(, k3)), got {len(numbers)}: correct it"
         )
     fx, fy, cx, cy, *bent = numbers
-    return Calibration((fx, fy, cx, cy), lens_of(bent, path), size_of(width, height, path))
+    return Calibration((fx, fy, cx, cy), lens_of("OPENCV", bent, path), size_of(width, height, path))
 
 
 def _orb_slam(values: Mapping[str, Any], path: Path) -> Calibration:
@@ -271,15 +212,14 @@ def _orb_slam(values: Mapping[str, Any], path: Path) -> Calibration:
     if "Camera2.fx" in values or strange:
         found = ", ".join(sorted(map(str, strange))) or "a second camera"
         raise ValueError(f"{path} has more than one camera's keys: {found}; remove what says nothing about the lens")
-    for model in (values.get("Camera.type", "PinHole"), values.get("Camera.model", "perspective")):
-        if str(model).lower() not in ("pinhole", "perspective"):
-            refuse_model(model, ("PinHole", "perspective"), path)
+    name = values.get("Camera.model", values.get("Camera.type", "PinHole"))
+    model = ORB_MODELS.get(str(name).lower()) or refuse_model(name, [*ORB_MODELS], path)
     values = {"Camera.width": values.get("Camera.cols"), "Camera.height": values.get("Camera.rows")} | dict(values)
     values = {key: value for key, value in values.items() if value is not None}
     names = [f"{section}.{key}" for key in ("fx", "fy", "cx", "cy")]
     fx, fy, cx, cy, width, height = needed(values, [*names, "Camera.width", "Camera.height"], path)
-    bent = [_number(values.get(f"{section}.{key}", 0), f"{section}.{key}", path) for key in DISTORTION]
-    return Calibration((fx, fy, cx, cy), lens_of(_short(bent), path), size_of(width, height, path))
+    lens = _lens(values, model, path, f"{section}.")
+    return Calibration((fx, fy, cx, cy), lens, size_of(width, height, path), model)
 
 
 def _plain(values: Mapping[str, Any], path: Path) -> Calibration:
@@ -287,5 +227,4 @@ def _plain(values: Mapping[str, Any], path: Path) -> Calibration:
     names = ("width", "height", "fx", "fy", "cx", "cy")
     _check_known(values, {*names, *DISTORTION}, path)
     width, height, fx, fy, cx, cy = needed(values, names, path)
-    bent = [_number(values.get(key, 0), key, path) for key in DISTORTION]
-    return Calibration((fx, fy, cx, cy), lens_of(_short(bent), path), size_of(width, height, path))
+    return Calibration((fx, fy, cx, cy), _lens(values, "OPENCV", path), size_of(width, height, path))

@@ -1,7 +1,7 @@
 """COLMAP's sparse model as it is read, from text or binary: cameras, and images with their poses.
 
-COLMAP counts pixels from the image's corner and its poses are world → camera; ours are camera → world, with pixel
-centres at integers.
+Its poses are world → camera; ours are camera → world. pycolmap does not read them here: a damaged binary file makes it
+hang or ask for gigabytes, it names no line, and it wants all points.
 """
 
 import math
@@ -13,13 +13,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.data import reading
+from emgs_jax.data.camera_models import MODELS, Calibration, as_number, from_colmap, size_of
+
 TEXT, BINARY = ("cameras.txt", "images.txt"), ("cameras.bin", "images.bin")
 MAX_NORM_ERROR = 1e-2  # of a quaternion: files of others have few digits
-MODELS = (  # of cameras.bin, by number, and how many parameters each has
-    *(("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8)),
-    *(("OPENCV_FISHEYE", 8), ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5)),
-    *(("THIN_PRISM_FISHEYE", 12), ("RAD_TAN_THIN_PRISM_FISHEYE", 16)),
-)
 POINT_SIZE = 24  # bytes of a point in images.bin: x, y and the number of its landmark
 
 
@@ -28,12 +26,12 @@ class SparseModel:
     """The cameras and images of a model.
 
     Args:
-        cameras: by id the words MODEL WIDTH HEIGHT PARAMS… as in cameras.txt, in COLMAP's own pixels.
+        cameras: by id.
         names: of the image files, below the folder of images.
         T_world_camera: (n, 4, 4), in the model's unit.
     """
 
-    cameras: dict[int, list[str]]
+    cameras: dict[int, Calibration]
     names: list[str]
     camera_ids: list[int]
     T_world_camera: np.ndarray
@@ -53,7 +51,7 @@ class _Records:
     """A binary file, read from its beginning; what ends before it should is a ValueError that names it."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._data, self._place = path, path.read_bytes(), 0
+        self._path, self._data, self._place = path, reading.read_bytes(path), 0
 
     def values(self, layout: str) -> tuple[Any, ...]:
         """The next values; little-endian and without gaps."""
@@ -75,17 +73,41 @@ class _Records:
             raise ValueError(f"{self._path} is damaged: it goes on after its last record; export the model again")
 
 
+def load_cameras(path: Path) -> dict[int, Calibration]:
+    """The cameras of cameras.txt or cameras.bin by id."""
+    return (_binary_cameras if path.suffix.lower() == ".bin" else _text_cameras)(path)
+
+
+def _binary_cameras(path: Path) -> dict[int, Calibration]:
+    records, cameras, names = _Records(path), {}, [*MODELS]
+    for _ in range(*records.values("Q")):
+        key, number, *size = records.values("IiQQ")
+        if not 0 <= number < len(names) or key in cameras:
+            raise ValueError(f"{path} is damaged: camera {key} is there twice or of no model; export it again")
+        params = records.values(f"{len(MODELS[names[number]].split())}d")
+        cameras[key] = from_colmap(names[number], params, size_of(*size, path), path)
+    records.end()
+    return cameras
+
+
+def _text_cameras(path: Path) -> dict[int, Calibration]:
+    cameras: dict[int, Calibration] = {}
+    for number, line in _lines(path):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) < 5 or not words[0].isdecimal() or int(words[0]) in cameras:
+            raise ValueError(f"{path}:{number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, got {line[:60]!r}")
+        key, model, width, height, *params = words
+        size = size_of(*(as_number(side, "a side", path) for side in (width, height)), path)
+        cameras[int(key)] = from_colmap(model, params, size, path)
+    return cameras
+
+
 def _load_binary(folder: Path) -> SparseModel:
     """Read cameras.bin and images.bin, whose layout is in COLMAP's documentation of its output format."""
     cameras_file, images_file = (folder / name for name in BINARY)
-    records, cameras = _Records(cameras_file), {}
-    for _ in range(*records.values("Q")):
-        key, number, width, height = records.values("IiQQ")
-        if not 0 <= number < len(MODELS) or key in cameras:
-            raise ValueError(f"{cameras_file} is damaged: camera {key} is there twice or of no model; export it again")
-        model, count = MODELS[number]
-        cameras[key] = [model, str(width), str(height), *(f"{value:.17g}" for value in records.values(f"{count}d"))]
-    records.end()
+    cameras = load_cameras(cameras_file)
     records, images = _Records(images_file), []
     for _ in range(*records.values("Q")):
         number, *values = records.values("I7dI")
@@ -101,16 +123,7 @@ def _load_binary(folder: Path) -> SparseModel:
 def _load_text(folder: Path) -> SparseModel:
     """Read cameras.txt and images.txt."""
     cameras_file, images_file = (folder / name for name in TEXT)
-    cameras: dict[int, list[str]] = {}
-    for number, line in _lines(cameras_file):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        if len(words) < 5 or not words[0].isdecimal() or int(words[0]) in cameras:
-            raise ValueError(
-                f"{cameras_file}:{number}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, got {line[:60]!r}"
-            )
-        cameras[int(words[0])] = words[1:]
+    cameras = load_cameras(cameras_file)
     names, ids, poses = [], [], []
     lines = iter(_lines(images_file))
     for number, line in lines:
@@ -135,7 +148,7 @@ def _is_whole(word: str) -> bool:
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    return [*enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1)]
+    return [*enumerate(reading.read_text(path).splitlines(), start=1)]
 
 
 def _image(line: str, place: str) -> tuple[str, int, np.ndarray]:

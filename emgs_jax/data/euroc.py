@@ -7,7 +7,7 @@ import numpy as np
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.data.calibration_files import Calibration, lens_of, needed, numbers_of, parse_keys, refuse_model, size_of
+from emgs_jax.data.calibration_files import Calibration, kalibr_camera, numbers_of, parse_keys
 from emgs_jax.data.posed_images import Pose, PosedImages, Solved
 from emgs_jax.data.reading import Number
 from emgs_jax.data.timestamps import check_tolerance, matched_rows
@@ -15,7 +15,6 @@ from emgs_jax.data.tum import as_transform, read_list
 
 LAYOUT = "root/SEQUENCE/mav0/{cam0/{data.csv, sensor.yaml, data/}, state_groundtruth_estimate0/data.csv}"
 SOURCE = "EuRoC MAV dataset of the ASL at ETH Zurich, the zip of a sequence in ASL format"
-MODELS = ("radial-tangential", "radtan")
 ORDER = (0, 1, 2, 4, 5, 6, 3)  # from x y z qw qx qy qz to TUM's order
 
 
@@ -90,17 +89,7 @@ def read_sensor(path: Path) -> tuple[Calibration, Pose]:
         values = parse_keys(reading.read_text(path), path)
     except BadFrameError as error:
         raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
-    for key in ("T_BS", "resolution", "intrinsics", "distortion_model", "distortion_coefficients"):
-        if key not in values:
-            raise ValueError(f"{path} has no {key}, which a camera of EuRoC has: fetch it again")
-    model = values["distortion_model"]
-    if model not in MODELS:
-        refuse_model(model, MODELS, path)
-    intrinsics, size = numbers_of(values["intrinsics"], "intrinsics", path), values["resolution"]
-    bent = numbers_of(values["distortion_coefficients"], "distortion_coefficients", path)
+    if "T_BS" not in values:
+        raise ValueError(f"{path} has no T_BS, which a camera of EuRoC has: fetch it again")
     mounted = numbers_of(values["T_BS"], "T_BS", path)
-    if len(intrinsics) != 4 or not isinstance(size, list) or len(size) != 2:
-        raise ValueError(f"{path}: intrinsics must be fx, fy, cx, cy and resolution width, height: fetch it again")
-    width, height = needed(dict(zip(("width", "height"), size, strict=True)), ("width", "height"), path)
-    T_body_camera = reading.as_pose(" ".join(map(repr, mounted)), f"{path}: T_BS")
-    return Calibration(tuple(intrinsics), lens_of(bent, path), size_of(width, height, path)), T_body_camera
+    return kalibr_camera(values, path), reading.as_pose(" ".join(map(repr, mounted)), f"{path}: T_BS")

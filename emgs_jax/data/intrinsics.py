@@ -2,8 +2,9 @@
 
 import math
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +15,20 @@ from PIL import ExifTags, Image
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.data.calibration_files import Calibration, read_calibration
+from emgs_jax.data.calibration_files import read_calibration
+from emgs_jax.data.camera_models import Calibration, from_colmap, lens_of
 from emgs_jax.data.focal_length import describe, estimate_focal_length
-from emgs_jax.data.plausible_camera import is_impossible, oddities, other_reading
+from emgs_jax.data.plausible_camera import is_impossible, oddities, other_reading, view_deg
 from emgs_jax.data.reading import Intrinsics, Number, Size
 from emgs_jax.data.tones import Tones, read_shown
+from emgs_jax.data.undistortion import Maps, undistortion
 
-Given = str | Sequence[Number]  # dataset.intrinsics
+Given = str | Sequence[Number | str]  # dataset.intrinsics
 DIAGONAL_35_MM = 43.27  # of 36 mm x 24 mm; cameras scale by the diagonal, whatever their aspect (COLMAP's rule)
-MAX_BORDER = 2.0  # pixels that the straight view may look beyond: OpenCV fits it to a few points of the border
-MIN_VIEW = 0.1  # of the image's area; a lens that leaves less has other coefficients
 MAX_ASPECT_CHANGE = 0.02  # between the picture that the camera took and the file
 ALTERNATIVES = (
-    "dataset.intrinsics=[fx,fy,cx,cy] in pixels of the images on disk (then k1,k2,p1,p2 and maybe k3 of the lens), "
-    "a calibration file, exif or estimate"
+    "dataset.intrinsics=[fx,fy,cx,cy] in pixels of the images on disk (then k1,k2,p1,p2 and maybe k3 of the lens; or "
+    "[MODEL,…] with COLMAP's parameters), a calibration file, exif or estimate"
 )
 
 
@@ -60,7 +61,7 @@ class Lens:
     """
 
     intrinsics: Intrinsics
-    maps: tuple[np.ndarray, np.ndarray] | None
+    maps: Maps | None
     about: Mapping[str, Any]
 
     def straighten(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -119,9 +120,13 @@ def to_lens(camera: Calibration, size: Size, what: str, about: Mapping[str, Any]
     raw = reading.check_intrinsics(camera.intrinsics, size, what, images)
     about = with_notes(about, check_plausible(camera, size, what, images))
     about = {**about, "size": [*size], "intrinsics": [*raw], "distortion": [*camera.distortion]}
-    if not any(camera.distortion):
+    if camera.is_pinhole:
         return Lens(raw, None, about)
-    straight, maps = undistortion(raw, camera.distortion, size, what)
+    straight, maps, share = undistortion(camera, size, what)
+    if camera.model != "OPENCV":
+        wide, high = view_deg(straight, size)
+        view = f"straight images of {wide:.0f} x {high:.0f} degrees show {100 * share:.0f} % of those on disk"
+        about = with_notes({**about, "model": camera.model}, f"{camera.model}: {view}")
     return Lens(straight, maps, about)
 
 
@@ -131,15 +136,18 @@ def with_notes(about: Mapping[str, Any], *notes: str | None) -> Mapping[str, Any
     return {**about, "note": "; ".join(said)} if said else about
 
 
-def from_numbers(given: Sequence[Number]) -> Calibration:
-    """fx, fy, cx, cy, and where there is distortion k1, k2, p1, p2 and maybe k3."""
-    values = tuple(float(value) for value in given)
-    if len(values) not in (4, 8, 9) or not np.isfinite(values).all():
+def from_numbers(given: Sequence[Number | str]) -> Calibration:
+    """fx, fy, cx, cy, and OpenCV's distortion where there is any; or the name of COLMAP's model and its parameters."""
+    what = "dataset.intrinsics"
+    values = [*given] if isinstance(given, Iterable) else [given]
+    if values and isinstance(values[0], str):
+        return from_colmap(values[0], values[1:], None, what, corner=0.0)
+    if len(values) not in (4, 8, 9, 12) or not all(isinstance(v, Real) and math.isfinite(v) for v in values):
         raise ValueError(
-            "dataset.intrinsics must be [fx, fy, cx, cy], or [fx, fy, cx, cy, k1, k2, p1, p2(, k3)] for images with "
-            f"distortion, all finite; got {list(given)}"
+            f"{what} must be [fx, fy, cx, cy], or [fx, fy, cx, cy, k1, k2, p1, p2(, k3(, k4, k5, k6))] for images with "
+            f"distortion, all finite, or [MODEL, …] with the parameters of COLMAP's model; got {values}"
         )
-    return Calibration(values[:4], values[4:])
+    return Calibration((*map(float, values[:4]),), lens_of("OPENCV", [*map(float, values[4:])], what))
 
 
 def from_exif(pictures: Pictures) -> Calibration:
@@ -241,38 +249,3 @@ def check_plausible(camera: Calibration, size: Size, what: str, images: str) -> 
     if other and camera.size is None:
         raise ValueError(f"{odd}; {other}, or, where they are right, a calibration file with width and height")
     return f"{odd}; {other or 'check it'}"
-
-
-def undistortion(
-    intrinsics: Intrinsics, distortion: Sequence[float], size: Size, what: str = "dataset.intrinsics"
-) -> tuple[Intrinsics, tuple[np.ndarray, np.ndarray]]:
-    """New intrinsics whose view lies wholly inside of the distorted image, and the cv2.remap tables that lead there.
-
-    Raises:
-        ValueError: there is no such view: the coefficients fold the image, or leave less than MIN_VIEW of it.
-    """
-    fx, fy, cx, cy = intrinsics
-    old, bent = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(distortion)
-    new, _ = cv2.getOptimalNewCameraMatrix(old, bent, size, alpha=0, newImgSize=size, centerPrincipalPoint=True)
-    # OpenCV answers nonsense where no pixel is left: a view that is mirrored, not finite, or of what no pixel shows.
-    share = 0.0
-    if np.isfinite(new).all() and min(new[0, 0], new[1, 1]) > 0:
-        maps = cv2.initUndistortRectifyMap(old, bent, None, new, size, cv2.CV_32FC1)
-        share = _seen_share(maps, size)
-    if share < MIN_VIEW:
-        raise ValueError(
-            f"{what}: the distortion {[*distortion]} leaves {100 * share:.0f} % of the {size[0]}x{size[1]} image: "
-            "check order (k1, k2, p1, p2, k3) and signs; a fisheye lens has another model, undistort its images before"
-        )
-    return (float(new[0, 0]), float(new[1, 1]), float(new[0, 2]), float(new[1, 2])), maps
-
-
-def _seen_share(maps: tuple[np.ndarray, np.ndarray], size: Size) -> float:
-    """Share of the distorted image that the straight view shows; 0 where it looks beyond or sees something twice."""
-    x, y = maps
-    if not (np.isfinite(x).all() and np.isfinite(y).all()):
-        return 0.0
-    is_inside = min(x.min(), y.min()) >= -MAX_BORDER
-    is_inside &= x.max() <= size[0] - 1 + MAX_BORDER and y.max() <= size[1] - 1 + MAX_BORDER
-    is_folded = (np.diff(x, axis=1) <= 0).any() or (np.diff(y, axis=0) <= 0).any()
-    return float(np.ptp(x) * np.ptp(y) / (size[0] * size[1])) if is_inside and not is_folded else 0.0

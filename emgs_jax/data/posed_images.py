@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import Frame
-from emgs_jax.data.calibration_files import Calibration, colmap_camera, read_calibration
+from emgs_jax.data.calibration_files import Calibration, read_calibration
 from emgs_jax.data.colmap_model import BINARY, TEXT, SparseModel, load_colmap
 from emgs_jax.data.file_names import IMAGE_SUFFIXES, find_image, natural_key, times_of
 from emgs_jax.data.intrinsics import to_lens, with_notes
@@ -196,18 +196,17 @@ def read_colmap(found: SparseModel, folder: Path) -> Solved:
     Raises:
         ValueError: no image, images of several cameras, a camera that is not read, a damaged file.
     """
-    used = {tuple(found.cameras[camera_id]) for camera_id in found.camera_ids}
+    used = {found.cameras[camera_id] for camera_id in found.camera_ids}
     if len(used) > 1:
         raise ValueError(
             f"{found.files[0]}: the images are of {len(used)} different cameras: map those of one, or run COLMAP with "
             "--ImageReader.single_camera 1 where they were taken by one"
         )
-    camera = colmap_camera([*used.pop()], found.files[0])
     images = [find_image(folder, name) for name in found.names]
     there = sum(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.rglob("*"))
     note = f"{found.files[1]} has {len(images)} of the {there} images in {folder}; the others have no pose"
     lacking = note if there > len(images) else None
-    return Solved(images, [*found.T_world_camera], camera, found.files[1], found.files, note=lacking)
+    return Solved(images, [*found.T_world_camera], used.pop(), found.files[1], found.files, note=lacking)
 
 
 def read_nerfstudio(path: Path) -> Solved:

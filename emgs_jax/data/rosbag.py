@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
-from emgs_jax.data.calibration_files import Calibration
+from emgs_jax.data.camera_models import Calibration, named_lens
 from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens, to_lens, with_notes
 from emgs_jax.data.tones import ALL_16_BITS, find_tones
 
@@ -24,7 +24,6 @@ TO_RGB |= {"rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB, "mono16": c
 TO_RGB |= {"8UC1": cv2.COLOR_GRAY2RGB, "8UC3": cv2.COLOR_BGR2RGB, "8UC4": cv2.COLOR_BGRA2RGB}
 CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4, "mono16": 1, "8UC1": 1, "8UC3": 3, "8UC4": 4}
 DEPTHS = re.compile(r"(16|32|64)[USF]C[1-4]$")  # also where they are compressed, as if they were pictures
-STRAIGHT_MODELS = ("plumb_bob", "rational_polynomial", "")
 RECTIFIED = re.compile(r"(^|[/_])rect([/_]|$)")  # a topic, as image_proc and others name it
 
 
@@ -239,11 +238,7 @@ def _camera_info(bag: Any, topic: str, info_topic: str | None, path: Path) -> Ca
             if not P[0] > 0 or not P[5] > 0:
                 raise ValueError(f"{path}: camera_info has no P for the rectified {topic}: give dataset.intrinsics")
             return Calibration((float(P[0]), float(P[5]), float(P[2]), float(P[6])), (), size)
-        if message.distortion_model not in STRAIGHT_MODELS or any(bent[5:]) or len(bent) in (1, 2, 3):
-            raise ValueError(
-                f"{path}: camera_info has the distortion {message.distortion_model!r} with {len(bent)} numbers, and "
-                "read are k1, k2, p1, p2(, k3): take the rectified topic, or give dataset.intrinsics"
-            )
         intrinsics = float(K[0]), float(K[4]), float(K[2]), float(K[5])
-        return Calibration(intrinsics, tuple(bent[:5]) if any(bent) else (), size)
+        lens, model = named_lens(message.distortion_model, bent, f"{path}: camera_info")
+        return Calibration(intrinsics, lens, size, model)
     raise ValueError(f"{path}: camera_info has no message, so dataset.intrinsics must say the camera: {ALTERNATIVES}")

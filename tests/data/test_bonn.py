@@ -6,8 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.bonn import CALIBRATION, T_M, Bonn
-from emgs_jax.data.intrinsics import undistortion
+from emgs_jax.data.camera_models import Calibration
 from emgs_jax.data.reading import is_rigid
+from emgs_jax.data.undistortion import undistortion
 
 SEQUENCE = "rgbd_bonn_plane"
 HALF_TURN = np.diag([-1.0, 1.0, 1.0, 1.0])[[0, 2, 1, 3]]  # x' = -x, y' = z, z' = y
@@ -40,7 +41,7 @@ def test_a_points_place_is_that_of_the_authors_formula_with_depths_in_their_unit
 
 def test_images_are_straightened_with_the_benchmarks_calibration_whatever_the_sequence_is_called(tum_root):
     dataset = load(tum_root)
-    straight, _ = undistortion(*CALIBRATION, (640, 480))
+    straight, *_ = undistortion(Calibration(*CALIBRATION), (640, 480))
     np.testing.assert_allclose(dataset.intrinsics[:2], np.array(straight[:2]) / 2)
     assert dataset.calibration["distortion"] == [*CALIBRATION[1]]
     with pytest.raises(ValueError, match=r"dataset.root is not set: .*Bonn RGB-D Dynamic"):

@@ -41,6 +41,17 @@ ORB = "%YAML:1.0\nCamera.type: PinHole\n" + "".join(
     )
 )
 PLAIN = dict(zip(("fx", "fy", "cx", "cy"), K, strict=True)) | {"width": 640, "height": 480}
+FISHEYE = LENS[:4]
+KALIBR = f"""cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: {[*FISHEYE]}
+  distortion_model: equidistant
+  intrinsics: {[*K]}
+  resolution: [640, 480]
+  rostopic: /cam0/image_raw
+"""
+RATIONAL = (*LENS, 0.01, -0.02, 0.003)
 MAST3R = f"width: 640\nheight: 480\n# a comment\ncalibration: {[*K, *LENS]}\n"
 FILES = {
     "cameras.txt": (f"# Camera list\n1 PINHOLE 640 480 500.5 502.25 {CORNER}\n", ()),
@@ -56,6 +67,32 @@ FILES = {
     "intrinsics.yaml": (MAST3R, LENS),
     "straight/intrinsics.yaml": (f"width: 640\nheight: 480\ncalibration: {[*K]}\n", ()),
     "vipe.json": (json.dumps(PLAIN), ()),
+    "rational.yaml": (
+        ROS.replace("plumb_bob", "rational_polynomial").replace("0.05]", "0.05, 0.01, -0.02, .003]"),
+        RATIONAL,
+    ),
+    "full/cameras.txt": (f"1 FULL_OPENCV 640 480 500.5 502.25 {CORNER} {' '.join(map(str, RATIONAL))}\n", RATIONAL),
+}
+OF_FISHEYES = {
+    "cameras.txt": f"1 OPENCV_FISHEYE 640 480 500.5 502.25 {CORNER} .1 -.2 .001 -.002\n",
+    "transforms.json": json.dumps(
+        TRANSFORMS | dict(zip(("k1", "k2", "k3", "k4"), FISHEYE, strict=True)) | {"camera_model": "OPENCV_FISHEYE"}
+    ),
+    "ngp/transforms.json": json.dumps(
+        TRANSFORMS | dict(zip(("k1", "k2", "k3", "k4"), FISHEYE, strict=True)) | {"is_fisheye": True, "p1": 0}
+    ),
+    "camera_info.yaml": ROS.replace("plumb_bob", "equidistant").replace(", 0.05]", "]"),
+    "opencv.yaml": ROS.replace("distortion_model: plumb_bob", "fisheye_model: 1").replace(", 0.05]", "]"),
+    "orb.yaml": ORB.replace("PinHole", "KannalaBrandt8").replace("k3", "k9").replace("p1", "k3").replace("p2", "k4"),
+    "openvslam.yaml": ORB.replace("type: PinHole", "model: fisheye")
+    .replace("k3", "k9")
+    .replace("p1", "k3")
+    .replace("p2", "k4"),
+    "camchain.yaml": KALIBR,
+    "stereo/camchain.yaml": KALIBR + KALIBR.replace("cam0:", "cam1:"),  # twice the same
+    "sensor.yaml": KALIBR.replace("cam0:", "sensor_type: camera")
+    .replace("\n  ", "\n")
+    .replace("coeffs", "coefficients"),
 }
 
 
@@ -73,6 +110,13 @@ def test_every_format_names_the_same_camera(name, tmp_path):
     np.testing.assert_allclose(camera.intrinsics, K, rtol=1e-12)
     assert camera.size == (640, 480)
     np.testing.assert_allclose(camera.distortion, lens, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", OF_FISHEYES)
+def test_every_format_names_the_same_fisheye(name, tmp_path):
+    camera = read_calibration(write(tmp_path, name, OF_FISHEYES[name]))
+    assert camera.model == "OPENCV_FISHEYE" and camera.size == (640, 480)
+    np.testing.assert_allclose((*camera.intrinsics, *camera.distortion), (*K, *FISHEYE), rtol=1e-12)
 
 
 @pytest.mark.parametrize("shape", [(1, 5), (5, 1), (1, 4), (1, 14)])
@@ -104,23 +148,23 @@ LENS_OF_ROS = "[0.1, -0.2, 1e-3, -0.002, 0.05]"
 WRONG = [
     *(
         ("cameras.txt", OTHER_MODEL.format(model), f"the camera model {model} is not read.*image_undistorter")
-        for model in ("OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE")
+        for model in ("EQUIRECTANGULAR", "FISHEYE624")
     ),
     ("cameras.txt", "", "lines CAMERA_ID MODEL"),
     ("cameras.txt", "1 PINHOLE 640 480 500 500 320\n", "PINHOLE has the parameters fx, fy, cx, cy, got 3"),
     ("cameras.txt", "1 PINHOLE 640 480 500 nan 320 240\n", "fy must be a finite number, got 'nan'"),
     ("cameras.txt", "1 PINHOLE 640.5 480 500 500 320 240\n", "width and height must be pixels"),
-    ("cameras.txt", "1 SIMPLE_PINHOLE 9 9 5 4 4\n2 SIMPLE_PINHOLE 9 9 6 4 4\n", "2 different cameras: leave the line"),
-    ("cameras.bin", "\x01", "model_converter"),
+    ("cameras.txt", "1 SIMPLE_PINHOLE 9 9 5 4 4\n2 SIMPLE_PINHOLE 9 9 6 4 4\n", "2 different cameras: leave that"),
+    ("cameras.bin", "\x01", "is damaged: it ends within a record"),
     ("camera.xml", "<a/>", "none of the calibration files that are known: COLMAP"),
     ("transforms.json", "{", "damaged or no json"),
     ("transforms.json", "[1]", "must hold keys and values"),
     ("transforms.json", '{"a": 1}', "has none of the keys"),
     ("transforms.json", '{"fl_x": 1, "fl_y": 1, "cx": 1, "cy": 1, "h": 3}', "has no w: add"),
     ("transforms.json", json.dumps(TRANSFORMS | {"k7": 1}), "unknown keys: k7.*remove"),
-    ("transforms.json", json.dumps(TRANSFORMS | {"k4": 1}), "with k4 is not read"),
-    ("transforms.json", json.dumps(TRANSFORMS | {"camera_model": "OPENCV_FISHEYE"}), "OPENCV_FISHEYE is not read"),
-    ("transforms.json", json.dumps(TRANSFORMS | {"is_fisheye": True}), "FISHEYE is not read"),
+    ("transforms.json", json.dumps(TRANSFORMS | {"k4": 1}), "OPENCV with k4 is not read"),
+    ("transforms.json", json.dumps(TRANSFORMS | {"camera_model": "FISHEYE624"}), "FISHEYE624 is not read"),
+    ("transforms.json", json.dumps(TRANSFORMS | {"is_fisheye": True, "p1": 0.1}), "OPENCV_FISHEYE with p1 is not read"),
     (
         "transforms.json",
         json.dumps(TRANSFORMS | {"frames": [{}, {}, {"cx": 3}]}),
@@ -128,19 +172,24 @@ WRONG = [
     ),
     ("transforms.json", json.dumps(TRANSFORMS | {"fl_x": True}), "fl_x must be a finite number"),
     ("info.yaml", ROS.replace("image_height: 480\n", ""), "has no image_height: add"),
-    ("info.yaml", ROS.replace("plumb_bob", "equidistant"), "equidistant is not read"),
+    ("info.yaml", ROS.replace("plumb_bob", "equidistant"), "OPENCV_FISHEYE has k1, k2, k3, k4, got 5 numbers"),
     ("info.yaml", ROS.replace("camera_name", "lens_name"), "unknown keys: lens_name"),
     ("info.yaml", ROS.replace("0, 502.25", "2, 502.25"), "camera_matrix must be fx 0 cx"),
     ("info.yaml", ROS.replace(LENS_OF_ROS, "[0.1, .inf, 0, 0]"), "distortion_coefficients must be a"),
     ("info.yaml", ROS.replace(LENS_OF_ROS, "[0.1, 1, 0]"), "3 distortion coefficients are no k1"),
-    ("info.yaml", ROS.replace("0.05]", "0.05, 1, 0, 0]"), "8 distortion coefficients are no k1"),
+    ("info.yaml", ROS.replace("plumb_bob", "omni"), "omni is not read, only none, plumb_bob"),
+    ("info.yaml", ROS.replace("0.05]", "0.05, 1, 0, 0, 0, 0, 0, 1]"), "12 distortion coefficients are no k1"),
     ("info.yaml", ROS.split("distortion_model")[0], "has no distortion_coefficients: add"),
     ("info.yaml", "a: [1", "damaged or no yaml"),
     ("info.yaml", "!!python/object/apply:os.getcwd []", "damaged or no yaml"),
-    ("orb.yaml", ORB.replace("PinHole", "KannalaBrandt8"), "KannalaBrandt8 is not read"),
+    ("orb.yaml", ORB.replace("PinHole", "KannalaBrandt8"), "OPENCV_FISHEYE with p1, p2 is not read"),
     ("orb.yaml", ORB.replace("Camera.width: 640\n", ""), "has no Camera.width: add"),
     ("orb.yaml", ORB + "Camera2.fx: 3\n", "more than one camera"),
-    ("orb.yaml", ORB + "Camera.model: fisheye\n", "the camera model fisheye is not read"),  # k1 and k2 are others there
+    ("orb.yaml", ORB + "Camera.model: equirectangular\n", "equirectangular is not read"),
+    ("camchain.yaml", KALIBR + KALIBR.replace("cam0:", "cam1:").replace("500.5", "501"), "2 different cameras"),
+    ("camchain.yaml", KALIBR.replace("pinhole", "omni"), "the camera model omni is not read, only pinhole"),
+    ("camchain.yaml", KALIBR.replace("resolution", "size"), "has no resolution: add"),
+    ("camchain.yaml", KALIBR.replace("[640, 480]", "[640]"), "resolution width, height: correct them"),
     ("intrinsics.yaml", MAST3R.replace("width", "widht"), "unknown keys: widht"),
     ("intrinsics.yaml", MAST3R.split("calib")[0] + "calibration: [1, 2, 3]\n", "must be fx, fy, cx, cy.*got 3"),
     ("intrinsics.yaml", MAST3R.split("calib")[0] + "calibration: pinhole\n", r"must have data: \[numbers\]"),

@@ -34,6 +34,16 @@ def test_images_are_straightened_as_those_of_a_folder_with_these_numbers(euroc_r
     np.testing.assert_array_equal(dataset[1].image, same[1].image)
 
 
+def test_a_lens_with_equidistant_distortion_is_a_fisheye(euroc_root):
+    path = euroc_root / "MH_01_easy" / "mav0" / "cam0" / "sensor.yaml"
+    path.write_text(path.read_text().replace("radial-tangential", "equidistant"))
+    same = Images(str(path.parent / "data"), size=(160, 120), intrinsics=["OPENCV_FISHEYE", *LENS])
+    np.testing.assert_array_equal(load(euroc_root)[1].image, same[1].image)
+    assert (
+        load(euroc_root).intrinsics == same.intrinsics != Images(str(path.parent / "data"), intrinsics=LENS).intrinsics
+    )
+
+
 def test_without_the_truths_folder_there_are_no_poses(euroc_root):
     truth = euroc_root / "MH_01_easy" / "mav0" / "state_groundtruth_estimate0"
     whole = load(euroc_root).fingerprint()
@@ -44,9 +54,9 @@ def test_without_the_truths_folder_there_are_no_poses(euroc_root):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("radial-tangential", "equidistant", "sensor.yaml: the camera model equidistant is not read, only radial-tan"),
+        ("radial-tangential", "omni", "sensor.yaml: the camera model omni is not read, only none, plumb_bob"),
         ("[160, 120]", "[752, 480]", r"data.csv is for images of 752x480, but the images are 160x120"),
-        ("[160, 120]", "752", "sensor.yaml: .* resolution width, height: fetch it again"),
+        ("[160, 120]", "752", r"sensor.yaml: resolution must have data: \[numbers\]"),
         ("T_BS:", "T_SB:", "sensor.yaml has no T_BS, which a camera of EuRoC has"),
     ],
 )

@@ -8,10 +8,11 @@ import pytest
 from written_scene import plane_depth, scene_pose
 
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.data.intrinsics import undistortion
+from emgs_jax.data.camera_models import Calibration
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.timestamps import nearest_rows
 from emgs_jax.data.tum import CALIBRATIONS, Tum, read_list
+from emgs_jax.data.undistortion import undistortion
 
 SEQUENCE = "rgbd_dataset_freiburg3_plane"
 LISTS = ("rgb", "depth", "groundtruth")
@@ -81,7 +82,7 @@ def test_an_unknown_folder_needs_intrinsics_and_takes_them(tum_root):
 @pytest.mark.parametrize("key", ["freiburg1", "freiburg2"])
 def test_undistorted_pixels_see_what_the_distorted_camera_saw(key):
     intrinsics, distortion = CALIBRATIONS[key]
-    (fx, fy, cx, cy), maps = undistortion(intrinsics, distortion, (640, 480))
+    (fx, fy, cx, cy), maps, _ = undistortion(Calibration(intrinsics, distortion), (640, 480))
     pixels = np.array([[10, 20], [320, 240], [600, 450]])
     rays = np.column_stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(3)])
     old = np.array([[intrinsics[0], 0, intrinsics[2]], [0, intrinsics[1], intrinsics[3]], [0, 0, 1]])

@@ -63,7 +63,7 @@ def tracked(run):
 
 
 def test_pycolmap_reads_the_cameras_where_they_are(written):
-    pycolmap = pytest.importorskip("pycolmap", reason="oracle: pip install -e .[oracles]")
+    pycolmap = pytest.importorskip("pycolmap", reason="no wheel for Linux on ARM")
     model = pycolmap.Reconstruction(str(written.folder / "colmap" / "sparse" / "0"))
     assert (model.num_images(), model.num_cameras(), model.num_points3D()) == (5, 1, 40)
     for image, pose in zip((model.images[key] for key in sorted(model.images)), tracked(written), strict=True):

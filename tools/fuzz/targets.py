@@ -222,6 +222,8 @@ CALIBRATIONS = {
     "transforms.json": json.dumps({"fl_x": 50.5, "fl_y": 50.2, "cx": 24, "cy": 18, "w": 48, "h": 36, "k1": 0.1}),
     "orb.yaml": "%YAML:1.0\nCamera.type: PinHole\nCamera.fx: 50.5\nCamera.fy: 50.2\nCamera.cx: 23.5\nCamera.cy: 17.5\n"
     "Camera.width: 48\nCamera.height: 36\nCamera.k1: 0.1\nCamera.k2: 0\nCamera.p1: 0\nCamera.p2: 0\n",
+    "camchain.yaml": "cam0:\n  camera_model: pinhole\n  distortion_coeffs: [.02, -.01, .003, .001]\n"
+    "  distortion_model: equidistant\n  intrinsics: [50.5, 50.2, 23.5, 17.5]\n  resolution: [48, 36]\n",
     "intrinsics.yaml": "width: 48\nheight: 36\ncalibration: [50.5, 50.2, 23.5, 17.5]\n",
     "plain.json": json.dumps({"fx": 50.5, "fy": 50.2, "cx": 23.5, "cy": 17.5, "width": 48, "height": 36}),
 }

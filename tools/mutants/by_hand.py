@@ -94,9 +94,9 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
         "the colour camera on the other side",
     ),
     (
-        "data/calibration_files",
-        'return fx, fy, values["cx"] - 0.5, values["cy"] - 0.5',
-        'return fx, fy, values["cx"], values["cy"]',
+        "data/camera_models",
+        'found["cx"] - corner, found["cy"] - corner',
+        'found["cx"], found["cy"]',
         "COLMAP's corner taken for the centre of a pixel",
     ),
     (

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.data.calibration_files import colmap_camera
 from emgs_jax.data.posed_images import find_model
 from emgs_jax.data.reading import resize_intrinsics
 from emgs_jax.ops.constants import FLIP
@@ -38,7 +37,11 @@ def read_colmap_workspace(folder: Path) -> Predictions:
 
     def read(row: int) -> View:
         path, depth = paths[rows[row]], load_colmap_array(paths[rows[row]])
-        camera = colmap_camera([*model.cameras[model.camera_ids[rows[row]]]], model.files[0])
+        camera = model.cameras[model.camera_ids[rows[row]]]
+        if not camera.is_pinhole:
+            raise ValueError(
+                f"{model.files[0]}: depth maps are of undistorted images: run colmap image_undistorter first"
+            )
         raw_size = camera.size or (depth.shape[1], depth.shape[0])
         return as_view(str(path), depth, None, resize_intrinsics(camera.intrinsics, raw_size, depth.shape[1::-1]))
 
