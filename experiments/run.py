@@ -67,8 +67,9 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         with clock.phase("setup"):
             slam, evaluation, densify = (build(config, name) for name in ("slam", "evaluation", "densify"))
             graph, fused = graph_config(config), baseline_configs(config)
-            dataset = build_dataset(config)
+            dataset = build_dataset(config, folder)
             prior = build_prior(config, dataset)
+            prior.keep(folder)
             saved = load_saved_map(config.map, config.map_mode, graph, dataset.intrinsics, float(slam.fit.min_std))
             session = new_run(dataset, slam, clock, graph=graph, saved=saved)
             watched = build(config, "view") if config.view else None

@@ -28,6 +28,7 @@ HOST = (
     "features",
     "keypoints",
     "loop_closure",
+    "structure",
     "prior",
     "evaluation",
     "device",

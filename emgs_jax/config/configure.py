@@ -29,6 +29,8 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.featured import Featured, Requeried
 from emgs_jax.prior.files.truth import check_truth
+from emgs_jax.structure.config import StructureConfig
+from emgs_jax.structure.sequence import calibrate
 
 if TYPE_CHECKING:
     from emgs_jax.back_end.state import BackEndConfig
@@ -203,9 +205,17 @@ def near(key: str, known: Sequence[str]) -> str:
     return f"near names: {', '.join(found)}" if found else f"the keys are {', '.join(known)}"
 
 
-def build_dataset(config: DictConfig) -> ReadableFrames:
-    """The data set of a config, without unreadable frames where it says so."""
-    dataset = build(config, "dataset")
+def build_dataset(config: DictConfig, folder: Path | None = None) -> ReadableFrames:
+    """The data set of a config, without unreadable frames where it says so.
+
+    Args:
+        folder: of a run, which keeps a structure that intrinsics are estimated by.
+    """
+    given: dict[str, Any] = {}
+    if config.dataset.get("intrinsics") == "estimate":
+        structure = folder and folder / "structure"
+        given["intrinsics"] = partial(calibrate, config=structure_config(config), folder=structure)
+    dataset = build(config, "dataset", **given)
     if "note" in dataset.calibration:
         tqdm.write(dataset.calibration["note"])
     progress = partial(tqdm, desc="checking", unit="frame")
@@ -214,6 +224,12 @@ def build_dataset(config: DictConfig) -> ReadableFrames:
         scale = config.dataset.depth_scale
         check_truth(frames, None if scale is None else float(scale))
     return frames
+
+
+def structure_config(config: DictConfig) -> StructureConfig:
+    """How a structure of the images is made: that of the prior, else the default."""
+    has_own = OmegaConf.select(config, "prior.structure") is not None
+    return build(config if has_own else compose("prior=multiview_stereo"), "prior.structure", _convert_="all")
 
 
 def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:

@@ -52,12 +52,17 @@ class Dataset(Protocol):
     calibration: Mapping[str, Any] = MappingProxyType(
         {}
     )  # where `intrinsics` are from, plain values for metrics.json; `note` if worth a line
+    full_intrinsics: tuple[float, float, float, float] | None = None  # of `full`; None where it is the frame's image
     classes: tuple[str, ...] = ()  # names of the labels; empty without semantics
     has_ground_truth: bool = False  # depth and poses are there
 
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> Frame: ...
+
+    def full(self, index: int) -> np.ndarray:
+        """RGB image of frame `index` as large as it is on disk, straight; uint8. May raise BadFrameError."""
+        return self[index].image
 
     def pose(self, index: int) -> np.ndarray | None:
         return None

@@ -60,6 +60,7 @@ class Images:
         self.size = reading.check_size(size)
         self._lens = find_lens(intrinsics, self._pictures())
         self.calibration = with_notes(self._lens.about, *self._source.notes)
+        self.full_intrinsics = self._lens.intrinsics
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, raw_size, self.size)
 
     def _pictures(self) -> Pictures:
@@ -72,11 +73,14 @@ class Images:
 
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
+        row, image = self._chosen[index], reading.resize_color(self.full(index), self.size)
+        return Frame(index, self._source.timestamp(row), self._source.label(row), image)
+
+    def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
         row = self._chosen[index]
         image = self._source.read(row)
         reading.check_raw_size(image, self._raw_size, self._source.label(row))
-        image = reading.resize_color(self._lens.straighten(image), self.size)
-        return Frame(index, self._source.timestamp(row), self._source.label(row), image)
+        return self._lens.straighten(image)
 
     def pose(self, index: int) -> None:
         return None

@@ -14,16 +14,13 @@ from jaxtyping import Float32, UInt8
 from PIL import ExifTags, Image
 
 from emgs_jax.data import reading
-from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.calibration_files import read_calibration
 from emgs_jax.data.camera_models import Calibration, from_colmap, lens_of
-from emgs_jax.data.focal_length import describe, estimate_focal_length
 from emgs_jax.data.plausible_camera import is_impossible, oddities, other_reading, view_deg
 from emgs_jax.data.reading import Intrinsics, Number, Size
 from emgs_jax.data.tones import Tones, read_shown
 from emgs_jax.data.undistortion import Maps, undistortion
 
-Given = str | Sequence[Number | str]  # dataset.intrinsics
 DIAGONAL_35_MM = 43.27  # of 36 mm x 24 mm; cameras scale by the diagonal, whatever their aspect (COLMAP's rule)
 MAX_ASPECT_CHANGE = 0.02  # between the picture that the camera took and the file
 ALTERNATIVES = (
@@ -48,6 +45,10 @@ class Pictures:
     read: Callable[[int], UInt8[np.ndarray, "_ _ 3"]]
     files: Sequence[Path] = ()
     name: str = "images"
+
+
+Estimator = Callable[[Pictures], tuple[Calibration, dict[str, Any]]]
+Given = str | Sequence[Number | str] | Estimator  # dataset.intrinsics; a function stands for "estimate"
 
 
 @dataclass(frozen=True)
@@ -87,14 +88,19 @@ def find_lens(given: Given, pictures: Pictures) -> Lens:
         FileNotFoundError: no such calibration file.
     """
     about: dict[str, Any] = {"source": "numbers"}
-    if not isinstance(given, str):
+    if callable(given):
+        what = "dataset.intrinsics=estimate"
+        camera, about = given(pictures)
+    elif not isinstance(given, str):
         what, camera = "dataset.intrinsics", from_numbers(given)
     elif given == "exif":
         what, camera = "dataset.intrinsics=exif", from_exif(pictures)
         about = {"source": given, "note": f"intrinsics from EXIF: focal length {camera.intrinsics[0]:.1f} px"}
     elif given == "estimate":
-        what = "dataset.intrinsics=estimate"
-        camera, about = from_images(pictures)
+        raise ValueError(
+            "dataset.intrinsics=estimate needs a structure of the images: build the data set from a config "
+            "(emgs_jax.load_config, build_dataset), or give a function of the pictures (structure.sequence.calibrate)"
+        )
     else:
         path = Path(given).expanduser()
         what, camera = str(path), read_calibration(path)
@@ -195,30 +201,6 @@ def exif_focal_length(path: Path, size: Size) -> float | None:
             f"{size[0]}x{size[1]}, so its EXIF is of another view: give {ALTERNATIVES}"
         )
     return value if math.isfinite(value) and value > 0 else None
-
-
-def from_images(pictures: Pictures) -> tuple[Calibration, dict[str, Any]]:
-    """The focal length that fits the images themselves, with the centre in the middle, and what it rests on."""
-
-    def read(index: int) -> np.ndarray | None:
-        try:
-            image = pictures.read(index)
-        except BadFrameError:
-            return None
-        return image if image.shape[1::-1] == tuple(pictures.size) else None
-
-    found = estimate_focal_length(pictures.count, read)
-    (w, h) = pictures.size
-    about = {
-        "source": "estimate",
-        "note": f"intrinsics {describe(found)}",
-        "focal_px": found.value,
-        "focal_deviation_px": found.spread,
-        "focal_quartiles_px": [*found.quartiles],
-        "num_pairs": found.num_pairs,
-        "num_images": found.num_images,
-    }
-    return Calibration((found.value, found.value, (w - 1) / 2, (h - 1) / 2)), about
 
 
 def check_image_size(camera: Calibration, size: Size, what: str) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import Frame
@@ -79,6 +79,7 @@ class PosedImages:
         self.calibration = with_notes(self._lens.about, solved.note, note, *shown)
         self.sequence = sequence
         self.size = reading.check_size(size)
+        self.full_intrinsics = self._lens.intrinsics
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
 
     def __len__(self) -> int:
@@ -86,10 +87,11 @@ class PosedImages:
 
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
-        path = self._images[index]
-        image = self._lens.straighten(read_shown(path, self._raw_size, self._tones, reading.AS_STORED))
-        image = reading.resize_color(image, self.size)
-        return Frame(index, self._times[index], str(path), image, None, self.pose(index))
+        image = reading.resize_color(self.full(index), self.size)
+        return Frame(index, self._times[index], str(self._images[index]), image, None, self.pose(index))
+
+    def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        return self._lens.straighten(read_shown(self._images[index], self._raw_size, self._tones, reading.AS_STORED))
 
     def pose(self, index: int) -> Pose | None:
         return self._poses[index]

@@ -49,7 +49,10 @@ class ReadableFrames:
         self._spool, self._places = Spool(), {}  # of each frame that was read, the rest of it and where its arrays are
         self.name, self.sequence, self.size = dataset.name, dataset.sequence, dataset.size
         self.intrinsics, self.calibration, self.classes = dataset.intrinsics, dataset.calibration, dataset.classes
-        self.has_ground_truth = dataset.has_ground_truth
+        self.has_ground_truth, self.full_intrinsics = (
+            dataset.has_ground_truth,
+            getattr(dataset, "full_intrinsics", None),
+        )
         indices = range(len(dataset))
         self.skipped = _unreadable(self._read, progress(indices)) if on_bad_frame == "skip" else {}
         self.kept = tuple(index for index in indices if index not in self.skipped)
@@ -82,6 +85,10 @@ class ReadableFrames:
             with contextlib.suppress(OSError):  # a full disk keeps nothing, and is no failure
                 places = {name: self._spool.append(array) for name, array in arrays.items()}
                 self._places[index] = replace(frame, **dict.fromkeys(ARRAYS)), places
+
+    def full(self, index: int) -> np.ndarray:
+        """The image as large as it is on disk; read anew each time."""
+        return self[index].image if self.full_intrinsics is None else self._dataset.full(self.kept[index])
 
     def pose(self, index: int) -> np.ndarray | None:
         return self._dataset.pose(self.kept[index])

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Frame
@@ -60,6 +60,7 @@ class Replica:
         self.calibration = self._lens.about
         self.sequence = str(sequence)
         self.size = reading.check_size(size)
+        self.full_intrinsics = self._lens.intrinsics
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
         self._depth_scale = reading.check_depth_scale(scale if depth_scale is None else depth_scale)
 
@@ -69,11 +70,13 @@ class Replica:
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
         path = self._images[index]
-        image = self._lens.straighten(reading.read_color(path, self._raw_size))
         depth = reading.read_depth(depth_path(path), self._depth_scale, self._raw_size)
         depth = self._lens.straighten_depth(depth)
-        image, depth = reading.resize_color(image, self.size), reading.resize_nearest(depth, self.size)
+        image, depth = reading.resize_color(self.full(index), self.size), reading.resize_nearest(depth, self.size)
         return Frame(index, float(number_of(path)), str(path), image, depth, self.pose(index))
+
+    def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        return self._lens.straighten(reading.read_color(self._images[index], self._raw_size))
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
         number = number_of(self._images[index])

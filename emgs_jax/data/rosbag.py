@@ -76,6 +76,7 @@ class RosBag:
         self.calibration = with_notes(self._lens.about, note, self._tones and self._tones.note)
         self.sequence = self._path.resolve().name if sequence is None else str(sequence)
         self.size = reading.check_size(size)
+        self.full_intrinsics = self._lens.intrinsics
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
 
     def __len__(self) -> int:
@@ -83,10 +84,13 @@ class RosBag:
 
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
+        image = reading.resize_color(self.full(index), self.size)
+        return Frame(index, self._taken[index] / 1e9, self._label(index), image)
+
+    def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
         image = self._read(index)
         reading.check_raw_size(image, self._raw_size, self._label(index))
-        image = reading.resize_color(self._lens.straighten(image), self.size)
-        return Frame(index, self._taken[index] / 1e9, self._label(index), image)
+        return self._lens.straighten(image)
 
     def pose(self, index: int) -> None:
         return None

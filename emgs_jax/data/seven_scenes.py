@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
@@ -80,6 +80,7 @@ class SevenScenes:
         self._poses_file = None if poses is None else Path(poses).expanduser()
         self._poses = None if self._poses_file is None else read_poses(self._poses_file, self._folder.name)
         self.calibration = self._lens.about
+        self.full_intrinsics = self._lens.intrinsics
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, RAW_SIZE, self.size)
 
     def __len__(self) -> int:
@@ -88,13 +89,16 @@ class SevenScenes:
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
         path = self._images[index]
-        image = reading.resize_color(self._lens.straighten(reading.read_color(path, RAW_SIZE)), self.size)
+        image = reading.resize_color(self.full(index), self.size)
         depth = reading.read_depth(sibling(path, "depth.png"), self._depth_scale, RAW_SIZE)
         if self._register:
             depth = register(depth, self.intrinsics, self.size)
         else:
             depth = reading.resize_nearest(depth, self.size)
         return Frame(index, frame_number(path), str(path), image, depth, self.pose(index))
+
+    def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        return self._lens.straighten(reading.read_color(self._images[index], RAW_SIZE))
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
         if self._poses is not None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Int32, UInt8
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
@@ -89,6 +89,7 @@ class Tum:
         self._tones = tones_of(self._images)
         self._lens = find_lens(given, pictures_of(self._images, self._raw_size, self._tones))
         self.calibration = with_notes(self._lens.about, self._tones and self._tones.note)
+        self.full_intrinsics = self._lens.intrinsics
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
         self._labels = None
         if labels is not None:
@@ -117,17 +118,18 @@ class Tum:
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
         path, (w, h) = self._images[index], self.size
-        image = read_shown(path, self._raw_size, self._tones)
-        depth = None
+        image, depth = reading.resize_color(self.full(index), self.size), None
         if self._depths is not None:
             depth = np.zeros((h, w), np.float32)
             if self._depths[index] is not None:
                 raw = reading.read_depth(self._depths[index], self._depth_scale, self._raw_size)
                 depth = reading.resize_nearest(self._lens.straighten_depth(raw), self.size)
-        image = reading.resize_color(self._lens.straighten(image), self.size)
         return Frame(
             index, float(self._times[index]), str(path), image, depth, self.pose(index), self._classes_of(path)
         )
+
+    def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        return self._lens.straighten(read_shown(self._images[index], self._raw_size, self._tones))
 
     def _classes_of(self, image: Path) -> Int32[np.ndarray, "h w"] | None:
         if self._labels is None:

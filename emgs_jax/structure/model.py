@@ -68,7 +68,11 @@ def to_structure(models: Sequence[Any], names: Sequence[str], config: StructureC
     taken: set[int] = set()
     found = []
     for model in models:
-        images = {row[stem(image.name)]: image for image in model.images.values() if image.has_pose and stem(image.name) in row}
+        images = {
+            row[stem(image.name)]: image
+            for image in model.images.values()
+            if image.has_pose and stem(image.name) in row
+        }
         images = {frame: image for frame, image in sorted(images.items()) if frame not in taken}
         taken |= images.keys()
         if images:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
-import numpy as np
 from tqdm import tqdm
 
 from emgs_jax.data.base import BadFrameError
@@ -176,7 +175,9 @@ def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
         mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if mask is None or mask.shape[::-1] != tuple(shots.size):
             size = "unreadable" if mask is None else f"{mask.shape[1]}x{mask.shape[0]}"
-            raise ValueError(f"{path} is {size}, but its image is {shots.size[0]}x{shots.size[1]}: make it of that size")
+            raise ValueError(
+                f"{path} is {size}, but its image is {shots.size[0]}x{shots.size[1]}: make it of that size"
+            )
         cv2.imwrite(str(own / f"{name}.png.png"), mask)
     return str(own)
 

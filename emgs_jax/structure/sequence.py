@@ -1,10 +1,15 @@
 """The structure of a data set's images, and the camera of images whose intrinsics nobody knows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from emgs_jax.data.base import Dataset
+from emgs_jax.data.camera_models import Calibration, from_colmap
+from emgs_jax.data.intrinsics import Pictures, from_exif
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.model import Structure, to_structure
 from emgs_jax.structure.reconstruct import Shots
@@ -29,6 +34,44 @@ def structure_of(dataset: Dataset, config: StructureConfig, folder: Path | None)
     return to_structure(models, names, config), False
 
 
+def calibrate(
+    pictures: Pictures, config: StructureConfig, folder: Path | None = None
+) -> tuple[Calibration, dict[str, Any]]:
+    """The camera of images, by COLMAP's self-calibration with all of them, and what to say of it.
+
+    It begins at the focal length that the first image's EXIF tells, else at COLMAP's default.
+    """
+    names = image_names([*pictures.files] or [None] * pictures.count, range(pictures.count))
+    width, height = pictures.size
+    focal = _exif_focal(pictures)
+    if config.camera_model == "SIMPLE_RADIAL" and focal is not None:
+        start = (focal, width / 2, height / 2, 0.0)
+    else:
+        start = ()
+    shots = Shots(names, pictures.read, pictures.size, (config.camera_model, start), is_calibrated=False)
+    key, models = make_models(shots, config, folder)
+    image = next(image for image in models[0].images.values() if image.has_pose)
+    camera = from_colmap(image.camera.model_name, [*image.camera.params], pictures.size, "COLMAP's self-calibration")
+    count = models[0].num_reg_images()
+    error = models[0].compute_mean_reprojection_error()
+    note = (
+        f"intrinsics estimated by COLMAP from {count} of {pictures.count} images: {camera.model} "
+        f"{[round(float(value), 4) for value in image.camera.params]}, reprojection error {error:.2f} px"
+    )
+    about = {"source": "estimate", "note": note, "num_images": count, "reprojection_error_px": error, ESTIMATED: key}
+    return camera, about
+
+
+def _exif_focal(pictures: Pictures) -> float | None:
+    """Focal length in pixels by the EXIF of the first image; None where it does not tell."""
+    if not pictures.files:
+        return None
+    try:
+        return from_exif(replace(pictures, files=pictures.files[:1])).intrinsics[0]
+    except ValueError:
+        return None
+
+
 def names_of(dataset: Dataset) -> list[str]:
     """A name for each frame in use: that of its file, or its number in the data set where files have no name each."""
     kept = getattr(dataset, "kept", range(len(dataset)))
@@ -42,12 +85,13 @@ def image_names(files: Sequence[Path | None], numbers: Sequence[int]) -> list[st
     return stems if all(stems) and len({*stems}) == len(stems) else [f"{number:06d}" for number in numbers]
 
 
-def full_images(dataset: Dataset) -> tuple[Any, tuple[int, int], tuple[float, ...]]:
+def full_images(dataset: Dataset) -> tuple[Callable[[int], np.ndarray], tuple[int, int], tuple[float, ...]]:
     """A function that reads an image as large as it is on disk, straight; its (width, height) and intrinsics."""
-    full = getattr(dataset, "full", None)
-    if full is None or full.intrinsics is None:
+    intrinsics = getattr(dataset, "full_intrinsics", None)
+    if intrinsics is None:
         return lambda index: dataset[index].image, tuple(dataset.size), tuple(dataset.intrinsics)
-    return full.read, full.size, full.intrinsics
+    height, width = dataset.full(0).shape[:2]
+    return dataset.full, (width, height), tuple(intrinsics)
 
 
 def pinhole_of(intrinsics: Sequence[float], config: StructureConfig) -> tuple[str, tuple[float, ...]]:

@@ -69,6 +69,13 @@ def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> t
     return key, models
 
 
+def models_of(key: str, folder: Path | None) -> list[Any] | None:
+    """Models that were made before, by their key; None where neither the run's folder nor the cache has them."""
+    places = [place for place in (folder, CACHE.expanduser() / key) if place is not None]
+    there = next((place for place in places if is_of(place, key)), None)
+    return None if there is None else read_models(there)
+
+
 def _made(shots: Shots, config: StructureConfig, key: str, places: Sequence[Path]) -> Path:
     """Make the models in the first of these folders that can be written, where an interrupted call has begun."""
     for place in [*places, Path(tempfile.gettempdir()) / f"emgs_structure_{key}"]:

@@ -55,7 +55,10 @@ def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict
 
     of_unit = {frame: with_unit(frame) for frame in frames[1:]}
     variance = sum(unit[frame] @ of_unit[frame] for frame in references if frame != first) / total
-    scale, found = max(2 / np.pi * model.compute_mean_reprojection_error() ** 2, pixel_std**2), {first: np.zeros((6, 6))}
+    scale, found = (
+        max(2 / np.pi * model.compute_mean_reprojection_error() ** 2, pixel_std**2),
+        {first: np.zeros((6, 6))},
+    )
     for frame in frames[1:]:
         mixed = np.outer(of_unit[frame], unit[frame])
         free = between(frame, frame) - mixed - mixed.T + variance * np.outer(unit[frame], unit[frame])

@@ -59,7 +59,7 @@ def learned(config: LearnedConfig) -> Stereo:
     network = load_weights(config.checkpoint, config.sha256)
 
     def prepare(image: np.ndarray, lens: Lens) -> Features:
-        shown = np.stack([rectify(np.float32(channel), lens) for channel in np.moveaxis(image, -1, 0)], axis=-1) / 255.0
+        shown = rectify(np.float32(image), lens) / 255.0
         grid = grid_of(Camera(lens.focal, lens.center, *image.shape[1::-1]), config.magnification)
         way = cv2.INTER_AREA if grid.width < image.shape[1] else cv2.INTER_LINEAR
         resized = cv2.resize(shown, (grid.width, grid.height), interpolation=way)
