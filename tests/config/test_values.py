@@ -53,6 +53,10 @@ def test_every_value_of_a_protocol_is_in_its_range(option):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
+        (
+            "dataset.intrinsics=525",
+            "dataset.intrinsics must be text or a list […, …] of numbers or text or null, got 525",
+        ),
         ("slam.em.max_mahalanobis_sq=nan", "slam.em.max_mahalanobis_sq must be a number from 0 to inf, got nan: give"),
         ("slam.em.max_mahalanobis_sq=-1", "slam.em.max_mahalanobis_sq must be a number from 0 to inf, got -1"),
         ("slam.em.noise=inf", "slam.em.noise must be a number from 0 to 1000000, got inf"),
