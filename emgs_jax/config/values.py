@@ -100,7 +100,8 @@ def _expected(field: Declared) -> str:
     kinds = field.kinds - {int} if float in field.kinds else field.kinds
     words = [name + ends * (kind in (int, float)) for kind, name in _NAMES.items() if kind in kinds]
     if field.elements:
-        words.append(f"a list […, …] of {'' if float in field.elements else 'whole '}numbers{ends}")
+        what = "numbers or text" if str in field.elements else "numbers" if float in field.elements else "whole numbers"
+        words.append(f"a list […, …] of {what}{ends}")
     return " or ".join(words + ["null"] * (type(None) in kinds))
 
 
@@ -157,7 +158,7 @@ def _kinds(hint: Any) -> tuple[frozenset[type], frozenset[type]]:
             plain.add(part)
         elif origin in (tuple, list, Sequence) and arguments:
             found = [_kinds(argument) for argument in arguments if argument is not ...]
-            if any(inner or not kinds <= {int, float} or not kinds for kinds, inner in found):
+            if any(inner or not kinds <= {int, float, str} or not kinds & {int, float} for kinds, inner in found):
                 return frozenset(), frozenset()
             elements |= set().union(*(kinds for kinds, _ in found))
         else:

@@ -75,7 +75,7 @@ def read_calibration(path: Path) -> Calibration:
     chain = [camera for key, camera in values.items() if str(key).startswith("cam") and isinstance(camera, dict)]
     if chain or "distortion_model" in values:
         return _only([kalibr_camera(camera, path) for camera in chain or [values]], path)
-    raise ValueError(f"{path} has none of the keys fl_x, camera_matrix, calibration, Camera.fx, fx: give {KNOWN_FILES}")
+    raise ValueError(f"{path} has none of the keys of a camera: give {KNOWN_FILES}")
 
 
 def _only(cameras: list[Calibration], path: Path) -> Calibration:

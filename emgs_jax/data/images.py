@@ -28,7 +28,8 @@ class Images:
         start, stop, stride: which of the images that are there, in natural order of their names.
         size: (width, height) of the frames given out; another aspect than the images' is allowed (fx and fy follow).
         intrinsics: required. fx, fy, cx, cy in pixels of the images on disk, where they are distorted followed by k1,
-            k2, p1, p2 and maybe k3; or a calibration file, "exif" or "estimate", see `intrinsics.find_lens`.
+            k2, p1, p2 and maybe k3; the name of a model of COLMAP and its parameters; or a calibration file, "exif" or
+            "estimate", see `intrinsics.find_lens`.
     """
 
     name = "images"

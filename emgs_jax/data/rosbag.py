@@ -243,6 +243,7 @@ def _camera_info(bag: Any, topic: str, info_topic: str | None, path: Path) -> Ca
                 raise ValueError(f"{path}: camera_info has no P for the rectified {topic}: give dataset.intrinsics")
             return Calibration((float(P[0]), float(P[5]), float(P[2]), float(P[6])), (), size)
         intrinsics = float(K[0]), float(K[4]), float(K[2]), float(K[5])
-        lens, model = named_lens(message.distortion_model, bent, f"{path}: camera_info")
+        where = f"{path}: camera_info (a rectified topic needs none of its distortion)"
+        lens, model = named_lens(message.distortion_model, bent, where)
         return Calibration(intrinsics, lens, size, model)
     raise ValueError(f"{path}: camera_info has no message, so dataset.intrinsics must say the camera: {ALTERNATIVES}")

@@ -11,7 +11,8 @@ from tiny_run import TINY, compose
 
 from emgs_jax.config import configure
 from emgs_jax.config.configure import build, groups, message_of
-from emgs_jax.config.values import check_values, declared
+from emgs_jax.config.values import check_value, check_values, declared
+from emgs_jax.data.images import Images
 from emgs_jax.ops.pytree import choice, static, traced
 from emgs_jax.ops.ranges import number
 from emgs_jax.sequence import load_config
@@ -43,6 +44,14 @@ def test_every_value_of_conf_is_in_its_range():
     check_all("experiment=paper")
     for option in groups()["prior/dense"]:
         check_all("prior=multiview_stereo", f"prior/dense={option}")
+
+
+def test_intrinsics_are_numbers_that_a_name_may_precede():
+    field = declared(Images)["intrinsics"]
+    check_value("dataset.intrinsics", ["OPENCV_FISHEYE", 130, 128.5, 80, 59, 0.02, 0, 0, 0], field)
+    for given in (525, [float("nan"), 1, 2, 3], [[1, 2], 3]):
+        with pytest.raises(ValueError, match="dataset.intrinsics must be text or a list .* of numbers or text or null"):
+            check_value("dataset.intrinsics", given, field)
 
 
 @pytest.mark.parametrize("option", ["conceptgraphs", "ovo", "rayfronts"])

@@ -17,15 +17,17 @@ rosbags = pytest.importorskip("rosbags", reason="reads bags: pip install -e .[ro
 from tests.data.written_bag import SIZE, D, K, P, write_bag  # noqa: E402
 
 
+@pytest.mark.parametrize("lens", [("plumb_bob", D), ("equidistant", D[:4], "OPENCV_FISHEYE")], ids=lambda lens: lens[0])
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("kind", ["Image", "CompressedImage"])
-def test_images_and_camera_are_those_that_were_recorded(version, kind, tmp_path):
-    path = write_bag(tmp_path, version, kind)
+def test_images_and_camera_are_those_that_were_recorded(version, kind, lens, tmp_path):
+    model, bent, *colmaps = lens
+    path = write_bag(tmp_path, version, kind, model=model, bent=bent)
     dataset = RosBag(str(path), size=SIZE)
     (tmp_path / "images").mkdir()
     for i in range(3):
         cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), color_image(i, SIZE))
-    same = Images(str(tmp_path / "images"), size=SIZE, intrinsics=[K[0], K[4], K[2], K[5], *D])
+    same = Images(str(tmp_path / "images"), size=SIZE, intrinsics=[*colmaps, K[0], K[4], K[2], K[5], *bent])
     np.testing.assert_allclose(dataset.intrinsics, same.intrinsics)
     assert len(dataset) == 3 and not dataset.has_ground_truth
     for index in (2, 0, 1):
@@ -83,7 +85,7 @@ def test_topics_and_the_camera_are_chosen_and_what_cannot_be_read_is_refused_wit
         (
             write(tmp_path / "omni", model="omni", bent=D[:4]),
             {},
-            "camera_info: the camera model omni is not read, only",
+            "camera_info .a rectified topic.*the camera model omni is not read",
         ),
         (write(tmp_path / "bayer", encoding="bayer_rggb8"), {}, "encoding 'bayer_rggb8'.*dataset.topic"),
         (

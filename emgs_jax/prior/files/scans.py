@@ -34,14 +34,13 @@ def read_colmap_workspace(folder: Path) -> Predictions:
     rows = [row for row, path in enumerate(paths) if path.is_file()]
     if not rows:
         raise ValueError(f"{maps} has no {model.names[0]}{' or '.join(COLMAP_KINDS)}: run colmap patch_match_stereo")
+    cameras = [model.cameras[model.camera_ids[row]] for row in rows]
+    if not all(camera.is_pinhole for camera in cameras):
+        raise ValueError(f"{model.files[0]}: depth maps are of undistorted images: give the model of image_undistorter")
 
     def read(row: int) -> View:
         path, depth = paths[rows[row]], load_colmap_array(paths[rows[row]])
-        camera = model.cameras[model.camera_ids[rows[row]]]
-        if not camera.is_pinhole:
-            raise ValueError(
-                f"{model.files[0]}: depth maps are of undistorted images: run colmap image_undistorter first"
-            )
+        camera = cameras[row]
         raw_size = camera.size or (depth.shape[1], depth.shape[0])
         return as_view(str(path), depth, None, resize_intrinsics(camera.intrinsics, raw_size, depth.shape[1::-1]))
 

@@ -238,6 +238,15 @@ def test_a_depth_map_of_colmap_that_ends_early_is_named(tmp_path):
         asked(tmp_path, NUMBERS)
 
 
+def test_depth_maps_beside_the_model_of_distorted_images_are_refused(tmp_path):
+    """Its distortion was ignored: the dense maps of COLMAP are of undistorted images."""
+    write_colmap(tmp_path)
+    path = tmp_path / "sparse" / "cameras.txt"
+    path.write_text(path.read_text().replace("PINHOLE", "OPENCV").strip() + " .1 0 0 0\n")
+    with pytest.raises(ValueError, match=r"cameras.txt: depth maps are of undistorted images"):
+        asked(tmp_path, NUMBERS)
+
+
 def test_one_file_may_be_given_in_place_of_its_folder(tmp_path):
     write_mapanything(tmp_path)
     path = (tmp_path / "predictions.npz").rename(tmp_path / "mine.npz")
