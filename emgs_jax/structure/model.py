@@ -116,7 +116,7 @@ def in_unit(structure: Structure, median_depth: float) -> Structure:
 
 
 def interpolated(structure: Structure, max_gap: int) -> Structure:
-    """The structure with poses of frames between two of one world, at most `max_gap` after the first and before the second."""
+    """The structure with poses of frames between two of one world, where these are at most `max_gap` in a row."""
     world, T, guessed = structure.world.copy(), structure.T_world_camera.copy(), structure.is_interpolated.copy()
     placed = np.flatnonzero(structure.world != NONE)
     for before, after in zip(placed[:-1], placed[1:], strict=True):

@@ -1,7 +1,6 @@
 """From images to models: COLMAP's features, matches and mapper, in a folder that an interrupted call goes on in."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +9,7 @@ from tqdm import tqdm
 
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.structure.config import StructureConfig
+from emgs_jax.structure.library import load, member, options_of, quiet
 from emgs_jax.structure.pairs import choose_pairs
 
 BATCH = 8  # images of one call of COLMAP, so that the bar moves
@@ -31,33 +31,10 @@ class Shots(NamedTuple):
     """
 
     names: Sequence[str]
-    read: Any
+    read: Callable[[int], np.ndarray]
     size: tuple[int, int]
     camera: tuple[str, tuple[float, ...]]
     is_calibrated: bool
-
-
-def options_of(cls: type, *given: Mapping[str, Any]) -> Any:
-    """An options object of pycolmap with values put into it, the last ones win.
-
-    Raises:
-        ValueError: COLMAP knows no such option, or not this value; the message names those that there are.
-    """
-    options = cls()
-    for values in given:
-        try:
-            options.mergedict(_plain(values))
-        except (AttributeError, TypeError, ValueError, RuntimeError) as error:
-            known = ", ".join(sorted(options.todict()))
-            raise ValueError(
-                f"prior.structure.options: {cls.__name__} of pycolmap does not take {dict(values)} "
-                f"({str(error).splitlines()[0]}): its options are {known}"
-            ) from error
-    return options
-
-
-def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: _plain(value) if isinstance(value, Mapping) else value for key, value in values.items()}
 
 
 def map_images(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]:
@@ -99,24 +76,23 @@ def _say(shots: Shots, config: StructureConfig) -> None:
     if minutes > 5:
         tqdm.write(
             f"structure of {count} images: some {minutes:.0f} minutes on two cores and {count * 1.5 / 1024:.1f} GB of "
-            "disk while it lasts; prior.structure.mapper=global is faster, prior.structure.model=DIR takes a finished one"
+            "disk while it lasts; prior.structure.mapper=global is faster, prior.structure.model=DIR takes one"
         )
 
 
 def detect(shots: Shots, config: StructureConfig, folder: Path) -> None:
     """Find the features of all images that the database lacks."""
-    import pycolmap
-
+    pycolmap = load()
     database, images = folder / DATABASE, folder / IMAGES
     images.mkdir(exist_ok=True)
     with pycolmap.Database.open(database) as opened:
         done = {image.name for image in opened.read_all_images()}
     extraction = options_of(
-        pycolmap.FeatureExtractionOptions,
+        "FeatureExtractionOptions",
         {"num_threads": config.num_threads, "max_image_size": config.max_image_size, "use_gpu": False},
         config.options.get("extraction", {}),
     )
-    extraction.type = _member(pycolmap.FeatureExtractorType, config.features, "features")
+    extraction.type = member("FeatureExtractorType", config.features, "features")
     model, parameters = shots.camera
     reader = pycolmap.ImageReaderOptions(
         camera_model=model, camera_params=",".join(map(repr, parameters)), mask_path=_masks(shots, config, folder)
@@ -184,21 +160,20 @@ def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
 
 def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
     """Match and verify the pairs that `choose_pairs` names; those that are in the database stay."""
-    import pycolmap
-
+    pycolmap = load()
     database, listed = folder / DATABASE, folder / "pairs.txt"
     matching = options_of(
-        pycolmap.FeatureMatchingOptions,
+        "FeatureMatchingOptions",
         {"num_threads": config.num_threads, "guided_matching": True, "use_gpu": False},
         config.options.get("matching", {}),
     )
     if config.matcher is not None:
-        matching.type = _member(pycolmap.FeatureMatcherType, config.matcher, "matcher")
+        matching.type = member("FeatureMatcherType", config.matcher, "matcher")
     elif config.features != "sift":
         kind = {"aliked": "aliked_lightglue", "loma": config.features}[config.features.split("_")[0]]
-        matching.type = _member(pycolmap.FeatureMatcherType, kind, "matcher")
+        matching.type = member("FeatureMatcherType", kind, "matcher")
     verification = options_of(
-        pycolmap.TwoViewGeometryOptions,
+        "TwoViewGeometryOptions",
         {"ransac": {"random_seed": config.seed}},
         config.options.get("verification", {}),
     )
@@ -221,8 +196,7 @@ def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
 
 def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]:
     """Run the mapper; models in the order of their numbers of images."""
-    import pycolmap
-
+    pycolmap = load()
     is_free = not shots.is_calibrated
     common = {"num_threads": config.num_threads, "random_seed": config.seed}
     given = config.options.get("mapping", {})
@@ -231,7 +205,7 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
     if config.mapper == "global":
         refined = {"refine_focal_length": is_free, "refine_extra_params": is_free or config.refine_distortion}
         options = options_of(
-            pycolmap.GlobalPipelineOptions, common, {"mapper": {**common, "bundle_adjustment": refined}}, given
+            "GlobalPipelineOptions", common, {"mapper": {**common, "bundle_adjustment": refined}}, given
         )
         found = pycolmap.global_mapping(folder / DATABASE, folder / IMAGES, output, options)
     else:
@@ -245,7 +219,7 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
             },
             "triangulation": {"random_seed": config.seed},
         }
-        options = options_of(pycolmap.IncrementalPipelineOptions, common, refined, given)
+        options = options_of("IncrementalPipelineOptions", common, refined, given)
         with tqdm(total=len(shots.names), unit="image", desc="structure") as bar:
             found = pycolmap.incremental_mapping(
                 folder / DATABASE, folder / IMAGES, output, options, next_image_callback=lambda: bar.update()
@@ -255,8 +229,7 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
 
 def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) -> None:
     """Register images that no model holds with fewer inliers, in the model that shows most of what they show."""
-    import pycolmap
-
+    pycolmap = load()
     with pycolmap.Database.open(folder / DATABASE) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions(min_num_matches=config.min_inliers))
@@ -280,8 +253,7 @@ def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) 
 
 def check_found(found: Sequence[Any], shots: Shots, config: StructureConfig, folder: Path) -> None:
     """Raise ValueError where no model was found, with the likeliest reason."""
-    import pycolmap
-
+    pycolmap = load()
     if found:
         return
     count = len(shots.names)
@@ -306,24 +278,3 @@ def check_found(found: Sequence[Any], shots: Shots, config: StructureConfig, fol
     else:
         reason = "no pair of images has parallax to begin with: take images farther apart (dataset.stride)"
     raise ValueError(f"prior=multiview_stereo finds no structure: {reason}; or bring predictions (prior=files)")
-
-
-def _member(kinds: Any, name: str, key: str) -> Any:
-    """The value of one of pycolmap's enumerations by its name in any case."""
-    members = {member.lower(): value for member, value in kinds.__members__.items() if member != "UNDEFINED"}
-    if name.lower() not in members:
-        raise ValueError(f"prior.structure.{key}={name} is unknown: pycolmap has {', '.join(members)}")
-    return members[name.lower()]
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """COLMAP logs its errors only."""
-    import pycolmap
-
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before

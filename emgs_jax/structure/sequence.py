@@ -42,12 +42,9 @@ def calibrate(
     It begins at the focal length that the first image's EXIF tells, else at COLMAP's default.
     """
     names = image_names([*pictures.files] or [None] * pictures.count, range(pictures.count))
-    width, height = pictures.size
-    focal = _exif_focal(pictures)
-    if config.camera_model == "SIMPLE_RADIAL" and focal is not None:
-        start = (focal, width / 2, height / 2, 0.0)
-    else:
-        start = ()
+    (width, height), focal = pictures.size, _exif_focal(pictures)
+    is_known = focal is not None and config.camera_model == "SIMPLE_RADIAL"
+    start = (focal, width / 2, height / 2, 0.0) if is_known else ()
     shots = Shots(names, pictures.read, pictures.size, (config.camera_model, start), is_calibrated=False)
     key, models = make_models(shots, config, folder)
     image = next(image for image in models[0].images.values() if image.has_pose)

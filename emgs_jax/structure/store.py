@@ -16,6 +16,7 @@ from tqdm import tqdm
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.io.files import write_file
 from emgs_jax.structure.config import StructureConfig
+from emgs_jax.structure.library import load
 from emgs_jax.structure.model import stem
 from emgs_jax.structure.reconstruct import DATABASE, Shots, map_database, map_images
 
@@ -116,8 +117,7 @@ def read_models(place: Path) -> list[Any]:
     Raises:
         ValueError: there is none, or one is damaged.
     """
-    import pycolmap
-
+    pycolmap = load()
     below = [place, *sorted((path for path in place.glob("*") if path.name.isdecimal()), key=lambda p: int(p.name))]
     found = [folder for folder in below if all(any(folder.glob(f"{part}.*")) for part in PARTS)]
     if not found:
@@ -157,7 +157,7 @@ def given_models(place: Path, shots: Shots, config: StructureConfig) -> list[Any
     named = {name for model in models for name in stems_of(model)}
     if not named & {*shots.names}:
         raise ValueError(
-            f"{key} is of other images: it has {', '.join(sorted(named)[:3])}, …, this run {', '.join(shots.names[:3])}, "
-            "…; names count without folder and suffix"
+            f"{key} is of other images: it has {', '.join(sorted(named)[:3])}, …, this run "
+            f"{', '.join(shots.names[:3])}, …; names count without folder and suffix"
         )
     return models

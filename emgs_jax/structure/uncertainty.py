@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from emgs_jax.structure.library import load
+
 NUM_REFERENCES = 32  # frames that determine the unit
 
 
@@ -67,9 +69,8 @@ def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict
 
 
 def _joint(model: Any, images: Mapping[int, Any]) -> Any:
-    """A function of two frames: the covariance (6, 6) of their z, for residuals of one pixel; None if it is singular."""
-    import pycolmap
-
+    """A function of two frames: covariance (6, 6) of their z, for residuals of one pixel; None if it is singular."""
+    pycolmap = load()
     problem = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():
         problem.add_image(image)

@@ -15,7 +15,7 @@ class Lens:
     Args:
         focal: fx, fy of the pinhole camera in pixels.
         center: cx, cy likewise.
-        shown: (h, w, 2) float32, the image's pixel that shows what each pixel of the pinhole camera sees; None: its own.
+        shown: (h, w, 2) float32, the image's pixel that shows what each of the pinhole camera's sees; None: its own.
         straight: (h, w, 2) float32, the inverse.
     """
 

@@ -92,14 +92,15 @@ class MultiviewStereo(Prior):
         """
         if len(dataset) < 3:
             raise ValueError(
-                f"prior=multiview_stereo needs three images or more of one place, {dataset.name} {dataset.sequence} has "
-                f"{len(dataset)} in use: give more (dataset.stop, dataset.stride)"
+                f"prior=multiview_stereo needs three images or more of one place, {dataset.name} {dataset.sequence} "
+                f"has {len(dataset)} in use: give more (dataset.stop, dataset.stride)"
             )
         self._dataset = dataset
 
     def keep(self, folder: Path) -> None:
-        """Keep the structure in `folder`/structure, and take it from there."""
+        """Keep the structure in `folder`/structure, and take it from there; it is made now."""
         self._folder = folder / "structure"
+        self._prepare()
 
     def report(self) -> dict[str, float]:
         """`prior/placed_percent`: frames with a pose in a model; `prior/num_worlds`: models that hold them."""
@@ -110,7 +111,7 @@ class MultiviewStereo(Prior):
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Poses of all views and depth of `window.dense`; a view that no model holds has NaN and no valid point."""
-        self._prepare(frames, intrinsics)
+        self._prepare()
         structure, world = self._found, self._found.world[window.current]
         depths = [self._answer(frame) for frame in window.dense]
         points, confidence, mask = (np.stack(found) for found in zip(*depths, strict=True))
@@ -128,13 +129,13 @@ class MultiviewStereo(Prior):
             window, T, points, confidence, mask, features, pose_covariance=spread, world=max(int(world), 0)
         )
 
-    def _prepare(self, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
-        """Make the structure before the first answer."""
+    def _prepare(self) -> None:
+        """Make the structure, once."""
         if self._found is not None:
             return
         if self._dataset is None:
             raise ValueError("multiview_stereo makes a structure of a data set: call check(dataset, window_size) first")
-        height, width = frames[0].image.shape[:2]
+        (width, height), intrinsics = self._dataset.size, self._dataset.intrinsics
         self._camera = Camera(np.float32(intrinsics[:2]), np.float32(intrinsics[2:]), width, height)
         self._found, is_straight = structure_of(self._dataset, self._config, self._folder)
         pinhole = Lens(self._camera.focal, self._camera.center)
