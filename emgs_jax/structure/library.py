@@ -12,8 +12,8 @@ def load() -> ModuleType:
         import pycolmap
     except ImportError as error:
         raise ValueError(
-            "poses of images are found by pycolmap, which is not installed (for Linux on ARM there is no wheel): install "
-            "it from source, or bring predictions with poses (prior=files)"
+            "poses of images are found by pycolmap, which is not installed (for Linux on ARM there is no wheel): "
+            "install it from source, or bring predictions with poses (prior=files)"
         ) from error
     return pycolmap
 

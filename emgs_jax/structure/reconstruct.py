@@ -204,9 +204,8 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
     output.mkdir(exist_ok=True)
     if config.mapper == "global":
         refined = {"refine_focal_length": is_free, "refine_extra_params": is_free or config.refine_distortion}
-        options = options_of(
-            "GlobalPipelineOptions", common, {"mapper": {**common, "bundle_adjustment": refined}}, given
-        )
+        mapper = {"mapper": {**common, "bundle_adjustment": refined}}
+        options = options_of("GlobalPipelineOptions", common, mapper, given)
         found = pycolmap.global_mapping(folder / DATABASE, folder / IMAGES, output, options)
     else:
         refined = {
