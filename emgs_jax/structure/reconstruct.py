@@ -15,6 +15,7 @@ from emgs_jax.structure.pairs import choose_pairs
 
 BATCH = 8  # images of one call of COLMAP, so that the bar moves
 PAIRS = 400  # likewise
+MIN_DEPTH = 0.01  # of a point, in median depths of the image
 DATABASE, IMAGES = "database.db", "images"
 SECONDS = 0.5, 0.05, 0.6  # of two cores: features of a 640x480 image, a pair, an image mapped
 
@@ -65,6 +66,8 @@ def map_database(shots: Shots, config: StructureConfig, folder: Path) -> list[An
         found = find_models(shots, config, folder)
         check_found(found, shots, config, folder)
         register_rest(found, config, folder)
+        for model in found:
+            drop_points_at_cameras(model)
     return found
 
 
@@ -249,6 +252,16 @@ def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) 
             mapper.triangulate_image(pycolmap.IncrementalTriangulatorOptions(random_seed=config.seed), image)
         placed.update(new)
         mapper.end_reconstruction(False)
+
+
+def drop_points_at_cameras(model: Any) -> None:
+    """Delete points that lie at a camera that shows them: their rays tell nothing, and no covariance is finite."""
+    for image in [image for image in model.images.values() if image.has_pose]:
+        keys = [point.point3D_id for point in image.points2D if point.has_point3D()]
+        pose = image.cam_from_world().matrix()
+        depths = np.array([pose[2, :3] @ model.points3D[key].xyz + pose[2, 3] for key in keys])
+        for key in np.array(keys)[depths < MIN_DEPTH * np.median(depths)] if keys else ():
+            model.delete_point3D(int(key))
 
 
 def check_found(found: Sequence[Any], shots: Shots, config: StructureConfig, folder: Path) -> None:
