@@ -15,7 +15,10 @@ from emgs_jax.structure.pairs import choose_pairs
 
 BATCH = 8  # images of one call of COLMAP, so that the bar moves
 PAIRS = 400  # likewise
+MIN_IMAGES = 3  # of a model, that no larger one holds
+MIN_FOR_CENTER = 30  # images
 MIN_DEPTH = 0.01  # of a point, in median depths of the image
+FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 DATABASE, IMAGES = "database.db", "images"
 SECONDS = 0.5, 0.05, 0.6  # of two cores: features of a 640x480 image, a pair, an image mapped
 
@@ -68,6 +71,7 @@ def map_database(shots: Shots, config: StructureConfig, folder: Path) -> list[An
         register_rest(found, config, folder)
         for model in found:
             drop_points_at_cameras(model)
+            adjust(model, shots, config)
     return found
 
 
@@ -130,7 +134,7 @@ def _write(shots: Shots, index: int, images: Path) -> bool:
     except BadFrameError:
         return False
     path = images / f"{shots.names[index]}.png"
-    return image.shape[1::-1] == tuple(shots.size) and cv2.imwrite(str(path), image[..., ::-1], [1, 1])
+    return image.shape[1::-1] == tuple(shots.size) and cv2.imwrite(str(path), image[..., ::-1], FAST)
 
 
 def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
@@ -203,7 +207,7 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
     pycolmap = load()
     is_free = not shots.is_calibrated
     common = {"num_threads": config.num_threads, "random_seed": config.seed}
-    given = config.options.get("mapping", {})
+    given = config.options.get(config.mapper, {})
     output = folder / "models"
     output.mkdir(exist_ok=True)
     if config.mapper == "global":
@@ -227,7 +231,13 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
             found = pycolmap.incremental_mapping(
                 folder / DATABASE, folder / IMAGES, output, options, next_image_callback=lambda: bar.update()
             )
-    return sorted(found.values(), key=lambda model: -model.num_reg_images())
+    held: set[int] = set()
+    models = []
+    for model in sorted(found.values(), key=lambda model: -model.num_reg_images()):
+        if len(new := {*model.reg_image_ids()} - held) >= MIN_IMAGES:
+            models.append(model)
+            held |= new
+    return models
 
 
 def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) -> None:
@@ -252,6 +262,25 @@ def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) 
             mapper.triangulate_image(pycolmap.IncrementalTriangulatorOptions(random_seed=config.seed), image)
         placed.update(new)
         mapper.end_reconstruction(False)
+
+
+def adjust(model: Any, shots: Shots, config: StructureConfig) -> None:
+    """Adjust all of a model once more, by a robust loss, with the centre of a camera that is being calibrated.
+
+    The mapper's own adjustments weigh all residuals by their squares and hold the centre in the middle of the image.
+    """
+    is_free, pycolmap = not shots.is_calibrated, load()
+    refined = {
+        "refine_focal_length": is_free,
+        "refine_principal_point": is_free and model.num_reg_images() >= MIN_FOR_CENTER,
+        "refine_extra_params": is_free or config.refine_distortion,
+        "print_summary": False,
+    }
+    options = options_of("BundleAdjustmentOptions", refined)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.solver_options.num_threads = config.num_threads
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
 
 
 def drop_points_at_cameras(model: Any) -> None:
