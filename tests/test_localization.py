@@ -298,8 +298,9 @@ def submap(camera, config):
 def lenient(config):
     """Coarse as the prior says, fine as printed but with wide gates; every check passes."""
     settings = config("slam.localization.coarse_scale=none", "slam.localization.icp.residual=colored").localization
-    gates = {"min_inlier_fraction": 0.0, "min_eigenvalue": -np.inf, "icp.prior_information": 0.0}
-    gates |= dict.fromkeys(("max_residual", "max_step", "max_step_rad"), np.inf) | {"icp.max_mahalanobis_sq": 25.0}
+    gates = {"min_inlier_fraction": 0.0, "icp.prior_information": 0.0}
+    gates |= dict.fromkeys(("max_residual", "max_step", "max_step_rad", "max_pose_std"), np.inf)
+    gates |= {"icp.max_mahalanobis_sq": 25.0}
     return sc.changed(settings, coarse=COARSE["anchored"], **gates)
 
 
@@ -355,7 +356,10 @@ def test_the_fine_step_is_icp_of_the_scaled_points_with_the_noise_of_the_coarse_
     scaled = sc.replace(current, points=coarse_scale * np.asarray(current.points))
     known = sc.device(sc.on_host(root_information)(coarse.estimate.covariance))
     expected, scale, found = solve(
-        scaled, submap, CoarseStart(coarse.T_world_camera, known, sc.device(depth_noise)), settings.icp
+        scaled,
+        submap,
+        CoarseStart(coarse.T_world_camera, known, sc.device(depth_noise), sc.device(False)),
+        settings.icp,
     )
     # Another program rounds in another order; the solver stops within its tolerance.
     assert max(sc.pose_error(T, expected)) < 1e-4
@@ -385,7 +389,7 @@ def test_a_scale_that_is_accepted_is_that_of_the_points_and_one_that_is_not_is_d
         (2, "max_residual", 0.0),
         (3, "max_step", 1e-6),
         (3, "max_step_rad", 1e-6),
-        (4, "min_eigenvalue", 1e12),
+        (4, "max_pose_std", 1e-9),
     ],
 )
 def test_each_check_alone_keeps_the_coarse_pose_and_says_why(camera, submap, lenient, bit, field, value):
@@ -420,7 +424,7 @@ def test_a_single_untextured_wall_does_not_determine_the_pose(camera, submap, le
     wall = submap.normals[:, 2] < -0.99
     plain = sc.replace(submap, valid=wall, colors=np.full((192, 3), 0.5), normals=np.tile([0.0, 0, -1], (192, 1)))
     grey = eqx.tree_at(lambda p: p.current.colors, sc.predict_room(FRAME, camera), sc.device(np.full((768, 3), 0.5)))
-    settings = sc.changed(lenient, **{"min_eigenvalue": config().localization.min_eigenvalue, "icp.residual": residual})
+    settings = sc.changed(lenient, **{"max_pose_std": config().localization.max_pose_std, "icp.residual": residual})
     coarse, T, _, info = fine_of(grey, plain, camera, settings)
     assert int(info.reason) & 16 and not info.is_tracked
     sc.assert_same(T, coarse.T_world_camera)

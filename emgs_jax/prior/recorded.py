@@ -10,8 +10,9 @@ The format `emgs_jax.predictions`, version 3, is a folder; nothing in it is ever
 - `visits_A_…_B.npz`, for pairs of frames that show one place twice, named by all its views: as below, of one more
   inference with views of both visits (`recorded_visits`). A folder may have none.
 - `000000.npz`, …, one file per inference: `inference` (), `views` (v,), `dense` (d,), `current` () and the arrays of
-  `PriorPrediction` in the dtypes stated there, `pose_covariance` only where the prior gives it: about d·(17·h·w + 2·y·x·f) bytes. Features are float16; points are
-  not, because a float16 step is 2 mm at 2 to 4 m. Version 1, whose features have one cell per pixel, and 2, which has no covariances, are read as well.
+  `PriorPrediction` in the dtypes stated there, `pose_covariance` only where the prior gives it: about
+  d·(17·h·w + 2·y·x·f) bytes. Features are float16; points are not, because a float16 step is 2 mm at 2 to 4 m. Version
+  1, whose features have one cell per pixel, and 2, which has no covariances, are read as well.
 
 Each file is written under a temporary name and then renamed, data before the manifest: a full disk or an interrupted
 run leaves a valid folder, which `record` completes.

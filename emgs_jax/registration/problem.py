@@ -76,14 +76,14 @@ class CoarseStart(eqx.Module):
     Args:
         T_world_coarse: also the mean of the pose.
         root_information: root of the information of (xi, log s) where the points fit as well as they should.
-        is_given: the prior itself says how sure it is of the pose, see `pose_worth`.
         noise: least standard deviation of the points' depth, as a fraction of it.
+        is_given: the prior itself says how sure it is of the pose, see `pose_worth`.
     """
 
     T_world_coarse: jaxlie.SE3
     root_information: Float[Array, "7 7"]
-    is_given: Bool[Array, ""]
     noise: Float[Array, ""]
+    is_given: Bool[Array, ""]
 
 
 class Problem(eqx.Module):
@@ -248,7 +248,8 @@ def information(
 ) -> Float[Array, "6 6"]:
     """Compute the inliers' information about xi by planes and colours: w Σ j j' with j = (a, x × a) / std.
 
-    Offsets from means do not count: the mean of a Gaussian is no landmark of its surface. w is the weight of a point, a is the normal, or the gradient of the intensity, and x the point, both in the camera's axes.
+    w is the weight of a point, a is the normal, or the gradient of the intensity, and x the point, both in the camera's
+    axes. Offsets from means do not count: the mean of a Gaussian is no landmark of its surface.
     """
     points, to_camera = scale * problem.source.points, T.rotation().as_matrix()
     normals, gradients = matches.normals @ to_camera, matches.gradients @ to_camera
