@@ -73,7 +73,8 @@ class LocalizationConfig(eqx.Module):
         max_residual: root mean square distance to the map's planes, as a fraction of the depth.
         max_step: between the coarse and the fine pose, as a fraction of the mean depth.
         max_step_rad: likewise, rad.
-        max_pose_std: of the pose in its least certain direction, see `IcpInfo.pose_std`.
+        max_pose_std: standard deviation of the pose in its least certain direction, by what is known before and by the
+            points: of the translation as a fraction of the depth, of the rotation in rad.
     """
 
     coarse: Float[Array, "*b"] = choice(*COARSE)
@@ -305,7 +306,7 @@ def localize_fine(
             ~(info.inlier_fraction >= config.min_inlier_fraction),
             ~(info.residual <= config.max_residual),
             ~((step_m <= config.max_step * coarse.mean_depth) & (step_rad <= config.max_step_rad)),
-            ~(info.pose_std <= config.max_pose_std),
+            ~(info.min_eigenvalue >= config.max_pose_std**-2),
         ]
     )
     is_tracked = ~jnp.any(failed)

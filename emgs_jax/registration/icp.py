@@ -27,7 +27,7 @@ from emgs_jax.registration.problem import (
     data_information,
     distances,
     information,
-    largest_std,
+    least_information,
     matches_at,
     pose_of,
     pose_problem,
@@ -50,8 +50,8 @@ class IcpInfo(eqx.Module):
         level_edges: where these levels end.
         information: of the points alone, of (xi, log s).
         num_effective: how many independent measurements the points are worth, see `num_independent`.
-        pose_std: of the pose in its least certain direction, by the prior and by planes and colours together:
-            translation in median depths, rotation in rad; inf where nothing determines it.
+        min_eigenvalue: of the pose's information by prior, planes and colours together, for translations in median
+            depths and rotations in rad: the variance of its least certain direction is one over it.
         num_steps: of all solves.
         is_converged: False where the last solve reached `max_steps` or failed.
     """
@@ -64,7 +64,7 @@ class IcpInfo(eqx.Module):
     level_edges: Float[Array, "e"]
     information: Float[Array, "7 7"]
     num_effective: Float[Array, ""]
-    pose_std: Float[Array, ""]
+    min_eigenvalue: Float[Array, ""]
     num_steps: Int[Array, ""]
     is_converged: Bool[Array, ""]
 
@@ -174,7 +174,7 @@ def icp(
         level_edges=edges,
         information=data_information(y, matches, problem, config),
         num_effective=seen.num_effective,
-        pose_std=largest_std(information(T, scale, matches, problem, config), problem),
+        min_eigenvalue=least_information(information(T, scale, matches, problem, config), problem),
         num_steps=jnp.sum(rounds[1]),
         is_converged=is_converged,
     )

@@ -260,12 +260,11 @@ def information(
     return problem.weight * rows.T @ rows
 
 
-def largest_std(points: Float[Array, "6 6"], problem: Problem) -> Float[Array, ""]:
-    """Standard deviation of the pose in its least certain direction, in the units of the unknowns; inf for none.
+def least_information(points: Float[Array, "6 6"], problem: Problem) -> Float[Array, ""]:
+    """Smallest eigenvalue of the information about the pose, in the units of the unknowns.
 
     Args:
         points: their information about xi, to which that of the prior is added.
     """
     units, prior = problem.units[:6], problem.prior[:, :6]
-    least = jnp.linalg.eigvalsh(units[:, None] * points * units + prior.T @ prior)[0]
-    return jnp.where(least > 0, 1.0 / jnp.sqrt(jnp.where(least > 0, least, 1.0)), jnp.inf)
+    return jnp.maximum(jnp.linalg.eigvalsh(units[:, None] * points * units + prior.T @ prior)[0], 0.0)

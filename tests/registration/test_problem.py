@@ -4,7 +4,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from compiled_rows import random_problem
 from scene import at, device, matrix_of, on_host
 
