@@ -144,15 +144,15 @@ class LocalizationInfo(eqx.Module):
 
 
 def _ratio_noise(
-    depth_noise: Float[Array, ""], ratio_std: Float[Array, ""], is_given: Bool[Array, ""], config: LocalizationConfig
+    depth_noise: Float[Array, ""], ratio_std: Float[Array, ""], is_firm: Bool[Array, ""], config: LocalizationConfig
 ) -> Float[Array, ""]:
     """Variance of the logarithm of the ratio of two frames' scales.
 
-    Where poses are given, a depth that is repeated exactly is no evidence for the scale of the next one: a drift of the
-    scale must not look like one of the surface, as the pose does not give way.
+    Depths that are repeated exactly hold the scale, for a drift of it and of the pose look alike. A pose that is firm
+    does not give way, and tells them apart.
     """
     guess = depth_noise * config.icp.scale_noise
-    ratio = jnp.where(config.coarse_scale > 0, jnp.maximum(ratio_std, jnp.where(is_given, guess, 0.0)), guess)
+    ratio = jnp.where(config.coarse_scale > 0, jnp.maximum(ratio_std, jnp.where(is_firm, guess, 0.0)), guess)
     return jnp.maximum(jnp.where(config.icp.scale_noise > 0, ratio, 0.0), NO_INFORMATION) ** 2
 
 
@@ -254,9 +254,10 @@ def localize_coarse(
     repeats, latest = repeat_poses(prediction, estimate.repeats, scale, mean_depth, config.num_shared)
     guess = axis_std(repeats, latest, depth_noise, mean_depth, config.icp.prior_information, config.pose_shared)
     of_motion, of_pose = pose_covariances(prediction.pose_covariance, guess, mean_depth, unit)
-    noise = (
-        jnp.zeros((7, 7)).at[:6, :6].set(of_motion).at[6, 6].set(_ratio_noise(depth_noise, ratio_std, is_given, config))
-    )
+    # Surer than it would be taken to be if nothing was given.
+    is_firm = is_given & jnp.all(jnp.diagonal(of_pose) <= guess[1] ** 2)
+    of_ratio = _ratio_noise(depth_noise, ratio_std, is_firm, config)
+    noise = jnp.zeros((7, 7)).at[:6, :6].set(of_motion).at[6, 6].set(of_ratio)
     noise = jnp.where(is_linked, noise, jnp.diag(_no_motion(mean_depth, config) ** 2))
     estimate = propagate(estimate, motion, noise)
     # A pose that is given with its uncertainty needs no other evidence of it.
