@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float
 
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.device.arrays import on_device, to_se3
@@ -24,12 +23,12 @@ class FirstWindow(eqx.Module):
     """The first prediction of a sequence: all views, camera frames, oldest first, with the prior's poses.
 
     Args:
-        pose_covariance: see `Prediction`.
+        pose_covariance: (n, 2, 6, 6), see `Prediction`.
     """
 
     views: Observation
     T_world_views: jaxlie.SE3
-    pose_covariance: Float[Array, "n 2 6 6"]
+    pose_covariance: jax.Array
 
 
 def to_camera(dataset: Dataset) -> Camera:

@@ -123,6 +123,7 @@ def test_from_then_on_the_prior_says_its_poses_from_where_the_camera_was_found()
     relative[:3, 3] *= 1.1  # as `localize_coarse` scales it
     np.testing.assert_allclose(anchor @ relative, PLACE, atol=1e-5)
     assert move_prediction(given, None) is given
+    assert np.isnan(there.pose_covariance).all()  # that world is only as sure as the pose that was found
     record = FrameRecord(0, None, None, "tracked", pose=PLACE, scale=1.1)
     np.testing.assert_allclose(anchor_motion_of(record, given).wxyz_xyz, motion.wxyz_xyz, atol=1e-6)
 
