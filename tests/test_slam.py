@@ -13,7 +13,7 @@ from scene import FULL, ROOM, WHOLE
 from emgs_jax import slam
 from emgs_jax.device.executables import call
 from emgs_jax.mapping.capacity import advance, grow_capacities, start
-from emgs_jax.mapping.convert import FirstWindow, opening
+from emgs_jax.mapping.convert import opening
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow  # one compilation of the whole step is half a min
 # With executables that are kept, as runs have them: those that test_growth.py compiled.
 init_state, step = (calling(call)(function) for function in (slam.init_state, slam.step))
 # An exact chain, lenient checks: the room is coarse at this resolution.
-LENIENT = {"localization.max_residual": 1.0, "localization.min_eigenvalue": 0.0}
+LENIENT = {"localization.max_residual": 1.0, "localization.max_pose_std": np.inf}
 
 
 def lenient(*overrides: str, **values):
@@ -39,7 +39,7 @@ def exact(i, **more) -> Prediction:
 @pytest.fixture(scope="module")
 def window(camera):
     poses = [sc.path_pose(i) for i in range(FRAME)]
-    return FirstWindow(sc.stack([sc.observe_room(T, camera, num_features=2) for T in poses]), sc.stack_poses(poses))
+    return sc.first_window(sc.stack([sc.observe_room(T, camera, num_features=2) for T in poses]), sc.stack_poses(poses))
 
 
 @pytest.fixture(scope="module")
@@ -413,7 +413,7 @@ def test_a_map_of_noisy_predictions_is_more_accurate_than_their_points(camera):
         rng, count = np.random.default_rng(seed), 8
         views = [noisy(sc.observe_room(T, camera, num_features=2), camera, rng, 0.02) for T in poses]
         sequence = [noisy_prediction(FRAME + i, camera, rng) for i in range(count)]
-        final, infos = run([FirstWindow(sc.stack(views), sc.stack_poses(poses)), *sequence], chosen)
+        final, infos = run([sc.first_window(sc.stack(views), sc.stack_poses(poses)), *sequence], chosen)
         assert all(i.localization.is_tracked for i in infos)
         raw_poses = [jaxlie.SE3(np.asarray(p.T_world_views.wxyz_xyz)[1]) for p in sequence]
         pairs = [*zip(poses, views, strict=True), *zip(raw_poses, (p.current for p in sequence), strict=True)]

@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 from jax._src.lru_cache import LRUCache
 from listening import compiled
-from scene import observe_room, path_pose, predict_room, slam_config, stack_poses
+from scene import first_window, observe_room, path_pose, predict_room, slam_config, stack_poses
 
 from emgs_jax.device import executable_files, executables
 from emgs_jax.device.executables import call, outputs, ready, stored
 from emgs_jax.mapping.capacity import start
-from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
 from emgs_jax.ops.pytree import stack
@@ -220,7 +219,7 @@ def test_a_new_process_that_lowers_nothing_finds_lapack(tmp_path):
 def test_a_step_of_kept_executables_has_the_bits_of_a_step_without(folder, camera):
     config = slam_config("slam.initialization=merged")
     poses = [path_pose(i) for i in range(3)]
-    first = FirstWindow(stack([observe_room(T, camera, num_features=2) for T in poses]), stack_poses(poses))
+    first = first_window(stack([observe_room(T, camera, num_features=2) for T in poses]), stack_poses(poses))
     state, config = start(first, camera, config)
     given = predict_room(3, camera, num_features=2), camera, config
     expected = step(state, *given)

@@ -32,6 +32,12 @@ def test_the_same_to_the_bit_is_certain():
     assert scale[0] == pytest.approx(1.1, rel=1e-5) and std[0] < 1e-6
 
 
+@pytest.mark.parametrize("true", [0.01, 50.0])
+def test_a_ratio_is_found_however_small_or_large(true):
+    scale, std = scales_of(np.full((200, NUM_PIXELS), np.log(true), np.float32))
+    assert scale[0] == pytest.approx(true, rel=1e-4) and std[0] < 1e-5
+
+
 def test_the_deviation_is_that_of_the_scales_where_pixels_err_apart():
     scale, std = scales_of(np.float32(0.05 * normal(200, NUM_PIXELS)))
     assert np.mean(std) == pytest.approx(np.std(np.log(scale)), rel=0.25)
