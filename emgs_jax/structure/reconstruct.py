@@ -191,7 +191,7 @@ def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
     with tqdm(total=len(pairs), unit="pair", desc="matches") as bar:
         for start in range(0, len(pairs), PAIRS):
             some = pairs[start : start + PAIRS]
-            listed.write_text("\n".join(f"{a} {b}" for a, b in some))
+            listed.write_text("\n".join(f"{a} {b}" for a, b in some), encoding="utf-8")
             pycolmap.match_image_pairs(
                 database,
                 matching_options=matching,
