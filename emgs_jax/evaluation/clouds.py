@@ -104,42 +104,46 @@ class VoxelMeans:
     def __len__(self) -> int:
         return sum(self.sizes)
 
-    def __iter__(self) -> Iterator[np.ndarray]:
+    def tables(self) -> Iterator[np.ndarray]:
+        """The rows of each part."""
         return (self.parts[part] for part in range(len(self.sizes)))
+
+    def __iter__(self) -> Iterator[PointCloud]:
+        return map(_cloud, self.tables())
 
     def rows(self, positions: np.ndarray) -> np.ndarray:
         """Rows (m, 10) at positions (m,) in ascending order."""
         ends = np.searchsorted(positions, np.cumsum(self.sizes))
         chosen = np.split(positions, ends[:-1]) if self.sizes else []
         begins = np.cumsum((0, *self.sizes))
-        found = [part[rows - begin] for part, rows, begin in zip(self, chosen, begins, strict=False)]
+        found = [part[rows - begin] for part, rows, begin in zip(self.tables(), chosen, begins, strict=False)]
         return np.concatenate([np.empty((0, 10), np.float32), *found])
 
     def cloud(self) -> PointCloud:
         """All of them."""
-        rows = np.concatenate([np.empty((0, 10), np.float32), *self])
-        return PointCloud(*(rows[:, begin : begin + 3].astype(np.float64) for begin in (0, 3, 6)))
+        return _cloud(np.concatenate([np.empty((0, 10), np.float32), *self.tables()]))
 
     def counts(self) -> np.ndarray:
         """Count the points of each row of `cloud`."""
-        return np.concatenate([np.empty(0), *(part[:, 9] for part in self)])
+        return np.concatenate([np.empty(0), *(part[:, 9] for part in self.tables())])
 
 
 class SpooledCloud:
     """All points of many clouds, in a temporary file, averaged once the side of a voxel is known.
 
     What is not metric has a unit that only its alignment tells: 1 cm of the truth is .01 of one estimate's lengths and
-    .00001 of another's. float32 (n, 9) a cloud; points that are not finite are dropped.
+    .00001 of another's. Rows (n, 9) of `dtype` a cloud; points that are not finite are dropped.
     """
 
-    def __init__(self) -> None:
-        self._parts, self._some, self._count = Spool(), [np.empty((0, 3), np.float32)], 0
+    def __init__(self, dtype: type = np.float32) -> None:
+        self._parts, self._some, self._count, self._dtype = Spool(), [np.empty((0, 3), dtype)], 0, dtype
         self._averaged: tuple[float, VoxelMeans] | None = None  # the last answer: one alignment serves several numbers
         self._averaging = threading.Lock()
 
     def append(self, cloud: PointCloud) -> None:
         """Add the points of a cloud."""
-        rows = _rows(cloud).astype(np.float32)
+        rows = np.concatenate([cloud.points, cloud.normals, cloud.colors], axis=1)
+        rows = rows[np.isfinite(rows[:, :3]).all(axis=1)].astype(self._dtype)
         self._parts.append(rows)
         self._some.append(rows[::_SOME, :3].copy())
         self._count, self._averaged = self._count + len(rows), None
@@ -157,25 +161,22 @@ class SpooledCloud:
             return self._averaged[1]
 
 
-def voxel_means(cloud: PointCloud | SpooledCloud, voxel: float) -> VoxelMeans:
-    """The mean of each voxel [lengths of the cloud] that holds points; rows are of the cloud's own precision."""
-    if isinstance(cloud, SpooledCloud):
-        return cloud.averaged(voxel)
-    rows = _rows(cloud)
-    return _average(iter([rows]), _edges(rows[::_SOME, :3], len(rows), voxel), voxel)
+def spooled(clouds: Iterable[PointCloud], dtype: type = np.float32) -> SpooledCloud:
+    """The points of all clouds, one in memory at a time."""
+    found = SpooledCloud(dtype)
+    for cloud in clouds:
+        found.append(cloud)
+    return found
 
 
 def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
-    """Average the points of all clouds per voxel, to float32, without holding them at once."""
-    spooled = SpooledCloud()
-    for cloud in clouds:
-        spooled.append(cloud)
-    return spooled.averaged(voxel).cloud()
+    """Average the points of all clouds per voxel, to float32."""
+    return spooled(clouds).averaged(voxel).cloud()
 
 
 def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
     """Average the points of each voxel [m]; doing it twice changes nothing."""
-    return voxel_means(cloud, voxel).cloud()
+    return spooled([cloud], np.float64).averaged(voxel).cloud()
 
 
 def coarse_points(parts: Iterable[np.ndarray], voxel: float) -> np.ndarray:
@@ -224,14 +225,14 @@ class NearestPoints:
 def register(points: np.ndarray, target: NearestPoints, max_distance: float, max_steps: int) -> Sim3:
     """Find the rigid motion of points (n, 3) onto those of a target by point-to-point ICP (Besl and McKay 1992).
 
-    Pairs are nearest points within `max_distance` [m]; ends when a step moves them by less than a ten thousandth of
-    it (RMS). With fewer than 3 pairs nothing holds the cloud: it stays where it is.
+    Pairs are nearest points within `max_distance` [m]; ends when a step moves them by less than a hundred
+    thousandth of it (RMS). With fewer than 3 pairs nothing holds the cloud: it stays where it is.
     """
     found, moved, shift = Sim3(1.0, np.eye(3), np.zeros(3)), points, np.inf
     for _ in range(max_steps if len(target) else 0):
         distances, partners = (values[:, 0] for values in target.query(moved))
         near = distances < max_distance
-        if near.sum() < 3 or shift < 1e-4 * max_distance:
+        if near.sum() < 3 or shift < 1e-5 * max_distance:
             return found
         found = align(points[near], target.points[partners[near]], with_scale=False)
         moved, before = found.apply(points), moved
@@ -239,10 +240,8 @@ def register(points: np.ndarray, target: NearestPoints, max_distance: float, max
     return found
 
 
-def _rows(cloud: PointCloud) -> np.ndarray:
-    """Points, normals and colours (n, 9) of the points that are finite."""
-    rows = np.concatenate([cloud.points, cloud.normals, cloud.colors], axis=1)
-    return rows[np.isfinite(rows[:, :3]).all(axis=1)]
+def _cloud(rows: np.ndarray) -> PointCloud:
+    return PointCloud(*(rows[:, begin : begin + 3].astype(np.float64) for begin in (0, 3, 6)))
 
 
 def _edges(some: np.ndarray, count: int, voxel: float) -> np.ndarray:

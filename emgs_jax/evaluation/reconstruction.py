@@ -16,12 +16,12 @@ from emgs_jax.evaluation.clouds import (
     coarse_points,
     fuse_clouds,
     register,
+    spooled,
     transform_cloud,
     voxel_downsample,
-    voxel_means,
 )
 from emgs_jax.evaluation.trajectory import align_poses
-from emgs_jax.geometry import Sim3, rotated
+from emgs_jax.geometry import Sim3
 from emgs_jax.ops.ranges import number
 
 Metrics = dict[str, float | int | str | None]
@@ -158,14 +158,20 @@ def compare_placements(
     """Metrics of the estimate's cloud where its poses put it, moved from there by ICP of each distance (0: left there).
 
     The alignment is that of the poses, estimated and true (n, 4, 4); what they leave open is noted, see `align_poses`.
-    The cloud is averaged by `voxel_m` of the truth, so that its own unit does not matter. ICP moves it rigidly: the
-    scale stays that of the poses, and what is averaged and indexed serves every placement.
+    A `SpooledCloud` is averaged by `voxel_m` of the truth before, so that its own unit does not matter. ICP moves the
+    cloud rigidly: the scale stays that of the poses.
     """
     alignment, note = align_poses(*poses, with_scale=config.alignment == "sim3")
-    means = voxel_means(cloud, own_voxel(alignment, config))
-    source = coarse_points((alignment.apply(part[:, :3]) for part in means), config.icp_voxel_m)
-    placed = [_moved(source, truth, distance, config) @ alignment for distance in icp_distances_m]
-    return [found | {"reconstruction/alignment_note": note} for found in _compare(means, placed, truth, config)]
+    is_spooled = isinstance(cloud, SpooledCloud)
+    own = cloud.averaged(own_voxel(alignment, config)) if is_spooled else [cloud]
+    precision = np.float32 if is_spooled else np.float64
+    source = coarse_points((alignment.apply(part.points) for part in own), config.icp_voxel_m)
+    found: dict[float, Metrics] = {}
+    for distance in {*icp_distances_m}:
+        placed = _moved(source, truth, distance, config) @ alignment
+        means = spooled((transform_cloud(part, placed) for part in own), precision).averaged(config.voxel_m)
+        found[distance] = _compare(means, truth, config) | {"reconstruction/alignment_note": note}
+    return [found[distance] for distance in icp_distances_m]
 
 
 def own_voxel(alignment: Sim3, config: EvaluationConfig) -> float:
@@ -196,33 +202,29 @@ def reconstruction_metrics(estimate: PointCloud, truth: Reference, config: Evalu
     and recall of all of the truth to all of the estimate. The normal metrics take the nearest neighbours' |cos| and
     average both directions. Without points the values are None, with a reason.
     """
-    return _compare(voxel_means(estimate, config.voxel_m), [Sim3(1.0, np.eye(3), np.zeros(3))], truth, config)[0]
+    return _compare(spooled([estimate], np.float64).averaged(config.voxel_m), truth, config)
 
 
-def _compare(means: VoxelMeans, placed: Sequence[Sim3], truth: Reference, config: EvaluationConfig) -> list[Metrics]:
-    """`reconstruction_metrics` of an estimate that is put into the frame of the truth in several ways."""
+def _compare(means: VoxelMeans, truth: Reference, config: EvaluationConfig) -> Metrics:
+    """`reconstruction_metrics` of an estimate that is averaged already."""
     empty: Metrics = dict.fromkeys(_metric_names(config)) | {"reconstruction/num_points": len(means)}
     if not len(means) or not len(truth.cloud):
         which = "estimate" if not len(means) else "ground truth"
-        return [empty | {"reconstruction/reason": f"the {which} has no points"} for _ in placed]
+        return empty | {"reconstruction/reason": f"the {which} has no points"}
     rng = np.random.default_rng(0)  # one for both: equally long clouds must not keep the same rows
     if config.max_points is None:
         some = means.rows(_spread(len(means), config.num_sampled, rng))
-        parts = means if len(some) < len(means) else ()
+        parts = means.tables() if len(some) < len(means) else ()
     else:
         some, parts = means.rows(_choice(len(means), config.max_points, rng)), ()
     kept = _choice(len(truth.cloud), config.max_points, rng)
     normals, of_truth = truth.cloud.normals[kept], truth.points
     if len(kept) < len(truth.cloud):
         of_truth = NearestPoints(truth.cloud.points[kept])
-    nearest = _nearest_means(parts, some, [place.inverse().apply(of_truth.points) for place in placed])
-    metrics = []
-    for place, (to_estimate, seen) in zip(placed, nearest, strict=True):
-        to_truth, partners = (values[:, 0] for values in of_truth.query(place.apply(some[:, :3])))
-        pairs = (some[:, 3:6], normals[partners]), (seen, normals)
-        cosines = [_abs_cosines(rotated(own, place.rotation), true) for own, true in pairs]
-        metrics.append(empty | _scores((to_truth, place.scale * to_estimate), cosines, config))
-    return metrics
+    to_estimate, seen = _nearest_means(parts, some, of_truth.points)
+    to_truth, partners = (values[:, 0] for values in of_truth.query(some[:, :3]))
+    cosines = _abs_cosines(some[:, 3:6], normals[partners]), _abs_cosines(seen, normals)
+    return empty | _scores((to_truth, to_estimate), cosines, config)
 
 
 def _scores(distances: Sequence[np.ndarray], cosines: Sequence[np.ndarray], config: EvaluationConfig) -> Metrics:
@@ -240,26 +242,20 @@ def _scores(distances: Sequence[np.ndarray], cosines: Sequence[np.ndarray], conf
     return reason | dict(zip(_metric_names(config), values, strict=False))
 
 
-def _nearest_means(
-    parts: VoxelMeans | tuple[()], some: np.ndarray, queries: Sequence[np.ndarray]
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Distances (m,) of each set of queries (m, 3) to the nearest mean, and the normals (m, 3) there.
+def _nearest_means(parts: Iterable[np.ndarray], some: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of each point (m, 3) to the nearest mean, and the normal (m, 3) there.
 
-    A part of the means is searched for those queries that are nearer to it than to `some` (n, 10) of all parts.
+    A part of the means is searched for those points that are nearer to it than to `some` (n, 10) of all parts.
     """
-    tree, found = NearestPoints(some[:, :3]), []
-    for points in queries:
-        distances, rows = (values[:, 0] for values in tree.query(points))
-        found.append((distances, some[rows, 3:6]))
+    distances, rows = (values[:, 0] for values in NearestPoints(some[:, :3]).query(points))
+    normals, x = some[rows, 3:6], points[:, 0]
     for part in parts:
-        low, high = part[:, 0].min(), part[:, 0].max()  # parts lie one behind the other along the first axis
-        tree = NearestPoints(part[:, :3])
-        for points, (distances, normals) in zip(queries, found, strict=True):
-            open_rows = np.flatnonzero(np.maximum(low - points[:, 0], points[:, 0] - high) < distances)
-            nearer, rows = (values[:, 0] for values in tree.query(points[open_rows]))
-            closer = nearer < distances[open_rows]
-            distances[open_rows[closer]], normals[open_rows[closer]] = nearer[closer], part[rows[closer], 3:6]
-    return found
+        # Parts lie one behind the other along the first axis.
+        near = np.flatnonzero(np.maximum(part[:, 0].min() - x, x - part[:, 0].max()) < distances)
+        nearer, rows = (values[:, 0] for values in NearestPoints(part[:, :3]).query(points[near]))
+        closer = nearer < distances[near]
+        distances[near[closer]], normals[near[closer]] = nearer[closer], part[rows[closer], 3:6]
+    return distances, normals
 
 
 def _average(distances: np.ndarray, config: EvaluationConfig) -> float:
