@@ -76,11 +76,19 @@ def _columns(vertices: Mapping[str, np.ndarray], names: Sequence[str], path: obj
 
 
 def _fitted_normals(points: np.ndarray, num_neighbours: int) -> np.ndarray:
-    import open3d as o3d  # slow to import, and only clouds of other systems need it
+    """Normals (n, 3) of planes through the nearest distinct points, sign unknown; 0 where these lie on a line.
 
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(num_neighbours))
-    return np.asarray(cloud.normals)
+    In a mesh whose triangles share no vertices each point is there many times, which are one for a plane.
+    """
+    distinct, rows = np.unique(points, axis=0, return_inverse=True)
+    search, normals = NearestPoints(distinct), np.zeros_like(distinct)
+    for begin in range(0, len(distinct), _PART_ROWS // num_neighbours):
+        part = slice(begin, begin + _PART_ROWS // num_neighbours)
+        near = distinct[search.query(distinct[part], num_neighbours)[1]]
+        offsets = near - near.mean(1, keepdims=True)
+        spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
+        normals[part] = np.where(spread[:, 1:2] > 1e-6 * spread[:, 2:], axes[:, :, 0], 0.0)
+    return normals[rows.reshape(-1)]
 
 
 def transform_cloud(cloud: PointCloud, alignment: Sim3) -> PointCloud:

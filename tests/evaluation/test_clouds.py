@@ -148,6 +148,18 @@ def test_a_cloud_without_normals_gets_those_of_planes_through_its_points(tmp_pat
     assert not found.colors.any()
 
 
+def test_normals_of_a_mesh_whose_triangles_share_no_vertices_are_its_planes_and_those_of_a_line_unknown(tmp_path):
+    """Neighbours that are one point six times have no plane, and (0, 0, 1) was taken for theirs."""
+    x, y = (values.ravel() * 0.02 for values in np.meshgrid(np.arange(20.0), np.arange(20.0)))
+    grid = np.column_stack([x, 0.6 * y, 0.8 * y])
+    line = np.column_stack([np.linspace(5.0, 6.0, 20), np.zeros(20), np.zeros(20)])
+    points = np.repeat(np.concatenate([grid, line]), 6, axis=0)
+    save_points_ply(tmp_path / "a.ply", points, np.zeros_like(points), np.zeros_like(points))
+    normals = read_cloud(tmp_path / "a.ply", 12).normals
+    np.testing.assert_allclose(np.abs(normals[: 6 * 400] @ [0.0, -0.8, 0.6]), 1.0, atol=1e-4)
+    assert not normals[6 * 400 :].any()
+
+
 def test_normals_of_length_0_are_none_and_others_get_length_1(tmp_path):
     """3DGS writes zeros, which scored as 0 % of normals; and cosines of normals of length 2 were above 1."""
     rng = np.random.default_rng(11)
