@@ -20,7 +20,7 @@ from tqdm import tqdm
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.reading import check_depth_scale, fingerprint
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window, relative_poses
-from emgs_jax.prior.files.conventions import Sight, check_conventions
+from emgs_jax.prior.files.conventions import Sight, check_conventions, median_misfit
 from emgs_jax.prior.files.exports import find_export, read_cut3r, read_export
 from emgs_jax.prior.files.own import GIVES_POSES, read_own
 from emgs_jax.prior.files.scans import DEPTH_MAPS, read_colmap_workspace, read_record3d, read_scannet
@@ -41,10 +41,17 @@ class Files(Prior):
         median_depth: m, of the first view where the scale is arbitrary.
         depth_scale: units of a metre in 16-bit .png files.
         max_depth_step: relative depth difference across which nothing is interpolated.
+        max_misfit: by which the depths of two views may differ, median.
     """
 
     def __init__(
-        self, folder: Path | str, scale: str, median_depth: float, depth_scale: float, max_depth_step: float
+        self,
+        folder: Path | str,
+        scale: str,
+        median_depth: float,
+        depth_scale: float,
+        max_depth_step: float,
+        max_misfit: float = 0.1,
     ) -> None:
         if scale not in SCALES:
             raise ValueError(f"prior.scale must be one of {', '.join(SCALES)}, got {scale!r}")
@@ -54,7 +61,7 @@ class Files(Prior):
         self._found = read_predictions(self.folder, check_depth_scale(depth_scale, "prior.depth_scale"))
         if not np.isfinite(self._found.poses).all((1, 2)).any():
             raise ValueError(f"{self._found.pose_source}: none of {len(self._found.poses)} is known: {GIVES_POSES}")
-        self._max_depth_step = float(max_depth_step)
+        self._max_depth_step, self._max_misfit = float(max_depth_step), float(max_misfit)
         self._is_metric = self._found.is_metric if scale == "auto" else scale == "metric"
         self._factor = 1.0 if self._is_metric else median_depth / self._first_depth()[1]
         self._rows: list[int | None] = []  # of the frames
@@ -79,10 +86,12 @@ class Files(Prior):
             )
         scale = "metres" if self._is_metric else f"up to scale, times {self._factor:.4g}"
         lacking = f", {len(self._rows) - len(known)} frames have none" if len(known) < len(self._rows) else ""
-        tqdm.write(
-            f"prior=files: {self.folder}, layout {found.layout}, {scale}{lacking}{_focal_note(view, camera, found)}"
-        )
-        check_conventions(self._pairs(known, camera), dataset.intrinsics, found.pose_source)
+        note = _focal_note(view, camera, found)
+        pairs = self._pairs(known, camera)
+        if not np.isfinite(median_misfit(pairs, dataset.intrinsics, lambda sight: sight)):  # the camera turns fast
+            pairs = self._pairs(known, camera, gap=1) or pairs
+        fit = check_conventions(pairs, dataset.intrinsics, found.pose_source, self._max_misfit)
+        tqdm.write(f"prior=files: {self.folder}, layout {found.layout}, {scale}{lacking}; {fit}{note}")
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Predict a window from the files of its views; `check` comes first, as it matches files with frames."""
@@ -125,11 +134,11 @@ class Files(Prior):
                 return view, float(np.median(depth[usable(view.geometry)]))
         raise ValueError(f"{self.folder}: none of its {len(self._found.names)} files has a depth above 0")
 
-    def _pairs(self, known: list[int], camera: Camera) -> list[tuple[Sight, Sight]]:
+    def _pairs(self, known: list[int], camera: Camera, gap: int = PAIR_GAP) -> list[tuple[Sight, Sight]]:
         """Views with a pose, some frames apart, from all of the sequence."""
         known = [index for index in known if np.isfinite(self._pose(index)).all()]
-        places = np.linspace(0, max(len(known) - 1 - PAIR_GAP, 0), NUM_PAIRS).astype(int)
-        chosen = {(known[place], known[min(place + PAIR_GAP, len(known) - 1)]) for place in places}
+        places = np.linspace(0, max(len(known) - 1 - gap, 0), NUM_PAIRS).astype(int)
+        chosen = {(known[place], known[min(place + gap, len(known) - 1)]) for place in places}
         sights = {}
         for index in sorted({index for pair in chosen for index in pair}):
             points, _, mask = self._at_frame(index, camera)
