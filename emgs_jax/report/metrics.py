@@ -17,10 +17,9 @@ from emgs_jax.evaluation.loops import double_wall_share, loop_metrics
 from emgs_jax.evaluation.reconstruction import (
     EvaluationConfig,
     Reference,
-    align_cloud,
     compare_clouds,
+    compare_placements,
     ground_truth_cloud,
-    reconstruction_metrics,
     reference,
 )
 from emgs_jax.evaluation.rendering import Rendered
@@ -108,9 +107,7 @@ def score_map(
     other = replace(config, alignment="se3" if config.alignment == "sim3" else "sim3")
     metrics = trajectory_metrics(*poses) | score_cloud(dense, poses, scorer)
     metrics |= _renamed(compare_clouds(dense, truth, poses, other), f"reconstruction_{other.alignment}/")
-    aligned, note = align_cloud(centers, truth, poses, config)
-    found = reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
-    metrics |= _renamed(found, "reconstruction_centers/")
+    metrics |= _renamed(compare_clouds(centers, truth, poses, config), "reconstruction_centers/")
     return metrics | _score_labels(labels, poses, scorer)
 
 
@@ -121,11 +118,9 @@ def score_cloud(cloud: PointCloud | SpooledCloud, poses: tuple[np.ndarray, np.nd
     leaves the rotation about itself open, and then the first one says more about that than about the cloud.
     """
     config = scorer.evaluation
-    by_points = replace(config, icp_distance_m=config.placement_icp_m)
-    with ThreadPoolExecutor(1, "placed by its points") as thread:
-        placed = thread.submit(compare_clouds, cloud, scorer.truth, poses, by_points)
-        found = compare_clouds(cloud, scorer.truth, poses, config)
-        return found | _renamed(placed.result(), "reconstruction_icp/")
+    distances = config.icp_distance_m, config.placement_icp_m
+    found, placed = compare_placements(cloud, scorer.truth, poses, config, distances)
+    return found | _renamed(placed, "reconstruction_icp/")
 
 
 def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:

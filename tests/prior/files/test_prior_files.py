@@ -182,7 +182,8 @@ def test_what_was_found_is_one_line_and_says_by_how_much_focal_lengths_differ(tm
     fx, fy, cx, cy = tiny_run.dataset().intrinsics
     near = write_npz(tmp_path / "near", NAMES, intrinsics=lambda f: [fx * 1.02, fy * 1.02, cx, cy])
     asked(near)
-    assert capsys.readouterr().out.splitlines() == [f"prior=files: {near}, layout npz, metres, {UNKNOWN}"]
+    fit = "the depths of two views differ by 0.3 %"
+    assert capsys.readouterr().out.splitlines() == [f"prior=files: {near}, layout npz, metres; {fit}, {UNKNOWN}"]
     far = write_npz(tmp_path / "far", NAMES, intrinsics=lambda f: np.diag([fx * 1.1, fy * 1.1, 1]) + [[0, 0, cx]] * 3)
     with pytest.raises(ValueError, match=r"camera matrix|intrinsics"):  # a matrix with numbers below the diagonal
         asked(write_npz(tmp_path / "no", NAMES, intrinsics=lambda f: [fx, fy, cx]))
