@@ -279,7 +279,11 @@ def adjust(model: Any, shots: Shots, config: StructureConfig) -> None:
     options = options_of("BundleAdjustmentOptions", refined)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.solver_options.num_threads = config.num_threads
-    pycolmap.bundle_adjustment(model, options)
+    problem = pycolmap.BundleAdjustmentConfig()  # `pycolmap.bundle_adjustment` prints whatever the level of the log
+    for image in model.reg_image_ids():
+        problem.add_image(image)
+    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_ceres_bundle_adjuster(options, problem, model).solve()
     model.update_point_3d_errors()
 
 
