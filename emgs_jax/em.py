@@ -15,8 +15,10 @@ from emgs_jax.ops.linalg import (
     Whitening,
     across,
     between,
+    cross,
     dot,
     down,
+    floored,
     outer,
     principal_axes_2x2,
     safe_normalize,
@@ -101,14 +103,16 @@ class EmInfo(eqx.Module):
 
 
 def widened_distance_sq(triangle: Entries, offsets: Entries, noise: Entries) -> tuple[Array, Array]:
-    """Squared Mahalanobis distance under Σ_k + ν ν' and log|Σ_k + ν ν'| - log|Σ_k| (Sherman–Morrison).
+    """Squared Mahalanobis distance under Σ_k + ν ν' and log|Σ_k + ν ν'| - log|Σ_k|.
 
-    ν is a point's noise: a standard deviation along its viewing ray. `triangle` is that of `whitening`.
+    ν is a point's noise: a standard deviation along its viewing ray. `triangle` is that of `whitening`. With the
+    whitened offset w and noise u that is (|w|² + |w × u|²) / (1 + |u|²), in which nothing cancels as it does in
+    |w|² - (w·u)² / (1 + |u|²) (Sherman–Morrison) where a distant point lies behind its Gaussian along the ray.
     """
     white, noise = whiten(triangle, offsets), whiten(triangle, noise)
     growth = 1.0 + dot(noise, noise)
-    distance_sq = dot(white, white) - dot(white, noise) ** 2 / growth
-    return jnp.maximum(distance_sq, 0.0), jnp.log(growth)
+    turned = cross(white, tuple(entry / jnp.sqrt(growth) for entry in noise))
+    return dot(white, white) / growth + dot(turned, turned), jnp.log(growth)
 
 
 @full_precision
@@ -228,7 +232,7 @@ def m_step(
         gaussians,
         (
             gaussians.means + mean[:, :3],
-            second - outer(mean[:, :3]) + config.min_std**2 * jnp.eye(3),
+            floored(second - outer(mean[:, :3]), config.min_std),
             safe_normalize(mean[:, 9:12]),
             mean[:, 12:],
         ),

@@ -12,6 +12,7 @@ from emgs_jax.ops.executable import executable
 from emgs_jax.ops.linalg import (
     Whitening,
     dot,
+    floored,
     inverse_2x2,
     outer,
     safe_normalize,
@@ -106,7 +107,7 @@ def fit_to_points(
     count = jnp.maximum(jnp.sum(found, axis=-1), 1)[:, None]
     offsets = jnp.where(found[..., None], near.points - centers[:, None], 0.0)
     centered = jnp.where(found[..., None], offsets - (jnp.sum(offsets, axis=1) / count)[:, None], 0.0)
-    covs = jnp.sum(outer(centered), axis=1) / count[..., None] + config.min_std**2 * jnp.eye(3)
+    covs = floored(jnp.sum(outer(centered), axis=1) / count[..., None], config.min_std)
     triangle = jnp.unstack(whitening(covs)[0][:, None], axis=-1)
     white = whiten(triangle, jnp.unstack(offsets, axis=-1))
     weights = jax.nn.softmax(-0.5 * dot(white, white), axis=-1, where=found)
