@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
 from emgs_jax.gaussians import GaussianIndex, Gaussians, gathered_features, has_feature, index_of
-from emgs_jax.observation import Observation
+from emgs_jax.observation import Observation, sound
 from emgs_jax.ops.linalg import (
     Entries,
     Whitening,
@@ -132,6 +132,9 @@ def e_step(
         index: of the Gaussians; None makes it here.
     """
     index = index_of(gaussians) if index is None else index
+    has_noise = jnp.all(jnp.isfinite(noise), axis=-1)
+    points = sound(eqx.tree_at(lambda o: o.valid, points, points.valid & has_noise))
+    noise = jnp.where(points.valid[:, None], noise, 0.0)
     near = nearby(points.points, points.valid, index.groups, config.num_candidates, BLOCK)
     meaning = eqx.tree_at(lambda g: g.features, gaussians, safe_normalize(gaussians.features))
     table = meaning, index.white
@@ -281,7 +284,8 @@ def em_update(
     Returns:
         The updated submap, what explains which point, and counts. Without any fused point the submap is unchanged.
     """
-    gaussians = submap.gaussians
+    gaussians, aligned = submap.gaussians, sound(aligned)
+    noise = jnp.where(jnp.isfinite(noise), noise, 0.0)
     step, best = e_step(gaussians, aligned, noise, config, index)
     new, total = m_step(gaussians, aligned, precision(noise, config), step, config)
     evidence = jnp.where(total > 0, support(gaussians, aligned, step, config), 0.0)

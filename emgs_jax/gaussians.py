@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.observation import Observation
+from emgs_jax.observation import Observation, sound
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import kmeans, strided_seeds
 from emgs_jax.ops.executable import executable
@@ -97,6 +97,7 @@ def fit_to_points(
     The covariance has min_std² added on the diagonal, which keeps every eigenvalue at or above the floor. A centre
     with fewer than four points becomes invalid.
     """
+    observation = sound(observation)
     points, num = observation.points, config.num_fit_neighbours
     groups = group_points(points, observation.valid)
     # A centre stands for several points: few centres share a list, and that is long.
@@ -140,6 +141,7 @@ def cluster(
     Returns:
         ceil(p / spacing) Gaussians, and the number of points of each in units of `spacing`; 0 where invalid.
     """
+    observation = sound(observation)
     num_points, num_neighbours = order.shape[0], config.num_fit_neighbours
     num_seeds = -(-num_points // spacing)
     seeds, seed_exists = strided_seeds(observation.valid, order, spacing, num_seeds)

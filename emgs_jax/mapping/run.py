@@ -200,6 +200,7 @@ def _add(run: MappingRun, window: WindowInput, row: int, **described: Any) -> Ma
         timestamp=frame.timestamp,
         raw_pose=window.raw[row].T_world_camera,
         true_pose=frame.T_world_camera,
+        left_out=window.raw[row].num_left_out,
         **described,
     )
     return replace(run, records=(*run.records, record))

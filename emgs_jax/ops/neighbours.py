@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from emgs_jax.ops.linalg import between, dot
 from emgs_jax.ops.pytree import fill_rows, join_rows, split_rows
+from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 GROUP = 16  # points per group: near each other
 NUM_GROUPS = 24  # groups that a block of queries looks into
@@ -23,7 +24,6 @@ NUM_SAMPLED = 64  # positions by whose gaps those cells are laid
 WIDE_GAP = 16.0  # of the usual one; wider ones between positions are cut to that
 FAR = 1e18  # m; where what does not count stands: its squared distance is finite, and larger than any other
 FAR_SQ = 0.5 * FAR**2  # m²; less is the distance of two that count
-FARTHEST = 1e9  # m; what is not within it counts as little as what is not finite: its squares are summed and multiplied
 MAX_BLOCKS = 4096  # which are compared with their groups at once; more are done one part after the other
 
 
@@ -59,8 +59,8 @@ class Nearby(eqx.Module):
 
 
 def is_within_reach(positions: Float[Array, "*m d"]) -> Bool[Array, "*m"]:
-    """Positions that are finite, and no farther from the origin than what is computed with them can hold."""
-    return jnp.all(jnp.abs(positions) < FARTHEST, axis=-1)
+    """Positions that are finite, and along each axis within what a map can hold."""
+    return jnp.all(jnp.abs(positions) < MAX_LENGTH_M, axis=-1)
 
 
 def curve_order(positions: Float[Array, "m d"], counts: Bool[Array, "m"]) -> Int[Array, "m"]:
