@@ -31,6 +31,7 @@ from emgs_jax.ops.pytree import choice, join_rows, split_rows, static, take_rows
 
 BLOCK = 16  # points that share a list of Gaussians
 MAX_BLOCKS = 8192  # whose explanations are held at once
+LEAST_SHARE = 1e-18  # of a point; a smaller sum of them counts as none, since the slopes of a ratio would overflow
 
 
 class EmConfig(eqx.Module):
@@ -200,7 +201,8 @@ def support(gaussians: Gaussians, points: Observation, step: EStep, config: EmCo
     sums = jnp.zeros((gaussians.valid.shape[0], 4)).at[step.near.rows].add(jnp.stack(sides, axis=-1))
     first, second = sums[:, 0::2], sums[:, 1::2]
     smaller, total = 2.0 * jnp.minimum(first, second), first + second
-    normalized = smaller / jnp.where(total > 0, total, 1.0)
+    has_share = total > LEAST_SHARE
+    normalized = jnp.where(has_share, smaller, 0.0) / jnp.where(has_share, total, 1.0)
     both = jnp.where(config.support > 0, normalized, jnp.minimum(smaller, 1.0))
     return jnp.min(both, axis=-1)
 
@@ -225,8 +227,8 @@ def m_step(
     sums = _statistics(gaussians.means[step.near.rows], *blocks, step.responsibilities)
     sums = jnp.zeros((gaussians.valid.shape[0], 17)).at[step.near.rows].add(sums)
     total = sums[:, 0]
-    has_points = (total > config.min_responsibility) & (sums[:, 1] > 0)  # a vanishing share times a precision is 0
-    mean = sums[:, 2:] / jnp.where(has_points, sums[:, 1], 1.0)[:, None]
+    has_points = (total > config.min_responsibility) & (sums[:, 1] > LEAST_SHARE)
+    mean = jnp.where(has_points[:, None], sums[:, 2:], 0.0) / jnp.where(has_points, sums[:, 1], 1.0)[:, None]
     rows, columns = jnp.triu_indices(3)
     second = jnp.zeros((total.shape[0], 3, 3)).at[:, rows, columns].set(mean[:, 3:9])
     second = second.at[:, columns, rows].set(mean[:, 3:9])

@@ -212,7 +212,8 @@ def color_gradients(gaussians: Gaussians, num_neighbours: int, groups: Groups | 
     light = intensity(gaussians.colors)
     moments = jnp.einsum("nka,nkb->nab", offsets, offsets)
     cross = jnp.einsum("nka,nk->na", offsets, light[rows] - light[:, None])
-    # A hundredth of the spread keeps the fit of collinear neighbours finite.
-    ridge = 0.01 * jnp.trace(moments, axis1=-2, axis2=-1) + 1e-8
+    # A hundredth of the spread keeps the fit of collinear neighbours finite, and of coincident ones the own widths do.
+    own = jnp.trace(gaussians.covs, axis1=-2, axis2=-1)
+    ridge = 0.01 * jnp.trace(moments, axis1=-2, axis2=-1) + 1e-5 * own
     slopes = (inverse_2x2(moments + ridge[:, None, None] * jnp.eye(2)) @ cross[..., None])[..., 0]
     return jnp.einsum("nda,na->nd", basis, slopes)
