@@ -71,7 +71,9 @@ def fuse(map, aligned, noise, config):
 def look(map, view, T, config):
     frame = existence.Look(view, T, CAMERA, jnp.float32(0.02))
     updated, is_seen = existence.update_existence(map, jnp.arange(32) % 3 - 1, frame, config.existence)
-    return existence.merge_duplicates(updated, is_seen, T.translation(), jnp.float32(0.1), config.existence), is_seen
+    merged = existence.merge_duplicates(updated, is_seen, T.translation(), jnp.float32(0.1), config.existence)
+    taken = merged.gaussians.valid[:, None, None]
+    return eqx.tree_at(lambda m: m.gaussians.covs, merged, merged.gaussians.covs * taken), is_seen
 
 
 refined = sc.on_host(lambda m, g, T, config: refine(m, g, T, CAMERA, config.refinement)[:2])
@@ -81,14 +83,8 @@ moved = sc.on_host(lambda m, a, b, std: deform.deform(m, a, b, std, deform.Defor
 started = sc.on_host(lambda views, T, config: initialize(views, T, CAMERA, 1, config.fit)[0])
 slopes = sc.on_host(lambda g: gaussians.color_gradients(g, 6))
 continued = sc.on_host(
-    lambda o, m, T, config: surface_extrapolation.extrapolate(
-        o,
-        take_rows(m, jnp.asarray(ROWS) % 32),
-        jnp.asarray(ROWS) % 3 > 0,
-        o.confidence,
-        T,
-        CAMERA,
-        config.extrapolation,
+    lambda o, m, rows, T, config: surface_extrapolation.extrapolate(
+        o, take_rows(m, rows % 32), rows % 3 > 0, o.confidence, T, CAMERA, config.extrapolation
     )
 )
 
@@ -117,7 +113,7 @@ def looks(s):
 
 
 def extrapolation(s):
-    return continued(lengths(seen(2), s), lengths(map_of(0), s), pose(VIEW, s), config(s))
+    return continued(lengths(seen(2), s), lengths(map_of(0), s), ROWS, pose(VIEW, s), config(s))
 
 
 def rendering(s):
