@@ -25,6 +25,7 @@ from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, static, take_rows, traced, where_rows
 
 MIN_ROWS = 4  # fewer have no covariance
+REFERENCE = 518 * 392  # pixels of the images in which λ counts
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 
@@ -84,7 +85,7 @@ class FitConfig(eqx.Module):
 
 def spacing(camera: Camera, thin: int, config: FitConfig) -> int:
     """Rows of a thinned observation that make one Gaussian, which are λ pixels of an image of 518 × 392."""
-    share = camera.width * camera.height / (518 * 392)
+    share = camera.width * camera.height / REFERENCE
     return max(round(config.points_per_gaussian * share / thin**2), MIN_ROWS)
 
 
