@@ -69,6 +69,7 @@ class FrameRecord:
         similarity: where it is `joined`, the motion of its submap into the other: (4, 4) with e^σ R in the place of R.
         origin: frame whose Gaussians it was registered to (median of their births), counted from the map's first one.
         repeat_rms: robust standard deviation between the two predictions of the previous image, m.
+        left_out: pixels with a prediction that is not finite, behind the camera or farther than a map can hold.
         fused: points that moved Gaussians.
         updated: Gaussians that they moved.
         mean_log_joint: of the fused points with their best Gaussians.
@@ -101,6 +102,7 @@ class FrameRecord:
     similarity: np.ndarray | None = None
     origin: int | None = None
     repeat_rms: float | None = None
+    left_out: int = 0
     fused: int | None = None
     updated: int | None = None
     mean_log_joint: float | None = None

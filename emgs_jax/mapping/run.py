@@ -3,8 +3,11 @@
 A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; files write it as TUM's seven numbers.
 """
 
+import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import jax
@@ -17,6 +20,7 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.device.arrays import to_matrix
 from emgs_jax.device.clock import Clock
 from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.gaussians import MIN_ROWS, REFERENCE
 from emgs_jax.geometry import seen_from
 from emgs_jax.localization import REASONS
 from emgs_jax.loop_closure.prior_query import PriorQuery
@@ -110,12 +114,37 @@ def new_run(
     """
     back_end = None if graph is None else BackEnd(graph, tuple(dataset.intrinsics), float(config.fit.min_std))
     clock, camera = Clock() if clock is None else clock, to_camera(dataset)
+    for words in clamped(config, camera):
+        warn_once(words)
     if saved is None:
         return MappingRun(camera, config, clock, back_end=back_end)
     if config.initialization == "merged":
         raise ValueError("map= places one view after the other: use slam.initialization=incremental with it")
     config = replace(config, submap=replace(config.submap, map_capacity=saved.map.weight.shape[0]))
     return MappingRun(camera, config, clock, back_end=saved.back_end, saved=saved)
+
+
+def clamped(config: SlamConfig, camera: Camera) -> list[str]:
+    """Say which settings have no effect on images of this size, and what is done instead."""
+    found, least = [], MIN_ROWS * config.observation.thin**2 * REFERENCE / (camera.width * camera.height)
+    if config.fit.points_per_gaussian < math.floor(least):
+        found.append(
+            f"slam.fit.points_per_gaussian={config.fit.points_per_gaussian} makes the Gaussians of "
+            f"{math.floor(least)}: fewer than {MIN_ROWS} points of an image of {camera.width}×{camera.height} with "
+            f"slam.observation.thin={config.observation.thin} have no covariance"
+        )
+    if config.em.num_neighbours > config.em.num_candidates:
+        found.append(
+            f"slam.em.num_neighbours={config.em.num_neighbours} finds no more than "
+            f"slam.em.num_candidates={config.em.num_candidates}"
+        )
+    return found
+
+
+@cache
+def warn_once(words: str) -> None:
+    """Print a warning that no later run of this process repeats."""
+    print(f"warning: {words}", file=sys.stderr)
 
 
 @dataclass(frozen=True)
@@ -212,6 +241,7 @@ def _add(run: MappingRun, window: WindowInput, row: int, **described: Any) -> Ma
         timestamp=frame.timestamp,
         raw_pose=window.raw[row].T_world_camera,
         true_pose=frame.T_world_camera,
+        left_out=window.raw[row].num_left_out,
         **described,
     )
     return replace(run, records=(*run.records, record))

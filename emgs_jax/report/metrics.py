@@ -214,7 +214,7 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     """Size of the map, how many frames came to what, time and memory."""
     statuses = Counter(record.status for record in run.records)
     metrics: Metrics = {"map/num_gaussians": int(np.asarray(confirmed(run.state.map).valid).sum())}
-    metrics["map/double_wall_percent"] = double_walls(confirmed(run.state.map), metres(run))
+    metrics["map/double_wall_percent"] = double_walls(confirmed(run.state.map), metre(run))
     metrics["map/num_tentative"] = int(np.asarray(run.state.map.gaussians.valid).sum()) - metrics["map/num_gaussians"]
     metrics["map/capacity"] = run.config.submap.map_capacity
     metrics |= {f"frames/{status}": statuses[status] for status in STATUSES}
@@ -228,17 +228,17 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     return metrics
 
 
-def metres(run: MappingRun) -> float:
-    """A length of the map in metres, as the true path says; without one the map's unit is taken for a metre."""
+def metre(run: MappingRun) -> float | None:
+    """A metre in the map's unit, as the true path says; None without one."""
     poses = with_truth(run, run.poses)
-    return 1.0 if poses is None else align_poses(*poses, with_scale=True)[0].scale
+    return None if poses is None else 1.0 / align_poses(*poses, with_scale=True)[0].scale
 
 
-def double_walls(gaussians: Gaussians, scale: float) -> float | None:
-    """Per cent of valid Gaussians that another stands behind, see `double_wall_share`; `scale`: see `metres`."""
+def double_walls(gaussians: Gaussians, metre: float | None) -> float | None:
+    """Per cent of valid Gaussians that another stands behind, see `double_wall_share`."""
     rows = jax.device_get(gaussians)
     means, normals, covs = (values[rows.valid] for values in (rows.means, rows.normals, rows.covs))
-    share = double_wall_share(scale * means, normals, scale**2 * covs)
+    share = double_wall_share(means, normals, covs, metre)
     return None if share is None else 100.0 * share
 
 

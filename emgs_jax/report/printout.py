@@ -6,6 +6,7 @@ from typing import Any
 
 from emgs_jax.device.clock import Clock
 from emgs_jax.mapping.records import MANY_IN_A_ROW, REMEDIES, UNTRACKED, FrameRecord, called, longest_row, main_reason
+from emgs_jax.ops.ranges import MAX_LENGTH_M
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, aligned, metric_table
 from emgs_jax.report.provenance import has_metric_truth, lines_of
 
@@ -27,6 +28,12 @@ def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
         end = "to the end" if is_to_the_end else f"to {called(records[row[-1]])}"
         where = f" ({len(row)} in a row, from {called(records[row[0]])} {end})" if len(row) > 1 else ""
         lines.append(f"{len(bad)} frames were not tracked{where}, {count} of them because {reason}: {REMEDIES[reason]}")
+    if left_out := [record for record in records if record.left_out]:
+        count = sum(record.left_out for record in left_out)
+        lines.append(
+            f"{count} points of {len(left_out)} frames, from {called(left_out[0])} on, were left out: the prior's "
+            f"depth there is not finite, not positive, or farther than a map can hold ({MAX_LENGTH_M:g} m)"
+        )
     return lines
 
 

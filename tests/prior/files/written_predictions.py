@@ -13,8 +13,12 @@ from emgs_jax.prior.base import PriorPrediction, windows
 from emgs_jax.prior.files.prior import Files
 
 KEYS = {
-    "scale": "auto", "median_depth": 2.0, "depth_scale": 1000.0, "max_depth_step": 0.03,
-    "pose_std": None, "max_misfit": 0.1,
+    "scale": "auto",
+    "median_depth": 2.0,
+    "depth_scale": 1000.0,
+    "max_depth_step": 0.03,
+    "pose_std": None,
+    "max_misfit": 0.1,
 }
 
 
