@@ -284,6 +284,11 @@ def adjust(model: Any, shots: Shots, config: StructureConfig) -> None:
         problem.add_image(image)
     problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_ceres_bundle_adjuster(options, problem, model).solve()
+    # What the loss let go may lie anywhere now.
+    filters = options_of("IncrementalPipelineOptions", config.options.get("incremental", {})).mapper
+    observations = pycolmap.ObservationManager(model)
+    observations.filter_all_points3D(filters.filter_max_reproj_error, filters.filter_min_tri_angle)
+    drop_points_at_cameras(model)
     model.update_point_3d_errors()
 
 
