@@ -25,7 +25,7 @@ from emgs_jax.geometry import seen_from
 from emgs_jax.localization import REASONS
 from emgs_jax.loop_closure.prior_query import PriorQuery
 from emgs_jax.mapping.convert import to_camera
-from emgs_jax.mapping.records import NEW_SUBMAP, NOT_FOUND, RESTARTED, FrameRecord
+from emgs_jax.mapping.records import APART, NEW_SUBMAP, NOT_FOUND, RESTARTED, FrameRecord
 from emgs_jax.mapping.window_input import PlacedStructure, WindowInput
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
@@ -55,6 +55,7 @@ class MappingRun:
         prior_motion: of the prior's world since relocalization; None: the identity.
         structure: pose of the prior's own world, if it is not related to the first frame any more.
         inactive: states of the other disconnected submaps, by their number.
+        apart: states of submaps that were never joined, when the run has ended.
         worlds: other worlds of the prior that the run has been in, by their number.
         prior_query: predicts both visits of a loop, see `prior_queries`.
         first_covariance: (6, 6) of the first frame, as frames were placed, when the run has ended (`first_frame.py`).
@@ -70,6 +71,7 @@ class MappingRun:
     prior_motion: jaxlie.SE3 | None = None
     structure: PlacedStructure | None = None
     inactive: Mapping[int, SlamState] = field(default_factory=dict)
+    apart: Mapping[int, SlamState] = field(default_factory=dict)
     worlds: Mapping[int, LeftWorld] = field(default_factory=dict)
     prior_query: PriorQuery = lambda a, b: None
     first_covariance: np.ndarray | None = None
@@ -282,8 +284,12 @@ def row_of_first_node(run: MappingRun) -> int:
 
 
 def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return poses and true poses (n, 4, 4) of the frames whose truth is known; None without any."""
-    pairs = [(pose, true) for pose, true in zip(poses, run.true_poses, strict=True) if true is not None]
+    """Return poses and true poses (n, 4, 4) of the frames whose truth is known; None without any.
+
+    Frames of submaps that were never joined are left out: their poses are in a world of their own.
+    """
+    rows = zip(poses, run.true_poses, run.records, strict=True)
+    pairs = [(pose, true) for pose, true, record in rows if true is not None and record.status != APART]
     if not pairs:
         return None
     estimate, truth = zip(*pairs, strict=True)

@@ -36,7 +36,7 @@ from emgs_jax.evaluation.trajectory import align_poses, trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.geometry import scale_pose
-from emgs_jax.mapping.records import UNJOINED, FrameRecord, longest_row
+from emgs_jax.mapping.records import APART, UNJOINED, UNPLACED, FrameRecord, longest_row
 from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
@@ -47,7 +47,7 @@ from emgs_jax.report.labelling import labelled_map
 from emgs_jax.report.provenance import RAW_PRIOR, prefixed
 
 Metrics = dict[str, Any]
-STATUSES = ("tracked", "degraded", "lost", "initialization")
+STATUSES = ("tracked", "degraded", "lost", APART, "initialization")
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer
 
     Rendered is each frame whose pose is known: at our poses those that are not lost, at the prior's those with points.
     """
-    is_known = [record.status != "lost" for record in run.records]
+    is_known = [record.status not in UNPLACED for record in run.records]
     metrics: Metrics = {}
     for fusions, poses, rows, kind in (
         (baselines.raw, run.raw_poses, [raw.points[row].any() for row in range(len(raw.points))], "raw"),
@@ -219,6 +219,8 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     metrics["map/capacity"] = run.config.submap.map_capacity
     metrics |= {f"frames/{status}": statuses[status] for status in STATUSES}
     metrics["frames/skipped"] = len(dataset.skipped)
+    for number in run.apart:
+        metrics |= _submap_metrics(run, number)
     metrics["segments/unjoined_frames"] = sum(record.reason == UNJOINED for record in run.records)
     row = longest_row(run.records)
     metrics["frames/longest_untracked"] = len(row)
@@ -226,6 +228,17 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     metrics["frames/overflow"] = sum(record.overflow or 0 for record in run.records)
     metrics["time/seconds_per_frame"] = seconds_per_frame(run.records)
     return metrics
+
+
+def _submap_metrics(run: MappingRun, number: int) -> Metrics:
+    """`submaps/N/…` of a submap that was never joined: its frames, and the error of its path in its own unit."""
+    records = [record for record in run.records if record.submap == number and record.status == APART]
+    known = [(record.pose, record.true_pose) for record in records if record.true_pose is not None]
+    found: Metrics = {f"submaps/{number}/frames": len(records)}
+    if len(known) >= 3:
+        ate = trajectory_metrics(*map(np.stack, zip(*known, strict=True)))["trajectory/ate_sim3_m"]
+        found[f"submaps/{number}/ate_sim3_m"] = ate
+    return found
 
 
 def metre(run: MappingRun) -> float | None:
