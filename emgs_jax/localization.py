@@ -246,7 +246,9 @@ def localize_coarse(
     scale, ratio_std = repeat_scale(now, previous, T_world_previous, jnp.exp(estimate.log_scale), config.coarse_scale)
     repeat_rms, mean_depth = repeat_error(now, previous, T_world_previous, scale, config.max_pair_distance)
     depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, estimate.depth_noise), LEAST_NOISE)
-    is_given, own_unit = is_given_pose(prediction), jnp.exp(estimate.log_scale)
+    # As printed, nothing is known before.
+    is_given = is_given_pose(prediction) & (config.icp.prior_information > 0)
+    own_unit = jnp.exp(estimate.log_scale)
     unit = jnp.where(is_given, own_unit, scale)
     motion, anchored, forms, is_linked = _readings(
         prediction, previous, T_world_previous, (scale, unit), camera, config

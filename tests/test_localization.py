@@ -192,7 +192,7 @@ def test_poses_that_are_given_are_weighed_as_the_prior_says_and_not_by_what_diff
     """Motion and own pose differ by 5 mm: the variances are the given ones, whatever was predicted twice before."""
     shifted_by, motion, own = 0.005, 0.02, 0.01
     elsewhere = given(shifted(sc.predict_room(FRAME, wide), sc.pose(translation=(shifted_by, 0, 0))), motion, own)
-    config = sc.changed(printed, coarse=COARSE["fused"], pose_shared=0.75)
+    config = sc.changed(printed, coarse=COARSE["fused"], pose_shared=0.75, **{"icp.prior_information": 30.0})
     estimate = eqx.tree_at(lambda b: b.repeats, CERTAIN, repeats_of(1e-3, 0.3))
     result = coarse_of(elsewhere, wide, config, estimate=estimate)
     weighted = own**2 * (1 + shifted_by**2 / (motion**2 + own**2) / 6)  # Cauchy
@@ -207,7 +207,8 @@ def test_the_scale_of_the_depths_moves_no_pose_that_is_given(wide, printed):
     """Depths 10 % too small, poses right: the scale is that of the depths, the pose that of the prior."""
     right, small = sc.predict_room(FRAME, wide), sc.predict_room(FRAME, wide, scale=0.9)
     mixed = eqx.tree_at(lambda p: p.T_world_views, small, right.T_world_views)
-    config = sc.changed(printed, coarse=COARSE["fused"], coarse_scale=SCALES["ratio"])
+    known = {"coarse": COARSE["fused"], "coarse_scale": SCALES["ratio"], "icp.prior_information": 30.0}
+    config = sc.changed(printed, **known)
     result = coarse_of(given(mixed, 1e-3, 1e-3), wide, config)
     np.testing.assert_allclose(result.scale, 1 / 0.9, rtol=1e-3)
     for T, expected in ((result.T_world_camera, FRAME), (result.T_world_newest, FRAME + 1)):
@@ -490,6 +491,14 @@ def test_a_pose_that_is_given_stays_where_the_points_do_not_fit(camera, submap, 
         moved.append(sc.pose_error(T, sc.path_pose(FRAME))[0])
         assert info.is_tracked
     assert moved[0] < 2e-3 < 5e-3 < moved[1]
+
+
+def test_the_printed_form_knows_nothing_before_whatever_the_prior_says(camera, submap, config):
+    settings, prediction = config("slam/localization=paper").localization, nudged(camera)
+    unknown, known = (fine_of(p, submap, camera, settings) for p in (prediction, given(prediction, 1e-3, 1e-3)))
+    sc.assert_same(known[0].T_world_camera, unknown[0].T_world_camera)
+    sc.assert_same(known[1:3], unknown[1:3])
+    sc.assert_same(known[3].icp, unknown[3].icp)
 
 
 def longer(T, unit: float):
