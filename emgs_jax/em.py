@@ -9,14 +9,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
 from emgs_jax.gaussians import GaussianIndex, Gaussians, gathered_features, has_feature, index_of
-from emgs_jax.observation import Observation
+from emgs_jax.observation import Observation, sound
 from emgs_jax.ops.linalg import (
     Entries,
     Whitening,
     across,
     between,
+    cross,
     dot,
     down,
+    floored,
     outer,
     principal_axes_2x2,
     safe_normalize,
@@ -29,6 +31,7 @@ from emgs_jax.ops.pytree import choice, join_rows, split_rows, static, take_rows
 
 BLOCK = 16  # points that share a list of Gaussians
 MAX_BLOCKS = 8192  # whose explanations are held at once
+LEAST_SHARE = 1e-18  # of a point; a smaller sum of them counts as none, since the slopes of a ratio would overflow
 
 
 class EmConfig(eqx.Module):
@@ -101,14 +104,16 @@ class EmInfo(eqx.Module):
 
 
 def widened_distance_sq(triangle: Entries, offsets: Entries, noise: Entries) -> tuple[Array, Array]:
-    """Squared Mahalanobis distance under Σ_k + ν ν' and log|Σ_k + ν ν'| - log|Σ_k| (Sherman–Morrison).
+    """Squared Mahalanobis distance under Σ_k + ν ν' and log|Σ_k + ν ν'| - log|Σ_k|.
 
-    ν is a point's noise: a standard deviation along its viewing ray. `triangle` is that of `whitening`.
+    ν is a point's noise: a standard deviation along its viewing ray. `triangle` is that of `whitening`. With the
+    whitened offset w and noise u that is (|w|² + |w × u|²) / (1 + |u|²), in which nothing cancels as it does in
+    |w|² - (w·u)² / (1 + |u|²) (Sherman–Morrison) where a distant point lies behind its Gaussian along the ray.
     """
     white, noise = whiten(triangle, offsets), whiten(triangle, noise)
     growth = 1.0 + dot(noise, noise)
-    distance_sq = dot(white, white) - dot(white, noise) ** 2 / growth
-    return jnp.maximum(distance_sq, 0.0), jnp.log(growth)
+    turned = cross(white, tuple(entry / jnp.sqrt(growth) for entry in noise))
+    return dot(white, white) / growth + dot(turned, turned), jnp.log(growth)
 
 
 @full_precision
@@ -128,6 +133,9 @@ def e_step(
         index: of the Gaussians; None makes it here.
     """
     index = index_of(gaussians) if index is None else index
+    has_noise = jnp.all(jnp.isfinite(noise), axis=-1)
+    points = sound(eqx.tree_at(lambda o: o.valid, points, points.valid & has_noise))
+    noise = jnp.where(points.valid[:, None], noise, 0.0)
     near = nearby(points.points, points.valid, index.groups, config.num_candidates, BLOCK)
     meaning = eqx.tree_at(lambda g: g.features, gaussians, safe_normalize(gaussians.features))
     table = meaning, index.white
@@ -193,7 +201,8 @@ def support(gaussians: Gaussians, points: Observation, step: EStep, config: EmCo
     sums = jnp.zeros((gaussians.valid.shape[0], 4)).at[step.near.rows].add(jnp.stack(sides, axis=-1))
     first, second = sums[:, 0::2], sums[:, 1::2]
     smaller, total = 2.0 * jnp.minimum(first, second), first + second
-    normalized = smaller / jnp.where(total > 0, total, 1.0)
+    has_share = total > LEAST_SHARE
+    normalized = jnp.where(has_share, smaller, 0.0) / jnp.where(has_share, total, 1.0)
     both = jnp.where(config.support > 0, normalized, jnp.minimum(smaller, 1.0))
     return jnp.min(both, axis=-1)
 
@@ -218,8 +227,8 @@ def m_step(
     sums = _statistics(gaussians.means[step.near.rows], *blocks, step.responsibilities)
     sums = jnp.zeros((gaussians.valid.shape[0], 17)).at[step.near.rows].add(sums)
     total = sums[:, 0]
-    has_points = (total > config.min_responsibility) & (sums[:, 1] > 0)  # a vanishing share times a precision is 0
-    mean = sums[:, 2:] / jnp.where(has_points, sums[:, 1], 1.0)[:, None]
+    has_points = (total > config.min_responsibility) & (sums[:, 1] > LEAST_SHARE)
+    mean = jnp.where(has_points[:, None], sums[:, 2:], 0.0) / jnp.where(has_points, sums[:, 1], 1.0)[:, None]
     rows, columns = jnp.triu_indices(3)
     second = jnp.zeros((total.shape[0], 3, 3)).at[:, rows, columns].set(mean[:, 3:9])
     second = second.at[:, columns, rows].set(mean[:, 3:9])
@@ -228,7 +237,7 @@ def m_step(
         gaussians,
         (
             gaussians.means + mean[:, :3],
-            second - outer(mean[:, :3]) + config.min_std**2 * jnp.eye(3),
+            floored(second - outer(mean[:, :3]), config.min_std),
             safe_normalize(mean[:, 9:12]),
             mean[:, 12:],
         ),
@@ -277,7 +286,8 @@ def em_update(
     Returns:
         The updated submap, what explains which point, and counts. Without any fused point the submap is unchanged.
     """
-    gaussians = submap.gaussians
+    gaussians, aligned = submap.gaussians, sound(aligned)
+    noise = jnp.where(jnp.isfinite(noise), noise, 0.0)
     step, best = e_step(gaussians, aligned, noise, config, index)
     new, total = m_step(gaussians, aligned, precision(noise, config), step, config)
     evidence = jnp.where(total > 0, support(gaussians, aligned, step, config), 0.0)

@@ -13,7 +13,7 @@ from emgs_jax.gaussian_map import GaussianMap, without
 from emgs_jax.gaussians import blend, has_feature
 from emgs_jax.observation import Observation, depth_in
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
-from emgs_jax.ops.linalg import inverse_3x3, mahalanobis_sq, outer
+from emgs_jax.ops.linalg import dot, outer, whiten, whitening
 from emgs_jax.ops.neighbours import group_points, nearest, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, put_rows, static, take_rows, traced, where_rows
@@ -237,7 +237,9 @@ def nearest_duplicates(
     noise = depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - origins))[:, None]
 
     def distance_under(variance: Float[Array, "n #k"]) -> Float[Array, "n k"]:
-        return mahalanobis_sq(offsets, inverse_3x3(both + variance[..., None, None] * outer(normals)))
+        triangles, _ = whitening(both + variance[..., None, None] * outer(normals))
+        white = whiten(*(jnp.unstack(rows, axis=-1) for rows in (triangles, offsets)))
+        return dot(white, white)
 
     frames = jnp.maximum(map.weight, 1.0)
     distance_sq = distance_under(noise**2)

@@ -5,13 +5,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.observation import Observation
+from emgs_jax.observation import Observation, sound
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import kmeans, strided_seeds
 from emgs_jax.ops.executable import executable
 from emgs_jax.ops.linalg import (
     Whitening,
     dot,
+    floored,
     inverse_2x2,
     outer,
     safe_normalize,
@@ -24,6 +25,7 @@ from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, static, take_rows, traced, where_rows
 
 MIN_ROWS = 4  # fewer have no covariance
+REFERENCE = 518 * 392  # pixels of the images in which λ counts
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 
@@ -83,7 +85,7 @@ class FitConfig(eqx.Module):
 
 def spacing(camera: Camera, thin: int, config: FitConfig) -> int:
     """Rows of a thinned observation that make one Gaussian, which are λ pixels of an image of 518 × 392."""
-    share = camera.width * camera.height / (518 * 392)
+    share = camera.width * camera.height / REFERENCE
     return max(round(config.points_per_gaussian * share / thin**2), MIN_ROWS)
 
 
@@ -96,6 +98,7 @@ def fit_to_points(
     The covariance has min_std² added on the diagonal, which keeps every eigenvalue at or above the floor. A centre
     with fewer than four points becomes invalid.
     """
+    observation = sound(observation)
     points, num = observation.points, config.num_fit_neighbours
     groups = group_points(points, observation.valid)
     # A centre stands for several points: few centres share a list, and that is long.
@@ -106,7 +109,7 @@ def fit_to_points(
     count = jnp.maximum(jnp.sum(found, axis=-1), 1)[:, None]
     offsets = jnp.where(found[..., None], near.points - centers[:, None], 0.0)
     centered = jnp.where(found[..., None], offsets - (jnp.sum(offsets, axis=1) / count)[:, None], 0.0)
-    covs = jnp.sum(outer(centered), axis=1) / count[..., None] + config.min_std**2 * jnp.eye(3)
+    covs = floored(jnp.sum(outer(centered), axis=1) / count[..., None], config.min_std)
     triangle = jnp.unstack(whitening(covs)[0][:, None], axis=-1)
     white = whiten(triangle, jnp.unstack(offsets, axis=-1))
     weights = jax.nn.softmax(-0.5 * dot(white, white), axis=-1, where=found)
@@ -139,6 +142,7 @@ def cluster(
     Returns:
         ceil(p / spacing) Gaussians, and the number of points of each in units of `spacing`; 0 where invalid.
     """
+    observation = sound(observation)
     num_points, num_neighbours = order.shape[0], config.num_fit_neighbours
     num_seeds = -(-num_points // spacing)
     seeds, seed_exists = strided_seeds(observation.valid, order, spacing, num_seeds)
@@ -209,7 +213,8 @@ def color_gradients(gaussians: Gaussians, num_neighbours: int, groups: Groups | 
     light = intensity(gaussians.colors)
     moments = jnp.einsum("nka,nkb->nab", offsets, offsets)
     cross = jnp.einsum("nka,nk->na", offsets, light[rows] - light[:, None])
-    # A hundredth of the spread keeps the fit of collinear neighbours finite.
-    ridge = 0.01 * jnp.trace(moments, axis1=-2, axis2=-1) + 1e-8
+    # A hundredth of the spread keeps the fit of collinear neighbours finite, and of coincident ones the own widths do.
+    own = jnp.trace(gaussians.covs, axis1=-2, axis2=-1)
+    ridge = 0.01 * jnp.trace(moments, axis1=-2, axis2=-1) + 1e-5 * own
     slopes = (inverse_2x2(moments + ridge[:, None, None] * jnp.eye(2)) @ cross[..., None])[..., 0]
     return jnp.einsum("nda,na->nd", basis, slopes)

@@ -1,12 +1,13 @@
 """Initialisation (Method B): the map from the merged predictions of the first window."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float, Int
 
 from emgs_jax.gaussians import FitConfig, Gaussians, cluster, spacing
-from emgs_jax.observation import Observation, transform
+from emgs_jax.observation import Observation, sound, sound_poses, transform
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.executable import executable
@@ -17,7 +18,15 @@ from emgs_jax.ops.precision import full_precision
 def merge(
     views: Observation, T_world_views: jaxlie.SE3, camera: Camera
 ) -> tuple[Observation, Observation, Int[Array, "q"]]:
-    """The views in the world frame, the same as one cloud of q points, and an order that is even over every image."""
+    """The views in the world frame, the same as one cloud of q points, and an order that is even over every image.
+
+    A view without a pose has no point.
+    """
+    T_world_views, views = sound_poses(T_world_views), jax.vmap(sound)(views)
+    is_known = jnp.all(jnp.isfinite(T_world_views.wxyz_xyz), axis=-1)
+    identity = jaxlie.SE3.identity().wxyz_xyz
+    T_world_views = jaxlie.SE3(jnp.where(is_known[:, None], T_world_views.wxyz_xyz, identity))
+    views = eqx.tree_at(lambda o: o.valid, views, views.valid & is_known[:, None])
     world = jax.vmap(lambda T, view: transform(T, view, jnp.ones(())))(T_world_views, views)
     num_views, num_points = views.valid.shape
     order = morton_order(camera.height, camera.width)

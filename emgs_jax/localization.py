@@ -73,7 +73,8 @@ class LocalizationConfig(eqx.Module):
         max_residual: root mean square distance to the map's planes, as a fraction of the depth.
         max_step: between the coarse and the fine pose, as a fraction of the mean depth.
         max_step_rad: likewise, rad.
-        max_pose_std: of the pose in its least certain direction, see `IcpInfo.pose_std`.
+        max_pose_std: standard deviation of the pose in its least certain direction, by what is known before and by the
+            points: of the translation as a fraction of the depth, of the rotation in rad.
     """
 
     coarse: Float[Array, "*b"] = choice(*COARSE)
@@ -143,15 +144,20 @@ class LocalizationInfo(eqx.Module):
 
 
 def _ratio_noise(
-    depth_noise: Float[Array, ""], ratio_std: Float[Array, ""], config: LocalizationConfig
+    depth_noise: Float[Array, ""], ratio_std: Float[Array, ""], is_firm: Bool[Array, ""], config: LocalizationConfig
 ) -> Float[Array, ""]:
-    """Variance of the logarithm of the ratio of two frames' scales."""
-    ratio = jnp.where(config.coarse_scale > 0, ratio_std, depth_noise * config.icp.scale_noise)
+    """Variance of the logarithm of the ratio of two frames' scales.
+
+    Depths that are repeated exactly hold the scale, for a drift of it and of the pose look alike. A pose that is firm
+    does not give way, and tells them apart.
+    """
+    guess = depth_noise * config.icp.scale_noise
+    ratio = jnp.where(config.coarse_scale > 0, jnp.maximum(ratio_std, jnp.where(is_firm, guess, 0.0)), guess)
     return jnp.maximum(jnp.where(config.icp.scale_noise > 0, ratio, 0.0), NO_INFORMATION) ** 2
 
 
 def _no_motion(mean_depth: Float[Array, ""], config: LocalizationConfig) -> Float[Array, "7"]:
-    """Standard deviations where nothing is known of the motion: as far as a fine step may go, at most a depth, a radian and e."""
+    """Standard deviations where no motion is known: as far as a fine step may go, at most a depth, a radian and e."""
     step = jnp.stack([config.max_step, config.max_step_rad, config.scale_std])
     return jnp.minimum(step, 1.0)[jnp.array([0, 0, 0, 1, 1, 1, 2])] * jnp.ones(7).at[:3].set(mean_depth)
 
@@ -240,7 +246,9 @@ def localize_coarse(
     scale, ratio_std = repeat_scale(now, previous, T_world_previous, jnp.exp(estimate.log_scale), config.coarse_scale)
     repeat_rms, mean_depth = repeat_error(now, previous, T_world_previous, scale, config.max_pair_distance)
     depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, estimate.depth_noise), LEAST_NOISE)
-    is_given, own_unit = is_given_pose(prediction), jnp.exp(estimate.log_scale)
+    # As printed, nothing is known before.
+    is_given = is_given_pose(prediction) & (config.icp.prior_information > 0)
+    own_unit = jnp.exp(estimate.log_scale)
     unit = jnp.where(is_given, own_unit, scale)
     motion, anchored, forms, is_linked = _readings(
         prediction, previous, T_world_previous, (scale, unit), camera, config
@@ -248,7 +256,10 @@ def localize_coarse(
     repeats, latest = repeat_poses(prediction, estimate.repeats, scale, mean_depth, config.num_shared)
     guess = axis_std(repeats, latest, depth_noise, mean_depth, config.icp.prior_information, config.pose_shared)
     of_motion, of_pose = pose_covariances(prediction.pose_covariance, guess, mean_depth, unit)
-    noise = jnp.zeros((7, 7)).at[:6, :6].set(of_motion).at[6, 6].set(_ratio_noise(depth_noise, ratio_std, config))
+    # Surer than it would be taken to be if nothing was given.
+    is_firm = is_given & jnp.all(jnp.diagonal(of_pose) <= guess[1] ** 2)
+    of_ratio = _ratio_noise(depth_noise, ratio_std, is_firm, config)
+    noise = jnp.zeros((7, 7)).at[:6, :6].set(of_motion).at[6, 6].set(of_ratio)
     noise = jnp.where(is_linked, noise, jnp.diag(_no_motion(mean_depth, config) ** 2))
     estimate = propagate(estimate, motion, noise)
     # A pose that is given with its uncertainty needs no other evidence of it.
@@ -286,8 +297,8 @@ def localize_fine(
         T_world_camera, the observation in the world frame, and the outcome.
     """
     scaled = transform(jaxlie.SE3.identity(), current, coarse.scale)
-    known = root_information(coarse.estimate.covariance), coarse.estimate.is_given
-    start = CoarseStart(coarse.T_world_camera, *known, coarse.depth_noise)
+    known = root_information(coarse.estimate.covariance)
+    start = CoarseStart(coarse.T_world_camera, known, coarse.depth_noise, coarse.estimate.is_given)
     fine, scale, info = icp(scaled, submap, start, config.icp, index)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     # The length has no gradient where a step is zero, which it is to the bit with an exact prior; this has.
@@ -298,7 +309,7 @@ def localize_fine(
             ~(info.inlier_fraction >= config.min_inlier_fraction),
             ~(info.residual <= config.max_residual),
             ~((step_m <= config.max_step * coarse.mean_depth) & (step_rad <= config.max_step_rad)),
-            ~(info.pose_std <= config.max_pose_std),
+            ~(info.min_eigenvalue >= config.max_pose_std**-2),
         ]
     )
     is_tracked = ~jnp.any(failed)

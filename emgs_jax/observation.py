@@ -9,8 +9,9 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.ops.linalg import safe_normalize
+from emgs_jax.ops.neighbours import is_within_reach
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import static, traced
+from emgs_jax.ops.pytree import static, traced, where_rows
 
 
 class Observation(eqx.Module):
@@ -141,12 +142,29 @@ def sample_features(grid: Float[Array, "y x f"], size: tuple[int, int], thin: in
     return safe_normalize(grid)
 
 
+def sound(observation: Observation) -> Observation:
+    """The observation with every row invalid, and 0, in which a number is not finite or a point beyond any map."""
+    o = observation
+    is_sound = is_within_reach(o.points) & jnp.isfinite(o.confidence)
+    is_sound &= jnp.all(jnp.isfinite(jnp.concatenate([o.colors, o.normals, o.features], axis=-1)), axis=-1)
+    o = where_rows(is_sound, o, jax.tree.map(jnp.zeros_like, o))
+    return eqx.tree_at(lambda o: o.confidence, o, jnp.where(is_sound, o.confidence, 1.0))
+
+
+def sound_poses(poses: jaxlie.SE3) -> jaxlie.SE3:
+    """The poses, NaN where one is beyond any map or its quaternion is no rotation's."""
+    quaternion, translation = poses.wxyz_xyz[..., :4], poses.wxyz_xyz[..., 4:]
+    length_sq = jnp.sum(quaternion**2, axis=-1)
+    is_sound = (jnp.abs(length_sq - 1.0) < 0.1) & is_within_reach(translation)
+    return jaxlie.SE3(jnp.where(is_sound[..., None], poses.wxyz_xyz, jnp.nan))
+
+
 @full_precision
 def known_surface(
     points: Float[Array, "h w 3"], mask: Bool[Array, "h w"], config: ObservationConfig
 ) -> Bool[Array, "h w"]:
     """Return the mask of the points that `observe` takes: inside `mask`, before the camera and with a normal."""
-    valid = mask & (points[..., 2] > 0)
+    valid = mask & is_within_reach(points) & (points[..., 2] > 0)
     return valid & _is_surface(normals_from_pointmap(jnp.where(valid[..., None], points, 0.0), valid, config))
 
 
@@ -167,10 +185,12 @@ def observe(
 ) -> Observation:
     """Normals from the full point map, then every `thin`-th row and column as rows of an `Observation`.
 
-    `features` is a grid of any resolution that covers the image, see `sample_features`.
+    Left out is what is not finite, behind the camera or beyond any map. `features` is a grid of any resolution that
+    covers the image, see `sample_features`; one that is not finite is missing.
     """
-    is_finite = jnp.all(jnp.isfinite(points), axis=-1) & (points[..., 2] > 0)
-    valid = mask & is_finite & (confidence >= config.min_confidence)
+    is_sound = is_within_reach(points) & (points[..., 2] > 0) & jnp.all(jnp.isfinite(colors), axis=-1)
+    valid = mask & is_sound & jnp.isfinite(confidence) & (confidence >= config.min_confidence)
+    features = jnp.where(jnp.all(jnp.isfinite(features), axis=-1, keepdims=True), features, 0.0)
     points = jnp.where(valid[..., None], points, 0.0)
     normals = normals_from_pointmap(points, valid, config)
     valid &= _is_surface(normals)

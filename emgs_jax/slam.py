@@ -24,7 +24,7 @@ from emgs_jax.gaussian_map import (
 from emgs_jax.gaussians import FitConfig, GaussianIndex, Gaussians, cluster, index_of, spacing
 from emgs_jax.initialization import initialize
 from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
-from emgs_jax.observation import Observation, ObservationConfig, Prediction, transform
+from emgs_jax.observation import Observation, ObservationConfig, Prediction, sound, sound_poses, transform
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.executable import executable
@@ -101,7 +101,12 @@ class Overflow(eqx.Module):
 
 
 class StepInfo(eqx.Module):
-    """Diagnostics of one step; `origin`: median birth of the Gaussians that explain its points, its own if none do."""
+    """Diagnostics of one step.
+
+    Args:
+        origin: median birth of the Gaussians that explain its points, its own if none do.
+        num_left_out: points of the current frame that no map can hold, or with a number that is not finite.
+    """
 
     T_world_camera: jaxlie.SE3
     T_world_newest: jaxlie.SE3
@@ -110,6 +115,7 @@ class StepInfo(eqx.Module):
     refinement: RefinementInfo
     origin: Int[Array, ""]
     num_gaussians: Int[Array, ""]
+    num_left_out: Int[Array, ""]
     overflow: Overflow
 
 
@@ -218,11 +224,11 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
     view = downscale(camera, config.observation.thin)  # its pixels are an observation's rows
     num_rows = spacing(camera, config.observation.thin, config.fit)
 
-    coarse, guess = _localize_coarse(
+    coarse, current, guess, num_left_out = _localize_coarse(
         prediction, state.previous, state.T_world_previous, state.estimate, view, config.localization
     )
     submap = _select(state.map, state.previous, guess, config.submap)
-    frame = _localize_fine(prediction.current, submap, coarse, state.time, config.localization)
+    frame = _localize_fine(current, submap, coarse, state.time, config.localization)
     fused = _fuse(submap, frame, view, num_rows, config.fusion)
     candidates, weight = cluster(fused.unexplained, _order(view), num_rows, config.fit)
     refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config.refinement)
@@ -237,6 +243,7 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
         refinement=refinement,
         origin=fused.origin,
         num_gaussians=num_gaussians,
+        num_left_out=num_left_out,
         overflow=Overflow(overflow, submap.overflow, refinement.overflow),
     )
     return SlamState(map, frame.points, frame.T_world_camera, frame.localization.estimate, time), info
@@ -250,10 +257,15 @@ def _localize_coarse(
     estimate: PoseEstimate,
     view: Camera,
     config: LocalizationConfig,
-) -> tuple[CoarsePose, Observation]:
-    """The coarse pose, and the current frame placed by it."""
+) -> tuple[CoarsePose, Observation, Observation, Int[Array, ""]]:
+    """The coarse pose, the current frame as it is sound and placed by that pose, and how many points it has lost."""
+    current, before = sound(prediction.current), sound(prediction.previous)
+    num_left_out = jnp.sum(prediction.current.valid & ~current.valid)
+    prediction = replace(
+        prediction, current=current, previous=before, T_world_views=sound_poses(prediction.T_world_views)
+    )
     coarse = localize_coarse(prediction, previous, T_world_previous, view, config, estimate)
-    return coarse, transform(coarse.T_world_camera, prediction.current, coarse.scale)
+    return coarse, current, transform(coarse.T_world_camera, current, coarse.scale), num_left_out
 
 
 @executable

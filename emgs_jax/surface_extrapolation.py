@@ -11,6 +11,8 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import traced
 
+LEAST_POWER = 1e-18  # of errors, squared logarithms of depth; less are rounding, and say nothing of each other
+
 
 class ExtrapolationConfig(eqx.Module):
     """Extrapolation of a frame's depth errors from observed surfaces to the new surface beside them.
@@ -84,8 +86,9 @@ def extrapolate(
     """
     center = T_world_camera.translation()
     error, is_known = depth_error(aligned.points, explained_by, is_fused, center, config)
-    least = jnp.min(jnp.where(is_known, noise, jnp.inf))
-    precision = jnp.where(is_known & (noise > 0), (least / jnp.where(noise > 0, noise, 1.0)) ** 2, is_known)
+    least = jnp.min(noise, where=is_known, initial=jnp.finfo(jnp.float32).max)
+    has_noise = is_known & (noise > 0)
+    precision = jnp.where(has_noise, jnp.where(has_noise, least, 0.0) / jnp.where(has_noise, noise, 1.0), is_known) ** 2
     std = config.width * camera.width
     down, along = window(camera.height, std), window(camera.width, std)
 
@@ -94,7 +97,9 @@ def extrapolate(
 
     weighted, near = precision * error, total(precision)
     alone = (total(weighted) - weighted) / (1.0 + near - precision)
-    slope = jnp.sum(weighted * alone) / jnp.maximum(jnp.sum(precision * alone**2), jnp.finfo(jnp.float32).tiny)
+    power = jnp.sum(precision * alone**2)
+    is_alike = power > LEAST_POWER
+    slope = jnp.where(is_alike, jnp.sum(weighted * alone), 0.0) / jnp.where(is_alike, power, 1.0)
     own_share = explained_by.weight / (explained_by.weight + 1.0)
     expected = jnp.clip(slope, 0.0, 1.0) * total(weighted * own_share) / (1.0 + near)
     is_moved = aligned.valid & ~is_fused & (expected != 0)

@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from emgs_jax.config.configure import CONF, compose, first_of_sweep, message_of
 from emgs_jax.config.overrides import quoted, readable
 from emgs_jax.device.settings import check_platforms, leave_memory_to_torch, use_compilation_cache
-from emgs_jax.io.files import check_writable
+from emgs_jax.io.files import check_writable, owned
 
 from .console import speak_on
 from .interrupt import clear_interrupt
@@ -206,7 +206,7 @@ def check_out(config: DictConfig) -> None:
 def nothing_left() -> Iterator[None]:
     """Remove the folder that Hydra made where nothing came of the command: it has no result.
 
-    Where it held anything before, or Hydra keeps no log and so made none, all of it stays.
+    Where it held anything before, another program is in it, or Hydra keeps no log and so made none, all of it stays.
     """
     hydra = HydraConfig.get()
     folder, log = Path(hydra.runtime.output_dir), log_of(hydra.job_logging)
@@ -219,7 +219,7 @@ def nothing_left() -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, InstantiationException, OmegaConfBaseException):
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, ValueError), owned(folder):
             if is_new and is_bare():
                 shutil.rmtree(folder / ".hydra", ignore_errors=True)
                 log.unlink()

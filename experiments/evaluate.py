@@ -147,6 +147,8 @@ def _run_all(jobs: Sequence[Job], failures: dict[str, str]) -> None:
             jax.clear_caches()  # other shapes: the old executables would only hold memory
         try:
             job.folder.mkdir(parents=True, exist_ok=True)
+            # There before anything fails, is killed or fills the disk: what comes after metrics.json belongs to a job.
+            write_file(job.folder / ERROR_FILE, "the job has begun and not ended\n")
             run(job.config, job.folder)
             (job.folder / ERROR_FILE).unlink(missing_ok=True)
         except Exception as error:  # whatever it is, the other jobs go on
@@ -157,7 +159,10 @@ def _run_all(jobs: Sequence[Job], failures: dict[str, str]) -> None:
 
 
 def _is_finished(job: Job) -> bool:
-    return is_finished(job.folder, OmegaConf.to_container(job.config, resolve=True))
+    """Test whether the result of a job is there, and nothing of the job was left to do after it."""
+    return not (job.folder / ERROR_FILE).exists() and is_finished(
+        job.folder, OmegaConf.to_container(job.config, resolve=True)
+    )
 
 
 def _shard(text: str) -> tuple[int, int]:

@@ -104,6 +104,7 @@ KEYS: dict[str, dict[str, Kind | Declared]] = {
     },
     "score": {
         "max_time_difference": ranged(0, 1e6),
+        "min_associated_percent": ranged(0, 100),
         "min_matched_percent": ranged(0, 100),
         "normal_neighbours": ranged(3, 1000, int),
     },

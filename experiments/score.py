@@ -39,7 +39,9 @@ def score(config: DictConfig) -> tuple[Metrics, Path]:
     folder = result_folder(Path(config.out), dataset.name, dataset.sequence, config.method, 0)
     is_finished(folder, settings)  # scoring again replaces its own result, never another one
     cloud = None if config.points is None else read_cloud(config.points, config.normal_neighbours)
-    poses, truth, counts = matched_poses(config.trajectory, dataset, config.max_time_difference)
+    poses, truth, counts = matched_poses(
+        config.trajectory, dataset, config.max_time_difference, config.min_associated_percent
+    )
     metrics = trajectory_metrics(poses, truth) | counts
     if cloud is not None:
         metrics |= compare(cloud, (poses, truth), dataset, evaluation)
@@ -51,12 +53,18 @@ def score(config: DictConfig) -> tuple[Metrics, Path]:
 
 
 def matched_poses(
-    path: str, dataset: ReadableFrames, max_difference: float
+    path: str, dataset: ReadableFrames, max_difference: float, min_percent: float
 ) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
-    """Poses of the file and true poses of the same times (n, 4, 4), and how many of either there are in all."""
+    """Poses of the file and true poses of the same times (n, 4, 4) in order of time, and how many of either there are.
+
+    Raises:
+        ValueError: of neither as many as `min_percent` have a partner, so that the times are no times of the frames.
+    """
     if not Path(path).is_file():
         raise FileNotFoundError(f"trajectory={path} is no file: give a file with `timestamp tx ty tz qx qy qz qw`")
     times, poses = load_trajectory_tum(path)
+    order = np.argsort(times, kind="stable")  # motions are from one pose to the next in time
+    times, poses = times[order], poses[order]
     times = in_seconds(times)  # ORB-SLAM3 and others write the nanoseconds of EuRoC's clock into this format
     what = f"{dataset.name} {dataset.sequence}"
     frames = (dataset[row] for row in range(len(dataset)))
@@ -65,12 +73,15 @@ def matched_poses(
         raise ValueError(f"{what} has no true poses to compare with: choose another data set")
     true_times = np.array([time for time, _ in known])
     rows, true_rows = associate(times, true_times, max_difference)
-    if not len(rows):
+    spans = f"Its timestamps are {_span(times)}, those of {what} {_span(true_times)}"
+    if len(rows) < max(1, 0.01 * min_percent * min(len(times), len(known))):
+        few = f"{len(rows)} of {len(times)} poses, which may be by chance, are" if len(rows) else "no pose is"
         raise ValueError(
-            f"{path}: no pose is within {max_difference:g} s of a frame. Its timestamps are {_span(times)}, those of "
-            f"{what} {_span(true_times)}: write the data set's timestamps, choose the same frames (dataset.start, "
-            "stop, stride) or raise max_time_difference"
+            f"{path}: {few} within {max_difference:g} s of one of {len(known)} frames. {spans}: write "
+            "the data set's timestamps (numbers of frames are none), choose the same frames (dataset.start, stop, "
+            "stride), raise max_time_difference, or accept fewer (min_associated_percent)"
         )
+    print(f"{path}: {spans}")
     truth = np.stack([known[row][1] for row in true_rows]).astype(np.float64)
     _check_twice(times, poses, path)
     check_conventions(poses[rows], truth, path)

@@ -47,13 +47,14 @@ def random_problem(rng: np.random.Generator) -> tuple[Matches, Problem]:
         gradients=normal(NUM_POINTS, 3),
         is_inlier=jnp.asarray(rng.random(NUM_POINTS) < 2 / 3),
     )
+    units = jnp.ones(7).at[6].set(0.005)
     one, zeros = jnp.ones(()), jnp.zeros((1, 3))
     nothing = Gaussians(zeros, jnp.eye(3)[None], zeros, zeros, jnp.zeros((1, 0)), jnp.zeros(1, bool))
     groups = group_points(nothing.means, nothing.valid)
     surface = Surface(
         nothing, groups, jnp.zeros((1, 6)), one[None], one[None], zeros
     )  # what is matched does not look at it
-    return matches, Problem(source, surface, T, jnp.full(NUM_POINTS, 0.01), 0.005 * one, jnp.eye(7), 0.01 * one)
+    return matches, Problem(source, surface, T, jnp.full(NUM_POINTS, 0.01), units, jnp.eye(7), 0.01 * one)
 
 
 def largest_difference(matches: Matches, problem: Problem, options: dict | None = None) -> float:

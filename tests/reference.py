@@ -12,13 +12,13 @@ def nearest_rows(query, points, valid, k):
 
 def lloyd(points, seeds, num_iterations):
     """k-means; an empty cluster keeps its centroid. Returns centroids and the counts of the last assignment."""
-    centroids, counts = np.array(seeds, float), np.ones(len(seeds))
-    for _ in range(num_iterations):
+    centroids = np.array(seeds, float)
+    for _ in range(max(num_iterations, 1)):
         nearest = np.argmin(np.linalg.norm(points[:, None] - centroids, axis=-1), axis=1)
         counts = np.bincount(nearest, minlength=len(centroids)).astype(float)
         for k in np.flatnonzero(counts):
             centroids[k] = points[nearest == k].mean(axis=0)
-    return centroids, counts
+    return (centroids if num_iterations else np.array(seeds, float)), counts
 
 
 def fit_to_points(center, points, normals, colors, features, valid, num_neighbours, min_std):

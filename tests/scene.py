@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.em import EStep
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.observation import Observation, Prediction
+from emgs_jax.mapping.convert import FirstWindow
+from emgs_jax.observation import Observation, Prediction, no_covariance
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.neighbours import Nearby
 
@@ -191,6 +192,11 @@ def stack_poses(poses: list[jaxlie.SE3]) -> jaxlie.SE3:
     return jaxlie.SE3(device(np.stack([T.wxyz_xyz for T in poses])))
 
 
+def first_window(views: Observation, T_world_views: jaxlie.SE3) -> FirstWindow:
+    """The first window of a prior that does not say how sure its poses are."""
+    return FirstWindow(views, T_world_views, jnp.tile(no_covariance(), (len(views.valid), 1, 1, 1)))
+
+
 def predict_room(
     i: float, camera: Camera, scale: float = 1.0, has_newest: bool = True, num_features: int = 0
 ) -> Prediction:
@@ -206,6 +212,7 @@ def predict_room(
         previous=observe_room(path_pose(i - 1), camera, num_features, scale),
         T_world_views=stack_poses(poses),
         T_world_anchor=path_pose(0),
+        pose_covariance=no_covariance(),
         has_newest=jnp.asarray(has_newest),
         is_repeat=jnp.asarray(True),
     )

@@ -4,12 +4,12 @@ from functools import cache
 
 import hydra
 import numpy as np
+from emgs_jax.prior.multiview.incremental import StructureConfig
+from emgs_jax.prior.multiview.landmarks import NONE, Structure, View
 from scene import compose
 
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.multiview.depth import DepthConfig
-from emgs_jax.prior.multiview.incremental import StructureConfig
-from emgs_jax.prior.multiview.landmarks import NONE, Structure, View
 from emgs_jax.prior.multiview.lens import Lens
 from emgs_jax.prior.multiview.planar import PlanarConfig
 

@@ -1,5 +1,7 @@
 """E-step, M-step and support against NumPy and closed limits: sums, textbook mixtures, one-hot assignments, gates."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ QUIET = np.zeros((M, 3), np.float32)
 NOISE = (np.random.default_rng(5).normal(size=(M, 3)) * 0.1).astype(np.float32)
 ONES = np.ones(M, np.float32)
 estep, mstep, supported, updated_map = (sc.on_host(f) for f in (e_step, m_step, support, em_update))
+widened = sc.on_host(widened_distance_sq)
 
 
 def em(*arguments):
@@ -354,3 +357,51 @@ def test_confidence_makes_a_map_better_and_a_wrong_one_not_worse(config):
     }
     assert errors["honest"] < 0.85 * errors["none"]
     assert errors["wrong"] < 1.02 * errors["none"]
+
+
+@pytest.mark.parametrize(("noise", "depth"), [(0.02, 3e3), (0.1, 1e4), (0.3, 1e4)])
+def test_a_distant_point_behind_a_gaussian_is_judged_as_in_float64(noise, depth):
+    """The difference of two terms of 1e12 was clipped to 0, and points of a sky were fused into a wall at 2 m."""
+    rays = np.random.default_rng(0).uniform(-0.4, 0.4, (M, 3)) * [1, 1, 0] + [0, 0, 1]
+    points, mean, cov = np.float32(depth * rays), np.float32([0.1, 0, 2]), np.float32(np.diag([0.05, 0.05, 0.01]) ** 2)
+    along = np.float32(noise) * points
+    triangle = [np.float32(x) for x in whitening(cov)[0]]
+    found, growth = widened(triangle, tuple((points - mean).T), tuple(along.T))
+    offsets, along = points.astype(float) - mean, along.astype(float)
+    whole = cov + along[:, :, None] * along[:, None]
+    exact = np.einsum("ni,nij,nj->n", offsets, np.linalg.inv(whole), offsets)
+    np.testing.assert_allclose(found, exact, rtol=0.02)  # a point is rounded by .06 of the least deviation
+    np.testing.assert_allclose(growth, np.linalg.slogdet(whole)[1] - np.linalg.slogdet(cov)[1], rtol=1e-5)
+
+
+POISON = {
+    "colour": ("colors", np.nan),
+    "normal": ("normals", np.inf),
+    "feature": ("features", np.nan),
+    "confidence": ("confidence", np.inf),
+    "point": ("points", np.nan),
+    "point beyond any map": ("points", 1e18),
+}
+
+
+@pytest.mark.parametrize("what", POISON)
+def test_a_point_with_a_number_that_is_none_is_left_out(paper, what):
+    """One colour of 80 that was NaN made those of 36 of 40 Gaussians NaN."""
+    name, value = POISON[what]
+    values = np.array(getattr(POINTS, name))
+    values[7] = value
+    config = sc.changed(paper, min_normal_cos=0.85, max_mahalanobis_sq=60.0)
+    expected = em(MAP, sc.replace(POINTS, valid=np.arange(M) != 7), NOISE, config)
+    sc.assert_same(em(MAP, sc.replace(POINTS, **{name: values}), NOISE, config), expected)
+
+
+def test_where_a_gaussian_has_a_vanishing_share_its_support_has_finite_slopes(paper):
+    """1e-21 over 1e-21: the slopes of the ratio overflow."""
+    gaussians = sc.rows_of(GAUSSIANS, [0, 0])
+    points = sc.rows_of(POINTS, [0, 1])
+
+    def total(shares):
+        step = sc.explained([[0, 1], [0, 1]], np.ones((2, 2)), [True, True])
+        return jnp.sum(support(gaussians, points, eqx.tree_at(lambda s: s.responsibilities, step, shares), paper))
+
+    assert np.isfinite(jax.grad(total)(jnp.asarray([[[1.0, 1e-21]], [[1.0, 1e-23]]]))).all()

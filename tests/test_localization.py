@@ -182,6 +182,41 @@ def test_the_fused_pose_weighs_chain_and_anchor_by_their_variances(wide, printed
     )
 
 
+def given(prediction, motion: float, own: float):
+    """The prediction of a prior that knows its motion and its own pose to so many metres and radians."""
+    covariance = np.stack([std**2 * np.eye(6) for std in (motion, own)])
+    return eqx.tree_at(lambda p: p.pose_covariance, prediction, sc.device(covariance))
+
+
+def test_poses_that_are_given_are_weighed_as_the_prior_says_and_not_by_what_differs(wide, printed):
+    """Motion and own pose differ by 5 mm: the variances are the given ones, whatever was predicted twice before."""
+    shifted_by, motion, own = 0.005, 0.02, 0.01
+    elsewhere = given(shifted(sc.predict_room(FRAME, wide), sc.pose(translation=(shifted_by, 0, 0))), motion, own)
+    config = sc.changed(printed, coarse=COARSE["fused"], pose_shared=0.75, **{"icp.prior_information": 30.0})
+    estimate = eqx.tree_at(lambda b: b.repeats, CERTAIN, repeats_of(1e-3, 0.3))
+    result = coarse_of(elsewhere, wide, config, estimate=estimate)
+    weighted = own**2 * (1 + shifted_by**2 / (motion**2 + own**2) / 6)  # Cauchy
+    moved = sc.pose_error(result.T_world_camera, sc.path_pose(FRAME))[0]
+    assert moved == pytest.approx(shifted_by * motion**2 / (motion**2 + weighted), abs=3e-4)  # roundings of float32
+    expected = motion**2 * weighted / (motion**2 + weighted)
+    np.testing.assert_allclose(np.diag(result.estimate.covariance)[:6], expected, rtol=0.02)
+    assert result.estimate.is_given and not np.any(result.estimate.repeats.counts)
+
+
+def test_the_scale_of_the_depths_moves_no_pose_that_is_given(wide, printed):
+    """Depths 10 % too small, poses right: the scale is that of the depths, the pose that of the prior."""
+    right, small = sc.predict_room(FRAME, wide), sc.predict_room(FRAME, wide, scale=0.9)
+    mixed = eqx.tree_at(lambda p: p.T_world_views, small, right.T_world_views)
+    known = {"coarse": COARSE["fused"], "coarse_scale": SCALES["ratio"], "icp.prior_information": 30.0}
+    config = sc.changed(printed, **known)
+    result = coarse_of(given(mixed, 1e-3, 1e-3), wide, config)
+    np.testing.assert_allclose(result.scale, 1 / 0.9, rtol=1e-3)
+    for T, expected in ((result.T_world_camera, FRAME), (result.T_world_newest, FRAME + 1)):
+        assert max(sc.pose_error(T, sc.path_pose(expected))) < 1e-3
+    # Of poses that are not given the scale is one with that of the depths.
+    assert sc.pose_error(coarse_of(mixed, wide, config).T_world_camera, sc.path_pose(FRAME))[0] > 3e-3
+
+
 def test_points_that_are_too_far_apart_are_no_pair(wide, printed):
     """Three in five points of the previous image are half a metre off in both of its predictions, so they agree.
 
@@ -204,11 +239,13 @@ def test_a_frame_is_usable_from_sixteen_points_on(wide, printed, count):
     assert coarse_of(few, wide, printed).is_usable == (count == 16)
 
 
-def test_a_scale_beyond_belief_is_no_scale(wide, printed):
-    config = sc.at(printed, "coarse_scale", SCALES["ratio"])
-    for factor, expected in ((8.0, 1 / 8), (12.0, 1.0)):  # a tenth of a scale is a mistake
+@pytest.mark.parametrize("factor", [1 / 64, 8.0, 64.0])
+def test_a_scale_is_found_however_large_or_small(wide, printed, factor):
+    """No unit is special: of a prediction in another one the depths say by what it is to be multiplied."""
+    for kind in ("ratio", "estimated"):
+        config = sc.at(printed, "coarse_scale", SCALES[kind])
         result = coarse_of(sc.predict_room(FRAME, wide, scale=factor), wide, config)
-        np.testing.assert_allclose(result.scale, expected, rtol=1e-4)
+        np.testing.assert_allclose(result.scale, 1 / factor, rtol=1e-4)
 
 
 def test_a_newest_pose_that_is_no_number_is_the_current_one(wide, printed):
@@ -298,8 +335,9 @@ def submap(camera, config):
 def lenient(config):
     """Coarse as the prior says, fine as printed but with wide gates; every check passes."""
     settings = config("slam.localization.coarse_scale=none", "slam.localization.icp.residual=colored").localization
-    gates = {"min_inlier_fraction": 0.0, "min_eigenvalue": -np.inf, "icp.prior_information": 0.0}
-    gates |= dict.fromkeys(("max_residual", "max_step", "max_step_rad"), np.inf) | {"icp.max_mahalanobis_sq": 25.0}
+    gates = {"min_inlier_fraction": 0.0, "icp.prior_information": 0.0}
+    gates |= dict.fromkeys(("max_residual", "max_step", "max_step_rad", "max_pose_std"), np.inf)
+    gates |= {"icp.max_mahalanobis_sq": 25.0}
     return sc.changed(settings, coarse=COARSE["anchored"], **gates)
 
 
@@ -355,7 +393,10 @@ def test_the_fine_step_is_icp_of_the_scaled_points_with_the_noise_of_the_coarse_
     scaled = sc.replace(current, points=coarse_scale * np.asarray(current.points))
     known = sc.device(sc.on_host(root_information)(coarse.estimate.covariance))
     expected, scale, found = solve(
-        scaled, submap, CoarseStart(coarse.T_world_camera, known, sc.device(depth_noise)), settings.icp
+        scaled,
+        submap,
+        CoarseStart(coarse.T_world_camera, known, sc.device(depth_noise), sc.device(False)),
+        settings.icp,
     )
     # Another program rounds in another order; the solver stops within its tolerance.
     assert max(sc.pose_error(T, expected)) < 1e-4
@@ -385,7 +426,7 @@ def test_a_scale_that_is_accepted_is_that_of_the_points_and_one_that_is_not_is_d
         (2, "max_residual", 0.0),
         (3, "max_step", 1e-6),
         (3, "max_step_rad", 1e-6),
-        (4, "min_eigenvalue", 1e12),
+        (4, "max_pose_std", 1e-9),
     ],
 )
 def test_each_check_alone_keeps_the_coarse_pose_and_says_why(camera, submap, lenient, bit, field, value):
@@ -420,10 +461,82 @@ def test_a_single_untextured_wall_does_not_determine_the_pose(camera, submap, le
     wall = submap.normals[:, 2] < -0.99
     plain = sc.replace(submap, valid=wall, colors=np.full((192, 3), 0.5), normals=np.tile([0.0, 0, -1], (192, 1)))
     grey = eqx.tree_at(lambda p: p.current.colors, sc.predict_room(FRAME, camera), sc.device(np.full((768, 3), 0.5)))
-    settings = sc.changed(lenient, **{"min_eigenvalue": config().localization.min_eigenvalue, "icp.residual": residual})
+    settings = sc.changed(lenient, **{"max_pose_std": config().localization.max_pose_std, "icp.residual": residual})
     coarse, T, _, info = fine_of(grey, plain, camera, settings)
     assert int(info.reason) & 16 and not info.is_tracked
     sc.assert_same(T, coarse.T_world_camera)
+
+
+def test_a_wall_before_a_camera_whose_pose_is_given_is_enough(camera, submap, lenient, config):
+    """What determines the pose is what was known of it before and the points, together."""
+    wall = submap.normals[:, 2] < -0.99
+    plain = sc.replace(submap, valid=wall, colors=np.full((192, 3), 0.5), normals=np.tile([0.0, 0, -1], (192, 1)))
+    limit = {"max_pose_std": config().localization.max_pose_std, "icp.prior_information": 30.0}
+    settings = sc.changed(lenient, coarse=COARSE["fused"], **limit)
+    for std, is_tracked in ((0.01, True), (1.0, False)):
+        prediction = given(sc.predict_room(FRAME, camera), std, std)
+        prediction = eqx.tree_at(lambda p: p.current.colors, prediction, sc.device(np.full((768, 3), 0.5)))
+        *_, info = fine_of(prediction, plain, camera, settings)
+        assert info.is_tracked == is_tracked and int(info.reason) == (0 if is_tracked else 16)
+
+
+def test_a_pose_that_is_given_stays_where_the_points_do_not_fit(camera, submap, lenient):
+    """A millimetre, and points that are 4 % too small, which no scale may mend."""
+    settings = sc.changed(lenient, coarse=COARSE["fused"], **{"icp.prior_information": 30.0})
+    right = sc.predict_room(FRAME, camera)
+    small = eqx.tree_at(lambda p: p.T_world_views, small_prediction(camera), right.T_world_views)
+    moved = []
+    for prediction in (given(small, 1e-3, 1e-3), small):
+        _, T, _, info = fine_of(prediction, submap, camera, settings)
+        moved.append(sc.pose_error(T, sc.path_pose(FRAME))[0])
+        assert info.is_tracked
+    assert moved[0] < 2e-3 < 5e-3 < moved[1]
+
+
+def test_the_printed_form_knows_nothing_before_whatever_the_prior_says(camera, submap, config):
+    settings, prediction = config("slam/localization=paper").localization, nudged(camera)
+    unknown, known = (fine_of(p, submap, camera, settings) for p in (prediction, given(prediction, 1e-3, 1e-3)))
+    sc.assert_same(known[0].T_world_camera, unknown[0].T_world_camera)
+    sc.assert_same(known[1:3], unknown[1:3])
+    sc.assert_same(known[3].icp, unknown[3].icp)
+
+
+def longer(T, unit: float):
+    return jaxlie.SE3(T.wxyz_xyz * sc.device([1.0] * 4 + [unit] * 3))
+
+
+def prediction_in(unit: float, prediction):
+    """The prediction with all lengths times a number."""
+    units = np.repeat([unit, 1.0], 3)
+    seen = [sc.replace(o, points=unit * np.asarray(o.points)) for o in (prediction.current, prediction.previous)]
+    poses = longer(prediction.T_world_views, unit), longer(prediction.T_world_anchor, unit)
+    covariance = sc.device(units[:, None] * np.asarray(prediction.pose_covariance) * units)
+    flags = prediction.has_newest, prediction.is_repeat
+    return type(prediction)(*seen, *poses, covariance, *flags)
+
+
+@pytest.mark.parametrize("is_given", [False, True])
+def test_a_frame_is_placed_alike_in_every_unit_of_length(camera, submap, config, is_given):
+    """A world times 2^±10: the same decisions and counts, and lengths that are as many times as long."""
+    settings, found, prediction = config().localization, {}, nudged(camera)
+    prediction = given(prediction, 0.01, 0.01) if is_given else prediction
+    grey = sc.replace(submap, colors=np.full((192, 3), 0.5))  # gradients of colour are not a matter of this file
+    for unit in (2.0**-10, 1.0, 2.0**10):
+        before = world(FRAME - 1, camera)
+        before = sc.replace(before, points=unit * np.asarray(before.points))
+        target = sc.replace(grey, means=unit * np.asarray(grey.means), covs=unit**2 * np.asarray(grey.covs))
+        there, T_before = prediction_in(unit, prediction), longer(sc.path_pose(FRAME - 1), unit)
+        coarse = coarse_step(there, before, T_before, camera, settings, CERTAIN)
+        T, aligned, info = fine_step(there.current, target, coarse, settings)
+        covariance = np.asarray(info.estimate.covariance)[:6, :6] / np.outer(*[np.repeat([unit, 1.0], 3)] * 2)
+        lengths = aligned.points / unit, info.step_m / unit, info.repeat_rms / unit
+        others = info.noise, info.scale, info.step_rad, info.icp.min_eigenvalue
+        counts = bool(info.is_tracked), int(info.reason), int(info.icp.num_inliers), int(info.icp.num_steps)
+        found[unit] = counts, (longer(T, 1 / unit).wxyz_xyz, covariance, *lengths, *others)
+    for counts, numbers in found.values():
+        assert counts == found[1.0][0]
+        for one, expected in zip(numbers, found[1.0][1], strict=True):
+            np.testing.assert_allclose(one, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())  # roundings
 
 
 @pytest.mark.parametrize("loss", ["no point", "nan pose"])

@@ -3,6 +3,7 @@
 from functools import partial
 
 import jax
+import jaxlie
 import numpy as np
 import pytest
 import reference
@@ -291,3 +292,30 @@ def test_a_transform_scales_about_the_source_then_moves_points_and_turns_normals
     np.testing.assert_allclose(moved.normals, expected.normals, atol=1e-6)
     for name in ("colors", "features", "confidence", "valid"):
         assert_same(getattr(moved, name), getattr(o, name))
+
+
+@pytest.mark.parametrize("what", ["points", "colors", "features", "confidence"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
+def test_a_number_that_is_none_leaves_its_pixel_out_and_no_other(camera, config, what, value):
+    points, _ = plane_points(camera, (0, 0, -1), 1.5)
+    given = {
+        "points": points,
+        "colors": np.full((24, 32, 3), 0.5, np.float32),
+        "features": np.full((24, 32, 2), 0.5**0.5, np.float32),
+        "confidence": np.ones((24, 32), np.float32),
+    }
+    clean = observe(*given.values(), EVERY, config().observation)
+    given[what][5, 6] = value
+    found = observe(*given.values(), EVERY, config().observation)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found) if value != 1e30 or what == "points")
+    others = np.arange(24 * 32) != 5 * 32 + 6
+    np.testing.assert_array_equal(found.valid[others], clean.valid[others])
+    if what == "points" or (what in ("colors", "confidence") and value != 1e30):
+        assert not found.valid[~others].any()
+
+
+def test_a_pose_whose_quaternion_is_none_is_unknown():
+    values = np.float32([[1, 0, 0, 0, 1, 2, 3], [0, 0, 0, 0, 1, 2, 3], [1, 0, 0, 0, 1e30, 2, 3], [np.nan] * 7])
+    found = on_host(observation.sound_poses)(jaxlie.SE3(values)).wxyz_xyz
+    np.testing.assert_array_equal(np.isfinite(found).all(axis=1), [True, False, False, False])
+    np.testing.assert_array_equal(found[0], values[0])

@@ -1,6 +1,8 @@
 """Whole steps and runs on the box room: exact poses, nothing fused when not tracked, growth that changes nothing, and a
 map of noisy predictions that is better than they are."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jaxlie
@@ -13,7 +15,7 @@ from scene import FULL, ROOM, WHOLE
 from emgs_jax import slam
 from emgs_jax.device.executables import call
 from emgs_jax.mapping.capacity import advance, grow_capacities, start
-from emgs_jax.mapping.convert import FirstWindow, opening
+from emgs_jax.mapping.convert import opening
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
@@ -24,7 +26,7 @@ pytestmark = pytest.mark.slow  # one compilation of the whole step is half a min
 # With executables that are kept, as runs have them: those that test_growth.py compiled.
 init_state, step = (calling(call)(function) for function in (slam.init_state, slam.step))
 # An exact chain, lenient checks: the room is coarse at this resolution.
-LENIENT = {"localization.max_residual": 1.0, "localization.min_eigenvalue": 0.0}
+LENIENT = {"localization.max_residual": 1.0, "localization.max_pose_std": np.inf}
 
 
 def lenient(*overrides: str, **values):
@@ -39,7 +41,7 @@ def exact(i, **more) -> Prediction:
 @pytest.fixture(scope="module")
 def window(camera):
     poses = [sc.path_pose(i) for i in range(FRAME)]
-    return FirstWindow(sc.stack([sc.observe_room(T, camera, num_features=2) for T in poses]), sc.stack_poses(poses))
+    return sc.first_window(sc.stack([sc.observe_room(T, camera, num_features=2) for T in poses]), sc.stack_poses(poses))
 
 
 @pytest.fixture(scope="module")
@@ -235,9 +237,13 @@ def every_pose(change, poses: jaxlie.SE3) -> jaxlie.SE3:
     return sc.stack_poses([change(jaxlie.SE3(values)) for values in np.asarray(poses.wxyz_xyz)])
 
 
-def test_a_step_moves_with_a_rigid_motion_of_the_world(state, camera, settings):
-    """With noisy depths, so that the noise along the rays from the camera, wherever that is, decides what is fused."""
-    motion = sc.pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
+@pytest.mark.parametrize("translation", [(1.0, -2.0, 0.5), (600.0, -700.0, 400.0)])
+def test_a_step_moves_with_a_rigid_motion_of_the_world(state, camera, settings, translation):
+    """With noisy depths, so that the noise along the rays from the camera, wherever that is, decides what is fused.
+
+    A kilometre away float32 has steps of .06 mm.
+    """
+    motion = sc.pose((0.7, 0.2, -0.4), translation)
     prediction = noisy_prediction(FRAME, camera, np.random.default_rng(0))
     stepped = step(state, prediction, FULL, settings)
     quiet = step(state, prediction, FULL, sc.at(settings, "em.noise", 0.0))[1]
@@ -264,45 +270,49 @@ def test_a_step_moves_with_a_rigid_motion_of_the_world(state, camera, settings):
     assert np.median(error) < 2e-3 and np.quantile(error, 0.95) < 0.02
 
 
-def larger_pose(T: jaxlie.SE3) -> jaxlie.SE3:
-    return jaxlie.SE3(sc.device(np.asarray(T.wxyz_xyz) * ([1.0] * 4 + [LARGER] * 3)))
+def larger_pose(T: jaxlie.SE3, factor: float) -> jaxlie.SE3:
+    return jaxlie.SE3(sc.device(np.asarray(T.wxyz_xyz) * ([1.0] * 4 + [factor] * 3)))
 
 
-LARGER = 4.0  # a power of two, so that floats are scaled without rounding
+of_registration = pytest.mark.xfail(reason="issue 52.1: what registration has of a unit; to be enabled with it")
 
 
-def test_in_a_world_four_times_as_large_a_step_makes_a_map_four_times_as_large(state, camera, settings):
+# Powers of two, so that floats are scaled without rounding.
+@pytest.mark.parametrize("larger_by", [4.0, *(pytest.param(2.0**power, marks=of_registration) for power in (-10, 10))])
+def test_in_a_world_so_many_times_as_large_a_step_makes_a_map_as_many_times_as_large(
+    state, camera, settings, larger_by
+):
     """With the lengths of the config, too; fractions of the depth, angles and pixels stay."""
     lengths = "fit.min_std", "em.min_std", "splitting.min_std", "submap.voxel_size", "submap.margin"
-    config = settings
+    config, larger_of = settings, partial(larger_pose, factor=larger_by)
     for path in lengths:
         group, name = path.split(".")
-        config = sc.at(config, path, LARGER * float(getattr(getattr(settings, group), name)))
+        config = sc.at(config, path, larger_by * float(getattr(getattr(settings, group), name)))
     points = lambda p: (p.current.points, p.previous.points, p.T_world_views, p.T_world_anchor)  # noqa: E731
     prediction = noisy_prediction(FRAME, camera, np.random.default_rng(0))
     current, previous, views, anchor = points(prediction)
-    grown = sc.device(LARGER * np.asarray(current)), sc.device(LARGER * np.asarray(previous))
-    large = eqx.tree_at(points, prediction, (*grown, every_pose(larger_pose, views), larger_pose(anchor)))
+    grown = sc.device(larger_by * np.asarray(current)), sc.device(larger_by * np.asarray(previous))
+    large = eqx.tree_at(points, prediction, (*grown, every_pose(larger_of, views), larger_of(anchor)))
 
     def larger(state: SlamState) -> SlamState:
         parts = lambda s: (s.map.gaussians.means, s.map.gaussians.covs, s.previous.points, s.T_world_previous)  # noqa: E731
         means, covs, seen, T = parts(state)
-        arrays = LARGER * np.asarray(means), LARGER**2 * np.asarray(covs), LARGER * np.asarray(seen)
-        return eqx.tree_at(parts, state, (*map(sc.device, arrays), larger_pose(T)))
+        arrays = larger_by * np.asarray(means), larger_by**2 * np.asarray(covs), larger_by * np.asarray(seen)
+        return eqx.tree_at(parts, state, (*map(sc.device, arrays), larger_of(T)))
 
     expected, said = step(state, prediction, FULL, settings)
     new, info = step(larger(state), large, FULL, config)
     assert info.localization.is_tracked
-    distance, angle = sc.pose_error(info.T_world_camera, larger_pose(said.T_world_camera))
-    assert distance < LARGER * 1e-3 and angle < 1e-3  # the solver's tolerance
+    distance, angle = sc.pose_error(info.T_world_camera, larger_of(said.T_world_camera))
+    assert distance < larger_by * 1e-3 and angle < 1e-3  # the solver's tolerance
     np.testing.assert_allclose(info.localization.scale, said.localization.scale, rtol=1e-3)
     np.testing.assert_allclose(info.localization.depth_noise, said.localization.depth_noise, rtol=1e-2)
     assert abs(int(info.em.num_fused) - int(said.em.num_fused)) <= 0.02 * 768  # at a gate a point may pass or not
     assert abs(int(info.num_gaussians) - int(said.num_gaussians)) <= 5
     old, g, h = np.asarray(state.map.gaussians.valid), new.map.gaussians, expected.map.gaussians
-    error = np.linalg.norm(np.asarray(g.means) / LARGER - h.means, axis=1)[old]
+    error = np.linalg.norm(np.asarray(g.means) / larger_by - h.means, axis=1)[old]
     assert np.median(error) < 1e-3 and np.quantile(error, 0.95) < 0.01
-    error = np.abs(np.asarray(g.covs) / LARGER**2 - h.covs).max(axis=(1, 2))[old]
+    error = np.abs(np.asarray(g.covs) / larger_by**2 - h.covs).max(axis=(1, 2))[old]
     assert np.median(error) < 1e-4 and np.quantile(error, 0.95) < 1e-3
 
 
@@ -413,7 +423,7 @@ def test_a_map_of_noisy_predictions_is_more_accurate_than_their_points(camera):
         rng, count = np.random.default_rng(seed), 8
         views = [noisy(sc.observe_room(T, camera, num_features=2), camera, rng, 0.02) for T in poses]
         sequence = [noisy_prediction(FRAME + i, camera, rng) for i in range(count)]
-        final, infos = run([FirstWindow(sc.stack(views), sc.stack_poses(poses)), *sequence], chosen)
+        final, infos = run([sc.first_window(sc.stack(views), sc.stack_poses(poses)), *sequence], chosen)
         assert all(i.localization.is_tracked for i in infos)
         raw_poses = [jaxlie.SE3(np.asarray(p.T_world_views.wxyz_xyz)[1]) for p in sequence]
         pairs = [*zip(poses, views, strict=True), *zip(raw_poses, (p.current for p in sequence), strict=True)]

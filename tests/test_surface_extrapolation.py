@@ -1,5 +1,8 @@
 """What is new goes on where the map ends: a wall that a frame shows too far away."""
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scene import device, flat_gaussians, fresh_map, matrix_of, on_host, pose
@@ -111,3 +114,18 @@ def test_window_is_gaussian_and_the_identity_without_width() -> None:
     weights = on_host(window)
     np.testing.assert_array_equal(weights(4, np.float32(0.0)), np.eye(4))
     np.testing.assert_allclose(weights(4, np.float32(2.0))[0], np.exp(-(np.arange(4) ** 2) / 8.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("count", [0, 1, HALF.sum()])
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_slopes_are_finite_however_few_points_are_fused(count, noise):
+    is_fused = HALF & (np.cumsum(HALF) <= count)
+    frame, map = seen(2.1), wall(weight=3.0)
+
+    def total(noise, points, weight):
+        given = eqx.tree_at(lambda o: o.points, frame, points), eqx.tree_at(lambda m: m.weight, map, weight)
+        moved = extrapolate(*given, is_fused, noise, T, CAMERA, config())
+        return jnp.sum(moved.points**2)
+
+    given = device(np.full(HALF.shape, noise)), frame.points, map.weight
+    assert all(np.isfinite(slope).all() for slope in on_host(jax.grad(total, (0, 1, 2)))(*given))

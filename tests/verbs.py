@@ -67,7 +67,8 @@ def image_of(seed: int):
 
 def belief_of(seed: int) -> pose_estimate.PoseEstimate:
     covariance = sc.device(np.diag([4e-4] * 3 + [1e-4] * 4) * (1.0 + seed))
-    return pose_estimate.PoseEstimate(covariance, *map(sc.device, (0.01, 0.02, 3.0)), pose_noise.no_repeats())
+    numbers, no = map(sc.device, (0.01, 0.02, 3.0)), jnp.asarray(False)
+    return pose_estimate.PoseEstimate(covariance, *numbers, pose_noise.no_repeats(), no)
 
 
 def coarse_of(seed: int) -> localization.CoarsePose:
@@ -163,7 +164,7 @@ VERBS = {
     ),
     "fit_rigid": (rigid.fit_rigid, lambda s: (points(s).points, points(s + 5).points, sc.device(np.ones(40)))),
     "predict": (
-        lambda b, T: pose_estimate.propagate_covariance(b.covariance, T, jnp.full(7, 0.01)),
+        lambda b, T: pose_estimate.propagate_covariance(b.covariance, T, 1e-4 * jnp.eye(7)),
         lambda s: (belief_of(s), sc.path_pose(s)),
     ),
     "update": (
@@ -172,7 +173,10 @@ VERBS = {
     ),
     "icp": (
         lambda o, g, T: icp.icp(
-            o, g, problem.CoarseStart(T, jnp.diag(50.0 * jnp.ones(7)), ONE * 0.01), CONFIG.localization.icp
+            o,
+            g,
+            problem.CoarseStart(T, jnp.diag(50.0 * jnp.ones(7)), ONE * 0.01, jnp.asarray(False)),
+            CONFIG.localization.icp,
         ),
         lambda s: (
             sc.moved_points(sc.pose_of(np.linalg.inv(sc.matrix_of(sc.path_pose(s)))), close(s)),

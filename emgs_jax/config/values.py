@@ -11,7 +11,7 @@ import numbers
 import re
 import types
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from hydra.utils import get_class
@@ -161,6 +161,6 @@ def _kinds(hint: Any) -> tuple[frozenset[type], frozenset[type]]:
             if any(inner or not kinds <= {int, float, str} or not kinds & {int, float} for kinds, inner in found):
                 return frozenset(), frozenset()
             elements |= set().union(*(kinds for kinds, _ in found))
-        else:
+        elif origin is not Callable:  # a function stands in no config
             return frozenset(), frozenset()
     return frozenset(plain), frozenset(elements)

@@ -20,6 +20,7 @@ Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy; pixel centres 
 MAX_SIDE = 16384  # pixels; more is a slip of the hand, and would ask for gigabytes
 MAX_POSITION_M = 1000.0  # from the origin: steps of float32 are .06 mm there, and 6 cm at 1e6 m
 RIGID_TOLERANCE = 1e-2  # text files round; a flipped digit moves R^T R by more
+SAME_SURFACE = 0.05  # relative inverse-depth step to the next pixel up to which two depths are of one surface
 AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION  # not turned by EXIF: other programs solve for the pixels of the file
 OWN_BITS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH  # BGR in 8 or 16 bits, or float
 REMEDY = "fetch the file again or set on_bad_frame=skip"
@@ -116,11 +117,34 @@ def resize_color(image: UInt8[np.ndarray, "_ _ 3"], size: Size) -> UInt8[np.ndar
 
 
 def resize_nearest(values: np.ndarray, size: Size) -> np.ndarray:
-    """Value of the pixel whose area holds each new pixel's centre: depths and labels must not be mixed."""
-    h, w = values.shape[:2]
-    rows = np.minimum(((np.arange(size[1]) + 0.5) * h / size[1]).astype(int), h - 1)
-    columns = np.minimum(((np.arange(size[0]) + 0.5) * w / size[0]).astype(int), w - 1)
-    return values[rows[:, None], columns[None, :]]
+    """Depth (float) or label (integer) at each new pixel's centre; what lies on two sides of an edge is never mixed.
+
+    The pixels around the centre vote by their bilinear weights, for labels that are equal and for depths of one
+    surface; of a tie wins the lower right. Where all depths are of one surface its inverse depth is interpolated, which
+    on a plane is exact: with even factors each single pixel is half a pixel off, and all to the same side.
+    """
+    (top, bottom, v), (left, right, u) = (_around(*sides) for sides in zip(values.shape, size[::-1], strict=True))
+    corners = np.stack([values[rows[:, None], columns] for rows in (bottom, top) for columns in (right, left)])
+    weights = np.stack([y[:, None] * x for y in (v, 1 - v) for x in (u, 1 - u)])
+    is_depth = values.dtype.kind == "f"
+    inverse = np.where(corners > 0, 1.0 / np.where(corners > 0, corners, 1.0), 0.0) if is_depth else corners
+    largest = np.maximum(inverse[:, None], inverse) if is_depth else 0
+    is_alike = np.abs(inverse[:, None] - inverse) <= SAME_SURFACE * largest
+    votes = (is_alike * weights).sum(1)
+    chosen = (votes + 1e-3 * weights).argmax(0)[None]
+    nearest = np.take_along_axis(corners, chosen, 0)[0]
+    if not is_depth:
+        return nearest
+    is_mixed = (np.take_along_axis(votes, chosen, 0)[0] > 1 - 1e-6) & (weights.max(0) < 1) & (nearest > 0)
+    blended = 1.0 / np.where(is_mixed, (weights * inverse).sum(0), 1.0)
+    return np.where(is_mixed, blended, nearest).astype(values.dtype)
+
+
+def _around(count: int, wanted: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The pixels, of `count`, before and after each of `wanted` centres, and the weight of the second."""
+    centres = np.clip((np.arange(wanted) + 0.5) * count / wanted - 0.5, 0, count - 1)
+    before = np.floor(centres).astype(int)
+    return before, np.minimum(before + 1, count - 1), centres - before
 
 
 def read_bytes(path: Path) -> bytes:

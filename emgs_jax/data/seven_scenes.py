@@ -188,20 +188,27 @@ def sibling(path: Path, ending: str) -> Path:
 def register(depth: Float32[np.ndarray, "_ _"], intrinsics: Intrinsics, size: Size) -> Float32[np.ndarray, "_ _"]:
     """Depth of the colour camera at `size` from the depth camera's 640x480 image; metres, 0 where nothing falls.
 
-    Every source pixel is a square that covers the target pixels whose centres lie in it; the nearest one wins.
+    Every source pixel is a square that covers the target pixels whose centres lie in it; the nearest surface wins, and
+    of that the mean inverse depth: the nearest square alone is before a slanted surface.
     """
     points = color_camera_points(depth)
     (fx, fy, cx, cy), (w, h) = intrinsics, size
     u, v, z = fx * points[:, 0] / points[:, 2] + cx, fy * points[:, 1] / points[:, 2] + cy, points[:, 2]
     half_u, half_v = (0.5 * FOOTPRINT_MARGIN * f / g for f, g in zip((fx, fy), DEPTH_INTRINSICS[:2], strict=True))
-    nearest = np.full(h * w, np.inf, np.float32)
+    found = []
     for du in range(-int(half_u + 0.5), int(half_u + 0.5) + 1):
         for dv in range(-int(half_v + 0.5), int(half_v + 0.5) + 1):
             x, y = np.rint(u) + du, np.rint(v) + dv
             covered = (np.abs(x - u) <= half_u) & (np.abs(y - v) <= half_v)
             covered &= (x >= 0) & (x < w) & (y >= 0) & (y < h)
-            np.minimum.at(nearest, (y[covered] * w + x[covered]).astype(np.intp), z[covered])
-    return np.where(np.isfinite(nearest), nearest, 0).reshape(h, w)
+            found.append(((y[covered] * w + x[covered]).astype(np.intp), z[covered]))
+    pixels, depths = (np.concatenate(column) for column in zip(*found, strict=True))
+    nearest = np.full(h * w, np.inf)
+    np.minimum.at(nearest, pixels, depths)
+    is_front = depths <= (1.0 + reading.SAME_SURFACE) * nearest[pixels]
+    pixels, inverse = pixels[is_front], 1.0 / depths[is_front]
+    count, total = np.bincount(pixels, minlength=h * w), np.bincount(pixels, inverse, minlength=h * w)
+    return np.where(count > 0, count / np.where(count > 0, total, 1.0), 0.0).astype(np.float32).reshape(h, w)
 
 
 def color_camera_points(depth: Float32[np.ndarray, "h w"]) -> Float[np.ndarray, "p 3"]:

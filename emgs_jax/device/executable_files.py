@@ -27,14 +27,13 @@ def read(folder: Path, name: str) -> bytes | None:
     path, used = _paths(folder, name)
     try:
         data = path.read_bytes()
-        if hashlib.sha256(data[32:]).digest() != data[:32]:
-            raise ValueError("it is damaged")
+    except OSError:  # not there, or not for this user
+        return None
+    if hashlib.sha256(data[32:]).digest() != data[:32]:
+        remove(folder, name, ValueError("it is damaged"))
+        return None
+    with contextlib.suppress(OSError):  # in a folder that may only be read
         used.write_bytes(time.time_ns().to_bytes(8, "little"))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        remove(folder, name, error)
-        return None
     return zlib.decompress(data[32:])
 
 

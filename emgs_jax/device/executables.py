@@ -1,8 +1,9 @@
 """Executables of the processes before this one, loaded without tracing and lowering, which cost ten times as much.
 
-JAX's own cache finds an executable by its program, which has to be made first. Here it is found by what its program is
-made from: the source of the function and of what that imports, versions, machine, settings, shapes and static values.
-The files are in JAX's folder (`use_compilation_cache`), whose bound is theirs, too; without a folder nothing is kept.
+JAX's own cache finds an executable by its program, which has to be made first: some seven CPU seconds more for every
+run. Here it is found by what its program is made from: the function and all that it names, as they are in memory
+(`fingerprint`), versions, machine, settings, shapes and static values. What cannot be told so is JAX's to keep. The
+files are in JAX's folder (`use_compilation_cache`), whose bound is theirs, too; without a folder nothing is kept.
 
 An entry says which program it stands for and what comes out of it; the program's executable is a file of its own, so
 that after a change of the source whatever still is the same program is not compiled again. Loading one runs machine
@@ -15,10 +16,9 @@ import json
 import os
 import platform
 import re
-import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -30,15 +30,17 @@ import jax.monitoring
 from jax.experimental import serialize_executable
 
 from emgs_jax.device.executable_files import described, read, rebuilt, remove, write
+from emgs_jax.device.fingerprint import PACKAGES, fingerprint
 
-PACKAGES = ("jax", "jaxlib", "equinox", "jaxlie", "optimistix", "lineax", "numpy")
-FORMAT = 2  # of entries; 1 had executables of arguments of other shapes
-ROOT = Path(__file__).parents[1]
+FORMAT = 3  # of entries; 2 were found by the text of source files
+# By what XLA decides how many threads an executable has, beside the CPUs that the process may use.
+THREADS = ("XLA_FLAGS", "PJRT_NPROC", "NPROC")
 COMPILED = "/jax/core/compile/backend_compile_duration"
 # Defaults, but executables that are asked for with one of them are others to JAX's cache: what was taken from there
 # cannot be kept again, as on CPUs it has lost its functions (jaxlib 0.10.1). The second is for a file that was damaged.
 _OPTIONS = {"xla_embed_ir_in_executable": False}, {"xla_dump_hlo_as_text": False}, {"xla_dump_hlo_as_proto": False}
 _loaded: dict[tuple, Callable] = {}
+_seen: dict[tuple, str | None] = {}  # fingerprints of what this process has traced
 _thread = threading.local()  # `hits`: executables that JAX took from its cache
 
 
@@ -60,7 +62,7 @@ def stored(function: Callable) -> Callable:
 def ready(function: Callable, *arguments: Any) -> Callable | None:
     """The executable of a function for arguments like these, loaded or compiled; None where nothing is kept."""
     leaves, tree = jax.tree.flatten(arguments)
-    if _folder() is None or not _are_plain(leaves):
+    if _written(function, tree) is None or _folder() is None or not _are_plain(leaves):
         return None
     about = tuple(_about(leaf) for leaf in leaves)
     key = function, tree, about, jax.config.jax_default_matmul_precision, jax.config.jax_enable_x64
@@ -72,13 +74,43 @@ def ready(function: Callable, *arguments: Any) -> Callable | None:
 def outputs(function: Callable, *arguments: Any) -> Any:
     """`eqx.filter_eval_shape`, which traces the function, or what is kept of that."""
     leaves, tree = jax.tree.flatten(arguments)
-    entry = None if _folder() is None else _entry(_digest(function, tree, tuple(map(_about, leaves))))
+    is_kept = _written(function, tree) is not None and _folder() is not None
+    entry = _entry(_digest(function, tree, tuple(map(_about, leaves)))) if is_kept else None
     return eqx.filter_eval_shape(function, *arguments) if entry is None else rebuilt(entry["outputs"])
 
 
 def forget() -> None:
     """Drop what this process has loaded and compiled here, as `jax.clear_caches` does for all else."""
     _loaded.clear()
+    _seen.clear()
+
+
+def forget_replaced() -> None:
+    """Drop everything that is compiled where a function has been replaced since it was traced.
+
+    JAX would go on with what the function was when it was first called with arrays of these shapes.
+    """
+    if any(fingerprint(function.__wrapped__, *classes) != before for (function, classes), before in _seen.items()):
+        forget()
+        jax.clear_caches()
+
+
+def _written(function: Callable, tree: Any) -> str | None:
+    """Fingerprint of a function and of the classes of its arguments, as they were when it was first called with such.
+
+    None where something that it names cannot be told.
+    """
+    key = function, tuple(dict.fromkeys(_classes(tree)))
+    if key not in _seen:
+        _seen[key] = fingerprint(function.__wrapped__, *key[1])
+    return _seen[key]
+
+
+def _classes(tree: Any) -> Iterator[type]:
+    if tree.node_data() is not None:
+        yield tree.node_data()[0]
+    for child in tree.children():
+        yield from _classes(child)
 
 
 def _folder() -> Path | None:
@@ -192,10 +224,9 @@ def _listen() -> None:
 
 def _digest(function: Callable, tree: Any, about: tuple) -> str:
     """Of all that a program is made from."""
-    named = function.__wrapped__
     inside = {name: getattr(jax.config, name, value) for name, value in jax.config.values.items()}  # of `with`
     settings = [f"{name}={inside[name]}" for name in sorted(inside) if "cache" not in name]
-    return _hash(FORMAT, *_machine(), *settings, *_source(named.__module__), named.__qualname__, tree, about)
+    return _hash(FORMAT, *_machine(), *settings, _written(function, tree), tree, about)
 
 
 def _hash(*parts: object) -> str:
@@ -205,32 +236,14 @@ def _hash(*parts: object) -> str:
 @cache
 def _machine() -> tuple[str, ...]:
     """Describe the machine and versions that an executable is for; the number of threads decides how sums are split."""
+    may_use = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))(0)
     device = jax.devices()[0]
     cpu = Path("/proc/cpuinfo")
     text = cpu.read_text(encoding="utf-8") if cpu.exists() else ""
     features = sorted(set(re.findall(r"^(?:flags|Features)\s*:.*", text, re.M)))
     versions = [f"{name} {version(name)}" for name in PACKAGES]
-    about = platform.python_version(), platform.machine(), os.cpu_count(), os.environ.get("XLA_FLAGS")
+    about = platform.python_version(), platform.machine(), len(may_use), *map(os.environ.get, THREADS)
     return *map(str, about), *versions, *features, device.device_kind, device.client.platform_version
-
-
-def _source(module: str) -> list[str]:
-    """Text and constants of a module and of all that it imports of this package, by name."""
-    found: dict[str, str] = {}
-    ahead = [module]
-    while ahead:
-        name = ahead.pop()
-        path = ROOT.parent / (name.replace(".", "/") + ".py")
-        if name not in found and path.exists():
-            found[name] = path.read_text(encoding="utf-8")
-            ahead += re.findall(r"^\s*(?:from|import) (emgs_jax[\w.]*)", found[name], re.M)
-    constants = {name: vars(sys.modules[name]) for name in found if name in sys.modules}
-    said = [f"{name}.{key}={value}" for name in sorted(constants) for key, value in _numbers(constants[name])]
-    return [*(found[name] for name in sorted(found)), *said]
-
-
-def _numbers(names: dict[str, Any]) -> list[tuple[str, Any]]:
-    return sorted((key, value) for key, value in names.items() if key.isupper() and isinstance(value, (int, float)))
 
 
 def _entry(digest: str) -> dict[str, Any] | None:

@@ -1,13 +1,13 @@
 """Settings of JAX: where executables are kept for the next process, and how much of a GPU's memory it takes."""
 
+import math
 import os
 import re
 import sys
+import tempfile
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
-
-from emgs_jax.io.files import check_writable
 
 MAX_BYTES = 2 * 2**30  # what was not used for longest goes first
 # Where a config says so, and where it has the words that will.
@@ -26,7 +26,8 @@ def use_compilation_cache(folder: str | None = "auto") -> None:
 
     Args:
         folder: `auto` is `cache_folder()`, but where JAX has been told a folder (JAX_COMPILATION_CACHE_DIR or
-            `jax.config`) that one stays, with its settings; None or `off` keeps nothing that nobody asked for.
+            `jax.config`) that one stays, with its settings; None or `off` keeps nothing that nobody asked for. One that
+            cannot be written to is read, and one line says so.
     """
     if folder is None or str(folder) in ("off", "False"):
         return
@@ -36,15 +37,21 @@ def use_compilation_cache(folder: str | None = "auto") -> None:
         return
     if str(folder) == "auto" and jax.config.jax_compilation_cache_dir is not None:
         return
-    path = cache_folder() if str(folder) == "auto" else Path(folder).expanduser()
     try:
-        check_writable(path, str(path))
-    except ValueError as error:
-        print(f"warning: nothing is kept of what JAX compiles, {error}", file=sys.stderr)
-        return
+        path = cache_folder() if str(folder) == "auto" else Path(folder).expanduser()
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path) as file:
+            file.write(b"is there room?")
+        is_kept = True
+    except (OSError, RuntimeError) as error:  # the second: no home
+        print(f"warning: nothing is kept of what JAX compiles: {error}", file=sys.stderr)
+        if not isinstance(error, OSError) or not os.access(path, os.R_OK | os.X_OK):
+            return
+        is_kept = False
     jax.config.update("jax_compilation_cache_dir", str(path))
-    jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    # To keep its bound JAX notes when a file was used; where it must not, nothing takes long enough to be kept.
+    jax.config.update("jax_compilation_cache_max_size", MAX_BYTES if is_kept else -1)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0 if is_kept else math.inf)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 

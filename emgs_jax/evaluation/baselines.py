@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from emgs_jax.data.backprojection import backproject
-from emgs_jax.evaluation.clouds import PointCloud, VoxelGrid, transform_cloud
+from emgs_jax.evaluation.clouds import PointCloud, SpooledCloud, transform_cloud
 from emgs_jax.geometry import Sim3, rotated
 from emgs_jax.ops.ranges import number
 
@@ -117,17 +117,18 @@ BaselineConfig = VoxelConfig | TsdfConfig
 
 class _Voxels:
     def __init__(self, config: VoxelConfig, pinhole: Pinhole) -> None:
-        self._config, self._pinhole, self._grid = config, pinhole, VoxelGrid(config.voxel_m)
+        self._config, self._pinhole, self._points = config, pinhole, SpooledCloud()
 
     def add(self, view: View, T_world_camera: np.ndarray, scale: float) -> None:
         motion = Sim3(scale, T_world_camera[:3, :3], T_world_camera[:3, 3])
-        self._grid.add(transform_cloud(view.cloud, motion))
+        self._points.append(transform_cloud(view.cloud, motion))
 
     def cloud(self) -> PointCloud:
-        return self._grid.cloud()
+        return self._points.averaged(self._config.voxel_m).cloud()
 
     def renderer(self) -> Draw:
-        cloud, counts = self.cloud(), self._grid.counts()
+        means = self._points.averaged(self._config.voxel_m)
+        cloud, counts = means.cloud(), means.counts()
         return lambda T: draw_voxels(cloud, counts, T, self._pinhole, self._config)
 
 

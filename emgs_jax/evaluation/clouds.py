@@ -2,13 +2,13 @@
 
 import os
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
 
 from emgs_jax.data.spool import Spool
 from emgs_jax.evaluation.trajectory import align
@@ -17,7 +17,8 @@ from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 _NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
-_MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
+_PART_ROWS = 500_000  # points that are averaged together: bounds the memory, does not change the result
+_SOME = 61  # every so manieth point says where a cloud is divided
 
 
 @dataclass(frozen=True)
@@ -75,11 +76,19 @@ def _columns(vertices: Mapping[str, np.ndarray], names: Sequence[str], path: obj
 
 
 def _fitted_normals(points: np.ndarray, num_neighbours: int) -> np.ndarray:
-    import open3d as o3d  # slow to import, and only clouds of other systems need it
+    """Normals (n, 3) of planes through the nearest distinct points, sign unknown; 0 where these lie on a line.
 
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(num_neighbours))
-    return np.asarray(cloud.normals)
+    In a mesh whose triangles share no vertices each point is there many times, which are one for a plane.
+    """
+    distinct, rows = np.unique(points, axis=0, return_inverse=True)
+    search, normals = NearestPoints(distinct), np.zeros_like(distinct)
+    for begin in range(0, len(distinct), _PART_ROWS // num_neighbours):
+        part = slice(begin, begin + _PART_ROWS // num_neighbours)
+        near = distinct[search.query(distinct[part], num_neighbours)[1]]
+        offsets = near - near.mean(1, keepdims=True)
+        spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
+        normals[part] = np.where(spread[:, 1:2] > 1e-6 * spread[:, 2:], axes[:, :, 0], 0.0)
+    return normals[rows.reshape(-1)]
 
 
 def transform_cloud(cloud: PointCloud, alignment: Sim3) -> PointCloud:
@@ -87,76 +96,104 @@ def transform_cloud(cloud: PointCloud, alignment: Sim3) -> PointCloud:
     return PointCloud(alignment.apply(cloud.points), rotated(cloud.normals, alignment.rotation), cloud.colors)
 
 
-class VoxelGrid:
-    """Averages all points that share a voxel [m] of the world grid, however they are spread over the clouds.
+@dataclass(frozen=True)
+class VoxelMeans:
+    """The mean of each occupied voxel of a cloud, in parts that need not be in memory together.
 
-    Rows come out ordered by cell, so the result is deterministic; points that are not finite are dropped.
+    Args:
+        parts: rows (n, 10) by the number of their cell, in one part and from part to part: point, normal (unit length,
+            or zero), colour, and how many points there were.
+        sizes: rows of each part.
     """
 
-    def __init__(self, voxel: float) -> None:
-        self._voxel = voxel
-        self._tables: list[tuple[np.ndarray, np.ndarray]] = []  # cells of the clouds; the first may hold many of them
+    parts: Spool
+    sizes: tuple[int, ...]
 
-    def add(self, cloud: PointCloud) -> None:
-        """Add the points of a cloud."""
-        self._tables.append(_cells(cloud, self._voxel))
-        if sum(len(keys) for keys, _ in self._tables[1:]) > max(_MERGE_ROWS, len(self._tables[0][0])):
-            self._tables = [_merge(self._tables)]
+    def __len__(self) -> int:
+        return sum(self.sizes)
+
+    def tables(self) -> Iterator[np.ndarray]:
+        """The rows of each part."""
+        return (self.parts[part] for part in range(len(self.sizes)))
+
+    def __iter__(self) -> Iterator[PointCloud]:
+        return map(_cloud, self.tables())
+
+    def rows(self, positions: np.ndarray) -> np.ndarray:
+        """Rows (m, 10) at positions (m,) in ascending order."""
+        ends = np.searchsorted(positions, np.cumsum(self.sizes))
+        chosen = np.split(positions, ends[:-1]) if self.sizes else []
+        begins = np.cumsum((0, *self.sizes))
+        found = [part[rows - begin] for part, rows, begin in zip(self.tables(), chosen, begins, strict=False)]
+        return np.concatenate([np.empty((0, 10), np.float32), *found])
 
     def cloud(self) -> PointCloud:
-        """The mean of each occupied voxel so far."""
-        sums = self._sums()
-        means = sums[:, :9] / sums[:, 9:]
-        length = np.linalg.norm(means[:, 3:6], axis=1, keepdims=True)
-        # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
-        normals = np.where(length > 0.1, means[:, 3:6] / np.maximum(length, 0.1), 0.0)
-        return PointCloud(means[:, :3], normals, means[:, 6:9])
+        """All of them."""
+        return _cloud(np.concatenate([np.empty((0, 10), np.float32), *self.tables()]))
 
     def counts(self) -> np.ndarray:
-        """Count the points that were averaged for each row of `cloud`."""
-        return self._sums()[:, 9]
-
-    def _sums(self) -> np.ndarray:
-        if len(self._tables) != 1:
-            self._tables = [_merge([(np.empty(0, np.int64), np.empty((0, 10))), *self._tables])]
-        return self._tables[0][1]
-
-
-def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
-    """Average the points of all clouds as a `VoxelGrid` does."""
-    grid = VoxelGrid(voxel)
-    for cloud in clouds:
-        grid.add(cloud)
-    return grid.cloud()
+        """Count the points of each row of `cloud`."""
+        return np.concatenate([np.empty(0), *(part[:, 9] for part in self.tables())])
 
 
 class SpooledCloud:
     """All points of many clouds, in a temporary file, averaged once the side of a voxel is known.
 
     What is not metric has a unit that only its alignment tells: 1 cm of the truth is .01 of one estimate's lengths and
-    .00001 of another's. float32 (n, 9) a cloud.
+    .00001 of another's. Rows (n, 9) of `dtype` a cloud; points that are not finite are dropped.
     """
 
-    def __init__(self) -> None:
-        self._parts, self._count = Spool(), 0
-        self._averaged: tuple[float, PointCloud] | None = None  # the last answer: one alignment serves several numbers
-        self._averaging = threading.Lock()  # threads that place the cloud differently ask for the same average
+    def __init__(self, dtype: type = np.float32) -> None:
+        self._parts, self._some, self._count, self._dtype = Spool(), [np.empty((0, 3), dtype)], 0, dtype
+        self._averaged: tuple[float, VoxelMeans] | None = None  # the last answer: one alignment serves several numbers
+        self._averaging = threading.Lock()
 
     def append(self, cloud: PointCloud) -> None:
         """Add the points of a cloud."""
-        self._parts.append(np.concatenate([cloud.points, cloud.normals, cloud.colors], axis=1).astype(np.float32))
-        self._count, self._averaged = self._count + len(cloud), None
+        rows = np.concatenate([cloud.points, cloud.normals, cloud.colors], axis=1)
+        rows = rows[np.isfinite(rows[:, :3]).all(axis=1)].astype(self._dtype)
+        self._parts.append(rows)
+        self._some.append(rows[::_SOME, :3].copy())
+        self._count, self._averaged = self._count + len(rows), None
 
     def __len__(self) -> int:
         return self._count
 
-    def averaged(self, voxel: float) -> PointCloud:
-        """The points, averaged per voxel [lengths of the clouds]."""
+    def averaged(self, voxel: float) -> VoxelMeans:
+        """The means of all points of each voxel [lengths of the clouds] of the world grid, however they were spread."""
         with self._averaging:
             if self._averaged is None or self._averaged[0] != voxel:
-                parts = (self._parts[row].astype(np.float64) for row in range(len(self._parts)))
-                self._averaged = voxel, fuse_clouds((PointCloud(p[:, :3], p[:, 3:6], p[:, 6:]) for p in parts), voxel)
+                parts = (self._parts[row] for row in range(len(self._parts)))
+                edges = _edges(np.concatenate(self._some), len(self), voxel)
+                self._averaged = voxel, _average(parts, edges, voxel)
             return self._averaged[1]
+
+
+def spooled(clouds: Iterable[PointCloud], dtype: type = np.float32) -> SpooledCloud:
+    """The points of all clouds, one in memory at a time."""
+    found = SpooledCloud(dtype)
+    for cloud in clouds:
+        found.append(cloud)
+    return found
+
+
+def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
+    """Average the points of all clouds per voxel, to float32."""
+    return spooled(clouds).averaged(voxel).cloud()
+
+
+def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
+    """Average the points of each voxel [m]; doing it twice changes nothing."""
+    return spooled([cloud], np.float64).averaged(voxel).cloud()
+
+
+def coarse_points(parts: Iterable[np.ndarray], voxel: float) -> np.ndarray:
+    """Mean (n, 3) of the points (m, 3) of all parts in each voxel; one part is in memory at a time."""
+    tables = [(np.empty(0, np.int64), np.empty((0, 4)))]
+    for points in parts:
+        tables.append(_sum_cells(cell_numbers(points, voxel), np.column_stack([points, np.ones(len(points))])))
+    _, sums = _sum_cells(*(np.concatenate(column) for column in zip(*tables, strict=True)))
+    return sums[:, :3] / sums[:, 3:]
 
 
 def cell_numbers(points: np.ndarray, voxel: float) -> np.ndarray:
@@ -164,7 +201,8 @@ def cell_numbers(points: np.ndarray, voxel: float) -> np.ndarray:
 
     What is farther than a million voxels shares the border cells.
     """
-    index = np.floor(np.clip(points / voxel, -(2.0**20), 2.0**20 - 1)).astype(np.int64) + 2**20
+    cells = np.asarray(points, np.float64) / voxel
+    index = np.floor(np.clip(cells, -(2.0**20), 2.0**20 - 1)).astype(np.int64) + 2**20
     return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
 
 
@@ -174,21 +212,12 @@ def cell_centers(numbers: np.ndarray, voxel: float) -> np.ndarray:
     return (index - 2**20 + 0.5) * voxel
 
 
-def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
-    """Average the points of each voxel [m]; doing it twice changes nothing."""
-    return fuse_clouds([cloud], voxel)
-
-
 class NearestPoints:
-    """Exact nearest neighbours among points (n, 3), by Open3D: SciPy's k-d tree takes twice as long for a scene.
-
-    Args:
-        points: (n, 3), of any unit.
-    """
+    """Exact nearest neighbours among points (n, 3) of any unit; other threads run while it builds and searches."""
 
     def __init__(self, points: np.ndarray) -> None:
         self.points = np.ascontiguousarray(points, np.float64)
-        self._search: Any = None
+        self._tree = cKDTree(self.points, balanced_tree=False)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -198,50 +227,80 @@ class NearestPoints:
         k = min(num_neighbours, len(self))
         if not k or not len(queries):
             return np.empty((len(queries), k)), np.empty((len(queries), k), np.int64)
-        import open3d as o3d  # slow to import, and only a comparison needs it
-
-        if self._search is None:
-            self._search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(self.points))
-            self._search.knn_index()
-        queries = o3d.core.Tensor(np.ascontiguousarray(queries, np.float64))
-        rows, squares = (found.numpy() for found in self._search.knn_search(queries, k))
-        return np.sqrt(squares), rows
+        return self._tree.query(queries, np.arange(1, k + 1), workers=-1)
 
 
 def register(points: np.ndarray, target: NearestPoints, max_distance: float, max_steps: int) -> Sim3:
     """Find the rigid motion of points (n, 3) onto those of a target by point-to-point ICP (Besl and McKay 1992).
 
-    Pairs are nearest points within `max_distance` [m]; ends when they stay the same. With fewer than 3 pairs nothing
-    holds the cloud: it stays where it is.
+    Pairs are nearest points within `max_distance` [m]; ends when a step moves them by less than a hundred
+    thousandth of it (RMS). With fewer than 3 pairs nothing holds the cloud: it stays where it is.
     """
-    found, known = Sim3(1.0, np.eye(3), np.zeros(3)), np.empty(0)
-    if not len(target):
-        return found
-    for _ in range(max_steps):
-        distances, partners = (values[:, 0] for values in target.query(found.apply(points)))
+    found, moved, shift = Sim3(1.0, np.eye(3), np.zeros(3)), points, np.inf
+    for _ in range(max_steps if len(target) else 0):
+        distances, partners = (values[:, 0] for values in target.query(moved))
         near = distances < max_distance
-        pairs = np.where(near, partners, -1)
-        if near.sum() < 3 or np.array_equal(pairs, known):
+        if near.sum() < 3 or shift < 1e-5 * max_distance:
             return found
-        found, known = align(points[near], target.points[partners[near]], with_scale=False), pairs
+        found = align(points[near], target.points[partners[near]], with_scale=False)
+        moved, before = found.apply(points), moved
+        shift = np.sqrt(np.mean(np.sum((moved - before)[near] ** 2, axis=1)))
     return found
 
 
-def _cells(cloud: PointCloud, voxel: float) -> tuple[np.ndarray, np.ndarray]:
-    """Reduce one cloud to its occupied cells: packed cell numbers (n,), sorted, and sums (n, 10), the last a count."""
-    finite = np.isfinite(cloud.points).all(axis=1)
-    points = np.asarray(cloud.points[finite], np.float64)
-    keys = cell_numbers(points, voxel)
-    rows = np.concatenate([points, cloud.normals[finite], cloud.colors[finite], np.ones((len(points), 1))], axis=1)
-    return _sum_cells(keys, rows)
+def _cloud(rows: np.ndarray) -> PointCloud:
+    return PointCloud(*(rows[:, begin : begin + 3].astype(np.float64) for begin in (0, 3, 6)))
 
 
-def _merge(tables: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    return _sum_cells(*(np.concatenate(column) for column in zip(*tables, strict=True)))
+def _edges(some: np.ndarray, count: int, voxel: float) -> np.ndarray:
+    """Numbers of the cells that part `count` points into ranges of about `_PART_ROWS`, as `some` (n, 3) are spread."""
+    numbers, num_parts = np.sort(cell_numbers(some, voxel)), -(-count // _PART_ROWS)
+    return numbers[len(numbers) * np.arange(1, num_parts) // max(num_parts, 1)]
+
+
+def _average(parts: Iterator[np.ndarray], edges: np.ndarray, voxel: float) -> VoxelMeans:
+    """Average rows (n, 9) per voxel; those of the cells between two `edges` are in memory at a time."""
+    spread, places = Spool(), [[] for _ in range(len(edges) + 1)]
+    for rows in _batches(parts):
+        which = np.searchsorted(edges, cell_numbers(rows[:, :3], voxel), side="right")
+        order = np.argsort(which, kind="stable")
+        ends = np.cumsum(np.bincount(which, minlength=len(places)))
+        for place, own in zip(places, np.split(order, ends[:-1]), strict=True):
+            if len(own):
+                place.append(spread.append(rows[own]))
+    found, sizes = Spool(), []
+    for place in filter(None, places):
+        means = _means(np.concatenate([spread[position] for position in place]), voxel)
+        found.append(means)
+        sizes.append(len(means))
+    return VoxelMeans(found, tuple(sizes))
+
+
+def _batches(parts: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+    """Rows of one part after the other, about `_PART_ROWS` together."""
+    pending: list[np.ndarray] = []
+    for part in parts:
+        for begin in range(0, len(part), _PART_ROWS):
+            pending.append(part[begin : begin + _PART_ROWS])
+            if sum(map(len, pending)) >= _PART_ROWS:
+                yield np.concatenate(pending)
+                pending = []
+    if pending:
+        yield np.concatenate(pending)
+
+
+def _means(rows: np.ndarray, voxel: float) -> np.ndarray:
+    """Rows of `VoxelMeans` of points with attributes (n, 9), of their precision."""
+    _, sums = _sum_cells(cell_numbers(rows[:, :3], voxel), np.column_stack([rows, np.ones(len(rows))]))
+    sums[:, :9] /= sums[:, 9:]
+    length = np.linalg.norm(sums[:, 3:6], axis=1, keepdims=True)
+    # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
+    sums[:, 3:6] = np.where(length > 0.1, sums[:, 3:6] / np.maximum(length, 0.1), 0.0)
+    return sums.astype(rows.dtype)
 
 
 def _sum_cells(keys: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sum the rows (n, 10) of equal keys (n,), in the order in which they stand."""
+    """Sum the rows (n, c) of equal keys (n,) to float64, in the order in which they stand."""
     order = np.argsort(keys, kind="stable")
     begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
     # A sparse matrix that picks the rows of each cell: whole rows are read once, whatever the number of columns.

@@ -8,10 +8,12 @@ from scipy.spatial import cKDTree
 from emgs_jax.evaluation.trajectory import rotation_angles
 
 MAX_GAP_M = 0.15  # layers farther apart may be two surfaces
+MAX_GAP = 4.0  # likewise where metres are not known, as a multiple of how far Gaussians stand apart
 MIN_COS = 0.9  # of their normals; the two sides of a board face opposite ways
 MIN_STDS = 2.0  # what is nearer is one layer, as thick as it is
 PLACE_M, PLACE_DEG = 1.0, 30.0  # two frames that are nearer than this show one place
 RIGHT_M, RIGHT_DEG = 0.3, 10.0  # a loop that errs by more is false
+_CHUNK = 512  # Gaussians whose neighbours are looked at together: of a desk each has a thousand within the gap
 REACH = 10  # frames by which a loop beside them finds the others of a visit
 
 
@@ -71,17 +73,20 @@ def _returning(truth: Sequence[np.ndarray | None], min_gap: int) -> list[int]:
     return found
 
 
-def double_wall_share(means: np.ndarray, normals: np.ndarray, covs: np.ndarray) -> float | None:
+def double_wall_share(
+    means: np.ndarray, normals: np.ndarray, covs: np.ndarray, metre: float | None = 1.0
+) -> float | None:
     """Share of Gaussians that have another beside them on a second layer.
 
     That is one with a normal alike, nearer across than Gaussians stand apart (median distance to the nearest one), and
-    along the normal between two standard deviations and 15 cm away. What truly stands that near behind another, facing
-    the same way, counts too: compare maps of one scene.
+    along the normal between two standard deviations and 15 cm away, or four times that distance where no metre is
+    known. What truly stands that near behind another, facing the same way, counts too: compare maps of one scene.
 
     Args:
-        means: (n, 3), metres.
-        normals: (n, 3), unit.
-        covs: (n, 3, 3), square metres.
+        means: (n, 3), in any unit.
+        normals: (n, 3), unit vectors.
+        covs: (n, 3, 3), of that unit squared.
+        metre: in that unit; None where it is not known.
 
     Returns:
         In [0, 1]; None for fewer than two Gaussians.
@@ -90,14 +95,30 @@ def double_wall_share(means: np.ndarray, normals: np.ndarray, covs: np.ndarray) 
         return None
     tree = cKDTree(means)
     spacing = float(np.median(tree.query(means, k=2)[0][:, 1]))
-    pairs = tree.query_pairs(float(np.hypot(spacing, MAX_GAP_M)), output_type="ndarray")
-    pairs = pairs[np.einsum("nd,nd->n", normals[pairs[:, 0]], normals[pairs[:, 1]]) > MIN_COS]
-    a, b = pairs.T
-    normal = normals[a] + normals[b]
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    offset = means[b] - means[a]
+    max_gap = MAX_GAP * spacing if metre is None else MAX_GAP_M * metre
+    is_double = np.zeros(len(means), bool)
+    for begin in range(0, len(means), _CHUNK):
+        near = cKDTree(means[begin : begin + _CHUNK]).sparse_distance_matrix(
+            tree, float(np.hypot(spacing, max_gap)), output_type="coo_matrix"
+        )
+        a, b = near.row + begin, near.col
+        rows = np.flatnonzero((a < b) & (np.einsum("nd,nd->n", normals[a], normals[b]) > MIN_COS))
+        a, b = a[rows], b[rows]
+        doubled = _is_behind(means[b] - means[a], normals[a] + normals[b], (covs[a], covs[b]), spacing, max_gap)
+        is_double[a[doubled]] = is_double[b[doubled]] = True
+    return float(is_double.mean())
+
+
+def _is_behind(
+    offset: np.ndarray,
+    normal: np.ndarray,
+    covs: tuple[np.ndarray, np.ndarray],
+    spacing: float,
+    max_gap: float,
+) -> np.ndarray:
+    """Test pairs (n,) for two layers, by their distance (n, 3), a normal of both (n, 3) and covariances (n, 3, 3)."""
+    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     gap = np.abs(np.einsum("nd,nd->n", offset, normal))
     across = np.sqrt(np.maximum(np.einsum("nd,nd->n", offset, offset) - gap**2, 0.0))
-    variance = [np.einsum("nd,nde,ne->n", normal, covs[row], normal) for row in (a, b)]
-    is_double = (across < spacing) & (gap > MIN_STDS * np.sqrt(np.maximum(*variance))) & (gap < MAX_GAP_M)
-    return len(np.unique(pairs[is_double])) / len(means)
+    std = np.sqrt(np.maximum(*(np.einsum("nd,nde,ne->n", normal, cov, normal) for cov in covs)))
+    return (across < spacing) & (gap > MIN_STDS * std) & (gap < max_gap)

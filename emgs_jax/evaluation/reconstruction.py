@@ -1,7 +1,7 @@
 """Distance of a reconstructed cloud from the true one: building both clouds, accuracy, completion, F1, normals."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +12,11 @@ from emgs_jax.evaluation.clouds import (
     NearestPoints,
     PointCloud,
     SpooledCloud,
+    VoxelMeans,
+    coarse_points,
     fuse_clouds,
     register,
+    spooled,
     transform_cloud,
     voxel_downsample,
 )
@@ -21,6 +24,7 @@ from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.geometry import Sim3
 from emgs_jax.ops.ranges import number
 
+Metrics = dict[str, float | int | str | None]
 _BAND_ROWS = 40  # of an image whose normals are fitted at a time: what is computed in between stays in the cache
 
 
@@ -39,6 +43,7 @@ class EvaluationConfig:
     icp_max_steps: int = number(low=0, high=10000)
     voxel_m: float = number(low=1e-4)
     max_points: int | None = number(low=1, high=1e9)  # compare a random choice of so many points of each cloud
+    num_sampled: int = number(low=1, high=1e9)  # points of the estimate whose distances to the truth are taken
     f1_thresholds_m: tuple[float, ...] = number(low=1e-9)
     max_normal_angle_deg: float = number(low=0, high=180)
     normal_radius_px: int = number(low=1, high=64)
@@ -138,10 +143,35 @@ def reference(truth: PointCloud, config: EvaluationConfig) -> Reference:
 
 def compare_clouds(
     cloud: PointCloud | SpooledCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
-) -> dict[str, float | int | str | None]:
-    """Bring the estimate's cloud into the frame of the truth, then measure how far they are apart."""
-    aligned, note = align_cloud(cloud, truth, poses, config)
-    return reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
+) -> Metrics:
+    """Bring the estimate's cloud into the frame of the truth as the protocol says; measure how far they are apart."""
+    return compare_placements(cloud, truth, poses, config, [config.icp_distance_m])[0]
+
+
+def compare_placements(
+    cloud: PointCloud | SpooledCloud,
+    truth: Reference,
+    poses: tuple[np.ndarray, np.ndarray],
+    config: EvaluationConfig,
+    icp_distances_m: Sequence[float],
+) -> list[Metrics]:
+    """Metrics of the estimate's cloud where its poses put it, moved from there by ICP of each distance (0: left there).
+
+    The alignment is that of the poses, estimated and true (n, 4, 4); what they leave open is noted, see `align_poses`.
+    A `SpooledCloud` is averaged by `voxel_m` of the truth before, so that its own unit does not matter. ICP moves the
+    cloud rigidly: the scale stays that of the poses.
+    """
+    alignment, note = align_poses(*poses, with_scale=config.alignment == "sim3")
+    is_spooled = isinstance(cloud, SpooledCloud)
+    own = cloud.averaged(own_voxel(alignment, config)) if is_spooled else [cloud]
+    precision = np.float32 if is_spooled else np.float64
+    source = coarse_points((alignment.apply(part.points) for part in own), config.icp_voxel_m)
+    found: dict[float, Metrics] = {}
+    for distance in {*icp_distances_m}:
+        placed = _moved(source, truth, distance, config) @ alignment
+        means = spooled((transform_cloud(part, placed) for part in own), precision).averaged(config.voxel_m)
+        found[distance] = _compare(means, truth, config) | {"reconstruction/alignment_note": note}
+    return [found[distance] for distance in icp_distances_m]
 
 
 def own_voxel(alignment: Sim3, config: EvaluationConfig) -> float:
@@ -149,62 +179,83 @@ def own_voxel(alignment: Sim3, config: EvaluationConfig) -> float:
     return config.voxel_m / alignment.scale if alignment.scale > 0 else config.voxel_m
 
 
-def align_cloud(
-    cloud: PointCloud | SpooledCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
-) -> tuple[PointCloud, str | None]:
-    """Bring the estimate's cloud into the frame of the truth; what the poses left open is noted, see `align_poses`.
-
-    The alignment is that of the poses, estimated and true (n, 4, 4). A `SpooledCloud` is averaged by `voxel_m` of the
-    truth, so that its own unit does not matter. ICP, where the protocol has it, then moves the
-    cloud rigidly: the scale stays that of the poses.
-    """
-    alignment, note = align_poses(*poses, with_scale=config.alignment == "sim3")
-    if isinstance(cloud, SpooledCloud):
-        cloud = cloud.averaged(own_voxel(alignment, config))
-    aligned = transform_cloud(cloud, alignment)
-    if config.icp_distance_m > 0:
-        source = voxel_downsample(aligned, config.icp_voxel_m).points
-        aligned = transform_cloud(
-            aligned, register(source, truth.icp_points, config.icp_distance_m, config.icp_max_steps)
-        )
-    return aligned, note
+def align_points(
+    points: np.ndarray, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
+) -> np.ndarray:
+    """Bring points (n, 3) of the estimate to where `compare_clouds` compares its cloud."""
+    alignment, _ = align_poses(*poses, with_scale=config.alignment == "sim3")
+    aligned = alignment.apply(points)
+    return _moved(coarse_points([aligned], config.icp_voxel_m), truth, config.icp_distance_m, config).apply(aligned)
 
 
-def reconstruction_metrics(
-    estimate: PointCloud, truth: Reference, config: EvaluationConfig
-) -> dict[str, float | int | str | None]:
+def _moved(source: np.ndarray, truth: Reference, distance: float, config: EvaluationConfig) -> Sim3:
+    """The motion of coarse points (n, 3) onto the truth; none for a distance of 0."""
+    return register(source, truth.icp_points, distance, config.icp_max_steps if distance > 0 else 0)
+
+
+def reconstruction_metrics(estimate: PointCloud, truth: Reference, config: EvaluationConfig) -> Metrics:
     """Compare two clouds in one frame; flat keys, metres and percent.
 
     Both clouds are averaged per voxel. Accuracy (estimate → truth) and completion (truth → estimate) are the
     protocol's statistic of the distances to the nearest point; unless it clips them, one far outlier counts in full.
-    The normal metrics take the nearest neighbours' |cos| and average both directions. Without points the values are
-    None, with a reason.
+    Accuracy and precision are those of `num_sampled` points of the estimate, evenly spread over its voxels; completion
+    and recall of all of the truth to all of the estimate. The normal metrics take the nearest neighbours' |cos| and
+    average both directions. Without points the values are None, with a reason.
     """
-    estimate, true = voxel_downsample(estimate, config.voxel_m), truth.cloud
-    metrics: dict[str, float | int | str | None] = dict.fromkeys(_metric_names(config))
-    metrics["reconstruction/num_points"] = len(estimate)
-    if not len(estimate) or not len(true):
-        which = "estimate" if not len(estimate) else "ground truth"
-        metrics["reconstruction/reason"] = f"the {which} has no points"
-        return metrics
+    return _compare(spooled([estimate], np.float64).averaged(config.voxel_m), truth, config)
+
+
+def _compare(means: VoxelMeans, truth: Reference, config: EvaluationConfig) -> Metrics:
+    """`reconstruction_metrics` of an estimate that is averaged already."""
+    empty: Metrics = dict.fromkeys(_metric_names(config)) | {"reconstruction/num_points": len(means)}
+    if not len(means) or not len(truth.cloud):
+        which = "estimate" if not len(means) else "ground truth"
+        return empty | {"reconstruction/reason": f"the {which} has no points"}
     rng = np.random.default_rng(0)  # one for both: equally long clouds must not keep the same rows
-    estimate, true = _chosen(estimate, config.max_points, rng), _chosen(true, config.max_points, rng)
-    of_truth = truth.points if true is truth.cloud else NearestPoints(true.points)
-    to_truth, partner = (values[:, 0] for values in of_truth.query(estimate.points))
-    to_estimate, back = (values[:, 0] for values in NearestPoints(estimate.points).query(true.points))
-    values = [_average(distances, config) for distances in (to_truth, to_estimate)]
+    if config.max_points is None:
+        some = means.rows(_spread(len(means), config.num_sampled, rng))
+        parts = means.tables() if len(some) < len(means) else ()
+    else:
+        some, parts = means.rows(_choice(len(means), config.max_points, rng)), ()
+    kept = _choice(len(truth.cloud), config.max_points, rng)
+    normals, of_truth = truth.cloud.normals[kept], truth.points
+    if len(kept) < len(truth.cloud):
+        of_truth = NearestPoints(truth.cloud.points[kept])
+    to_estimate, seen = _nearest_means(parts, some, of_truth.points)
+    to_truth, partners = (values[:, 0] for values in of_truth.query(some[:, :3]))
+    cosines = _abs_cosines(some[:, 3:6], normals[partners]), _abs_cosines(seen, normals)
+    return empty | _scores((to_truth, to_estimate), cosines, config)
+
+
+def _scores(distances: Sequence[np.ndarray], cosines: Sequence[np.ndarray], config: EvaluationConfig) -> Metrics:
+    """Metrics of distances and |cos| of normals, both from the estimate to the truth and back."""
+    values = [_average(both, config) for both in distances]
     for threshold in config.f1_thresholds_m:
-        precision, recall = 100.0 * np.mean(to_truth <= threshold), 100.0 * np.mean(to_estimate <= threshold)
+        precision, recall = (100.0 * np.mean(both <= threshold) for both in distances)
         f1 = 2.0 * precision * recall / max(precision + recall, 1e-12)
         values += [float(f1), float(precision), float(recall)]
-    both = [_abs_cosines(estimate.normals, true.normals[partner]), _abs_cosines(true.normals, estimate.normals[back])]
-    if all(len(cosines) for cosines in both):
-        limit = np.cos(np.radians(config.max_normal_angle_deg))
-        values.append(100.0 * float(np.mean([cosines.mean() for cosines in both])))
-        values.append(100.0 * float(np.mean([(cosines >= limit).mean() for cosines in both])))
-    else:
-        metrics["reconstruction/reason"] = "no normals to compare"
-    return metrics | dict(zip(_metric_names(config), values, strict=False))
+    reason: Metrics = {"reconstruction/reason": "no normals to compare"}
+    if all(map(len, cosines)):
+        limit, reason = np.cos(np.radians(config.max_normal_angle_deg)), {}
+        values.append(100.0 * float(np.mean([both.mean() for both in cosines])))
+        values.append(100.0 * float(np.mean([(both >= limit).mean() for both in cosines])))
+    return reason | dict(zip(_metric_names(config), values, strict=False))
+
+
+def _nearest_means(parts: Iterable[np.ndarray], some: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of each point (m, 3) to the nearest mean, and the normal (m, 3) there.
+
+    A part of the means is searched for those points that are nearer to it than to `some` (n, 10) of all parts.
+    """
+    distances, rows = (values[:, 0] for values in NearestPoints(some[:, :3]).query(points))
+    normals, x = some[rows, 3:6], points[:, 0]
+    for part in parts:
+        # Parts lie one behind the other along the first axis.
+        near = np.flatnonzero(np.maximum(part[:, 0].min() - x, x - part[:, 0].max()) < distances)
+        nearer, rows = (values[:, 0] for values in NearestPoints(part[:, :3]).query(points[near]))
+        closer = nearer < distances[near]
+        distances[near[closer]], normals[near[closer]] = nearer[closer], part[rows[closer], 3:6]
+    return distances, normals
 
 
 def _average(distances: np.ndarray, config: EvaluationConfig) -> float:
@@ -212,12 +263,18 @@ def _average(distances: np.ndarray, config: EvaluationConfig) -> float:
     return float(clipped.mean() if config.statistic == "mean" else np.sqrt(np.mean(np.square(clipped))))
 
 
-def _chosen(cloud: PointCloud, max_points: int | None, rng: np.random.Generator) -> PointCloud:
-    """At most `max_points` rows at random."""
-    if max_points is None or len(cloud) <= max_points:
-        return cloud
-    rows = np.sort(rng.choice(len(cloud), max_points, replace=False))
-    return PointCloud(cloud.points[rows], cloud.normals[rows], cloud.colors[rows])
+def _choice(count: int, at_most: int | None, rng: np.random.Generator) -> np.ndarray:
+    """Ascending numbers below `count`, at most so many of them at random."""
+    if at_most is None or count <= at_most:
+        return np.arange(count)
+    return np.sort(rng.choice(count, at_most, replace=False))
+
+
+def _spread(count: int, at_most: int, rng: np.random.Generator) -> np.ndarray:
+    """Likewise, one at random of each of `at_most` equal ranges."""
+    if count <= at_most:
+        return np.arange(count)
+    return ((np.arange(at_most) + rng.random(at_most)) * (count / at_most)).astype(np.int64)
 
 
 def _metric_names(config: EvaluationConfig) -> list[str]:

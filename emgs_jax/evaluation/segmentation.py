@@ -14,8 +14,8 @@ from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.class_file import ClassFile
 from emgs_jax.data.spool import Spool
-from emgs_jax.evaluation.clouds import NearestPoints, PointCloud, cell_centers, cell_numbers
-from emgs_jax.evaluation.reconstruction import EvaluationConfig, Reference, align_cloud, own_voxel
+from emgs_jax.evaluation.clouds import NearestPoints, cell_centers, cell_numbers
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, Reference, align_points, own_voxel
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.geometry import rotated
 from emgs_jax.io.ply_reader import read_vertices
@@ -64,13 +64,11 @@ def align_labels(
     poses: tuple[np.ndarray, np.ndarray],
     config: EvaluationConfig,
 ) -> LabelledPoints:
-    """Bring points with classes into the frame of the truth, as `align_cloud` does with those of a cloud."""
+    """Bring points with classes into the frame of the truth, as `align_points` does."""
     if isinstance(labels, SpooledLabels):
         alignment, _ = align_poses(*poses, with_scale=config.alignment == "sim3")
         labels = labels.points(own_voxel(alignment, config))
-    nothing = np.zeros_like(labels.points)
-    aligned, _ = align_cloud(PointCloud(labels.points, nothing, nothing), truth, poses, config)
-    return replace(labels, points=aligned.points)
+    return replace(labels, points=align_points(labels.points, truth, poses, config))
 
 
 def compare_labels(found: LabelledPoints, truth: LabelledPoints, num_neighbours: int) -> dict[str, float | int | None]:

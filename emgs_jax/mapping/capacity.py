@@ -14,6 +14,7 @@ import numpy as np
 
 from emgs_jax.device.arrays import on_device
 from emgs_jax.device.executables import call, outputs, ready
+from emgs_jax.device.fingerprint import fingerprint
 from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert
 from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.observation import Prediction, no_covariance, transform
@@ -25,7 +26,7 @@ from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state,
 
 _insert = eqx.filter_jit(insert)
 _init, _step = (calling(call)(function) for function in (init_state, step))  # by executables that are kept
-_prepared: set[tuple] = set()  # shapes whose step this process has compiled
+_prepared: set[tuple] = set()  # steps and shapes that this process has compiled
 
 
 def start(
@@ -103,7 +104,8 @@ def prepare_step(first: FirstWindow, camera: Camera, config: SlamConfig) -> None
         is_repeat=unknown,
     )
     map = _zeros(jax.eval_shape(lambda: empty_map(config.submap.map_capacity, view.features.shape[-1])))
-    key = jax.tree.structure((map, view, config)), tuple(leaf.shape for leaf in jax.tree.leaves((map, view)))
+    shapes = tuple(leaf.shape for leaf in jax.tree.leaves((map, view)))
+    key = fingerprint(step), jax.tree.structure((map, view, config)), shapes
     if key in _prepared:
         return
     state = SlamState(map, view, pose, _zeros(jax.eval_shape(exact_estimate)), on_device(np.int32(0)))

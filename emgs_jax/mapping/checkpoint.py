@@ -22,7 +22,7 @@ from emgs_jax.ops.ranges import number
 from emgs_jax.slam import SlamState
 
 CHECKPOINT_FILE = "checkpoint.npz"
-FORMAT, VERSION = "emgs_jax.checkpoint", 6
+FORMAT, VERSION = "emgs_jax.checkpoint", 7
 POSES = tuple(field.name for field in fields(FrameRecord) if field.name.endswith("pose"))
 MATRICES = dict.fromkeys(POSES, 4) | {"covariance": 6, "similarity": 4}  # of a record, and how many rows they have
 

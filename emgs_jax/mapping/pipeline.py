@@ -24,11 +24,11 @@ from emgs_jax.mapping.relocalization import (
 )
 from emgs_jax.mapping.run import MappingRun, TrackedFrame, record_lost, record_new_submap, record_start, record_step
 from emgs_jax.mapping.submaps import (
-    drop_unjoined_submaps,
     enter_submap,
     join_submaps,
     match_submap,
     return_to_world,
+    set_unjoined_apart,
     start_submap,
 )
 from emgs_jax.mapping.window_input import RawView, WindowInput, make_prior_query, window_inputs
@@ -75,7 +75,7 @@ def map_frames(
 
 def finish_run(run: MappingRun, is_interrupted: bool = False) -> MappingRun:
     """Complete a run after its last input; one that was interrupted gets the same unit, and is not optimized again."""
-    run = drop_unjoined_submaps(run)
+    run = set_unjoined_apart(run)
     if run.back_end is not None and not run.is_fixed and not is_interrupted:
         with run.clock.phase("back_end"):
             run = finish_back_end(run)

@@ -17,10 +17,12 @@ from emgs_jax.io.trajectory import to_tum
 from emgs_jax.localization import REASONS
 
 IN_MAP = ("tracked", "initialization")  # statuses of frames that the map holds
+APART = "apart"  # status of a frame that a submap holds which was never joined with the map
+UNPLACED = ("lost", APART)  # statuses of frames whose pose says nothing in the map
 # Outcomes of relocalization, `FrameRecord.location`; files have these words.
 RELOCALIZED, RESTARTED, NEW_SUBMAP, JOINED = "found", "anew", "segment", "joined"
 NOT_FOUND = "its place in the saved map is not found"
-UNJOINED = "its part was never joined with the map (unjoined)"
+UNJOINED = "its submap was never joined with the map (unjoined)"
 MANY_IN_A_ROW = 10  # single frames fail in every long sequence, so many together do not
 UNTRACKED = ("degraded", "lost")
 REMEDIES = dict(
@@ -51,7 +53,8 @@ class FrameRecord:
 
     Args:
         status: tracked, degraded (the coarse pose stays, nothing is fused), lost (not even that is known),
-            initialization (the map was made from it) or skipped (it cannot be read).
+            initialization (the map was made from it), apart (a submap holds it that was never joined with the map) or
+            skipped (it cannot be read).
         location: outcome of relocalization: `found`, and the run continues from there; `anew`, and the map restarts
             from its coarse pose; or the reason of the failure. `segment`: a disconnected submap starts; `joined`: this
             frame connects it.
@@ -67,8 +70,10 @@ class FrameRecord:
         depth_noise: how much the points differ from the map, as a fraction of their depth; None where none agrees.
         step_m: between the coarse and the fine pose.
         similarity: where it is `joined`, the motion of its submap into the other: (4, 4) with e^σ R in the place of R.
+        submap: number of the submap that holds it where it is apart; its pose is in that one's world.
         origin: frame whose Gaussians it was registered to (median of their births), counted from the map's first one.
         repeat_rms: robust standard deviation between the two predictions of the previous image, m.
+        left_out: pixels with a prediction that is not finite, behind the camera or farther than a map can hold.
         fused: points that moved Gaussians.
         updated: Gaussians that they moved.
         mean_log_joint: of the fused points with their best Gaussians.
@@ -99,8 +104,10 @@ class FrameRecord:
     step_m: float | None = None
     step_rad: float | None = None
     similarity: np.ndarray | None = None
+    submap: int | None = None
     origin: int | None = None
     repeat_rms: float | None = None
+    left_out: int = 0
     fused: int | None = None
     updated: int | None = None
     mean_log_joint: float | None = None

@@ -3,8 +3,11 @@
 A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; files write it as TUM's seven numbers.
 """
 
+import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import jax
@@ -17,11 +20,12 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.device.arrays import to_matrix
 from emgs_jax.device.clock import Clock
 from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.gaussians import MIN_ROWS, REFERENCE
 from emgs_jax.geometry import seen_from
 from emgs_jax.localization import REASONS
 from emgs_jax.loop_closure.prior_query import PriorQuery
 from emgs_jax.mapping.convert import to_camera
-from emgs_jax.mapping.records import NEW_SUBMAP, NOT_FOUND, RESTARTED, FrameRecord
+from emgs_jax.mapping.records import APART, NEW_SUBMAP, NOT_FOUND, RESTARTED, FrameRecord
 from emgs_jax.mapping.window_input import PlacedStructure, WindowInput
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
@@ -51,6 +55,7 @@ class MappingRun:
         prior_motion: of the prior's world since relocalization; None: the identity.
         structure: pose of the prior's own world, if it is not related to the first frame any more.
         inactive: states of the other disconnected submaps, by their number.
+        apart: states of submaps that were never joined, when the run has ended.
         worlds: other worlds of the prior that the run has been in, by their number.
         prior_query: predicts both visits of a loop, see `prior_queries`.
         first_covariance: (6, 6) of the first frame, as frames were placed, when the run has ended (`first_frame.py`).
@@ -66,6 +71,7 @@ class MappingRun:
     prior_motion: jaxlie.SE3 | None = None
     structure: PlacedStructure | None = None
     inactive: Mapping[int, SlamState] = field(default_factory=dict)
+    apart: Mapping[int, SlamState] = field(default_factory=dict)
     worlds: Mapping[int, LeftWorld] = field(default_factory=dict)
     prior_query: PriorQuery = lambda a, b: None
     first_covariance: np.ndarray | None = None
@@ -110,12 +116,37 @@ def new_run(
     """
     back_end = None if graph is None else BackEnd(graph, tuple(dataset.intrinsics), float(config.fit.min_std))
     clock, camera = Clock() if clock is None else clock, to_camera(dataset)
+    for words in clamped(config, camera):
+        warn_once(words)
     if saved is None:
         return MappingRun(camera, config, clock, back_end=back_end)
     if config.initialization == "merged":
         raise ValueError("map= places one view after the other: use slam.initialization=incremental with it")
     config = replace(config, submap=replace(config.submap, map_capacity=saved.map.weight.shape[0]))
     return MappingRun(camera, config, clock, back_end=saved.back_end, saved=saved)
+
+
+def clamped(config: SlamConfig, camera: Camera) -> list[str]:
+    """Say which settings have no effect on images of this size, and what is done instead."""
+    found, least = [], MIN_ROWS * config.observation.thin**2 * REFERENCE / (camera.width * camera.height)
+    if config.fit.points_per_gaussian < math.floor(least):
+        found.append(
+            f"slam.fit.points_per_gaussian={config.fit.points_per_gaussian} makes the Gaussians of "
+            f"{math.floor(least)}: fewer than {MIN_ROWS} points of an image of {camera.width}×{camera.height} with "
+            f"slam.observation.thin={config.observation.thin} have no covariance"
+        )
+    if config.em.num_neighbours > config.em.num_candidates:
+        found.append(
+            f"slam.em.num_neighbours={config.em.num_neighbours} finds no more than "
+            f"slam.em.num_candidates={config.em.num_candidates}"
+        )
+    return found
+
+
+@cache
+def warn_once(words: str) -> None:
+    """Print a warning that no later run of this process repeats."""
+    print(f"warning: {words}", file=sys.stderr)
 
 
 @dataclass(frozen=True)
@@ -212,6 +243,7 @@ def _add(run: MappingRun, window: WindowInput, row: int, **described: Any) -> Ma
         timestamp=frame.timestamp,
         raw_pose=window.raw[row].T_world_camera,
         true_pose=frame.T_world_camera,
+        left_out=window.raw[row].num_left_out,
         **described,
     )
     return replace(run, records=(*run.records, record))
@@ -252,8 +284,12 @@ def row_of_first_node(run: MappingRun) -> int:
 
 
 def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return poses and true poses (n, 4, 4) of the frames whose truth is known; None without any."""
-    pairs = [(pose, true) for pose, true in zip(poses, run.true_poses, strict=True) if true is not None]
+    """Return poses and true poses (n, 4, 4) of the frames whose truth is known; None without any.
+
+    Frames of submaps that were never joined are left out: their poses are in a world of their own.
+    """
+    rows = zip(poses, run.true_poses, run.records, strict=True)
+    pairs = [(pose, true) for pose, true, record in rows if true is not None and record.status != APART]
     if not pairs:
         return None
     estimate, truth = zip(*pairs, strict=True)

@@ -2,7 +2,7 @@
 
 A prior that has lost the first view may continue in a world of its own. There a new map starts, and the one before
 becomes inactive. Where a frame fits an inactive map, the similarity between its two poses joins both submaps: the newer
-one moves, poses, scales and Gaussians. Submaps that are never joined are dropped at the end.
+one moves, poses, scales and Gaussians. Submaps that are never joined are apart in the end.
 """
 
 from collections import Counter
@@ -21,7 +21,7 @@ from emgs_jax.geometry import Sim3, scale_covariance, scale_pose
 from emgs_jax.loop_closure.relocalization import RelocalizedPose
 from emgs_jax.mapping.capacity import add_map, advance, start
 from emgs_jax.mapping.convert import FirstWindow
-from emgs_jax.mapping.records import JOINED, UNJOINED, transform_record
+from emgs_jax.mapping.records import APART, IN_MAP, JOINED, UNJOINED, transform_record
 from emgs_jax.mapping.relocalization import (
     anchor_motion_of,
     as_step_prediction,
@@ -181,11 +181,8 @@ def join_factor(end: BackEnd, place: RelocalizedPose, unit: float) -> Factor:
     return Factor(a, b, measured, ratio, np.linalg.cholesky(information).T, is_loop=False)
 
 
-def drop_unjoined_submaps(run: MappingRun) -> MappingRun:
-    """Keep the submap of most placed frames, or the saved map's, and drop those that were never joined with it.
-
-    The other frames are lost: the poses of their submaps are placeholders.
-    """
+def set_unjoined_apart(run: MappingRun) -> MappingRun:
+    """Make the submap of most placed frames, or the saved map's, the run's map; the others stay as they are, apart."""
     if not run.inactive:
         return run
     end = run.back_end
@@ -208,6 +205,10 @@ def drop_unjoined_submaps(run: MappingRun) -> MappingRun:
     first, records = row_of_first_node(run) - end.first_node, list(run.records)
     for row in range(end.first_node, len(is_kept)):
         if not is_kept[row]:
-            records[first + row] = replace(records[first + row], status="lost", reason=UNJOINED, covariance=None)
-    state = {run.back_end.submap_id: run.state, **run.inactive}[kept]
-    return replace(run, state=state, inactive={}, back_end=end, records=tuple(records))
+            record = records[first + row]
+            status = APART if record.status in IN_MAP else "lost"
+            known = {"submap": end.submap_ids[row], "covariance": record.covariance if status == APART else None}
+            records[first + row] = replace(record, status=status, reason=UNJOINED, **known)
+    states = {run.back_end.submap_id: run.state, **run.inactive}
+    state = states.pop(kept)
+    return replace(run, state=state, inactive={}, apart=states, back_end=end, records=tuple(records))

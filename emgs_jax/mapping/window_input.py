@@ -10,9 +10,11 @@ import numpy as np
 from emgs_jax.back_end.factors import FrameData
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.device.clock import Clock, Timer
+from emgs_jax.device.executables import forget_replaced
 from emgs_jax.loop_closure.prior_query import JointPrediction, PriorQuery
 from emgs_jax.mapping.convert import FirstWindow, opening, to_first_window, to_prediction
 from emgs_jax.observation import Prediction
+from emgs_jax.ops.ranges import MAX_LENGTH_M
 from emgs_jax.prior.base import Prior, PriorPrediction, check_unit, visits, windows, with_frames
 from emgs_jax.slam import SlamConfig
 
@@ -20,7 +22,8 @@ from emgs_jax.slam import SlamConfig
 class RawView(NamedTuple):
     """Raw prediction of a frame: points (h, w, 3), camera frame, and the mask of those that are confident enough.
 
-    The mapping leaves out points without a normal as well.
+    The mapping leaves out points without a normal as well. `num_left_out` points that the prior gives are none: not
+    finite, behind the camera, or farther than a map can hold.
     """
 
     points: np.ndarray
@@ -28,6 +31,7 @@ class RawView(NamedTuple):
     image: np.ndarray
     T_world_camera: np.ndarray  # of the frame before where the prior has none
     features: np.ndarray  # (y, x, f), a grid that covers the image
+    num_left_out: int = 0
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,7 @@ def window_inputs(
         ValueError: no frame has a point and a pose from which a map can start, or predictions are in no unit that
             thresholds are for.
     """
+    forget_replaced()
     done: dict[int, np.ndarray] = {}  # raw poses
     is_started, clock, structure, known = False, clock or Clock(), 0, set()
     for prediction, frames in predictions(dataset, prior, config.window_size, clock):
@@ -181,12 +186,15 @@ def _raw_views(
     for row, index in enumerate(window.dense):
         if index in known:
             continue
-        mask = prediction.mask[row] & (prediction.confidence[row] >= float(config.observation.min_confidence))
+        points, confidence = prediction.points[row], prediction.confidence[row]
+        given = prediction.mask[row] & ~(confidence < float(config.observation.min_confidence))
+        is_sound = (np.abs(points) < MAX_LENGTH_M).all(axis=-1) & (points[..., 2] > 0) & np.isfinite(confidence)
+        mask = given & is_sound
         pose = anchor @ _poses(prediction)[index] if structure == 0 else _pose_after(prediction, index, known)
         if not np.isfinite(pose).all():
             pose, mask = known.get(index - 1, anchor), np.zeros_like(mask)
         image, features = frames[index].image, prediction.features[row]
-        views[index] = RawView(prediction.points[row], mask, image, pose, features)
+        views[index] = RawView(points, mask, image, pose, features, int(np.sum(given & ~is_sound)))
         known[index] = pose
     return views
 

@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.ops.pytree import static, traced
 
-NEAREST_DEPTH = 1e-3  # m; a point nearer than this, or behind the camera, has no pixel
+NEAREST_DEPTH = 1e-6  # m; a point nearer than this, or behind the camera, has no pixel
 
 
 class Camera(eqx.Module):
@@ -49,9 +49,10 @@ def nearest_pixel(pixels: Float[Array, "*b 2"], size: tuple[int, int]) -> tuple[
     The number is 0 where it is not.
     """
     height, width = size
-    column, row = jnp.moveaxis(jnp.round(pixels).astype(jnp.int32), -1, 0)
+    column, row = jnp.moveaxis(jnp.round(pixels), -1, 0)  # which may be larger than any integer
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return jnp.where(inside, row * width + column, 0), inside
+    column, row = (jnp.where(inside, x, 0.0).astype(jnp.int32) for x in (column, row))
+    return row * width + column, inside
 
 
 def rays(camera: Camera, pixels: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:

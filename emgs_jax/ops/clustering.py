@@ -66,4 +66,6 @@ def kmeans(
         return centroids + total[:, :3] / jnp.maximum(count, 1.0)[:, None], exists & (count > 0), count
 
     start = seeds, seed_exists, seed_exists.astype(seeds.dtype)
+    if num_iterations == 0:  # the seeds, with the points that are nearest to each
+        return seeds, *iterate(jnp.zeros((), jnp.int32), start)[1:]
     return jax.lax.fori_loop(0, num_iterations, iterate, start)

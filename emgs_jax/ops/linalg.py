@@ -6,6 +6,7 @@ stay finite too.
 
 from typing import TypeAlias
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -14,6 +15,8 @@ Whitening: TypeAlias = tuple[Float[Array, "n 6"], Float[Array, "n"]]  # what `wh
 
 # Below this length (m) a vector has no direction; far under any distance that is measured, far above float32's least.
 SMALLEST_LENGTH = 1e-12
+# Of a covariance's trace: what float32 loses of its entries, and the least variance that can be told from none.
+ROUNDED, FLATTEST = 2.0**-22, 2.0**-28
 
 
 def safe_normalize(vectors: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
@@ -54,33 +57,71 @@ def inverse_3x3(covs: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
 def whitening(covs: Float[Array, "*b 3 3"]) -> tuple[Float[Array, "*b 6"], Float[Array, "*b"]]:
     """W = L⁻¹ for the Cholesky factor Σ = L L', and log|Σ|; W x has unit covariance, and |W x|² = x' Σ⁻¹ x.
 
+    By the leading minors of Σ, whose terms cancel where it is flat and are summed in twice the precision. What is
+    flatter than rounding lets its entries tell counts as that flat, a ratio of widths of some ten thousand.
+
     Returns:
-        The lower triangle of W, row by row, and the log-determinant; those of the identity where Σ is not positive.
+        The lower triangle of W, row by row, and the log-determinant; those of the identity where a variance is negative
+        or none is positive.
     """
     trace = jnp.trace(covs, axis1=-2, axis2=-1)
-    scale = jnp.where(trace > 0, trace, 1.0)
-    a, b, c, d, e, f = (covs[..., row, column] / scale for row, column in zip(*jnp.tril_indices(3), strict=True))
-    # Pivots d_i and unit factors of L D L'; every pivot is made positive before it divides.
-    first = jnp.where(a > 0, a, 1.0)
-    x, y = b / first, d / first
-    second = c - b * x
-    safe_second = jnp.where(second > 0, second, 1.0)
-    z = (e - d * x) / safe_second
-    third = f - d * y - (e - d * x) * z
-    is_positive = (trace > 0) & (a > 0) & (second > 0) & (third > 0)
-    safe_third = jnp.where(third > 0, third, 1.0)
-    pivots = (first, safe_second, safe_third)
-    i, j, k = (1.0 / jnp.sqrt(scale * pivot) for pivot in pivots)
-    triangle = jnp.stack([i, -x * j, j, (x * z - y) * k, -z * k, k], axis=-1)
-    logdet = sum(jnp.log(pivot) for pivot in pivots) + 3.0 * jnp.log(scale)
-    identity = jnp.array([1.0, 0.0, 1.0, 0.0, 0.0, 1.0], covs.dtype)
-    return jnp.where(is_positive[..., None], triangle, identity), jnp.where(is_positive, logdet, 0.0)
+    # A power of two, which rounds no entry.
+    scale = jax.lax.stop_gradient(jax.lax.reduce_precision(jnp.where(trace > 0, trace, 1.0), 8, 0))
+    variances = jnp.diagonal(covs, axis1=-2, axis2=-1) / scale[..., None]
+    is_positive = (trace > 0) & (jnp.min(variances, axis=-1) >= -ROUNDED)
+    scaled = jnp.where(is_positive[..., None, None], covs / scale[..., None, None], jnp.eye(3))
+    a, b, c, d, e, f = (scaled[..., row, column] for row, column in zip(*jnp.tril_indices(3), strict=True))
+    first = jnp.where(a > FLATTEST, a, FLATTEST)
+    # Of the last row of the adjugate, each a sum of two parts: x + y is the minor.
+    of_d, of_e, of_f = minor_2x2(b, e, d, c), minor_2x2(d, b, e, first), minor_2x2(first, c, b, b)
+    least = first * FLATTEST
+    second = jnp.maximum(sum(of_f), least)
+    products = [two_product(x, y[0]) for x, y in ((d, of_d), (e, of_e), (f, of_f))]
+    total, lost = two_sum(products[0][0], products[1][0])
+    total, more = two_sum(total, products[2][0])
+    det = total + (lost + more + sum(part[1] for part in products) + d * of_d[1] + e * of_e[1] + f * of_f[1])
+    third = jnp.maximum(det, second * FLATTEST)
+    unit = jnp.where(is_positive, scale, 1.0)
+    i, j, k = (1.0 / jnp.sqrt(x) for x in (first, second, third))
+    entries = jnp.stack([i, -b * i * j, first * i * j, sum(of_d) * j * k, sum(of_e) * j * k, second * j * k], axis=-1)
+    return entries / jnp.sqrt(unit)[..., None], jnp.log(third) + 3.0 * jnp.log(unit)
+
+
+def two_product(first: Float[Array, "*b"], second: Float[Array, "*b"]) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+    """A product, and what its rounding loses (Dekker 1971); that has no gradient."""
+    product = first * second
+    high, other_high = (jax.lax.reduce_precision(x, exponent_bits=8, mantissa_bits=11) for x in (first, second))
+    low, other_low = first - high, second - other_high
+    lost = ((high * other_high - product) + high * other_low + low * other_high) + low * other_low
+    return product, jax.lax.stop_gradient(lost)
+
+
+def two_sum(first: Float[Array, "*b"], second: Float[Array, "*b"]) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+    """A sum, and what its rounding loses (Knuth); that has no gradient."""
+    total = first + second
+    part = total - first
+    return total, jax.lax.stop_gradient((first - (total - part)) + (second - part))
+
+
+def minor_2x2(
+    a: Float[Array, "*b"], b: Float[Array, "*b"], c: Float[Array, "*b"], d: Float[Array, "*b"]
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+    """a b - c d as a sum of two numbers, in twice the precision."""
+    (one, lost), (other, more) = two_product(a, b), two_product(-c, d)
+    total, rest = two_sum(one, other)
+    return total, rest + lost + more
+
+
+def floored(covs: Float[Array, "*b 3 3"], min_std: Float[Array, ""]) -> Float[Array, "*b 3 3"]:
+    """Σ + σ² I with σ² = min_std², or what keeps a very wide Σ positive where its entries are rounded."""
+    trace = jnp.trace(covs, axis1=-2, axis2=-1)
+    return covs + (min_std**2 + ROUNDED * trace)[..., None, None] * jnp.eye(3)
 
 
 def inverse_2x2(matrices: Float[Array, "*b 2 2"]) -> Float[Array, "*b 2 2"]:
     """Inverse of symmetric positive 2×2 matrices; zero where the determinant is not positive."""
     a, b, c = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]
-    det = a * c - b * b
+    det = sum(minor_2x2(a, c, b, b))
     is_positive = det > 0
     adjugate = jnp.stack([jnp.stack([c, -b], -1), jnp.stack([-b, a], -1)], -2)
     return jnp.where(is_positive[..., None, None], adjugate / jnp.where(is_positive, det, 1.0)[..., None, None], 0.0)
@@ -124,6 +165,12 @@ def between(first: Float[Array, "b q d"], second: Float[Array, "b c d"]) -> Entr
 def dot(first: Entries, second: Entries) -> Float[Array, "..."]:
     """Inner product."""
     return sum((a * b for a, b in zip(first, second, strict=True)), start=jnp.zeros(()))
+
+
+def cross(first: Entries, second: Entries) -> Entries:
+    """Cross product."""
+    (a, b, c), (x, y, z) = first, second
+    return b * z - c * y, c * x - a * z, a * y - b * x
 
 
 def whiten(triangle: Entries, vector: Entries) -> Entries:

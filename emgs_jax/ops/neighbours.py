@@ -12,14 +12,18 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from emgs_jax.ops.linalg import between, dot
 from emgs_jax.ops.pytree import fill_rows, join_rows, split_rows
+from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 GROUP = 16  # points per group: near each other
 NUM_GROUPS = 24  # groups that a block of queries looks into
 BLOCK = 8  # queries of a block of `knn`
 LEAST_LISTED = 32  # points near a block of queries, of which six times as many as are wanted
 RANKED = 12  # values that are compared with all others at once
-CURVE_BITS = 8  # per axis, of the cells of the Hilbert curve
+CURVE_BITS = 10  # per axis, of the cells of the Hilbert curve
+NUM_SAMPLED = 64  # positions by whose gaps those cells are laid
+WIDE_GAP = 16.0  # of the usual one; wider ones between positions are cut to that
 FAR = 1e18  # m; where what does not count stands: its squared distance is finite, and larger than any other
+FAR_SQ = 0.5 * FAR**2  # m²; less is the distance of two that count
 MAX_BLOCKS = 4096  # which are compared with their groups at once; more are done one part after the other
 
 
@@ -54,16 +58,45 @@ class Nearby(eqx.Module):
     beyond_sq: Float[Array, "b"]
 
 
+def is_within_reach(positions: Float[Array, "*m d"]) -> Bool[Array, "*m"]:
+    """Positions that are finite, and along each axis within what a map can hold."""
+    return jnp.all(jnp.abs(positions) < MAX_LENGTH_M, axis=-1)
+
+
 def curve_order(positions: Float[Array, "m d"], counts: Bool[Array, "m"]) -> Int[Array, "m"]:
-    """Rows along the Hilbert curve through the box of those that count; the others come last."""
+    """Rows along the Hilbert curve through those that count; the others come last."""
+    number = _curve(_cells(positions, counts))
+    return jnp.argsort(jnp.where(counts, number, jnp.iinfo(jnp.int32).max))
+
+
+def _cells(positions: Float[Array, "m d"], counts: Bool[Array, "m"]) -> Int[Array, "m d"]:
+    """Cells along each axis, of one size but where nothing is.
+
+    Some positions tell the gaps along an axis. One that is much wider than most is cut, so that a point far away, or
+    another room, leaves the cells of the others as small as they were.
+    """
     low = jnp.min(jnp.where(counts[:, None], positions, jnp.inf), axis=0)
     high = jnp.max(jnp.where(counts[:, None], positions, -jnp.inf), axis=0)
-    return jnp.argsort(jnp.where(counts, _curve(positions, low, high), jnp.iinfo(jnp.int32).max))
+    place = jnp.cumsum(counts)
+    # Multiples of the golden section: no stride that rows of pixels may have, too.
+    wanted = jnp.floor(jnp.mod(0.618034 * jnp.arange(NUM_SAMPLED), 1.0) * place[-1])
+    rows = jnp.searchsorted(place, wanted.astype(place.dtype), side="right")
+    some = jnp.take(positions, rows, axis=0, mode="clip")
+    known = jnp.sort(jnp.concatenate([low[None], some, high[None]]), axis=0)
+    gaps = jnp.diff(known, axis=0)
+    usual = jnp.max(jnp.median(gaps, axis=0))
+    cut = jnp.minimum(gaps, jnp.where(usual > 0, WIDE_GAP * usual, jnp.inf))
+    ends = jnp.concatenate([jnp.zeros_like(cut[:1]), jnp.cumsum(cut, axis=0)])
+    size = jnp.max(ends)
+    placed = jax.vmap(jnp.interp, in_axes=1, out_axes=1)(positions, known, ends)
+    scaled = placed * (2**CURVE_BITS / jnp.where((size > 0) & jnp.isfinite(size), size, 1.0))
+    return jnp.clip(jnp.where(jnp.isfinite(scaled), scaled, 0.0), 0, 2**CURVE_BITS - 1).astype(jnp.int32)
 
 
 def group_points(points: Float[Array, "n d"], valid: Bool[Array, "n"], order: Int[Array, "n"] | None = None) -> Groups:
     """Groups of the valid points along `order`; None: along the curve."""
     points = jax.lax.stop_gradient(points)  # a row number has no gradient
+    valid &= is_within_reach(points)
     order = curve_order(points, valid) if order is None else order
     counts = fill_rows(valid[order], GROUP, False).reshape(-1, GROUP)
     members = fill_rows(points[order], GROUP, FAR).reshape(-1, GROUP, points.shape[1])
@@ -88,13 +121,13 @@ def nearby(
     """The `count` points nearest to any query of each block, of those in the groups whose boxes are nearest to it.
 
     Args:
-        asked: those that count; one that is not finite never does.
+        asked: those that count; one that is not within reach never does.
         count: length of the list, static; not more than NUM_GROUPS groups hold.
         size: queries of a block, static.
         order: of the queries, `size` consecutive ones are a block; None: along the curve.
     """
     queries, groups = jax.lax.stop_gradient((queries, groups))
-    asked &= jnp.all(jnp.isfinite(queries), axis=-1)
+    asked &= is_within_reach(queries)
     order = curve_order(queries, asked) if order is None else order
     rows = fill_rows(order, size, queries.shape[0]).reshape(-1, size)
     counts = fill_rows(asked[order], size, False).reshape(-1, size)
@@ -128,7 +161,7 @@ def _nearest_to_any(
     rows = groups.rows[jnp.take_along_axis(near, best // GROUP, axis=1), best % GROUP]
     if count < nearest_sq.shape[1]:  # what is nearby beside the list
         beyond_sq = jnp.minimum(beyond_sq, -jnp.min(negative, axis=1))
-    return rows, negative > -FAR, beyond_sq
+    return rows, negative > -FAR_SQ, beyond_sq
 
 
 def _distance_to_boxes_sq(low: Float[Array, "b d"], high: Float[Array, "b d"], groups: Groups) -> Float[Array, "b g"]:
@@ -199,6 +232,7 @@ def knn(
     """
     queries, points = jax.lax.stop_gradient((queries, points))  # a row number has no gradient
     asked = jnp.ones(queries.shape[0], bool) if asked is None else asked
+    valid &= is_within_reach(points)
     groups = group_points(points, valid)
     near, distance_sq, rank = _ranked(queries, asked, points, groups, BLOCK, max(6 * k, LEAST_LISTED), None)
     found = _first(near, distance_sq, rank, k, queries.shape[0])
@@ -212,7 +246,7 @@ def knn(
         block = open_blocks[number]
         distance_sq = jnp.sum((blocks[block][:, None] - points) ** 2, axis=-1)
         negative, rows = jax.lax.top_k(-jnp.where(valid, distance_sq, jnp.inf), k)
-        return found.at[near.queries[block]].set(jnp.where(negative > -FAR, rows, -1), mode="drop")
+        return found.at[near.queries[block]].set(jnp.where(negative > -FAR_SQ, rows, -1), mode="drop")
 
     return _existing(jax.lax.fori_loop(0, jnp.sum(is_open), look_at_all, found))
 
@@ -239,7 +273,7 @@ def _first(
     near: Nearby, distance_sq: Float[Array, "b q c"], rank: Int[Array, "b q c"], k: int, num_queries: int
 ) -> Int[Array, "m k"]:
     """Rows of the k that rank first, in the order of the queries; -1 where there is none."""
-    rows = jnp.where(distance_sq < FAR, near.rows[:, None], -1)
+    rows = jnp.where(distance_sq < FAR_SQ, near.rows[:, None], -1)
     # Each row goes to its query and rank; what comes after the k nearest falls off the end.
     return jnp.full((num_queries, k), -1, rows.dtype).at[near.queries[..., None], rank].set(rows, mode="drop")
 
@@ -269,15 +303,12 @@ def ranks(values: Float[Array, "*b c"]) -> Int[Array, "*b c"]:
     return jax.lax.fori_loop(0, -(-num // RANKED), compare, jnp.zeros(keys.shape, jnp.int32))
 
 
-def _curve(positions: Float[Array, "m d"], low: Float[Array, "d"], high: Float[Array, "d"]) -> Int[Array, "m"]:
-    """Number of every position's cell along the Hilbert curve through the box; outside of it, the nearest cell's.
+def _curve(cells: Int[Array, "m d"]) -> Int[Array, "m"]:
+    """Number of every cell along the Hilbert curve.
 
     Source: Skilling, "Programming the Hilbert curve", AIP Conf. Proc. 707, 2004. Consecutive cells touch, so that
     groups are compact: a search takes an eighth less time than along the Z curve.
     """
-    size = jnp.max(high - low)
-    scaled = (positions - low) * (2**CURVE_BITS / jnp.where((size > 0) & jnp.isfinite(size), size, 1.0))
-    cells = jnp.clip(jnp.where(jnp.isfinite(scaled), scaled, 0.0), 0, 2**CURVE_BITS - 1).astype(jnp.int32)
     axes = list(jnp.unstack(cells, axis=1))
     for bit in range(CURVE_BITS - 1, 0, -1):  # undo the turns of every cube, from the largest on
         lower = (1 << bit) - 1

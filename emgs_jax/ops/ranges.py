@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-MAX_LENGTH_M = 1e6  # of a coordinate that is read; what is farther is damaged, or no length in metres
+MAX_LENGTH_M = 1e6  # of a coordinate; what is farther is damaged, or no length in metres: no map holds it
 LARGE = 1e6  # what a field without a bound of its own may reach
 
 

@@ -108,7 +108,7 @@ class Recorded(Prior):
         pose_std: of every pose, a length in the recording's unit and degrees, in place of what is recorded; None: that.
     """
 
-    def __init__(self, folder: Path | str, pose_std: Sequence[float] | None) -> None:
+    def __init__(self, folder: Path | str, pose_std: Sequence[float] | None = None) -> None:
         self.folder, self._pose_std = Path(folder), check_pose_std(pose_std)
         self._manifest = _read_manifest(self.folder)
         if not self._manifest["complete"]:

@@ -1,6 +1,7 @@
 """ICP against Gaussians as one Levenberg–Marquardt solve."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import TypeAlias
 
@@ -27,7 +28,7 @@ from emgs_jax.registration.problem import (
     data_information,
     distances,
     information,
-    largest_std,
+    least_information,
     matches_at,
     pose_of,
     pose_problem,
@@ -50,8 +51,8 @@ class IcpInfo(eqx.Module):
         level_edges: where these levels end.
         information: of the points alone, of (xi, log s).
         num_effective: how many independent measurements the points are worth, see `num_independent`.
-        pose_std: of the pose in its least certain direction, by the prior and by planes and colours together:
-            translation in median depths, rotation in rad; inf where nothing determines it.
+        min_eigenvalue: of the pose's information by prior, planes and colours together, for translations in median
+            depths and rotations in rad: the variance of its least certain direction is one over it.
         num_steps: of all solves.
         is_converged: False where the last solve reached `max_steps` or failed.
     """
@@ -64,7 +65,7 @@ class IcpInfo(eqx.Module):
     level_edges: Float[Array, "e"]
     information: Float[Array, "7 7"]
     num_effective: Float[Array, ""]
-    pose_std: Float[Array, ""]
+    min_eigenvalue: Float[Array, ""]
     num_steps: Int[Array, ""]
     is_converged: Bool[Array, ""]
 
@@ -96,20 +97,24 @@ def _observed(
 
 def _search_and_solve(
     carry: _Carry,
-    is_first: Bool[Array, ""],
+    look: tuple[Bool[Array, ""], Bool[Array, ""]],
     problem_of: Callable[[Uncertainty], Problem],
     levels: Int[Array, "p"],
     noise: Float[Array, ""],
     config: IcpConfig,
 ) -> tuple[_Carry, tuple[Candidates, Int[Array, ""], Bool[Array, ""]]]:
-    """Look up the Gaussians near every point, see how well the points fit them, and solve for y from there."""
-    y, before = carry
+    """Look up the Gaussians near every point, see how well the points fit them, and solve for y from there.
+
+    Args:
+        look: whether the misfit here is that of the coarse pose, and that of the points.
+    """
+    (y, before), (is_first, is_new) = carry, look
     problem = problem_of(before)
     candidates = candidates_at(y, problem, config)
     seen, _, _ = _observed(y, matches_at(y, candidates, problem, config), levels, problem, noise, config)
     # y is the coarse pose at first, and only then do the distances say what that is worth.
     common = jnp.where(is_first, seen.common, before.common)
-    uncertainty = Uncertainty(common=common, depth=seen.depth, num_effective=seen.num_effective)
+    uncertainty = jax.tree.map(partial(jnp.where, is_new), replace(seen, common=common), replace(before, common=common))
     # Seven unknowns: on a CPU the normal equations take a fraction of a QR of all rows.
     solver = optx.LevenbergMarquardt(
         rtol=config.tolerance, atol=config.tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
@@ -138,7 +143,8 @@ def icp(
 
     Its noise is a lower bound. Where the points do not fit the map at the coarse pose as well as that, the coarse pose
     is worth no more than they fit there, and the depths no more than they fit where they are looked up: a prior may
-    repeat itself exactly and still err.
+    repeat itself exactly and still err. A pose that is given with its uncertainty keeps that: where its points do not
+    fit, the error is theirs.
 
     Args:
         source: points to align, camera frame.
@@ -158,7 +164,8 @@ def icp(
     levels = levels_of(source.confidence, edges)
     step = partial(_search_and_solve, problem_of=problem_of, levels=levels, noise=noise, config=config)
     given = Uncertainty(common=noise, depth=jnp.full(source.valid.shape, noise), num_effective=jnp.ones(()))
-    (y, uncertainty), rounds = jax.lax.scan(step, (jnp.zeros(7), given), jnp.arange(config.num_searches) == 0)
+    is_first = jnp.arange(config.num_searches) == 0
+    (y, uncertainty), rounds = jax.lax.scan(step, (jnp.zeros(7), given), (is_first, is_first | ~start.is_given))
     candidates, _, is_converged = jax.tree.map(lambda leaf: leaf[-1], rounds)
     problem = problem_of(uncertainty)
     matches = matches_at(y, candidates, problem, config)
@@ -174,7 +181,7 @@ def icp(
         level_edges=edges,
         information=data_information(y, matches, problem, config),
         num_effective=seen.num_effective,
-        pose_std=largest_std(information(T, scale, matches, problem, config), problem),
+        min_eigenvalue=least_information(information(T, scale, matches, problem, config), problem),
         num_steps=jnp.sum(rounds[1]),
         is_converged=is_converged,
     )

@@ -98,6 +98,7 @@ def match(
     best = jnp.argmin(distance_sq, axis=-1)[:, None]
     row = jnp.take_along_axis(rows, best, axis=1)[:, 0]
     normals, triangle = gaussians.normals[row], surface.triangles[row]
+    plane_var = surface.plane_vars[row] + jnp.sum(normals * noise, axis=-1) ** 2
     white_noise = whiten(jnp.unstack(triangle, axis=-1), jnp.unstack(noise, axis=-1))
     max_mahalanobis_sq, min_normal_cos = gates
     is_near = jnp.min(distance_sq, axis=-1) <= max_mahalanobis_sq
@@ -108,9 +109,7 @@ def match(
         triangle=triangle,
         noise=jnp.stack(white_noise, axis=-1),
         plane_vars=surface.plane_vars[row],
-        plane_std=jnp.sqrt(
-            jnp.maximum(surface.plane_vars[row] + jnp.sum(normals * noise, axis=-1) ** 2, LEAST_VARIANCE)
-        ),
+        plane_std=jnp.sqrt(jnp.maximum(plane_var, LEAST_VARIANCE)),
         light=surface.light[row],
         gradients=surface.gradients[row],
         is_inlier=points.valid & is_near & is_alike,

@@ -76,14 +76,14 @@ class CoarseStart(eqx.Module):
     Args:
         T_world_coarse: also the mean of the pose.
         root_information: root of the information of (xi, log s) where the points fit as well as they should.
-        is_given: the prior itself says how sure it is of the pose, see `pose_worth`.
         noise: least standard deviation of the points' depth, as a fraction of it.
+        is_given: the prior itself says how sure it is of the pose, see `pose_worth`.
     """
 
     T_world_coarse: jaxlie.SE3
     root_information: Float[Array, "7 7"]
-    is_given: Bool[Array, ""]
     noise: Float[Array, ""]
+    is_given: Bool[Array, ""]
 
 
 class Problem(eqx.Module):
@@ -248,7 +248,8 @@ def information(
 ) -> Float[Array, "6 6"]:
     """Compute the inliers' information about xi by planes and colours: w Σ j j' with j = (a, x × a) / std.
 
-    Offsets from means do not count: the mean of a Gaussian is no landmark of its surface. w is the weight of a point, a is the normal, or the gradient of the intensity, and x the point, both in the camera's axes.
+    w is the weight of a point, a is the normal, or the gradient of the intensity, and x the point, both in the camera's
+    axes. Offsets from means do not count: the mean of a Gaussian is no landmark of its surface.
     """
     points, to_camera = scale * problem.source.points, T.rotation().as_matrix()
     normals, gradients = matches.normals @ to_camera, matches.gradients @ to_camera
@@ -259,12 +260,11 @@ def information(
     return problem.weight * rows.T @ rows
 
 
-def largest_std(points: Float[Array, "6 6"], problem: Problem) -> Float[Array, ""]:
-    """Standard deviation of the pose in its least certain direction, in the units of the unknowns; inf for none.
+def least_information(points: Float[Array, "6 6"], problem: Problem) -> Float[Array, ""]:
+    """Smallest eigenvalue of the information about the pose, in the units of the unknowns.
 
     Args:
         points: their information about xi, to which that of the prior is added.
     """
     units, prior = problem.units[:6], problem.prior[:, :6]
-    least = jnp.linalg.eigvalsh(units[:, None] * points * units + prior.T @ prior)[0]
-    return jnp.where(least > 0, 1.0 / jnp.sqrt(jnp.where(least > 0, least, 1.0)), jnp.inf)
+    return jnp.maximum(jnp.linalg.eigvalsh(units[:, None] * points * units + prior.T @ prior)[0], 0.0)

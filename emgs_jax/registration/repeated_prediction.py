@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from emgs_jax.observation import Observation, Prediction, depth_in, transform
+from emgs_jax.observation import Observation, Prediction, depth_in, sound, transform
 from emgs_jax.ops.camera import Camera, nearest_pixel, project
 from emgs_jax.ops.constants import MAD_TO_STD
 from emgs_jax.ops.precision import full_precision
@@ -36,7 +36,8 @@ def repeat_scale(
         reading: row of `LocalizationConfig.coarse_scale`: 0 (1, as printed), 1 (median ratio of depths) or 2 (of the
             similarity that fits best).
     """
-    paired, depth_now = now.valid & before.valid, now.points[:, 2]
+    now, before = sound(now), sound(before)
+    paired, depth_now = now.valid & before.valid & (now.points[:, 2] > 0), now.points[:, 2]
     ratios = depth_in(T_world_previous, before) / jnp.where(paired, depth_now, 1.0)
     ratio = median(ratios, paired)
     is_positive = ratio > 0

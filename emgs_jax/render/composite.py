@@ -18,6 +18,7 @@ from emgs_jax.render.tiles import CHUNK, Chunks, TileLists, list_splats, num_til
 
 OPAQUE = 0.99  # coverage of a pixel behind which nothing changes it by more than a hundredth
 MAX_ALPHA = 0.999  # of its light that a splat takes from those behind it, so that a logarithm of the rest exists
+ROUNDED = 2.0**-20  # of a depth, its least standard deviation: that of its rounding
 Sums: TypeAlias = tuple[Float[Array, "t v q"], Float[Array, "t q"], Float[Array, "t q"], Float[Array, "t q"]]
 State = TypeVar("State")
 
@@ -68,12 +69,13 @@ class Rendering(eqx.Module):
 
 
 def splat_alpha(splats: Splats, pixels: Float[Array, "*p q 2"], config: RenderConfig) -> Float[Array, "*c q"]:
-    """Opacity of every splat at every pixel: opacity · exp(-½ d²); 0 beyond `radius` standard deviations."""
+    """Opacity of every splat at every pixel: opacity · exp(-½ d²) up to `MAX_ALPHA`; 0 beyond `radius` deviations."""
     dx, dy = _offsets(splats, pixels)
     a, b, c = (splats.precisions[..., i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     distance_sq = a * dx**2 + 2.0 * b * dx * dy + c * dy**2
     opacity = config.opacity * splats.opacity[..., None]
-    return jnp.where(distance_sq <= config.radius**2, opacity * jnp.exp(-0.5 * distance_sq), 0.0)
+    alpha = jnp.minimum(opacity * jnp.exp(-0.5 * distance_sq), MAX_ALPHA)
+    return jnp.where(distance_sq <= config.radius**2, alpha, 0.0)
 
 
 def splat_depth(splats: Splats, pixels: Float[Array, "*p q 2"], config: RenderConfig) -> Float[Array, "*c q"]:
@@ -127,7 +129,7 @@ def light_before(
     alpha: Float[Array, "c k q"], chunks: Chunks, log_light: Float[Array, "t q"]
 ) -> tuple[Float[Array, "c k q"], Float[Array, "t q"]]:
     """Light that reaches every splat of some chunks, and the logarithm of what is left behind them."""
-    before, log_light = _sum_before(jnp.log(1.0 - jnp.minimum(alpha, MAX_ALPHA)), chunks, log_light)
+    before, log_light = _sum_before(jnp.log(1.0 - alpha), chunks, log_light)
     return jnp.exp(before), log_light
 
 
@@ -218,7 +220,7 @@ def _composite_backward(
         if front is None:
             before, so_far = _sum_before(weights * slope, chunks, so_far)
             behind = take_rows(whole, chunks.tiles)[:, None] - before - weights * slope
-            by_alpha -= jnp.where(alpha < MAX_ALPHA, behind / (1.0 - jnp.minimum(alpha, MAX_ALPHA)), 0.0)
+            by_alpha -= behind / (1.0 - alpha)
         by_splats, by_config = pull((by_alpha, weights * (z + 2.0 * z_sq * depth)))
         by_values = jnp.where(chunks.exists[..., None], jnp.einsum("ckq,cvq->ckv", weights, per_value), 0.0)
         more = by_splats, jnp.zeros_like(values).at[chunks.rows].add(by_values), by_config
@@ -268,7 +270,8 @@ def rendering_of(sums: Sums, lists: TileLists, camera: Camera, config: RenderCon
     is_covered = alpha >= jnp.maximum(config.min_alpha, 1e-6)
     total = jnp.where(is_covered, alpha, 1.0)
     depth = jnp.where(is_covered, depth_sum / total, 0.0)
-    variance = jnp.maximum(depth_sq_sum / total - depth**2, 1e-12)
+    least = (ROUNDED * depth) ** 2
+    variance = jnp.where(is_covered, jnp.maximum(depth_sq_sum / total - depth**2, least), 1.0)
     depth_std = jnp.where(is_covered, jnp.sqrt(variance), 0.0)
     return Rendering(values, alpha, depth, depth_std, _seen_overflow(lists.overflow, alpha, config.tile_size))
 

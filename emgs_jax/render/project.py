@@ -72,7 +72,8 @@ def project_gaussians(
     )
     covs_2d = jnp.einsum("nai,nij,nbj->nab", jacobian, covs, jacobian) + blur * jnp.eye(2)
 
-    depth_std = jnp.sqrt(jnp.maximum(covs[:, 2, 2], 1e-12))
+    depth_var = covs[:, 2, 2]
+    depth_std = jnp.sqrt(jnp.where(depth_var > 0, depth_var, 1.0))
     # The plane n·X = n·μ meets the ray d = (x, y, 1) at 1/z = n·d / n·μ, which is linear in the pixel.
     facing = jnp.einsum("ni,ni->n", normals, points)
     limit = SMALLEST_COSINE * jnp.linalg.norm(jnp.where(is_in_front[:, None], points, 1.0), axis=-1)

@@ -13,6 +13,7 @@ STATUS_COLORS = {
     "degraded": "#e69f2e",
     "lost": "#d9413f",
     "initialization": "#4c7de0",
+    "apart": "#9a6fc4",
     "skipped": "#a3aab5",
 }
 

@@ -18,6 +18,7 @@ from emgs_jax.evaluation.rendering import Rendered
 from emgs_jax.evaluation.segmentation import LabelledPoints, translate
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.gaussian_map import confirmed
+from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.mapping.run import MappingRun, with_truth
 from emgs_jax.ops.camera import Camera, nearest_pixel, project
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
@@ -62,7 +63,7 @@ def dense_map(
     """
     if config.points != "map" and own is None:
         raise ValueError(f"densify.points={config.points} takes the points of the frames: give own=")
-    known = [row for row, record in enumerate(run.records) if record.status != "lost"]
+    known = [row for row, record in enumerate(run.records) if record.status not in UNPLACED]
     shown = {known[int(i)] for i in np.linspace(0, len(known) - 1, num_pictures)} if known else set()
     pictures: list[dict[str, Any]] = []
     compares_classes = labelled is not None and bool(dataset.classes)

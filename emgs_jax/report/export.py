@@ -18,6 +18,7 @@ from emgs_jax.io.map_file import save_map
 from emgs_jax.io.ply import with_colors, write_ply
 from emgs_jax.io.ply_reader import read_vertices, scale_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
+from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.ranges import number
 from emgs_jax.report.colors import OURS, STATUS_COLORS, rgb
 from emgs_jax.report.recorded_run import RecordedRun
@@ -149,7 +150,7 @@ def factor_of(run: RecordedRun, length: Sequence[float]) -> float:
     centers = []
     for index in map(int, length[:2]):
         found = [row for row, frame in enumerate(run.frames) if frame["index"] == index]
-        if not found or run.frames[found[0]]["status"] == "lost":
+        if not found or run.frames[found[0]]["status"] in UNPLACED:
             why = "is lost, so its pose is a guess" if found else "is none of the run's"
             raise ValueError(f"length={[*length]}: frame {index} {why}: take another one (index in frames.jsonl)")
         centers.append(run.poses[found[0]][:3, 3])

@@ -17,10 +17,9 @@ from emgs_jax.evaluation.loops import double_wall_share, loop_metrics
 from emgs_jax.evaluation.reconstruction import (
     EvaluationConfig,
     Reference,
-    align_cloud,
     compare_clouds,
+    compare_placements,
     ground_truth_cloud,
-    reconstruction_metrics,
     reference,
 )
 from emgs_jax.evaluation.rendering import Rendered
@@ -37,7 +36,7 @@ from emgs_jax.evaluation.trajectory import align_poses, trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.geometry import scale_pose
-from emgs_jax.mapping.records import UNJOINED, FrameRecord, longest_row
+from emgs_jax.mapping.records import APART, UNJOINED, UNPLACED, FrameRecord, longest_row
 from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
@@ -48,7 +47,7 @@ from emgs_jax.report.labelling import labelled_map
 from emgs_jax.report.provenance import RAW_PRIOR, prefixed
 
 Metrics = dict[str, Any]
-STATUSES = ("tracked", "degraded", "lost", "initialization")
+STATUSES = ("tracked", "degraded", "lost", APART, "initialization")
 
 
 @dataclass(frozen=True)
@@ -108,9 +107,7 @@ def score_map(
     other = replace(config, alignment="se3" if config.alignment == "sim3" else "sim3")
     metrics = trajectory_metrics(*poses) | score_cloud(dense, poses, scorer)
     metrics |= _renamed(compare_clouds(dense, truth, poses, other), f"reconstruction_{other.alignment}/")
-    aligned, note = align_cloud(centers, truth, poses, config)
-    found = reconstruction_metrics(aligned, truth, config) | {"reconstruction/alignment_note": note}
-    metrics |= _renamed(found, "reconstruction_centers/")
+    metrics |= _renamed(compare_clouds(centers, truth, poses, config), "reconstruction_centers/")
     return metrics | _score_labels(labels, poses, scorer)
 
 
@@ -121,11 +118,9 @@ def score_cloud(cloud: PointCloud | SpooledCloud, poses: tuple[np.ndarray, np.nd
     leaves the rotation about itself open, and then the first one says more about that than about the cloud.
     """
     config = scorer.evaluation
-    by_points = replace(config, icp_distance_m=config.placement_icp_m)
-    with ThreadPoolExecutor(1, "placed by its points") as thread:
-        placed = thread.submit(compare_clouds, cloud, scorer.truth, poses, by_points)
-        found = compare_clouds(cloud, scorer.truth, poses, config)
-        return found | _renamed(placed.result(), "reconstruction_icp/")
+    distances = config.icp_distance_m, config.placement_icp_m
+    found, placed = compare_placements(cloud, scorer.truth, poses, config, distances)
+    return found | _renamed(placed, "reconstruction_icp/")
 
 
 def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
@@ -168,7 +163,7 @@ def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer
 
     Rendered is each frame whose pose is known: at our poses those that are not lost, at the prior's those with points.
     """
-    is_known = [record.status != "lost" for record in run.records]
+    is_known = [record.status not in UNPLACED for record in run.records]
     metrics: Metrics = {}
     for fusions, poses, rows, kind in (
         (baselines.raw, run.raw_poses, [raw.points[row].any() for row in range(len(raw.points))], "raw"),
@@ -219,11 +214,13 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     """Size of the map, how many frames came to what, time and memory."""
     statuses = Counter(record.status for record in run.records)
     metrics: Metrics = {"map/num_gaussians": int(np.asarray(confirmed(run.state.map).valid).sum())}
-    metrics["map/double_wall_percent"] = double_walls(confirmed(run.state.map), metres(run))
+    metrics["map/double_wall_percent"] = double_walls(confirmed(run.state.map), metre(run))
     metrics["map/num_tentative"] = int(np.asarray(run.state.map.gaussians.valid).sum()) - metrics["map/num_gaussians"]
     metrics["map/capacity"] = run.config.submap.map_capacity
     metrics |= {f"frames/{status}": statuses[status] for status in STATUSES}
     metrics["frames/skipped"] = len(dataset.skipped)
+    for number in run.apart:
+        metrics |= _submap_metrics(run, number)
     metrics["segments/unjoined_frames"] = sum(record.reason == UNJOINED for record in run.records)
     row = longest_row(run.records)
     metrics["frames/longest_untracked"] = len(row)
@@ -233,17 +230,28 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
     return metrics
 
 
-def metres(run: MappingRun) -> float:
-    """A length of the map in metres, as the true path says; without one the map's unit is taken for a metre."""
+def _submap_metrics(run: MappingRun, number: int) -> Metrics:
+    """`submaps/N/…` of a submap that was never joined: its frames, and the error of its path in its own unit."""
+    records = [record for record in run.records if record.submap == number and record.status == APART]
+    known = [(record.pose, record.true_pose) for record in records if record.true_pose is not None]
+    found: Metrics = {f"submaps/{number}/frames": len(records)}
+    if len(known) >= 3:
+        ate = trajectory_metrics(*map(np.stack, zip(*known, strict=True)))["trajectory/ate_sim3_m"]
+        found[f"submaps/{number}/ate_sim3_m"] = ate
+    return found
+
+
+def metre(run: MappingRun) -> float | None:
+    """A metre in the map's unit, as the true path says; None without one."""
     poses = with_truth(run, run.poses)
-    return 1.0 if poses is None else align_poses(*poses, with_scale=True)[0].scale
+    return None if poses is None else 1.0 / align_poses(*poses, with_scale=True)[0].scale
 
 
-def double_walls(gaussians: Gaussians, scale: float) -> float | None:
-    """Per cent of valid Gaussians that another stands behind, see `double_wall_share`; `scale`: see `metres`."""
+def double_walls(gaussians: Gaussians, metre: float | None) -> float | None:
+    """Per cent of valid Gaussians that another stands behind, see `double_wall_share`."""
     rows = jax.device_get(gaussians)
     means, normals, covs = (values[rows.valid] for values in (rows.means, rows.normals, rows.covs))
-    share = double_wall_share(scale * means, normals, scale**2 * covs)
+    share = double_wall_share(means, normals, covs, metre)
     return None if share is None else 100.0 * share
 
 

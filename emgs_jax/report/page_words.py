@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from emgs_jax.mapping.records import APART
 from emgs_jax.report import columns, provenance
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Line, Table
 from emgs_jax.report.html import Head, commit_words
@@ -98,7 +99,10 @@ def verdict(run: RecordedRun) -> tuple[str, str]:
     tracked = f"{statuses['tracked'] + statuses['initialization']} of {len(run.frames)} frames are in the map"
     if statuses["lost"] or statuses["degraded"]:
         tracked += f" ({statuses['degraded']} degraded, {statuses['lost']} lost)"
+    if statuses[APART]:
+        tracked += f", {statuses[APART]} in submaps that were never joined with it"
     tracked += f", {len(run.skipped)} skipped" if run.skipped else ""
+    statuses["lost"] += statuses[APART]
     is_lost, is_degraded = (statuses[word] > MANY_LOST * total for word in ("lost", "degraded"))
     ours, raw = (metrics.get(prefix + MAIN[0].key) for prefix in ("", RAW_PRIOR))
     if ours is None:

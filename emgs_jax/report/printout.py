@@ -5,7 +5,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from emgs_jax.device.clock import Clock
-from emgs_jax.mapping.records import MANY_IN_A_ROW, REMEDIES, UNTRACKED, FrameRecord, called, longest_row, main_reason
+from emgs_jax.mapping.records import (
+    APART,
+    MANY_IN_A_ROW,
+    REMEDIES,
+    UNJOINED,
+    UNTRACKED,
+    FrameRecord,
+    called,
+    longest_row,
+    main_reason,
+)
+from emgs_jax.ops.ranges import MAX_LENGTH_M
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, aligned, metric_table
 from emgs_jax.report.provenance import has_metric_truth, lines_of
 
@@ -18,8 +29,13 @@ def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
     Many are a tenth of all, or `MANY_IN_A_ROW`; these are named, too.
     """
     counts = Counter(record.status for record in records) | Counter(skipped=num_skipped)
-    words = ("tracked", "degraded", "lost", "initialization", "skipped")
+    words = ("tracked", "degraded", "lost", "initialization", "skipped", *[APART] * bool(counts[APART]))
     lines = [f"{len(records) + num_skipped} frames: " + ", ".join(f"{counts[word]} {word}" for word in words)]
+    if counts[APART]:
+        lines.append(
+            f"{counts[APART]} frames are in submaps that were never joined with the map; each is in submaps/ as it is: "
+            f"{REMEDIES[UNJOINED]}"
+        )
     bad, row = [record for record in records if record.status in UNTRACKED], longest_row(records)
     if len(bad) > MANY * len(records) or len(row) >= MANY_IN_A_ROW:
         reason, count = main_reason(bad)
@@ -27,6 +43,12 @@ def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
         end = "to the end" if is_to_the_end else f"to {called(records[row[-1]])}"
         where = f" ({len(row)} in a row, from {called(records[row[0]])} {end})" if len(row) > 1 else ""
         lines.append(f"{len(bad)} frames were not tracked{where}, {count} of them because {reason}: {REMEDIES[reason]}")
+    if left_out := [record for record in records if record.left_out]:
+        count = sum(record.left_out for record in left_out)
+        lines.append(
+            f"{count} points of {len(left_out)} frames, from {called(left_out[0])} on, were left out: the prior's "
+            f"depth there is not finite, not positive, or farther than a map can hold ({MAX_LENGTH_M:g} m)"
+        )
     return lines
 
 
@@ -42,10 +64,11 @@ def last_words(metrics: Mapping[str, Any]) -> str:
     count = metrics["frames/degraded"] + metrics["frames/lost"]
     if not count:
         return ""
-    whole = count + sum(metrics[f"frames/{status}"] for status in ("tracked", "initialization", "skipped"))
+    others = ("tracked", "initialization", "skipped", APART)
+    whole = count + sum(metrics.get(f"frames/{status}", 0) for status in others)
     row, start = metrics["frames/longest_untracked"], metrics["frames/longest_untracked_from"]
     apart = metrics["segments/unjoined_frames"]
-    words = f", {apart} of them because their part was never joined with the map" if apart else ""
+    words = f", {apart} are in submaps that were never joined with the map" if apart else ""
     return f"{count} of {whole} frames are degraded or lost, {row} in a row from frame {start} on{words}; "
 
 

@@ -17,6 +17,7 @@ from emgs_jax.features.text import TextEmbeddings, read_text
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.map_file import load_map
 from emgs_jax.io.trajectory import from_tum, load_trajectory_tum
+from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report.provenance import is_metric
@@ -92,7 +93,7 @@ class RecordedRun:
     @property
     def is_placed(self) -> np.ndarray:
         """Of each frame, bool (n,): its pose means something; a lost one's is a guess."""
-        return np.array([frame["status"] != "lost" for frame in self.frames], bool)
+        return np.array([frame["status"] not in UNPLACED for frame in self.frames], bool)
 
     @property
     def is_metric(self) -> bool:

@@ -21,7 +21,7 @@ from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import from_tum, save_trajectory_tum
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE
-from emgs_jax.mapping.records import NEW_SUBMAP, UNJOINED
+from emgs_jax.mapping.records import APART, NEW_SUBMAP, UNJOINED, UNPLACED
 from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
@@ -30,6 +30,7 @@ from emgs_jax.report.dense import DenseMap, center_cloud
 from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.layers import feature_colors
 from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, POLISH, REPORT_FILE, TEXT_FILE
+from emgs_jax.slam import SlamState
 
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (
@@ -62,7 +63,7 @@ def save_progress(folder: Path, run: MappingRun) -> None:
 
     With a back end also places.npz, by which another run goes on in the map; trajectory_online.txt, the poses as they
     were when the frames were placed (in the unit of the finished map), graph.g2o and loops.json. Frames that are left
-    out are marked in frames.jsonl.
+    out are marked in frames.jsonl; submaps that were never joined are in submaps/, by their numbers.
     """
     _complete_lines(folder / FRAMES_FILE, run)
     if run.state is not None:
@@ -70,6 +71,8 @@ def save_progress(folder: Path, run: MappingRun) -> None:
             folder / "trajectory.txt", [record.timestamp for record in run.records], np.stack(run.poses)
         )
         save_map(folder / "map.npz", run.state.map)
+    for number, state in run.apart.items():
+        _save_submap(folder / "submaps" / str(number), number, state, run)
     end = run.back_end
     if end is not None and end.database.keyframes and run.state is not None:
         save_places(folder / "places.npz", end, float(run.state.estimate.depth_noise))
@@ -80,6 +83,16 @@ def save_progress(folder: Path, run: MappingRun) -> None:
         write_json(folder / LOOPS_FILE, loop_list(end))
         if end.factors:  # of a single frame nothing was measured
             save_graph_g2o(folder / "graph.g2o", metric_graph(end))
+
+
+def _save_submap(folder: Path, number: int, state: SlamState, run: MappingRun) -> None:
+    """Write map and path of a submap that was never joined, in its own world and unit."""
+    folder.mkdir(parents=True, exist_ok=True)
+    records = [record for record in run.records if record.submap == number and record.status == APART]
+    save_trajectory_tum(
+        folder / "trajectory.txt", [record.timestamp for record in records], np.stack([r.pose for r in records])
+    )
+    save_map(folder / "map.npz", state.map)
 
 
 def _complete_lines(path: Path, run: MappingRun) -> None:
@@ -100,7 +113,8 @@ def _complete_lines(path: Path, run: MappingRun) -> None:
     for line in lines:
         record = None if line["status"] == "skipped" else next(records)
         if record is not None and record.reason == UNJOINED:
-            line |= {name: getattr(record, name) for name in ("status", "reason", "covariance")}
+            line |= {name: getattr(record, name) for name in ("status", "reason", "submap")}
+            line |= {} if record.status == APART else {"covariance": None}
     with atomic_write(path, "w") as handle:
         handle.writelines(json.dumps(line, allow_nan=False) + "\n" for line in lines)
 
@@ -143,7 +157,7 @@ def save_outputs(
     centers = center_cloud(run)
     colored = dense.cloud.points, dense.cloud.colors
     no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, colored)
-    is_placed = np.array([record.status != "lost" for record in run.records])
+    is_placed = np.array([record.status not in UNPLACED for record in run.records])
     paths = Paths(np.stack(run.poses), is_placed, _placed_truth(run, with_scale), *_moved(run), unit=unit)
     classes = () if dense.labels is None else dense.labels.classes
     draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes, feature_cloud(shown))

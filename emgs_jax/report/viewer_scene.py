@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report.colors import OURS, PATHS, STATUS_COLORS, rgb, to_bytes
@@ -47,7 +48,7 @@ class Shown:
     @property
     def is_placed(self) -> np.ndarray:
         """Of each frame, bool (n,): its pose means something; a lost one's is a guess."""
-        return np.array([frame["status"] != "lost" for frame in self.frames], bool)
+        return np.array([frame["status"] not in UNPLACED for frame in self.frames], bool)
 
 
 def shown(run: RecordedRun) -> Shown:

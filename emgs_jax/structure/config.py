@@ -27,7 +27,7 @@ class StructureConfig:
             recognition proposes.
         overlap: neighbours on each side; and one at each power of two beyond.
         num_similar: images that place recognition proposes for each.
-        options: further options by part (extraction, matching, verification, mapping), as pycolmap's classes name them.
+        options: further options by part (extraction, matching, verification, incremental, global), in pycolmap's words.
         min_inliers: of a frame that no model holds, registered in the end with fewer than the mapper asks for.
         max_gap: frames; one that is still without a pose is interpolated between neighbours so near, without points.
         median_depth: of what a model's images show; its unit, since images do not tell the scale.

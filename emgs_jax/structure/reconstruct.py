@@ -15,6 +15,10 @@ from emgs_jax.structure.pairs import choose_pairs
 
 BATCH = 8  # images of one call of COLMAP, so that the bar moves
 PAIRS = 400  # likewise
+MIN_IMAGES = 3  # of a model, that no larger one holds
+MIN_FOR_CENTER = 30  # images
+MIN_DEPTH = 0.01  # of a point, in median depths of the image
+FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 DATABASE, IMAGES = "database.db", "images"
 SECONDS = 0.5, 0.05, 0.6  # of two cores: features of a 640x480 image, a pair, an image mapped
 
@@ -65,6 +69,9 @@ def map_database(shots: Shots, config: StructureConfig, folder: Path) -> list[An
         found = find_models(shots, config, folder)
         check_found(found, shots, config, folder)
         register_rest(found, config, folder)
+        for model in found:
+            drop_points_at_cameras(model)
+            adjust(model, shots, config)
     return found
 
 
@@ -127,7 +134,7 @@ def _write(shots: Shots, index: int, images: Path) -> bool:
     except BadFrameError:
         return False
     path = images / f"{shots.names[index]}.png"
-    return image.shape[1::-1] == tuple(shots.size) and cv2.imwrite(str(path), image[..., ::-1], [1, 1])
+    return image.shape[1::-1] == tuple(shots.size) and cv2.imwrite(str(path), image[..., ::-1], FAST)
 
 
 def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
@@ -184,7 +191,7 @@ def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
     with tqdm(total=len(pairs), unit="pair", desc="matches") as bar:
         for start in range(0, len(pairs), PAIRS):
             some = pairs[start : start + PAIRS]
-            listed.write_text("\n".join(f"{a} {b}" for a, b in some))
+            listed.write_text("\n".join(f"{a} {b}" for a, b in some), encoding="utf-8")
             pycolmap.match_image_pairs(
                 database,
                 matching_options=matching,
@@ -200,7 +207,7 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
     pycolmap = load()
     is_free = not shots.is_calibrated
     common = {"num_threads": config.num_threads, "random_seed": config.seed}
-    given = config.options.get("mapping", {})
+    given = config.options.get(config.mapper, {})
     output = folder / "models"
     output.mkdir(exist_ok=True)
     if config.mapper == "global":
@@ -224,7 +231,13 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
             found = pycolmap.incremental_mapping(
                 folder / DATABASE, folder / IMAGES, output, options, next_image_callback=lambda: bar.update()
             )
-    return sorted(found.values(), key=lambda model: -model.num_reg_images())
+    held: set[int] = set()
+    models = []
+    for model in sorted(found.values(), key=lambda model: -model.num_reg_images()):
+        if len(new := {*model.reg_image_ids()} - held) >= MIN_IMAGES:
+            models.append(model)
+            held |= new
+    return models
 
 
 def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) -> None:
@@ -249,6 +262,44 @@ def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) 
             mapper.triangulate_image(pycolmap.IncrementalTriangulatorOptions(random_seed=config.seed), image)
         placed.update(new)
         mapper.end_reconstruction(False)
+
+
+def adjust(model: Any, shots: Shots, config: StructureConfig) -> None:
+    """Adjust all of a model once more, by a robust loss, with the centre of a camera that is being calibrated.
+
+    The mapper's own adjustments weigh all residuals by their squares and hold the centre in the middle of the image.
+    """
+    is_free, pycolmap = not shots.is_calibrated, load()
+    refined = {
+        "refine_focal_length": is_free,
+        "refine_principal_point": is_free and model.num_reg_images() >= MIN_FOR_CENTER,
+        "refine_extra_params": is_free or config.refine_distortion,
+        "print_summary": False,
+    }
+    options = options_of("BundleAdjustmentOptions", refined)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.solver_options.num_threads = config.num_threads
+    problem = pycolmap.BundleAdjustmentConfig()  # `pycolmap.bundle_adjustment` prints whatever the level of the log
+    for image in model.reg_image_ids():
+        problem.add_image(image)
+    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_ceres_bundle_adjuster(options, problem, model).solve()
+    # What the loss let go may lie anywhere now.
+    filters = options_of("IncrementalPipelineOptions", config.options.get("incremental", {})).mapper
+    observations = pycolmap.ObservationManager(model)
+    observations.filter_all_points3D(filters.filter_max_reproj_error, filters.filter_min_tri_angle)
+    drop_points_at_cameras(model)
+    model.update_point_3d_errors()
+
+
+def drop_points_at_cameras(model: Any) -> None:
+    """Delete points that lie at a camera that shows them: their rays tell nothing, and no covariance is finite."""
+    for image in [image for image in model.images.values() if image.has_pose]:
+        keys = [point.point3D_id for point in image.points2D if point.has_point3D()]
+        pose = image.cam_from_world().matrix()
+        depths = np.array([pose[2, :3] @ model.points3D[key].xyz + pose[2, 3] for key in keys])
+        for key in np.array(keys)[depths < MIN_DEPTH * np.median(depths)] if keys else ():
+            model.delete_point3D(int(key))
 
 
 def check_found(found: Sequence[Any], shots: Shots, config: StructureConfig, folder: Path) -> None:

@@ -52,7 +52,7 @@ def calibrate(
     count = models[0].num_reg_images()
     error = models[0].compute_mean_reprojection_error()
     note = (
-        f"intrinsics estimated by COLMAP from {count} of {pictures.count} images: {camera.model} "
+        f"intrinsics estimated by COLMAP from {count} of {pictures.count} images: {image.camera.model_name} "
         f"{[round(float(value), 4) for value in image.camera.params]}, reprojection error {error:.2f} px"
     )
     about = {"source": "estimate", "note": note, "num_images": count, "reprojection_error_px": error, ESTIMATED: key}

@@ -95,7 +95,7 @@ def _made(shots: Shots, config: StructureConfig, key: str, places: Sequence[Path
 def is_of(place: Path, key: str) -> bool:
     """True if a folder holds the models of this key."""
     try:
-        return json.loads((place / ABOUT).read_text())["key"] == key
+        return json.loads((place / ABOUT).read_text(encoding="utf-8"))["key"] == key
     except (OSError, ValueError, KeyError):
         return False
 

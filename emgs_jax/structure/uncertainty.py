@@ -5,13 +5,12 @@ inverse, T_world_camera Exp(xi), translation first: xi = (-b - t x 2 q, -2 q).
 """
 
 from collections.abc import Mapping
-from functools import cache
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from emgs_jax.structure.library import load
+from emgs_jax.structure.library import load, options_of
 
 NUM_REFERENCES = 32  # frames that determine the unit
 
@@ -24,75 +23,65 @@ def camera_in_world(image: Any) -> Float[np.ndarray, "4 4"]:
 def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict[int, Float[np.ndarray, "6 6"]]:
     """Covariance of xi of each image's pose relative to the first's, for the unit that fits all of them best.
 
-    Poses and points are free, up to three points that are held. That leaves a common factor of all lengths, which is no
-    error of a pose: the factor s = sum(w_r xi_r) that some of the frames agree on is taken out, xi_i - g_i s with g_i
-    the change of xi_i by log s. Residuals have the standard deviation that they show, or `pixel_std` if that is larger.
+    The first pose and one point are held. What a common factor of all lengths changes is no error of a pose: the factor
+    s = sum(w_r xi_r) that some of the frames agree on is taken out, xi_i - g_i s with g_i the change of xi_i by log s.
+    Residuals have the standard deviation that they show, or `pixel_std` if that is larger.
 
     Args:
         images: by frame, in order. Frames whose covariance cannot be found are left out.
     """
-    frames = [*images]
-    joint = _joint(model, images)
-    if joint is None or len(frames) < 3:
+    frames, found = [*images], _covariance(model, next(iter(images.values())))
+    if found is None or len(frames) < 3:
         return {}
-    T = {frame: camera_in_world(images[frame]) for frame in frames}
     first, references = frames[0], [frames[row] for row in _spread(len(frames), NUM_REFERENCES)]
+    T = {frame: camera_in_world(images[frame]) for frame in frames}
+    to_xi = {frame: _to_xi(np.linalg.inv(T[frame])) for frame in frames}
     relative = {frame: np.linalg.inv(T[first]) @ T[frame] for frame in frames}
-    own = {frame: _to_xi(np.linalg.inv(T[frame])) for frame in frames}
-    of_first = {frame: -adjoint(np.linalg.inv(relative[frame])) @ own[first] for frame in frames}
     unit = {frame: np.append(relative[frame][:3, :3].T @ relative[frame][:3, 3], np.zeros(3)) for frame in frames}
     total = sum(unit[frame] @ unit[frame] for frame in references)
 
     def between(a: int, b: int) -> np.ndarray:
-        """Covariance (6, 6) of xi of two frames relative to the first."""
-        return (
-            own[a] @ joint(a, b) @ own[b].T
-            + own[a] @ joint(a, first) @ of_first[b].T
-            + of_first[a] @ joint(first, b) @ own[b].T
-            + of_first[a] @ joint(first, first) @ of_first[b].T
-        )
+        """Covariance (6, 6) of xi of two frames."""
+        joint = found.get_cam_cross_cov_from_world(images[a].image_id, images[b].image_id)
+        return to_xi[a] @ (np.full((6, 6), np.nan) if joint is None else joint) @ to_xi[b].T
 
-    def with_unit(frame: int) -> np.ndarray:
-        return sum(between(frame, other) @ unit[other] for other in references) / total
-
-    of_unit = {frame: with_unit(frame) for frame in frames[1:]}
-    variance = sum(unit[frame] @ of_unit[frame] for frame in references if frame != first) / total
-    scale, found = (
-        max(2 / np.pi * model.compute_mean_reprojection_error() ** 2, pixel_std**2),
-        {first: np.zeros((6, 6))},
-    )
+    with_unit = {
+        frame: sum(between(frame, other) @ unit[other] for other in references) / total for frame in frames[1:]
+    }
+    variance = sum(unit[frame] @ with_unit[frame] for frame in references) / total
+    # The mean length of an error of standard deviation s along both axes is s sqrt(pi / 2).
+    scale = max(2 / np.pi * model.compute_mean_reprojection_error() ** 2, pixel_std**2)
+    spread = {first: np.zeros((6, 6))}
     for frame in frames[1:]:
-        mixed = np.outer(of_unit[frame], unit[frame])
+        mixed = np.outer(with_unit[frame], unit[frame])
         free = between(frame, frame) - mixed - mixed.T + variance * np.outer(unit[frame], unit[frame])
-        found[frame] = scale * 0.5 * (free + free.T)
-    return found
+        spread[frame] = scale * 0.5 * (free + free.T)
+    return {frame: one for frame, one in spread.items() if np.isfinite(one).all()}
 
 
-def _joint(model: Any, images: Mapping[int, Any]) -> Any:
-    """A function of two frames: covariance (6, 6) of their z, for residuals of one pixel; None if it is singular."""
+def _covariance(model: Any, first: Any) -> Any:
+    """pycolmap's covariances of all poses, for residuals of one pixel; None if the problem is singular.
+
+    The pose of the image `first` is held, and of what it shows the point that most images show, which fixes the unit.
+    """
     pycolmap = load()
+    shown = {point.point3D_id for point in first.points2D if point.has_point3D()}
+    if not shown:
+        return None
     problem = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():
         problem.add_image(image)
     for camera in model.cameras:
         problem.set_constant_cam_intrinsics(camera)
-    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
-    options = pycolmap.BundleAdjustmentOptions(
-        refine_focal_length=False, refine_extra_params=False, print_summary=False
+    problem.set_constant_rig_from_world_pose(first.frame_id)
+    problem.add_constant_point(max(shown, key=lambda key: (model.points3D[key].track.length(), key)))
+    options = options_of(
+        "BundleAdjustmentOptions",
+        {"refine_focal_length": False, "refine_extra_params": False, "print_summary": False},
     )
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, problem, model)
     poses = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.POSES)
-    found = pycolmap.estimate_ba_covariance(poses, model, adjuster)
-    if found is None:
-        return None
-
-    @cache
-    def joint(a: int, b: int) -> np.ndarray:
-        if a > b:
-            return joint(b, a).T
-        return found.get_cam_cross_cov_from_world(images[a].image_id, images[b].image_id)
-
-    return joint
+    return pycolmap.estimate_ba_covariance(poses, model, adjuster)
 
 
 def _spread(count: int, most: int) -> np.ndarray:
@@ -105,10 +94,3 @@ def _to_xi(T_camera_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]
     t = T_camera_world[:3, 3]
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     return np.block([[-2 * cross, -np.eye(3)], [-2 * np.eye(3), np.zeros((3, 3))]])
-
-
-def adjoint(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
-    """Ad of a pose: T Exp(xi) = Exp(Ad xi) T."""
-    R, t = T[:3, :3], T[:3, 3]
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    return np.block([[R, cross @ R], [np.zeros((3, 3)), R]])

@@ -83,7 +83,7 @@ def time_icp(data: Data, offset: tuple[float, float], repetitions: int) -> list[
     target = gaussians_of(data, 3 * count // 4)
     stride = max(reference.valid.shape[0] // config.num_points, 1)
     cases = [_icp_case(data, row, offset) for row in range(1, len(data.true_poses))]
-    starts = [CoarseStart(start, jnp.eye(7), jnp.asarray(0.01)) for _, start, _ in cases]
+    starts = [CoarseStart(start, jnp.eye(7), jnp.asarray(0.01), jnp.asarray(False)) for _, start, _ in cases]
     arguments = [(case[0], target, start, config) for case, start in zip(cases, starts, strict=True)]
     ours = executable(icp, *arguments[0])
     clouds = [

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from emgs_jax.data import reading
+from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.file_names import natural_key
 
@@ -34,6 +35,26 @@ def test_nearest_takes_the_pixel_that_holds_the_new_centre(size):
     columns = reading.resize_nearest(RAMP[..., 0].astype(np.uint16), size)[0].astype(float)
     centres = (np.arange(size[0]) + 0.5) * 64 / size[0] - 0.5
     assert np.abs(columns - centres).max() <= 0.5
+
+
+@pytest.mark.parametrize("size", [(320, 240), (160, 120), (213, 160), (640, 480), (500, 375)])
+def test_depth_of_a_plane_stays_on_it(size):
+    """Every lower right pixel of four was 3 mm before a floor, in all of TUM and 7-Scenes at 320x240."""
+    intrinsics, normal = (525.0, 525.0, 319.5, 239.5), np.array([0.0, 0.42, 0.91])
+    depth = (1.5 / (backproject(np.ones((480, 640)), intrinsics) @ normal)).astype(np.float32)
+    resized = reading.resize_nearest(depth, size)
+    own = backproject(resized, reading.resize_intrinsics(intrinsics, (640, 480), size)) @ normal
+    np.testing.assert_allclose(own, 1.5, atol=1e-6)
+    assert resized.dtype == np.float32 and (size != (640, 480) or (resized == depth).all())
+
+
+def test_depths_and_labels_at_an_edge_are_of_one_side_the_same_one_and_that_of_most_pixels():
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 2, (40, 60)).astype(np.int32)
+    small, found = (reading.resize_nearest(v, (30, 20)) for v in (labels.astype(np.float32), labels))
+    np.testing.assert_array_equal(small, found, err_msg="depths 0 (unknown) and 1")
+    shares = labels.reshape(20, 2, 30, 2).mean((1, 3))
+    np.testing.assert_array_equal(found, np.where(shares == 0.5, labels[1::2, 1::2], shares > 0.5))
 
 
 def test_files_sort_by_their_numbers(tmp_path):

@@ -27,10 +27,10 @@ print(jax.config.jax_compilation_cache_dir)
 QUIET = {"TF_CPP_MIN_LOG_LEVEL": "3"}  # as experiments/__init__.py says to commands
 
 
-def start(folder: object, max_bytes: int = 2**30, **environment: str) -> subprocess.Popen:
+def start(folder: object, max_bytes: int = 2**30, first: str = "", **environment: str) -> subprocess.Popen:
     variables = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")} | environment
     variables |= QUIET  # else jaxlib 0.10.1 calls every executable from the folder an error
-    command = [sys.executable, "-c", PROGRAM, str(folder), str(max_bytes)]
+    command = [sys.executable, "-c", first + PROGRAM, str(folder), str(max_bytes)]
     return subprocess.Popen(command, env=variables, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -62,6 +62,16 @@ def test_a_folder_that_cannot_be_written_is_one_line_and_no_failure(tmp_path):
     hits, _, folder, complaints = finish(start(tmp_path / "file" / "below"))
     assert hits == 0 and folder == "None"
     assert complaints.startswith("warning: nothing is kept of what JAX compiles") and complaints.count("\n") == 1
+
+
+def test_a_folder_that_can_only_be_read_is_read_and_one_line_says_so(tmp_path):
+    assert finish(start(tmp_path))[1] >= 3
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    refuse = "import tempfile; tempfile.TemporaryFile = lambda dir: open('/no such folder/x')"
+    hits, misses, folder, complaints = finish(start(tmp_path, first=refuse))
+    assert hits >= 3 and misses == 0 and folder == str(tmp_path)
+    assert complaints.startswith("warning: nothing is kept of what JAX compiles") and complaints.count("\n") == 1
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 @pytest.mark.parametrize("word", ["None", "off"])

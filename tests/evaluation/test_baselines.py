@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.config.configure import baseline_configs
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.evaluation.baselines import Pinhole, TsdfConfig, View, VoxelConfig, draw_voxels
-from emgs_jax.evaluation.clouds import PointCloud, VoxelGrid, fuse_clouds
+from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, transform_cloud
 from emgs_jax.evaluation.reconstruction import camera_cloud
+from emgs_jax.geometry import Sim3
 
 PINHOLE = Pinhole((60.0, 55.0, 31.0, 25.5), 64, 48)
 VOXEL, TSDF = VoxelConfig(0.02, 8, 0.1, 1), TsdfConfig(0.02, 0.08, 1)
@@ -130,17 +131,14 @@ def test_two_orders_of_threads_give_the_same_rows(config):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
-def test_voxels_are_the_means_of_all_points_however_they_came():
-    rng = np.random.default_rng(2)
-    clouds = [PointCloud(*rng.uniform(0, 0.1, (3, 50, 3))) for _ in range(4)]
-    grid = VoxelGrid(0.02)
-    for cloud in clouds[:2]:
-        grid.add(cloud)
-    assert len(grid.cloud()) == len(fuse_clouds(clouds[:2], 0.02))
-    for cloud in clouds[2:]:
-        grid.add(cloud)
-    whole = PointCloud(*(np.concatenate([getattr(c, n) for c in clouds]) for n in ("points", "normals", "colors")))
-    np.testing.assert_allclose(grid.cloud().points, fuse_clouds([whole], 0.02).points, atol=1e-12)
+def test_voxels_are_the_means_of_all_views_so_far():
+    views = [(a_view(plane((0.1, 0.2, 1.0))), pose(), scale) for scale in (1.0, 1.2)]
+    fusion = fused(VOXEL, views[0])
+    for count in (1, 2):
+        clouds = [transform_cloud(view.cloud, Sim3(scale, T[:3, :3], T[:3, 3])) for view, T, scale in views[:count]]
+        expected = fuse_clouds(clouds, VOXEL.voxel_m)
+        np.testing.assert_array_equal(fusion.cloud().points, expected.points)
+        fusion.add(*views[1])
 
 
 def test_the_nearest_point_is_drawn_in_every_pixel_of_its_footprint():

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.evaluation.clouds import (
     NearestPoints,
     PointCloud,
+    SpooledCloud,
     cell_centers,
     cell_numbers,
-    fuse_clouds,
+    coarse_points,
     read_cloud,
     register,
     transform_cloud,
@@ -71,17 +72,31 @@ def test_a_similarity_moves_the_points_and_only_turns_the_normals():
     np.testing.assert_array_equal(moved.colors, cloud.colors)
 
 
-def test_fusing_pieces_is_reducing_the_whole(monkeypatch):
-    monkeypatch.setattr("emgs_jax.evaluation.clouds._MERGE_ROWS", 50)  # or a million points are needed for one merge
+def test_fusing_pieces_is_reducing_the_whole_part_by_part(monkeypatch):
+    """No more than a part is in memory; the pieces of a voxel may have come with any cloud. Rows are float32."""
     cloud = random_cloud(np.random.default_rng(4), 900)
     pieces = [PointCloud(cloud.points[i::7], cloud.normals[i::7], cloud.colors[i::7]) for i in range(7)]
-    whole, fused = voxel_downsample(cloud, 0.1), fuse_clouds(iter(pieces), 0.1)
+    poisoned = PointCloud(np.full((5, 3), np.nan), np.zeros((5, 3)), np.zeros((5, 3)))
+    whole = voxel_downsample(cloud, 0.1)
+    monkeypatch.setattr("emgs_jax.evaluation.clouds._PART_ROWS", 50)
+    monkeypatch.setattr("emgs_jax.evaluation.clouds._SOME", 3)
+    spooled = SpooledCloud()
+    for piece in (*pieces, poisoned):
+        spooled.append(piece)
+    means = spooled.averaged(0.1)
     for name in ("points", "normals", "colors"):
-        np.testing.assert_allclose(getattr(fused, name), getattr(whole, name), atol=1e-12)
-    poisoned = PointCloud(cloud.points.copy(), cloud.normals, cloud.colors)
-    poisoned.points[::2] = np.nan
-    assert np.isfinite(voxel_downsample(poisoned, 0.1).points).all()
-    assert len(voxel_downsample(poisoned, 1e-6)) == 450
+        np.testing.assert_allclose(getattr(means.cloud(), name), getattr(whole, name), atol=3e-7)
+    assert len(spooled) == means.counts().sum() == 900
+    assert len(means.sizes) > 5 and max(means.sizes) < 200
+    rows = np.array([0, 7, 8, len(means) - 1])
+    np.testing.assert_array_equal(means.rows(rows)[:, :3], means.cloud().points[rows])
+
+
+def test_coarse_points_of_parts_are_those_of_the_whole():
+    points = random_cloud(np.random.default_rng(5), 900).points
+    np.testing.assert_allclose(
+        coarse_points([points[::2], points[1::2]], 0.5), coarse_points([points], 0.5), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("num_steps", [1, 4])
@@ -131,6 +146,18 @@ def test_a_cloud_without_normals_gets_those_of_planes_through_its_points(tmp_pat
     found = read_cloud(tmp_path / "a.ply", 12)
     np.testing.assert_allclose(np.abs(found.normals @ across), 1.0, atol=1e-6)
     assert not found.colors.any()
+
+
+def test_normals_of_a_mesh_whose_triangles_share_no_vertices_are_its_planes_and_those_of_a_line_unknown(tmp_path):
+    """Neighbours that are one point six times have no plane, and (0, 0, 1) was taken for theirs."""
+    x, y = (values.ravel() * 0.02 for values in np.meshgrid(np.arange(20.0), np.arange(20.0)))
+    grid = np.column_stack([x, 0.6 * y, 0.8 * y])
+    line = np.column_stack([np.linspace(5.0, 6.0, 20), np.zeros(20), np.zeros(20)])
+    points = np.repeat(np.concatenate([grid, line]), 6, axis=0)
+    save_points_ply(tmp_path / "a.ply", points, np.zeros_like(points), np.zeros_like(points))
+    normals = read_cloud(tmp_path / "a.ply", 12).normals
+    np.testing.assert_allclose(np.abs(normals[: 6 * 400] @ [0.0, -0.8, 0.6]), 1.0, atol=1e-4)
+    assert not normals[6 * 400 :].any()
 
 
 def test_normals_of_length_0_are_none_and_others_get_length_1(tmp_path):

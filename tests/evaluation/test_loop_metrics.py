@@ -97,3 +97,12 @@ def test_the_two_sides_of_a_board_and_a_slope_are_no_double_wall():
     assert double_wall_share(*both(wall(0.0), (means, tilted, covs))) == 0.0
     turn = np.array([[0.8, 0.0, -0.6], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
     assert double_wall_share(means @ turn.T, normals @ turn.T, turn @ covs @ turn.T) == 0.0
+
+
+@pytest.mark.parametrize("unit", [0.001, 1.0, 1000.0])
+def test_where_no_metre_is_known_a_layer_counts_by_how_far_gaussians_stand_apart(unit):
+    means, normals, covs = both(wall(0.0), wall(0.08))
+    assert double_wall_share(unit * means, normals, unit**2 * covs, None) == 1.0
+    assert double_wall_share(unit * means, normals, unit**2 * covs, unit) == 1.0
+    means, normals, covs = both(wall(0.0), wall(0.22))
+    assert double_wall_share(unit * means, normals, unit**2 * covs, None) == 0.0

@@ -14,6 +14,7 @@ from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, transform_cloud
 from emgs_jax.evaluation.reconstruction import (
     compare_clouds,
+    compare_placements,
     ground_truth_cloud,
     posed_cloud,
     reconstruction_metrics,
@@ -224,6 +225,25 @@ def test_icp_of_a_protocol_takes_back_a_small_motion_that_the_poses_do_not_show(
     assert without["reconstruction/accuracy_m"] > 0.01
     found = compare_clouds(moved, reference(truth, refined), (estimated, poses), refined)
     assert found["reconstruction/accuracy_m"] < 1e-9
+
+
+def test_a_sample_of_the_estimate_changes_its_accuracy_by_chance_and_its_completion_not_at_all(monkeypatch):
+    """The raw cloud of 1,000 frames has 60 million voxels: its parts are searched one after the other."""
+    rng = np.random.default_rng(12)
+    truth, estimate = random_cloud(rng, 900), random_cloud(rng, 4000)
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, 3] = rng.normal(size=(5, 3))
+    away = Sim3(0.5, Rotation.random(rng=rng).as_matrix(), np.array([1.0, -2.0, 3.0]))
+    given = transform_cloud(estimate, away), reference(truth, CONFIG), (away.apply_to_poses(poses), poses)
+    whole = compare_placements(*given, CONFIG, [0.0, 0.1])
+    monkeypatch.setattr("emgs_jax.evaluation.clouds._PART_ROWS", 500)
+    sampled = compare_placements(*given, dataclasses.replace(CONFIG, num_sampled=1000), [0.0, 0.1])
+    assert whole[0] != whole[1], "the second is moved by ICP"
+    for found, expected in zip(sampled, whole, strict=True):
+        for name in ("completion_m", "recall_5cm_percent", "num_points"):
+            np.testing.assert_allclose(found[f"reconstruction/{name}"], expected[f"reconstruction/{name}"], rtol=1e-9)
+        accuracy = (other["reconstruction/accuracy_m"] for other in (found, expected))
+        assert 1e-6 < abs(np.subtract(*accuracy)) < 0.05 * expected["reconstruction/accuracy_m"]
 
 
 @pytest.mark.skipif(not REPLICA.exists(), reason="the shared Replica sequence is not here")

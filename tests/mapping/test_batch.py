@@ -3,12 +3,11 @@
 import jax
 import numpy as np
 import pytest
-from scene import at, observe_room, path_pose, predict_room, slam_config, stack_poses
+from scene import at, first_window, observe_room, path_pose, predict_room, slam_config, stack_poses
 from tiny_run import EditedPrior, dataset
 
 from emgs_jax.data.base import Frame
 from emgs_jax.mapping.batch import integrate_stack, make_stack, map_together, programs, unstacked
-from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.mapping.pipeline import integrate
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.mapping.window_input import RawView, WindowInput
@@ -31,7 +30,7 @@ def sequence(camera):
     views = stack([observe_room(T, camera, num_features=2) for T in poses])
     steps = [predict_room(FRAME + i, camera, has_newest=i < 1, num_features=2) for i in range(2)]
     first = WindowInput(
-        *zip(*map(shown, range(FRAME)), strict=True), FirstWindow(views, stack_poses(poses)), np.eye(4), {}, {}
+        *zip(*map(shown, range(FRAME)), strict=True), first_window(views, stack_poses(poses)), np.eye(4), {}, {}
     )
     return [
         first,

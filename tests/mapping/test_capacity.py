@@ -6,12 +6,11 @@ The first of a group: what is compiled here test_slam.py finds in memory.
 import jax
 import pytest
 from listening import compiled
-from scene import FULL, WHOLE, observe_room, path_pose, predict_room, slam_config, stack_poses
+from scene import FULL, WHOLE, first_window, observe_room, path_pose, predict_room, slam_config, stack_poses
 
 from emgs_jax.device.executables import forget
 from emgs_jax.gaussian_map import grow
 from emgs_jax.mapping.capacity import advance, prepare_step, start
-from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.ops.pytree import stack
 
 pytestmark = pytest.mark.slow  # the whole step is compiled
@@ -22,7 +21,7 @@ def prepared(camera):
     """A map and its config after `prepare_step`, and what `prepare_step` compiled."""
     config = slam_config(*WHOLE)
     poses = [path_pose(i) for i in range(3)]
-    first = FirstWindow(stack([observe_room(T, camera, num_features=2) for T in poses]), stack_poses(poses))
+    first = first_window(stack([observe_room(T, camera, num_features=2) for T in poses]), stack_poses(poses))
     jax.clear_caches()
     forget()
     with compiled() as names:

@@ -1,12 +1,14 @@
 """Predictions to arrays; oracle: every view has a depth and a colour of its own, and every pose a place of its own."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 from hand_run import poses_along
-from scene import slam_config
+from scene import matrix_of, pose, pose_of, slam_config
 
 from emgs_jax.data.base import Frame
 from emgs_jax.device.arrays import to_se3
@@ -78,6 +80,51 @@ def test_a_step_has_the_current_and_the_previous_view_and_their_poses_in_the_wor
     assert_poses(step.T_world_views, world([4, 5, 6 if has_newest else 5]))
     assert_poses(step.T_world_anchor, ANCHOR)
     np.testing.assert_allclose(step.current.features, np.broadcast_to([1.0, 0.0], step.current.features.shape))
+
+
+def covariances(count: int) -> np.ndarray:
+    """Of views, each its own."""
+    factors = 0.01 * np.random.default_rng(0).normal(size=(count, 6, 6))
+    return factors @ factors.mT
+
+
+def test_a_step_knows_its_motion_as_well_as_both_poses_together_and_its_own_pose():
+    """Against 20,000 draws of the errors of both poses."""
+    prediction, frames = predicted(Window(3, (0, 3, 4, 5, 6), (4, 5), 5))
+    turned = np.stack([matrix_of(pose((0, 0.3 * k, 0.1), (0.1 * k, 0, 1.0))) for k in range(5)])
+    P = covariances(5)
+    sure = replace(prediction, T_anchor_view=turned, pose_covariance=P)
+    step = to_prediction(sure, frames, ANCHOR, CONFIG)
+    rng = np.random.default_rng(1)
+    draws = [rng.multivariate_normal(np.zeros(6), P[k], 20_000) for k in (2, 3)]
+    before, here = (jaxlie.SE3.exp(draw.astype(np.float32)) for draw in draws)
+    a, b = (pose_of(T) for T in turned[2:4])
+    errors = np.asarray(((a.inverse() @ b).inverse() @ (a @ before).inverse() @ b @ here).log(), float)
+    said = np.asarray(step.pose_covariance[0])
+    units = np.sqrt(np.outer(np.diag(said), np.diag(said)))
+    np.testing.assert_allclose(np.cov(errors.T) / units, said / units, atol=0.04)
+    np.testing.assert_allclose(step.pose_covariance[1], P[3], rtol=1e-6)
+    assert np.isnan(to_prediction(prediction, frames, ANCHOR, CONFIG).pose_covariance).all()
+
+
+def test_the_steps_of_the_first_window_know_their_poses_as_well():
+    prediction, frames = predicted(FIRST)
+    sure = replace(prediction, pose_covariance=covariances(len(FIRST.views)))
+    window, _ = to_first_window(sure, frames, ANCHOR, CONFIG)
+    _, steps = opening(window, SimpleNamespace(initialization="incremental"))
+    for row, step in enumerate(steps, start=1):
+        places = [FIRST.views.index(FIRST.dense[k]) for k in (row - 1, row)]
+        np.testing.assert_allclose(step.pose_covariance[1], sure.pose_covariance[places[1]], rtol=1e-6)
+        assert np.trace(step.pose_covariance[0]) > np.trace(step.pose_covariance[1])
+
+
+@pytest.mark.parametrize("fault", ["shape", "asymmetric", "negative"])
+def test_a_covariance_that_is_none_is_refused(fault):
+    prediction, frames = predicted(FIRST)
+    wrong = np.tile(np.eye(6), (len(FIRST.views), 1, 1))
+    wrong = {"shape": wrong[1:], "asymmetric": wrong + np.eye(6, k=1), "negative": wrong - 2 * np.eye(6)}[fault]
+    with pytest.raises(ValueError, match="pose_covariance"):
+        to_first_window(replace(prediction, pose_covariance=wrong), frames, ANCHOR, CONFIG)
 
 
 def test_points_that_are_masked_or_not_sure_enough_are_not_valid():

@@ -11,14 +11,13 @@ import jaxlie
 import numpy as np
 import pytest
 from loop_scene import matrix
-from scene import assert_same, random_gaussians, random_observation
+from scene import assert_same, first_window, random_gaussians, random_observation
 
 import emgs_jax
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.localization import localize_coarse
 from emgs_jax.loop_closure.relocalization import RelocalizedPose
-from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.mapping.records import RELOCALIZED, FrameRecord
 from emgs_jax.mapping.relocalization import (
     anchor_motion,
@@ -52,6 +51,7 @@ def prediction() -> Prediction:
         previous=random_observation(20, seed=2),
         T_world_views=to_se3(np.stack(poses)),
         T_world_anchor=to_se3(matrix((0, 0, 30), (1, 1, 1))),
+        pose_covariance=jnp.tile(1e-4 * jnp.eye(6), (2, 1, 1)),
         has_newest=jnp.asarray(True),
         is_repeat=jnp.asarray(True),
     )
@@ -123,6 +123,7 @@ def test_from_then_on_the_prior_says_its_poses_from_where_the_camera_was_found()
     relative[:3, 3] *= 1.1  # as `localize_coarse` scales it
     np.testing.assert_allclose(anchor @ relative, PLACE, atol=1e-5)
     assert move_prediction(given, None) is given
+    assert np.isnan(there.pose_covariance).all()  # that world is only as sure as the pose that was found
     record = FrameRecord(0, None, None, "tracked", pose=PLACE, scale=1.1)
     np.testing.assert_allclose(anchor_motion_of(record, given).wxyz_xyz, motion.wxyz_xyz, atol=1e-6)
 
@@ -140,7 +141,7 @@ def test_a_frame_of_its_own_is_where_the_camera_was_found_and_goes_with_it_from_
 
 def test_the_first_view_of_a_sequence_is_its_own_previous_one():
     views = jax.tree.map(lambda leaf: leaf[None], random_observation(20))
-    found = as_step_prediction(FirstWindow(views, to_se3(PLACE[None])))
+    found = as_step_prediction(first_window(views, to_se3(PLACE[None])))
     assert_same(found.current, random_observation(20))
     assert_same(found.previous, found.current)
     np.testing.assert_allclose(found.T_world_views.as_matrix(), [PLACE] * 3, atol=1e-5)

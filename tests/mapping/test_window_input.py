@@ -88,3 +88,14 @@ def test_predictions_in_another_unit_are_named_before_the_first_step_with_a_fact
     factor = float(str(caught.value).split("T_anchor_view by ")[1].split(" ")[0])
     assert 0.1 < factor / metres < 10, "a scene of some units"
     assert len(taken(lambda prediction: in_unit(in_unit(prediction, metres), 1 / factor))) > 1
+
+
+def test_points_that_are_none_are_counted_where_they_come_and_are_in_no_raw_view():
+    def sky(prediction: PriorPrediction) -> PriorPrediction:
+        points = prediction.points.copy()
+        points[:, 0, :3] = ((1e7, 0, 1e7), (0, 0, 0), (np.nan, 0, 1))
+        return replace(prediction, points=points, mask=np.ones_like(prediction.mask))
+
+    for one in taken(sky):
+        for raw in one.raw:
+            assert raw.num_left_out == 3 and not raw.mask[0, :3].any() and raw.mask[1:].all()

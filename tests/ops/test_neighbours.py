@@ -6,7 +6,7 @@ import pytest
 from scene import on_host
 from scipy.spatial import cKDTree
 
-from emgs_jax.ops.neighbours import compact_rows, curve_order, knn
+from emgs_jax.ops.neighbours import compact_rows, curve_order, group_points, knn, nearest
 
 search, compacted, along_curve = on_host(knn), on_host(compact_rows), on_host(curve_order)
 # Sizes of most tests, so that they share programs: a few blocks of queries among few and among many groups of points.
@@ -151,3 +151,31 @@ def test_compaction_of_nothing_is_all_missing():
     rows, exists, overflow = compacted(np.zeros(3, bool), 5)
     np.testing.assert_array_equal(rows, [3] * 5)
     assert not exists.any() and overflow == 0
+
+
+AROUND = on_host(lambda q, p: nearest(q, q[:, 0] > -np.inf, p, group_points(p, p[:, 0] > -np.inf), 4))
+FAR_AWAY = {
+    "one": lambda points: np.where(np.arange(len(points))[:, None] == 7, np.float32([0, 0, 1000]), points),
+    "a sky": lambda points: np.where(np.arange(len(points))[:, None] % 3 == 0, 1e4 * points, points),
+    "another room": lambda points: points + np.where(np.arange(len(points))[:, None] % 2 == 0, np.float32(2000), 0),
+    "beyond any map": lambda points: np.where(np.arange(len(points))[:, None] == 7, np.float32(1e30), points),
+}
+
+
+@pytest.mark.parametrize("what", FAR_AWAY)
+@pytest.mark.parametrize("is_query", [False, True])
+def test_what_is_far_away_takes_no_neighbour_from_others(what, is_query):
+    """One Gaussian at 1 km left all others of a room in one cell: a fifth of the points got a farther one."""
+    x, y = np.meshgrid(np.arange(40), np.arange(60))
+    grid = np.stack([x / 20 - 1, y / 20 - 1.5, 2 + 0.1 * np.sin(x / 5)], axis=-1).reshape(-1, 3).astype(np.float32)
+    grid = np.random.default_rng(2).permutation(grid)
+    points, queries = grid[::2], grid[: NUM_QUERIES * 4 : 4] + np.float32(0.003)
+    if is_query:
+        queries, is_here = FAR_AWAY[what](queries), FAR_AWAY[what](queries)[:, 2] < 10
+    else:
+        points, is_here = FAR_AWAY[what](points), np.ones(len(queries), bool)
+    rows, found = AROUND(queries, points)
+    kept = np.where(np.abs(points[:, :1]) < 1e6, points, np.float32(1e9)).astype(float)
+    nearest_m = cKDTree(kept).query(queries[is_here].astype(float))[0]
+    got = np.linalg.norm(kept[rows[is_here, 0]] - queries[is_here], axis=1)
+    assert found[is_here].all() and (got > 1.01 * nearest_m + 1e-6).mean() < 0.01

@@ -50,7 +50,7 @@ def contents(folder):
 def assert_same_bits(a, b):
     assert a.window == b.window
     for name in [field.name for field in fields(a) if field.name != "window"]:
-        x, y = getattr(a, name), getattr(b, name)
+        x, y = (np.asarray(getattr(one, name)) for one in (a, b))
         assert (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes()), name
 
 
@@ -84,10 +84,10 @@ def with_array(name, change):
     return edit
 
 
-def test_replay_is_the_live_prior_bit_for_bit_in_version_1_as_well(folder, prior, room):
+def test_replay_is_the_live_prior_bit_for_bit_in_older_versions_as_well(folder, prior, room):
     names = ["000000.npz", "000001.npz", "000002.npz", "000003.npz", "manifest.json", "text_features.npz"]
     assert sorted(contents(folder)) == names, "nothing but the documented files is left"
-    for _ in range(2):
+    for older in (2, 1, 1):
         replay = Recorded(folder)
         replay.check(room, WINDOW_SIZE)
         assert replay.provenance == prior.provenance
@@ -96,7 +96,29 @@ def test_replay_is_the_live_prior_bit_for_bit_in_version_1_as_well(folder, prior
         for window, frames in calls(room):
             live = prior.predict(window, frames, room.intrinsics)
             assert_same_bits(replay.predict(window, frames, room.intrinsics), live)
-        forge_manifest(folder, lambda manifest: manifest.update(version=1))
+        forge_manifest(folder, lambda manifest: manifest.update(version=older))  # noqa: B023
+
+
+class Sure(Simulated):
+    """The simulated prior, which says how sure it is of its poses."""
+
+    def predict(self, window, frames, intrinsics):
+        found = super().predict(window, frames, intrinsics)
+        return replace(found, pose_covariance=np.multiply.outer(1.0 + np.arange(len(window.views)), 1e-4 * np.eye(6)))
+
+
+def test_how_sure_poses_are_is_replayed_and_what_the_key_says_stands_in_its_place(tmp_path, room):
+    prior = Sure(seed=5, feature_size=4, classes=room.classes)
+    record(prior, room, WINDOW_SIZE, tmp_path)
+    window, frames = calls(room)[1]
+    live = prior.predict(window, frames, room.intrinsics)
+    found = Recorded(tmp_path).predict(window, frames, room.intrinsics)
+    np.testing.assert_array_equal(found.pose_covariance, live.pose_covariance)
+    other = Recorded(tmp_path, pose_std=[0.02, 3.0])
+    found = other.predict(window, frames, room.intrinsics)
+    expected = np.diag(np.repeat([0.02, np.radians(3.0)], 3) ** 2)
+    np.testing.assert_allclose(found.pose_covariance, np.broadcast_to(expected, live.pose_covariance.shape))
+    assert other.provenance.settings["pose_std"] == [0.02, 3.0]
 
 
 def test_an_interrupted_recording_says_so_and_is_completed_without_repeating_work(tmp_path, folder, prior, room):
@@ -178,7 +200,7 @@ def test_missing_and_foreign_folders_name_the_path(tmp_path, folder):
         Recorded(tmp_path / "nowhere")
     manifest = json.loads((folder / "manifest.json").read_text())
     for content, message in (
-        (manifest | {"version": 3}, r"version 3, this program reads \(1, 2\)"),
+        (manifest | {"version": 4}, r"version 4, this program reads \(1, 2, 3\)"),
         (manifest | {"format": "other"}, "not of the format"),
         ([1, 2], "not of the format"),
     ):

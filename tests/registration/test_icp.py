@@ -23,11 +23,12 @@ STARTS = [
 ]
 
 
-def start_at(T, settings, pose_std=NOISE[0], depth_noise=NOISE[1]):
+def start_at(T, settings, pose_std=NOISE[0], depth_noise=NOISE[1], is_given=False):
     """Known: what `prior_information` points so noisy say of the pose, and `scale_noise` of the scale."""
     pose = np.sqrt(float(settings.prior_information)) / np.repeat([pose_std, depth_noise], 3)
     scale = 1.0 / (max(float(settings.scale_noise), 1e-3) * depth_noise)
-    return CoarseStart(T, sc.device(np.diag(np.append(pose, scale))), sc.device(np.float32(depth_noise)))
+    known = sc.device(np.diag(np.append(pose, scale)))
+    return CoarseStart(T, known, sc.device(np.float32(depth_noise)), sc.device(is_given))
 
 
 solve, gradients_of = sc.on_host(icp), sc.on_host(color_gradients)
@@ -93,9 +94,9 @@ def points_of(points, normals=TOWARDS, light=0.5, valid=True) -> Observation:
     return on_even_rows(points, np.broadcast_to(normals, points.shape), colors, np.broadcast_to(valid, len(points)))
 
 
-def solved(points, gaussians, settings, pose_std=POSE_STD, depth_noise=STIFF):
+def solved(points, gaussians, settings, pose_std=POSE_STD, depth_noise=STIFF, is_given=False):
     """xi of T = COARSE exp(xi), the scale and the info."""
-    start = start_at(COARSE, settings, pose_std, depth_noise)
+    start = start_at(COARSE, settings, pose_std, depth_noise, is_given)
     T, scale, info = solve(points, sc.move_gaussians(COARSE, gaussians), start, settings)
     return step_to(T).astype(float), float(scale), info
 
@@ -264,18 +265,31 @@ def test_a_pose_is_held_no_harder_than_the_points_fit_the_map_there(small):
     np.testing.assert_allclose(found, expected, atol=1e-5)  # the solver's tolerance
     held, _, _ = solved(points, WALL, settings, 1e-3, claimed)
     assert abs(held[2]) < 0.2 * abs(expected[2]) < 0.03
+    # Of a pose that comes with its uncertainty the misfit says nothing.
+    given, _, _ = solved(points, WALL, sc.at(settings, "max_misfit", 0.1), 1e-3, claimed, is_given=True)
+    sure, std = 30 / 1e-6, np.hypot(0.02, misfit * 2.03 * float(settings.noise))
+    assert_as_stated(given, [0, 0, -0.03 / (1 + sure * std**2 / NUM_CELLS**2)])
     # What is farther away than `max_misfit` shows something else.
     other, _, _ = solved(points, WALL, sc.at(settings, "max_misfit", 0.01), 1e-3, claimed)
     np.testing.assert_allclose(other, held, atol=1e-6)
 
 
 @pytest.mark.parametrize("arm", [0.5, 2.0])
-def test_the_least_eigenvalue_is_that_of_one_point(small, arm):
-    """Planes through points on the axes at ±a, facing the next axis: I / 3σ², for rotation a² I / 3σ²."""
-    axes, normals = arm * np.concatenate([np.eye(3), -np.eye(3)]), np.tile(np.roll(np.eye(3), 1, axis=1), (2, 1))
-    _, _, info = solved(points_of(axes, normals), gaussians_of(axes, (0.1, 0.1, 0.1), normals), small)
-    expected = min(1.0, arm**2) / 3 / 0.1**2
-    assert info.min_eigenvalue == pytest.approx(expected, rel=1e-3)  # roundings of a product of so many rows
+def test_the_certainty_of_a_pose_is_that_of_points_and_prior_together(small, arm):
+    """Planes through points at ±a on the axes, facing the next axis: N I / 3σ², for rotation a² as much.
+
+    The median depth of a half, of a half of one point and more, is the unit of the translation.
+    """
+    axes = arm * np.concatenate([np.eye(3), -np.eye(3)]) + [0, 0, 2.0]
+    normals = np.tile(np.roll(np.eye(3), 1, axis=1), (2, 1))
+    points, gaussians = points_of(axes, normals), gaussians_of(axes, (0.1, 0.1, 0.1), normals)
+    # The rows of exact points, x × n about the camera.
+    rows = np.hstack([normals, np.cross(axes, normals)]) * np.repeat([2.0, 1.0], 3) / 0.1
+    for settings, known in ((sc.at(small, "prior_information", 0.0), 0.0), (small, 30.0)):
+        _, _, info = solved(points, gaussians, settings, 0.02, 0.01)
+        information = float(info.num_effective) / 6 * rows.T @ rows
+        information += np.diag(np.repeat([known * (2.0 / 0.02) ** 2, known / 0.01**2], 3))
+        assert info.min_eigenvalue == pytest.approx(np.linalg.eigvalsh(information)[0], rel=2e-3)
 
 
 # The closed room.
@@ -355,7 +369,7 @@ def test_the_info_counts_inliers_and_measures_their_planes(source, target, setti
     assert 0.5 * 768 < info.num_inliers <= 768
     assert info.inlier_fraction == pytest.approx(float(info.num_inliers) / 768)
     assert info.residual < 0.02 and info.misfit < 0.02  # exact points: only edges are off their planes
-    assert info.min_eigenvalue > 0 and info.num_steps > 0
+    assert info.min_eigenvalue > 100 and info.num_steps > 0
     _, _, strict = solve(source, target, start_at(TRUTH, settings), sc.at(settings, "min_normal_cos", 1.1))
     assert strict.num_inliers == 0 and strict.inlier_fraction == 0 and strict.residual == 0
 

@@ -49,22 +49,22 @@ def test_the_errors_of_the_next_pose_are_distributed_as_predicted():
         return (MOTION.inverse() @ moved).log()
 
     errors = np.column_stack([errors_of(np.float32(before[:, :6]), np.float32(own[:, :6])), before[:, 6] + own[:, 6]])
-    sampled, predicted = np.cov(errors.T), predict(P, MOTION, NOISE)
+    sampled, predicted = np.cov(errors.T), predict(P, MOTION, np.diag(NOISE**2))
     std = np.sqrt(np.diag(predicted))
     np.testing.assert_allclose(sampled / np.outer(std, std), predicted / np.outer(std, std), atol=0.04)
 
 
 def test_a_motion_that_is_not_finite_only_adds_noise():
     P, lost = covariance(), jaxlie.SE3(device(np.full(7, np.nan)))
-    np.testing.assert_allclose(predict(P, lost, np.full(7, 0.1, np.float32)), P + 0.01 * np.eye(7), rtol=1e-6)
+    np.testing.assert_allclose(predict(P, lost, 0.01 * np.eye(7, dtype=np.float32)), P + 0.01 * np.eye(7), rtol=1e-6)
 
 
 def test_in_another_unit_of_length_all_is_known_as_well_as_before():
     """Of which a metre has three times as many: motion, noise and errors of the pose are three times as long."""
     factor, units = np.float32(3.0), np.float32([3.0] * 3 + [1.0] * 4)
     longer = jaxlie.SE3(MOTION.wxyz_xyz * np.float32([1.0] * 4 + [3.0] * 3))
-    found = moved(rescaled(known(), factor), longer, units * NOISE)
-    expected = rescaled(moved(known(), MOTION, NOISE), factor)
+    found = moved(rescaled(known(), factor), longer, np.diag((units * NOISE) ** 2))
+    expected = rescaled(moved(known(), MOTION, np.diag(NOISE**2)), factor)
     np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-4, atol=1e-9)
     np.testing.assert_array_equal(rescaled(known(), factor).covariance[3:, 3:], covariance()[3:, 3:])
     assert expected.log_scale == pytest.approx(np.log(3.0))
@@ -89,8 +89,8 @@ def test_what_is_certain_stays_and_what_is_not_measured_says_nothing():
 
 def test_the_estimate_takes_motion_and_measurement():
     W = np.linalg.inv(covariance(1))
-    step, after = measured(moved(known(), MOTION, NOISE), STEP, W)
-    expected_step, expected = update(predict(covariance(), MOTION, NOISE), STEP, W)
+    step, after = measured(moved(known(), MOTION, np.diag(NOISE**2)), STEP, W)
+    expected_step, expected = update(predict(covariance(), MOTION, np.diag(NOISE**2)), STEP, W)
     np.testing.assert_allclose(step, expected_step, rtol=1e-5)
     np.testing.assert_allclose(after.covariance, expected, rtol=1e-5)
 
@@ -101,21 +101,42 @@ def test_the_root_measures_the_mahalanobis_distance():
     assert np.sum((root_information(P) @ x) ** 2) == pytest.approx(expected, rel=1e-2)
 
 
+def found_with(information: np.ndarray, misfit: float = 0.04) -> IcpInfo:
+    zero, one = device(0.0), device(np.int32(1))
+    numbers = zero, zero, device(misfit), device(np.zeros(8)), device(np.zeros(7)), device(information), zero, zero
+    return IcpInfo(one, *numbers, one, device(True))
+
+
+def test_a_pose_that_is_given_keeps_its_weight_and_its_unit_and_has_little_of_the_maps_error():
+    """P and points that do not fit: the textbook's posterior, and the gain of the points as the part of the map."""
+    before = replace(known(), is_given=np.array(True), log_scale=np.float32(0.3))
+    W = np.float32(np.diag([1e4] * 6 + [0.0]))
+    arguments = before, found_with(W), np.float32(0.02), np.float32(1.1)
+    after, by_map = next_belief(*arguments, np.array(True), np.float32(1.0))
+    P = (
+        np.diag([1.0] * 6 + [2.0]) @ covariance().astype(float) @ np.diag([1.0] * 6 + [2.0])
+    )  # a scale is held as before
+    expected = np.linalg.inv(np.linalg.inv(P) + W)
+    np.testing.assert_allclose(after.covariance, expected, rtol=2e-2, atol=1e-7)
+    np.testing.assert_allclose(by_map, (expected @ W)[:6, :6], atol=1e-2)
+    assert after.log_scale == np.float32(0.3) and after.num_scales == before.num_scales
+    _, by_map = next_belief(*arguments, np.array(False), np.float32(1.0))
+    assert not np.any(by_map)
+
+
 def test_a_frame_that_is_tracked_is_known_as_its_points_say_and_another_as_before():
     twice = jaxlie.SE3(device(np.tile(MOTION.wxyz_xyz, (2, 1))))
     before = jax.device_get(eqx.tree_at(lambda b: b.repeats.predicted, known(), twice))
-    zero, one, information = device(0.0), device(np.int32(1)), 1e4 * np.eye(7)
-    numbers = zero, zero, device(0.04), device(np.zeros(8)), device(np.zeros(7)), device(information), zero, zero
-    found = IcpInfo(one, *numbers, one, device(True))
-    arguments = before, found, np.float32(0.02), np.float32(1.1)
-    after = next_belief(*arguments, np.array(True), np.float32(5.0))
+    arguments = before, found_with(1e4 * np.eye(7)), np.float32(0.02), np.float32(1.1)
+    after, by_map = next_belief(*arguments, np.array(True), np.float32(5.0))
     # Twice the noise is four times P, and five frames whose points err alike say of the scale what one of them does.
     nothing, said = np.zeros(7, np.float32), np.float32(np.diag([1e4] * 6 + [2e3]))
     _, expected = update(4.0 * covariance(), nothing, said)
     np.testing.assert_allclose(after.covariance, expected, rtol=1e-5)
     np.testing.assert_allclose(after.log_scale, np.log(1.1) / 2, rtol=1e-5)
     assert after.num_scales == 2 and after.depth_noise == pytest.approx(0.04)
-    same = next_belief(*arguments, np.array(False), np.float32(5.0))
+    np.testing.assert_array_equal(by_map, np.eye(6))  # the estimate is relative to the map
+    same, _ = next_belief(*arguments, np.array(False), np.float32(5.0))
     # What the prior said of the poses is said, whether its points fit or not: in the unit of its final scale.
     for one in (after, same):
         said = one.repeats.predicted.wxyz_xyz[:, 4:]

@@ -11,7 +11,7 @@ import pytest
 from scene import device, matrix_of, on_host, pose, pose_of, product, random_observation, stack_poses
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.observation import Prediction
+from emgs_jax.observation import Prediction, no_covariance
 from emgs_jax.registration import pose_noise
 from emgs_jax.registration.pose_noise import Repeats, no_repeats, repeat_poses, rescale_repeats
 
@@ -57,6 +57,7 @@ def answer(
         NOTHING,
         stack_poses([product(anchor, scaled(T, scale)) for T in views]),
         anchor,
+        no_covariance(),
         *(device(flags[name]) for name in ("has_newest", "is_repeat")),
     )
 

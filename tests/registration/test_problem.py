@@ -4,7 +4,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from compiled_rows import random_problem
 from scene import at, device, matrix_of, on_host
 
@@ -43,8 +42,8 @@ def noisy_problem():
         matches,
         tuple(map(device, (placed + matrix[:3, 3], triangle, DEPTH_NOISE / STD * placed, valid))),
     )
-    fields = lambda p: (p.source.points, p.source.valid, p.scale_unit, p.weight)  # noqa: E731
-    return matches, eqx.tree_at(fields, problem, tuple(map(device, (noisy, valid, 1.0, 1.0))))
+    fields = lambda p: (p.source.points, p.source.valid, p.units, p.weight)  # noqa: E731
+    return matches, eqx.tree_at(fields, problem, tuple(map(device, (noisy, valid, np.ones(7), 1.0))))
 
 
 def test_noise_along_the_rays_pulls_the_scale_nowhere(config):
@@ -81,15 +80,15 @@ def test_depths_that_err_by_a_factor_pull_the_pose_nowhere_along_their_rays(conf
         return np.linalg.lstsq(jacobian, -rows, rcond=None)[0]
 
     assert np.abs(step(COLORED_RAY)).max() < 0.01 * DEPTH_NOISE**2
-    assert step(COLORED)[6] * float(problem.scale_unit) < -0.5 * DEPTH_NOISE**2
+    assert step(COLORED)[6] * float(problem.units[6]) < -0.5 * DEPTH_NOISE**2
 
 
 def test_the_information_of_the_points_is_that_of_their_rows_whatever_the_unit_of_the_seventh_unknown(config):
     settings = at(config("slam/localization=default").localization.icp, "residual", DISTRIBUTION)
     matches, problem = noisy_problem()
     found, small, still = (
-        data_information(NOWHERE, matches, eqx.tree_at(lambda p: p.scale_unit, problem, device(unit)), settings)
-        for unit in (1.0, 0.01, 0.0)
+        data_information(NOWHERE, matches, eqx.tree_at(lambda p: p.units, problem, device(units)), settings)
+        for units in (np.ones(7), np.array([3.0] * 3 + [1.0] * 3 + [0.01]), np.append(np.ones(6), 0.0))
     )
     jacobian = jacobian_of(NOWHERE, matches, problem, settings).astype(float).reshape(-1, 7)  # its unit is 1
     np.testing.assert_allclose(found, jacobian.T @ jacobian, rtol=1e-3, atol=1e-3 * found.max())
@@ -104,19 +103,25 @@ def test_what_is_known_is_the_prior_of_the_unknowns_and_worth_less_where_the_poi
     known = on_host(root_information)(np.float32(factor @ factor.T + 1e-4 * np.eye(7)))
 
     @on_host
-    def problem_of(noise, depth, known, settings: IcpConfig) -> Problem:
-        uncertainty = Uncertainty(noise, depth, jnp.ones(()))
-        start = CoarseStart(problem.T_world_coarse, known, jnp.asarray(0.02))
+    def problem_of(noise, known, is_given, settings: IcpConfig) -> Problem:
+        uncertainty = Uncertainty(noise, jnp.full(problem.source.valid.shape, 0.02), jnp.ones(()))
+        start = CoarseStart(problem.T_world_coarse, known, jnp.asarray(0.02), is_given)
         return pose_problem(problem.source, problem.surface, start, uncertainty, settings)
 
-    y, depth = np.linspace(-1.0, 1.0, 7), np.full(problem.source.valid.shape, 0.02, np.float32)
-    prior = lambda worse, chosen: problem_of(np.float32(0.02 * worse), depth, known, chosen).prior  # noqa: E731
-    scaled = y * ([1.0] * 6 + [0.5 * 0.02])  # the seventh counts `scale_noise` of the depth noise
-    expected = np.linalg.norm(known @ scaled)
+    def made(worse: float, is_given: bool = False, chosen: IcpConfig = settings) -> Problem:
+        return problem_of(np.float32(0.02 * worse), known, np.array(is_given), chosen)
+
+    points, valid = np.asarray(problem.source.points), np.asarray(problem.source.valid)
+    depth = np.sort(points[valid, 2])[(valid.sum() - 1) // 2]
+    units = np.array([depth] * 3 + [1.0] * 3 + [0.5 * 0.02])  # the last counts `scale_noise` of the depth noise
+    np.testing.assert_allclose(made(1.0).units, units, rtol=1e-6)
+    np.testing.assert_allclose(made(1.0).depth_noise, settings.noise * 0.02, rtol=1e-6)
+    y = np.linspace(-1.0, 1.0, 7)
     for worse in (1.0, 3.0):
-        np.testing.assert_allclose(np.linalg.norm(prior(worse, settings) @ y), expected / worse, rtol=1e-4)
-    made = problem_of(np.float32(0.02), depth, known, settings)
-    assert float(made.scale_unit) == pytest.approx(0.5 * 0.02)
-    np.testing.assert_allclose(made.depth_noise, settings.noise * depth, rtol=1e-6)
-    nothing = prior(1.0, at(settings, "prior_information", 0.0))
+        expected = np.linalg.norm(known @ (units * y)) / worse
+        np.testing.assert_allclose(np.linalg.norm(made(worse).prior @ y), expected, rtol=1e-4)
+        # Of a pose that comes with its uncertainty they say nothing, and of the scale as much as ever.
+        expected = np.linalg.norm(known @ (units * y / np.append(np.ones(6), worse)))
+        np.testing.assert_allclose(np.linalg.norm(made(worse, True).prior @ y), expected, rtol=1e-4)
+    nothing = made(1.0, True, at(settings, "prior_information", 0.0)).prior
     assert not np.any(nothing[:6]) and nothing[6, 6] == 1  # as printed; a scale that no point moves stays

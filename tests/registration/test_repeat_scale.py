@@ -32,6 +32,12 @@ def test_the_same_to_the_bit_is_certain():
     assert scale[0] == pytest.approx(1.1, rel=1e-5) and std[0] < 1e-6
 
 
+@pytest.mark.parametrize("true", [0.01, 50.0])
+def test_a_ratio_is_found_however_small_or_large(true):
+    scale, std = scales_of(np.full((200, NUM_PIXELS), np.log(true), np.float32))
+    assert scale[0] == pytest.approx(true, rel=1e-4) and std[0] < 1e-5
+
+
 def test_the_deviation_is_that_of_the_scales_where_pixels_err_apart():
     scale, std = scales_of(np.float32(0.05 * normal(200, NUM_PIXELS)))
     assert np.mean(std) == pytest.approx(np.std(np.log(scale)), rel=0.25)
@@ -49,3 +55,13 @@ def test_without_a_pair_the_other_scale_stands():
     blind = replace(moved_points(T, NOW), valid=np.zeros(NUM_PIXELS, bool))
     scale, std = on_host(repeat_scale)(NOW, blind, T, np.float32(0.8), RATIO)
     assert scale == pytest.approx(0.8) and np.isfinite(std)
+
+
+@pytest.mark.parametrize("poison", [0.0, np.nan, 1e30])
+def test_a_row_that_is_no_point_says_nothing(poison):
+    """A depth of 0 in both predictions made the error of the scale, and with it the whole state, NaN."""
+    points, valid = np.array(NOW.points), np.arange(NUM_PIXELS) != 7
+    points[7] = poison
+    bad, good = replace(NOW, points=points), replace(NOW, points=np.where(valid[:, None], points, 1), valid=valid)
+    found, expected = (repeat_scale(one, moved_points(T, one), T, jnp.ones(()), RATIO) for one in (bad, good))
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-7)

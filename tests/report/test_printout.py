@@ -61,3 +61,9 @@ def test_a_remedy_names_keys_that_there_are():
     words = " ".join(REMEDIES.values()).replace("(", " ").replace(")", " ").replace(",", " ").split()
     keys = {word.removesuffix("=…") for word in words if word.startswith(("slam.", "dataset."))}
     assert len(keys) > 5 and keys <= known
+
+
+def test_points_that_no_map_can_hold_are_counted_in_the_last_words():
+    given = [*records(tracked=2), FrameRecord(5, "a/sky.png", 0.0, "tracked", left_out=30)]
+    _, said = frame_lines(given, 0)
+    assert said.startswith("30 points of 1 frames, from sky.png on, were left out: ") and "1e+06 m" in said

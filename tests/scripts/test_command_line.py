@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from emgs_jax.config.configure import compose, groups
 from emgs_jax.config.overrides import parsed, readable
+from emgs_jax.io.files import owned
 from experiments.cli import COMMANDS, main
 from experiments.command import check_arguments, check_missing, check_out, kept_words, nothing_left
 from experiments.console import speak_on
@@ -265,6 +266,16 @@ def test_a_command_that_comes_to_nothing_leaves_nothing(tmp_path, monkeypatch):
             raise ValueError("wrong")
         assert tmp_path.exists() and folder.exists() == (kept is not None)
         assert [path.name for path in tmp_path.iterdir()] == (["outputs"] if kept else [])
+
+
+def test_a_command_that_is_refused_leaves_the_folder_of_the_one_that_is_in_it(tmp_path, monkeypatch):
+    """Two runs of the same second: the second was refused, and removed the folder of the first, which then failed."""
+    monkeypatch.setattr("experiments.command.HydraConfig", SimpleNamespace(get=lambda: hydra_of(tmp_path)))
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / "run.log").touch()
+    with owned(tmp_path), pytest.raises(ValueError, match="another program"), nothing_left(), owned(tmp_path):
+        pass
+    assert {path.name for path in tmp_path.iterdir()} == {".hydra", "run.log"}
 
 
 @pytest.mark.parametrize("own", ["notes.log", "session.log/frames.csv", "run.log", None])

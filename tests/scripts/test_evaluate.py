@@ -1,5 +1,6 @@
 """The batch: what runs, what is skipped, what failures and interruptions leave; oracle: a run that is made up."""
 
+import contextlib
 import csv
 import importlib.metadata
 import json
@@ -38,18 +39,22 @@ def jobs_of(*words: str) -> list:
 def evaluate(tmp_path, monkeypatch):
     """`evaluate("seeds=[0,1]", …)`: problems of an evaluation of two rooms whose runs only write what they are of.
 
-    `evaluate.runs` holds the room and seed of each run; `evaluate.broken` maps a room to the error that its runs raise.
+    `evaluate.runs` holds the room and seed of each run; `evaluate.broken` maps a room to the error that its runs raise,
+    those of `evaluate.late` after they have written their metrics.
     """
 
     def run(config, folder):
         evaluation.runs.append((config.dataset.seed, config.prior.seed))
-        if config.dataset.seed in evaluation.broken:
+        is_broken = config.dataset.seed in evaluation.broken
+        if is_broken and config.dataset.seed not in evaluation.late:
             raise evaluation.broken[config.dataset.seed]
         block = {"format": RESULT_FORMAT, "protocol": config.evaluation.protocol, "simulated": True} | THIS_CODE
         block |= {"prior": {"name": "simulated"}, "config": OmegaConf.to_container(config, resolve=True)}
         block["data"] = {"name": "synthetic", "sequence": f"room{config.dataset.seed}"}
         ate = 0.01 * (1 + config.dataset.seed) + 0.001 * config.prior.seed
         write_json(folder / METRICS_FILE, {"trajectory/ate_sim3_m": ate, "provenance": block})
+        if is_broken:
+            raise evaluation.broken[config.dataset.seed]
 
     def evaluation(*overrides):
         evaluation.runs.clear()
@@ -57,7 +62,7 @@ def evaluate(tmp_path, monkeypatch):
         words = "suite=smoke", rooms, f"out={tmp_path / 'out'}", *overrides
         return experiments.evaluate.evaluate(composed(*words))
 
-    evaluation.runs, evaluation.broken, evaluation.out = [], {}, tmp_path / "out"
+    evaluation.runs, evaluation.broken, evaluation.late, evaluation.out = [], {}, set(), tmp_path / "out"
     monkeypatch.setattr(experiments.evaluate, "run", run)
     return evaluation
 
@@ -119,6 +124,16 @@ def test_a_job_that_fails_does_not_stop_the_others_and_is_named_at_the_end(evalu
     evaluate.broken.clear()
     assert evaluate("seeds=[0]") == [] and evaluate.runs == [(0, 0)]
     assert not note.exists() and "not finished" not in (evaluate.out / "results.md").read_text()
+
+
+@pytest.mark.parametrize("error", [OSError("no space left"), KeyboardInterrupt()])
+def test_a_job_that_fails_after_its_metrics_are_there_is_not_finished(evaluate, error):
+    evaluate.broken[0], evaluate.late = error, {0}
+    with contextlib.suppress(KeyboardInterrupt):
+        assert evaluate("seeds=[0]") == ["synthetic/0/default/0: no space left"]
+    evaluate.broken.clear()
+    assert evaluate("seeds=[0]") == [] and (0, 0) in evaluate.runs
+    assert evaluate("seeds=[0]") == [] and evaluate.runs == []
 
 
 def test_an_interrupted_evaluation_has_the_tables_of_what_is_finished_and_resumes(evaluate):

@@ -77,6 +77,28 @@ def test_keyframes_are_matched_by_time_and_a_trajectory_alone_is_enough(tmp_path
     assert not any(key.startswith("reconstruction") for key in metrics)
 
 
+def test_lines_in_any_order_have_the_errors_of_those_in_order_of_time(tmp_path, truth):
+    """The motion from each line to the next was compared: an RPE of .70 cm became 5.29."""
+    times, poses, cloud = truth
+    moved = poses.copy()
+    moved[:, :3, 3] += np.random.default_rng(0).normal(0, 0.01, (len(poses), 3))
+    found = []
+    for rows in (np.arange(len(times)), [3, 0, 5, 1, 4, 2]):
+        (tmp_path / str(len(found))).mkdir()
+        trajectory, _, out = write_system(tmp_path / str(len(found)), times[rows], moved[rows], cloud)
+        found.append(scored(trajectory, out)[0]["trajectory/rpe_translation_m"])
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
+
+
+def test_numbers_of_frames_that_meet_half_of_the_timestamps_are_refused_and_both_ranges_said(tmp_path, truth):
+    """Numbers 0, 1, 2 … met every second frame of a sequence with two a second: an ATE of 22.6 cm in place of 1.2."""
+    times, poses, cloud = truth
+    trajectory, _, out = write_system(tmp_path, 2.0 * times, poses, cloud)
+    with pytest.raises(ValueError, match=r"3 of 6 poses.* 0.000 to 10.000, those of .* 0.000 to 5.000: .*numbers of"):
+        scored(trajectory, out)
+    assert scored(trajectory, out, "min_associated_percent=50")[0]["trajectory/num_frames"] == 3
+
+
 @pytest.mark.parametrize(("matched", "warns"), [(18, False), (17, True)])
 def test_a_system_that_knows_less_than_the_wanted_share_of_the_frames_is_warned_of(matched, warns):
     text = coverage({"trajectory/num_frames": matched, "score/num_poses": 40, "score/num_frames": 20}, 90)

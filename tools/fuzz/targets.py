@@ -293,7 +293,8 @@ def write_depth_images(folder: Path) -> None:
 
 def read_predictions(folder: Path) -> None:
     dataset = _recorded()[0]
-    prior = Files(folder, scale="auto", median_depth=2.0, depth_scale=1000.0, max_depth_step=0.03)
+    given = {"scale": "auto", "median_depth": 2.0, "depth_scale": 1000.0, "max_depth_step": 0.03}
+    prior = Files(folder, **given, pose_std=None, max_misfit=0.1)
     prior.check(dataset, 2)
     for window in windows(len(dataset), 2):
         found = prior.predict(window, [dataset[i] for i in window.views], dataset.intrinsics)

@@ -25,40 +25,64 @@ class Sight(NamedTuple):
     T_world_camera: Float[np.ndarray, "4 4"]
 
 
-def check_conventions(pairs: Iterable[tuple[Sight, Sight]], intrinsics: Sequence[float], source: str) -> None:
-    """Raise ValueError where poses or depths of another convention or unit fit each other much better.
+def check_conventions(
+    pairs: Iterable[tuple[Sight, Sight]], intrinsics: Sequence[float], source: str, max_misfit: float
+) -> str:
+    """Say by how much the depths of two views differ.
 
     Args:
         pairs: of views that see the same.
         intrinsics: fx, fy, cx, cy.
         source: where poses and depths are from.
+        max_misfit: median of |log of the ratio| of depths up to which a map can be made.
+
+    Raises:
+        ValueError: they differ by more, or poses or depths of another convention or unit fit each other much better.
     """
     pairs = [*pairs]
     own = median_misfit(pairs, intrinsics, lambda sight: sight)
+    words = f"the depths of two views differ by {100 * own:.1f} %{' (they share nothing)' if np.isinf(own) else ''}"
     if not own > MAX_MISFIT:
-        return
+        return words
     found = {words: median_misfit(pairs, intrinsics, read) for words, read in _readings().items()}
     best = min(found, key=lambda words: found[words])
+    closest = f"by {100 * found[best]:.1f} % where {best}"
+    expected = f"expected are {EXPECTED}, depths along z, and one unit for poses and depths"
     if found[best] < min(own / MIN_GAIN, GOOD_MISFIT):
+        raise ValueError(f"{source}: {words}, and {closest}: {expected}")
+    rest = median_misfit(pairs, intrinsics, lambda sight: sight, has_own_scales=True)
+    rest = f"by {100 * rest:.1f} % where each view has a scale of its own"
+    if own > max_misfit:
         raise ValueError(
-            f"{source}: the depths of two views differ by {100 * own:.1f} % (inf: they share nothing), and by "
-            f"{100 * found[best]:.1f} % where {best}: expected are {EXPECTED}, depths along z, and one unit for "
-            "poses and depths"
+            f"{source}: {words}, {rest}, {closest}: {expected}. Depths of a network that sees one image at a time have "
+            "a scale, and often a shift, of their own in each: align them with the poses, or predict all images "
+            f"together. prior.max_misfit={own:.2g} maps them as they are"
         )
+    return f"{words}, {rest}"
 
 
 def median_misfit(
-    pairs: Sequence[tuple[Sight, Sight]], intrinsics: Sequence[float], read: Callable[[Sight], Sight]
+    pairs: Sequence[tuple[Sight, Sight]],
+    intrinsics: Sequence[float],
+    read: Callable[[Sight], Sight],
+    has_own_scales: bool = False,
 ) -> float:
     """`misfit` of the pairs as `read` takes them, 0 without any."""
     with np.errstate(divide="ignore", invalid="ignore"):  # where there is no depth
         sights = [(read(a), read(b)) for a, b in pairs]
-    found = [misfit(a, b, np.linalg.inv(a.T_world_camera) @ b.T_world_camera, intrinsics) for a, b in sights]
+    moved = [(a, b, np.linalg.inv(a.T_world_camera) @ b.T_world_camera) for a, b in sights]
+    found = [misfit(*pair, intrinsics, has_own_scales) for pair in moved]
     return float(np.median(found)) if found else 0.0
 
 
-def misfit(a: Sight, b: Sight, T_a_b: Float[np.ndarray, "4 4"], intrinsics: Sequence[float]) -> float:
-    """Median of |log of the ratio| of the depths of b's points in a and those that a has there; inf for too few."""
+def misfit(
+    a: Sight, b: Sight, T_a_b: Float[np.ndarray, "4 4"], intrinsics: Sequence[float], has_own_scales: bool = False
+) -> float:
+    """Median of |log of the ratio| of the depths of b's points in a and those that a has there; inf for too few.
+
+    Args:
+        has_own_scales: of the log of the ratio the median is taken off first.
+    """
     fx, fy, cx, cy = intrinsics
     points = b.points[::STEP, ::STEP][b.mask[::STEP, ::STEP]] @ T_a_b[:3, :3].T + T_a_b[:3, 3]
     points = points[points[:, 2] > 0]
@@ -71,7 +95,8 @@ def misfit(a: Sight, b: Sight, T_a_b: Float[np.ndarray, "4 4"], intrinsics: Sequ
     if known.sum() < MIN_SHARED:
         return np.inf
     ratios = points[inside, 2][known] / a.points[rows, columns, 2][known]
-    return float(np.median(np.abs(np.log(ratios))))
+    logs = np.log(ratios)
+    return float(np.median(np.abs(logs - np.median(logs) if has_own_scales else logs)))
 
 
 def _readings() -> dict[str, Callable[[Sight], Sight]]:
@@ -80,6 +105,8 @@ def _readings() -> dict[str, Callable[[Sight], Sight]]:
         f"the poses are taken as {words}": partial(_posed, change=change) for words, change in READINGS.items()
     }
     found["the depths are taken as lengths of the rays"] = lambda sight: times(sight, 1 / _stretch(sight.points))
+    found["the points are taken as those of the world"] = _in_camera
+    found["the depths are mirrored, left for right"] = _mirrored
     for factor in FACTORS:
         if abs(np.log(factor)) > np.log(MIN_FACTOR):
             found[f"the depths are multiplied by about {factor:.4g}, or the positions by {1 / factor:.4g}"] = partial(
@@ -91,6 +118,18 @@ def _readings() -> dict[str, Callable[[Sight], Sight]]:
 
 def _posed(sight: Sight, change: Callable[[np.ndarray], np.ndarray]) -> Sight:
     return sight._replace(T_world_camera=change(sight.T_world_camera))
+
+
+def _in_camera(sight: Sight) -> Sight:
+    T = sight.T_world_camera
+    return sight._replace(points=(sight.points - T[:3, 3]) @ T[:3, :3])
+
+
+def _mirrored(sight: Sight) -> Sight:
+    """The sight whose depths are those of the pixels at the other side."""
+    depth = sight.points[..., 2]
+    rays = sight.points / np.where(depth > 0, depth, 1)[..., None]
+    return Sight(rays * depth[:, ::-1, None], sight.mask & sight.mask[:, ::-1], sight.T_world_camera)
 
 
 def times(sight: Sight, factor: float | Float[np.ndarray, "h w"]) -> Sight:

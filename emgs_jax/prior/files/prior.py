@@ -28,7 +28,7 @@ from emgs_jax.prior.base import (
     equal_covariances,
     relative_poses,
 )
-from emgs_jax.prior.files.conventions import Sight, check_conventions
+from emgs_jax.prior.files.conventions import Sight, check_conventions, median_misfit
 from emgs_jax.prior.files.exports import find_export, read_cut3r, read_export
 from emgs_jax.prior.files.own import GIVES_POSES, read_own
 from emgs_jax.prior.files.pose_error import pose_angle
@@ -53,6 +53,7 @@ class Files(Prior):
         max_depth_step: relative depth difference across which nothing is interpolated.
         pose_std: of every pose, a length in the files' unit and degrees; None: not known; `auto`: as the images say,
             see `pose_angle`.
+        max_misfit: by which the depths of two views may differ, median.
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class Files(Prior):
         depth_scale: float,
         max_depth_step: float,
         pose_std: Sequence[float] | str | None,
+        max_misfit: float,
     ) -> None:
         if scale not in SCALES:
             raise ValueError(f"prior.scale must be one of {', '.join(SCALES)}, got {scale!r}")
@@ -72,7 +74,7 @@ class Files(Prior):
         self._found = read_predictions(self.folder, check_depth_scale(depth_scale, "prior.depth_scale"))
         if not np.isfinite(self._found.poses).all((1, 2)).any():
             raise ValueError(f"{self._found.pose_source}: none of {len(self._found.poses)} is known: {GIVES_POSES}")
-        self._max_depth_step = float(max_depth_step)
+        self._max_depth_step, self._max_misfit = float(max_depth_step), float(max_misfit)
         self._is_metric = self._found.is_metric if scale == "auto" else scale == "metric"
         self._factor = 1.0 if self._is_metric else median_depth / self._first_depth()[1]
         self._pose_std = None if pose_std == AUTO else check_pose_std(pose_std)
@@ -104,11 +106,15 @@ class Files(Prior):
             self._pose_std = None if angle is None else (angle * depth, float(np.degrees(angle)))
         scale = "metres" if self._is_metric else f"up to scale, times {self._factor:.4g}"
         lacking = f", {len(self._rows) - len(known)} frames have none" if len(known) < len(self._rows) else ""
+        note = _focal_note(view, camera, found)
+        pairs = self._pairs(known, camera)
+        if not np.isfinite(median_misfit(pairs, dataset.intrinsics, lambda sight: sight)):  # the camera turns fast
+            pairs = self._pairs(known, camera, gap=1) or pairs
+        fit = check_conventions(pairs, dataset.intrinsics, found.pose_source, self._max_misfit)
         tqdm.write(
-            f"prior=files: {self.folder}, layout {found.layout}, {scale}{lacking}, "
-            f"{_pose_note(self._pose_std)}{_focal_note(view, camera, found)}"
+            f"prior=files: {self.folder}, layout {found.layout}, {scale}{lacking}; {fit}, "
+            f"{_pose_note(self._pose_std)}{note}"
         )
-        check_conventions(self._pairs(known, camera), dataset.intrinsics, found.pose_source)
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Predict a window from the files of its views; `check` comes first, as it matches files with frames."""
@@ -154,11 +160,11 @@ class Files(Prior):
                 return view, float(np.median(depth[usable(view.geometry)]))
         raise ValueError(f"{self.folder}: none of its {len(self._found.names)} files has a depth above 0")
 
-    def _pairs(self, known: list[int], camera: Camera) -> list[tuple[Sight, Sight]]:
+    def _pairs(self, known: list[int], camera: Camera, gap: int = PAIR_GAP) -> list[tuple[Sight, Sight]]:
         """Views with a pose, some frames apart, from all of the sequence."""
         known = [index for index in known if np.isfinite(self._pose(index)).all()]
-        places = np.linspace(0, max(len(known) - 1 - PAIR_GAP, 0), NUM_PAIRS).astype(int)
-        chosen = {(known[place], known[min(place + PAIR_GAP, len(known) - 1)]) for place in places}
+        places = np.linspace(0, max(len(known) - 1 - gap, 0), NUM_PAIRS).astype(int)
+        chosen = {(known[place], known[min(place + gap, len(known) - 1)]) for place in places}
         sights = {}
         for index in sorted({index for pair in chosen for index in pair}):
             points, _, mask = self._at_frame(index, camera)

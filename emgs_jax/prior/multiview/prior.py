@@ -129,6 +129,13 @@ class MultiviewStereo(Prior):
             window, T, points, confidence, mask, features, pose_covariance=spread, world=max(int(world), 0)
         )
 
+    def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
+        """Predict for views of two visits of a place; None where they are not in one world."""
+        self._prepare()
+        world = self._found.world[[window.views[0], window.current]]
+        is_known = world[0] == world[1] != NONE
+        return self.predict(window, frames, intrinsics) if is_known else None
+
     def _prepare(self) -> None:
         """Make the structure, once."""
         if self._found is not None:

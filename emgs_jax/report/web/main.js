@@ -10,7 +10,7 @@ const REST = 200; // ms without a move until it is drawn in full
 
 async function start() {
   const sets = await readSets(), arrays = sets.gaussians;
-  const first = Math.max(ABOUT.frames.status.findIndex((status) => status !== "lost"), 0);
+  const first = Math.max(ABOUT.frames.status.findIndex((status) => !["lost", "apart"].includes(status)), 0);
   const state = { frame: first, view: null, pivot: ABOUT.pivot, size: ABOUT.size, focal: FOCAL, flies: false,
                   atFrame: false, image: null, ruler: [], measures: false, paths: {}, seesThrough: true };
   const report = { state, arrays, sets, shown: arrays, frameTime: 0 };

@@ -55,7 +55,7 @@ class Overlay {
     for (let row = 0; row < poses.length / 12; row++) {
       const here = poseAt(poses, row).position;
       const isKnown = Number.isFinite(here[0]);
-      const isLost = poses === this.arrays.poses && ABOUT.frames.status[row] === "lost";
+      const isLost = poses === this.arrays.poses && ["lost", "apart"].includes(ABOUT.frames.status[row]);
       const look = isLost ? ["#e5484d", 1, [3, 6]] : [color, width];
       if (before && isKnown) this.segment(before, here, ...look);
       before = isKnown ? here : null;

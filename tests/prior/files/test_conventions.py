@@ -1,5 +1,7 @@
 """Poses that depths contradict: against views of a wall and a floor, which are known in closed form."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -45,12 +47,20 @@ def test_true_poses_fit_and_others_do_not():
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_right_poses_are_left_alone_however_noisy_the_depths(noise):
-    check_conventions([(sight(A, noise=noise), sight(B, noise=noise))], INTRINSICS, "poses")
+    check_conventions([(sight(A, noise=noise), sight(B, noise=noise))], INTRINSICS, "poses", 0.1)
 
 
-def test_views_that_share_nothing_say_nothing():
-    check_conventions([(sight(A), sight(pose(2.0, 0, 0)))], INTRINSICS, "poses")
-    check_conventions([], INTRINSICS, "poses")
+def test_what_is_measured_is_said_and_what_no_convention_explains_stops_a_run_that_is_not_told_to_go_on():
+    """Depths of one image at a time made a map of nothing, whose advice was another stride."""
+    pair = [(sight(A), sight(B))]
+    assert re.search(r"differ by 0\.\d %$", check_conventions(pair, INTRINSICS, "poses", 0.1))
+    scaled = [(sight(A)._replace(points=1.5 * sight(A).points), sight(B)._replace(points=0.8 * sight(B).points))]
+    with pytest.raises(ValueError, match=r"differ by \d\d\.\d %, by [0-4]\.\d % where each view has a scale"):
+        check_conventions(scaled, INTRINSICS, "poses", 0.1)
+    assert "each view has a scale of its own" in check_conventions(scaled, INTRINSICS, "poses", 1.0)
+    with pytest.raises(ValueError, match="they share nothing"):
+        check_conventions([(sight(A), sight(pose(2.0, 0, 0)))], INTRINSICS, "poses", 0.1)
+    check_conventions([], INTRINSICS, "poses", 0.1)
 
 
 @pytest.mark.parametrize(
@@ -71,7 +81,7 @@ def test_views_that_share_nothing_say_nothing():
 )
 def test_a_pose_of_another_convention_is_named(said, words):
     with pytest.raises(ValueError, match=f"poses.txt: the depths .*{words}"):
-        check_conventions([(sight(A, said(A)), sight(B, said(B)))], INTRINSICS, "poses.txt")
+        check_conventions([(sight(A, said(A)), sight(B, said(B)))], INTRINSICS, "poses.txt", 0.1)
 
 
 @pytest.mark.parametrize(
@@ -81,6 +91,7 @@ def test_a_pose_of_another_convention_is_named(said, words):
             lambda points: points * np.linalg.norm(points / points[..., 2:], axis=-1, keepdims=True),
             "lengths of the ray",
         ),
+        (lambda points: points / points[..., 2:] * points[:, ::-1, 2:], "mirrored"),
         (lambda points: points / points[..., 2:] ** 2, "1 / depth"),
         (lambda points: 0.4 * points / points[..., 2:] ** 2, "0.398. / depth"),
         (lambda points: points * 5, "multiplied by about 0.1995"),
@@ -91,4 +102,10 @@ def test_depths_of_another_kind_are_named(change, words):
     with np.errstate(invalid="ignore", divide="ignore"):
         pair = [seen._replace(points=change(seen.points)) for seen in (sight(A), sight(B))]
     with pytest.raises(ValueError, match=f"where the depths are .*{words}"):
-        check_conventions([(pair[0], pair[1])], INTRINSICS, "depths")
+        check_conventions([(pair[0], pair[1])], INTRINSICS, "depths", 0.1)
+
+
+def test_points_of_the_world_are_named():
+    pair = [seen._replace(points=seen.points @ T[:3, :3].T + T[:3, 3]) for T, seen in ((A, sight(A)), (B, sight(B)))]
+    with pytest.raises(ValueError, match="points are taken as those of the world"):
+        check_conventions([(pair[0], pair[1])], INTRINSICS, "points", 0.1)

@@ -17,6 +17,7 @@ from emgs_jax.prior.files.prior import Files
 from emgs_jax.prior.files.view import Camera, View, at_frame, whole_image
 
 SIZE = (48, 64)
+UNKNOWN = "how sure the poses are is not known (prior.pose_std)"
 
 
 @pytest.fixture
@@ -181,12 +182,36 @@ def test_what_was_found_is_one_line_and_says_by_how_much_focal_lengths_differ(tm
     fx, fy, cx, cy = tiny_run.dataset().intrinsics
     near = write_npz(tmp_path / "near", NAMES, intrinsics=lambda f: [fx * 1.02, fy * 1.02, cx, cy])
     asked(near)
-    assert capsys.readouterr().out.splitlines() == [f"prior=files: {near}, layout npz, metres"]
+    fit = "the depths of two views differ by 0.3 %"
+    assert capsys.readouterr().out.splitlines() == [f"prior=files: {near}, layout npz, metres; {fit}, {UNKNOWN}"]
     far = write_npz(tmp_path / "far", NAMES, intrinsics=lambda f: np.diag([fx * 1.1, fy * 1.1, 1]) + [[0, 0, cx]] * 3)
     with pytest.raises(ValueError, match=r"camera matrix|intrinsics"):  # a matrix with numbers below the diagonal
         asked(write_npz(tmp_path / "no", NAMES, intrinsics=lambda f: [fx, fy, cx]))
     asked(far)
     assert "dataset.intrinsics times 1.100 would agree" in capsys.readouterr().out
+
+
+def test_poses_are_as_sure_as_is_said_in_the_unit_of_the_prediction(own, capsys):
+    assert asked(own)[1][0].pose_covariance is None
+    assert UNKNOWN in capsys.readouterr().out
+    prior, predictions = asked(own, pose_std=[0.02, 3.0], scale="arbitrary", median_depth=20.0)
+    assert "prior.pose_std=[0.02,3]" in capsys.readouterr().out
+    assert prior.provenance.settings["pose_std"] == [0.02, 3.0]
+    factor = predictions[0].points[..., 2].max() / asked(own)[1][0].points[..., 2].max()
+    expected = np.diag(np.repeat([(0.02 * factor) ** 2, np.radians(3.0) ** 2], 3))
+    for prediction in predictions:
+        shape = (len(prediction.window.views), 6, 6)
+        np.testing.assert_allclose(prediction.pose_covariance, np.broadcast_to(expected, shape), rtol=1e-5)
+    poses = {"T_world_camera": lambda f: f.T_world_camera * (np.nan if f.index == 2 else 1.0)}
+    lost = write_npz(own.parent / "lost", NAMES, **poses)
+    _, predictions = asked(lost, pose_std=[0.02, 3.0])
+    assert np.isnan(predictions[0].pose_covariance[list(predictions[0].window.views).index(2)]).all()
+
+
+@pytest.mark.parametrize("wrong", [0.1, [0.1], [0.1, -1], [np.nan, 1], "much", [1, 2, 3]])
+def test_an_uncertainty_that_is_no_length_and_angle_is_refused(wrong, own):
+    with pytest.raises(ValueError, match=r"prior.pose_std must be \[length, degrees\]"):
+        asked(own, pose_std=wrong)
 
 
 def test_the_script_of_the_documentation_writes_what_the_prior_reads(tmp_path, monkeypatch):

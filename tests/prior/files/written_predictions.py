@@ -12,7 +12,14 @@ from emgs_jax.data.base import Frame
 from emgs_jax.prior.base import PriorPrediction, windows
 from emgs_jax.prior.files.prior import Files
 
-KEYS = {"scale": "auto", "median_depth": 2.0, "depth_scale": 1000.0, "max_depth_step": 0.03}
+KEYS = {
+    "scale": "auto",
+    "median_depth": 2.0,
+    "depth_scale": 1000.0,
+    "max_depth_step": 0.03,
+    "pose_std": None,
+    "max_misfit": 0.1,
+}
 
 
 class Named:

@@ -1,0 +1,91 @@
+"""How far off poses are, as the images say: against disturbances that are drawn."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.config.configure import build_dataset, compose
+from emgs_jax.prior.files import pose_error
+from emgs_jax.prior.files.pose_error import calibration, pair_error, pose_angle, sampson
+
+
+@cache
+def room():
+    """Frames of the built-in room, each drawn once."""
+    dataset = build_dataset(compose())
+    return SimpleNamespace(frames=[dataset[row] for row in range(len(dataset))], intrinsics=dataset.intrinsics)
+
+
+class Frames:
+    """The frames of the room as a data set."""
+
+    intrinsics = property(lambda self: room().intrinsics)
+
+    def __getitem__(self, index: int):
+        return room().frames[index]
+
+
+def poses(std_rad: float, walk: bool = False, seed: int = 0) -> dict[int, np.ndarray]:
+    """True poses with errors per axis, of rotations and of positions over the depth: drawn anew, or summed up."""
+    rng, frames = np.random.default_rng(seed), room().frames
+    errors = std_rad * rng.normal(size=(len(frames), 6))
+    errors = np.cumsum(errors, axis=0) if walk else errors
+    found = {}
+    for frame, (*turn, x, y, z) in zip(frames, errors, strict=True):
+        error = np.eye(4)
+        error[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+        error[:3, 3] = np.median(frame.depth[frame.depth > 0]) * np.array([x, y, z])
+        found[frame.index] = frame.T_world_camera @ error
+    return found
+
+
+@pytest.fixture(autouse=True)
+def detect_once(monkeypatch):
+    monkeypatch.setattr(pose_error, "detect", _detect)
+
+
+@cache
+def _found(image: bytes, shape: tuple[int, ...], *settings):
+    return DETECT(np.frombuffer(image, np.uint8).reshape(shape), *settings)
+
+
+def _detect(image, *settings):
+    return _found(image.tobytes(), image.shape, *settings)
+
+
+DETECT = pose_error.detect
+
+
+def test_a_point_that_both_rays_meet_has_no_error_and_one_beside_has_its_distance():
+    K, E = calibration((100.0, 100.0, 50.0, 40.0)), np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # along x
+    a = np.array([[20.0, 30.0], [70.0, 44.0]])
+    np.testing.assert_allclose(sampson(E, a, a + [5.0, 0.0], K), 0, atol=1e-12)
+    # Half of it in each image.
+    np.testing.assert_allclose(np.abs(sampson(E, a, a + [5.0, 2.0], K)), 2 / np.sqrt(2), rtol=1e-12)
+
+
+@pytest.mark.parametrize("std", [0.002, 0.01])
+def test_the_angle_is_that_of_the_errors_that_were_drawn(std):
+    found = [pose_angle(Frames(), poses(std, seed=seed)) for seed in range(4)]
+    # The median of six pairs, of which each has one error of its two poses.
+    assert np.mean(found) == pytest.approx(std, rel=0.35)
+
+
+def test_true_poses_are_sure_and_a_drift_is_found_out_by_frames_that_are_far_apart(monkeypatch):
+    exact, drifting = (pose_angle(Frames(), poses(std, walk=True)) for std in (0.0, 0.001))
+    assert exact < 1e-4 < drifting / 2
+    monkeypatch.setattr(pose_error, "GAPS", (1,))
+    assert pose_angle(Frames(), poses(0.001, walk=True)) < 0.7 * drifting
+
+
+def test_images_without_points_and_a_camera_that_rests_say_nothing():
+    image = room().frames[0].image
+    blank = np.full_like(image, 90)
+    moved = np.eye(4)
+    moved[0, 3] = 0.1
+    assert pair_error([blank, blank], moved, room().intrinsics) is None
+    assert pair_error([image, image], np.eye(4), room().intrinsics) is None
+    assert pose_angle(Frames(), {0: np.eye(4)}) is None
