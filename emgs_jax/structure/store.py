@@ -103,6 +103,9 @@ def is_of(place: Path, key: str) -> bool:
 def write_models(models: Sequence[Any], key: str, place: Path) -> None:
     """Write models as COLMAP reads them, one folder each, and last what they are of."""
     place.mkdir(parents=True, exist_ok=True)
+    (place / ABOUT).unlink(missing_ok=True)
+    for folder in place.glob("[0-9]*"):  # of another structure
+        shutil.rmtree(folder)
     for number, model in enumerate(models):
         folder = place / str(number)
         folder.mkdir(exist_ok=True)
