@@ -121,7 +121,8 @@ def floored(covs: Float[Array, "*b 3 3"], min_std: Float[Array, ""]) -> Float[Ar
 def inverse_2x2(matrices: Float[Array, "*b 2 2"]) -> Float[Array, "*b 2 2"]:
     """Inverse of symmetric positive 2×2 matrices; zero where the determinant is not positive."""
     a, b, c = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]
-    det = sum(minor_2x2(a, c, b, b))
+    det, rest = minor_2x2(a, c, b, b)
+    det += rest
     is_positive = det > 0
     adjugate = jnp.stack([jnp.stack([c, -b], -1), jnp.stack([-b, a], -1)], -2)
     return jnp.where(is_positive[..., None, None], adjugate / jnp.where(is_positive, det, 1.0)[..., None, None], 0.0)
