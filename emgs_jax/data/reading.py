@@ -330,6 +330,12 @@ def as_motion(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
     if not np.isfinite(pose).all():
         return None
     if not is_rigid(pose):
+        scale = float(np.cbrt(np.linalg.det(pose[:3, :3])))
+        if scale > 0 and is_rigid(pose / np.where(np.arange(4) < 3, [[scale]] * 3 + [[1.0]], 1.0)):
+            raise BadFrameError(
+                f"{where} has a rotation times {scale:.4g}, of an alignment with a scale: divide the first three "
+                "columns by it, and give depth and positions in one unit"
+            )
         raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded

@@ -188,3 +188,11 @@ def test_an_image_that_is_shown_otherwise_than_stored_is_known(tmp_path):
         image.save(tmp_path / "a.jpg", exif=exif)
         assert reading.is_turned(tmp_path / "a.jpg") == (orientation > 1)
     assert not reading.is_turned(tmp_path / "none.jpg")
+
+
+def test_a_pose_with_a_scale_is_named_as_such():
+    """The advice was to fetch the file again."""
+    pose = np.diag([2.0, 2.0, 2.0, 1.0])
+    pose[:3, 3] = 1.0, 2.0, 3.0
+    with pytest.raises(BadFrameError, match="pose.txt has a rotation times 2, of an alignment"):
+        reading.as_motion(" ".join(map(str, pose.ravel())), "pose.txt")
