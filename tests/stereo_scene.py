@@ -1,11 +1,9 @@
-"""Scenes with known geometry for the classical prior: textured planes as images, random points as keypoints."""
+"""Textured planes as images, with known geometry, for the classical prior."""
 
 from functools import cache
 
 import hydra
 import numpy as np
-from emgs_jax.prior.multiview.incremental import StructureConfig
-from emgs_jax.prior.multiview.landmarks import NONE, Structure, View
 from scene import compose
 
 from emgs_jax.ops.camera import Camera
@@ -28,13 +26,6 @@ def planar_config(*overrides: str) -> PlanarConfig:
     """`prior.dense.planar` of conf/ for small regions."""
     small = ("prior.dense.planar.min_area=150", "prior.dense.planar.min_matches=40")
     return hydra.utils.instantiate(compose("prior=multiview_stereo", *small, *overrides).prior.dense.planar)
-
-
-@cache
-def structure_config(*overrides: str) -> StructureConfig:
-    """`prior.structure` of conf/ for a few landmarks."""
-    small = ("prior.structure.max_landmarks=128",)
-    return hydra.utils.instantiate(compose("prior=multiview_stereo", *small, *overrides).prior.structure)
 
 
 @cache
@@ -82,54 +73,6 @@ def plane_image(
     return np.float32(np.clip(gray, 0, 1)), np.float32(depth)
 
 
-def cloud(count: int, seed: int = 0) -> np.ndarray:
-    """Points (count, 3) 1.5 to 3 m before the first camera of `arc`, inside the image."""
-    rng = np.random.default_rng(seed)
-    pixels = rng.uniform((4, 4), (SIZE[0] - 5, SIZE[1] - 5), (count, 2))
-    rays = np.column_stack([pixels, np.ones(count)]) @ np.linalg.inv(calibration()).T
-    return rays * rng.uniform(1.5, 3.0, (count, 1))
-
-
-def arc(count: int, step: float = 0.08) -> np.ndarray:
-    """T_world_camera (count, 4, 4): `step` metres a frame sideways, turning to keep the cloud in view."""
-    poses = [
-        matrix((0.01 * np.sin(i), -0.4 * step * i, 0.01 * i), (step * i, 0.02 * np.sin(i), 0.03 * i))
-        for i in range(count)
-    ]
-    return np.stack(poses)
-
-
-def projected(T_world_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Pixels (n, 2)."""
-    local = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
-    return (local @ calibration().T)[:, :2] / local[:, 2:]
-
-
-def views_of(points: np.ndarray, poses: np.ndarray, noise: float = 0.0, seed: int = 0) -> list[View]:
-    """Keypoints as `detect` would give them, in another order in every view; not linked and not placed.
-
-    Keypoint i of a view is point `order[i]`, which its descriptor encodes: `whose` reads it back.
-    """
-    rng = np.random.default_rng(seed)
-    descriptors = np.abs(np.random.default_rng(99).normal(size=(len(points), 128)))
-    descriptors = np.float32(descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
-    views = []
-    for T in poses:
-        order = rng.permutation(len(points))
-        pixels = projected(T, points[order]) + noise * rng.normal(size=(len(points), 2))
-        views.append(View(pixels, descriptors[order], np.full(len(points), NONE)))
-    return views
-
-
-def whose(view: View, reference: View) -> np.ndarray:
-    """For each keypoint the row of `reference` that shows the same point."""
-    return (view.descriptors @ reference.descriptors.T).argmax(axis=1)
-
-
-def structure_of(views: list[View]) -> Structure:
-    return Structure(calibration(), dict(enumerate(views)))
-
-
 def similarity_error(estimate: np.ndarray, truth: np.ndarray) -> float:
     """Root mean square distance (n, 3) after the best Sim(3) (Umeyama 1991)."""
     a, b = estimate - estimate.mean(0), truth - truth.mean(0)
@@ -137,15 +80,3 @@ def similarity_error(estimate: np.ndarray, truth: np.ndarray) -> float:
     sign = np.array([1, 1, np.linalg.det(U @ Vt)])
     scale = (S * sign).sum() / (a**2).sum()
     return float(np.sqrt(((scale * a @ (U * sign @ Vt).T - b) ** 2).sum(1).mean()))
-
-
-def placed_structure(poses, points, seen_by):
-    """All points are landmark = row; views hold their true poses."""
-    views = [
-        View(projected(T, points), np.zeros((len(points), 128), np.float32), np.arange(len(points)), T) for T in poses
-    ]
-    for frame, view in enumerate(views):
-        view.landmark[~seen_by[frame]] = NONE
-    structure = structure_of(views)
-    structure.points = np.full((len(points), 3), np.nan)
-    return structure
