@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
+import numpy as np
 from tqdm import tqdm
 
 from emgs_jax.data.base import BadFrameError
