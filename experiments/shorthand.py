@@ -38,10 +38,10 @@ def implied(path: Path, given: dict[str, str]) -> list[str]:
     """The overrides that a video or folder of images stands for, without those whose key is given."""
     if given.get("dataset", "images") != "images":
         return [f"dataset.root={_quoted(path)}"]
-    found = {"dataset": "images", "dataset.root": _quoted(path)}
-    if "dataset.size" not in given or "dataset.intrinsics" not in given:
-        size, intrinsics = _look(path)
-        found |= {"dataset.size": f"[{size[0]},{size[1]}]", "dataset.intrinsics": intrinsics}
+    found = {"dataset": "images", "dataset.root": _quoted(path), "dataset.intrinsics": "estimate"}
+    if "dataset.size" not in given:
+        size = _size(path)
+        found["dataset.size"] = f"[{size[0]},{size[1]}]"
     if given.get("prior", "multiview_stereo") == "multiview_stereo":
         found["prior"] = "multiview_stereo"
         if "baseline" not in given:  # it fuses frames where they were placed, the back end moves them afterwards
@@ -55,21 +55,15 @@ def frame_size(width: int, height: int) -> tuple[int, int]:
     return max(round(width * scale / SIDE), 1) * SIDE, max(round(height * scale / SIDE), 1) * SIDE
 
 
-def _look(path: Path) -> tuple[tuple[int, int], str]:
-    """The size of frames, and `exif` where the first image says its focal length, else `estimate`."""
+def _size(path: Path) -> tuple[int, int]:
+    """The size of frames of a video or a folder of images."""
     from emgs_jax.data.images import Folder
-    from emgs_jax.data.intrinsics import exif_focal_length
     from emgs_jax.data.video import VIDEO_SUFFIXES, Video
 
     if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
-        return frame_size(*Video(path, 1).find_size(range(1))), "estimate"
+        return frame_size(*Video(path, 1).find_size(range(1)))
     images = Folder(path)
-    size = images.find_size(range(images.count))
-    try:
-        has_exif = exif_focal_length(images.file(0), size) is not None
-    except (OSError, SyntaxError, ValueError):  # Pillow's for what is no image, and of an image that was cut
-        has_exif = False
-    return frame_size(*size), "exif" if has_exif else "estimate"
+    return frame_size(*images.find_size(range(images.count)))
 
 
 def _is_path(word: str, before: Sequence[str]) -> bool:
