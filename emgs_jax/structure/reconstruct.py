@@ -10,7 +10,8 @@ from tqdm import tqdm
 
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.structure.config import StructureConfig
-from emgs_jax.structure.library import load, member, options_of, quiet
+from emgs_jax.structure.library import check_kinds, load, member, options_of
+from emgs_jax.structure.model import stem
 from emgs_jax.structure.pairs import choose_pairs
 
 BATCH = 8  # images of one call of COLMAP, so that the bar moves
@@ -48,10 +49,9 @@ def map_images(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]
         ValueError: the images do not determine a structure; with the reason and a remedy.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with quiet():
-        _say(shots, config)
-        detect(shots, config, folder)
-        match(shots, config, folder)
+    _say(shots, config)
+    detect(shots, config, folder)
+    match(shots, config, folder)
     return map_database(shots, config, folder)
 
 
@@ -61,10 +61,9 @@ def map_database(shots: Shots, config: StructureConfig, folder: Path) -> list[An
     Raises:
         ValueError: it cannot be read, or there is no model; with the reason and a remedy.
     """
-    with quiet():
-        found = find_models(shots, config, folder)
-        check_found(found, shots, config, folder)
-        register_rest(found, config, folder)
+    found = find_models(shots, config, folder)
+    check_found(found, shots, config, folder)
+    register_rest(found, config, folder)
     return found
 
 
@@ -94,6 +93,8 @@ def detect(shots: Shots, config: StructureConfig, folder: Path) -> None:
         config.options.get("extraction", {}),
     )
     extraction.type = member("FeatureExtractorType", config.features, "features")
+    if config.features.lower() != "sift" or config.matcher is not None:
+        check_kinds(extraction.type.name, matcher_of(config).name)
     model, parameters = shots.camera
     reader = pycolmap.ImageReaderOptions(
         camera_model=model, camera_params=",".join(map(repr, parameters)), mask_path=_masks(shots, config, folder)
@@ -127,7 +128,9 @@ def _write(shots: Shots, index: int, images: Path) -> bool:
     except BadFrameError:
         return False
     path = images / f"{shots.names[index]}.png"
-    return image.shape[1::-1] == tuple(shots.size) and cv2.imwrite(str(path), image[..., ::-1], [1, 1])
+    return image.shape[1::-1] == tuple(shots.size) and cv2.imwrite(
+        str(path), image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    )
 
 
 def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
@@ -139,7 +142,7 @@ def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
     if config.masks is None:
         return ""
     given, own = Path(config.masks).expanduser(), folder / "masks"
-    found = {path.stem: path for path in given.iterdir()} if given.is_dir() else {}
+    found = {stem(path.name): path for path in given.iterdir()} if given.is_dir() else {}
     missing = [name for name in shots.names if name not in found and f"{name}.png" not in found]
     if missing:
         raise ValueError(
@@ -159,6 +162,13 @@ def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
     return str(own)
 
 
+def matcher_of(config: StructureConfig) -> Any:
+    """pycolmap's FeatureMatcherType: the one that is named, else that of the features."""
+    features = config.features.lower()
+    kinds = {"sift": "sift_bruteforce", "aliked": "aliked_lightglue", "loma": features}
+    return member("FeatureMatcherType", config.matcher or kinds[features.split("_")[0]], "matcher")
+
+
 def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
     """Match and verify the pairs that `choose_pairs` names; those that are in the database stay."""
     pycolmap = load()
@@ -168,11 +178,7 @@ def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
         {"num_threads": config.num_threads, "guided_matching": True, "use_gpu": False},
         config.options.get("matching", {}),
     )
-    if config.matcher is not None:
-        matching.type = member("FeatureMatcherType", config.matcher, "matcher")
-    elif config.features != "sift":
-        kind = {"aliked": "aliked_lightglue", "loma": config.features}[config.features.split("_")[0]]
-        matching.type = member("FeatureMatcherType", kind, "matcher")
+    matching.type = matcher_of(config)
     verification = options_of(
         "TwoViewGeometryOptions",
         {"ransac": {"random_seed": config.seed}},
@@ -222,7 +228,7 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
         options = options_of("IncrementalPipelineOptions", common, refined, given)
         with tqdm(total=len(shots.names), unit="image", desc="structure") as bar:
             found = pycolmap.incremental_mapping(
-                folder / DATABASE, folder / IMAGES, output, options, next_image_callback=lambda: bar.update()
+                folder / DATABASE, folder / IMAGES, output, options, "", lambda: bar.update(2), bar.update
             )
     return sorted(found.values(), key=lambda model: -model.num_reg_images())
 

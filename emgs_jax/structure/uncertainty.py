@@ -31,9 +31,9 @@ def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict
     Args:
         images: by frame, in order. Frames whose covariance cannot be found are left out.
     """
-    frames = [*images]
     joint = _joint(model, images)
-    if joint is None or len(frames) < 3:
+    frames = [] if joint is None else [frame for frame in images if joint(frame, frame) is not None]
+    if len(frames) < 3:
         return {}
     T = {frame: camera_in_world(images[frame]) for frame in frames}
     first, references = frames[0], [frames[row] for row in _spread(len(frames), NUM_REFERENCES)]
