@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 from emgs_jax.ops.ranges import number
 
@@ -39,7 +39,7 @@ class StructureConfig:
     model: str | None
     features: str
     matcher: str | None
-    mapper: Literal["incremental", "global"]
+    mapper: str = field(metadata={"choices": ("incremental", "global")})
     camera_model: str
     refine_distortion: bool
     masks: str | None

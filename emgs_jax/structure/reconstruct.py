@@ -208,7 +208,8 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
     common = {"num_threads": config.num_threads, "random_seed": config.seed}
     given = config.options.get("mapping", {})
     output = folder / "models"
-    output.mkdir(exist_ok=True)
+    for needed in (output, folder / IMAGES):  # of a database alone there are none
+        needed.mkdir(exist_ok=True)
     if config.mapper == "global":
         refined = {"refine_focal_length": is_free, "refine_extra_params": is_free or config.refine_distortion}
         mapper = {"mapper": {**common, "bundle_adjustment": refined}}

@@ -70,7 +70,7 @@ def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> t
         for place in places:
             if not is_of(place, key):
                 try:
-                    write_models(models, key, place)
+                    copy_models(there, place)
                 except OSError as error:
                     tqdm.write(f"{place} cannot keep the structure ({error.strerror}): the next run makes it again")
     return key, models
@@ -108,16 +108,29 @@ def is_of(place: Path, key: str) -> bool:
 
 def write_models(models: Sequence[Any], key: str, place: Path) -> None:
     """Write models as COLMAP reads them, one folder each, and last what they are of."""
-    place.mkdir(parents=True, exist_ok=True)
-    (place / ABOUT).unlink(missing_ok=True)
-    for folder in [path for path in place.iterdir() if path.name.isdecimal()]:
-        shutil.rmtree(folder)
+    _clear(place)
     for number, model in enumerate(models):
         folder = place / str(number)
         folder.mkdir(exist_ok=True)
         model.write_binary(folder)
     about = {"key": key, "pycolmap": load().__version__, "images": [model.num_reg_images() for model in models]}
     write_file(place / ABOUT, json.dumps(about, indent=1).encode())
+
+
+def copy_models(source: Path, place: Path) -> None:
+    """Copy the files as they are: written again they would be in another order, and sums over them in other bits."""
+    _clear(place)
+    for folder in [path for path in source.iterdir() if path.name.isdecimal()]:
+        shutil.copytree(folder, place / folder.name)
+    write_file(place / ABOUT, (source / ABOUT).read_bytes())
+
+
+def _clear(place: Path) -> None:
+    """An empty place: other models may be there, of other settings."""
+    place.mkdir(parents=True, exist_ok=True)
+    (place / ABOUT).unlink(missing_ok=True)
+    for folder in [path for path in place.iterdir() if path.name.isdecimal()]:
+        shutil.rmtree(folder)
 
 
 def read_models(place: Path) -> list[Any]:
@@ -163,7 +176,10 @@ def given_models(place: Path, shots: Shots, config: StructureConfig) -> list[Any
     else:
         with tempfile.TemporaryDirectory() as work:
             shutil.copy(database, Path(work) / DATABASE)
-            models = map_database(shots, config, Path(work))
+            try:
+                models = map_database(shots, config, Path(work))
+            except RuntimeError as error:
+                raise ValueError(f"{key} is no database of COLMAP, or a damaged one ({error})") from error
     for model in models:
         stems = stems_of(model)
         twice = next((name for name in shots.names if stems.count(name) > 1), None)
