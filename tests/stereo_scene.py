@@ -1,4 +1,4 @@
-"""Textured planes as images, with known geometry, for the classical prior."""
+"""Scenes with known geometry for the classical prior: textured planes, and the built-in room as COLMAP takes it."""
 
 from functools import cache
 
@@ -6,10 +6,14 @@ import hydra
 import numpy as np
 from scene import compose
 
+from emgs_jax.config.configure import build
+from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.multiview.depth import DepthConfig
-from emgs_jax.prior.multiview.lens import Lens
 from emgs_jax.prior.multiview.planar import PlanarConfig
+from emgs_jax.structure.config import StructureConfig
+from emgs_jax.structure.reconstruct import Shots
 
 FOCAL, CENTER, SIZE = (55.0, 53.0), (30.5, 24.25), (64, 48)
 SMALL = ("prior.dense.depth.sweep.num_planes=24",)
@@ -29,6 +33,32 @@ def planar_config(*overrides: str) -> PlanarConfig:
 
 
 @cache
+def structure_config(*overrides: str) -> StructureConfig:
+    """`prior.structure` of conf/, on one thread."""
+    words = ("prior.structure.num_threads=1", *overrides)
+    return build(compose("prior=multiview_stereo", *words), "prior.structure", _convert_="all")
+
+
+@cache
+def room() -> list[Frame]:
+    """Eight frames of the built-in room, large enough for SIFT."""
+    drawn = Synthetic(num_frames=40, stop=8, size=(160, 120))
+    return [drawn[index] for index in range(len(drawn))]
+
+
+def shots(images, is_calibrated: bool = True, names=None) -> Shots:
+    """Images of the room's camera; None is one that cannot be read."""
+
+    def read(index):
+        if images[index] is None:
+            raise BadFrameError("unreadable")
+        return images[index]
+
+    camera = ("SIMPLE_RADIAL", (131.2, 80.0, 60.0, 0.0)[: 4 * is_calibrated])
+    return Shots(names or [f"{row:03d}" for row in range(len(images))], read, (160, 120), camera, is_calibrated)
+
+
+@cache
 def small_camera() -> Camera:
     return Camera(FOCAL, CENTER, *SIZE)
 
@@ -44,11 +74,6 @@ def matrix(rotation=(0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0)) -> np.ndarray:
 
 def calibration() -> np.ndarray:
     return np.array([[FOCAL[0], 0, CENTER[0]], [0, FOCAL[1], CENTER[1]], [0, 0, 1]])
-
-
-def small_lens(distortion: float) -> Lens:
-    """`small_camera` with a lens."""
-    return Lens(np.array(FOCAL), np.array(CENTER), distortion)
 
 
 def plane_image(
