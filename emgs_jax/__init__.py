@@ -7,12 +7,14 @@ JAX prints a line for every executable that it reads from the compilation cache.
 
 # ruff: noqa: F401 (names for type checkers)
 
+import ast
 import os
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
+if TYPE_CHECKING:  # for editors and type checkers, and the list of names
     from emgs_jax.config.configure import build_dataset, build_prior, compose
     from emgs_jax.data.base import BadFrameError, Dataset, Frame
     from emgs_jax.device.settings import use_compilation_cache
@@ -68,47 +70,14 @@ if TYPE_CHECKING:  # for editors and type checkers; what runs is `_HOMES`
 # lists as a feature. What does fail raises an exception. It reads this as it is loaded.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-_HOMES = {
-    "surface_extrapolation": ("ExtrapolationConfig", "extrapolate"),
-    "data.base": ("BadFrameError", "Dataset", "Frame"),
-    "em": ("EmConfig", "EmInfo", "em_update"),
-    "evaluation.reconstruction": ("EvaluationConfig",),
-    "gaussian_map": (
-        *("AverageConfig", "GaussianMap", "SubmapConfig"),
-        *("confirmed", "empty_map", "grow", "insert", "new_map", "select_submap", "write_back"),
-    ),
-    "existence": ("ExistenceConfig", "fusion_evidence", "merge_all_duplicates", "merge_duplicates", "update_existence"),
-    "gaussians": ("FitConfig", "Gaussians", "cluster", "fit_to_points"),
-    "initialization": ("initialize",),
-    "io.map_file": ("load_map", "save_map"),
-    "localization": ("CoarsePose", "LocalizationConfig", "LocalizationInfo", "localize_coarse", "localize_fine"),
-    "observation": ("Observation", "ObservationConfig", "Prediction", "observe", "transform"),
-    "ops.camera": ("Camera", "downscale"),
-    "prior.base": ("Prior", "PriorPrediction", "Provenance", "Window", "windows"),
-    "prior.recorded": ("Recorded", "record"),
-    "refinement": ("RefinementConfig", "RefinementInfo", "refine"),
-    "registration.icp": ("IcpInfo", "icp"),
-    "registration.problem": ("IcpConfig",),
-    "render.composite": ("RenderConfig", "Rendering", "render_gaussians"),
-    "render.densify": ("DensifyConfig", "densify"),
-    "config.configure": ("build_dataset", "build_prior", "compose"),
-    "device.settings": ("use_compilation_cache",),
-    "mapping.capacity": ("advance", "start"),
-    "mapping.convert": ("FirstWindow", "opening", "to_camera", "to_first_window", "to_prediction"),
-    "mapping.finalize": ("in_prior_unit",),
-    "mapping.pipeline": ("finish_run", "integrate", "map_frames"),
-    "mapping.records": ("FrameRecord",),
-    "mapping.run": ("MappingRun", "new_run"),
-    "mapping.window_input": ("WindowInput", "window_inputs"),
-    "semantics": ("classify",),
-    "sequence": ("RunConfig", "load_config", "map_sequence"),
-    "slam": ("Overflow", "SlamConfig", "SlamState", "StepInfo", "init_state", "step"),
-    "splitting": ("SplittingConfig", "split"),
+_HOMES = {  # name -> file that has it and its name there, as they are imported above
+    name.asname or name.name: (node.module, name.name)
+    for node in ast.walk(ast.parse(Path(__file__).read_text(encoding="utf-8")))
+    if isinstance(node, ast.ImportFrom) and f"{node.module}".startswith(f"{__name__}.")
+    for name in node.names
 }
-_OWN_NAMES = {"render_gaussians": "render"}  # in its file; `emgs_jax.render` is a folder
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
-__all__ = ["__version__", *_HOME_OF]  # noqa: PLE0604 (names from the table)
+__all__ = ["__version__", *_HOMES]  # noqa: PLE0604 (names from the list)
 
 try:
     __version__ = version("emgs_jax")
@@ -117,10 +86,10 @@ except PackageNotFoundError:  # a clone that is not installed
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME_OF:
+    if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), _OWN_NAMES.get(name, name))
-    globals()[name] = value
+    module, own_name = _HOMES[name]
+    globals()[name] = value = getattr(import_module(module), own_name)
     return value
 
 

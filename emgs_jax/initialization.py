@@ -49,7 +49,6 @@ def initialize(
         views: camera frames, v views of p points each.
         T_world_views: the prior's poses, which are the map's by construction.
         camera: of the full images.
-        config: λ and how points become Gaussians.
 
     Returns:
         The Gaussians, their number of points in units of λ, and the views in the world frame.

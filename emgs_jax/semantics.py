@@ -81,10 +81,7 @@ def answers(
 
     Args:
         words: cosine of every Gaussian with each word that is asked for, at least one.
-        rivals: likewise with each rival; may be empty.
         is_known: False for Gaussians that cannot be an answer.
-        margin: the lead that an answer needs.
-        min_cosine: the cosine that an answer needs.
     """
     count, known = rivals.shape[-1], jnp.concatenate([rivals, words], axis=-1)
     best = jnp.argmax(known, axis=-1)  # the first of equals

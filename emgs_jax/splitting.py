@@ -51,7 +51,6 @@ def is_too_coarse(
         noise: of each along its viewing ray, a vector, m.
         owners: the Gaussian that explains each point best; n where none does.
         spacing: points that make a new Gaussian.
-        config: what counts as too many and as contradicted.
     """
     own = take_rows(gaussians, owners)
     height = jnp.sum((points.points - own.means) * own.normals, axis=-1)

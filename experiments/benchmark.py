@@ -1,7 +1,7 @@
-"""Run times of the stages, beside alternatives that one would pick: `python -m experiments.benchmark [parts=[em,icp]]`.
+"""Run times of the stages, of a registration beside Open3D's, and how they scale: `python -m experiments.benchmark`.
 
 Compilation and run time apart, everything in turns on the same data; the tables are printed and written to benchmark.md
-and benchmark.json in Hydra's folder. The parts: stages, em, icp, render, sweep, growth.
+and benchmark.json in Hydra's folder. The parts: stages, icp, sweep, growth.
 """
 
 import os
@@ -20,8 +20,8 @@ from emgs_jax.io.files import write_file, write_json
 from emgs_jax.report.columns import Table, markdown
 from emgs_jax.report.provenance import provenance
 
-from .benchmarks.comparisons import time_em, time_icp, time_render
 from .benchmarks.data import load
+from .benchmarks.registration import time_icp
 from .benchmarks.scaling import time_growth, time_settings
 from .benchmarks.stages import time_stages
 from .benchmarks.timing import Timing, spread
@@ -31,12 +31,10 @@ from .command import command
 def parts(config: DictConfig) -> dict[str, Callable[[], Iterable[Timing]]]:
     """Return the benchmarks that can be chosen, by name."""
     chosen = config.benchmark
-    count, turns = chosen.num_gaussians, chosen.repetitions
+    turns = chosen.repetitions
     return {
         "stages": lambda: time_stages(load(config), turns),
-        "em": lambda: time_em(load(config, thin=1), count, turns),
         "icp": lambda: time_icp(load(config), tuple(chosen.icp_offset), turns),
-        "render": lambda: time_render(load(config, thin=1), config.slam.observation.thin, count, turns),
         "sweep": lambda: time_settings(load(config), chosen.num_settings, turns),
         "growth": lambda: time_growth(config, chosen.image_sizes, chosen.map_sizes, turns),
     }

@@ -26,7 +26,7 @@ COMMANDS = {  # name: (what it does, an example)
     "query": ("ask a finished map for things", "emgs query map=outputs/monday 'text=[chair,table]'"),
     "segment": ("segmentation of finished maps, as the paper's Table III", "emgs segment 'map=[outputs/office0]' …"),
     "tables": ("the tables of README.md, from one commit", "emgs tables root=data"),
-    "benchmark": ("how long the stages take", "emgs benchmark 'parts=[em,icp]'"),
+    "benchmark": ("how long the stages take", "emgs benchmark 'parts=[stages,icp]'"),
 }
 
 

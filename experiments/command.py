@@ -56,6 +56,7 @@ def command(
                 check_out(config)
                 leave_memory_to_torch(config)
                 check_platforms()
+                leave_float32()
                 if "compilation_cache" in config:
                     use_compilation_cache(config.compilation_cache)
                 return task(config)
@@ -75,6 +76,15 @@ def command(
         return main
 
     return decorate
+
+
+def leave_float32() -> None:
+    """Turn off what JAX_ENABLE_X64 turns on, and say so: maps are made in float32."""
+    if os.environ.get("JAX_ENABLE_X64", "").lower() in ("1", "true", "yes", "on", "y", "t"):
+        import jax  # noqa: PLC0415 (not all commands need it)
+
+        jax.config.update("jax_enable_x64", False)
+        print("JAX_ENABLE_X64 is set, and is of no effect here: maps are made in float32")
 
 
 class Spoken:

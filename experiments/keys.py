@@ -112,7 +112,6 @@ KEYS: dict[str, dict[str, Kind | Declared]] = {
     "benchmark": {
         "parts": NAMES,
         "benchmark.repetitions": whole(1),
-        "benchmark.num_gaussians": whole(1),
         "benchmark.num_settings": COUNTS,
         "benchmark.map_sizes": COUNTS,
         "benchmark.image_sizes": SIZES,

@@ -55,7 +55,7 @@ def _check_folder(folder: Path) -> None:
 def _record_visits(prior: Prior, dataset: Dataset, config: DictConfig, folder: Path) -> None:
     """Record the predictions of both visits of a loop that a run's back end will need beside the sequence's windows."""
     end, size = graph_config(config), config.slam.window_size
-    if not end.prior_query.is_used or prior.is_sequential:
+    if not end.prior_query.is_used:
         return
     pairs = places_seen_twice(
         Recorded(folder),

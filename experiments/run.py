@@ -119,7 +119,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         write_report(recorded, dataset)
     if live is not None:
         notes = [*notes, f"the live view has ended; emgs view {folder} shows the finished run"]
-    notes = [*notes, *revisit_note(session.back_end, prior.is_sequential)]
+    notes = [*notes, *revisit_note(session.back_end)]
     counts, took = frame_lines(session.records, len(dataset.skipped)), time_words(clock, len(session.records))
     for note in [*counts, *notes, took]:
         tqdm.write(note)

@@ -99,6 +99,16 @@ def products_in_full_float32():
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_structures(tmp_path_factory):
+    """Structures are not kept where commands keep theirs."""
+    import emgs_jax.structure.store  # after the hook
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(emgs_jax.structure.store, "CACHE", tmp_path_factory.mktemp("structures"))
+        yield
+
+
 @pytest.fixture(scope="session")
 def config():
     """`config("slam.em.noise=0", ...)`: a small SlamConfig from conf/ with Hydra overrides."""

@@ -81,6 +81,7 @@ def hand_run(poses, raw_poses, true_poses, statuses=STATUSES, gaussians=None) ->
         raw_poses=[*raw_poses],
         true_poses=[*true_poses],
         back_end=None,
+        apart={},
     )
 
 

@@ -31,7 +31,6 @@ GROUPS = {
 # What the quick subset (-m "not slow") takes nothing of, beside the marked tests: some five CPU seconds and more each.
 SLOW = {
     "data/test_apartment.py",
-    "data/test_focal_length.py",
     "data/test_rosbag.py",
     "features/test_dino.py",
     "features/test_dinotxt.py",

@@ -1,17 +1,19 @@
-"""Scenes with known geometry for the classical prior: textured planes as images, random points as keypoints."""
+"""Scenes with known geometry for the classical prior: textured planes, and the built-in room as COLMAP takes it."""
 
 from functools import cache
 
 import hydra
 import numpy as np
-from emgs_jax.prior.multiview.incremental import StructureConfig
-from emgs_jax.prior.multiview.landmarks import NONE, Structure, View
 from scene import compose
 
+from emgs_jax.config.configure import build
+from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.multiview.depth import DepthConfig
-from emgs_jax.prior.multiview.lens import Lens
 from emgs_jax.prior.multiview.planar import PlanarConfig
+from emgs_jax.structure.config import StructureConfig
+from emgs_jax.structure.reconstruct import Shots
 
 FOCAL, CENTER, SIZE = (55.0, 53.0), (30.5, 24.25), (64, 48)
 SMALL = ("prior.dense.depth.sweep.num_planes=24",)
@@ -32,9 +34,28 @@ def planar_config(*overrides: str) -> PlanarConfig:
 
 @cache
 def structure_config(*overrides: str) -> StructureConfig:
-    """`prior.structure` of conf/ for a few landmarks."""
-    small = ("prior.structure.max_landmarks=128",)
-    return hydra.utils.instantiate(compose("prior=multiview_stereo", *small, *overrides).prior.structure)
+    """`prior.structure` of conf/, on one thread."""
+    words = ("prior.structure.num_threads=1", *overrides)
+    return build(compose("prior=multiview_stereo", *words), "prior.structure", _convert_="all")
+
+
+@cache
+def room() -> list[Frame]:
+    """Eight frames of the built-in room, large enough for SIFT."""
+    drawn = Synthetic(num_frames=40, stop=8, size=(160, 120))
+    return [drawn[index] for index in range(len(drawn))]
+
+
+def shots(images, is_calibrated: bool = True, names=None) -> Shots:
+    """Images of the room's camera; None is one that cannot be read."""
+
+    def read(index):
+        if images[index] is None:
+            raise BadFrameError("unreadable")
+        return images[index]
+
+    camera = ("SIMPLE_RADIAL", (131.2, 80.0, 60.0, 0.0)[: 4 * is_calibrated])
+    return Shots(names or [f"{row:03d}" for row in range(len(images))], read, (160, 120), camera, is_calibrated)
 
 
 @cache
@@ -53,11 +74,6 @@ def matrix(rotation=(0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0)) -> np.ndarray:
 
 def calibration() -> np.ndarray:
     return np.array([[FOCAL[0], 0, CENTER[0]], [0, FOCAL[1], CENTER[1]], [0, 0, 1]])
-
-
-def small_lens(distortion: float) -> Lens:
-    """`small_camera` with a lens."""
-    return Lens(np.array(FOCAL), np.array(CENTER), distortion)
 
 
 def plane_image(
@@ -82,54 +98,6 @@ def plane_image(
     return np.float32(np.clip(gray, 0, 1)), np.float32(depth)
 
 
-def cloud(count: int, seed: int = 0) -> np.ndarray:
-    """Points (count, 3) 1.5 to 3 m before the first camera of `arc`, inside the image."""
-    rng = np.random.default_rng(seed)
-    pixels = rng.uniform((4, 4), (SIZE[0] - 5, SIZE[1] - 5), (count, 2))
-    rays = np.column_stack([pixels, np.ones(count)]) @ np.linalg.inv(calibration()).T
-    return rays * rng.uniform(1.5, 3.0, (count, 1))
-
-
-def arc(count: int, step: float = 0.08) -> np.ndarray:
-    """T_world_camera (count, 4, 4): `step` metres a frame sideways, turning to keep the cloud in view."""
-    poses = [
-        matrix((0.01 * np.sin(i), -0.4 * step * i, 0.01 * i), (step * i, 0.02 * np.sin(i), 0.03 * i))
-        for i in range(count)
-    ]
-    return np.stack(poses)
-
-
-def projected(T_world_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Pixels (n, 2)."""
-    local = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
-    return (local @ calibration().T)[:, :2] / local[:, 2:]
-
-
-def views_of(points: np.ndarray, poses: np.ndarray, noise: float = 0.0, seed: int = 0) -> list[View]:
-    """Keypoints as `detect` would give them, in another order in every view; not linked and not placed.
-
-    Keypoint i of a view is point `order[i]`, which its descriptor encodes: `whose` reads it back.
-    """
-    rng = np.random.default_rng(seed)
-    descriptors = np.abs(np.random.default_rng(99).normal(size=(len(points), 128)))
-    descriptors = np.float32(descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
-    views = []
-    for T in poses:
-        order = rng.permutation(len(points))
-        pixels = projected(T, points[order]) + noise * rng.normal(size=(len(points), 2))
-        views.append(View(pixels, descriptors[order], np.full(len(points), NONE)))
-    return views
-
-
-def whose(view: View, reference: View) -> np.ndarray:
-    """For each keypoint the row of `reference` that shows the same point."""
-    return (view.descriptors @ reference.descriptors.T).argmax(axis=1)
-
-
-def structure_of(views: list[View]) -> Structure:
-    return Structure(calibration(), dict(enumerate(views)))
-
-
 def similarity_error(estimate: np.ndarray, truth: np.ndarray) -> float:
     """Root mean square distance (n, 3) after the best Sim(3) (Umeyama 1991)."""
     a, b = estimate - estimate.mean(0), truth - truth.mean(0)
@@ -137,15 +105,3 @@ def similarity_error(estimate: np.ndarray, truth: np.ndarray) -> float:
     sign = np.array([1, 1, np.linalg.det(U @ Vt)])
     scale = (S * sign).sum() / (a**2).sum()
     return float(np.sqrt(((scale * a @ (U * sign @ Vt).T - b) ** 2).sum(1).mean()))
-
-
-def placed_structure(poses, points, seen_by):
-    """All points are landmark = row; views hold their true poses."""
-    views = [
-        View(projected(T, points), np.zeros((len(points), 128), np.float32), np.arange(len(points)), T) for T in poses
-    ]
-    for frame, view in enumerate(views):
-        view.landmark[~seen_by[frame]] = NONE
-    structure = structure_of(views)
-    structure.points = np.full((len(points), 3), np.nan)
-    return structure

@@ -365,7 +365,7 @@ def test_a_distant_point_behind_a_gaussian_is_judged_as_in_float64(noise, depth)
     rays = np.random.default_rng(0).uniform(-0.4, 0.4, (M, 3)) * [1, 1, 0] + [0, 0, 1]
     points, mean, cov = np.float32(depth * rays), np.float32([0.1, 0, 2]), np.float32(np.diag([0.05, 0.05, 0.01]) ** 2)
     along = np.float32(noise) * points
-    triangle = [np.float32(x) for x in whitening(cov)[0]]
+    triangle = tuple(jnp.unstack(whitening(jnp.asarray(cov))[0]))
     found, growth = widened(triangle, tuple((points - mean).T), tuple(along.T))
     offsets, along = points.astype(float) - mean, along.astype(float)
     whole = cov + along[:, :, None] * along[:, None]
@@ -397,8 +397,7 @@ def test_a_point_with_a_number_that_is_none_is_left_out(paper, what):
 
 def test_where_a_gaussian_has_a_vanishing_share_its_support_has_finite_slopes(paper):
     """1e-21 over 1e-21: the slopes of the ratio overflow."""
-    gaussians = sc.rows_of(GAUSSIANS, [0, 0])
-    points = sc.rows_of(POINTS, [0, 1])
+    gaussians, points = sc.join(sc.rows_of(GAUSSIANS, [0, 0])), sc.join(sc.rows_of(POINTS, [0, 1]))
 
     def total(shares):
         step = sc.explained([[0, 1], [0, 1]], np.ones((2, 2)), [True, True])

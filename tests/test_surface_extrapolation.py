@@ -119,7 +119,7 @@ def test_window_is_gaussian_and_the_identity_without_width() -> None:
 @pytest.mark.parametrize("count", [0, 1, HALF.sum()])
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_slopes_are_finite_however_few_points_are_fused(count, noise):
-    is_fused = HALF & (np.cumsum(HALF) <= count)
+    is_fused = device(HALF & (np.cumsum(HALF) <= count))
     frame, map = seen(2.1), wall(weight=3.0)
 
     def total(noise, points, weight):

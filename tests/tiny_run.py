@@ -32,11 +32,6 @@ SMOKE = (  # for what needs images in which places are recognised; as few points
     *("slam.submap.map_capacity=2048", "slam.submap.submap_capacity=1024"),
     *("slam.em.num_neighbours=6", "slam.fit.num_fit_neighbours=8"),
 )
-SMALL_STEREO = (  # for images of 128 by 96; at this size a first window of 4 images leaves depths 15 % wrong
-    *("prior=multiview_stereo", "prior.structure.max_landmarks=192", "prior.structure.num_fixed=3"),
-    *("prior.dense.depth.sweep.num_planes=40", "prior.structure.matching.num_features=600"),
-    "prior.structure.matching.magnification=1",  # the 600 strongest of the image doubled are its finest details
-)
 
 
 def compose(*overrides: str, name: str = "config"):

@@ -123,7 +123,6 @@ MASK, ORDER = np.arange(40) % 3 > 0, np.arange(40)
 # name: (verb of one item, its arguments by seed)
 VERBS = {
     "safe_normalize": (linalg.safe_normalize, lambda s: (points(s).points,)),
-    "inverse_3x3": (linalg.inverse_3x3, lambda s: (sc.random_gaussians(9, s).covs,)),
     "whitening": (linalg.whitening, lambda s: (sc.random_gaussians(9, s).covs,)),
     "tangent_basis": (linalg.tangent_basis, lambda s: (points(s).normals,)),
     "principal_axes": (linalg.principal_axes_2x2, lambda s: (np.asarray(sc.random_gaussians(9, s).covs)[:, :2, :2],)),

@@ -94,11 +94,9 @@ def sequential_factor(
     surfaces.
 
     Args:
-        frame: the last one.
         poses: T_world_camera (4, 4) of all nodes, the last one its own; that of a frame k before it is k before.
         log_scales: σ of all nodes, likewise.
         is_connected: true for a node that a factor may join: its pose is an estimate and no placeholder.
-        noise: of the measurements.
     """
     time = len(poses) - 1
     known = {index for index, pose in frame.T_anchor_views.items() if np.isfinite(pose).all()}

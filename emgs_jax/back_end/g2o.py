@@ -26,7 +26,6 @@ def load_graph_g2o(path: str | os.PathLike, half_angles: bool = False) -> PoseGr
     solve with scale_std = 0. Lines that begin with # or FIX are read over (the first node is the gauge).
 
     Args:
-        path: the file.
         half_angles: the information on rotation is on the quaternion's vector part, half of the rotation vector near 0,
             as g2o itself defines it. False: on the rotation vector, as GTSAM reads the same files.
 

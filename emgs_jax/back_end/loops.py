@@ -58,7 +58,6 @@ def relocalize_frame(
     """Relocalize a frame by keyframes of its submap that are in the map; else return why that fails.
 
     Args:
-        end: the back end.
         frame: of a frame that is no node yet, or is no keyframe.
         in_other_submap: search the other submap that has the most similar keyframe, with a free ratio of units.
     """

@@ -101,11 +101,8 @@ def load_saved_map(
     """The map of a finished run's folder; None without one.
 
     Args:
-        folder: of the run.
         mode: `extend` or `localize`.
-        config: of the back end.
         intrinsics: of the new images, which may be those of another camera.
-        min_std: floor of the map's covariances.
 
     Raises:
         ValueError: the folder is not that of a finished run with a back end, or a file of it cannot be used.

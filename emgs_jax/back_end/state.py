@@ -28,10 +28,6 @@ class BackEndConfig:
     """Settings of the back end: noise of factors, place recognition, loop closures, optimization and relocalization.
 
     Args:
-        noise: of sequential and map factors.
-        place_recognition: keyframes, and candidates by their appearance.
-        consistency: spatial consistency of verified loops.
-        prior_query: second measurement of loops by the prior.
         every: frames between keyframes.
         min_violation: χ² of a loop at the current poses beyond which it violates them: only such a loop starts a
             closure, and only for such a loop the prior is queried.
@@ -124,9 +120,6 @@ def add_node(
     """Add a node with the pose of its frame, and its sequential and map factors.
 
     Args:
-        end: the back end.
-        frame: its data.
-        pose: T_world_camera.
         scale: of its inference.
         origin: node whose Gaussians it was registered to; None where it was not registered to the map.
         is_placed: the map holds it: it was registered to it, or the map was made from it.

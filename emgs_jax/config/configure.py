@@ -64,7 +64,6 @@ def build(config: DictConfig, key: str, **more: Any) -> Any:
 
     Args:
         key: dotted, of a node with `_target_`.
-        more: parameters that the config does not hold.
 
     Raises:
         ValueError: a value is not of the kind or in the range that its field declares; the message has its full key.

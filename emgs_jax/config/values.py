@@ -26,7 +26,7 @@ _NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: 
 class Declared:
     """Values that a field allows: plain kinds, the kinds of a list's elements, the range, the names.
 
-    A field with `is_node` has fields of its own.
+    A field with `is_node` has fields of its own. A list has `length` elements, any number where it is 0.
     """
 
     kinds: frozenset[type]
@@ -34,6 +34,7 @@ class Declared:
     range: Range | None = None
     choices: tuple[str, ...] = ()
     is_node: bool = False
+    length: int = 0
 
 
 def check_values(config: DictConfig, key: str) -> None:
@@ -77,7 +78,8 @@ def check_value(key: str, value: Any, field: Declared) -> None:
         return
     is_list = isinstance(value, ListConfig | list | tuple) and bool(field.elements)
     items, kinds = (value, field.elements) if is_list else ([value], field.kinds)
-    if not all(_fits(item, kinds, field.range) for item in items):
+    has_length = not (is_list and field.length) or len(value) == field.length
+    if not (has_length and all(_fits(item, kinds, field.range) for item in items)):
         raise ValueError(
             f"{key} must be {_expected(field)}, got {_shown(value)}{_advice(value)}: "
             "give such a value, or none for the one of conf/"
@@ -101,7 +103,8 @@ def _expected(field: Declared) -> str:
     words = [name + ends * (kind in (int, float)) for kind, name in _NAMES.items() if kind in kinds]
     if field.elements:
         what = "numbers or text" if str in field.elements else "numbers" if float in field.elements else "whole numbers"
-        words.append(f"a list […, …] of {what}{ends}")
+        count = f"{field.length} " if field.length else ""
+        words.append(f"a list […, …] of {count}{what}{ends}")
     return " or ".join(words + ["null"] * (type(None) in kinds))
 
 
@@ -141,12 +144,15 @@ def _declarations(cls: type) -> Iterator[tuple[str, Declared]]:
             elif "range" in about:
                 kinds, elements = _kinds(hint)
                 known = kinds or elements  # a traced field is annotated as the array that it becomes
-                yield field.name, Declared(kinds if known else frozenset({float}), elements, about["range"])
+                yield (
+                    field.name,
+                    Declared(kinds if known else frozenset({float}), elements, about["range"], length=_length(hint)),
+                )
             else:
-                yield field.name, Declared(*_kinds(hint), is_node=dataclasses.is_dataclass(hint))
+                yield field.name, Declared(*_kinds(hint), is_node=dataclasses.is_dataclass(hint), length=_length(hint))
         return
     for name, parameter in inspect.signature(cls).parameters.items():
-        yield name, Declared(*_kinds(parameter.annotation))
+        yield name, Declared(*_kinds(parameter.annotation), length=_length(parameter.annotation))
 
 
 def _kinds(hint: Any) -> tuple[frozenset[type], frozenset[type]]:
@@ -164,3 +170,11 @@ def _kinds(hint: Any) -> tuple[frozenset[type], frozenset[type]]:
         elif origin is not Callable:  # a function stands in no config
             return frozenset(), frozenset()
     return frozenset(plain), frozenset(elements)
+
+
+def _length(hint: Any) -> int:
+    """How many elements the tuples of a hint have; 0 where that is open."""
+    parts = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+    counts = {len(typing.get_args(part)) for part in parts if typing.get_origin(part) is tuple}
+    is_open = any(typing.get_origin(part) in (list, Sequence) or ... in typing.get_args(part) for part in parts)
+    return counts.pop() if len(counts) == 1 and not is_open else 0

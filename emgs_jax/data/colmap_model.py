@@ -120,6 +120,59 @@ def _load_binary(folder: Path) -> SparseModel:
     return _checked(SparseModel(cameras, names, ids, _inverted(poses), (cameras_file, images_file)), folder)
 
 
+def check_whole(folder: Path) -> None:
+    """Check that the binary files of a model do not end too soon; pycolmap would not end.
+
+    Raises:
+        ValueError: one does.
+    """
+    for path in sorted(folder.glob("*.bin")):
+        if path.stem in _SKIP:
+            records = _Records(path)
+            for _ in range(*records.values("Q")):
+                _SKIP[path.stem](records)
+            records.end()
+
+
+def _skip_camera(records: _Records) -> None:
+    _, number, _, _ = records.values("IiQQ")
+    known = [*MODELS.values()]
+    records.skip(8 * len(known[number].split()) if 0 <= number < len(known) else -1)
+
+
+def _skip_image(records: _Records) -> None:
+    records.values("I7dI")
+    records.text()
+    records.skip(POINT_SIZE * records.values("Q")[0])
+
+
+def _skip_point(records: _Records) -> None:
+    records.skip(43)
+    records.skip(8 * records.values("Q")[0])
+
+
+def _skip_rig(records: _Records) -> None:
+    _, count = records.values("II")
+    for number in range(count):
+        records.values("iI")
+        if number and records.values("?")[0]:
+            records.values("7d")
+
+
+def _skip_frame(records: _Records) -> None:
+    records.values("II7d")
+    records.skip(16 * records.values("I")[0])
+
+
+_SKIP = {
+    "cameras": _skip_camera,
+    "images": _skip_image,
+    "points3D": _skip_point,
+    "rigs": _skip_rig,
+    "frames": _skip_frame,
+}
+
+
 def _load_text(folder: Path) -> SparseModel:
     """Read cameras.txt and images.txt."""
     cameras_file, images_file = (folder / name for name in TEXT)

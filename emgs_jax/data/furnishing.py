@@ -26,7 +26,6 @@ def furnish(
         pieces: placed in this order; one without a free place after TRIES draws is left out.
         middle: parts in the world, which stay.
         lanes: points (x, y) of the routes through the room.
-        rng: draws the pieces and the places.
     """
     parts, taken = [*middle], [*([bounds(middle)] if middle else []), *_doorsteps(area)]
     for build in pieces:

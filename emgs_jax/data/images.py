@@ -122,7 +122,7 @@ class Folder:
 
     def find_size(self, rows: range) -> Size:
         self.tones = tones_of([self._paths[row] for row in rows])
-        self.notes += [self.tones and self.tones.note, reading.transparency_note(self._paths[rows[0]])]
+        self.notes += [self.tones and self.tones.note, reading.transparency_note(self._paths[row] for row in rows)]
         return reading.first_size((self._paths[row] for row in rows), self.folder)
 
     def read(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:

@@ -75,7 +75,7 @@ class PosedImages:
         about = {"source": solved.source.name}
         self._lens = to_lens(solved.camera, self._raw_size, str(solved.source), about)
         self._tones = tones_of(self._images)
-        shown = self._tones and self._tones.note, reading.transparency_note(self._images[0])
+        shown = self._tones and self._tones.note, reading.transparency_note(self._images)
         self.calibration = with_notes(self._lens.about, solved.note, note, *shown)
         self.sequence = sequence
         self.size = reading.check_size(size)

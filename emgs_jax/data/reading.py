@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
+from PIL import ExifTags, Image
 
 from emgs_jax.data.base import BadFrameError, Dataset
 
@@ -214,8 +215,31 @@ def decode(path: Path, flags: int) -> np.ndarray:
         except cv2.error as error:
             reason = f"cannot be decoded ({error.err})"
     if image is None:
-        raise BadFrameError(f"{path} is {reason or 'not a readable image'}: {REMEDY}")
+        other = other_kind(data)
+        remedy = f"convert it to png or jpg, {REMEDY}" if other else REMEDY
+        raise BadFrameError(f"{path} is {other or reason or 'not a readable image'}: {remedy}")
     return image
+
+
+def is_turned(path: Path) -> bool:
+    """Test whether an image is shown otherwise than it is stored, by its EXIF orientation; False where it has none."""
+    try:
+        with Image.open(path) as image:
+            return image.getexif().get(ExifTags.Base.Orientation, 1) not in (0, 1)
+    except (OSError, ValueError, SyntaxError):
+        return False
+
+
+def other_kind(data: bytes) -> str | None:
+    """What a file is by its content, of what OpenCV reads as no image; None where that is not known."""
+    if data[4:8] == b"ftyp":
+        brand = data[8:12]
+        if brand in (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1"):
+            return "an image in HEIC, whatever its name says"
+        return "a video" if brand != b"avif" else "an image in AVIF, whatever its name says"
+    if data[:4] == b"%PDF":
+        return "a PDF"
+    return "a web page" if data.lstrip()[:1] == b"<" else None
 
 
 def read_color(path: Path, raw_size: Size | None = None, flags: int = 0) -> UInt8[np.ndarray, "_ _ 3"]:
@@ -246,16 +270,32 @@ def check_raw_size(image: np.ndarray, raw_size: Size | None, path: object) -> No
 
 def first_size(paths: Iterable[Path], where: object, flags: int = 0) -> Size:
     """(width, height) of the first image that can be read, as `read_color` does."""
+    reasons = []
     for path in paths:
         try:
             return decode(path, OWN_BITS | flags).shape[1::-1]
-        except BadFrameError:
-            continue
-    raise ValueError(f"{where}: none of its images can be read; fetch them again")
+        except BadFrameError as error:
+            reasons.append(str(error))
+    raise ValueError(f"{where}: none of its {len(reasons)} images can be read: {'; '.join(dict.fromkeys(reasons[:3]))}")
 
 
-def transparency_note(path: Path) -> str | None:
-    """Words where an image is transparent in places; None also for one that cannot be read."""
+def transparency_note(paths: Iterable[Path]) -> str | None:
+    """Words where an image is transparent in places, about the first such; files that cannot be read are left out."""
+    return next((note for path in paths if _may_be_transparent(path) and (note := _transparency(path))), None)
+
+
+def _may_be_transparent(path: Path) -> bool:
+    """Test by its first bytes whether a file may have an alpha channel; only these are decoded."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(26)
+    except OSError:
+        return False
+    is_png = head.startswith(b"\x89PNG")
+    return head[25:26] in (b"\x03", b"\x04", b"\x06") if is_png else not head.startswith((b"\xff\xd8", b"BM"))
+
+
+def _transparency(path: Path) -> str | None:
     try:
         image = decode(path, cv2.IMREAD_UNCHANGED)
     except BadFrameError:
@@ -290,6 +330,12 @@ def as_motion(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
     if not np.isfinite(pose).all():
         return None
     if not is_rigid(pose):
+        scale = float(np.cbrt(np.linalg.det(pose[:3, :3])))
+        if scale > 0 and is_rigid(pose / np.where(np.arange(4) < 3, [[scale]] * 3 + [[1.0]], 1.0)):
+            raise BadFrameError(
+                f"{where} has a rotation times {scale:.4g}, of an alignment with a scale: divide the first three "
+                "columns by it, and give depth and positions in one unit"
+            )
         raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded

@@ -1,6 +1,7 @@
 """The frames of a video file, as they can be read: what its header says of their number and rate is often wrong."""
 
 import math
+import struct
 from pathlib import Path
 
 import cv2
@@ -32,14 +33,25 @@ class Video:
         announced = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self._times = _times(self._capture, stop)
         self.count = self._next = len(self._times)  # _next: number of the frame that the capture gives next
+        if not self.count:
+            raise ValueError(self._nothing_decoded())
         is_short = math.isfinite(announced) and self.count < (announced if stop is None else min(announced, stop))
         self.notes = [f"{path} announces {announced:.0f} frames, {self.count} can be read"] if is_short else []
 
     def _open(self) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(str(self._path))
         if not capture.isOpened():
-            raise ValueError(f"{self._path} is no video that OpenCV can open: convert it to mp4 (h264) or to images")
+            reason = damage(self._path) or "no video that OpenCV can open: convert it to mp4 (h264) or to images"
+            raise ValueError(f"{self._path} is {reason}")
         return capture
+
+    def _nothing_decoded(self) -> str:
+        code = int(self._capture.get(cv2.CAP_PROP_FOURCC))
+        codec = "".join(chr(code >> shift & 255) for shift in (0, 8, 16, 24)).strip("\0 ")
+        return (
+            f"{self._path}: none of its frames can be decoded, by OpenCV and as {codec or 'its codec'} (AV1 is read by "
+            "few): convert it to h264 (ffmpeg -i VIDEO -c:v libx264 NEW.mp4) or to images"
+        )
 
     def find_size(self, rows: range) -> Size:
         return self.read(rows[0]).shape[1::-1]
@@ -51,6 +63,8 @@ class Video:
             self._next += 1
         is_read, image = self._capture.read() if self._next == row else (False, None)
         if not is_read or image is None:
+            if not self._next:
+                raise ValueError(self._nothing_decoded())
             raise BadFrameError(
                 f"{self.label(row)} cannot be read, the video ends or is damaged after frame {self._next - 1}: "
                 f"set dataset.stop={self._next}"
@@ -67,6 +81,28 @@ class Video:
 
     def label(self, row: int) -> str:
         return f"{self._path}, frame {row}"
+
+
+def damage(path: Path) -> str | None:
+    """What is wrong with a video file that does not open; None where nothing is seen.
+
+    A recording that was cut off, or copied in part, lacks the box `moov` that mp4 and mov end with.
+    """
+    remedy = "copy it again from where it was recorded; no program can convert it as it is"
+    size = path.stat().st_size
+    if not size:
+        return f"empty: {remedy}"
+    with open(path, "rb") as file:
+        begin, names = 0, []
+        while begin + 8 <= size:
+            file.seek(begin)
+            length, name = struct.unpack(">I4s", file.read(8))
+            if length == 1:
+                length = int.from_bytes(file.read(8), "big")
+            names.append(name)
+            begin = size if length == 0 else begin + max(length, 8)
+    is_mp4 = names[:1] == [b"ftyp"]
+    return f"not whole, the recording or the copy was cut off: {remedy}" if is_mp4 and b"moov" not in names else None
 
 
 def _times(capture: cv2.VideoCapture, stop: int | None) -> list[float]:

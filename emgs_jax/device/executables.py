@@ -40,7 +40,7 @@ COMPILED = "/jax/core/compile/backend_compile_duration"
 # cannot be kept again, as on CPUs it has lost its functions (jaxlib 0.10.1). The second is for a file that was damaged.
 _OPTIONS = {"xla_embed_ir_in_executable": False}, {"xla_dump_hlo_as_text": False}, {"xla_dump_hlo_as_proto": False}
 _loaded: dict[tuple, Callable] = {}
-_seen: dict[tuple, str | None] = {}  # fingerprints of what this process has traced
+_seen: dict[tuple, tuple] = {}  # what this process has traced: a function and classes, and their fingerprint
 _thread = threading.local()  # `hits`: executables that JAX took from its cache
 
 
@@ -90,7 +90,7 @@ def forget_replaced() -> None:
 
     JAX would go on with what the function was when it was first called with arrays of these shapes.
     """
-    if any(fingerprint(function.__wrapped__, *classes) != before for (function, classes), before in _seen.items()):
+    if any(fingerprint(*things) != before for things, before in dict(_seen.values()).items()):
         forget()
         jax.clear_caches()
 
@@ -100,10 +100,11 @@ def _written(function: Callable, tree: Any) -> str | None:
 
     None where something that it names cannot be told.
     """
-    key = function, tuple(dict.fromkeys(_classes(tree)))
+    key = function, tree
     if key not in _seen:
-        _seen[key] = fingerprint(function.__wrapped__, *key[1])
-    return _seen[key]
+        things = function.__wrapped__, *dict.fromkeys(_classes(tree))
+        _seen[key] = things, fingerprint(*things)
+    return _seen[key][1]
 
 
 def _classes(tree: Any) -> Iterator[type]:

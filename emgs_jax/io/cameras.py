@@ -64,7 +64,6 @@ def save_transforms(path: Path, camera: Camera, names: Sequence[str], T_world_ca
     """Write transforms.json of one pinhole camera.
 
     Args:
-        path: of the file.
         camera: of all images.
         names: of the image files, from the folder of `path`.
         T_world_camera: (n, 4, 4), OpenCV axes, metres.
@@ -89,7 +88,6 @@ def save_frustums(
     """Write cameras and path as coloured triangles; returns how many triangles.
 
     Args:
-        path: of the PLY.
         camera: whose pyramids have the images' shape.
         T_world_camera: (n, 4, 4), metres.
         colors: (n, 3), RGB in [0, 1], of each camera.

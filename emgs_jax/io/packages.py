@@ -16,9 +16,7 @@ def extra(module: str, words: str, name: str) -> ModuleType:
     """Import a module that one of the extras of this package brings.
 
     Args:
-        module: to import.
         words: what needs it, for the message.
-        name: of the extra.
 
     Raises:
         ValueError: it is not installed; the message says how it would be.
@@ -48,7 +46,6 @@ def best_device(torch: ModuleType, what: str, key: str) -> str:
     """A GPU if there is one; a CPU, which nobody asked for, is mentioned.
 
     Args:
-        torch: the package.
         what: runs there, for the message.
         key: of the config that would ask for it.
     """

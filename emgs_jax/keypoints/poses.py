@@ -4,28 +4,13 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 
 def calibration(intrinsics: Sequence[float]) -> Float[np.ndarray, "3 3"]:
     """The matrix K of fx, fy, cx, cy."""
     fx, fy, cx, cy = intrinsics
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-
-
-def unit_rays(pixels: Float[np.ndarray, "n 2"], K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
-    """Unit viewing directions of pixels, camera frame."""
-    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(K).T
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
-
-
-def fits(
-    points: Float[np.ndarray, "n 3"], pixels: Float[np.ndarray, "n 2"], K: Float[np.ndarray, "3 3"], max_error: float
-) -> Bool[np.ndarray, " n"]:
-    """Mark points of the camera's frame whose images lie less than `max_error` from their pixels; none behind it."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        error = np.linalg.norm((points @ K.T)[:, :2] / points[:, 2:] - pixels, axis=1)
-    return (points[:, 2] > 0) & (error < max_error)
 
 
 def essential(

@@ -8,26 +8,22 @@ DESCRIPTOR_SIZE = 128
 
 
 def detect(
-    gray: np.ndarray, num_features: int, min_contrast: float, magnification: int = 1
+    gray: np.ndarray, num_features: int, min_contrast: float
 ) -> tuple[Float[np.ndarray, "n 2"], Float32[np.ndarray, "n 128"]]:
     """SIFT keypoints with the square roots of their normalised descriptors (Arandjelović and Zisserman, CVPR 2012).
 
     Args:
         gray: uint8 (h, w).
-        magnification: of the image that is searched: more finds what is small or faint.
 
     Returns:
         pixels, centres at integers, and unit descriptors; none for a blank image.
     """
-    if magnification > 1:
-        gray = cv2.resize(gray, None, fx=magnification, fy=magnification, interpolation=cv2.INTER_LINEAR)
     detector = cv2.SIFT_create(nfeatures=num_features, contrastThreshold=min_contrast, enable_precise_upscale=True)
     keypoints, descriptors = detector.detectAndCompute(gray, None)
     if not keypoints:
         return np.zeros((0, 2)), np.zeros((0, DESCRIPTOR_SIZE), np.float32)
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
-    pixels = (np.array([point.pt for point in keypoints]) + 0.5) / magnification - 0.5
-    return pixels, np.sqrt(descriptors / total)
+    return np.array([point.pt for point in keypoints]), np.sqrt(descriptors / total)
 
 
 def mutual(

@@ -36,24 +36,6 @@ def outer(vectors: Float[Array, "*b d"]) -> Float[Array, "*b d d"]:
     return vectors[..., :, None] * vectors[..., None, :]
 
 
-def inverse_3x3(covs: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
-    """Inverse by the adjugate of symmetric positive matrices; the identity where a matrix is not positive.
-
-    The matrices are scaled to unit trace first, which keeps the determinant of a millimetre-thin Gaussian inside
-    float32.
-    """
-    trace = jnp.trace(covs, axis1=-2, axis2=-1)
-    scale = jnp.where(trace > 0, trace, 1.0)
-    scaled = covs / scale[..., None, None]
-    a, b, c = scaled[..., 0, :], scaled[..., 1, :], scaled[..., 2, :]
-    adjugate = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
-    det = jnp.sum(a * adjugate[..., :, 0], axis=-1)
-    is_positive = (det > 0) & (trace > 0)
-    safe_det = jnp.where(is_positive, det, 1.0)
-    inverse = symmetrize(adjugate) / (safe_det * scale)[..., None, None]
-    return jnp.where(is_positive[..., None, None], inverse, jnp.eye(3, dtype=covs.dtype))
-
-
 def whitening(covs: Float[Array, "*b 3 3"]) -> tuple[Float[Array, "*b 6"], Float[Array, "*b"]]:
     """W = L⁻¹ for the Cholesky factor Σ = L L', and log|Σ|; W x has unit covariance, and |W x|² = x' Σ⁻¹ x.
 
@@ -121,7 +103,8 @@ def floored(covs: Float[Array, "*b 3 3"], min_std: Float[Array, ""]) -> Float[Ar
 def inverse_2x2(matrices: Float[Array, "*b 2 2"]) -> Float[Array, "*b 2 2"]:
     """Inverse of symmetric positive 2×2 matrices; zero where the determinant is not positive."""
     a, b, c = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]
-    det = sum(minor_2x2(a, c, b, b))
+    det, rest = minor_2x2(a, c, b, b)
+    det += rest
     is_positive = det > 0
     adjugate = jnp.stack([jnp.stack([c, -b], -1), jnp.stack([-b, a], -1)], -2)
     return jnp.where(is_positive[..., None, None], adjugate / jnp.where(is_positive, det, 1.0)[..., None, None], 0.0)

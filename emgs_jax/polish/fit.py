@@ -121,9 +121,6 @@ def fit(
     Args:
         anchors: where the splats begin.
         colors: (n, 3), likewise.
-        views: the frames.
-        camera: of the frames.
-        config: how.
         path: of what a stopped fit goes on from; gone at the end.
         on_step: told the number of each step, and the PSNR (dB) of its frame before it.
 

@@ -85,13 +85,11 @@ class Prior(ABC):
         provenance: where its predictions come from.
         feature_names: classes that `text_features` describes; empty without features.
         text_features: (classes, f) unit embeddings comparable with `PriorPrediction.features`.
-        is_sequential: an answer depends on the windows before it, so none of them can be left out.
     """
 
     provenance: Provenance
     feature_names: tuple[str, ...] = ()
     text_features: np.ndarray = np.zeros((0, 0), np.float32)
-    is_sequential: bool = False
 
     @abstractmethod
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
@@ -99,7 +97,7 @@ class Prior(ABC):
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
         """Predict for views of two visits of a place, see `visits`; None where that is not known."""
-        return None if self.is_sequential else self.predict(window, frames, intrinsics)
+        return self.predict(window, frames, intrinsics)
 
     def num_newer(self, window_size: int) -> int:
         """Images after the current one that its windows have, see `windows`: a camera's frames are mapped so late."""

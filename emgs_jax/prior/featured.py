@@ -16,7 +16,7 @@ class Wrapped(Prior):
     """A prior that answers as another one does, but for what a subclass changes."""
 
     def __init__(self, prior: Prior) -> None:
-        self._prior, self.is_sequential = prior, prior.is_sequential
+        self._prior = prior
 
     def num_newer(self, window_size: int) -> int:
         return self._prior.num_newer(window_size)

@@ -64,8 +64,7 @@ def record(
 ) -> None:
     """Write what `prior` predicts for every window of `dataset`; inferences that are there already are kept.
 
-    A prior with `is_sequential = True` predicts them again, because later ones depend on them. `progress` wraps
-    the list of windows, e.g. tqdm.
+    `progress` wraps the list of windows, e.g. tqdm.
     """
     folder = Path(folder)
     calls = list(windows(len(dataset), window_size, prior.num_newer(window_size)))
@@ -76,14 +75,12 @@ def record(
     files["text_features.npz"] = _write(folder / "text_features.npz", _npz({"text_features": prior.text_features}))
     names = [f"{window.inference:06d}.npz" for window in calls]
     missing = {row for row, name in enumerate(names) if _digest_of(folder / name) != files.get(name, "")}
-    asked = range(max(missing, default=-1) + 1) if prior.is_sequential else missing
-    for window, frames in with_frames((call for call in progress(calls) if call.inference in asked), dataset):
+    for window, frames in with_frames((call for call in progress(calls) if call.inference in missing), dataset):
         prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
         check_unit(prediction)
-        if window.inference in missing:
-            name = names[window.inference]
-            files[name] = _write(folder / name, _npz(_arrays(prediction)))
-            _write_manifest(folder, header, files)
+        name = names[window.inference]
+        files[name] = _write(folder / name, _npz(_arrays(prediction)))
+        _write_manifest(folder, header, files)
     _write_manifest(folder, header | {"complete": True}, files)
 
 

@@ -61,7 +61,7 @@ def record_visits(
 ) -> int:
     """Add the predictions of both visits of each pair to a recording that is complete; return how many it holds.
 
-    Those that are there already are kept; a prior that cannot predict out of order leaves none.
+    Those that are there already are kept; of visits of which the prior knows nothing there are none.
     """
     replay, known = Recorded(folder), 0
     for a, b in progress(pairs):

@@ -75,14 +75,13 @@ def _unsolved(end: BackEnd) -> dict[tuple[int, int], str]:
     return {(loop.a, loop.b): one.info.reason for one in end.closures if one.info.reason for loop in one.loops}
 
 
-def revisit_note(end: BackEnd | None, is_sequential: bool) -> list[str]:
-    """A line where the prior could be asked for no loop, and how it can; none where it was asked, or never can be."""
-    if end is None or is_sequential or set(end.queries.values()) != {SILENT}:
+def revisit_note(end: BackEnd | None) -> list[str]:
+    """A line where the prior could be asked for no loop, and how it can; none where it was asked."""
+    if end is None or set(end.queries.values()) != {SILENT}:
         return []
     return [
         f"loops: {len(end.queries)} were measured by keypoints alone, because the prior has no answer for both; a "
-        "recording has them if it is made with `python -m experiments.predict … graph=default`, but for a prior that "
-        "answers in order only, as multiview_stereo does"
+        "recording has them if it is made with `python -m experiments.predict … graph=default`"
     ]
 
 

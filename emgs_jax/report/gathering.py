@@ -102,7 +102,7 @@ def gather(
     labels = None if text is None else SpooledLabels(text[0])
 
     def take(record: FrameRecord | None, view: RawView) -> None:
-        points, mask, image, pose, features = view[:5]
+        points, mask, image, pose, features, _ = view
         known = mask & np.isfinite(points).all(-1)
         depth = np.where(known, points[..., 2], 0.0).astype(np.float32)
         seen = camera_cloud(points, mask, image, evaluation)

@@ -27,6 +27,8 @@ FILES = {
     "graph.g2o": "poses and measurements; what reads g2o files",
     "loops.json": "candidates of loops and what became of them; any editor",
     "map.npz": "the map itself: emgs_jax.load_map",
+    "structure": "poses, points and lens of the images; COLMAP",
+    "submaps": "map and path of each part that was never joined with the map; emgs_jax.load_map",
     "text.npz": "classes that the map's features are compared with; features.text=",
     "map.ply": "the Gaussians as 3D Gaussian splatting has them; splat-transform, rerun",
     "points.ply": "a dense cloud with normals, colours and labels; MeshLab, CloudCompare, Open3D",
@@ -200,7 +202,7 @@ def polished(run: RecordedRun) -> tuple[Table, str] | None:
 
 def files(run: RecordedRun) -> Table:
     """List the files beside the page, with the programs that open them."""
-    there = [(name, words) for name, words in FILES.items() if name == "report.html" or (run.folder / name).is_file()]
+    there = [(name, words) for name, words in FILES.items() if name == "report.html" or (run.folder / name).exists()]
     return Table(("file", "what it is; what opens it"), there)
 
 

@@ -50,8 +50,6 @@ def polish(
 
     Args:
         run: whose folder is written into.
-        dataset: its images.
-        config: how.
         densify_config: how the run drew its map.
 
     Returns:

@@ -35,7 +35,7 @@ from emgs_jax.slam import SlamState
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (
     *("metrics.json", "trajectory.txt", "trajectory_online.txt", "graph.g2o", LOOPS_FILE, "frames.jsonl"),
-    *("map.npz", "places.npz", "map.ply", "points.ply", "mesh.ply", "overview.png", TEXT_FILE, REPORT_FILE),
+    *("map.npz", "submaps", "places.npz", "map.ply", "points.ply", "mesh.ply", "overview.png", TEXT_FILE, REPORT_FILE),
     *(CHECKPOINT_FILE, "query.json", "query.png", "semantic.npz", "semantic.ply", "features.png", "labels"),
     *EXPORTS,
     *POLISH,

@@ -6,6 +6,8 @@ from typing import Any
 
 from emgs_jax.ops.ranges import number
 
+PARTS = ("extraction", "matching", "verification", "mapping")  # of the options
+
 
 @dataclass(frozen=True)
 class StructureConfig:
@@ -37,7 +39,7 @@ class StructureConfig:
     model: str | None
     features: str
     matcher: str | None
-    mapper: str
+    mapper: str = field(metadata={"choices": ("incremental", "global")})
     camera_model: str
     refine_distortion: bool
     masks: str | None
@@ -52,3 +54,11 @@ class StructureConfig:
     median_depth: float = number(low=1e-6, high=1e6)
     pixel_std: float = number(low=1e-3, high=100)
     options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for part, values in self.options.items():
+            if part not in PARTS or not isinstance(values, Mapping):
+                raise ValueError(
+                    f"prior.structure.options.{part}={values} is none of its parts: there are "
+                    f"{', '.join(f'{name}.KEY=…' for name in PARTS)}"
+                )

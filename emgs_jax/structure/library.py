@@ -1,13 +1,33 @@
 """pycolmap, which is loaded when it is needed, and its options and names as a config writes them."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
 
+PROBE = """
+import sys, tempfile, cv2, numpy as np, pycolmap
+features, matcher = (getattr(pycolmap, kinds).__members__[name] for kinds, name in zip(sys.argv[1::2], sys.argv[2::2]))
+extraction = pycolmap.FeatureExtractionOptions(type=features, use_gpu=False)
+matching = pycolmap.FeatureMatchingOptions(type=matcher, use_gpu=False)
+with tempfile.TemporaryDirectory() as folder:
+    image = cv2.resize(np.random.default_rng(0).integers(0, 255, (40, 40), np.uint8), (320, 320))
+    for name in "ab":
+        cv2.imwrite(f"{folder}/{name}.png", image)
+    database, cpu = f"{folder}/database.db", pycolmap.Device.cpu
+    pycolmap.extract_features(database, folder, extraction_options=extraction, device=cpu)
+    pycolmap.match_exhaustive(database, matching_options=matching, device=cpu)
+"""
+
 
 def load() -> ModuleType:
-    """The module; ValueError where it is not installed."""
+    """The module, which logs nothing but what ends it; ValueError where it is not installed.
+
+    It takes SIGTERM for itself, to print a stack; whoever listened to it before gets it back.
+    """
     try:
         import pycolmap
     except ImportError as error:
@@ -15,19 +35,28 @@ def load() -> ModuleType:
             "poses of images are found by pycolmap, which is not installed (for Linux on ARM there is no wheel): "
             "install it from source, or bring predictions with poses (prior=files)"
         ) from error
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    handler = signal.getsignal(signal.SIGTERM)
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
     return pycolmap
 
 
-@contextmanager
-def quiet() -> Iterator[None]:
-    """COLMAP logs nothing but what ends it."""
-    logging = load().logging
-    before = logging.minloglevel
-    logging.minloglevel = logging.Level.FATAL.value
-    try:
-        yield
-    finally:
-        logging.minloglevel = before
+def check_kinds(features: str, matcher: str) -> None:
+    """Try features and a matcher in another process: where they need what this build lacks, COLMAP ends its process.
+
+    Raises:
+        ValueError: it ends.
+    """
+    kinds = "FeatureExtractorType", features, "FeatureMatcherType", matcher
+    done = subprocess.run([sys.executable, "-c", PROBE, *kinds], capture_output=True, text=True)
+    if done.returncode:
+        said = [line.removeprefix("  what():").strip() for line in done.stderr.splitlines() if line.strip()]
+        reason = next((line for line in said if "ONNX" in line), said[-1] if said else "it ends without a word")
+        raise ValueError(
+            f"this pycolmap cannot use prior.structure.features={features.lower()} with the matcher {matcher.lower()} "
+            f"({reason}): use features=sift matcher=null, or a pycolmap that is built with what they need"
+        )
 
 
 def options_of(name: str, *given: Mapping[str, Any]) -> Any:
@@ -40,6 +69,9 @@ def options_of(name: str, *given: Mapping[str, Any]) -> Any:
     for values in given:
         try:
             options.mergedict(_plain(values))
+            checked = options.ransac if hasattr(options, "ransac") else options
+            if hasattr(checked, "check") and checked.check() is False:
+                raise ValueError("a value is out of its range")
         except (AttributeError, TypeError, ValueError, RuntimeError) as error:
             known = ", ".join(sorted(options.todict()))
             raise ValueError(

@@ -1,5 +1,6 @@
 """What COLMAP found, as arrays: poses with their covariances, points, which frame shows which, and the lens."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -97,8 +98,8 @@ def to_structure(models: Sequence[Any], names: Sequence[str], config: StructureC
 
 
 def stem(name: str) -> str:
-    """Name of an image without folder and suffix."""
-    return name.rpartition("/")[2].rpartition(".")[0] or name
+    """Name of an image without folder and suffix, and without what COLMAP's lists of pairs cannot hold."""
+    return re.sub(r"[\s#]", "_", name.rpartition("/")[2].rpartition(".")[0] or name)
 
 
 def in_unit(structure: Structure, median_depth: float) -> Structure:

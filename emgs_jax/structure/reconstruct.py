@@ -10,7 +10,8 @@ from tqdm import tqdm
 
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.structure.config import StructureConfig
-from emgs_jax.structure.library import load, member, options_of, quiet
+from emgs_jax.structure.library import check_kinds, load, member, options_of
+from emgs_jax.structure.model import stem
 from emgs_jax.structure.pairs import choose_pairs
 
 BATCH = 8  # images of one call of COLMAP, so that the bar moves
@@ -52,10 +53,9 @@ def map_images(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]
         ValueError: the images do not determine a structure; with the reason and a remedy.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with quiet():
-        _say(shots, config)
-        detect(shots, config, folder)
-        match(shots, config, folder)
+    _say(shots, config)
+    detect(shots, config, folder)
+    match(shots, config, folder)
     return map_database(shots, config, folder)
 
 
@@ -65,13 +65,12 @@ def map_database(shots: Shots, config: StructureConfig, folder: Path) -> list[An
     Raises:
         ValueError: it cannot be read, or there is no model; with the reason and a remedy.
     """
-    with quiet():
-        found = find_models(shots, config, folder)
-        check_found(found, shots, config, folder)
-        register_rest(found, config, folder)
-        for model in found:
-            drop_points_at_cameras(model)
-            adjust(model, shots, config)
+    found = find_models(shots, config, folder)
+    check_found(found, shots, config, folder)
+    register_rest(found, config, folder)
+    for model in found:
+        drop_points_at_cameras(model)
+        adjust(model, shots, config)
     return found
 
 
@@ -101,6 +100,8 @@ def detect(shots: Shots, config: StructureConfig, folder: Path) -> None:
         config.options.get("extraction", {}),
     )
     extraction.type = member("FeatureExtractorType", config.features, "features")
+    if config.features.lower() != "sift" or config.matcher is not None:
+        check_kinds(extraction.type.name, matcher_of(config).name)
     model, parameters = shots.camera
     reader = pycolmap.ImageReaderOptions(
         camera_model=model, camera_params=",".join(map(repr, parameters)), mask_path=_masks(shots, config, folder)
@@ -146,7 +147,7 @@ def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
     if config.masks is None:
         return ""
     given, own = Path(config.masks).expanduser(), folder / "masks"
-    found = {path.stem: path for path in given.iterdir()} if given.is_dir() else {}
+    found = {stem(path.name): path for path in given.iterdir()} if given.is_dir() else {}
     missing = [name for name in shots.names if name not in found and f"{name}.png" not in found]
     if missing:
         raise ValueError(
@@ -166,6 +167,13 @@ def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
     return str(own)
 
 
+def matcher_of(config: StructureConfig) -> Any:
+    """pycolmap's FeatureMatcherType: the one that is named, else that of the features."""
+    features = config.features.lower()
+    kinds = {"sift": "sift_bruteforce", "aliked": "aliked_lightglue", "loma": features}
+    return member("FeatureMatcherType", config.matcher or kinds[features.split("_")[0]], "matcher")
+
+
 def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
     """Match and verify the pairs that `choose_pairs` names; those that are in the database stay."""
     pycolmap = load()
@@ -175,11 +183,7 @@ def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
         {"num_threads": config.num_threads, "guided_matching": True, "use_gpu": False},
         config.options.get("matching", {}),
     )
-    if config.matcher is not None:
-        matching.type = member("FeatureMatcherType", config.matcher, "matcher")
-    elif config.features != "sift":
-        kind = {"aliked": "aliked_lightglue", "loma": config.features}[config.features.split("_")[0]]
-        matching.type = member("FeatureMatcherType", kind, "matcher")
+    matching.type = matcher_of(config)
     verification = options_of(
         "TwoViewGeometryOptions",
         {"ransac": {"random_seed": config.seed}},
@@ -209,7 +213,8 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
     common = {"num_threads": config.num_threads, "random_seed": config.seed}
     given = config.options.get(config.mapper, {})
     output = folder / "models"
-    output.mkdir(exist_ok=True)
+    for needed in (output, folder / IMAGES):  # of a database alone there are none
+        needed.mkdir(exist_ok=True)
     if config.mapper == "global":
         refined = {"refine_focal_length": is_free, "refine_extra_params": is_free or config.refine_distortion}
         mapper = {"mapper": {**common, "bundle_adjustment": refined}}
@@ -229,7 +234,7 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
         options = options_of("IncrementalPipelineOptions", common, refined, given)
         with tqdm(total=len(shots.names), unit="image", desc="structure") as bar:
             found = pycolmap.incremental_mapping(
-                folder / DATABASE, folder / IMAGES, output, options, next_image_callback=lambda: bar.update()
+                folder / DATABASE, folder / IMAGES, output, options, "", lambda: bar.update(2), bar.update
             )
     held: set[int] = set()
     models = []

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from emgs_jax.data.base import Dataset
-from emgs_jax.data.camera_models import Calibration, from_colmap
+from emgs_jax.data.camera_models import PERSPECTIVE, Calibration, from_colmap
 from emgs_jax.data.intrinsics import Pictures, from_exif
 from emgs_jax.structure.config import StructureConfig
-from emgs_jax.structure.model import Structure, to_structure
+from emgs_jax.structure.model import Structure, stem, to_structure
 from emgs_jax.structure.reconstruct import Shots
 from emgs_jax.structure.store import make_models, models_of
 
@@ -31,7 +31,9 @@ def structure_of(dataset: Dataset, config: StructureConfig, folder: Path | None)
     read, size, intrinsics = full_images(dataset)
     shots = Shots(names, read, size, pinhole_of(intrinsics, config), is_calibrated=True)
     _, models = make_models(shots, config, folder)
-    return to_structure(models, names, config), False
+    # A model that is given is of the images on disk, which the data set may have straightened.
+    is_straight = config.model is not None and any(dataset.calibration.get("distortion") or ())
+    return to_structure(models, names, config), is_straight
 
 
 def calibrate(
@@ -41,6 +43,8 @@ def calibrate(
 
     It begins at the focal length that the first image's EXIF tells, else at COLMAP's default.
     """
+    if config.camera_model not in PERSPECTIVE:
+        raise ValueError(f"prior.structure.camera_model={config.camera_model}: there are {', '.join(PERSPECTIVE)}")
     names = image_names([*pictures.files] or [None] * pictures.count, range(pictures.count))
     (width, height), focal = pictures.size, _exif_focal(pictures)
     is_known = focal is not None and config.camera_model == "SIMPLE_RADIAL"
@@ -78,7 +82,7 @@ def names_of(dataset: Dataset) -> list[str]:
 
 def image_names(files: Sequence[Path | None], numbers: Sequence[int]) -> list[str]:
     """Stems of the files if each has its own, else the numbers."""
-    stems = [path.stem if path is not None else "" for path in files]
+    stems = [stem(path.name) if path is not None else "" for path in files]
     return stems if all(stems) and len({*stems}) == len(stems) else [f"{number:06d}" for number in numbers]
 
 

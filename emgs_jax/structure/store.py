@@ -5,15 +5,17 @@ import json
 import shutil
 import tempfile
 from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock
 from tqdm import tqdm
 
 from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.colmap_model import check_whole
 from emgs_jax.io.files import write_file
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.library import load
@@ -29,7 +31,7 @@ CACHE = Path("~/.cache/emgs_jax/structure")
 def key_of(shots: Shots, config: StructureConfig) -> str:
     """Hex digest of the images' pixels, the camera, the settings and COLMAP's version."""
     settings = {name: value for name, value in asdict(config).items() if name not in NOT_OF_MODELS}
-    about = [settings, shots.camera, shots.is_calibrated, [*shots.names], version("pycolmap")]
+    about = [settings, shots.camera, shots.is_calibrated, [*shots.names], load().__version__]
     digest = hashlib.blake2b(json.dumps(about, sort_keys=True, default=str).encode(), digest_size=16)
     for index in range(len(shots.names)):
         try:
@@ -57,16 +59,20 @@ def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> t
     key = key_of(shots, config)
     cached = CACHE.expanduser() / key
     places = [place for place in (folder, cached) if place is not None]
-    there = next((place for place in places if is_of(place, key)), None)
-    if there is None:
-        there = _made(shots, config, key, places)
-    models = read_models(there)
-    for place in places:
-        if not is_of(place, key):
-            try:
-                write_models(models, key, place)
-            except OSError as error:
-                tqdm.write(f"{place} cannot keep the structure ({error.strerror}): the next run makes it again")
+    with ExitStack() as stack:
+        with suppress(OSError):  # a cache that cannot be written is shared by nobody
+            cached.parent.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(FileLock(cached.with_suffix(".lock")))  # another run may be making the same
+        there = next((place for place in places if is_of(place, key)), None)
+        if there is None:
+            there = _made(shots, config, key, places)
+        models = read_models(there)
+        for place in places:
+            if not is_of(place, key):
+                try:
+                    copy_models(there, place)
+                except OSError as error:
+                    tqdm.write(f"{place} cannot keep the structure ({error.strerror}): the next run makes it again")
     return key, models
 
 
@@ -102,13 +108,29 @@ def is_of(place: Path, key: str) -> bool:
 
 def write_models(models: Sequence[Any], key: str, place: Path) -> None:
     """Write models as COLMAP reads them, one folder each, and last what they are of."""
-    place.mkdir(parents=True, exist_ok=True)
+    _clear(place)
     for number, model in enumerate(models):
         folder = place / str(number)
         folder.mkdir(exist_ok=True)
         model.write_binary(folder)
-    about = {"key": key, "pycolmap": version("pycolmap"), "images": [model.num_reg_images() for model in models]}
+    about = {"key": key, "pycolmap": load().__version__, "images": [model.num_reg_images() for model in models]}
     write_file(place / ABOUT, json.dumps(about, indent=1).encode())
+
+
+def copy_models(source: Path, place: Path) -> None:
+    """Copy the files as they are: written again they would be in another order, and sums over them in other bits."""
+    _clear(place)
+    for folder in [path for path in source.iterdir() if path.name.isdecimal()]:
+        shutil.copytree(folder, place / folder.name)
+    write_file(place / ABOUT, (source / ABOUT).read_bytes())
+
+
+def _clear(place: Path) -> None:
+    """An empty place: other models may be there, of other settings."""
+    place.mkdir(parents=True, exist_ok=True)
+    (place / ABOUT).unlink(missing_ok=True)
+    for folder in [path for path in place.iterdir() if path.name.isdecimal()]:
+        shutil.rmtree(folder)
 
 
 def read_models(place: Path) -> list[Any]:
@@ -124,6 +146,7 @@ def read_models(place: Path) -> list[Any]:
         raise ValueError(f"{place} holds no model of COLMAP (cameras, images, points3D as .bin or .txt)")
     models = []
     for folder in found:
+        check_whole(folder)
         try:
             models.append(pycolmap.Reconstruction(folder))
         except (RuntimeError, ValueError, IndexError, MemoryError) as error:
@@ -153,7 +176,15 @@ def given_models(place: Path, shots: Shots, config: StructureConfig) -> list[Any
     else:
         with tempfile.TemporaryDirectory() as work:
             shutil.copy(database, Path(work) / DATABASE)
-            models = map_database(shots, config, Path(work))
+            try:
+                models = map_database(shots, config, Path(work))
+            except RuntimeError as error:
+                raise ValueError(f"{key} is no database of COLMAP, or a damaged one ({error})") from error
+    for model in models:
+        stems = stems_of(model)
+        twice = next((name for name in shots.names if stems.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"{key} has two images {twice}, and only their names tell them apart: export one folder's")
     named = {name for model in models for name in stems_of(model)}
     if not named & {*shots.names}:
         raise ValueError(

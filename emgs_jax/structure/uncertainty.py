@@ -30,10 +30,16 @@ def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict
     Args:
         images: by frame, in order. Frames whose covariance cannot be found are left out.
     """
-    frames, found = [*images], _covariance(model, next(iter(images.values())))
-    if found is None or len(frames) < 3:
+    found = _covariance(model, next(iter(images.values())))
+    if found is None:
         return {}
-    first, references = frames[0], [frames[row] for row in _spread(len(frames), NUM_REFERENCES)]
+    first, *others = images
+    # An image that shows no point is no variable of the problem.
+    others = [frame for frame in others if found.get_cam_cov_from_world(images[frame].image_id) is not None]
+    frames = [first, *others]
+    if len(frames) < 3:
+        return {}
+    references = [frames[row] for row in _spread(len(frames), NUM_REFERENCES)]
     T = {frame: camera_in_world(images[frame]) for frame in frames}
     to_xi = {frame: _to_xi(np.linalg.inv(T[frame])) for frame in frames}
     relative = {frame: np.linalg.inv(T[first]) @ T[frame] for frame in frames}
@@ -43,16 +49,14 @@ def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict
     def between(a: int, b: int) -> np.ndarray:
         """Covariance (6, 6) of xi of two frames."""
         joint = found.get_cam_cross_cov_from_world(images[a].image_id, images[b].image_id)
-        return to_xi[a] @ (np.full((6, 6), np.nan) if joint is None else joint) @ to_xi[b].T
+        return to_xi[a] @ joint @ to_xi[b].T
 
-    with_unit = {
-        frame: sum(between(frame, other) @ unit[other] for other in references) / total for frame in frames[1:]
-    }
+    with_unit = {frame: sum(between(frame, other) @ unit[other] for other in references) / total for frame in others}
     variance = sum(unit[frame] @ with_unit[frame] for frame in references) / total
     # The mean length of an error of standard deviation s along both axes is s sqrt(pi / 2).
     scale = max(2 / np.pi * model.compute_mean_reprojection_error() ** 2, pixel_std**2)
     spread = {first: np.zeros((6, 6))}
-    for frame in frames[1:]:
+    for frame in others:
         mixed = np.outer(with_unit[frame], unit[frame])
         free = between(frame, frame) - mixed - mixed.T + variance * np.outer(unit[frame], unit[frame])
         spread[frame] = scale * 0.5 * (free + free.T)

@@ -69,10 +69,4 @@ def time_growth(
             name = f"{size[0]}x{size[1]}, {count} Gaussians"
             candidates[name] = called(step, whole, data.prediction, data.camera, large)
             candidates[name].facts["submap_overflow"] = int(candidates[name].call()[1].overflow.submap)
-        yield from compare(interleaved("growth", candidates, repetitions), _reference(candidates, size, counts))
-
-
-def _reference(candidates: dict[str, Candidate], size: Sequence[int], counts: Sequence[int]) -> str:
-    """The row that the others are compared with: 8192 Gaussians, or the smallest map."""
-    name = f"{size[0]}x{size[1]}, {min(counts, key=lambda count: abs(count - 8192))} Gaussians"
-    return name if name in candidates else next(iter(candidates))
+        yield from compare(interleaved("growth", candidates, repetitions), next(iter(candidates)))

@@ -371,7 +371,7 @@ def test_a_loop_that_the_prior_sees_too_is_more_certain_and_asked_for_once(graph
         np.testing.assert_allclose(now.Z_a_b, before.Z_a_b, atol=1e-6)
         assert (np.diag(now.sqrt_info) > np.diag(before.sqrt_info)).all()
     end = query_prior(end, end.verified, ask)
-    assert len(calls) == 4 and len(end.verified) == 4 and revisit_note(end, is_sequential=False) == []
+    assert len(calls) == 4 and len(end.verified) == 4 and revisit_note(end) == []
 
 
 def test_of_a_closure_the_loops_with_most_inliers_are_asked_for(graph):
@@ -427,7 +427,7 @@ def test_an_answer_without_a_pose_is_none_and_is_counted(graph):
     loops, (ask, _) = list(end.verified), told_again(truth)
     end = query_prior(end, loops[:1], lambda a, b: replace(ask(a, b), T_a_b=np.full((4, 4), np.nan)))
     assert end.verified == loops and counts(end)["loops/unusable_answers"] == 1
-    assert counts(end)["loops/measured_again"] == 0 and revisit_note(end, is_sequential=False) == []
+    assert counts(end)["loops/measured_again"] == 0 and revisit_note(end) == []
 
 
 def test_a_loop_for_which_the_prior_has_no_word_and_one_of_another_run_stay(graph):
@@ -437,9 +437,9 @@ def test_a_loop_for_which_the_prior_has_no_word_and_one_of_another_run_stay(grap
     loops = list(end.verified)
     end = query_prior(end, loops[:2], lambda a, b: None)
     assert counts(end)["loops/measured_again"] == counts(end)["loops/unusable_answers"] == 0
-    (note,) = revisit_note(end, is_sequential=False)
+    (note,) = revisit_note(end)
     assert note.startswith("loops: 2 were measured by keypoints alone") and "graph=default" in note
-    assert revisit_note(end, is_sequential=True) == revisit_note(None, is_sequential=False) == []
+    assert revisit_note(None) == []
     ask, calls = told_again(truth)
     end = replace(end, first_node=10)
     end = query_prior(end, loops[2:], ask)

@@ -32,6 +32,13 @@ def check_all(*overrides: str) -> None:
         check_values(config, part)
 
 
+def test_a_list_of_another_length_is_refused_and_one_of_any_length_may_have_any():
+    """`graph.place_recognition.grid=[80]` ended in an error of zip."""
+    with pytest.raises(ValueError, match=r"grid must be a list \[…, …\] of 2 whole numbers from 1 to 4096, got \[80\]"):
+        check_all("graph=default", "graph.place_recognition.grid=[80]")
+    check_all("graph=default", "graph.place_recognition.grid=[80,60]", "evaluation.f1_thresholds_m=[0.1]")
+
+
 def test_every_value_of_conf_is_in_its_range():
     """The first options of all groups together, then the second ones, …; what is wrong is named by its full key."""
     others = ("suite", "sweep", "tune", "experiment", "experiment_on", "densify_on", "protocol", "prior/dense")

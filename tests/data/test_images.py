@@ -1,6 +1,7 @@
 """Folders of images and videos."""
 
 from fractions import Fraction
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -219,3 +220,25 @@ class StreamWithoutTimes:
 
 def test_a_stream_without_times_has_those_of_its_nominal_rate():
     assert _times(StreamWithoutTimes(), None) == [0.0, 1 / 25, 2 / 25]
+
+
+@pytest.mark.parametrize(("share", "words"), [(0.66, "not whole, the recording or the copy was cut off"), (0, "empty")])
+def test_a_video_that_is_not_whole_is_to_be_copied_again_and_not_converted(share, words, tmp_path):
+    path = tmp_path / "clip.mp4"
+    write_video(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ValueError, match=f"clip.mp4 is {words}: copy it again"):
+        load(path)
+
+
+@pytest.mark.parametrize("grabs", [True, False])
+def test_a_video_of_which_nothing_is_decoded_names_its_codec_and_the_program_that_converts_it(grabs, tmp_path):
+    """AV1: the header is read, and no frame; the advice was dataset.stop=0, which is refused."""
+    path = tmp_path / "clip.mp4"
+    write_video(path)
+    opened = mock.Mock(**{"isOpened.return_value": True, "read.return_value": (False, None)})
+    opened.grab.side_effect = [grabs] * 3 + [False] * 9
+    opened.get.side_effect = lambda key: float(cv2.VideoWriter_fourcc(*"av01")) if key == cv2.CAP_PROP_FOURCC else 3.0
+    with mock.patch("cv2.VideoCapture", return_value=opened), pytest.raises(ValueError, match=r"av01.*h264 \(ffmpeg"):
+        load(path)

@@ -6,6 +6,7 @@ import struct
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from emgs_jax.data import reading
 from emgs_jax.data.backprojection import backproject
@@ -159,3 +160,39 @@ def test_the_fingerprint_is_of_names_contents_and_options_not_of_the_place(tmp_p
     assert one != fingerprint("a", whole, whole[:-1] + b"\0"), "one byte of one file, as long as it was"
     assert one == fingerprint("a", whole, whole)
     assert fingerprint("c", whole, whole) != fingerprint("c", whole, whole, b""), "a missing file is no empty one"
+
+
+def test_what_is_no_image_is_named_by_its_content_and_a_folder_of_it_by_its_first_file(tmp_path):
+    """Phones write HEIC under .jpg: of a folder of it was said to fetch it again, which changes nothing."""
+    (tmp_path / "a.jpg").write_bytes(b"\x00\x00\x00\x18ftypheic" + bytes(100))
+    (tmp_path / "b.jpg").write_text("<!DOCTYPE html>")
+    words = r"none of its 2 images.*a\.jpg is an image in HEIC.*convert.*b\.jpg is a web page"
+    with pytest.raises(ValueError, match=words):
+        reading.first_size([tmp_path / "a.jpg", tmp_path / "b.jpg"], "folder")
+
+
+def test_transparency_of_any_image_is_told(tmp_path):
+    paths = [tmp_path / name for name in ("a.jpg", "b.png", "c.png")]
+    alpha = np.where(np.arange(64) < 32, 0, 255) * np.ones((48, 1))
+    for path, image in zip(paths, (RAMP, RAMP, np.dstack([RAMP, alpha])), strict=True):
+        cv2.imwrite(str(path), image)
+    assert reading.transparency_note(paths[:2]) is None
+    assert reading.transparency_note(paths).startswith("c.png is transparent")
+
+
+def test_an_image_that_is_shown_otherwise_than_stored_is_known(tmp_path):
+    image = Image.fromarray(RAMP)
+    for orientation in (1, 3, 6):
+        exif = image.getexif()
+        exif[0x0112] = orientation
+        image.save(tmp_path / "a.jpg", exif=exif)
+        assert reading.is_turned(tmp_path / "a.jpg") == (orientation > 1)
+    assert not reading.is_turned(tmp_path / "none.jpg")
+
+
+def test_a_pose_with_a_scale_is_named_as_such():
+    """The advice was to fetch the file again."""
+    pose = np.diag([2.0, 2.0, 2.0, 1.0])
+    pose[:3, 3] = 1.0, 2.0, 3.0
+    with pytest.raises(BadFrameError, match="pose.txt has a rotation times 2, of an alignment"):
+        reading.as_motion(" ".join(map(str, pose.ravel())), "pose.txt")

@@ -9,12 +9,9 @@ from scene import on_host
 from emgs_jax.ops import linalg
 from emgs_jax.ops.linalg import dot, gather_entries, gather_offsets, whiten, widen
 
-inverse_2x2, inverse_3x3, mahalanobis_sq, outer, principal_axes_2x2, safe_normalize, symmetrize = (
+inverse_2x2, mahalanobis_sq, outer, principal_axes_2x2, safe_normalize, symmetrize = (
     on_host(getattr(linalg, name))
-    for name in (
-        *("inverse_2x2", "inverse_3x3", "mahalanobis_sq", "outer"),
-        *("principal_axes_2x2", "safe_normalize", "symmetrize"),
-    )
+    for name in ("inverse_2x2", "mahalanobis_sq", "outer", "principal_axes_2x2", "safe_normalize", "symmetrize")
 )
 tangent_basis, whitening = on_host(linalg.tangent_basis), on_host(linalg.whitening)
 RNG = np.random.default_rng(0)
@@ -26,13 +23,10 @@ def spd(count, dimension, stds):
 
 
 @pytest.mark.parametrize("stds", [(0.1, 0.2, 0.3), (0.001, 0.05, 0.05), (30.0, 10.0, 20.0), (0.01, 0.01, 0.01)])
-def test_inverse_and_whitening_equal_numpy_from_millimetres_to_decametres(stds):
+def test_whitening_equals_numpy_from_millimetres_to_decametres(stds):
     covs = spd(50, 3, stds)
     # Rounding the input alone moves the inverse by eps · condition number.
     tolerance = 1e-6 * (max(stds) / min(stds)) ** 2 + 1e-5
-    expected = np.linalg.inv(covs)
-    inverse = inverse_3x3(np.float32(covs))
-    np.testing.assert_allclose(inverse, expected, atol=tolerance * np.abs(expected).max())
     triangle, logdet = whitening(np.float32(covs))
     lower = np.linalg.inv(np.linalg.cholesky(covs))[:, *np.tril_indices(3)]
     np.testing.assert_allclose(triangle, lower, atol=tolerance * np.abs(lower).max())
@@ -41,12 +35,11 @@ def test_inverse_and_whitening_equal_numpy_from_millimetres_to_decametres(stds):
 
 def test_a_matrix_that_is_not_positive_counts_as_the_identity():
     matrices = np.float32([np.zeros((3, 3)), -np.eye(3), np.diag([1.0, 1.0, -1.0])])
-    np.testing.assert_array_equal(inverse_3x3(matrices), np.tile(np.eye(3), (3, 1, 1)))
     triangles, logdets = whitening(matrices)
     np.testing.assert_array_equal(triangles, np.tile(np.eye(3)[np.tril_indices(3)], (3, 1)))
     np.testing.assert_array_equal(logdets, 0)
-    both = lambda m: jnp.sum(linalg.inverse_3x3(m)) + jnp.sum(linalg.whitening(m)[0])  # noqa: E731
-    assert np.isfinite(on_host(jax.grad(both))(matrices)).all()
+    total = lambda m: jnp.sum(linalg.whitening(m)[0])  # noqa: E731
+    assert np.isfinite(on_host(jax.grad(total))(matrices)).all()
 
 
 def entries(rows):
@@ -148,4 +141,4 @@ def test_whitening_keeps_all_that_a_flat_covariance_says(ratio):
 def test_a_covariance_flatter_than_float32_holds_is_flat_and_not_the_identity():
     covs = np.float32(spd(500, 3, (1.0, 0.7, 1e-5)))
     triangle = whitening(0.5 * (covs + covs.mT))[0]
-    assert (triangle[:, [0, 2, 5]].max(axis=1) > 1e3).all()
+    assert (triangle[:, [0, 2, 5]].max(axis=1) > 100).all()  # the last axis may lie nearly in the surface

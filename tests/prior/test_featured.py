@@ -66,16 +66,13 @@ def test_another_image_of_the_same_number_is_described_anew(textured):
     np.testing.assert_array_equal(features, model.extract(second))
 
 
-def test_provenance_tells_the_geometry_and_the_features_and_a_sequential_prior_stays_one():
+def test_provenance_tells_the_geometry_and_the_features():
     geometry = Simulated(level=0.5, seed=3)
     prior = Featured(geometry, make_model(seed=7))
     assert prior.provenance.name == "simulated+random" and prior.provenance.is_simulated
     model = {"name": "random", "version": 1, "width": 8, "seed": 7}
     told = {"features": {"model": model, "cell": 5, "templates": ["a {}."]}}
     assert prior.provenance.settings == geometry.provenance.settings | told
-    assert not prior.is_sequential
-    geometry.is_sequential = True
-    assert Featured(geometry, make_model()).is_sequential
 
 
 def test_replay_is_the_live_prior_bit_for_bit_and_a_recording_with_other_features_is_not_mixed(tmp_path, textured):

@@ -43,7 +43,7 @@ def test_the_line_that_ends_a_run_says_how_many_frames_are_not_in_the_map_and_fr
     said = "260 of 400 frames are degraded or lost, 250 in a row from frame 138 on"
     assert last_words(metrics) == f"{said}; "
     metrics["segments/unjoined_frames"] = 40
-    assert last_words(metrics) == f"{said}, 40 of them because their part was never joined with the map; "
+    assert last_words(metrics) == f"{said}, 40 are in submaps that were never joined with the map; "
 
 
 def test_the_seconds_of_a_run_are_those_of_all_its_phases():

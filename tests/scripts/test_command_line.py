@@ -14,6 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import hydra
+import jax
 import pytest
 from hydra.types import RunMode
 from omegaconf import OmegaConf
@@ -25,7 +26,7 @@ from emgs_jax.config.configure import compose, groups
 from emgs_jax.config.overrides import parsed, readable
 from emgs_jax.io.files import owned
 from experiments.cli import COMMANDS, main
-from experiments.command import check_arguments, check_missing, check_out, kept_words, nothing_left
+from experiments.command import check_arguments, check_missing, check_out, kept_words, leave_float32, nothing_left
 from experiments.console import speak_on
 from experiments.evaluate import delegated
 from experiments.interrupt import clear_interrupt
@@ -266,6 +267,18 @@ def test_a_command_that_comes_to_nothing_leaves_nothing(tmp_path, monkeypatch):
             raise ValueError("wrong")
         assert tmp_path.exists() and folder.exists() == (kept is not None)
         assert [path.name for path in tmp_path.iterdir()] == (["outputs"] if kept else [])
+
+
+def test_numbers_of_64_bits_are_turned_off_and_that_is_said(monkeypatch, capsys):
+    """JAX_ENABLE_X64=1, set for another program, ended a run after its first frame."""
+    monkeypatch.setenv("JAX_ENABLE_X64", "1")
+    with jax.enable_x64(True):
+        leave_float32()
+        assert not jax.config.jax_enable_x64
+    assert capsys.readouterr().out.startswith("JAX_ENABLE_X64 is set, and is of no effect")
+    monkeypatch.setenv("JAX_ENABLE_X64", "0")
+    leave_float32()
+    assert not capsys.readouterr().out
 
 
 def test_a_command_that_is_refused_leaves_the_folder_of_the_one_that_is_in_it(tmp_path, monkeypatch):

@@ -98,7 +98,8 @@ def as_poses(values: Any, where: str) -> np.ndarray:
     if poses.shape[1:] == (3, 4):
         poses = np.concatenate([poses, np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (len(poses), 1, 4))], axis=1)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
-        raise ValueError(f"{where} must be a matrix of 4 by 4 numbers, camera -> world, got {poses.shape[1:]}")
+        many = ": more than one scene, give each a folder of its own" if poses.ndim == 4 else ""
+        raise ValueError(f"{where} must be matrices of 3 or 4 by 4 numbers, got {poses.shape}{many}")
     poses = np.where(np.isfinite(poses).all((1, 2), keepdims=True), poses, np.nan)
     for row in np.flatnonzero(np.isfinite(poses).all((1, 2))):
         if not is_rigid(poses[row]) or np.abs(poses[row, :3, 3]).max() > MAX_POSITION:
@@ -144,10 +145,13 @@ def as_view(
             )
         known = confidence[usable(geometry)]
         if not (np.isfinite(known) & (known >= 1)).all():
-            least = np.nan if np.isnan(known).any() else known.min()
+            odd = known[~np.isfinite(known)]
+            worst = odd[0] if len(odd) else known.min()
+            remedy = (
+                "give finite numbers" if len(odd) else "of what begins at 0, such as probabilities, give 1 + confidence"
+            )
             raise ValueError(
-                f"{source}: confidence must be at least 1 where there is a depth, and is {least:.3g}: of what begins "
-                "at 0, such as probabilities, give 1 + confidence"
+                f"{source}: confidence must be at least 1 where there is a depth, and is {worst:.3g}: {remedy}"
             )
     return View(source, geometry, confidence, intrinsics)
 

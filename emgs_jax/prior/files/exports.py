@@ -15,7 +15,7 @@ from emgs_jax.prior.files.arrays import (
     load_npz,
     names_in,
 )
-from emgs_jax.prior.files.view import Camera, Part, Place, Predictions, View, whole_image
+from emgs_jax.prior.files.view import Camera, Part, Place, Predictions, View, grid_intrinsics, whole_image
 from emgs_jax.prior.network.resize import plan_resize
 
 PLACES = (".", "exports/npz", "exports/mini_npz")  # below the folder
@@ -47,13 +47,33 @@ class Export:
     is_metric: bool = False
 
 
-def vggt_crop(camera: Camera, view: View) -> Part:
-    """VGGT: the width becomes that of the grid, the height whole patches of which the middle is kept."""
+def vggt_place(camera: Camera, view: View) -> Part:
+    """VGGT: the width becomes 518, the height whole patches, of which 518 in the middle are kept (mode crop).
+
+    In mode pad the longer side becomes 518, and the image stands in the middle of a square. Where both are of this
+    shape the focal length tells.
+    """
     width, height = view.grid
-    scaled = round(width / camera.aspect / PATCH) * PATCH
-    if scaled < height:
-        raise ValueError(f"{view.source} is {width}x{height}, which VGGT has of images padded: predict in mode crop")
-    return Part((width, scaled), (0, (scaled - height) // 2))
+    wide = Part((width, scaled := _patches(width / camera.aspect)), (0, (scaled - height) // 2))
+    narrow = _patches(height * camera.aspect), height
+    whole = (width, _patches(width / camera.aspect)) if camera.aspect >= 1 else narrow
+    padded = Part(whole, (-((width - whole[0]) // 2), -((height - whole[1]) // 2)))
+    fits = [wide] if abs(min(scaled, width) - height) <= PATCH else []
+    fits += [padded] if width == height else []
+    if not fits:
+        raise ValueError(
+            f"{view.source} is {width}x{height}, and of images {camera.aspect:.3f} times as wide as high VGGT has "
+            f"{width}x{min(scaled, width)}: predict from the images as they are shown (EXIF may turn them: save them "
+            "upright)"
+        )
+    if view.intrinsics is None:
+        return fits[0]
+    focal = [grid_intrinsics(camera, part)[0] for part in fits]
+    return fits[int(np.argmin(np.abs(np.log(np.divide(focal, view.intrinsics[0])))))]
+
+
+def _patches(side: float) -> int:
+    return round(side / PATCH) * PATCH
 
 
 def mapanything_crop(camera: Camera, view: View) -> Part:
@@ -76,7 +96,7 @@ EXPORTS = (
         is_inverted=False,
         is_metric=True,
     ),
-    Export("VGGT", "depth", "extrinsic", "intrinsic", "depth_conf", vggt_crop, needs=("pose_enc",)),
+    Export("VGGT", "depth", "extrinsic", "intrinsic", "depth_conf", vggt_place, needs=("pose_enc",)),
     Export("Depth Anything 3", "depth", "extrinsics", "intrinsics", "conf", whole_image),
     Export("Depth Anything 3", "depths", "extrinsics", "intrinsics", "conf", whole_image),
 )
@@ -98,6 +118,8 @@ def read_export(path: Path) -> Predictions:
         raise ValueError(f"{path} has {', '.join(there) or 'no arrays'}, and known are {known}")
     kind = kinds[0]
     cameras = load_npz(path, (kind.poses, kind.intrinsics))
+    is_batch = cameras[kind.poses].ndim == 4 and len(cameras[kind.poses]) == 1  # as a network returns one scene
+    cameras = {name: array[0] for name, array in cameras.items()} if is_batch else cameras
     poses = as_poses(cameras[kind.poses], f"{path}: {kind.poses}")
     poses = np.linalg.inv(poses) if kind.is_inverted else poses
     count = len(poses)
@@ -105,6 +127,7 @@ def read_export(path: Path) -> Predictions:
     @cache  # all images are one array
     def dense() -> dict[str, np.ndarray]:
         arrays = load_npz(path, (kind.depth,), (kind.confidence, kind.mask))
+        arrays = {name: array[0] for name, array in arrays.items()} if is_batch else arrays
         for name, array in (arrays | {kind.intrinsics: cameras[kind.intrinsics]}).items():
             sides = 1 if name == kind.intrinsics else 3
             if array.shape[:sides] != (count, *arrays[kind.depth].shape[1:sides]) or array.ndim < 3:

@@ -18,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from emgs_jax.data.base import Dataset, Frame
-from emgs_jax.data.reading import check_depth_scale, fingerprint
+from emgs_jax.data.reading import check_depth_scale, fingerprint, is_turned
 from emgs_jax.prior.base import (
     Prior,
     PriorPrediction,
@@ -106,7 +106,7 @@ class Files(Prior):
             self._pose_std = None if angle is None else (angle * depth, float(np.degrees(angle)))
         scale = "metres" if self._is_metric else f"up to scale, times {self._factor:.4g}"
         lacking = f", {len(self._rows) - len(known)} frames have none" if len(known) < len(self._rows) else ""
-        note = _focal_note(view, camera, found)
+        note = _focal_note(view, camera, found) + _turned_note(dataset)
         pairs = self._pairs(known, camera)
         if not np.isfinite(median_misfit(pairs, dataset.intrinsics, lambda sight: sight)):  # the camera turns fast
             pairs = self._pairs(known, camera, gap=1) or pairs
@@ -236,3 +236,15 @@ def _focal_note(view: View, camera: Camera, found: Predictions) -> str:
     if 1 / FOCAL_NOTE < ratio < FOCAL_NOTE:
         return ""
     return f"; {words}: points lie where the files' have them; dataset.intrinsics times {ratio:.3f} would agree"
+
+
+def _turned_note(dataset: Dataset) -> str:
+    """Words where images are turned by their EXIF orientation, as dataset=images does and not all programs do."""
+    files = [file for index in range(len(dataset)) for file in dataset.files(index)[:1]]
+    turned = [file.name for file in files if dataset.name == "images" and is_turned(file)]
+    if not turned:
+        return ""
+    return (
+        f"; {len(turned)} images are shown turned by their EXIF orientation ({turned[0]}), and predictions must be of "
+        "the turned images: VGGT and others take the pixels as they are stored (save the images upright for these)"
+    )

@@ -148,7 +148,6 @@ def _correlation(
         source: features of the other view.
         points: in its camera.
         camera: of its features.
-        num_groups: of channels.
     """
     is_ahead = points[..., 2] > 0
     pixels = camera.focal * points[..., :2] / jnp.where(is_ahead, points[..., 2], 1.0)[..., None] + camera.center
@@ -231,12 +230,10 @@ def _around(
     """How well depths around the present one fit, at a quarter of the size, on the features of three scales.
 
     Args:
-        network: weights.
         references: features of the view, all at a quarter of its size.
         sources: and how far each shows each pixel.
         points: of the view's camera, for each scale.
         camera: of the images.
-        config: sizes.
     """
     cameras = [downscale(camera, scale) for scale in (FINEST, MIDDLE, COARSEST)]
 
@@ -266,12 +263,8 @@ def estimate(
     Without a source that counts both mean nothing.
 
     Args:
-        network: weights.
-        reference: features of the view.
-        sources: other views.
         depth_range: nearest and farthest depth.
         camera: of all images; width and height are multiples of 32.
-        config: sizes.
     """
     fits, weights = _initial(network, reference.coarsest, sources, depth_range, camera, config)
     hidden = jnp.tanh(_double(chain(fits, network.hidden)))

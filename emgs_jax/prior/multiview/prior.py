@@ -112,22 +112,19 @@ class MultiviewStereo(Prior):
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Poses of all views and depth of `window.dense`; a view that no model holds has NaN and no valid point."""
         self._prepare()
-        structure, world = self._found, self._found.world[window.current]
+        structure, world = self._found, self._world_at(window.current)
         depths = [self._answer(frame) for frame in window.dense]
         points, confidence, mask = (np.stack(found) for found in zip(*depths, strict=True))
         T, spread = np.full((len(window.views), 4, 4), np.nan), np.full((len(window.views), 6, 6), np.nan)
         anchor = window.views[0]
-        if world != NONE:
-            is_same = structure.world[anchor] == world
-            T_anchor_world = np.linalg.inv(structure.T_world_camera[anchor]) if is_same else np.eye(4)
-            for row, frame in enumerate(window.views):
-                if structure.world[frame] == world:
-                    T[row] = np.eye(4) if frame == anchor else T_anchor_world @ structure.T_world_camera[frame]
-                    spread[row] = structure.covariance[frame]
+        is_same = structure.world[anchor] == world
+        T_anchor_world = np.linalg.inv(structure.T_world_camera[anchor]) if is_same else np.eye(4)
+        for row, frame in enumerate(window.views):
+            if structure.world[frame] == world:
+                T[row] = np.eye(4) if frame == anchor else T_anchor_world @ structure.T_world_camera[frame]
+                spread[row] = structure.covariance[frame]
         features = np.zeros((*mask.shape, 0), np.float16)
-        return PriorPrediction(
-            window, T, points, confidence, mask, features, pose_covariance=spread, world=max(int(world), 0)
-        )
+        return PriorPrediction(window, T, points, confidence, mask, features, pose_covariance=spread, world=world)
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
         """Predict for views of two visits of a place; None where they are not in one world."""
@@ -150,6 +147,11 @@ class MultiviewStereo(Prior):
             pinhole if is_straight else lens_of(world.camera, tuple(intrinsics), (width, height))
             for world in self._found.worlds
         ]
+
+    def _world_at(self, frame: int) -> int:
+        """World of a frame; of one that none holds that of the last before which one does, so that nothing changes."""
+        placed = np.flatnonzero(self._found.world[: frame + 1] != NONE)
+        return int(self._found.world[placed[-1]]) if len(placed) else 0
 
     def _answer(self, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points (h, w, 3), confidence and mask of a frame's pixels."""

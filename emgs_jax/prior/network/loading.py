@@ -102,7 +102,6 @@ def whole_weights(torch: ModuleType, source: str, remedy: str, is_exact: bool = 
 
     Args:
         source: of the weights, for the message.
-        remedy: what to do about it.
         is_exact: names that the network does not have are refused as well; MASt3R's file has more than what the
             framework's DUSt3R takes of it.
     """

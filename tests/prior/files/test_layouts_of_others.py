@@ -13,7 +13,7 @@ from written_predictions import Named, asked, truth, write_npz
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.prior.base import relative_poses
-from emgs_jax.prior.files.exports import dust3r_crop, mapanything_crop, vggt_crop
+from emgs_jax.prior.files.exports import dust3r_crop, mapanything_crop, read_export, vggt_place
 from emgs_jax.prior.files.view import Camera, View, at_frame
 
 NUMBERS = Named(names=[str(index) for index in range(tiny_run.NUM_FRAMES)])
@@ -168,12 +168,14 @@ def seen(camera: Camera, scaled: tuple[int, int], grid: tuple[int, int]) -> tupl
 
 
 CROPS = [  # the camera of the frames, the whole image as the network resizes it, what it keeps, and the rule
-    (Camera((64, 48), (60, 60, 31.5, 23.5)), (518, 392), (518, 392), vggt_crop),
-    (Camera((48, 64), (60, 60, 23.5, 31.5)), (518, 686), (518, 518), vggt_crop),
+    (Camera((64, 48), (60, 60, 31.5, 23.5)), (518, 392), (518, 392), vggt_place),
+    (Camera((48, 64), (60, 60, 23.5, 31.5)), (518, 686), (518, 518), vggt_place),
+    (Camera((64, 48), (60, 60, 31.5, 23.5)), (518, 392), (518, 518), vggt_place),  # mode pad
+    (Camera((48, 64), (60, 60, 23.5, 31.5)), (392, 518), (518, 518), vggt_place),  # likewise, and as large as cropped
     (Camera((48, 48), (60, 60, 23.5, 23.5)), (512, 512), (512, 384), dust3r_crop),
     (Camera((48, 64), (60, 60, 23.5, 31.5)), (384, 512), (384, 512), dust3r_crop),
     (Camera((60, 48), (60, 60, 29.5, 23.5)), (518, 414), (518, 392), mapanything_crop),
-    (Camera((64, 64), (45, 60, 31.5, 31.5)), (518, 392), (518, 392), vggt_crop),  # frames that are squeezed
+    (Camera((64, 64), (45, 60, 31.5, 31.5)), (518, 392), (518, 392), vggt_place),  # frames that are squeezed
 ]
 
 
@@ -186,7 +188,7 @@ def test_what_a_network_sees_of_an_image_is_found_by_its_own_rule(camera, scaled
     rays = backproject(np.ones(mask.shape), camera.intrinsics)
     np.testing.assert_allclose(points[mask] / points[mask][:, 2:], rays[mask], atol=2e-4)  # sides are whole pixels
     np.testing.assert_allclose(points[mask] @ [0.2, 0, 1], 2, atol=1e-4)
-    share = grid[0] * grid[1] / (scaled[0] * scaled[1])
+    share = min(grid[0] * grid[1] / (scaled[0] * scaled[1]), 1.0)
     assert mask.mean() == pytest.approx(share, abs=2 / min(camera.size))
 
 
@@ -206,15 +208,27 @@ def test_vggts_file_is_read_with_its_own_crop(tmp_path):
         np.testing.assert_allclose(steps, expected / expected[1], atol=1e-6)
 
 
-def test_images_that_were_padded_are_refused(tmp_path):
-    write_vggt(tmp_path, Camera((64, 48), (60, 60, 31.5, 23.5)), np.eye(4)[None].repeat(6, 0), 392)
-    arrays = dict(np.load(tmp_path / "predictions.npz"))
-    for name in ("depth", "depth_conf"):
-        pads = [(0, 0), (63, 63), *[(0, 0)] * (arrays[name].ndim - 2)]
-        arrays[name] = np.pad(arrays[name], pads, constant_values=1)
-    np.savez(tmp_path / "predictions.npz", **arrays)
-    with pytest.raises(ValueError, match="is 518x518, which VGGT has of images padded: predict in mode crop"):
-        asked(tmp_path, NUMBERS)
+def test_a_grid_that_cannot_be_of_the_images_is_refused_with_what_may_have_turned_them():
+    view = View("row 0", np.ones((392, 518)), None, (400.0, 400.0, 258.5, 195.5))
+    with pytest.raises(ValueError, match=r"is 518x392, .* 0\.750 times as wide as high VGGT has 518x518: .*EXIF"):
+        vggt_place(Camera((48, 64), (60, 60, 23.5, 31.5)), view)
+
+
+def test_a_scene_as_a_network_returns_it_has_a_dimension_more_and_two_scenes_are_refused(tmp_path):
+    """Who followed "must be 4 by 4, camera -> world" wrote wrong poses."""
+    poses = np.tile(np.eye(4), (tiny_run.NUM_FRAMES, 1, 1))
+    write_vggt(tmp_path, Camera(tiny_run.dataset().size, tiny_run.dataset().intrinsics), poses, 392)
+    path = tmp_path / "predictions.npz"
+    arrays = dict(np.load(path))
+    expected = read_export(path)
+    for count in (1, 2):
+        np.savez(path, **{name: np.stack([array] * count) for name, array in arrays.items()})
+        if count == 2:
+            with pytest.raises(ValueError, match=r"got \(2, \d+, 3, 4\): more than one scene"):
+                read_export(path)
+        else:
+            np.testing.assert_array_equal(read_export(path).poses, expected.poses)
+            np.testing.assert_array_equal(read_export(path).read(3).geometry, arrays["depth"][3, ..., 0])
 
 
 @pytest.mark.parametrize(

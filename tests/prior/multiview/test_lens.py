@@ -1,53 +1,42 @@
-"""A lens with radial distortion: against OpenCV's, its inverse, images of a painted plane, and what is outside."""
+"""The lens of COLMAP's cameras: against pycolmap and OpenCV, its inverse, and a pinhole."""
 
 import cv2
 import numpy as np
-from stereo_scene import FOCAL, SIZE, calibration, plane_image, small_lens
+import pycolmap
+import pytest
 
-from emgs_jax.prior.multiview.lens import as_shown, distort, grid, points_shown, rectify, straight
+from emgs_jax.prior.multiview.lens import as_shown, lens_of, points_shown, rectify
 
-WIDTH, HEIGHT = SIZE
+PINHOLE, SIZE = (120.0, 118.0, 79.5, 58.0), (160, 120)
+GRID = np.stack(np.meshgrid(*map(np.arange, SIZE)), axis=-1).astype(float)
 
 
-def test_distorting_is_opencvs_undistortion():
-    """OpenCV's k1 distorts what a pinhole sees; ours is the same polynomial the other way."""
-    pixels, lens = grid(HEIGHT, WIDTH).reshape(-1, 2), small_lens(-0.2)
-    on_plane = ((pixels - lens.center) / lens.focal)[None]
-    expected, _ = cv2.projectPoints(
-        np.dstack([on_plane, np.ones(on_plane.shape[:2])]).reshape(-1, 3),
-        *(np.zeros(3), np.zeros(3), calibration(), np.array([-0.2, 0, 0, 0])),
+def opencv(factor, *distortion):
+    """COLMAP's camera of images so many times as large."""
+    values = [factor * 120, factor * 118, factor * 80, factor * 58.5, *distortion]
+    return pycolmap.Camera(model="OPENCV", width=int(factor * 160), height=int(factor * 120), params=values)
+
+
+@pytest.mark.parametrize("factor", [1, 4])
+def test_where_a_lens_shows_what_a_pinhole_sees_is_opencvs_projection(factor):
+    k = (-0.2, 0.03, 0.001, -0.002)
+    lens = lens_of(opencv(factor, *k), PINHOLE, SIZE)
+    rays = np.dstack([(GRID - PINHOLE[2:]) / PINHOLE[:2], np.ones(GRID.shape[:2])]).reshape(-1, 3)
+    matrix = np.array([[120.0, 0, 79.5], [0, 118, 58], [0, 0, 1]])
+    expected, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array(k))
+    np.testing.assert_allclose(lens.shown.reshape(-1, 2), expected[:, 0], atol=1e-3)
+    inside = lens.straight[20:-20, 20:-20]
+    back = cv2.remap(lens.shown, np.float32(inside), None, cv2.INTER_LINEAR)
+    np.testing.assert_allclose(back, GRID[20:-20, 20:-20], atol=0.02)
+    image = np.zeros((120, 160), np.float32)
+    assert rectify(image, lens).shape == image.shape and np.abs(lens.shown - GRID).max() > 2
+
+
+def test_a_pinhole_changes_nothing():
+    lens, values = (
+        lens_of(opencv(4, 0, 0, 0, 0), PINHOLE, SIZE),
+        np.random.default_rng(0).random((120, 160), np.float32),
     )
-    np.testing.assert_allclose(straight(pixels, lens), expected[:, 0], atol=1e-9)
-
-
-def test_distorting_and_straightening_undo_each_other_and_a_pinhole_changes_nothing():
-    pixels = grid(HEIGHT, WIDTH)
-    for distortion in (-0.2, 0.0, 0.1):
-        lens = small_lens(distortion)
-        np.testing.assert_allclose(straight(distort(pixels, lens), lens), pixels, atol=0.01)
-    gray, depth = plane_image(np.eye(4), 0.4)
-    np.testing.assert_array_equal(rectify(gray, small_lens(0.0)), gray)
-    both = np.stack([gray, gray[::-1]])
-    one_by_one = [rectify(image, small_lens(0.1)) for image in both]
-    np.testing.assert_array_equal(rectify(both, small_lens(0.1)), one_by_one)
-    np.testing.assert_array_equal(as_shown(depth, small_lens(0.0)), depth)
-
-
-def test_a_rectified_image_is_what_a_pinhole_sees():
-    gray, lens = cv2.GaussianBlur(plane_image(np.eye(4), 0.0)[0], (0, 0), 1.5), small_lens(-0.1)
-    x, y = np.moveaxis(np.float32(straight(grid(HEIGHT, WIDTH), lens)), -1, 0)
-    shown = cv2.remap(gray, x, y, cv2.INTER_CUBIC)  # what the lens makes of it
-    inside = np.s_[8:-8, 8:-8]
-    error = np.abs(rectify(shown, lens) - gray)[inside].mean()  # of two interpolations
-    assert error < 0.4 * np.abs(shown - gray)[inside].mean()
-
-
-def test_points_of_shown_depths_lie_on_the_surface_and_beyond_the_pinholes_image_there_are_none():
-    _, depth = plane_image(np.eye(4), 0.4)
-    lens = small_lens(0.15)  # shows more than the pinhole's image
-    points = points_shown(as_shown(depth, lens), lens)
-    known = points[..., 2] > 0
-    assert not known[0, 0] and not points[~known].any() and known.mean() > 0.8
-    # Of the plane z = 2 m + .4 x; the nearest pixel's depth is half a pixel off at most.
-    x, _, z = points[known].T
-    np.testing.assert_allclose(z, 2.0 + 0.4 * x, atol=0.5 * 0.4 * z.max() / FOCAL[0] * 1.5)
+    assert rectify(values, lens) is values and as_shown(values, lens) is values
+    points = points_shown(values, lens)
+    np.testing.assert_allclose(points[..., :2], values[..., None] * (GRID - PINHOLE[2:]) / PINHOLE[:2], atol=1e-6)
