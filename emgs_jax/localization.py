@@ -326,7 +326,7 @@ def localize_fine(
         scale=scale,
         repeat_rms=coarse.repeat_rms,
         depth_noise=info.misfit,
-        noise=info.misfit_of_levels[levels_of(current.confidence, info.level_edges)] * current.depth_std,
+        noise=info.misfit_of_levels[levels_of(current.confidence, info.level_edges)],
         step_m=step_m,
         step_rad=step_rad,
         estimate=estimate,

@@ -25,7 +25,6 @@ class Observation(eqx.Module):
     normals: Float[Array, "*b p 3"]  # unit, towards the camera; zero where the row is invalid
     features: Float[Array, "*b p f"]  # unit; f = 0 without features
     confidence: Float[Array, "*b p"]  # >= 1
-    depth_std: Float[Array, "*b p"]  # as a fraction, up to a factor common to the image; 1 where the prior says none
     valid: Bool[Array, "*b p"]
 
 
@@ -179,7 +178,6 @@ def observe(
     colors: Float[Array, "h w 3"],
     features: Float[Array, "y x f"],
     confidence: Float[Array, "h w"],
-    depth_std: Float[Array, "h w"],
     mask: Bool[Array, "h w"],
     config: ObservationConfig,
 ) -> Observation:
@@ -194,15 +192,15 @@ def observe(
     points = jnp.where(valid[..., None], points, 0.0)
     normals = normals_from_pointmap(points, valid, config)
     valid &= _is_surface(normals)
-    confidence, depth_std = (jnp.where(valid, image, 1.0) for image in (confidence, depth_std))
+    confidence = jnp.where(valid, confidence, 1.0)
     thin = config.thin
-    points, colors, normals, confidence, depth_std, valid = (
-        image[::thin, ::thin] for image in (points, colors, normals, confidence, depth_std, valid)
+    points, colors, normals, confidence, valid = (
+        image[::thin, ::thin] for image in (points, colors, normals, confidence, valid)
     )
     height, width = mask.shape
     features = sample_features(features, (height, width), thin)
     colors, features = (jnp.where(valid[..., None], image, 0.0) for image in (colors, features))
-    image = Observation(points, colors, normals, features, confidence, depth_std, valid)
+    image = Observation(points, colors, normals, features, confidence, valid)
     return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), image)
 
 

@@ -80,9 +80,7 @@ def _observation(prediction: PriorPrediction, view: int, frame: Frame, config: O
         np.asarray(values[view], np.float32)
         for values in (prediction.points, prediction.features, prediction.confidence)
     )
-    given = prediction.depth_std
-    depth_std = np.ones_like(confidence) if given is None else np.where(mask, given[view], np.float32(1.0))
-    return _observe(*on_device((points, image, features, confidence, depth_std, mask)), config)
+    return _observe(*on_device((points, image, features, confidence, mask)), config)
 
 
 def _pose_covariance(prediction: PriorPrediction, previous: int, current: int) -> np.ndarray:

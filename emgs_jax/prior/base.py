@@ -49,9 +49,6 @@ class PriorPrediction:
             What all views err alike counts for nothing. NaN for a view of which nothing is known, None where the prior
             does not say: then the map finds out. Poses that are known lie in one world: the scale of a frame's depths
             does not move them.
-        depth_std: standard deviations of the depths as fractions of them (of log z), float32 (d, h, w), without what a
-            whole view errs by; positive under the mask, 0 where it is off. The map finds out a factor that is common to
-            points of a view, so only ratios count. None where the prior does not say: then `confidence` alone counts.
         world: number of the frame of reference that the poses are in, of a prior that tells: 0 is that of the first
             frames with a pose, and it may come back. None: a new one begins where no view has a pose as before.
     """
@@ -64,7 +61,6 @@ class PriorPrediction:
     features: np.ndarray
     pose_covariance: np.ndarray | None = None
     world: int | None = None
-    depth_std: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -169,7 +169,7 @@ class Recorded(Prior):
         given = equal_covariances(self._pose_std, arrays["T_anchor_view"])
         covariance = arrays.get("pose_covariance") if given is None else given
         world = int(arrays["world"]) if "world" in arrays else None
-        return PriorPrediction(window, *(arrays[key] for key in FIELDS), covariance, world, arrays.get("depth_std"))
+        return PriorPrediction(window, *(arrays[key] for key in FIELDS), covariance, world)
 
     def _load(self, name: str, keys: Sequence[str], optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
         """Read and verify one file of the recording."""

@@ -17,7 +17,7 @@ from emgs_jax.gaussians import GaussianIndex, Gaussians
 from emgs_jax.observation import Observation
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.matching import Candidates, Matches, surface_of
-from emgs_jax.registration.noise import level_edges, levels_of, noise_of_levels, num_independent, robust_std
+from emgs_jax.registration.noise import level_edges, levels_of, noise_of_levels, num_independent
 from emgs_jax.registration.problem import (
     DISTRIBUTION,
     CoarseStart,
@@ -47,7 +47,7 @@ class IcpInfo(eqx.Module):
         residual: root mean square distance of the inliers to their Gaussians' planes, as a fraction of their depth.
         misfit: the same fraction of all points within `max_misfit`, as 1.4826 times the median, a robust standard
             deviation; 0 without any.
-        misfit_of_levels: likewise of the points in each level of confidence, in units of their `depth_std`.
+        misfit_of_levels: likewise of the points in each level of confidence.
         level_edges: where these levels end.
         information: of the points alone, of (xi, log s).
         num_effective: how many independent measurements the points are worth, see `num_independent`.
@@ -85,8 +85,8 @@ def _observed(
     """
     source = problem.source
     distance, is_near = distances(y, matches, problem, config)
-    of_levels = noise_of_levels(distance / source.depth_std, is_near, levels)
-    misfit, depth = robust_std(distance, is_near), jnp.maximum(of_levels[levels] * source.depth_std, noise)
+    misfit, of_levels = noise_of_levels(distance, is_near, levels)
+    depth = jnp.maximum(of_levels, noise)[levels]
     uncertainty = Uncertainty(
         common=noise * jnp.maximum(misfit / noise, 1.0),
         depth=depth,

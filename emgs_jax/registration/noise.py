@@ -34,15 +34,17 @@ def robust_std(errors: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Arra
     return jnp.where(jnp.any(valid), MAD_TO_STD * median(jnp.abs(errors), valid), 0.0)
 
 
-def noise_of_levels(errors: Float[Array, "p"], valid: Bool[Array, "p"], levels: Int[Array, "p"]) -> Float[Array, "l"]:
-    """`robust_std` of the errors in every level; that of all where a level has too few.
+def noise_of_levels(
+    errors: Float[Array, "p"], valid: Bool[Array, "p"], levels: Int[Array, "p"]
+) -> tuple[Float[Array, ""], Float[Array, "l"]]:
+    """`robust_std` of all errors, and of those in every level; there that of all where a level has too few.
 
     So a confidence that is wrong about its points is found out by their errors.
     """
     chosen = valid & jnp.append(levels == jnp.arange(NUM_LEVELS)[:, None], jnp.ones_like(valid)[None], axis=0)
     *of_levels, of_all = jax.vmap(robust_std, (None, 0))(errors, chosen)
     has_enough = jnp.sum(chosen[:-1], axis=1) >= MIN_PAIRS
-    return jnp.where(has_enough, jnp.stack(of_levels), of_all)
+    return of_all, jnp.where(has_enough, jnp.stack(of_levels), of_all)
 
 
 def num_independent(
