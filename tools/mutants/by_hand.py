@@ -22,7 +22,7 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
     ),
     (
         "localization",
-        "scale_translation(raw_current.inverse() @ raw_newest, scale)",
+        "scale_translation(raw_current.inverse() @ raw_newest, unit)",
         "raw_current.inverse() @ raw_newest",
         "the newest pose without its scale",
     ),
