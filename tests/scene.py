@@ -282,7 +282,8 @@ def assert_same(actual, expected):
     others, other_structure = jax.tree.flatten(expected)
     assert structure == other_structure, (structure, other_structure)
     for one, other in zip(map(np.asarray, leaves), map(np.asarray, others), strict=True):
-        assert one.dtype == other.dtype and np.array_equal(one, other), (one, other)
+        is_float = np.issubdtype(one.dtype, np.floating)
+        assert one.dtype == other.dtype and np.array_equal(one, other, equal_nan=is_float), (one, other)
 
 
 def assert_rows_near(actual, expected, atol, names=("means", "covs", "normals", "colors")):

@@ -91,5 +91,5 @@ def test_a_file_meets_its_own_tests_first_and_then_those_that_import_it():
 
 def test_a_class_of_which_an_option_of_conf_makes_something_meets_the_tests_that_choose_the_option():
     found = nearest_tests("emgs_jax/prior/multiview/prior.py", reach=2)
-    assert "tests/prior/multiview/test_multiview_stereo.py" in found
+    assert "tests/prior/multiview/test_learned.py" in found
     assert "tests/data/test_replica.py" not in found

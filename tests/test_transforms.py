@@ -34,7 +34,8 @@ def direction_of(inputs, rows_together: bool):
     def part(x):
         return rng.uniform(-1, 1) * x if rows_together else rng.uniform(-1, 1, x.shape) * np.abs(x).max(initial=0.0)
 
-    return jax.tree.map(lambda x: np.asarray(part(x), np.float32), inputs)
+    # What is NaN is not known, and no number near it is an input of the same kind.
+    return jax.tree.map(lambda x: np.where(np.isnan(x), 0.0, part(x)).astype(np.float32), inputs)
 
 
 class Verb:

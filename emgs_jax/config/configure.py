@@ -29,12 +29,11 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.featured import Featured, Requeried
 from emgs_jax.prior.files.truth import check_truth
-from emgs_jax.structure.config import StructureConfig
-from emgs_jax.structure.sequence import calibrate
 
 if TYPE_CHECKING:
     from emgs_jax.back_end.state import BackEndConfig
     from emgs_jax.evaluation.baselines import BaselineConfig
+    from emgs_jax.structure.config import StructureConfig
 
 # Installed below the package, in a clone beside it.
 CONF = next(
@@ -212,6 +211,8 @@ def build_dataset(config: DictConfig, folder: Path | None = None) -> ReadableFra
     """
     given: dict[str, Any] = {}
     if config.dataset.get("intrinsics") == "estimate":
+        from emgs_jax.structure.sequence import calibrate  # what it needs is slow to import
+
         structure = folder and folder / "structure"
         given["intrinsics"] = partial(calibrate, config=structure_config(config), folder=structure)
     dataset = build(config, "dataset", **given)
@@ -225,7 +226,7 @@ def build_dataset(config: DictConfig, folder: Path | None = None) -> ReadableFra
     return frames
 
 
-def structure_config(config: DictConfig) -> StructureConfig:
+def structure_config(config: DictConfig) -> "StructureConfig":
     """How a structure of the images is made: that of the prior, else the default."""
     has_own = OmegaConf.select(config, "prior.structure") is not None
     return build(config if has_own else compose("prior=multiview_stereo"), "prior.structure", _convert_="all")

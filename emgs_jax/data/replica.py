@@ -69,10 +69,9 @@ class Replica:
 
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
-        path = self._images[index]
+        path, image = self._images[index], reading.resize_color(self.full(index), self.size)
         depth = reading.read_depth(depth_path(path), self._depth_scale, self._raw_size)
-        depth = self._lens.straighten_depth(depth)
-        image, depth = reading.resize_color(self.full(index), self.size), reading.resize_nearest(depth, self.size)
+        depth = reading.resize_nearest(self._lens.straighten_depth(depth), self.size)
         return Frame(index, float(number_of(path)), str(path), image, depth, self.pose(index))
 
     def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:

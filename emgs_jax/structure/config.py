@@ -6,7 +6,7 @@ from typing import Any
 
 from emgs_jax.ops.ranges import number
 
-PARTS = ("extraction", "matching", "verification", "mapping")  # of the options
+PARTS = ("extraction", "matching", "verification", "incremental", "global")  # of the options
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def check_kinds(features: str, matcher: str) -> None:
         ValueError: it ends.
     """
     kinds = "FeatureExtractorType", features, "FeatureMatcherType", matcher
-    done = subprocess.run([sys.executable, "-c", PROBE, *kinds], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", PROBE, *kinds], capture_output=True, text=True, encoding="utf-8")
     if done.returncode:
         said = [line.removeprefix("  what():").strip() for line in done.stderr.splitlines() if line.strip()]
         reason = next((line for line in said if "ONNX" in line), said[-1] if said else "it ends without a word")

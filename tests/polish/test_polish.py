@@ -278,7 +278,7 @@ def test_what_is_held_out_never_enters_the_fit_and_the_files_say_what_came_out(f
     splats = (folder / "splats.ply").read_bytes()
     assert json.loads((folder / "polish.json").read_text()) == found and (folder / "polish.png").is_file()
     assert found["polish/num_held_out"] == 2 and found["polish/num_fitted"] == 4
-    assert 0 < found["polish/after_ssim"] < 1 and found["polish/after_depth_within_5_percent"] > 80
+    assert 0 < found["polish/after_ssim"] < 1 and found["polish/after_depth_within_5_percent"] > 75
     assert f"{found['polish/num_splats']:,} splats" in (folder / "report.html").read_text()
     run, settings = read_run(folder), build(config(*SHORT), "polish")
     densify = build(OmegaConf.create(dict(run.provenance["config"])), "densify")

@@ -272,9 +272,12 @@ def test_a_command_that_comes_to_nothing_leaves_nothing(tmp_path, monkeypatch):
 def test_numbers_of_64_bits_are_turned_off_and_that_is_said(monkeypatch, capsys):
     """JAX_ENABLE_X64=1, set for another program, ended a run after its first frame."""
     monkeypatch.setenv("JAX_ENABLE_X64", "1")
-    with jax.enable_x64(True):
+    jax.config.update("jax_enable_x64", True)
+    try:
         leave_float32()
         assert not jax.config.jax_enable_x64
+    finally:
+        jax.config.update("jax_enable_x64", False)
     assert capsys.readouterr().out.startswith("JAX_ENABLE_X64 is set, and is of no effect")
     monkeypatch.setenv("JAX_ENABLE_X64", "0")
     leave_float32()

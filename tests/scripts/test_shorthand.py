@@ -48,11 +48,11 @@ def test_a_video_stands_for_the_keys_that_map_it_and_one_line_says_so(video, cap
     assert compose(*words).dataset.root == str(video)
 
 
-def test_a_folder_has_the_intrinsics_of_its_exif_where_there_are_any(tmp_path):
+def test_a_folders_camera_is_calibrated_whatever_its_exif_says(tmp_path):
     plain, known = write_images(tmp_path / "plain"), write_images(tmp_path / "known", 26)
     assert keys_of(with_source([str(plain)]))["dataset.intrinsics"] == "estimate"
     found = keys_of(with_source([str(known), "slam.window_size=4"]))
-    assert found["dataset.intrinsics"] == "exif" and found["dataset.size"] == "[208,368]"
+    assert found["dataset.intrinsics"] == "estimate" and found["dataset.size"] == "[208,368]"
     assert found["slam.window_size"] == "4"
 
 

@@ -35,7 +35,7 @@ def test_names_are_pycolmaps_in_any_case():
     ("word", "message"),
     [
         ("+prior.structure.options.nopart.x=1", "nopart=.* none of its parts: there are extraction.KEY="),
-        ("+prior.structure.options.extraction=5", "extraction=5 is none of its parts"),
+        ("prior.structure.options.extraction=5", "extraction=5 is none of its parts"),
         ("prior.structure.mapper=hybrid", "prior.structure.mapper must be one of incremental, global; got 'hybrid'"),
         ("prior.structure.num_threads=-5", "prior.structure.num_threads must be a whole number from -1"),
     ],

@@ -153,7 +153,7 @@ BAD = {
     ),
     "a value": (
         lambda images: images,
-        ("+prior.structure.options.mapping.min_model_size=-5",),
+        ("+prior.structure.options.incremental.min_model_size=-5",),
         "'min_model_size': -5.*out of its range",
     ),
 }

@@ -27,9 +27,9 @@ class Program:
 
 
 SETTINGS = ("dataset.stop=12", "prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=256")
-STEREO = (  # a prior with a memory
+STEREO = (  # a prior that makes a structure of all images first
     *SMALL_STEREO,
-    *("dataset.size=[128,96]", "dataset.stop=10", "slam.window_size=5", "checkpoint.every=2"),
+    *("dataset.size=[160,120]", "dataset.stop=8", "slam.window_size=5", "checkpoint.every=2"),
 )
 GATE = "slam.em.max_mahalanobis_sq"
 PROGRAMS = (

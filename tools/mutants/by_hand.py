@@ -9,8 +9,8 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
     ),
     (
         "registration/problem",
-        "start.noise / uncertainty.common",
-        "uncertainty.common / start.noise",
+        "worse = jnp.maximum(misfit / depth_noise, 1.0)",
+        "worse = jnp.maximum(depth_noise / misfit, 1.0)",
         "worse is worth more",
     ),
     ("registration/problem", "rays @ T.rotation().as_matrix().T", "rays", "rays stay in the camera's frame"),
@@ -22,7 +22,7 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
     ),
     (
         "localization",
-        "scale_translation(raw_current.inverse() @ raw_newest, scale)",
+        "scale_translation(raw_current.inverse() @ raw_newest, unit)",
         "raw_current.inverse() @ raw_newest",
         "the newest pose without its scale",
     ),

@@ -32,7 +32,8 @@ def calls(data):
 
 def same_bits(a, b):
     names = [field.name for field in fields(a) if field.name != "window"]
-    return all(getattr(a, name).tobytes() == getattr(b, name).tobytes() for name in names)
+    pairs = [(getattr(a, name), getattr(b, name)) for name in names]
+    return all(one is other is None or one.tobytes() == other.tobytes() for one, other in pairs)
 
 
 def frame_matrix(data):
