@@ -1,5 +1,6 @@
 """What COLMAP found, as arrays: poses with their covariances, points, which frame shows which, and the lens."""
 
+import copy
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -86,7 +87,7 @@ def to_structure(models: Sequence[Any], names: Sequence[str], config: StructureC
         ids = sorted(model.points3D)
         place = {key: index for index, key in enumerate(ids)}
         points = np.array([model.points3D[key].xyz for key in ids]).reshape(-1, 3)
-        worlds.append(World(points, next(iter(images.values())).camera))
+        worlds.append(World(points, copy.copy(next(iter(images.values())).camera)))
         spread = covariances(model, images, config.pixel_std)
         for frame, image in images.items():
             world[frame], T[frame] = number, camera_in_world(image)
