@@ -4,8 +4,11 @@ COLMAP counts pixels from the image's corner, so .5 is taken off its principal p
 """
 
 import math
+import signal
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -139,19 +142,32 @@ def named_lens(name: object, coefficients: Sequence[float], where: object) -> tu
     return lens_of(model, coefficients, where), model
 
 
+def load_pycolmap(otherwise: str) -> ModuleType:
+    """The module, which logs nothing but what ends it; ValueError with these words where it is not installed.
+
+    It takes SIGTERM for itself, to print a stack; whoever listened to it before gets it back.
+    """
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise ValueError(otherwise) from error
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
+    return pycolmap
+
+
 def to_pycolmap(camera: Calibration, size: Size) -> Any:
     """pycolmap's camera, whose pixels have integers at their centres.
 
     Raises:
         ValueError: pycolmap is not installed.
     """
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise ValueError(
-            "images with lens distortion are straightened by pycolmap, which is not installed (for Linux on ARM there "
-            "is no wheel): build it from the source of COLMAP, or undistort the images on another machine"
-        ) from error
+    pycolmap = load_pycolmap(
+        "images with lens distortion are straightened by pycolmap, which is not installed (for Linux on ARM there "
+        "is no wheel): build it from the source of COLMAP, or undistort the images on another machine"
+    )
     model, rest = camera.model, camera.distortion
     if model == "OPENCV":
         model, rest = "FULL_OPENCV", (*rest, *[0.0] * (len(FULL_OPENCV) - len(rest)))

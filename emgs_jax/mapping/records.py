@@ -120,6 +120,11 @@ class FrameRecord:
     compile_seconds: float = 0.0
 
 
+def records_apart(records: Sequence[FrameRecord], number: int) -> list[FrameRecord]:
+    """Those that the submap of this number holds, which was never joined with the map."""
+    return [record for record in records if record.submap == number and record.status == APART]
+
+
 def transform_record(record: FrameRecord, similarity: Sim3) -> FrameRecord:
     """Map poses, covariance and scale of a record to another world."""
     poses = {name: getattr(record, name) for name in ("pose", "newest_pose")}

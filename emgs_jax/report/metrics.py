@@ -36,7 +36,7 @@ from emgs_jax.evaluation.trajectory import align_poses, trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.geometry import scale_pose
-from emgs_jax.mapping.records import APART, UNJOINED, UNPLACED, FrameRecord, longest_row
+from emgs_jax.mapping.records import APART, UNJOINED, UNPLACED, FrameRecord, longest_row, records_apart
 from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
@@ -232,7 +232,7 @@ def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
 
 def _submap_metrics(run: MappingRun, number: int) -> Metrics:
     """`submaps/N/…` of a submap that was never joined: its frames, and the error of its path in its own unit."""
-    records = [record for record in run.records if record.submap == number and record.status == APART]
+    records = records_apart(run.records, number)
     known = [(record.pose, record.true_pose) for record in records if record.true_pose is not None]
     found: Metrics = {f"submaps/{number}/frames": len(records)}
     if len(known) >= 3:

@@ -21,7 +21,7 @@ from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import from_tum, save_trajectory_tum
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE
-from emgs_jax.mapping.records import APART, NEW_SUBMAP, UNJOINED, UNPLACED
+from emgs_jax.mapping.records import APART, NEW_SUBMAP, UNJOINED, UNPLACED, records_apart
 from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
@@ -88,7 +88,7 @@ def save_progress(folder: Path, run: MappingRun) -> None:
 def _save_submap(folder: Path, number: int, state: SlamState, run: MappingRun) -> None:
     """Write map and path of a submap that was never joined, in its own world and unit."""
     folder.mkdir(parents=True, exist_ok=True)
-    records = [record for record in run.records if record.submap == number and record.status == APART]
+    records = records_apart(run.records, number)
     save_trajectory_tum(
         folder / "trajectory.txt", [record.timestamp for record in records], np.stack([r.pose for r in records])
     )

@@ -1,12 +1,12 @@
 """pycolmap, which is loaded when it is needed, and its options and names as a config writes them."""
 
-import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
+
+from emgs_jax.data.camera_models import load_pycolmap
 
 PROBE = """
 import sys, tempfile, cv2, numpy as np, pycolmap
@@ -24,22 +24,19 @@ with tempfile.TemporaryDirectory() as folder:
 
 
 def load() -> ModuleType:
-    """The module, which logs nothing but what ends it; ValueError where it is not installed.
+    """The module; ValueError where it is not installed."""
+    return load_pycolmap(
+        "poses of images are found by pycolmap, which is not installed (for Linux on ARM there is no wheel): "
+        "install it from source, or bring predictions with poses (prior=files)"
+    )
 
-    It takes SIGTERM for itself, to print a stack; whoever listened to it before gets it back.
-    """
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise ValueError(
-            "poses of images are found by pycolmap, which is not installed (for Linux on ARM there is no wheel): "
-            "install it from source, or bring predictions with poses (prior=files)"
-        ) from error
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
-    handler = signal.getsignal(signal.SIGTERM)
-    if handler is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, handler)
-    return pycolmap
+
+def bundle_of(model: Any) -> Any:
+    """pycolmap's problem of adjusting all images of a model; nothing is held yet."""
+    problem = load().BundleAdjustmentConfig()
+    for image in model.reg_image_ids():
+        problem.add_image(image)
+    return problem
 
 
 def check_kinds(features: str, matcher: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from emgs_jax.geometry import scale_covariance
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.uncertainty import camera_in_world, covariances
 
@@ -111,8 +112,7 @@ def in_unit(structure: Structure, median_depth: float) -> Structure:
         depths = np.concatenate([structure.depths(frame) for frame in frames])
         factor = median_depth / np.median(depths) if len(depths) else 1.0
         T[frames, :3, 3] *= factor
-        units = np.repeat([factor, 1.0], 3)
-        covariance[frames] *= units[:, None] * units
+        covariance[frames] = [scale_covariance(one, factor) for one in covariance[frames]]
         worlds.append(replace(world, points=factor * world.points))
     return replace(structure, worlds=worlds, T_world_camera=T, covariance=covariance)
 

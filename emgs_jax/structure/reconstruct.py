@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.structure.config import StructureConfig
-from emgs_jax.structure.library import check_kinds, load, member, options_of
+from emgs_jax.structure.library import bundle_of, check_kinds, load, member, options_of
 from emgs_jax.structure.model import stem
 from emgs_jax.structure.pairs import choose_pairs
 
@@ -69,7 +69,6 @@ def map_database(shots: Shots, config: StructureConfig, folder: Path) -> list[An
     check_found(found, shots, config, folder)
     register_rest(found, config, folder)
     for model in found:
-        drop_points_at_cameras(model)
         adjust(model, shots, config)
     return found
 
@@ -206,28 +205,33 @@ def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
             bar.update(len(some))
 
 
+def refined_lens(shots: Shots, config: StructureConfig) -> tuple[bool, bool]:
+    """Whether the focal length is refined, and the distortion."""
+    return not shots.is_calibrated, not shots.is_calibrated or config.refine_distortion
+
+
 def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]:
     """Run the mapper; models in the order of their numbers of images."""
     pycolmap = load()
-    is_free = not shots.is_calibrated
+    is_free, is_bent = refined_lens(shots, config)
     common = {"num_threads": config.num_threads, "random_seed": config.seed}
     given = config.options.get(config.mapper, {})
     output = folder / "models"
     for needed in (output, folder / IMAGES):  # of a database alone there are none
         needed.mkdir(exist_ok=True)
     if config.mapper == "global":
-        refined = {"refine_focal_length": is_free, "refine_extra_params": is_free or config.refine_distortion}
+        refined = {"refine_focal_length": is_free, "refine_extra_params": is_bent}
         mapper = {"mapper": {**common, "bundle_adjustment": refined}}
         options = options_of("GlobalPipelineOptions", common, mapper, given)
         found = pycolmap.global_mapping(folder / DATABASE, folder / IMAGES, output, options)
     else:
         refined = {
             "ba_refine_focal_length": is_free,
-            "ba_refine_extra_params": is_free or config.refine_distortion,
+            "ba_refine_extra_params": is_bent,
             "mapper": {
                 **common,
                 "abs_pose_refine_focal_length": is_free,
-                "abs_pose_refine_extra_params": is_free or config.refine_distortion,
+                "abs_pose_refine_extra_params": is_bent,
             },
             "triangulation": {"random_seed": config.seed},
         }
@@ -274,19 +278,18 @@ def adjust(model: Any, shots: Shots, config: StructureConfig) -> None:
 
     The mapper's own adjustments weigh all residuals by their squares and hold the centre in the middle of the image.
     """
-    is_free, pycolmap = not shots.is_calibrated, load()
+    pycolmap, (is_free, is_bent) = load(), refined_lens(shots, config)
+    drop_points_at_cameras(model)
     refined = {
         "refine_focal_length": is_free,
         "refine_principal_point": is_free and model.num_reg_images() >= MIN_FOR_CENTER,
-        "refine_extra_params": is_free or config.refine_distortion,
+        "refine_extra_params": is_bent,
         "print_summary": False,
     }
     options = options_of("BundleAdjustmentOptions", refined)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.solver_options.num_threads = config.num_threads
-    problem = pycolmap.BundleAdjustmentConfig()  # `pycolmap.bundle_adjustment` prints whatever the level of the log
-    for image in model.reg_image_ids():
-        problem.add_image(image)
+    problem = bundle_of(model)  # `pycolmap.bundle_adjustment` prints whatever the level of the log
     problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_ceres_bundle_adjuster(options, problem, model).solve()
     # What the loss let go may lie anywhere now.

@@ -57,13 +57,13 @@ def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> t
             write_models(models, key, folder)
         return key, models
     key = key_of(shots, config)
-    cached = CACHE.expanduser() / key
-    places = [place for place in (folder, cached) if place is not None]
+    places = places_of(key, folder)
+    cached = places[-1]
     with ExitStack() as stack:
         with suppress(OSError):  # a cache that cannot be written is shared by nobody
             cached.parent.mkdir(parents=True, exist_ok=True)
             stack.enter_context(FileLock(cached.with_suffix(".lock")))  # another run may be making the same
-        there = next((place for place in places if is_of(place, key)), None)
+        there = kept_at(key, places)
         if there is None:
             there = _made(shots, config, key, places)
         models = read_models(there)
@@ -78,9 +78,18 @@ def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> t
 
 def models_of(key: str, folder: Path | None) -> list[Any] | None:
     """Models that were made before, by their key; None where neither the run's folder nor the cache has them."""
-    places = [place for place in (folder, CACHE.expanduser() / key) if place is not None]
-    there = next((place for place in places if is_of(place, key)), None)
+    there = kept_at(key, places_of(key, folder))
     return None if there is None else read_models(there)
+
+
+def places_of(key: str, folder: Path | None) -> list[Path]:
+    """Where models of this key are kept: a run's folder, if there is one, and the cache."""
+    return [*([] if folder is None else [folder]), CACHE.expanduser() / key]
+
+
+def kept_at(key: str, places: Sequence[Path]) -> Path | None:
+    """The first of these places that holds the models of this key."""
+    return next((place for place in places if is_of(place, key)), None)
 
 
 def _made(shots: Shots, config: StructureConfig, key: str, places: Sequence[Path]) -> Path:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from emgs_jax.structure.library import load, options_of
+from emgs_jax.structure.library import bundle_of, load, options_of
 
 NUM_REFERENCES = 32  # frames that determine the unit
 
@@ -72,9 +72,7 @@ def _covariance(model: Any, first: Any) -> Any:
     shown = {point.point3D_id for point in first.points2D if point.has_point3D()}
     if not shown:
         return None
-    problem = pycolmap.BundleAdjustmentConfig()
-    for image in model.reg_image_ids():
-        problem.add_image(image)
+    problem = bundle_of(model)
     for camera in model.cameras:
         problem.set_constant_cam_intrinsics(camera)
     problem.set_constant_rig_from_world_pose(first.frame_id)

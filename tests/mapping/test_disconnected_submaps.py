@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scene import assert_same
 from scipy.spatial import cKDTree
-from walks import NEVER_FOUND, Apart, config, mapped, prior_of, same_run, walk
+from walks import NEVER_FOUND, Apart, Visited, config, mapped, prior_of, same_run, walk
 
 from emgs_jax.back_end.saved_map import load_saved_map
 from emgs_jax.back_end.state import BackEnd
@@ -129,6 +129,21 @@ def test_of_parts_that_never_meet_the_one_with_most_placed_frames_is_the_map(tmp
     assert metrics[f"submaps/{number}/ate_sim3_m"] < 0.03
     saved = load_saved_map(str(tmp_path), "extend", config().graph, run.back_end.intrinsics, 0.01)
     assert_same(jax.device_get(saved.map), jax.device_get(run.map))
+
+
+@pytest.mark.slow
+def test_a_world_that_comes_back_goes_on_in_its_submap():
+    """Oracle: the true poses of the first world's frames, those after the other world included."""
+    numbers = (*PARTS[0], *PARTS[1], 10, 12, 14, 16)
+    frames, is_first = walk(numbers), [row not in range(5, 10) for row in range(len(numbers))]
+    run = mapped(frames, Visited(prior_of(frames), (5, 10), UNITS), words=(NEVER_FOUND,))
+    assert [row for row, record in enumerate(run.records) if record.location == "segment"] == [5]
+    assert [record.status == APART for record in run.records] == [not first for first in is_first]
+    for row in np.flatnonzero(is_first):
+        distance, turn = pose_difference(run.records[row].pose, run.records[row].true_pose)
+        assert distance < 0.03 and turn < 1.0, row
+    births = {*np.asarray(run.map.birth)[np.asarray(run.map.gaussians.valid)].tolist()}
+    assert births & {0, 1, 2, 3, 4} and births & {10, 11, 12, 13} and not births & {5, 6, 7, 8, 9}
 
 
 @pytest.mark.slow

@@ -122,6 +122,16 @@ class Apart(Edited):
         return replace(found, T_anchor_view=poses, mask=mask, points=points)
 
 
+class Visited(Apart):
+    """The same, that numbers its worlds: the parts are in the first and the second in turn."""
+
+    def _part(self, frame: int) -> int:
+        return super()._part(frame) % 2
+
+    def _edit(self, found: PriorPrediction) -> PriorPrediction:
+        return replace(super()._edit(found), world=self._part(found.window.current))
+
+
 def mapped(
     frames: ReadableFrames, prior: Prior, saved=None, keeper=None, stop: int | None = None, words=()
 ) -> MappingRun:

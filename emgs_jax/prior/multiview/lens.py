@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from emgs_jax.data.camera_models import project
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -34,8 +36,7 @@ def lens_of(camera: Any, intrinsics: tuple[float, ...], size: tuple[int, int]) -
     focal, center = np.float64(intrinsics[:2]), np.float64(intrinsics[2:])
     ratio = np.array(size) / (camera.width, camera.height)  # borders lie on borders; COLMAP counts from them
     pixels = np.stack(np.meshgrid(*map(np.arange, size)), axis=-1).reshape(-1, 2).astype(float)
-    on_plane = np.column_stack([(pixels - center) / focal, np.ones(len(pixels))])
-    shown = camera.img_from_cam(on_plane) * ratio - 0.5
+    shown = project(camera, (pixels - center) / focal) * ratio - 0.5
     straight = focal * camera.cam_from_img((pixels + 0.5) / ratio) + center
     if max(np.abs(shown - pixels).max(), np.abs(straight - pixels).max()) < 0.01:
         return Lens(np.float32(focal), np.float32(center))
