@@ -13,8 +13,8 @@ from emgs_jax.ops.pytree import stack
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.itermvs.network import Features, IterMVS, IterMVSConfig, Sources, estimate, extract
 from emgs_jax.prior.itermvs.weights import load_weights
-from emgs_jax.prior.multiview.dense import DenseConfig, Matched, Stereo
 from emgs_jax.prior.multiview.lens import Lens, rectify
+from emgs_jax.prior.multiview.matched import Matched, MatchedConfig, Stereo
 
 MULTIPLE = 32  # of pixels; the network halves its images five times
 jitted_extract = eqx.filter_jit(extract)
@@ -30,7 +30,7 @@ def jitted_estimate(
 
 
 @dataclass(frozen=True)
-class LearnedConfig(DenseConfig):
+class LearnedConfig(MatchedConfig):
     """Depth by a network.
 
     Args:
