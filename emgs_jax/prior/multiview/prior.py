@@ -73,7 +73,7 @@ class MultiviewStereo(Prior):
         self._config, self._dense_config, self._stereo = structure, dense, stereo_of(dense)
         settings = {"structure": _values(structure), "dense": _values(dense)}
         settings["dense"].pop("checkpoint", None)  # its digest says which it is, wherever it lies
-        self.provenance = Provenance("multiview_stereo", {"version": 11} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 12} | settings)
         self._dataset: Dataset | None = None
         self._folder: Path | None = None
         self._found: Structure | None = None
