@@ -9,7 +9,7 @@ import numpy as np
 
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
-from emgs_jax.prior.multiview.confidence import ConfidenceConfig
+from emgs_jax.prior.multiview.depth_noise import DepthNoiseConfig
 from emgs_jax.prior.multiview.lens import Lens
 
 
@@ -18,21 +18,19 @@ class DenseConfig:
     """Settings of a view's dense depth: its source views and acceptance.
 
     Args:
-        confidence: probability that a depth is right.
+        noise: standard deviation of a depth.
         num_sources: views that it is matched against.
         best_parallax_rad: between the rays of a landmark, beyond which more is no better.
         num_checks: views whose depth is compared with it.
         depth_step: of the depths of two views, as a fraction: where they differ by so much they agree by 1/e.
-        min_probability: of a depth that is predicted.
         depth_margin: the range of depths that is tried goes beyond the landmarks' by this factor.
     """
 
-    confidence: ConfidenceConfig
+    noise: DepthNoiseConfig
     num_sources: int = number(low=1, high=64)
     best_parallax_rad: float = number(low=1e-6, high=4)
     num_checks: int = number(low=0, high=64)
     depth_step: float = number(low=1e-6)
-    min_probability: float = number(low=0, high=1)
     depth_margin: float = number(low=1, high=1000)
 
 
@@ -61,7 +59,8 @@ class Stereo(NamedTuple):
 
     Args:
         prepare: RGB image (h, w, 3), uint8, and its lens -> what is kept of the view.
-        estimate: depth (h, w) in metres, 0 where it is not known, and its spread, for `confidence.probability`.
+        estimate: depth (h, w) in metres, 0 where it is not known, and the spread of what its cost curve takes
+            for plausible, a multiple of the standard deviation of log z.
     """
 
     prepare: Callable[[np.ndarray, Lens], Any]

@@ -102,21 +102,26 @@ def estimate_depth(
 
 
 @full_precision
-def agreement(
+def mean_difference(
     depth: Float[Array, "h w"],
     others: Float[Array, "s h w"],
     T_other_reference: jaxlie.SE3,
+    is_used: Bool[Array, "s"],
     camera: Camera,
     depth_step: Float[Array, ""],
 ) -> Float[Array, "h w"]:
-    """Count the other depth maps that confirm each depth, each by exp(-difference / `depth_step`); 0 without a depth.
+    """By what fraction other depth maps differ from each depth, -δ₀ log mean exp(-d / δ₀); inf where none has any.
+
+    δ₀ is `depth_step`: a view that differs by much more, or shows nothing there, counts as one that does not confirm,
+    however much it is.
 
     Args:
         depth: of the view, m; 0 = none.
-        others: of other views, likewise; a map of zeros confirms nothing.
+        others: of other views, likewise.
         T_other_reference: view -> other view, batched like `others`.
+        is_used: others that count.
         camera: of all views.
-        depth_step: tolerance, as a fraction.
+        depth_step: δ₀, as a fraction.
     """
     points = unproject(camera, depth)
 
@@ -129,4 +134,35 @@ def agreement(
         difference = jnp.abs(seen_depth / jnp.where(is_seen, there, 1.0) - 1.0)
         return jnp.where(is_seen, jnp.exp(-difference / depth_step), 0.0)
 
-    return jnp.sum(jax.vmap(agrees)(T_other_reference.wxyz_xyz, others), axis=0)
+    agreed = jnp.mean(jax.vmap(agrees)(T_other_reference.wxyz_xyz, others), axis=0, where=is_used[:, None, None])
+    return jnp.where(agreed > 0, -depth_step * jnp.log(jnp.where(agreed > 0, agreed, 1.0)), jnp.inf)
+
+
+@full_precision
+def pixels_per_log_depth(
+    depth: Float[Array, "h w"], T_source_reference: jaxlie.SE3, is_used: Bool[Array, "s"], camera: Camera
+) -> Float[Array, "h w"]:
+    """By how many pixels each point moves in a source while log z grows by one, in that where it moves most.
+
+    0 where no source shows the point, or its ray goes through the sources' centres. A depth of 0 has no point.
+
+    Args:
+        depth: of the view, m.
+        T_source_reference: view -> source, batched like `is_used`.
+        is_used: sources that count.
+        camera: of all views.
+    """
+    points = unproject(camera, depth)
+
+    def moves(T: Array, used: Array) -> Array:
+        T = jaxlie.SE3(T)
+        turned = points @ T.rotation().as_matrix().T
+
+        def shown(log_scale: Array) -> tuple[Array, Array]:
+            return project(camera, jnp.exp(log_scale) * turned + T.translation())
+
+        (pixels, seen_depth), (speed, _) = jax.jvp(shown, (jnp.zeros(()),), (jnp.ones(()),))
+        is_shown = used & (depth > 0) & (seen_depth > 0) & nearest_pixel(pixels, depth.shape)[1]
+        return jnp.where(is_shown, jnp.linalg.norm(speed, axis=-1), 0.0)
+
+    return jnp.max(jax.vmap(moves)(T_source_reference.wxyz_xyz, is_used), axis=0)

@@ -55,7 +55,7 @@ def grid_of(camera: Camera, magnification: float) -> Camera:
 
 
 def learned(config: LearnedConfig) -> Stereo:
-    """Depth of RGB images by a network; the spread is 1 less its confidence."""
+    """Depth of RGB images by a network; the spread is -log of its confidence."""
     network = load_weights(config.checkpoint, config.sha256)
 
     def prepare(image: np.ndarray, lens: Lens) -> Features:
@@ -70,6 +70,6 @@ def learned(config: LearnedConfig) -> Stereo:
         depth, confidence = map(np.asarray, jitted_estimate(network, matched, grid, config.network))
         size = matched.camera.width, matched.camera.height
         inverse, confidence = (cv2.resize(values, size) for values in (1.0 / depth, confidence))
-        return 1.0 / inverse, 1.0 - confidence
+        return 1.0 / inverse, -np.log(confidence)
 
     return Stereo(prepare, depth_of)

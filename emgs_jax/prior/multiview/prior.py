@@ -2,7 +2,7 @@
 
 COLMAP finds the poses of all images at once (`structure/`); a plane sweep against some of the other views the depth of
 each, and the matches on a blank region its plane (`swept.py`), or a network whose weights the user has (`learned.py`).
-The confidence of a depth is 1 + the probability that it is right (`confidence.py`): 1 where nothing is known.
+The confidence of a depth is one over the standard deviation of log z (`depth_noise.py`), and 1 where nothing is known.
 
 Every model of COLMAP is a world with a frame and a unit of its own: images do not tell the scale, so its landmarks get
 the median depth `median_depth`. An answer has the poses of its current frame's world. A frame between two of one world
@@ -25,9 +25,9 @@ from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
-from emgs_jax.prior.multiview.confidence import probability
 from emgs_jax.prior.multiview.dense import DenseConfig, Matched, Stereo
-from emgs_jax.prior.multiview.depth import agreement
+from emgs_jax.prior.multiview.depth import mean_difference, pixels_per_log_depth
+from emgs_jax.prior.multiview.depth_noise import relative_std
 from emgs_jax.prior.multiview.learned import LearnedConfig, learned
 from emgs_jax.prior.multiview.lens import Lens, as_shown, lens_of, points_shown
 from emgs_jax.prior.multiview.sources import choose, parallax
@@ -36,7 +36,7 @@ from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.model import NONE, Structure
 from emgs_jax.structure.sequence import structure_of
 
-jitted_agreement = eqx.filter_jit(agreement)
+jitted_difference, jitted_pixels = eqx.filter_jit(mean_difference), eqx.filter_jit(pixels_per_log_depth)
 NUM_KEPT = 64  # frames whose images, depths and features are at hand
 
 
@@ -73,7 +73,7 @@ class MultiviewStereo(Prior):
         self._config, self._dense_config, self._stereo = structure, dense, stereo_of(dense)
         settings = {"structure": _values(structure), "dense": _values(dense)}
         settings["dense"].pop("checkpoint", None)  # its digest says which it is, wherever it lies
-        self.provenance = Provenance("multiview_stereo", {"version": 10} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 12} | settings)
         self._dataset: Dataset | None = None
         self._folder: Path | None = None
         self._found: Structure | None = None
@@ -160,18 +160,18 @@ class MultiviewStereo(Prior):
             nothing = np.zeros((height, width), np.float32)
             return np.zeros((height, width, 3), np.float32), nothing + 1, nothing > 0
         lens = self._lenses[world]
-        confidence = np.maximum(as_shown(self._confidence(frame), lens), np.float32(1.0))
-        depth = as_shown(self._depth(frame)[0], lens)
-        mask = (depth > 0) & (confidence >= 1.0 + self._dense_config.min_probability)
+        depth, std = (as_shown(values, lens) for values in (self._depth(frame)[0], self._std(frame)))
+        mask = (depth > 0) & (std <= self._dense_config.noise.max_std)
+        confidence = np.maximum(1.0 / np.where(mask, std, 1.0), np.float32(1.0))
         return points_shown(np.where(mask, depth, 0.0), lens), confidence, mask
 
-    def _make_depth(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Depth (h, w) of a view, 0 where it is not known, and its spread."""
+    def _make_depth(self, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Depth (h, w) of a view, 0 where it is not known, its spread, and `pixels_per_log_depth`."""
         nothing = np.zeros((self._camera.height, self._camera.width), np.float32)
         sources, z = self._sources(frame), self._found.depths(frame)
         z = z[z > 0]
         if not sources or not len(z):
-            return nothing, nothing
+            return nothing, nothing, nothing
         count = self._dense_config.num_sources
         is_used = np.arange(count) < len(sources)
         sources = (sources * count)[:count]
@@ -183,7 +183,9 @@ class MultiviewStereo(Prior):
             tried_depths(z, self._dense_config.depth_margin),
             self._camera,
         )
-        return self._stereo.estimate(matched)
+        depth, spread = self._stereo.estimate(matched)
+        seen = jnp.asarray(depth), matched.T_source_view, jnp.asarray(is_used), self._camera
+        return depth, spread, np.asarray(jitted_pixels(*seen))
 
     def _make_view(self, frame: int) -> Any:
         """Return what the way to a depth keeps of an image."""
@@ -209,24 +211,24 @@ class MultiviewStereo(Prior):
                 worth[int(other)] = is_shown * np.minimum(angle / best, 1.0)
         return choose(worth, self._dense_config.num_sources)
 
-    def _confidence(self, frame: int) -> np.ndarray:
-        """One more than the probability that each depth is right."""
-        depth, spread = self._depth(frame)
+    def _std(self, frame: int) -> np.ndarray:
+        """Standard deviation of the logarithm of each depth; inf where there is no telling."""
+        depth, spread, pixels = self._depth(frame)
         count = self._dense_config.num_checks
         others = [int(other) for other in self._placed_beside(frame)[:count]]
         if not others:
-            return np.ones_like(depth)
-        maps = np.zeros((count, *depth.shape), np.float32)
-        maps[: len(others)] = [self._depth(other)[0] for other in others]
+            return np.full_like(depth, np.inf)
+        is_used = np.arange(count) < len(others)
         others = (others * count)[:count]
-        agreed = jitted_agreement(
+        difference = jitted_difference(
             jnp.asarray(depth),
-            jnp.asarray(maps),
+            jnp.asarray(np.stack([self._depth(other)[0] for other in others])),
             self._relative(others, frame),
+            jnp.asarray(is_used),
             self._camera,
             jnp.float32(self._dense_config.depth_step),
         )
-        return 1.0 + probability(spread, np.asarray(agreed), self._dense_config.confidence)
+        return relative_std(pixels, spread, np.asarray(difference), self._dense_config.noise)
 
     def _relative(self, others: Sequence[int], frame: int) -> jaxlie.SE3:
         """T_other_frame of several views."""

@@ -29,7 +29,7 @@ class SweptConfig(DenseConfig):
 
 
 def swept(config: SweptConfig) -> Stereo:
-    """Depth of grey images by a plane sweep; the spread is in planes."""
+    """Depth of grey images by a plane sweep; the spread is that of plausible planes, in log z."""
 
     def prepare(image: np.ndarray, lens: Lens) -> np.ndarray:
         return rectify(np.float32(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) / 255.0, lens)
@@ -46,6 +46,7 @@ def swept(config: SweptConfig) -> Stereo:
             config.depth,
         )
         spacing = (1.0 / near - 1.0 / far) / (config.depth.sweep.num_planes - 1)
-        return fill_planes(np.asarray(depth), np.asarray(spread), matched.view, spacing, config.planar)
+        depth, planes = fill_planes(np.asarray(depth), np.asarray(spread), matched.view, spacing, config.planar)
+        return depth, planes * spacing * depth
 
     return Stereo(prepare, estimate)

@@ -1,4 +1,4 @@
-"""Depth of painted planes, holes where nothing is known, the parabola, the median, and who agrees with whom."""
+"""Depth of painted planes, holes where nothing is known, the parabola, and the median."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,11 +8,10 @@ import pytest
 import scipy.ndimage
 from stereo_scene import depth_config, matrix, plane_image, small_camera
 
-from emgs_jax.prior.multiview.depth import _between_planes, _median, _spread, agreement, estimate_depth
+from emgs_jax.prior.multiview.depth import _between_planes, _median, _spread, estimate_depth
 
 POSES = [matrix(translation=t) for t in ((0.2, 0, 0), (-0.2, 0, 0), (0, 0.2, 0), (0, -0.2, 0))]
 INSIDE = np.s_[8:-8, 8:-8]
-DEPTH_STEP = np.float32(0.02)
 jitted_depth = eqx.filter_jit(estimate_depth)
 
 
@@ -93,34 +92,3 @@ def test_the_median_is_scipys_and_keeps_holes():
     np.testing.assert_array_equal(_median(jnp.asarray(depth), 0), depth)
     depth[:, 3:] = 0
     assert not np.asarray(_median(jnp.asarray(depth), 2))[:, 3:].any()
-
-
-jitted_agreement = eqx.filter_jit(agreement)
-
-
-def agreeing(depth, others, poses):
-    """With as many more views as make four, which have no depth."""
-    more = 4 - len(others)
-    maps = jnp.asarray(np.stack([*others, *[np.zeros_like(depth)] * more]))
-    poses = relative([*poses, *[np.eye(4)] * more])
-    return np.asarray(jitted_agreement(jnp.asarray(depth), maps, poses, small_camera(), DEPTH_STEP))
-
-
-def test_views_of_a_wall_confirm_it_in_full_and_no_depth_is_confirmed_by_nothing_and_confirms_nothing():
-    _, depth = plane_image(np.eye(4), 0.0)
-    others = [plane_image(T, 0.0)[1] for T in POSES]
-    np.testing.assert_allclose(agreeing(depth, others, POSES)[INSIDE], 4, rtol=1e-3)
-    np.testing.assert_allclose(agreeing(depth, others[:1], POSES[:1])[INSIDE], 1, rtol=1e-3)
-    assert not agreeing(depth, [np.zeros_like(depth)], [np.eye(4)]).any()
-    assert not agreeing(np.zeros_like(depth), others, POSES).any()
-
-
-def test_agreement_falls_with_the_difference_as_a_share_of_the_depth_whatever_its_unit_and_not_behind_or_beside():
-    step = float(DEPTH_STEP)
-    for size in (0.1, 1.0, 10.0):
-        depth = size * plane_image(np.eye(4), 0.4)[1]
-        for share in (-3.0, -0.5, 0.0, 1.0):
-            found = agreeing(depth * (1 + share * step), [depth], [np.eye(4)])
-            np.testing.assert_allclose(found, np.exp(-abs(share)), rtol=1e-3)
-    turned, beside = matrix(rotation=(0, np.pi, 0)), matrix(translation=(30.0, 0, 0))
-    assert agreeing(depth, [depth, depth], [turned, beside]).max() < 1e-9

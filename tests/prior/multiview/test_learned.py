@@ -74,7 +74,7 @@ def test_every_pixel_of_the_view_has_a_depth_within_the_range_and_a_spread_whate
     depth, spread = estimate(learned(hydra.utils.instantiate(prior_node().dense)))
     assert depth.shape == spread.shape == (96, 128)
     assert depth.min() >= 1.2 - 1e-5 and depth.max() <= 5 + 1e-5
-    assert spread.min() >= 0 and spread.max() <= 1
+    assert spread.min() >= 0 and np.isfinite(spread).all()
 
 
 def test_settings_say_which_weights_and_not_where_they_lie(monkeypatch):
