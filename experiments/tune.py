@@ -55,7 +55,7 @@ def tune(words: Sequence[str], folder: Path) -> list[dict[str, Any]]:
     for key, allowed in space.items():
         if len(programs([variant_of(config, {key: value}).slam for value in ends_of(allowed)])) > 1:
             print(f"{key} shares no program: what has another value of it is compiled or mapped by itself")
-    searched = {key: str(allowed) for key, allowed in space.items()}
+    searched = {key: vars(allowed) for key, allowed in space.items()}
     about = {"space": searched, "objectives": objectives, "tuned": list(configs["tuned"]), "seed": config.search_seed}
     with owned(folder), Clock().watching() as clock:
         remove_temporaries(folder)
