@@ -21,7 +21,7 @@ from emgs_jax.config.overrides import written
 from emgs_jax.device.clock import Clock
 from emgs_jax.io.files import owned, remove_temporaries, write_file
 from emgs_jax.mapping.batch import programs
-from emgs_jax.report.sweeps import write_csv
+from emgs_jax.report.columns import csv_text
 from emgs_jax.report.tuning import DEFAULT, SequenceResults, draw_trials, settings_yaml, table, verdict
 
 from .command import command
@@ -190,7 +190,8 @@ def _write(
     ]
     lines = verdict(results, objectives)
     text = "\n".join([table(results, objectives), *(f"- {line}" for line in lines.values()), ""])
-    write_csv(folder / "trials.csv", [{**row, "is_best": row["trial"] in best} for row in rows])
+    trials = [{**row, "is_best": row["trial"] in best} for row in rows]
+    write_file(folder / "trials.csv", csv_text(trials))
     write_file(folder / "tune.md", text)
     _write_best(folder, best, lines)
     numbers = {row["trial"]: DEFAULT for row in rows if all(row[key] == own[key] for key in own)}
