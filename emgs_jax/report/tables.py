@@ -85,10 +85,7 @@ def average(estimates: Iterable[Estimate], each_sequence: bool) -> list[Row]:
 def to_csv(estimates: Sequence[Estimate]) -> str:
     """Write one line per estimate: what it is of, then every metric."""
     names = ("dataset", "sequence", "variant", "kind", "seed", "prior", "is_simulated", "protocol", "revision")
-    metrics = sorted({key for item in estimates for key in item.values})
-    about = [{name: getattr(item, name) for name in names} for item in estimates]
-    values = [{key: item.values.get(key) for key in metrics} for item in estimates]
-    return csv_text([one | other for one, other in zip(about, values, strict=True)])
+    return csv_text([{name: getattr(item, name) for name in names} | item.values for item in estimates])
 
 
 def paper_table(rows: Sequence[Row], published: Sequence[Mapping[str, Any]]) -> str:
