@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from g2o_reader import load_graph_g2o
 from omegaconf import OmegaConf
 from rings import (
     OFFSETS,
@@ -34,7 +35,6 @@ from rings import (
 )
 from scipy import stats
 
-from emgs_jax.back_end.g2o import load_graph_g2o
 from emgs_jax.pose_graph.chordal import chordal_initialization
 from emgs_jax.pose_graph.factors import Nodes, PoseGraph
 from emgs_jax.pose_graph.optimize import PoseGraphConfig, optimize
