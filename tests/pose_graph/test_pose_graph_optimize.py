@@ -260,8 +260,6 @@ def test_chi2_of_noisy_measurements_has_its_distribution():
     low, high = stats.chi2.interval(0.99, info.dof)
     assert low < 2 * info.cost < high
     assert info.dof == 7 * edges.a.shape[0] + 59 - 7 * 59
-    assert (info.num_other_rows, info.num_loop_rows) == (7 * (edges.a.shape[0] - 10), 70)
-    assert info.other_chi2 + info.loop_chi2 == pytest.approx(np.sum(info.factor_chi2))
 
 
 @pytest.fixture(scope="module")
