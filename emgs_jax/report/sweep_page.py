@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from emgs_jax.config.overrides import written
 from emgs_jax.report.columns import MAIN, Column, Line, Table, known, metric_table
 from emgs_jax.report.evaluation_page import run_facts
 from emgs_jax.report.html import MAX_LINES, Head, commit_words, page, picture, thumbnails, write_page
