@@ -26,11 +26,6 @@ def safe_normalize(vectors: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
     return jnp.where(is_long, vectors / jnp.sqrt(jnp.where(is_long, squared, 1.0)), 0.0)
 
 
-def symmetrize(matrices: Float[Array, "*b d d"]) -> Float[Array, "*b d d"]:
-    """The symmetric part."""
-    return 0.5 * (matrices + jnp.swapaxes(matrices, -1, -2))
-
-
 def outer(vectors: Float[Array, "*b d"]) -> Float[Array, "*b d d"]:
     """v v'."""
     return vectors[..., :, None] * vectors[..., None, :]
