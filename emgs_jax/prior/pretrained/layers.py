@@ -1,10 +1,14 @@
-"""Layers of convolutional networks as functions of (height, width, channels), as their weights were trained."""
+"""Layers of convolutional networks as functions of (height, width, channels), as their weights were trained.
+
+A volume has its depth before: (depth, height, width, channels).
+"""
 
 from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from emgs_jax.ops.pytree import static
@@ -14,36 +18,41 @@ class Conv(eqx.Module):
     """A convolution whose result is as large as the image, divided by `stride` or multiplied by `expansion`.
 
     Args:
-        weight: rows, columns, channels of the input, channels of the output.
+        weight: rows, columns, channels of the input (one, where each channel is by itself), channels of the output;
+            of volumes with depth before.
         bias: of each channel of the output.
-        stride: of the result's pixels on the image.
+        stride: of the result's pixels on the image, along every axis or each.
         dilation: pixels between those that are weighed.
         expansion: of the image before: the transposed convolution with that stride.
     """
 
-    weight: Float[Array, "kh kw i o"]
+    weight: Float[Array, "*k i o"]
     bias: Float[Array, "o"]
-    stride: int = static()
+    stride: int | tuple[int, ...] = static()
     dilation: int = static()
-    expansion: int = static()
+    expansion: int | tuple[int, ...] = static()
 
 
-def convolve(image: Float[Array, "*b h w i"], conv: Conv) -> Float[Array, "*b h2 w2 o"]:
+def convolve(image: Float[Array, "*b i"], conv: Conv) -> Float[Array, "*b2 o"]:
     """Apply a convolution; beyond the image there is zero."""
-    reach = conv.dilation * (conv.weight.shape[0] // 2)
+    axes = conv.weight.ndim - 2
+    stride, expansion = (tuple(np.broadcast_to(step, axes).tolist()) for step in (conv.stride, conv.expansion))
+    reach = [conv.dilation * (size // 2) for size in conv.weight.shape[:axes]]
+    letters = "DHW"[-axes:]
     found = jax.lax.conv_general_dilated(
-        image.reshape(-1, *image.shape[-3:]),
+        image.reshape(-1, *image.shape[-axes - 1 :]),
         conv.weight,
-        (conv.stride,) * 2,
-        [(reach, reach + conv.expansion - 1)] * 2,
-        (conv.expansion,) * 2,
-        (conv.dilation,) * 2,
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        stride,
+        [(r, r + step - 1) for r, step in zip(reach, expansion, strict=True)],
+        expansion,
+        (conv.dilation,) * axes,
+        dimension_numbers=(f"N{letters}C", f"{letters}IO", f"N{letters}C"),
+        feature_group_count=image.shape[-1] // conv.weight.shape[-2],
     )
-    return found.reshape(*image.shape[:-3], *found.shape[1:]) + conv.bias
+    return found.reshape(*image.shape[: -axes - 1], *found.shape[1:]) + conv.bias
 
 
-def chain(image: Float[Array, "*b h w i"], convs: Sequence[Conv]) -> Float[Array, "*b h2 w2 o"]:
+def chain(image: Float[Array, "*b i"], convs: Sequence[Conv]) -> Float[Array, "*b2 o"]:
     """Apply one convolution after the other, with a ReLU between them."""
     for conv in convs[:-1]:
         image = jax.nn.relu(convolve(image, conv))

@@ -22,21 +22,26 @@ from scene import compose, device, on_host
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.ops.camera import Camera
-from emgs_jax.prior.itermvs.layers import Conv, convolve, resize, sample
-from emgs_jax.prior.itermvs.network import Sources, estimate, extract
-from emgs_jax.prior.itermvs.weights import build_network, load_weights
+from emgs_jax.prior.pretrained.itermvs import SOURCE, build_network, estimate, extract
+from emgs_jax.prior.pretrained.layers import Conv, convolve, resize, sample
+from emgs_jax.prior.pretrained.matching import Sources
+from emgs_jax.prior.pretrained.weights import load_network
 
 BESIDE = Path(__file__).resolve().parents[3].parent
 CHECKPOINT = Path(os.environ.get("ITERMVS_CHECKPOINT", BESIDE / "shared/weights/itermvs_blendedmvs_model_000015.ckpt"))
 ORIGINAL = Path(os.environ.get("ITERMVS", BESIDE / "IterMVS"))
 SIZE, RANGE = (64, 96), (0.8, 5.0)  # rows and columns
-_extract = on_host(lambda network, images: jax.vmap(lambda image: extract(network.features, image))(images))
+_extract = on_host(lambda network, images: jax.vmap(lambda image: extract(network, image))(images))
 _estimate = on_host(estimate)
 
 
 @cache
 def dense_config():
     return hydra.utils.instantiate(compose("prior=multiview_stereo", "prior/dense=itermvs").prior.dense)
+
+
+def load(checkpoint, sha256):
+    return load_network(checkpoint, sha256, SOURCE, "model", build_network)
 
 
 def camera(size=SIZE):
@@ -142,11 +147,11 @@ def test_weights_that_are_missing_or_others_are_refused_by_name(tmp_path):
     other.write_bytes(b"nothing")
     digest = dense_config().sha256
     with pytest.raises(ValueError, match=r"prior.dense.checkpoint=None .* https://github.com/FangjinhuaWang/IterMVS"):
-        load_weights(None, digest)
+        load(None, digest)
     with pytest.raises(ValueError, match=f"SHA-256 {_digest(other)}, expected {digest}"):
-        load_weights(str(other), digest)
-    with pytest.raises(ValueError, match="has no weights of IterMVS"):
-        load_weights(str(other), _digest(other))
+        load(str(other), digest)
+    with pytest.raises(ValueError, match="has not the weights of https://github.com/FangjinhuaWang/IterMVS"):
+        load(str(other), _digest(other))
     tensors = random_tensors()
     del tensors["module.iter_mvs.update.gru.convr.bias"], tensors["module.iter_mvs.upsample.2.weight"]
     with pytest.raises(KeyError, match=r"iter_mvs.upsample.2.weight"):
@@ -161,7 +166,7 @@ def _digest(path):
 def published():
     if not CHECKPOINT.is_file():
         pytest.skip(f"the published weights are not at {CHECKPOINT}")
-    return load_weights(str(CHECKPOINT), dense_config().sha256)
+    return load(str(CHECKPOINT), dense_config().sha256)
 
 
 def original(images, T_source_view, size):
