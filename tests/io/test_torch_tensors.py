@@ -22,12 +22,17 @@ def test_tensors_are_what_torch_wrote(is_archive, tmp_path):
     torch = pytest.importorskip("torch", reason="torch is not installed")
     whole = torch.arange(24.0).reshape(2, 3, 4)
     tensors = {"whole": whole, "part": whole[1, 1:], "number": torch.tensor(7), "empty": torch.zeros(0, 3)}
-    content = saved({"epoch": 3, "model": tensors, "optimizer": {"state": [{"step": 0.5}], "groups": ()}}, tmp_path, is_archive)
+    content = saved(
+        {"epoch": 3, "model": tensors, "optimizer": {"state": [{"step": 0.5}], "groups": ()}}, tmp_path, is_archive
+    )
     found = read_tensors(content, "model")
     assert found.keys() == tensors.keys()
     for name, tensor in tensors.items():
         np.testing.assert_array_equal(found[name], tensor.numpy())
-    assert read_tensors(saved(torch.nn.Linear(2, 1).state_dict(), tmp_path, is_archive), None).keys() == {"weight", "bias"}
+    assert read_tensors(saved(torch.nn.Linear(2, 1).state_dict(), tmp_path, is_archive), None).keys() == {
+        "weight",
+        "bias",
+    }
     with pytest.raises(ValueError, match="damaged"):
         read_tensors(content, "weights")
     with pytest.raises(ValueError, match="no plain array"):

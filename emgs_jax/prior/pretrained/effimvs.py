@@ -230,7 +230,10 @@ def _refine(
         hidden, unit = state
         tried = _around(unit, step, 3)
         read = [jnp.moveaxis(_read(volume, volumes.ends, tried), 0, -1) for volume in (volumes.fits, volumes.scores)]
-        found = _relu_chain(jnp.concatenate(read, axis=-1), network.volumes), _relu_chain(unit[..., None], network.depth)
+        found = (
+            _relu_chain(jnp.concatenate(read, axis=-1), network.volumes),
+            _relu_chain(unit[..., None], network.depth),
+        )
         mixed = convolve(jnp.concatenate(found, axis=-1), network.mixed)
         seen = jax.nn.relu(convolve(jnp.concatenate([mixed, context], axis=-1), network.seen))
         hidden = turn(hidden, seen, network.gru)

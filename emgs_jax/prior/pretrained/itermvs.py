@@ -7,13 +7,12 @@ GRU sees how well depths around the present one fit, at three scales, and says a
 from 0 (farthest) to 1 (nearest), linear in 1/z, so the unit of poses and range does not matter.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from emgs_jax.ops.camera import Camera, downscale, pixel_grid, rays
 from emgs_jax.ops.precision import full_precision

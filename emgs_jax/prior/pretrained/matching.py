@@ -71,9 +71,7 @@ def correlation(
     return jnp.mean(product.reshape(*product.shape[:-1], num_groups, -1), axis=-1)
 
 
-def upsample(
-    values: Float[Array, "h w"], logits: Float[Array, "h w k"], beyond: str
-) -> Float[Array, "h2 w2"]:
+def upsample(values: Float[Array, "h w"], logits: Float[Array, "h w k"], beyond: str) -> Float[Array, "h2 w2"]:
     """Each of r×r pixels is a convex combination of nine values around it (Teed and Deng, ECCV 2020).
 
     Args:
@@ -94,5 +92,3 @@ def turn(hidden: Float[Array, "h w c"], seen: Float[Array, "h w i"], gru: Gru) -
     update, reset = jax.nn.sigmoid(convolve(both, gru.update)), jax.nn.sigmoid(convolve(both, gru.reset))
     candidate = jnp.tanh(convolve(jnp.concatenate([reset * hidden, seen], axis=-1), gru.candidate))
     return (1.0 - update) * hidden + update * candidate
-
-

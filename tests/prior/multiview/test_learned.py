@@ -1,4 +1,4 @@
-"""Depth by IterMVS within the classical prior: the camera of its images, and with published weights a painted plane."""
+"""Depth by a network within the classical prior: the camera of its images, and with real weights a painted plane."""
 
 import os
 import sys
@@ -19,7 +19,7 @@ from emgs_jax.prior.multiview.dense import Matched
 from emgs_jax.prior.multiview.learned import grid_of, learned
 from emgs_jax.prior.multiview.lens import Lens
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "itermvs"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "pretrained"))
 from random_weights import random_network
 
 BESIDE = Path(__file__).resolve().parents[3].parent
@@ -70,7 +70,7 @@ def test_the_networks_images_have_sizes_that_it_takes_and_their_edges_are_those_
 
 
 def test_every_pixel_of_the_view_has_a_depth_within_the_range_and_a_spread_whatever_the_weights(monkeypatch):
-    monkeypatch.setattr(module, "load_weights", lambda checkpoint, sha256: random_network())
+    monkeypatch.setattr(module, "load_network", lambda *given: random_network())
     depth, spread = estimate(learned(hydra.utils.instantiate(prior_node().dense)))
     assert depth.shape == spread.shape == (96, 128)
     assert depth.min() >= 1.2 - 1e-5 and depth.max() <= 5 + 1e-5
@@ -78,7 +78,7 @@ def test_every_pixel_of_the_view_has_a_depth_within_the_range_and_a_spread_whate
 
 
 def test_settings_say_which_weights_and_not_where_they_lie(monkeypatch):
-    monkeypatch.setattr(module, "load_weights", lambda checkpoint, sha256: random_network())
+    monkeypatch.setattr(module, "load_network", lambda *given: random_network())
     priors = [
         hydra.utils.instantiate(prior_node(*words))
         for words in ((), ("prior.dense.checkpoint=elsewhere",), ("prior.dense.sha256=0f",))
