@@ -23,7 +23,7 @@ class Conv(eqx.Module):
         bias: of each channel of the output.
         stride: of the result's pixels on the image, along every axis or each.
         dilation: pixels between those that are weighed.
-        expansion: of the image before: the transposed convolution with that stride.
+        expansion: of the image before: the transposed convolution with that stride, 2 of three weights.
     """
 
     weight: Float[Array, "*k i o"]
@@ -41,15 +41,41 @@ def convolve(image: Float[Array, "*b i"], conv: Conv) -> Float[Array, "*b2 o"]:
     letters = "DHW"[-axes:]
     found = jax.lax.conv_general_dilated(
         image.reshape(-1, *image.shape[-axes - 1 :]),
-        conv.weight,
+        _of_phases(conv.weight, expansion),
         stride,
-        [(r, r + step - 1) for r, step in zip(reach, expansion, strict=True)],
-        expansion,
-        (conv.dilation,) * axes,
+        [(r * (step == 1), r) for r, step in zip(reach, expansion, strict=True)],
+        rhs_dilation=(conv.dilation,) * axes,
         dimension_numbers=(f"N{letters}C", f"{letters}IO", f"N{letters}C"),
         feature_group_count=image.shape[-1] // conv.weight.shape[-2],
     )
+    found = _interleaved(found, expansion)
     return found.reshape(*image.shape[: -axes - 1], *found.shape[1:]) + conv.bias
+
+
+def _of_phases(weight: Float[Array, "*k i o"], expansion: tuple[int, ...]) -> Float[Array, "*k2 i p"]:
+    """Weights of the pixels that come of one where the image is expanded, whose other pixels would all be zero.
+
+    Of three weights in a row, those of a pixel of the image and the next: the middle one and none for the first of the
+    two pixels, the first and the last one for the second.
+    """
+    for axis, step in enumerate(expansion):
+        if step == 2:
+            before, at, after = jnp.split(weight, 3, axis)
+            pairs = (at, jnp.zeros_like(at)), (before, after)
+            weight = jnp.stack([jnp.concatenate(pair, axis) for pair in pairs], axis=-1)
+    return weight.reshape(*weight.shape[: len(expansion) + 1], -1)
+
+
+def _interleaved(found: Float[Array, "n *k p"], expansion: tuple[int, ...]) -> Float[Array, "n *k2 o"]:
+    """The image of channels in which the pixels of each phase stand."""
+    axes, phases = len(expansion), [step for step in expansion if step > 1]
+    found = found.reshape(*found.shape[:-1], -1, *phases)
+    for axis, step in enumerate(expansion):
+        if step > 1:
+            found = jnp.moveaxis(found, axes + 2, axis + 2)
+            size = found.shape
+            found = found.reshape(*size[: axis + 1], step * size[axis + 1], *size[axis + 3 :])
+    return found
 
 
 def chain(image: Float[Array, "*b i"], convs: Sequence[Conv]) -> Float[Array, "*b2 o"]:

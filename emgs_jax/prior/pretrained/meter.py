@@ -6,6 +6,8 @@ pixel of a 2×2 patch also attends to the same pixel of all other patches (Mehta
 it is doubled three times, with what was there on the way down beside it.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -54,7 +56,7 @@ class Meter(eqx.Module):
     out: Conv
 
 
-def _in_turn(image: Float[Array, "h w i"], convs: tuple[Conv, ...]) -> Float[Array, "h2 w2 o"]:
+def _in_turn(image: Float[Array, "h w i"], convs: Sequence[Conv]) -> Float[Array, "h2 w2 o"]:
     for each in convs:
         image = convolve(image, each)
     return image

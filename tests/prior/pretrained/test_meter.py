@@ -39,7 +39,7 @@ def original(images):
         del sys.modules["globals"]
     network = module.build_METER_model("cpu", "xxs").eval()
     network.load_state_dict(torch.load(CHECKPOINT, map_location="cpu", weights_only=True))
-    shown = (images - images.mean((1, 2, 3), keepdims=True)) / images.std((1, 2, 3), keepdims=True)
+    shown = (images - images.mean((1, 2, 3), keepdims=True)) / np.sqrt(images.var((1, 2, 3), keepdims=True) + 1e-5)
     with torch.no_grad():
         return network(torch.tensor(shown.transpose(0, 3, 1, 2)))[:, 0].numpy()
 
