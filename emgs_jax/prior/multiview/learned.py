@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.pytree import stack
 from emgs_jax.ops.ranges import number
-from emgs_jax.prior.multiview.dense import DenseConfig, Matched, Stereo
 from emgs_jax.prior.multiview.lens import Lens, rectify
+from emgs_jax.prior.multiview.matched import Matched, MatchedConfig, Stereo
 from emgs_jax.prior.pretrained import effimvs, itermvs
 from emgs_jax.prior.pretrained.effimvs import EffiMVSConfig
 from emgs_jax.prior.pretrained.itermvs import IterMVSConfig
@@ -40,7 +40,7 @@ def jitted_estimate(
 
 
 @dataclass(frozen=True)
-class LearnedConfig(DenseConfig):
+class LearnedConfig(MatchedConfig):
     """Depth by a network.
 
     Args:

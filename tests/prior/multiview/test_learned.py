@@ -15,9 +15,9 @@ from stereo_scene import matrix
 
 from emgs_jax.ops.camera import Camera, pixel_grid, rays
 from emgs_jax.prior.multiview import learned as module
-from emgs_jax.prior.multiview.dense import Matched
 from emgs_jax.prior.multiview.learned import grid_of, learned
 from emgs_jax.prior.multiview.lens import Lens
+from emgs_jax.prior.multiview.matched import Matched
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "pretrained"))
 from random_weights import random_network

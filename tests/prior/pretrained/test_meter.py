@@ -11,7 +11,7 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
-from scene import device, on_host
+from scene import compose, device, on_host
 from views import BESIDE, random_views, real_views
 
 from emgs_jax.prior.pretrained.meter import SOURCE, build_network, predict
@@ -20,7 +20,6 @@ from emgs_jax.prior.pretrained.weights import load_network
 CHECKPOINT = Path(os.environ.get("METER_CHECKPOINT", BESIDE / "shared/weights/meter_nyu_xxs"))
 ORIGINAL = Path(os.environ.get("METER", BESIDE / "METER"))
 SIZE = (192, 256)
-SHA256 = "327cddf3bfc85f4a13b8d18d2f13d8e40cdeb022ea397995c409ef1569bcbb53"
 
 
 def original(images):
@@ -49,7 +48,13 @@ def test_depth_is_that_of_the_authors_code(views):
     if not CHECKPOINT.is_file():
         pytest.skip(f"the published weights are not at {CHECKPOINT}")
     images, _ = views(SIZE)
-    network = load_network(str(CHECKPOINT), SHA256, SOURCE, None, build_network)
+    network = load_network(
+        str(CHECKPOINT),
+        compose("prior=multiview_stereo", "prior/dense=meter").prior.dense.sha256,
+        SOURCE,
+        None,
+        build_network,
+    )
     depths = np.stack([on_host(predict)(network, device(image)) for image in images])
     known = original(images)
     np.testing.assert_allclose(depths, known, atol=1e-4 * np.median(known))
