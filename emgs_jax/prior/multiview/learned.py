@@ -15,6 +15,7 @@ from emgs_jax.ops.pytree import stack
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.lens import Lens, rectify
 from emgs_jax.prior.multiview.matched import Matched, MatchedConfig, Stereo
+from emgs_jax.prior.multiview.swept import SweptConfig
 from emgs_jax.prior.pretrained import effimvs, itermvs
 from emgs_jax.prior.pretrained.effimvs import EffiMVSConfig
 from emgs_jax.prior.pretrained.itermvs import IterMVSConfig
@@ -48,12 +49,14 @@ class LearnedConfig(MatchedConfig):
         magnification: of the images that it is shown, then rounded to what it can take.
         checkpoint: path of its weights.
         sha256: of that file, in hexadecimal digits.
+        beside: the sweep, whose depths are taken where they are surer, and averaged where both agree.
     """
 
     network: IterMVSConfig | EffiMVSConfig
     magnification: float = number(low=0.01, high=16)
     checkpoint: str | None
     sha256: str
+    beside: SweptConfig | None
 
 
 def module_of(config: IterMVSConfig | EffiMVSConfig) -> ModuleType:
