@@ -46,9 +46,9 @@ class PriorPrediction:
             one cell per patch of a network to one per pixel; 0 where there is none, f = 0 without features.
         pose_covariance: how sure the poses are: float64 (v, 6, 6), of ξ where the true T_anchor_view is
             T_anchor_view Exp(ξ), translation (unit of the prediction) before rotation (rad), in the axes of the view.
-            What all views err alike counts for nothing. NaN for a view of which nothing is known, None where the prior
-            does not say: then the map finds out. Poses that are known lie in one world: the scale of a frame's depths
-            does not move them.
+            What a view errs like those before it, of which the map is made, counts for nothing. NaN for a view of which
+            nothing is known, None where the prior does not say: then the map finds out. Poses that are known lie in one
+            world: the scale of a frame's depths does not move them.
         world: number of the frame of reference that the poses are in, of a prior that tells: 0 is that of the first
             frames with a pose, and it may come back. None: a new one begins where no view has a pose as before.
     """

@@ -5,6 +5,7 @@ inverse, T_world_camera Exp(xi), translation first: xi = (-b - t x 2 q, -2 q).
 """
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,11 +22,15 @@ def camera_in_world(image: Any) -> Float[np.ndarray, "4 4"]:
 
 
 def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict[int, Float[np.ndarray, "6 6"]]:
-    """Covariance of xi of each image's pose relative to the first's, for the unit that fits all of them best.
+    """Covariance of xi of each image's pose relative to the pose before it, for the unit that fits all of them best.
 
-    The first pose and one point are held. What a common factor of all lengths changes is no error of a pose: the factor
-    s = sum(w_r xi_r) that some of the frames agree on is taken out, xi_i - g_i s with g_i the change of xi_i by log s.
-    Residuals have the standard deviation that they show, or `pixel_std` if that is larger.
+    A map is made of the frames before, at their poses: what they err alike moves the whole map, and a pose that is
+    right beside theirs is right in it. So the covariance is that of the motion T_before_image, of which xi is
+    xi_i - Ad(T_i_before) xi_before. The first pose is held.
+
+    What a common factor of all lengths changes is no error of a pose: the factor s = sum(w_r xi_r) that some of the
+    frames agree on is taken out, xi_i - g_i s with g_i the change of xi_i by log s. Residuals have the standard
+    deviation that they show, or `pixel_std` if that is larger.
 
     Args:
         images: by frame, in order. Frames whose covariance cannot be found are left out.
@@ -48,18 +53,27 @@ def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict
 
     def between(a: int, b: int) -> np.ndarray:
         """Covariance (6, 6) of xi of two frames."""
+        if first in (a, b):
+            return np.zeros((6, 6))
         joint = found.get_cam_cross_cov_from_world(images[a].image_id, images[b].image_id)
         return to_xi[a] @ joint @ to_xi[b].T
 
-    with_unit = {frame: sum(between(frame, other) @ unit[other] for other in references) / total for frame in others}
+    with_unit = {frame: sum(between(frame, other) @ unit[other] for other in references) / total for frame in frames}
     variance = sum(unit[frame] @ with_unit[frame] for frame in references) / total
+
+    def free(a: int, b: int) -> np.ndarray:
+        """`between` without the common factor."""
+        mixed = np.outer(with_unit[a], unit[b]) + np.outer(unit[a], with_unit[b])
+        return between(a, b) - mixed + variance * np.outer(unit[a], unit[b])
+
     # The mean length of an error of standard deviation s along both axes is s sqrt(pi / 2).
     scale = max(2 / np.pi * model.compute_mean_reprojection_error() ** 2, pixel_std**2)
     spread = {first: np.zeros((6, 6))}
-    for frame in others:
-        mixed = np.outer(with_unit[frame], unit[frame])
-        free = between(frame, frame) - mixed - mixed.T + variance * np.outer(unit[frame], unit[frame])
-        spread[frame] = scale * 0.5 * (free + free.T)
+    for before, frame in pairwise(frames):
+        moved = _adjoint(np.linalg.inv(T[frame]) @ T[before])
+        mixed = moved @ free(before, frame)
+        motion = free(frame, frame) - mixed - mixed.T + moved @ free(before, before) @ moved.T
+        spread[frame] = scale * 0.5 * (motion + motion.T)
     return {frame: one for frame, one in spread.items() if np.isfinite(one).all()}
 
 
@@ -91,8 +105,17 @@ def _spread(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(1, count - 1, min(count - 1, most)).astype(int))
 
 
+def _adjoint(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
+    """Ad of a pose: T Exp(xi) = Exp(Ad xi) T, translation first."""
+    R, t = T[:3, :3], T[:3, 3]
+    return np.block([[R, _cross(t) @ R], [np.zeros((3, 3)), R]])
+
+
+def _cross(t: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """[t]x, with [t]x v the cross product of t and v."""
+    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+
+
 def _to_xi(T_camera_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
     """Derivative of xi by z."""
-    t = T_camera_world[:3, 3]
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    return np.block([[-2 * cross, -np.eye(3)], [-2 * np.eye(3), np.zeros((3, 3))]])
+    return np.block([[-2 * _cross(T_camera_world[:3, 3]), -np.eye(3)], [-2 * np.eye(3), np.zeros((3, 3))]])

@@ -25,13 +25,14 @@ from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
-from emgs_jax.prior.multiview.dense import DenseConfig, Scene, Way
+from emgs_jax.prior.multiview.dense import DenseConfig, Depths, Scene, Way
 from emgs_jax.prior.multiview.depth import mean_difference
 from emgs_jax.prior.multiview.depth_files import DepthFilesConfig, way_of_files
-from emgs_jax.prior.multiview.depth_noise import relative_std
+from emgs_jax.prior.multiview.depth_noise import relative_std, surest
 from emgs_jax.prior.multiview.learned import LearnedConfig, learned
 from emgs_jax.prior.multiview.lens import Lens, as_shown, lens_of, points_shown
 from emgs_jax.prior.multiview.matched import begin_matched
+from emgs_jax.prior.multiview.monocular_network import MeterConfig, way_of_meter
 from emgs_jax.prior.multiview.sources import placed_beside, relative
 from emgs_jax.prior.multiview.swept import SweptConfig, swept
 from emgs_jax.structure.config import StructureConfig
@@ -40,16 +41,30 @@ from emgs_jax.structure.sequence import structure_of
 
 jitted_difference = eqx.filter_jit(mean_difference)
 NUM_KEPT = 64  # frames whose depths are at hand
-AnyDense = SweptConfig | LearnedConfig | DepthFilesConfig
+AnyDense = SweptConfig | LearnedConfig | DepthFilesConfig | MeterConfig
 
 
 def way_of(config: AnyDense) -> Way:
     """The way to a view's depth that a config is for."""
     if isinstance(config, DepthFilesConfig):
         return way_of_files(config)
+    if isinstance(config, MeterConfig):
+        return way_of_meter(config)
     if isinstance(config, LearnedConfig):  # its digest says which checkpoint it is, wherever it lies
         return Way(partial(begin_matched, stereo=learned(config), config=config), paths=("checkpoint",))
     return Way(partial(begin_matched, stereo=swept(config), config=config))
+
+
+def in_order(config: AnyDense) -> tuple[AnyDense, ...]:
+    """A config, and that of the way whose depths are taken where they are surer."""
+    beside = config.beside if isinstance(config, LearnedConfig) else None
+    return (config,) if beside is None else (config, beside)
+
+
+def _described(config: AnyDense, way: Way) -> dict:
+    """Settings without paths, which its contents stand for, and without the way beside it."""
+    left_out = *way.paths, "beside"
+    return {key: value for key, value in _values(config).items() if key not in left_out} | dict(way.contents)
 
 
 def _values(config: StructureConfig | DenseConfig) -> dict:
@@ -67,10 +82,11 @@ class MultiviewStereo(Prior):
     """
 
     def __init__(self, structure: StructureConfig, dense: AnyDense) -> None:
-        self._config, self._dense_config, self._way = structure, dense, way_of(dense)
-        values = {key: value for key, value in _values(dense).items() if key not in self._way.paths}
-        settings = {"structure": _values(structure), "dense": values | dict(self._way.contents)}
-        self.provenance = Provenance("multiview_stereo", {"version": 11} | settings)
+        self._config, self._ways = structure, [(config, way_of(config)) for config in in_order(dense)]
+        settings = {"structure": _values(structure), "dense": _described(*self._ways[0])}
+        if len(self._ways) > 1:
+            settings["dense"]["beside"] = _described(*self._ways[1])
+        self.provenance = Provenance("multiview_stereo", {"version": 12} | settings)
         self._dataset: Dataset | None = None
         self._folder: Path | None = None
         self._found: Structure | None = None
@@ -90,7 +106,8 @@ class MultiviewStereo(Prior):
                 f"prior=multiview_stereo needs three images or more of one place, {dataset.name} {dataset.sequence} "
                 f"has {len(dataset)} in use: give more (dataset.stop, dataset.stride)"
             )
-        self._way.check(dataset)
+        for _, way in self._ways:
+            way.check(dataset)
         self._dataset = dataset
 
     def keep(self, folder: Path) -> None:
@@ -143,9 +160,12 @@ class MultiviewStereo(Prior):
             pinhole if is_straight else lens_of(world.camera, tuple(intrinsics), (width, height))
             for world in found.worlds
         ]
-        self._found, depths = self._way.begin(Scene(self._dataset, found, self._lenses, self._camera))
-        # What was made of a frame last is asked for again by its neighbours.
-        self._depth = lru_cache(NUM_KEPT)(depths)
+        self._depths = []
+        for _, way in self._ways:
+            found, depths = way.begin(Scene(self._dataset, found, self._lenses, self._camera))
+            # What was made of a frame last is asked for again by its neighbours.
+            self._depths.append(lru_cache(NUM_KEPT)(depths))
+        self._found = found
 
     def _world_at(self, frame: int) -> int:
         """World of a frame; of one that none holds that of the last before which one does, so that nothing changes."""
@@ -159,15 +179,22 @@ class MultiviewStereo(Prior):
             nothing = np.zeros((height, width), np.float32)
             return np.zeros((height, width, 3), np.float32), nothing + 1, nothing > 0
         lens = self._lenses[world]
-        depth, std = (as_shown(values, lens) for values in (self._depth(frame).depth, self._std(frame)))
-        mask = (depth > 0) & (std <= self._dense_config.noise.max_std)
+        ways = [(depths, config) for depths, (config, _) in zip(self._depths, self._ways, strict=True)]
+        estimates = [(depths(frame).depth, self._std(frame, depths, config)) for depths, config in ways]
+        # What exceeds the noise that its own way accepts is none.
+        accepted = [
+            (np.where(std <= config.noise.max_std, depth, 0.0), std)
+            for (depth, std), (_, config) in zip(estimates, ways, strict=True)
+        ]
+        depth, std = (as_shown(values, lens) for values in surest(*zip(*accepted, strict=True)))
+        mask = depth > 0
         confidence = np.maximum(1.0 / np.where(mask, std, 1.0), np.float32(1.0))
         return points_shown(np.where(mask, depth, 0.0), lens), confidence, mask
 
-    def _std(self, frame: int) -> np.ndarray:
+    def _std(self, frame: int, depths: Depths, config: DenseConfig) -> np.ndarray:
         """Standard deviation of the logarithm of each depth; inf where there is no telling."""
-        depth, spread, pixels = self._depth(frame)
-        count = self._dense_config.num_checks
+        depth, spread, pixels = depths(frame)
+        count = config.num_checks
         others = [int(other) for other in placed_beside(self._found, frame)[:count]]
         if not others:
             return np.full_like(depth, np.inf)
@@ -175,10 +202,10 @@ class MultiviewStereo(Prior):
         others = (others * count)[:count]
         difference = jitted_difference(
             jnp.asarray(depth),
-            jnp.asarray(np.stack([self._depth(other).depth for other in others])),
+            jnp.asarray(np.stack([depths(other).depth for other in others])),
             relative(self._found, others, frame),
             jnp.asarray(is_used),
             self._camera,
-            jnp.float32(self._dense_config.depth_step),
+            jnp.float32(config.depth_step),
         )
-        return relative_std(pixels, spread, np.asarray(difference), self._dense_config.noise)
+        return relative_std(pixels, spread, np.asarray(difference), config.noise)
