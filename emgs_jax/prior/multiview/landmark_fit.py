@@ -162,8 +162,8 @@ def _check_kind(samples: Sequence[_Sample], kind: str, config: LandmarkFitConfig
             "depths (affine, up_to_scale, metric)" if kind == "affine_inverse" else "inverse depths (affine_inverse)"
         )
         raise ValueError(
-            f"{said} fall where these values grow (rank correlation {found:.2f}): they are {other}, or the structure is "
-            "inside out, as one of images from nearly one place may be (give more of them)"
+            f"{said} fall where these values grow (rank correlation {found:.2f}): they are {other}, or the "
+            "structure is inside out, as one of images from nearly one place may be (give more of them)"
         )
     raise ValueError(
         f"{said} have nothing to do with these values (rank correlation {found:.2f}): are they of these frames, in "
