@@ -75,7 +75,7 @@ class Tum:
         unknown: Sequence[int] | None = None,
     ) -> None:
         self._folder = reading.find_sequence(root, sequence, LAYOUT, self.source)
-        times, names, _ = read_list(self._folder / "rgb.txt", 2)
+        times, names, lines = read_list(self._folder / "rgb.txt", 2)
         chosen = reading.select(len(times), start, stop, stride, f"{self._folder / 'rgb.txt'} (layout {LAYOUT})")
         self._times, self._images = times[chosen], [find_image(self._folder, names[i][0]) for i in chosen]
         self.sequence = str(sequence)
@@ -88,7 +88,8 @@ class Tum:
         self._raw_size = RAW_SIZE if intrinsics is None else reading.first_size(self._images, self._folder)
         self._tones = tones_of(self._images)
         self._lens = find_lens(given, pictures_of(self._images, self._raw_size, self._tones))
-        self.calibration = with_notes(self._lens.about, self._tones and self._tones.note)
+        shown = self._tones and self._tones.note, reading.transparency_note(self._images)
+        self.calibration = with_notes(self._lens.about, back_note(self._folder / "rgb.txt", times, lines), *shown)
         self.full_intrinsics = self._lens.intrinsics
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
         self._labels = None
@@ -191,6 +192,19 @@ def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[l
         numbers.append(number)
     order = np.argsort(times, kind="stable")
     return in_seconds(np.array(times, np.float64)[order]), [words[i] for i in order], [numbers[i] for i in order]
+
+
+def back_note(path: Path, times: Float[np.ndarray, " n"], lines: Sequence[int]) -> str | None:
+    """Words where times of a `read_list` go back from one line to the next, as where a clock was set."""
+    written = np.argsort(lines)
+    steps = np.diff(times[written])
+    if not len(steps) or steps.min() >= 0:
+        return None
+    line = np.asarray(lines)[written][steps.argmin() + 1]
+    return (
+        f"{path.name}, line {line}: time goes back by {-steps.min():.3f} s, and all lines are taken in order of time: "
+        "where a clock was set back, add what it lost to the times from there on"
+    )
 
 
 def _file_name(line: str, first_word: str, folder: Path) -> str:
