@@ -223,13 +223,14 @@ def decode(path: Path, flags: int) -> np.ndarray:
     return image
 
 
-def is_turned(path: Path) -> bool:
-    """Test whether an image is shown otherwise than it is stored, by its EXIF orientation; False where it has none."""
+def orientation(path: Path) -> int:
+    """The EXIF orientation of an image, 1 (as it is stored) to 8; 1 where it has none."""
     try:
         with Image.open(path) as image:
-            return image.getexif().get(ExifTags.Base.Orientation, 1) not in (0, 1)
+            found = image.getexif().get(ExifTags.Base.Orientation, 1)
     except (OSError, ValueError, SyntaxError):
-        return False
+        return 1
+    return found if found in range(2, 9) else 1
 
 
 def other_kind(data: bytes) -> str | None:

@@ -45,8 +45,8 @@ def find_tones(read: Callable[[int], np.ndarray], count: int) -> Tones | None:
         read: image 0..count-1 in its own bits; raises BadFrameError.
 
     Returns:
-        None for images of 8 bits, for 16 bits of which more than MIN_SPAN is used, and where no image can be read. Among
-        others those of 8 bits do not count: they stay as they are.
+        None for images of 8 bits, for 16 bits of which more than MIN_SPAN is used, and where no image can be read.
+        Among others those of 8 bits do not count: they stay as they are.
     """
     ends, dtype = [], None
     for row in dict.fromkeys(np.linspace(0, count - 1, min(count, MAX_LOOKED_AT)).astype(int).tolist()):

@@ -201,14 +201,14 @@ def test_transparency_of_any_image_is_told(kind, tmp_path):
     assert reading.transparency_note(paths).startswith("d.png is transparent")
 
 
-def test_an_image_that_is_shown_otherwise_than_stored_is_known(tmp_path):
+def test_the_orientation_of_an_image_is_that_of_its_exif(tmp_path):
     image = Image.fromarray(RAMP)
-    for orientation in (1, 3, 6):
+    for number in (1, 3, 6, 9):
         exif = image.getexif()
-        exif[0x0112] = orientation
+        exif[0x0112] = number
         image.save(tmp_path / "a.jpg", exif=exif)
-        assert reading.is_turned(tmp_path / "a.jpg") == (orientation > 1)
-    assert not reading.is_turned(tmp_path / "none.jpg")
+        assert reading.orientation(tmp_path / "a.jpg") == (number if number < 9 else 1)
+    assert reading.orientation(tmp_path / "none.jpg") == 1
 
 
 def test_a_pose_with_a_scale_is_named_as_such():
