@@ -1,7 +1,7 @@
-"""Run times of the stages, of a registration beside Open3D's, and how they scale: `python -m experiments.benchmark`.
+"""Run times of stages, of a registration beside Open3D's, of many settings: `python -m experiments.benchmark`.
 
 Compilation and run time apart, everything in turns on the same data; the tables are printed and written to benchmark.md
-and benchmark.json in Hydra's folder. The parts: stages, icp, sweep, growth.
+and benchmark.json in Hydra's folder. The parts: stages, icp, sweep.
 """
 
 import os
@@ -22,8 +22,7 @@ from emgs_jax.report.provenance import provenance
 
 from .benchmarks.data import load
 from .benchmarks.registration import time_icp
-from .benchmarks.scaling import time_growth, time_settings
-from .benchmarks.stages import time_stages
+from .benchmarks.stages import time_settings, time_stages
 from .benchmarks.timing import Timing, spread
 from .command import command
 
@@ -36,7 +35,6 @@ def parts(config: DictConfig) -> dict[str, Callable[[], Iterable[Timing]]]:
         "stages": lambda: time_stages(load(config), turns),
         "icp": lambda: time_icp(load(config), tuple(chosen.icp_offset), turns),
         "sweep": lambda: time_settings(load(config), chosen.num_settings, turns),
-        "growth": lambda: time_growth(config, chosen.image_sizes, chosen.map_sizes, turns),
     }
 
 

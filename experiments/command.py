@@ -33,6 +33,7 @@ OPTIONS_WITH_A_VALUE = {
     *("--cfg", "-c", "--package", "-p", "--info", "-i", "--config-path", "-cp", "--config-name", "-cn"),
     "--experimental-rerun",
 }
+CONFIG_DIR = "--config-dir", "-cd"
 RUN = "config"  # conf/config.yaml, whose help lists every choice, by Hydra
 # Libraries that log at INFO which accelerators and threads are not there. A level of the logger "jax" that is set
 # before JAX is imported becomes the level of jaxlib, too, which then logs an error for each executable from the cache.
@@ -176,7 +177,7 @@ def check_words(name: str, arguments: list[str]) -> list[str]:
     while rest:
         word, rest = rest[0], rest[1:]
         option, has_value, value = word.partition("=")
-        if option in ("--config-dir", "-cd"):
+        if option in CONFIG_DIR:
             value, rest = (value, rest) if has_value else (rest[0] if rest else "", rest[1:])
             if not Path(value).is_dir():
                 raise ValueError(f"{option} {value} is no folder: give one with options such as dataset/my.yaml")

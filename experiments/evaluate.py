@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.config.configure import compose, message_of
-from emgs_jax.config.overrides import quoted
+from emgs_jax.config.overrides import quoted, written
 from emgs_jax.config.values import check_values
 from emgs_jax.io.files import check_writable, write_file, write_json
 from emgs_jax.report.evaluation_page import Found, JobLine, write_evaluation_page
@@ -49,7 +49,9 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
     """All jobs, those of one data set one after the other; `settings` is a resolved conf/evaluate.yaml."""
     for dataset, data in settings["suite"]["data"].items():
         for variant, changes in settings["variants"].items():
-            own, changed = ([_override(*item) for item in some.items()] for some in (data["overrides"], changes))
+            own, changed = (
+                [f"{key}={written(value)}" for key, value in some.items()] for some in (data["overrides"], changes)
+            )
             _check_free([*settings["overrides"], *changed], dataset, data["key"])
             overrides = [f"dataset={dataset}", *own, *settings["overrides"], *changed]
             common = compose(*overrides)
@@ -74,12 +76,6 @@ def _check_free(overrides: Sequence[str], dataset: str, key: str) -> None:
     for text in overrides:
         if (name := text.lstrip("+~").partition("=")[0]) in taken:
             raise ValueError(f"{text} would have no effect, because every job has its own {name}: give {taken[name]}")
-
-
-def _override(key: str, value: Any) -> str:
-    """`key=value` as Hydra reads it; text with anything special in it is quoted."""
-    is_plain = not isinstance(value, str) or re.fullmatch(r"[A-Za-z0-9_./-]+", value)
-    return f"{key}={value}" if is_plain else f"{key}={quoted(value)}"
 
 
 def delegated(arguments: Sequence[str]) -> list[str]:

@@ -58,9 +58,6 @@ def _is_change(value: Any) -> bool:
 
 TEXT = Kind("text", _is_text)
 COUNTS = many("whole numbers from 1 on", lambda value: _is_whole(value, 1))
-SIZES = many(
-    "[width,height]", lambda value: _is_list(value) and len(value) == 2 and all(_is_whole(v, 1) for v in value)
-)
 OFFSET = Kind(
     "[m,rad]",
     lambda value: (
@@ -113,8 +110,6 @@ KEYS: dict[str, dict[str, Kind | Declared]] = {
         "parts": NAMES,
         "benchmark.repetitions": whole(1),
         "benchmark.num_settings": COUNTS,
-        "benchmark.map_sizes": COUNTS,
-        "benchmark.image_sizes": SIZES,
         "benchmark.icp_offset": OFFSET,
     },
 }

@@ -7,7 +7,6 @@ asks what one asks that nobody stopped.
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -29,48 +28,32 @@ DIRECTIONS = ("minimize", "maximize")
 _EXAMPLE = "'space={slam.em.max_log_gap:{low:2,high:32,log:true}}'"
 
 
-@dataclass(frozen=True)
-class Choice:
-    """One of some values."""
-
-    values: tuple[Value, ...]
-
-    @property
-    def ends(self) -> tuple[Value, ...]:
-        """Two values that tell whether all of them share a program."""
-        return self.values[:2]
-
-    def __contains__(self, value: Any) -> bool:
-        return any(type(value) is type(one) and value == one for one in self.values)
+Space = Mapping[str, Any]  # key -> a distribution of Optuna
 
 
-@dataclass(frozen=True)
-class Between:
-    """A number from `low` to `high`, both of them allowed; evenly in its logarithm with `log`."""
-
-    low: float
-    high: float
-    log: bool
-    is_whole: bool
-
-    @property
-    def ends(self) -> tuple[Value, ...]:
-        """Two values that tell whether all of them share a program."""
-        return self.low, self.high
-
-    def __contains__(self, value: Any) -> bool:
-        is_number = isinstance(value, int if self.is_whole else int | float) and not isinstance(value, bool)
-        return is_number and self.low <= value <= self.high
+def ends_of(allowed: Any) -> tuple[Value, ...]:
+    """Two values of a distribution that tell whether all of them share a program."""
+    return allowed.choices[:2] if _is_choice(allowed) else (allowed.low, allowed.high)
 
 
-Space = Mapping[str, Choice | Between]
+def allows(allowed: Any, value: Value) -> bool:
+    """Test whether a distribution may draw a value; true is not 1."""
+    if _is_choice(allowed):
+        return any(type(value) is type(one) and value == one for one in allowed.choices)
+    kinds = int if isinstance(allowed.low, int) else int | float
+    return isinstance(value, kinds) and not isinstance(value, bool) and allowed.low <= value <= allowed.high
+
+
+def _is_choice(allowed: Any) -> bool:
+    return hasattr(allowed, "choices")
 
 
 def read_space(config: DictConfig) -> Space:
     """The search space of a composed config.
 
     Raises:
-        ValueError: there is none, a key is no key of a stage, or an end or value is not what its field declares.
+        ValueError: there is none, a key is no key of a stage, or an end or value is not what its field declares; or
+            Optuna is not installed.
     """
     space, known = OmegaConf.to_container(config)["space"], stage_keys(config)
     if not space:
@@ -81,13 +64,14 @@ def read_space(config: DictConfig) -> Space:
     return {key: _read(key, given, field_of(config, key)) for key, given in space.items()}
 
 
-def _read(key: str, given: Any, field: Declared) -> Choice | Between:
+def _read(key: str, given: Any, field: Declared) -> Any:
+    distributions = _optuna().distributions
     if isinstance(given, list):
         if len(given) < 2 or not all(isinstance(value, Value) for value in given) or len(set(given)) < len(given):
             raise ValueError(f"space: {key} must have two or more different numbers or names, got {given!r}")
         for value in given:
             check_value(key, value, field)
-        return Choice(tuple(given))
+        return distributions.CategoricalDistribution(given)
     if not isinstance(given, dict) or not {"low", "high"} <= set(given) <= {"low", "high", "log"}:
         raise ValueError(f"space: {key} must be a range {{low: …, high: …, log: true}} or a list, got {given!r}")
     if field.choices or not field.kinds & {int, float}:
@@ -99,14 +83,17 @@ def _read(key: str, given: Any, field: Declared) -> Choice | Between:
             raise ValueError(f"space: {key} cannot be drawn up to {end}: give a finite end, or a list with .inf in it")
     if not low < high or (log and low <= 0) or not isinstance(log, bool):
         raise ValueError(f"space: {key} needs low < high, and low above 0 with log: true; got {given!r}")
-    is_whole = float not in field.kinds
-    return Between(low if is_whole else float(low), high if is_whole else float(high), log, is_whole)
+    if float not in field.kinds:
+        return distributions.IntDistribution(low, high, log)
+    return distributions.FloatDistribution(float(low), float(high), log)
 
 
 def own_setting(config: DictConfig, space: Space) -> dict[str, Any]:
     """The config's own values of what is searched, as a trial would have them."""
     found = {key: OmegaConf.select(config, key) for key in space}
-    numbers = {key for key, allowed in space.items() if isinstance(allowed, Between) and not allowed.is_whole}
+    numbers = {
+        key for key, allowed in space.items() if isinstance(ends_of(allowed)[0], float) and not _is_choice(allowed)
+    }
     return {key: float(value) if key in numbers and value is not None else value for key, value in found.items()}
 
 
@@ -174,25 +161,17 @@ def ask(
     """
     optuna = _optuna()
     running = optuna.trial.TrialState.RUNNING
-    distributions = {key: _distribution(optuna, allowed) for key, allowed in space.items()}
     while (number := len(study.trials)) < end:
-        if number == 0 and all(own[key] in space[key] for key in space):
+        if number == 0 and all(allows(allowed, own[key]) for key, allowed in space.items()):
             params = {key: own[key] for key in space}
         else:
-            params = _drawn(optuna, study, distributions, [seed, number], startup)
-        study.add_trial(optuna.trial.create_trial(state=running, params=params, distributions=distributions))
+            params = _drawn(optuna, study, space, [seed, number], startup)
+        study.add_trial(optuna.trial.create_trial(state=running, params=params, distributions=dict(space)))
     return list(study.get_trials(states=(running,)))
 
 
-def _distribution(optuna: ModuleType, allowed: Choice | Between) -> Any:
-    if isinstance(allowed, Choice):
-        return optuna.distributions.CategoricalDistribution(allowed.values)
-    kind = "IntDistribution" if allowed.is_whole else "FloatDistribution"
-    return getattr(optuna.distributions, kind)(allowed.low, allowed.high, log=allowed.log)
-
-
 def _drawn(
-    optuna: ModuleType, study: "optuna.Study", distributions: Mapping[str, Any], seeds: Sequence[int], startup: int
+    optuna: ModuleType, study: "optuna.Study", space: Space, seeds: Sequence[int], startup: int
 ) -> dict[str, Any]:
     """Values of a new trial; drawn in a copy, because asking the file would write them one by one."""
     seed = int(np.random.SeedSequence(seeds).generate_state(1)[0])
@@ -201,7 +180,7 @@ def _drawn(
         sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=startup, multivariate=True, constant_liar=True)
     copy = optuna.create_study(directions=study.directions, sampler=sampler)
     copy.add_trials(study.trials)
-    return copy.ask(dict(distributions)).params
+    return copy.ask(dict(space)).params
 
 
 def front(study: "optuna.Study", count: int) -> list["optuna.trial.FrozenTrial"]:

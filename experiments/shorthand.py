@@ -4,7 +4,10 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-VALUED = ("--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--config-path", "-cp", "--config-dir", "-cd")
+from emgs_jax.config.overrides import written
+
+from .command import CONFIG_DIR, OPTIONS_WITH_A_VALUE, overrides_of
+
 NUM_PIXELS, SIDE = 320 * 240, 16  # of a frame, and what its sides are multiples of
 
 
@@ -31,14 +34,14 @@ def with_source(arguments: list[str]) -> list[str]:
 
 def keys_of(arguments: Sequence[str]) -> dict[str, str]:
     """Key and value of each override."""
-    return dict(word.lstrip("+~").split("=", 1) for word in arguments if "=" in word and not word.startswith("-"))
+    return dict(word.lstrip("+~").split("=", 1) for word in overrides_of(list(arguments)))
 
 
 def implied(path: Path, given: dict[str, str]) -> list[str]:
     """The overrides that a video or folder of images stands for, without those whose key is given."""
     if given.get("dataset", "images") != "images":
-        return [f"dataset.root={_quoted(path)}"]
-    found = {"dataset": "images", "dataset.root": _quoted(path), "dataset.intrinsics": "estimate"}
+        return [f"dataset.root={written(str(path))}"]
+    found = {"dataset": "images", "dataset.root": written(str(path)), "dataset.intrinsics": "estimate"}
     size = _size(path)
     found["dataset.size"] = "[{},{}]".format(*frame_size(*size))
     if given.get("prior") == "files" and "prior.folder" in given and "dataset.intrinsics" not in given:
@@ -74,10 +77,4 @@ def _size(path: Path) -> tuple[int, int]:
 def _is_path(word: str, before: Sequence[str]) -> bool:
     """Test whether a word is neither an override (~key deletes one) nor an option or the value of one."""
     is_other = "=" in word or word.startswith("-") or (word.startswith("~") and not word.startswith("~/"))
-    return not is_other and (not before or before[-1] not in VALUED)
-
-
-def _quoted(path: Path) -> str:
-    """A path as Hydra's grammar reads it."""
-    text = str(path)
-    return text if all(c.isalnum() or c in "/._-" for c in text) else "'" + text.replace("'", r"\'") + "'"
+    return not is_other and (not before or before[-1] not in {*OPTIONS_WITH_A_VALUE, *CONFIG_DIR})

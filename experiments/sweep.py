@@ -13,10 +13,11 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from emgs_jax.device.clock import Clock
-from emgs_jax.io.files import owned
+from emgs_jax.io.files import owned, write_file
+from emgs_jax.report.columns import csv_text
 from emgs_jax.report.heat_map import draw
 from emgs_jax.report.sweep_page import write_sweep_page
-from emgs_jax.report.sweeps import table, write_csv
+from emgs_jax.report.sweeps import table
 
 from .command import command
 from .grid import notes, read_axes, variants
@@ -41,7 +42,7 @@ def sweep(config: DictConfig, folder: Path, command_line: str = "") -> list[dict
         num_left = sequence.measure(grid)
         sequence.forget_predictions()
     rows = sequence.rows([variant.setting for variant in grid])
-    write_csv(folder / "sweep.csv", rows)
+    write_file(folder / "sweep.csv", csv_text(rows))
     if config.grid == "product":  # else most cells of a picture would be empty
         title = f"{sequence.dataset.name} {sequence.dataset.sequence}, {sequence.prior.provenance.name}"
         no_picture = draw(folder / "heat_map.png", rows, axes, title)

@@ -17,17 +17,17 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.config.configure import build_dataset, compose, near
+from emgs_jax.config.overrides import written
 from emgs_jax.device.clock import Clock
 from emgs_jax.io.files import owned, remove_temporaries, write_file
 from emgs_jax.mapping.batch import programs
-from emgs_jax.report.repeat import written
-from emgs_jax.report.sweeps import write_csv
+from emgs_jax.report.columns import csv_text
 from emgs_jax.report.tuning import DEFAULT, SequenceResults, draw_trials, settings_yaml, table, verdict
 
 from .command import command
 from .grid import variant_of
 from .keys import check_keys
-from .search import Space, ask, front, open_study, own_setting, read_objectives, read_space, told
+from .search import Space, ask, ends_of, front, open_study, own_setting, read_objectives, read_space, told
 from .together import Measured, refuse_other_maps
 
 Setting = Mapping[str, Any]
@@ -53,9 +53,10 @@ def tune(words: Sequence[str], folder: Path) -> list[dict[str, Any]]:
     _check_apart(configs["tuned"], configs["held_out"])
     own = own_setting(config, space)
     for key, allowed in space.items():
-        if len(programs([variant_of(config, {key: value}).slam for value in allowed.ends])) > 1:
+        if len(programs([variant_of(config, {key: value}).slam for value in ends_of(allowed)])) > 1:
             print(f"{key} shares no program: what has another value of it is compiled or mapped by itself")
-    about = {"space": space, "objectives": objectives, "tuned": list(configs["tuned"]), "seed": config.search_seed}
+    searched = {key: vars(allowed) for key, allowed in space.items()}
+    about = {"space": searched, "objectives": objectives, "tuned": list(configs["tuned"]), "seed": config.search_seed}
     with owned(folder), Clock().watching() as clock:
         remove_temporaries(folder)
         study = open_study(folder / "study.jsonl", about, objectives)
@@ -189,7 +190,8 @@ def _write(
     ]
     lines = verdict(results, objectives)
     text = "\n".join([table(results, objectives), *(f"- {line}" for line in lines.values()), ""])
-    write_csv(folder / "trials.csv", [{**row, "is_best": row["trial"] in best} for row in rows])
+    trials = [{**row, "is_best": row["trial"] in best} for row in rows]
+    write_file(folder / "trials.csv", csv_text(trials))
     write_file(folder / "tune.md", text)
     _write_best(folder, best, lines)
     numbers = {row["trial"]: DEFAULT for row in rows if all(row[key] == own[key] for key in own)}

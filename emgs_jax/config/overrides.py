@@ -1,8 +1,10 @@
 """Words of the command line for Hydra's grammar: what it cannot read as anything else is text, as it stands."""
 
+import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -12,6 +14,8 @@ KEY = re.compile(r"(?:\+{1,2}|~)?[A-Za-z_][\w./@:-]*=")
 NAMES = ("root", "sequence", "folder", "map", "out")  # keys whose values are names, though they may look like numbers
 HOME = re.compile(r"(^|[,\[] ?)~(?=/)")  # shells leave it, zsh always, others in quotes
 OPENS = {"[": "]", "{": "}"}
+PLAIN = re.compile(r"[A-Za-z_][\w./-]*|/[\w./-]*")  # text that needs no quotes, but for these words
+WORDS = {"null", "none", "true", "false", "nan", "inf", "on", "off", "yes", "no"}
 
 
 def readable(arguments: Sequence[str]) -> list[str]:
@@ -79,6 +83,17 @@ def _quoted_items(value: str) -> str:
     """A list whose items are quoted where Hydra does not read them."""
     items = (item.strip() for item in value[1:-1].split(","))
     return f"[{','.join(item if parsed(f'x=[{item}]') is not None else quoted(item) for item in items)}]"
+
+
+def written(value: Any) -> str:
+    """Write a value as Hydra's grammar reads it back."""
+    if isinstance(value, list | tuple):
+        return f"[{','.join(written(item) for item in value)}]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{written(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, str):
+        return value if PLAIN.fullmatch(value) and value.lower() not in WORDS else quoted(value)
+    return json.dumps(value) if value is None or isinstance(value, bool) else str(value)
 
 
 def quoted(value: str) -> str:

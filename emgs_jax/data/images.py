@@ -2,15 +2,22 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
 from emgs_jax.data import reading
+<<<<<<< HEAD
 from emgs_jax.data.base import Frame
 from emgs_jax.data.file_names import IMAGE_SUFFIXES, check_one_kind, natural_order, taken_note, times_of, unread_note
 from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens, with_notes
+=======
+from emgs_jax.data.file_names import IMAGE_SUFFIXES, check_one_kind, natural_key, times_of, unread_note
+from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens
+>>>>>>> main
 from emgs_jax.data.reading import Size
+from emgs_jax.data.straightened import Straightened
 from emgs_jax.data.tones import Tones, read_shown, tones_of
 from emgs_jax.data.video import VIDEO_SUFFIXES, Video
 
@@ -19,7 +26,7 @@ LAYOUT = (
 )
 
 
-class Images:
+class Images(Straightened):
     """Your own images.
 
     Args:
@@ -33,8 +40,6 @@ class Images:
     """
 
     name = "images"
-    classes: tuple[str, ...] = ()
-    has_ground_truth = False
 
     def __init__(
         self,
@@ -56,49 +61,35 @@ class Images:
         self._source = Video(path, reading.limit(start, stop)) if is_video else Folder(path)
         self._chosen = reading.select(self._source.count, start, stop, stride, f"{path} ({LAYOUT})")
         raw_size = self._source.find_size(self._chosen)
-        self._raw_size = raw_size
+        self._folder, self._tones = self._source.folder, self._source.tones
         self.sequence = path.name if sequence is None else str(sequence)
-        self.size = reading.check_size(size)
-        self._lens = find_lens(intrinsics, self._pictures())
-        self.calibration = with_notes(self._lens.about, *self._source.notes)
-        self.full_intrinsics = self._lens.intrinsics
-        self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, raw_size, self.size)
+        lens = find_lens(intrinsics, self._pictures(raw_size))
+        self._use(lens, raw_size, size, *self._source.notes)
 
-    def _pictures(self) -> Pictures:
+    def _pictures(self, size: Size) -> Pictures:
         files = [] if isinstance(self._source, Video) else [self._source.file(row) for row in self._chosen]
         name = f"images of {self._source.label(self._chosen[0])}" if len(self) else "images"
-        return Pictures(self._raw_size, len(self), lambda index: self._source.read(self._chosen[index]), files, name)
+        return Pictures(size, len(self), lambda index: self._source.read(self._chosen[index]), files, name)
 
     def __len__(self) -> int:
         return len(self._chosen)
 
-    def __getitem__(self, index: int) -> Frame:
-        reading.check_index(index, len(self))
-        row, image = self._chosen[index], reading.resize_color(self.full(index), self.size)
-        return Frame(index, self._source.timestamp(row), self._source.label(row), image)
+    def _place(self, index: int) -> tuple[float, str]:
+        row = self._chosen[index]
+        return self._source.timestamp(row), self._source.label(row)
 
-    def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
         row = self._chosen[index]
         image = self._source.read(row)
         reading.check_raw_size(image, self._raw_size, self._source.label(row))
-        return self._lens.straighten(image)
-
-    def pose(self, index: int) -> None:
-        return None
+        return image
 
     def files(self, index: int) -> list[Path]:
         return [self._source.file(self._chosen[index])]
 
-    def fingerprint(self) -> str:
-        options = {
-            "dataset": self.name,
-            "size": self.size,
-            "intrinsics": self.intrinsics,
-            **({} if self._lens.maps is None else {"lens": self.calibration["distortion"]}),
-            **({} if self._source.tones is None else {"tones": self._source.tones}),
-            "frames": (self._chosen.start, self._chosen.stop, self._chosen.step),
-        }
-        return reading.fingerprint(self._source.folder, reading.all_files(self), options)
+    def _options(self) -> dict[str, Any]:
+        lens = {} if self._lens.maps is None else {"lens": self.calibration["distortion"]}
+        return lens | {"frames": (self._chosen.start, self._chosen.stop, self._chosen.step)}
 
 
 class Folder:
@@ -123,7 +114,7 @@ class Folder:
 
     def find_size(self, rows: range) -> Size:
         self.tones = tones_of([self._paths[row] for row in rows])
-        self.notes += [self.tones and self.tones.note, reading.transparency_note(self._paths[row] for row in rows)]
+        self.notes.append(reading.transparency_note(self._paths[row] for row in rows))
         return reading.first_size((self._paths[row] for row in rows), self.folder)
 
     def read(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:

@@ -9,16 +9,22 @@ Pixels are those that are stored: these programs do not turn images by their EXI
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from emgs_jax.data import reading
-from emgs_jax.data.base import Frame
 from emgs_jax.data.calibration_files import Calibration, read_calibration
 from emgs_jax.data.colmap_model import BINARY, TEXT, SparseModel, load_colmap
+<<<<<<< HEAD
 from emgs_jax.data.file_names import IMAGE_SUFFIXES, find_image, natural_order, times_of
 from emgs_jax.data.intrinsics import to_lens, with_notes
+=======
+from emgs_jax.data.file_names import IMAGE_SUFFIXES, find_image, natural_key, times_of
+from emgs_jax.data.intrinsics import to_lens
+from emgs_jax.data.straightened import Straightened
+>>>>>>> main
 from emgs_jax.data.tones import read_shown, tones_of
 from emgs_jax.data.transforms_json import load_transforms
 
@@ -48,12 +54,8 @@ class Solved:
     note: str | None = None
 
 
-class PosedImages:
+class PosedImages(Straightened):
     """Base of the data sets in this file (a `Dataset`); images in the natural order of their folders and names."""
-
-    name = ""
-    classes: tuple[str, ...] = ()
-    has_ground_truth = False  # no depth
 
     def __init__(
         self, folder: Path, solved: Solved, chosen: tuple[int, int | None, int], size: Sequence[int], sequence: str
@@ -71,27 +73,20 @@ class PosedImages:
                 f"{solved.source} names {self._images[0].name} and {len(rows) - 1} others, and none of them is in "
                 f"{self._images[0].parent}: put the images there"
             )
-        self._raw_size = reading.first_size(self._images, self._images[0].parent, reading.AS_STORED)
-        about = {"source": solved.source.name}
-        self._lens = to_lens(solved.camera, self._raw_size, str(solved.source), about)
+        raw_size = reading.first_size(self._images, self._images[0].parent, reading.AS_STORED)
+        lens = to_lens(solved.camera, raw_size, str(solved.source), {"source": solved.source.name})
         self._tones = tones_of(self._images)
-        shown = self._tones and self._tones.note, reading.transparency_note(self._images)
-        self.calibration = with_notes(self._lens.about, solved.note, note, *shown)
+        self._use(lens, raw_size, size, solved.note, note, reading.transparency_note(self._images))
         self.sequence = sequence
-        self.size = reading.check_size(size)
-        self.full_intrinsics = self._lens.intrinsics
-        self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
 
     def __len__(self) -> int:
         return len(self._images)
 
-    def __getitem__(self, index: int) -> Frame:
-        reading.check_index(index, len(self))
-        image = reading.resize_color(self.full(index), self.size)
-        return Frame(index, self._times[index], str(self._images[index]), image, None, self.pose(index))
+    def _place(self, index: int) -> tuple[float, str]:
+        return self._times[index], str(self._images[index])
 
-    def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        return self._lens.straighten(read_shown(self._images[index], self._raw_size, self._tones, reading.AS_STORED))
+    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        return read_shown(self._images[index], self._raw_size, self._tones, reading.AS_STORED)
 
     def pose(self, index: int) -> Pose | None:
         return self._poses[index]
@@ -99,11 +94,8 @@ class PosedImages:
     def files(self, index: int) -> list[Path]:
         return [self._images[index], *self._files]
 
-    def fingerprint(self) -> str:
-        options = {"dataset": self.name, "size": self.size, "intrinsics": self.intrinsics}
-        options |= {"lens": self.calibration["distortion"], "images": [path.name for path in self._images]}
-        options |= {} if self._tones is None else {"tones": self._tones}
-        return reading.fingerprint(self._folder, reading.all_files(self), options)
+    def _options(self) -> dict[str, Any]:
+        return {"lens": self.calibration["distortion"], "images": [path.name for path in self._images]}
 
 
 def in_order(solved: Solved) -> tuple[list[int], list[float], str | None]:

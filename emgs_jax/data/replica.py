@@ -4,22 +4,24 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from emgs_jax.data import reading
-from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.calibration_files import Calibration
 from emgs_jax.data.file_names import natural_key
 from emgs_jax.data.intrinsics import Given, find_lens, pictures_of, to_lens
 from emgs_jax.data.reading import Intrinsics, Number, Size
+from emgs_jax.data.straightened import Straightened
 
 LAYOUT = "root/{cam_params.json, SCENE/{traj.txt, results/{frame000000.jpg, depth000000.png}}}"
 SOURCE = "Replica as rendered for iMAP and NICE-SLAM, see the NICE-SLAM project page"
 
 
-class Replica:
+class Replica(Straightened):
     """One rendered sequence of Replica.
 
     Args:
@@ -31,7 +33,6 @@ class Replica:
     """
 
     name = "replica"
-    classes: tuple[str, ...] = ()
     has_ground_truth = True
 
     def __init__(
@@ -51,31 +52,27 @@ class Replica:
         self._images = [images[i] for i in chosen]
         self._poses = read_rows(self._folder / "traj.txt", self._images)
         path = Path(str(root)).expanduser() / "cam_params.json"
-        self._raw_size, calibration, scale = read_calibration(path)
+        raw_size, calibration, scale = read_calibration(path)
         if intrinsics is None:
-            camera = Calibration(calibration, (), self._raw_size)
-            self._lens = to_lens(camera, self._raw_size, str(path), {"source": path.name})
+            lens = to_lens(Calibration(calibration, (), raw_size), raw_size, str(path), {"source": path.name})
         else:
-            self._lens = find_lens(intrinsics, pictures_of(self._images, self._raw_size))
-        self.calibration = self._lens.about
+            lens = find_lens(intrinsics, pictures_of(self._images, raw_size))
+        self._use(lens, raw_size, size)
         self.sequence = str(sequence)
-        self.size = reading.check_size(size)
-        self.full_intrinsics = self._lens.intrinsics
-        self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
         self._depth_scale = reading.check_depth_scale(scale if depth_scale is None else depth_scale)
 
     def __len__(self) -> int:
         return len(self._images)
 
-    def __getitem__(self, index: int) -> Frame:
-        reading.check_index(index, len(self))
-        path, image = self._images[index], reading.resize_color(self.full(index), self.size)
-        depth = reading.read_depth(depth_path(path), self._depth_scale, self._raw_size)
-        depth = reading.resize_nearest(self._lens.straighten_depth(depth), self.size)
-        return Frame(index, float(number_of(path)), str(path), image, depth, self.pose(index))
+    def _place(self, index: int) -> tuple[float, str]:
+        return float(number_of(self._images[index])), str(self._images[index])
 
-    def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        return self._lens.straighten(reading.read_color(self._images[index], self._raw_size))
+    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        return reading.read_color(self._images[index], self._raw_size)
+
+    def _depth(self, index: int) -> Float32[np.ndarray, "h w"]:
+        depth = reading.read_depth(depth_path(self._images[index]), self._depth_scale, self._raw_size)
+        return reading.resize_nearest(self._lens.straighten_depth(depth), self.size)
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
         number = number_of(self._images[index])
@@ -85,14 +82,8 @@ class Replica:
         image = self._images[index]
         return [image, depth_path(image), self._folder / "traj.txt"]
 
-    def fingerprint(self) -> str:
-        options = {
-            "dataset": self.name,
-            "size": self.size,
-            "intrinsics": self.intrinsics,
-            "depth_scale": self._depth_scale,
-        }
-        return reading.fingerprint(self._folder, reading.all_files(self), options)
+    def _options(self) -> dict[str, Any]:
+        return {"depth_scale": self._depth_scale}
 
 
 def find_images(folder: Path) -> list[Path]:

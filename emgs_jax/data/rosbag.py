@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from emgs_jax.data import reading
-from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.camera_models import Calibration, named_lens
-from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens, to_lens, with_notes
+from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens, to_lens
+from emgs_jax.data.straightened import Straightened
 from emgs_jax.data.tones import ALL_16_BITS, find_tones
 
 LAYOUT = "root[/sequence] = a .bag of ROS 1, or the folder of a ROS 2 bag with metadata.yaml"
@@ -27,7 +28,7 @@ DEPTHS = re.compile(r"(16|32|64)[USF]C[1-4]$")  # also where they are compressed
 RECTIFIED = re.compile(r"(^|[/_])rect([/_]|$)")  # a topic, as image_proc and others name it
 
 
-class RosBag:
+class RosBag(Straightened):
     """The images of one topic.
 
     Args:
@@ -39,8 +40,6 @@ class RosBag:
     """
 
     name = "rosbag"
-    classes: tuple[str, ...] = ()
-    has_ground_truth = False
 
     def __init__(
         self,
@@ -67,55 +66,44 @@ class RosBag:
         self._places = [places[order[place]] for place in chosen]
         self._taken = [taken[order[place]] for place in chosen]
         self._tones = find_tones(self._picture, len(self))
-        self._raw_size = self._first_size()
+        raw_size = self._first_size()
         if info is None:
-            pictures = Pictures(self._raw_size, len(self), self._read)
-            self._lens = find_lens(intrinsics, pictures)
+            lens = find_lens(intrinsics, Pictures(raw_size, len(self), self._shown))
         else:
-            self._lens = to_lens(info, self._raw_size, f"CameraInfo of {self._path}", {"source": "CameraInfo"})
-        self.calibration = with_notes(self._lens.about, note, self._tones and self._tones.note)
+            lens = to_lens(info, raw_size, f"CameraInfo of {self._path}", {"source": "CameraInfo"})
+        self._use(lens, raw_size, size, note)
+        self._folder = self._path.parent
         self.sequence = self._path.resolve().name if sequence is None else str(sequence)
-        self.size = reading.check_size(size)
-        self.full_intrinsics = self._lens.intrinsics
-        self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
 
     def __len__(self) -> int:
         return len(self._places)
 
-    def __getitem__(self, index: int) -> Frame:
-        reading.check_index(index, len(self))
-        image = reading.resize_color(self.full(index), self.size)
-        return Frame(index, self._taken[index] / 1e9, self._label(index), image)
+    def _place(self, index: int) -> tuple[float, str]:
+        return self._taken[index] / 1e9, f"{self._path}, {self._topic}, image at {self._taken[index]} ns"
 
-    def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        image = self._read(index)
-        reading.check_raw_size(image, self._raw_size, self._label(index))
-        return self._lens.straighten(image)
-
-    def pose(self, index: int) -> None:
-        return None
+    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        image = self._shown(index)
+        reading.check_raw_size(image, self._raw_size, self._place(index)[1])
+        return image
 
     def files(self, index: int) -> list[Path]:
         return sorted(path for path in self._path.iterdir() if path.is_file()) if self._path.is_dir() else [self._path]
 
-    def fingerprint(self) -> str:
-        options = {"dataset": self.name, "size": self.size, "intrinsics": self.intrinsics, "topic": self._topic}
-        options |= {"lens": self.calibration["distortion"], "frames": self._places}
-        options |= {} if self._tones is None else {"tones": self._tones}
-        return reading.fingerprint(self._path.parent, self.files(0), options)
+    def _options(self) -> dict[str, Any]:
+        return {"topic": self._topic, "lens": self.calibration["distortion"], "frames": self._places}
 
-    def _label(self, index: int) -> str:
-        return f"{self._path}, {self._topic}, image at {self._taken[index]} ns"
+    def _fingerprinted(self) -> list[Path]:
+        return self.files(0)  # the same for all
 
     def _first_size(self) -> reading.Size:
         for index in range(len(self)):
             try:
-                return self._read(index).shape[1::-1]
+                return self._shown(index).shape[1::-1]
             except BadFrameError as error:
                 last = error
         raise ValueError(f"none of the images of {self._topic} can be read: {last}")
 
-    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+    def _shown(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
         return (self._tones or ALL_16_BITS).shown(self._picture(index))
 
     def _picture(self, index: int) -> np.ndarray:
@@ -126,8 +114,8 @@ class RosBag:
             for number, (connection, _, raw) in enumerate(found):
                 if number == ordinal:
                     message = bag.deserialize(raw, connection.msgtype)
-                    return to_rgb(message, connection.msgtype == COMPRESSED, self._label(index))
-        raise BadFrameError(f"{self._label(index)} is not there any more: record the bag again")
+                    return to_rgb(message, connection.msgtype == COMPRESSED, self._place(index)[1])
+        raise BadFrameError(f"{self._place(index)[1]} is not there any more: record the bag again")
 
 
 def _times(bag: Any, topic: str) -> tuple[list[int], list[int]]:

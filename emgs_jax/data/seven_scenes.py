@@ -1,8 +1,9 @@
 """7-Scenes: hand-held Kinect, SCENE/seq-XX/frame-%06d.{color.png|jpg, depth.png, pose.txt}."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -10,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
 from emgs_jax.data.backprojection import backproject
-from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.intrinsics import Given, find_lens, pictures_of
 from emgs_jax.data.reading import Intrinsics, Number, Size
+from emgs_jax.data.straightened import Straightened
 
 LAYOUT = "root/SCENE/seq-XX/frame-000000.{color.png or color.jpg, depth.png, pose.txt}"
 SOURCE = "7-Scenes, project page of Microsoft Research; unpack the inner seq-XX.zip as well"
@@ -32,7 +34,7 @@ FOOTPRINT_MARGIN = 1.2  # slanted surfaces spread: a little overlap leaves no ho
 NEAR = 0.05  # metres; nothing the sensor measures is nearer
 
 
-class SevenScenes:
+class SevenScenes(Straightened):
     """One sequence of 7-Scenes.
 
     Args:
@@ -45,7 +47,6 @@ class SevenScenes:
     """
 
     name = "seven_scenes"
-    classes: tuple[str, ...] = ()
     has_ground_truth = True
 
     def __init__(
@@ -66,12 +67,11 @@ class SevenScenes:
         chosen = reading.select(len(images), start, stop, stride, f"{self._folder} (layout {LAYOUT})")
         self._images = [images[i] for i in chosen]
         self.sequence = str(sequence)
-        self.size = reading.check_size(size)
         self._depth_scale = reading.check_depth_scale(depth_scale)
         self._register = bool(register_depth)
         default = COLOR_INTRINSICS if register_depth else DEPTH_INTRINSICS
         given = default if intrinsics is None else intrinsics
-        self._lens = find_lens(given, pictures_of(self._images, RAW_SIZE))
+        self._use(find_lens(given, pictures_of(self._images, RAW_SIZE)), RAW_SIZE, size)
         if self._lens.maps is not None and not self._register:
             raise ValueError(
                 "dataset.intrinsics with distortion is the colour camera's, but with dataset.register_depth=false the "
@@ -79,26 +79,22 @@ class SevenScenes:
             )
         self._poses_file = None if poses is None else Path(poses).expanduser()
         self._poses = None if self._poses_file is None else read_poses(self._poses_file, self._folder.name)
-        self.calibration = self._lens.about
-        self.full_intrinsics = self._lens.intrinsics
-        self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, RAW_SIZE, self.size)
 
     def __len__(self) -> int:
         return len(self._images)
 
-    def __getitem__(self, index: int) -> Frame:
-        reading.check_index(index, len(self))
-        path = self._images[index]
-        image = reading.resize_color(self.full(index), self.size)
-        depth = reading.read_depth(sibling(path, "depth.png"), self._depth_scale, RAW_SIZE)
-        if self._register:
-            depth = register(depth, self.intrinsics, self.size)
-        else:
-            depth = reading.resize_nearest(depth, self.size)
-        return Frame(index, frame_number(path), str(path), image, depth, self.pose(index))
+    def _place(self, index: int) -> tuple[float, str]:
+        return frame_number(self._images[index]), str(self._images[index])
 
-    def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        return self._lens.straighten(reading.read_color(self._images[index], RAW_SIZE))
+    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        return reading.read_color(self._images[index], RAW_SIZE)
+
+    def _depth(self, index: int) -> Float32[np.ndarray, "h w"]:
+        depth = reading.read_depth(sibling(self._images[index], "depth.png"), self._depth_scale, RAW_SIZE)
+        is_registered = self._register
+        return (
+            register(depth, self.intrinsics, self.size) if is_registered else reading.resize_nearest(depth, self.size)
+        )
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
         if self._poses is not None:
@@ -113,16 +109,11 @@ class SevenScenes:
         image = self._images[index]
         return [image, sibling(image, "depth.png"), sibling(image, "pose.txt")]
 
-    def fingerprint(self) -> str:
-        options = {
-            "dataset": self.name,
-            "size": self.size,
-            "intrinsics": self.intrinsics,
-            "depth_scale": self._depth_scale,
-            "register_depth": self._register,
-        }
-        files = [*reading.all_files(self), *filter(None, [self._poses_file])]
-        return reading.fingerprint(self._folder, files, options)
+    def _options(self) -> dict[str, Any]:
+        return {"depth_scale": self._depth_scale, "register_depth": self._register}
+
+    def _fingerprinted(self) -> Iterable[Path]:
+        return [*super()._fingerprinted(), *filter(None, [self._poses_file])]
 
 
 def read_poses(path: Path, sequence: str) -> dict[float, Float[np.ndarray, "4 4"]]:

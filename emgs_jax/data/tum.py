@@ -4,17 +4,19 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int32, UInt8
+from jaxtyping import Float, Float32, Int32, UInt8
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
-from emgs_jax.data.base import BadFrameError, Frame
+from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.file_names import find_image, is_file
-from emgs_jax.data.intrinsics import ALTERNATIVES, Given, find_lens, pictures_of, with_notes
+from emgs_jax.data.intrinsics import ALTERNATIVES, Given, find_lens, pictures_of
 from emgs_jax.data.labels import LabelFolder, as_unknown
 from emgs_jax.data.reading import Intrinsics, Number
+from emgs_jax.data.straightened import Straightened
 from emgs_jax.data.timestamps import check_tolerance, in_seconds, matched_rows
 from emgs_jax.data.tones import read_shown, tones_of
 
@@ -36,7 +38,7 @@ CALIBRATIONS: Calibrations = {
 }
 
 
-class Tum:
+class Tum(Straightened):
     """One sequence in the TUM layout; without depth.txt or groundtruth.txt there is no ground truth.
 
     A colour image without depth near in time stays in use with depth 0 everywhere; one without a pose, or with one of
@@ -79,19 +81,22 @@ class Tum:
         chosen = reading.select(len(times), start, stop, stride, f"{self._folder / 'rgb.txt'} (layout {LAYOUT})")
         self._times, self._images = times[chosen], [find_image(self._folder, names[i][0]) for i in chosen]
         self.sequence = str(sequence)
-        self.size = reading.check_size(size)
         self._depth_scale = reading.check_depth_scale(depth_scale)
         self._pose_lines: list[int] = []
         self._depths, self._poses = self._associate(check_tolerance(max_time_difference))
         self.has_ground_truth = self._depths is not None and self._poses is not None
         given = find_calibration(self.sequence, intrinsics, distortion, self.calibrations)
-        self._raw_size = RAW_SIZE if intrinsics is None else reading.first_size(self._images, self._folder)
+        raw_size = RAW_SIZE if intrinsics is None else reading.first_size(self._images, self._folder)
         self._tones = tones_of(self._images)
+<<<<<<< HEAD
         self._lens = find_lens(given, pictures_of(self._images, self._raw_size, self._tones))
         shown = self._tones and self._tones.note, reading.transparency_note(self._images)
         self.calibration = with_notes(self._lens.about, back_note(self._folder / "rgb.txt", times, lines), *shown)
         self.full_intrinsics = self._lens.intrinsics
         self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
+=======
+        self._use(find_lens(given, pictures_of(self._images, raw_size, self._tones)), raw_size, size)
+>>>>>>> main
         self._labels = None
         if labels is not None:
             ids = as_unknown(unknown, "dataset.unknown")
@@ -116,26 +121,24 @@ class Tum:
     def __len__(self) -> int:
         return len(self._images)
 
-    def __getitem__(self, index: int) -> Frame:
-        reading.check_index(index, len(self))
-        path, (w, h) = self._images[index], self.size
-        image, depth = reading.resize_color(self.full(index), self.size), None
-        if self._depths is not None:
-            depth = np.zeros((h, w), np.float32)
-            if self._depths[index] is not None:
-                raw = reading.read_depth(self._depths[index], self._depth_scale, self._raw_size)
-                depth = reading.resize_nearest(self._lens.straighten_depth(raw), self.size)
-        return Frame(
-            index, float(self._times[index]), str(path), image, depth, self.pose(index), self._classes_of(path)
-        )
+    def _place(self, index: int) -> tuple[float, str]:
+        return float(self._times[index]), str(self._images[index])
 
-    def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        return self._lens.straighten(read_shown(self._images[index], self._raw_size, self._tones))
+    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        return read_shown(self._images[index], self._raw_size, self._tones)
 
-    def _classes_of(self, image: Path) -> Int32[np.ndarray, "h w"] | None:
+    def _depth(self, index: int) -> Float32[np.ndarray, "h w"] | None:
+        if self._depths is None:
+            return None
+        if self._depths[index] is None:
+            return np.zeros(self.size[::-1], np.float32)
+        raw = reading.read_depth(self._depths[index], self._depth_scale, self._raw_size)
+        return reading.resize_nearest(self._lens.straighten_depth(raw), self.size)
+
+    def _labels_of(self, index: int) -> Int32[np.ndarray, "h w"] | None:
         if self._labels is None:
             return None
-        ids = self._labels.read(image, self._raw_size)
+        ids = self._labels.read(self._images[index], self._raw_size)
         # Beyond a straight image's border there is no class; the lens fills with 0, which here would be a class.
         straight = self._lens.straighten_depth((ids + 1).astype(np.float32)).astype(np.int32) - 1
         return reading.resize_nearest(straight, self.size)
@@ -152,18 +155,13 @@ class Tum:
         labels = [] if self._labels is None else [self._labels.path(self._images[index]), self._labels.classes]
         return [self._images[index], *([] if depth is None else [depth]), *labels, *lists]
 
-    def fingerprint(self) -> str:
-        options = {
-            "dataset": self.name,
-            "size": self.size,
-            "intrinsics": self.intrinsics,
+    def _options(self) -> dict[str, Any]:
+        return {
             "undistorted": self._lens.maps is not None,
             "depth_scale": self._depth_scale,
             "depths": [p and p.name for p in self._depths or ()],
             "poses": self._poses,
         } | ({} if self._labels is None else {"classes": self.classes})
-        options |= {} if self._tones is None else {"tones": self._tones}
-        return reading.fingerprint(self._folder, reading.all_files(self), options)
 
 
 def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[list[str]], list[int]]:

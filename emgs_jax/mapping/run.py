@@ -58,7 +58,7 @@ class MappingRun:
         apart: states of submaps that were never joined, when the run has ended.
         worlds: other worlds of the prior that the run has been in, by their number.
         prior_query: predicts both visits of a loop, see `prior_queries`.
-        first_covariance: (6, 6) of the first frame, as frames were placed, when the run has ended (`first_frame.py`).
+        first_covariance: (6, 6) of the first frame, as frames were placed, when the run has ended (`with_first_frame`).
     """
 
     camera: Camera

@@ -12,7 +12,7 @@ BLOCK = 16  # points that share a list of seeds
 NUM_CANDIDATES = 24  # seeds near a block, among which every point keeps looking for its own while they move
 
 
-def morton_order(height: int, width: int) -> Int[Array, "{height}*{width}"]:
+def morton_order(height: int, width: int) -> Int[Array, "{height}*{width}"]:  # noqa: F821 (of the arguments)
     """Row-major pixel numbers along the Z curve, so that an even choice of them is even over the image."""
     y, x = jnp.divmod(jnp.arange(height * width), width)
     code = jnp.zeros_like(x)

@@ -55,9 +55,6 @@ class PoseGraphInfo:
         cost: likewise, at the end.
         factor_chi2: (e,) χ² of every factor at the end, unweighted; 0 where it is not in use.
         factor_weights: (e,) share of that χ² that counts: s² of dynamic covariance scaling, 1 for all but loops.
-        loop_chi2: weighted sum over loops.
-        other_chi2: sum over all other factors.
-        num_loop_rows: measured rows of loops.
         dof: measured rows, those of the scale prior included, minus free unknowns.
         num_disconnected: nodes without a path to the gauge, which stay where they are.
     """
@@ -69,10 +66,6 @@ class PoseGraphInfo:
     converged: bool
     factor_chi2: np.ndarray
     factor_weights: np.ndarray
-    loop_chi2: float
-    other_chi2: float
-    num_loop_rows: int
-    num_other_rows: int
     dof: int
     num_disconnected: int
 
@@ -104,10 +97,9 @@ def _minimize(problem: Problem, now: Linear, config: PoseGraphConfig) -> tuple[L
 def _info(
     problem: Problem, before: float, end: Linear, tried: tuple[int, bool], num_edges: int, reason: str = ""
 ) -> PoseGraphInfo:
-    factors, count = problem.graph.factors, int(problem.used.sum())
+    count = int(problem.used.sum())
     edge_chi2, edge_weights = np.zeros(num_edges), np.ones(num_edges)
     edge_chi2[problem.used], edge_weights[problem.used] = end.chi2[:count], end.weights[:count]
-    is_loop, (num_loop_rows, num_other_rows) = np.asarray(factors.is_loop), num_rows(factors)
     num_prior = int(np.sum(problem.free[:, 6])) if problem.scale_information > 0 else 0
     return PoseGraphInfo(
         reason=reason,
@@ -117,11 +109,7 @@ def _info(
         converged=tried[1],
         factor_chi2=edge_chi2,
         factor_weights=edge_weights,
-        loop_chi2=float(np.sum((end.weights * end.chi2)[is_loop])),
-        other_chi2=float(np.sum(end.chi2[~is_loop])),
-        num_loop_rows=num_loop_rows,
-        num_other_rows=num_other_rows,
-        dof=num_loop_rows + num_other_rows + num_prior - int(np.sum(end.equations.measured)),
+        dof=sum(num_rows(problem.graph.factors)) + num_prior - int(np.sum(end.equations.measured)),
         num_disconnected=problem.num_disconnected,
     )
 
@@ -130,7 +118,7 @@ def _refused(graph: PoseGraph, reason: str) -> PoseGraphInfo:
     """Build the result of a graph that cannot be solved."""
     num_edges, nothing = graph.factors.a.shape[0], float("nan")
     zeros = np.zeros(num_edges)
-    return PoseGraphInfo(reason, nothing, nothing, 0, False, zeros, np.ones(num_edges), 0.0, 0.0, 0, 0, 0, 0)
+    return PoseGraphInfo(reason, nothing, nothing, 0, False, zeros, np.ones(num_edges), 0, 0)
 
 
 def _start(problem: Problem, initial: Linear, config: PoseGraphConfig) -> Linear:

@@ -1,10 +1,12 @@
-"""Tables: the main metrics as columns with their units, numbers as text, and one writer for Markdown and terminals.
+"""Tables: the main metrics as columns with their units, numbers as text, and writers for Markdown, terminals and CSV.
 
 Pages write the same tables by `table` of web/parts.html.
 """
 
+import csv
+import io
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 DASH = "–"
 
@@ -130,3 +132,12 @@ def aligned(table: Table) -> str:
     widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
     rows = ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in texts]
     return "\n".join([rows[0], "─" * max(map(len, rows)), *rows[1:]])
+
+
+def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Write CSV with a line for each row; what a row does not have is empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()

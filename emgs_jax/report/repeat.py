@@ -1,7 +1,5 @@
 """The command that repeats a run: the words that make its config of conf/."""
 
-import json
-import re
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,11 +9,10 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.configure import CONF, compose
+from emgs_jax.config.overrides import written
 from emgs_jax.io.files import flat, jsonable
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # of C where it is there: seventy files a report
-_PLAIN = re.compile(r"[A-Za-z_][\w./-]*|/[\w./-]*")
-_WORDS = {"null", "none", "true", "false", "nan", "inf", "on", "off", "yes", "no"}
 
 
 class Repeated(NamedTuple):
@@ -97,18 +94,6 @@ def _content(path: Path) -> dict[str, Any]:
 
 def _read(path: Path) -> dict[str, Any]:
     return yaml.load(path.read_text(encoding="utf-8"), _LOADER) or {}
-
-
-def written(value: Any) -> str:
-    """Write a value as Hydra's grammar reads it back."""
-    if isinstance(value, list):
-        return f"[{','.join(written(item) for item in value)}]"
-    if isinstance(value, dict):
-        return "{" + ",".join(f"{key}:{written(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, str):
-        is_plain = _PLAIN.fullmatch(value) and value.lower() not in _WORDS
-        return value if is_plain else "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
-    return json.dumps(value)
 
 
 def check_targets(settings: Any) -> None:

@@ -5,11 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from emgs_jax.config.overrides import written
 from emgs_jax.report.columns import MAIN, Column, Line, Table, known, metric_table
 from emgs_jax.report.evaluation_page import run_facts
 from emgs_jax.report.html import MAX_LINES, Head, commit_words, page, picture, thumbnails, write_page
 from emgs_jax.report.provenance import RAW_PRIOR
-from emgs_jax.report.repeat import repeat, written
+from emgs_jax.report.repeat import repeat
 from emgs_jax.report.sweeps import picture_path
 
 Rows = Sequence[Mapping[str, Any]]

@@ -1,14 +1,12 @@
-"""The files of a sweep: sweep.json after every chunk, from which it is resumed, then sweep.csv; and its table."""
+"""The files of a sweep: sweep.json after every chunk, from which it is resumed; and its table."""
 
-import csv
 import hashlib
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from emgs_jax.io.files import changes, jsonable, write_file, write_json
+from emgs_jax.io.files import changes, jsonable, write_json
 from emgs_jax.report.columns import MAIN, Line, known, markdown, metric_table
 
 FORMAT, VERSION = "emgs_jax.running.stacked", 1
@@ -66,16 +64,6 @@ def _key(setting: Mapping[str, Any]) -> str:
 def picture_path(folder: Path, setting: Mapping[str, Any]) -> Path:
     """Return the path of a setting's picture; its name follows from the values."""
     return folder / "pictures" / f"{hashlib.sha256(_key(setting).encode()).hexdigest()[:16]}.jpg"
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write one line for each row; a metric that a setting does not have is empty."""
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_file(path, text.getvalue())
 
 
 def table(rows: Sequence[Mapping[str, Any]], axes: Sequence[str]) -> str:

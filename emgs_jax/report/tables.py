@@ -1,14 +1,24 @@
 """Results as one row per estimate (CSV), as mean and spread over seeds (JSON), and as Markdown tables."""
 
-import csv
-import io
 import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from emgs_jax.report.columns import DASH, MAIN, PLACED, RENDERED, Column, Line, Table, cell, markdown, metric_table
+from emgs_jax.report.columns import (
+    DASH,
+    MAIN,
+    PLACED,
+    RENDERED,
+    Column,
+    Line,
+    Table,
+    cell,
+    csv_text,
+    markdown,
+    metric_table,
+)
 from emgs_jax.report.results import Estimate
 
 _PAPER_DATASETS = {"seven_scenes": "7-Scenes", "tum": "TUM"}
@@ -75,13 +85,7 @@ def average(estimates: Iterable[Estimate], each_sequence: bool) -> list[Row]:
 def to_csv(estimates: Sequence[Estimate]) -> str:
     """Write one line per estimate: what it is of, then every metric."""
     names = ("dataset", "sequence", "variant", "kind", "seed", "prior", "is_simulated", "protocol", "revision")
-    metrics = sorted({key for item in estimates for key in item.values})
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*names, *metrics])
-    for item in estimates:
-        writer.writerow([*(getattr(item, name) for name in names), *(item.values.get(key) for key in metrics)])
-    return text.getvalue()
+    return csv_text([{name: getattr(item, name) for name in names} | item.values for item in estimates])
 
 
 def paper_table(rows: Sequence[Row], published: Sequence[Mapping[str, Any]]) -> str:

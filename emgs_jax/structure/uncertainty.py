@@ -24,8 +24,8 @@ def camera_in_world(image: Any) -> Float[np.ndarray, "4 4"]:
 def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict[int, Float[np.ndarray, "6 6"]]:
     """Covariance of xi of each image's pose relative to the pose before it, for the unit that fits all of them best.
 
-    A map is made of the frames before, at their poses: what they err alike moves the whole map, and a pose that is right
-    beside theirs is right in it. So the covariance is that of the motion T_before_image, of which xi is
+    A map is made of the frames before, at their poses: what they err alike moves the whole map, and a pose that is
+    right beside theirs is right in it. So the covariance is that of the motion T_before_image, of which xi is
     xi_i - Ad(T_i_before) xi_before. The first pose is held.
 
     What a common factor of all lengths changes is no error of a pose: the factor s = sum(w_r xi_r) that some of the

@@ -3,24 +3,18 @@
 import itertools
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from omegaconf import DictConfig
 
 from emgs_jax.config.configure import build, build_dataset, build_prior
 from emgs_jax.device.clock import Clock
-from emgs_jax.gaussian_map import GaussianMap, grow
-from emgs_jax.gaussians import Gaussians, cluster
 from emgs_jax.mapping.capacity import start
 from emgs_jax.mapping.convert import FirstWindow, to_camera, to_first_window, to_prediction
 from emgs_jax.mapping.window_input import first_pose, predictions
-from emgs_jax.observation import Observation, Prediction, transform
+from emgs_jax.observation import Observation, Prediction
 from emgs_jax.ops.camera import Camera
-from emgs_jax.ops.clustering import morton_order
-from emgs_jax.ops.pytree import take_rows
 from emgs_jax.prior.base import PriorPrediction
 from emgs_jax.slam import SlamConfig, SlamState
 
@@ -78,28 +72,3 @@ def first_state(data: Data) -> tuple[SlamState, SlamConfig]:
 def view(data: Data, row: int) -> tuple[jaxlie.SE3, Observation]:
     """One view of the first window: the prior's pose, and the points in the camera's frame."""
     return jax.tree.map(lambda leaf: leaf[row], (data.first.T_world_views, data.first.views))
-
-
-def gaussians_of(data: Data, count: int) -> Gaussians:
-    """`count` Gaussians that the first view is clustered into, world frame; fewer where it gives no more."""
-    T, observation = view(data, 0)
-    camera, thin = data.camera, data.config.observation.thin
-    order = morton_order(-(-camera.height // thin), -(-camera.width // thin))
-    spacing = max(int(observation.valid.sum()) // (count + count // 8), 1)  # some clusters stay empty
-    config = data.config.fit
-    fitted, _ = eqx.filter_jit(cluster)(transform(T, observation, jnp.ones(())), order, spacing, config)
-    rows = np.flatnonzero(np.asarray(fitted.valid))
-    return take_rows(fitted, jnp.asarray(rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]))
-
-
-def enlarged(map: GaussianMap, count: int, distance: float) -> GaussianMap:
-    """`count` Gaussians: the map's own, as often as needed, each copy `distance` metres farther away."""
-    valid = np.flatnonzero(np.asarray(map.gaussians.valid))
-    rows = np.arange(count)
-    copies = rows // len(valid)
-    chosen = (
-        valid[rows % len(valid)] if count >= len(valid) else valid[np.linspace(0, len(valid) - 1, count).astype(int)]
-    )
-    large = take_rows(map, jnp.asarray(chosen))
-    offsets = jnp.asarray(copies * distance, jnp.float32)[:, None] * jnp.array([1.0, 0.0, 0.0])
-    return grow(eqx.tree_at(lambda m: m.gaussians.means, large, large.gaussians.means + offsets), 2 * count)

@@ -1,8 +1,12 @@
-"""The stages of one step, each by itself, and the whole step."""
+"""The stages of one step, each by itself, the whole step, and a step of many settings."""
 
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from emgs_jax.em import e_step, m_step, owners, precision
@@ -10,24 +14,26 @@ from emgs_jax.existence import Look, fusion_evidence, merge_duplicates, update_e
 from emgs_jax.gaussian_map import confirmed, insert, new_map, select_submap, write_back
 from emgs_jax.gaussians import cluster, spacing
 from emgs_jax.localization import localize_coarse, localize_fine
+from emgs_jax.mapping.batch import step_states
 from emgs_jax.observation import observe, transform
 from emgs_jax.ops.camera import downscale
 from emgs_jax.ops.clustering import morton_order
+from emgs_jax.ops.pytree import stack
 from emgs_jax.refinement import refine
 from emgs_jax.render.composite import render
 from emgs_jax.slam import step
 from emgs_jax.splitting import split
 
 from .data import Data, first_state
-from .timing import Candidate, Timing, called, executable, interleaved
+from .timing import Candidate, Timing, called, compare, interleaved
 
 
 def time_stages(data: Data, repetitions: int) -> list[Timing]:
     """Compile every stage for what the stages before it give, then time all in turns."""
     candidates: dict[str, Candidate] = {}
 
-    def stage(name: str, verb: Any, *arguments: Any) -> Any:
-        candidates[name] = executable(verb, *arguments)
+    def stage(name: str, verb: Callable, *arguments: Any) -> Any:
+        candidates[name] = called(eqx.filter_jit(verb), *arguments)
         return candidates[name].call()
 
     state, config = first_state(data)
@@ -65,3 +71,32 @@ def time_stages(data: Data, repetitions: int) -> list[Timing]:
     stage("insert", add, state.map, submap, rows, fresh, weight)
     candidates["whole step"] = called(step, state, prediction, data.camera, config)
     return interleaved("stages", candidates, repetitions)
+
+
+def time_settings(data: Data, counts: Sequence[int], repetitions: int) -> Iterator[Timing]:
+    """A step of many settings: the step's own executable in turn and on all cores at once, and stacked with vmap."""
+    state, config = first_state(data)
+    compile_seconds = called(step, state, data.prediction, data.camera, config).compile_seconds
+    for count in counts:
+        gates = config.em.max_mahalanobis_sq * jnp.linspace(0.5, 2.0, count)
+        configs = [eqx.tree_at(lambda c: c.em.max_mahalanobis_sq, config, gate) for gate in gates]
+
+        def on(num_threads: int, configs: Sequence[Any] = configs) -> Callable[[], None]:
+            def call() -> None:
+                with ThreadPoolExecutor(num_threads) as threads:
+                    list(
+                        threads.map(
+                            lambda c: jax.block_until_ready(step(state, data.prediction, data.camera, c)), configs
+                        )
+                    )
+
+            return call
+
+        candidates = {
+            f"{count} settings, one after the other": Candidate(on(1), compile_seconds),
+            f"{count} settings, {os.cpu_count()} threads": Candidate(on(os.cpu_count() or 1), compile_seconds),
+            f"{count} settings, vmap": called(
+                step_states, stack([state] * count), data.prediction, data.camera, stack(configs)
+            ),
+        }
+        yield from compare(interleaved("sweep", candidates, repetitions), next(iter(candidates)))

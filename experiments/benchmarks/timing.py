@@ -6,24 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import equinox as eqx
 import jax
-
-
-@dataclass(frozen=True)
-class Timing:
-    """One row of a table.
-
-    Args:
-        compile_seconds: of tracing and compiling; None where nothing is compiled.
-        facts: what else was found, for example errors, sizes and ratios.
-    """
-
-    part: str
-    name: str
-    seconds: list[float]
-    compile_seconds: float | None = None
-    facts: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -32,32 +15,31 @@ class Candidate:
 
     Args:
         call: returns when its result is there.
-        compile_seconds: as in `Timing`; likewise
-        verb: what `call` calls, for other arguments of the same shapes.
+        compile_seconds: of tracing and compiling; None where nothing is compiled.
+        facts: what else was found, for example errors, sizes and ratios.
     """
 
     call: Callable[[], Any]
     compile_seconds: float | None = None
     facts: dict[str, Any] = field(default_factory=dict)
-    verb: Callable | None = None
 
 
-def executable(verb: Callable, *arguments: Any) -> Candidate:
-    """`verb` compiled for `arguments`, with the seconds that took and the memory that it needs."""
-    begin = time.perf_counter()
-    compiled = eqx.filter_jit(verb).lower(*arguments).compile()
-    seconds = time.perf_counter() - begin
-    memory = compiled.compiled.memory_analysis()
-    used = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
-    call = lambda: jax.block_until_ready(compiled(*arguments))  # noqa: E731
-    return Candidate(call, seconds, {"memory_mb": used / 2**20}, compiled)
+@dataclass(frozen=True)
+class Timing:
+    """One row of a table: a candidate's seconds in every turn, and what is known of it."""
+
+    part: str
+    name: str
+    seconds: list[float]
+    compile_seconds: float | None
+    facts: dict[str, Any]
 
 
 def called(verb: Callable, *arguments: Any) -> Candidate:
     """`verb` as users call it: its first call compiles, and what that takes longer than a second one is compilation."""
     call = lambda: jax.block_until_ready(verb(*arguments))  # noqa: E731
     first, second = _seconds(call), _seconds(call)
-    return Candidate(call, max(first - second, 0.0), {}, verb)
+    return Candidate(call, max(first - second, 0.0))
 
 
 def _seconds(call: Callable) -> float:

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from g2o_reader import load_graph_g2o
 from omegaconf import OmegaConf
 from scene import assert_same, random_gaussians, random_observation
 
 from emgs_jax import back_end, load_config
 from emgs_jax.back_end.factors import FrameData, map_factor, sequential_factor, stack_factors
-from emgs_jax.back_end.g2o import load_graph_g2o, save_graph_g2o
+from emgs_jax.back_end.g2o import save_graph_g2o
 from emgs_jax.back_end.loops import (
     consistent_loops,
     is_closure_due,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from g2o_reader import load_graph_g2o
 from omegaconf import OmegaConf
 from rings import (
     OFFSETS,
@@ -34,7 +35,6 @@ from rings import (
 )
 from scipy import stats
 
-from emgs_jax.back_end.g2o import load_graph_g2o
 from emgs_jax.pose_graph.chordal import chordal_initialization
 from emgs_jax.pose_graph.factors import Nodes, PoseGraph
 from emgs_jax.pose_graph.optimize import PoseGraphConfig, optimize
@@ -260,8 +260,6 @@ def test_chi2_of_noisy_measurements_has_its_distribution():
     low, high = stats.chi2.interval(0.99, info.dof)
     assert low < 2 * info.cost < high
     assert info.dof == 7 * edges.a.shape[0] + 59 - 7 * 59
-    assert (info.num_other_rows, info.num_loop_rows) == (7 * (edges.a.shape[0] - 10), 70)
-    assert info.other_chi2 + info.loop_chi2 == pytest.approx(np.sum(info.factor_chi2))
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from emgs_jax.report import heat_map
+from emgs_jax.report.columns import csv_text
 from emgs_jax.report.heat_map import draw
-from emgs_jax.report.sweeps import SweepResults, read_sweep, table, write_csv
+from emgs_jax.report.sweeps import SweepResults, read_sweep, table
 
 ATE, F1 = "trajectory/ate_sim3_m", "reconstruction/f1_5cm_percent"
 PROVENANCE = {"data": {"name": "room"}, "prior": {"name": "simulated", "settings": {"seed": 0}}, "config": {"a": 1}}
@@ -98,8 +99,7 @@ def test_sweeps_of_other_data_priors_or_settings_are_not_mixed(key, tmp_path):
         SweepResults(tmp_path, changed)
 
 
-def test_a_metric_that_a_setting_lacks_is_empty_in_the_csv(tmp_path):
-    write_csv(tmp_path / "sweep.csv", grid())
-    lines = list(csv.DictReader((tmp_path / "sweep.csv").open()))
+def test_a_metric_that_a_setting_lacks_is_empty_in_the_csv():
+    lines = list(csv.DictReader(csv_text(grid()).splitlines()))
     assert [line[F1] for line in lines] == ["10.0", "20.0", "30.0", "40.0", "50.0", ""]
     assert [float(line[ATE]) for line in lines] == [row[ATE] for row in grid()]

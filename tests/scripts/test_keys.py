@@ -45,7 +45,12 @@ def composed(name: str):
         ("predict", "out", None, "out must be text, got null"),
         ("embed", "classes", 3, "classes must be a list of names, got 3"),
         ("benchmark", "benchmark.repetitions", 0, "benchmark.repetitions must be a whole number from 1 on, got 0"),
-        ("benchmark", "benchmark.image_sizes", [320, 240], r"benchmark.image_sizes must be a list of \[width,height\]"),
+        (
+            "benchmark",
+            "benchmark.num_settings",
+            [0],
+            "benchmark.num_settings must be a list of whole numbers from 1 on",
+        ),
         ("benchmark", "benchmark.icp_offset", [0, math.inf], r"benchmark.icp_offset must be \[m,rad\]"),
     ],
 )

@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax import load_config
 from emgs_jax.back_end.factors import FrameData
-from emgs_jax.back_end.g2o import load_graph_g2o
 from emgs_jax.back_end.saved_map import load_places, save_places
 from emgs_jax.back_end.state import BackEnd, add_node
 from emgs_jax.config.configure import compose, keys_of
@@ -53,7 +52,6 @@ from emgs_jax.loop_closure.place_recognition import Keyframe, add_keyframe
 from emgs_jax.mapping.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.ops.camera import Camera
-from emgs_jax.pose_graph.factors import Nodes, PoseGraph
 from emgs_jax.prior.base import windows
 from emgs_jax.prior.files.prior import Files
 from emgs_jax.prior.recorded import Recorded, record
@@ -373,21 +371,6 @@ def read_points(folder: Path) -> None:
     assert len(cloud) and all(np.isfinite(rows).all() for rows in (cloud.points, cloud.normals, cloud.colors))
 
 
-def write_graph(folder: Path) -> None:
-    lines = [f"VERTEX_SE3:QUAT {i} {i} 0 0 0 0 0 1" for i in range(4)]
-    upper = " ".join("1" if row == column else "0" for row in range(6) for column in range(row, 6))
-    lines += [f"EDGE_SE3:QUAT {i} {j} {j - i} 0 0 0 0 0 1 {upper}" for i, j in ((0, 1), (1, 2), (2, 3), (0, 3))]
-    (folder / "graph.g2o").write_text("\n".join(lines) + "\n")
-
-
-def read_graph(folder: Path) -> None:
-    graph: PoseGraph = load_graph_g2o(folder / "graph.g2o")
-    nodes: Nodes = graph.nodes
-    assert np.isfinite(np.asarray(nodes.T_world.wxyz_xyz)).all()
-    assert np.asarray(graph.factors.is_loop).dtype == bool
-    assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(graph.factors))
-
-
 def write_embeddings(folder: Path) -> None:
     rng = np.random.default_rng(0)
     save_text(folder / "text.npz", TextEmbeddings(("wall", "chair"), rng.normal(size=(2, 8)), ("a {}",), {"name": "m"}))
@@ -543,7 +526,6 @@ def targets() -> Iterator[Target]:
     yield Target("map", write_map, read_map, {".npz": BYTES})
     yield Target("places", write_places, read_places, {".npz": BYTES})
     yield Target("points", write_cloud, read_points, {".ply": (*BYTES, *TEXT)})
-    yield Target("graph", write_graph, read_graph, {".g2o": TEXT})
     yield Target("text embeddings", write_embeddings, read_embeddings, {".npz": BYTES})
     damages = {".txt": TEXT, ".yaml": TEXT, ".ply": BYTES}
     yield Target("labelled mesh", write_labelled_mesh, read_classes_and_mesh, damages)

@@ -36,7 +36,7 @@ class FrameworkModel:
 
     Args:
         norm: key of `NORMALIZATIONS`.
-        resolution_set: key of `resize.GRIDS`.
+        resolution_set: key of `resize.HEIGHTS`.
         patch: width and height of its grid are multiples of this.
         scale: `metric`, `approximate` (metres, but not reliably) or `arbitrary` (a new unit in every call).
         weights: published weights and their licence.

@@ -16,43 +16,10 @@ from PIL import Image
 
 Size = tuple[int, int]
 
-GRIDS: dict[int, dict[float, Size]] = {  # resolution set -> aspect -> grid, upstream's `fixed_mapping`
-    518: {
-        3.083: (518, 168),
-        2.056: (518, 252),
-        1.762: (518, 294),
-        1.542: (518, 336),
-        1.321: (518, 392),
-        1.000: (518, 518),
-        0.757: (392, 518),
-        0.649: (336, 518),
-        0.567: (294, 518),
-        0.486: (252, 518),
-    },
-    512: {
-        3.200: (512, 160),
-        2.000: (512, 256),
-        1.778: (512, 288),
-        1.524: (512, 336),
-        1.333: (512, 384),
-        1.000: (512, 512),
-        0.750: (384, 512),
-        0.656: (336, 512),
-        0.562: (288, 512),
-        0.500: (256, 512),
-    },
-    504: {
-        3.273: (504, 154),
-        2.118: (504, 238),
-        1.800: (504, 280),
-        1.565: (504, 322),
-        1.333: (504, 378),
-        1.000: (504, 504),
-        0.750: (378, 504),
-        0.639: (322, 504),
-        0.556: (280, 504),
-        0.472: (238, 504),
-    },
+HEIGHTS = {  # resolution set, which is the longer side -> the shorter sides of its grids; upstream's `fixed_mapping`
+    518: (168, 252, 294, 336, 392, 518),
+    512: (160, 256, 288, 336, 384, 512),
+    504: (154, 238, 280, 322, 378, 504),
 }
 
 
@@ -75,9 +42,10 @@ class Resize:
 
 
 def choose_grid(frame: Size, resolution_set: int) -> Size:
-    """The grid of a set whose aspect is nearest to that of the frames."""
-    grids = GRIDS[resolution_set]
-    return grids[min(grids, key=lambda aspect: abs(aspect - frame[0] / frame[1]))]
+    """The grid of a set whose aspect is nearest to that of the frames; all but the widest are there upright, too."""
+    wide = [(resolution_set, height) for height in HEIGHTS[resolution_set]]
+    grids = [*wide, *((height, width) for width, height in wide[1:])]
+    return min(grids, key=lambda grid: abs(round(grid[0] / grid[1], 3) - frame[0] / frame[1]))  # as upstream's table
 
 
 def plan_resize(frame: Size, grid: Size) -> Resize:
