@@ -8,14 +8,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from emgs_jax.data import reading
-<<<<<<< HEAD
-from emgs_jax.data.base import Frame
 from emgs_jax.data.file_names import IMAGE_SUFFIXES, check_one_kind, natural_order, taken_note, times_of, unread_note
-from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens, with_notes
-=======
-from emgs_jax.data.file_names import IMAGE_SUFFIXES, check_one_kind, natural_key, times_of, unread_note
 from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens
->>>>>>> main
 from emgs_jax.data.reading import Size
 from emgs_jax.data.straightened import Straightened
 from emgs_jax.data.tones import Tones, read_shown, tones_of

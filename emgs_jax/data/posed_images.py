@@ -17,14 +17,9 @@ from jaxtyping import Float, UInt8
 from emgs_jax.data import reading
 from emgs_jax.data.calibration_files import Calibration, read_calibration
 from emgs_jax.data.colmap_model import BINARY, TEXT, SparseModel, load_colmap
-<<<<<<< HEAD
 from emgs_jax.data.file_names import IMAGE_SUFFIXES, find_image, natural_order, times_of
-from emgs_jax.data.intrinsics import to_lens, with_notes
-=======
-from emgs_jax.data.file_names import IMAGE_SUFFIXES, find_image, natural_key, times_of
 from emgs_jax.data.intrinsics import to_lens
 from emgs_jax.data.straightened import Straightened
->>>>>>> main
 from emgs_jax.data.tones import read_shown, tones_of
 from emgs_jax.data.transforms_json import load_transforms
 

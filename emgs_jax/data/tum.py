@@ -88,15 +88,9 @@ class Tum(Straightened):
         given = find_calibration(self.sequence, intrinsics, distortion, self.calibrations)
         raw_size = RAW_SIZE if intrinsics is None else reading.first_size(self._images, self._folder)
         self._tones = tones_of(self._images)
-<<<<<<< HEAD
-        self._lens = find_lens(given, pictures_of(self._images, self._raw_size, self._tones))
-        shown = self._tones and self._tones.note, reading.transparency_note(self._images)
-        self.calibration = with_notes(self._lens.about, back_note(self._folder / "rgb.txt", times, lines), *shown)
-        self.full_intrinsics = self._lens.intrinsics
-        self.intrinsics = reading.resize_intrinsics(self._lens.intrinsics, self._raw_size, self.size)
-=======
-        self._use(find_lens(given, pictures_of(self._images, raw_size, self._tones)), raw_size, size)
->>>>>>> main
+        lens = find_lens(given, pictures_of(self._images, raw_size, self._tones))
+        said = back_note(self._folder / "rgb.txt", times, lines), reading.transparency_note(self._images)
+        self._use(lens, raw_size, size, *said)
         self._labels = None
         if labels is not None:
             ids = as_unknown(unknown, "dataset.unknown")

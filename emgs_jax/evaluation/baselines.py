@@ -216,7 +216,7 @@ class _Tsdf:
 
 
 class _Blocks:
-    """Points of a cloud by cubes of the world, of which a camera sees few: a view costs what it shows, not the cloud."""
+    """Points of a cloud by cubes of the world, of which a camera sees few: a view costs what it shows."""
 
     def __init__(self, cloud: PointCloud, counts: np.ndarray, side: float) -> None:
         self.cloud, self.counts, self._side = cloud, counts, side
