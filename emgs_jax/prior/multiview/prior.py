@@ -1,7 +1,8 @@
 """The prior `multiview_stereo`: classical geometry from the images alone, without weights and without a GPU.
 
 COLMAP finds the poses of all images at once (`structure/`); a plane sweep against some of the other views the depth of
-each, and the matches on a blank region its plane (`swept.py`), or a network whose weights the user has (`learned.py`).
+each, and the matches on a blank region its plane (`swept.py`), or a network whose weights the user has (`learned.py`),
+or both: then the surest counts.
 Or the depths are those of a network that looks at one image at a time, in files, brought to the scale of COLMAP's
 landmarks (`depth_files.py`, `monocular.py`). The confidence of a depth is one over the standard deviation of log z
 (`depth_noise.py`), and 1 where nothing is known.
