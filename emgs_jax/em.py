@@ -11,11 +11,9 @@ from emgs_jax.gaussian_map import AverageConfig, GaussianMap, update_average
 from emgs_jax.gaussians import GaussianIndex, Gaussians, gathered_features, has_feature, index_of
 from emgs_jax.observation import Observation, sound
 from emgs_jax.ops.linalg import (
-    Entries,
     Whitening,
     across,
     between,
-    cross,
     dot,
     down,
     floored,
@@ -24,6 +22,7 @@ from emgs_jax.ops.linalg import (
     safe_normalize,
     tangent_basis,
     whiten,
+    widened_distance_sq,
 )
 from emgs_jax.ops.neighbours import Nearby, among_nearest, nearby, of_queries
 from emgs_jax.ops.precision import full_precision
@@ -103,19 +102,6 @@ class EmInfo(eqx.Module):
     mean_log_joint: Float[Array, ""]
 
 
-def widened_distance_sq(triangle: Entries, offsets: Entries, noise: Entries) -> tuple[Array, Array]:
-    """Squared Mahalanobis distance under Σ_k + ν ν' and log|Σ_k + ν ν'| - log|Σ_k|.
-
-    ν is a point's noise: a standard deviation along its viewing ray. `triangle` is that of `whitening`. With the
-    whitened offset w and noise u that is (|w|² + |w × u|²) / (1 + |u|²), in which nothing cancels as it does in
-    |w|² - (w·u)² / (1 + |u|²) (Sherman–Morrison) where a distant point lies behind its Gaussian along the ray.
-    """
-    white, noise = whiten(triangle, offsets), whiten(triangle, noise)
-    growth = 1.0 + dot(noise, noise)
-    turned = cross(white, tuple(entry / jnp.sqrt(growth) for entry in noise))
-    return dot(white, white) / growth + dot(turned, turned), jnp.log(growth)
-
-
 @full_precision
 def e_step(
     gaussians: Gaussians,
@@ -161,7 +147,7 @@ def _explain(
     offsets = between(points.points, gaussians.means)
     ray, normals = (down(vectors) for vectors in (config.noise * noise, points.normals))
     found = among_nearest(dot(offsets, offsets), near.exists[:, None], config.num_neighbours)
-    distance_sq, log_growth = widened_distance_sq(across(triangles), offsets, ray)
+    distance_sq, log_growth = widened_distance_sq(*(whiten(across(triangles), x) for x in (offsets, ray)))
     normal_cos = dot(across(gaussians.normals), normals)
     # Without one of the features the term must vanish.
     feature_gap = 0.0

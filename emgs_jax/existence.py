@@ -13,7 +13,15 @@ from emgs_jax.gaussian_map import GaussianMap, without
 from emgs_jax.gaussians import blend, has_feature
 from emgs_jax.observation import Observation, depth_in
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
-from emgs_jax.ops.linalg import dot, outer, whiten, whitening
+from emgs_jax.ops.linalg import (
+    dot,
+    lower_entries,
+    outer,
+    quadratic,
+    whiten,
+    whitened_entries,
+    widened_distance_sq,
+)
 from emgs_jax.ops.neighbours import group_points, nearest, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, put_rows, static, take_rows, traced, where_rows
@@ -132,7 +140,7 @@ def update_existence(
     pixels, depth = project(camera, rays @ rotation)
     index, inside = nearest_pixel(pixels, (camera.height, camera.width))
     nearest, farthest = depth_range(view, T_world_camera, camera)[:, index]
-    variance = _along(gaussians.normals, gaussians.covs)
+    variance = quadratic(lower_entries(gaussians.covs), jnp.unstack(gaussians.normals, axis=-1))
     reach = config.num_std * jnp.sqrt((depth_noise * depth) ** 2 + variance)
     is_steep = jnp.abs(_inner(gaussians.normals, rays)) >= config.min_cos * jnp.linalg.norm(rays, axis=-1)
     is_looked_at = gaussians.valid & inside & (depth > NEAREST_DEPTH) & is_steep
@@ -231,37 +239,37 @@ def nearest_duplicates(
     groups = group_points(gaussians.means, is_seen)
     order = order_of(groups, count)
     rows, found = nearest(gaussians.means, is_seen, gaussians.means, groups, config.num_neighbours, order=order)
-    near = jax.tree.map(lambda leaf: leaf[rows], gaussians)
-    offsets, normals = near.means - gaussians.means[:, None], gaussians.normals[:, None]
-    both = gaussians.covs[:, None] + near.covs
-    noise = depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - origins))[:, None]
-
-    def distance_under(variance: Float[Array, "n #k"]) -> Float[Array, "n k"]:
-        triangles, _ = whitening(both + variance[..., None, None] * outer(normals))
-        white = whiten(*(jnp.unstack(rows, axis=-1) for rows in (triangles, offsets)))
-        return dot(white, white)
-
+    noise = depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - origins))
+    covs, normals = lower_entries(gaussians.covs), jnp.unstack(gaussians.normals, axis=-1)
     frames = jnp.maximum(map.weight, 1.0)
-    distance_sq = distance_under(noise**2)
-    of_means_sq = distance_under(noise**2 * (1.0 / frames[:, None] + 1.0 / frames[rows]))
-    thickest = jnp.maximum(_along(normals, gaussians.covs[:, None]), _along(normals, near.covs))
-    is_behind = _inner(offsets, normals) ** 2 > MIN_GAP**2 * thickest
-    is_one = (distance_sq < config.max_mahalanobis_sq) | is_behind & (of_means_sq < config.max_layer_sq)
-    found &= is_seen[:, None] & (rows != jnp.arange(count)[:, None]) & is_one
-    found &= _inner(near.normals, gaussians.normals[:, None]) >= config.min_normal_cos
-    has_both = has_feature(near.features) & has_feature(gaussians.features)[:, None]
-    found &= ~has_both | (_inner(near.features, gaussians.features[:, None]) > 0)
-    distance_sq = jnp.where(found, distance_sq, jnp.inf)
-    best = jnp.argmin(distance_sq, axis=-1)[:, None]
-    partner = jnp.take_along_axis(rows, best, axis=-1)[:, 0]
-    has_layer = jnp.any(found, axis=-1)
+
+    def distance_to(one: tuple[Int[Array, "n"], Bool[Array, "n"]]) -> Float[Array, "n"]:
+        """Squared distance to one neighbour of each; infinite where that is no other layer."""
+        rows, found = one
+        near_covs, near_normals = (tuple(entry[rows] for entry in entries) for entries in (covs, normals))
+        offsets = jnp.unstack(gaussians.means[rows] - gaussians.means, axis=-1)
+        triangle, _ = whitened_entries(tuple(a + b for a, b in zip(covs, near_covs, strict=True)))
+        white, white_normal = whiten(triangle, offsets), whiten(triangle, normals)
+        of_means = noise * jnp.sqrt(1.0 / frames + 1.0 / frames[rows])
+        distance_sq, of_means_sq = (
+            widened_distance_sq(white, tuple(std * entry for entry in white_normal))[0] for std in (noise, of_means)
+        )
+        thickest = jnp.maximum(quadratic(covs, normals), quadratic(near_covs, normals))
+        is_behind = dot(offsets, normals) ** 2 > MIN_GAP**2 * thickest
+        is_one = (distance_sq < config.max_mahalanobis_sq) | is_behind & (of_means_sq < config.max_layer_sq)
+        is_alike = dot(near_normals, normals) >= config.min_normal_cos
+        near_features = gaussians.features[rows]
+        has_both = has_feature(near_features) & has_feature(gaussians.features)
+        is_alike &= ~has_both | (_inner(near_features, gaussians.features) > 0)
+        is_layer = found & is_seen & (rows != jnp.arange(count)) & is_one & is_alike
+        return jnp.where(is_layer, distance_sq, jnp.inf)
+
+    # In a loop, or XLA would do all of it again for everything that is asked of the distances.
+    distance_sq = jax.lax.map(distance_to, (rows.T, found.T))
+    partner = jnp.take_along_axis(rows, jnp.argmin(distance_sq, axis=0)[:, None], axis=1)[:, 0]
+    has_layer = jnp.min(distance_sq, axis=0) < jnp.inf
     return partner, has_layer & has_layer[partner] & (partner[partner] == jnp.arange(count))
 
 
 def _inner(first: Float[Array, "*b d"], second: Float[Array, "*#b d"]) -> Float[Array, "*b"]:
     return jnp.sum(first * second, axis=-1)
-
-
-def _along(directions: Float[Array, "*#b 3"], covs: Float[Array, "*#b 3 3"]) -> Float[Array, "*b"]:
-    """Variance along unit directions."""
-    return jnp.einsum("...i,...ij,...j->...", directions, covs, directions)

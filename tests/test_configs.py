@@ -147,6 +147,8 @@ def config_classes():
             return
         is_new = module not in found
         found.setdefault(module, set()).add(key)
+        for base in module.__bases__:
+            visit(base, key)
         if is_new:
             for name, hint in typing.get_type_hints(module).items():
                 for part in (hint, *typing.get_args(hint)):

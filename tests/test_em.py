@@ -8,9 +8,9 @@ import pytest
 import reference
 import scene as sc
 
-from emgs_jax.em import e_step, em_update, m_step, precision, support, widened_distance_sq
+from emgs_jax.em import e_step, em_update, m_step, precision, support
 from emgs_jax.observation import Observation
-from emgs_jax.ops.linalg import whitening
+from emgs_jax.ops.linalg import whiten, whitening, widened_distance_sq
 from emgs_jax.registration.noise import level_edges, levels_of, noise_of_levels
 
 M, N, F = 60, 40, 3
@@ -19,7 +19,11 @@ QUIET = np.zeros((M, 3), np.float32)
 NOISE = (np.random.default_rng(5).normal(size=(M, 3)) * 0.1).astype(np.float32)
 ONES = np.ones(M, np.float32)
 estep, mstep, supported, updated_map = (sc.on_host(f) for f in (e_step, m_step, support, em_update))
-widened = sc.on_host(widened_distance_sq)
+
+
+@sc.on_host
+def widened(triangle, offsets, noise):
+    return widened_distance_sq(whiten(triangle, offsets), whiten(triangle, noise))
 
 
 def em(*arguments):
@@ -169,16 +173,16 @@ def test_noise_along_the_ray_widens_the_gaussian_by_its_outer_product():
     offsets = np.random.default_rng(0).normal(size=(M, 5, 3)) * 0.2
     covs = np.asarray(sc.random_gaussians(M * 5).covs, float).reshape(M, 5, 3, 3)
 
-    def widened_by(covs, *vectors):
-        triangle = jnp.unstack(whitening(covs)[0], axis=-1)
-        return widened_distance_sq(triangle, *(jnp.unstack(x, axis=-1) for x in vectors))
-
-    distance_sq, log_growth = sc.on_host(widened_by)(*(np.float32(x) for x in (covs, offsets, NOISE[:, None])))
+    triangle, *vectors = (
+        jnp.unstack(jnp.asarray(x, jnp.float32), axis=-1)
+        for x in (sc.on_host(whitening)(covs)[0], offsets, NOISE[:, None])
+    )
+    distance_sq, log_growth = widened(triangle, *vectors)
     noise = np.asarray(NOISE, float)
-    widened = covs + (noise[:, :, None] * noise[:, None])[:, None]
-    expected = np.einsum("mki,mkij,mkj->mk", offsets, np.linalg.inv(widened), offsets)
+    whole = covs + (noise[:, :, None] * noise[:, None])[:, None]
+    expected = np.einsum("mki,mkij,mkj->mk", offsets, np.linalg.inv(whole), offsets)
     np.testing.assert_allclose(distance_sq, expected, rtol=1e-3, atol=1e-3)  # a difference of values up to 500
-    np.testing.assert_allclose(log_growth, np.linalg.slogdet(widened)[1] - np.linalg.slogdet(covs)[1], atol=1e-4)
+    np.testing.assert_allclose(log_growth, np.linalg.slogdet(whole)[1] - np.linalg.slogdet(covs)[1], atol=1e-4)
 
 
 def test_one_hot_responsibilities_give_the_clusters_mean_and_covariance(opened):

@@ -1,20 +1,24 @@
-"""Tensors of a file that `torch.save` wrote before version 1.6: read without torch, and without running what is in it.
+"""Tensors of a file that `torch.save` wrote: read without torch, and without running what is in it.
 
-Such a file is five pickles (magic number, version, the machine, what was saved, names of storages) and then every
-storage: its number of elements and its bytes. The instructions of the fourth are followed only as far as they make
-dictionaries, lists and numbers, and describe tensors; what else a pickle could ask for is refused.
+Such a file is an archive: a pickle of what was saved, and a member for every storage. Before version 1.6 it was five
+pickles (magic number, version, the machine, what was saved, names of storages) and then every storage: its number of
+elements and its bytes. The instructions of what was saved are followed only as far as they make dictionaries, lists and
+numbers, and describe tensors; what else a pickle could ask for is refused.
 """
 
 import math
 import pickletools
+import zlib
 from collections.abc import Mapping
 from io import BytesIO
 from typing import Any, NamedTuple
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
 MAGIC = 0x1950A86A20F9469CFC6C
 DTYPES = {"torch FloatStorage": "<f4", "torch LongStorage": "<i8"}
+BAD_ARCHIVE = (BadZipFile, EOFError, zlib.error)
 _MARK = object()
 
 
@@ -25,23 +29,41 @@ class _Tensor(NamedTuple):
     strides: tuple[int, ...]  # elements
 
 
-def read_tensors(content: bytes, key: str) -> dict[str, np.ndarray]:
-    """The tensors by name that stand under `key` of what was saved.
+def read_tensors(content: bytes, key: str | None) -> dict[str, np.ndarray]:
+    """The tensors by name that stand under `key` of what was saved; None = they are all that was.
 
     Raises:
         ValueError: it is no such file, or damaged.
     """
     try:
-        stream = BytesIO(content)
-        if _value(stream) != MAGIC:
-            raise ValueError("not of torch.save before version 1.6")
-        _, _, saved, names = (_value(stream) for _ in range(4))
-        tensors: Mapping[str, _Tensor] = saved[key]
-        known = {tensor.storage[2]: tensor.storage for tensor in _tensors(saved)}
-        storages = {name: _storage(stream, known[name]) for name in names}
+        saved, storages = (_from_archive if content.startswith(b"PK") else _from_stream)(BytesIO(content))
+        tensors: Mapping[str, _Tensor] = saved if key is None else saved[key]
         return {name: _array(storages[tensor.storage[2]], tensor) for name, tensor in tensors.items()}
-    except (LookupError, TypeError, AttributeError, UnicodeDecodeError) as error:
+    except (LookupError, TypeError, AttributeError, UnicodeDecodeError, RuntimeError, *BAD_ARCHIVE) as error:
         raise ValueError(f"damaged ({type(error).__name__}: {error})") from error
+
+
+def _from_archive(stream: BytesIO) -> tuple[Any, dict[str, np.ndarray]]:
+    """What was saved, and its storages by name."""
+    with ZipFile(stream) as archive:
+        first = [name for name in archive.namelist() if name.endswith("/data.pkl")][0]
+        saved = _value(BytesIO(archive.read(first)))
+        folder = first.removesuffix(".pkl")
+        known = {tensor.storage[2]: tensor.storage for tensor in _tensors(saved)}
+        return saved, {name: _numbers(archive.read(f"{folder}/{name}"), known[name]) for name in known}
+
+
+def _from_stream(stream: BytesIO) -> tuple[Any, dict[str, np.ndarray]]:
+    """Likewise of a file before version 1.6."""
+    if _value(stream) != MAGIC:
+        raise ValueError("not of torch.save")
+    _, _, saved, names = (_value(stream) for _ in range(4))
+    known = {tensor.storage[2]: tensor.storage for tensor in _tensors(saved)}
+    return saved, {name: _storage(stream, known[name]) for name in names}
+
+
+def _numbers(content: bytes, described: tuple) -> np.ndarray:
+    return np.frombuffer(content, np.dtype(DTYPES[described[1]]), described[4])
 
 
 def _storage(stream: BytesIO, described: tuple) -> np.ndarray:
@@ -49,8 +71,7 @@ def _storage(stream: BytesIO, described: tuple) -> np.ndarray:
     dtype, count = np.dtype(DTYPES[described[1]]), described[4]
     if int.from_bytes(stream.read(8), "little") != count:
         raise ValueError("a storage has another number of elements than its tensor says")
-    content = stream.read(count * dtype.itemsize)
-    return np.frombuffer(content, dtype, count)
+    return _numbers(stream.read(count * dtype.itemsize), described)
 
 
 def _array(storage: np.ndarray, tensor: _Tensor) -> np.ndarray:

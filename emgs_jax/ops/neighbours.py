@@ -69,8 +69,8 @@ def curve_order(positions: Float[Array, "m d"], counts: Bool[Array, "m"]) -> Int
     return jnp.argsort(jnp.where(counts, number, jnp.iinfo(jnp.int32).max))
 
 
-def _cells(positions: Float[Array, "m d"], counts: Bool[Array, "m"]) -> Int[Array, "m d"]:
-    """Cells along each axis, of one size but where nothing is.
+def _cells(positions: Float[Array, "m d"], counts: Bool[Array, "m"]) -> tuple[Int[Array, "m"], ...]:
+    """Cells along each axis, axis by axis, of one size but where nothing is.
 
     Some positions tell the gaps along an axis. One that is much wider than most is cut, so that a point far away, or
     another room, leaves the cells of the others as small as they were.
@@ -88,9 +88,11 @@ def _cells(positions: Float[Array, "m d"], counts: Bool[Array, "m"]) -> Int[Arra
     cut = jnp.minimum(gaps, jnp.where(usual > 0, WIDE_GAP * usual, jnp.inf))
     ends = jnp.concatenate([jnp.zeros_like(cut[:1]), jnp.cumsum(cut, axis=0)])
     size = jnp.max(ends)
-    placed = jax.vmap(jnp.interp, in_axes=1, out_axes=1)(positions, known, ends)
-    scaled = placed * (2**CURVE_BITS / jnp.where((size > 0) & jnp.isfinite(size), size, 1.0))
-    return jnp.clip(jnp.where(jnp.isfinite(scaled), scaled, 0.0), 0, 2**CURVE_BITS - 1).astype(jnp.int32)
+    unit = 2**CURVE_BITS / jnp.where((size > 0) & jnp.isfinite(size), size, 1.0)
+    # One axis after the other, or XLA looks all of them up for each again.
+    scaled = (unit * jnp.interp(*axis) for axis in zip(positions.T, known.T, ends.T, strict=True))
+    last = 2**CURVE_BITS - 1
+    return tuple(jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), 0, last).astype(jnp.int32) for x in scaled)
 
 
 def group_points(points: Float[Array, "n d"], valid: Bool[Array, "n"], order: Int[Array, "n"] | None = None) -> Groups:
@@ -303,13 +305,13 @@ def ranks(values: Float[Array, "*b c"]) -> Int[Array, "*b c"]:
     return jax.lax.fori_loop(0, -(-num // RANKED), compare, jnp.zeros(keys.shape, jnp.int32))
 
 
-def _curve(cells: Int[Array, "m d"]) -> Int[Array, "m"]:
+def _curve(cells: tuple[Int[Array, "m"], ...]) -> Int[Array, "m"]:
     """Number of every cell along the Hilbert curve.
 
     Source: Skilling, "Programming the Hilbert curve", AIP Conf. Proc. 707, 2004. Consecutive cells touch, so that
     groups are compact: a search takes an eighth less time than along the Z curve.
     """
-    axes = list(jnp.unstack(cells, axis=1))
+    axes = list(cells)
     for bit in range(CURVE_BITS - 1, 0, -1):  # undo the turns of every cube, from the largest on
         lower = (1 << bit) - 1
         for number, axis in enumerate(axes):

@@ -106,14 +106,22 @@ def stem(name: str) -> str:
 
 def in_unit(structure: Structure, median_depth: float) -> Structure:
     """The structure in a unit in which the depths of each world's landmarks have this median."""
-    T, covariance, worlds = structure.T_world_camera.copy(), structure.covariance.copy(), []
-    for number, world in enumerate(structure.worlds):
+    factors = []
+    for number in range(len(structure.worlds)):
         frames = np.flatnonzero(structure.world == number)
         depths = np.concatenate([structure.depths(frame) for frame in frames])
-        factor = median_depth / np.median(depths) if len(depths) else 1.0
+        factors.append(median_depth / np.median(depths) if len(depths) else 1.0)
+    return scaled(structure, factors)
+
+
+def scaled(structure: Structure, factors: Sequence[float]) -> Structure:
+    """The structure with the lengths of each world times its factor."""
+    T, covariance = structure.T_world_camera.copy(), structure.covariance.copy()
+    for number, factor in enumerate(factors):
+        frames = np.flatnonzero(structure.world == number)
         T[frames, :3, 3] *= factor
         covariance[frames] = [scale_covariance(one, factor) for one in covariance[frames]]
-        worlds.append(replace(world, points=factor * world.points))
+    worlds = [replace(w, points=factor * w.points) for w, factor in zip(structure.worlds, factors, strict=True)]
     return replace(structure, worlds=worlds, T_world_camera=T, covariance=covariance)
 
 

@@ -1,67 +1,88 @@
-"""Common parts of the ways to a view's dense depth: which views it is matched with, and what is accepted."""
+"""Common parts of the ways to the dense depth of views whose poses are known."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import jaxlie
 import numpy as np
 
+from emgs_jax.data.base import Dataset
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.depth_noise import DepthNoiseConfig
 from emgs_jax.prior.multiview.lens import Lens
+from emgs_jax.structure.model import Structure
 
 
 @dataclass(frozen=True)
 class DenseConfig:
-    """Settings of a view's dense depth: its source views and acceptance.
+    """Settings of a view's dense depth: what is accepted.
 
     Args:
         noise: standard deviation of a depth.
-        num_sources: views that it is matched against.
-        best_parallax_rad: between the rays of a landmark, beyond which more is no better.
         num_checks: views whose depth is compared with it.
         depth_step: of the depths of two views, as a fraction: where they differ by so much they agree by 1/e.
-        depth_margin: the range of depths that is tried goes beyond the landmarks' by this factor.
+        depth_margin: a depth may lie beyond the landmarks' by this factor.
     """
 
     noise: DepthNoiseConfig
-    num_sources: int = number(low=1, high=64)
-    best_parallax_rad: float = number(low=1e-6, high=4)
     num_checks: int = number(low=0, high=64)
     depth_step: float = number(low=1e-6)
     depth_margin: float = number(low=1, high=1000)
 
 
-class Matched(NamedTuple):
-    """A view and those that it is matched with.
+class Scene(NamedTuple):
+    """Frames with poses.
 
     Args:
-        view: what `Stereo.prepare` made of its image.
-        sources: likewise; `num_sources` of them.
-        T_source_view: view -> source, batched like `sources`.
-        is_used: (s,) sources that count; the others are repetitions.
-        depth_range: nearest and farthest depth that is tried, m.
-        camera: of all views.
+        lenses: of the worlds of the structure.
+        camera: pinhole, of all frames.
     """
 
-    view: Any
-    sources: Sequence[Any]
-    T_source_view: jaxlie.SE3
-    is_used: np.ndarray
-    depth_range: np.ndarray
+    dataset: Dataset
+    structure: Structure
+    lenses: list[Lens]
     camera: Camera
 
 
-class Stereo(NamedTuple):
+class Depth(NamedTuple):
+    """Depth of a view, at the pixels of the pinhole camera.
+
+    Args:
+        depth: (h, w) z in the unit of the structure, 0 where it is not known.
+        spread: (h, w) a multiple of the standard deviation of log z, as the way to it has it.
+        pixels: (h, w), see `pixels_per_log_depth`; 1 where nothing was matched, 0 where there is no telling.
+    """
+
+    depth: np.ndarray
+    spread: np.ndarray
+    pixels: np.ndarray
+
+
+Depths = Callable[[int], Depth]  # of a frame that the structure has placed
+
+
+@dataclass(frozen=True)
+class Way:
     """A way to dense depth.
 
     Args:
-        prepare: RGB image (h, w, 3), uint8, and its lens -> what is kept of the view.
-        estimate: depth (h, w) in metres, 0 where it is not known, and the spread of what its cost curve takes
-            for plausible, a multiple of the standard deviation of log z.
+        begin: the structure, whose unit it may have changed, and the depth of each frame.
+        check: raises ValueError where it does not fit a data set, before anything is computed.
+        contents: what its files hold, for provenance; in place of their paths, the keys `paths` of its config.
     """
 
-    prepare: Callable[[np.ndarray, Lens], Any]
-    estimate: Callable[[Matched], tuple[np.ndarray, np.ndarray]]
+    begin: Callable[[Scene], tuple[Structure, Depths]]
+    check: Callable[[Dataset], None] = lambda dataset: None
+    contents: Mapping[str, Any] = field(default_factory=dict)
+    paths: tuple[str, ...] = ()
+
+
+def tried_depths(z: np.ndarray, margin: float) -> np.ndarray:
+    """The nearest and the farthest depth that is tried: of all landmarks but a hundredth at either end, and a margin.
+
+    Args:
+        z: depths of those that a view shows, m.
+        margin: factor by which the range goes beyond theirs.
+    """
+    return np.float32([np.percentile(z, 1) / margin, np.percentile(z, 99) * margin])

@@ -1,6 +1,8 @@
-"""Dense depth by IterMVS, whose weights the user brings."""
+"""Dense depth by a network for multi-view stereo, whose weights the user brings."""
 
 from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
 
 import cv2
 import equinox as eqx
@@ -11,26 +13,35 @@ from jaxtyping import Array, Float
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.pytree import stack
 from emgs_jax.ops.ranges import number
-from emgs_jax.prior.itermvs.network import Features, IterMVS, IterMVSConfig, Sources, estimate, extract
-from emgs_jax.prior.itermvs.weights import load_weights
-from emgs_jax.prior.multiview.dense import DenseConfig, Matched, Stereo
 from emgs_jax.prior.multiview.lens import Lens, rectify
+from emgs_jax.prior.multiview.matched import Matched, MatchedConfig, Stereo
+from emgs_jax.prior.multiview.swept import SweptConfig
+from emgs_jax.prior.pretrained import effimvs, itermvs
+from emgs_jax.prior.pretrained.effimvs import EffiMVSConfig
+from emgs_jax.prior.pretrained.itermvs import IterMVSConfig
+from emgs_jax.prior.pretrained.matching import Sources
+from emgs_jax.prior.pretrained.weights import load_network
 
-MULTIPLE = 32  # of pixels; the network halves its images five times
-jitted_extract = eqx.filter_jit(extract)
+MULTIPLE = 32  # of pixels; the networks halve their images five times
+
+
+@eqx.filter_jit
+def jitted_extract(network: eqx.Module, image: Float[Array, "h w 3"], config: IterMVSConfig | EffiMVSConfig) -> Any:
+    """`extract` of the network that the config is for."""
+    return module_of(config).extract(network, image)
 
 
 @eqx.filter_jit
 def jitted_estimate(
-    network: IterMVS, matched: Matched, grid: Camera, config: IterMVSConfig
+    network: eqx.Module, matched: Matched, grid: Camera, config: IterMVSConfig | EffiMVSConfig
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """`estimate` of what is matched, with images of another camera."""
     sources = Sources(stack(matched.sources), matched.T_source_view, matched.is_used)
-    return estimate(network, matched.view, sources, matched.depth_range, grid, config)
+    return module_of(config).estimate(network, matched.view, sources, matched.depth_range, grid, config)
 
 
 @dataclass(frozen=True)
-class LearnedConfig(DenseConfig):
+class LearnedConfig(MatchedConfig):
     """Depth by a network.
 
     Args:
@@ -38,12 +49,19 @@ class LearnedConfig(DenseConfig):
         magnification: of the images that it is shown, then rounded to what it can take.
         checkpoint: path of its weights.
         sha256: of that file, in hexadecimal digits.
+        beside: the sweep, whose depths are taken where they are surer, and averaged where both agree.
     """
 
-    network: IterMVSConfig
+    network: IterMVSConfig | EffiMVSConfig
     magnification: float = number(low=0.01, high=16)
     checkpoint: str | None
     sha256: str
+    beside: SweptConfig | None
+
+
+def module_of(config: IterMVSConfig | EffiMVSConfig) -> ModuleType:
+    """The module of the network that a config is for."""
+    return effimvs if isinstance(config, EffiMVSConfig) else itermvs
 
 
 def grid_of(camera: Camera, magnification: float) -> Camera:
@@ -56,14 +74,15 @@ def grid_of(camera: Camera, magnification: float) -> Camera:
 
 def learned(config: LearnedConfig) -> Stereo:
     """Depth of RGB images by a network; the spread is -log of its confidence."""
-    network = load_weights(config.checkpoint, config.sha256)
+    module = module_of(config.network)
+    network = load_network(config.checkpoint, config.sha256, module.SOURCE, "model", module.build_network)
 
-    def prepare(image: np.ndarray, lens: Lens) -> Features:
+    def prepare(image: np.ndarray, lens: Lens) -> Any:
         shown = rectify(np.float32(image), lens) / 255.0
         grid = grid_of(Camera(lens.focal, lens.center, *image.shape[1::-1]), config.magnification)
         way = cv2.INTER_AREA if grid.width < image.shape[1] else cv2.INTER_LINEAR
         resized = cv2.resize(shown, (grid.width, grid.height), interpolation=way)
-        return jitted_extract(network.features, jnp.asarray(resized))
+        return jitted_extract(network, jnp.asarray(resized), config.network)
 
     def depth_of(matched: Matched) -> tuple[np.ndarray, np.ndarray]:
         grid = grid_of(matched.camera, config.magnification)

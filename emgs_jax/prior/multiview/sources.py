@@ -1,7 +1,27 @@
 """Choice of the other views that a view is matched against."""
 
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Float
+
+from emgs_jax.structure.model import Structure
+
+
+def placed_beside(found: Structure, frame: int) -> np.ndarray:
+    """Frames of the same world that show landmarks, without this one, the nearest in time first."""
+    others = np.flatnonzero((found.world == found.world[frame]) & ~found.is_interpolated)
+    others = others[others != frame]
+    return others[np.argsort(np.abs(others - frame), kind="stable")]
+
+
+def relative(found: Structure, others: Sequence[int], frame: int) -> jaxlie.SE3:
+    """T_other_frame of several views."""
+    poses = found.T_world_camera
+    T = [np.linalg.inv(poses[other]) @ poses[frame] for other in others]
+    return jaxlie.SE3.from_matrix(jnp.asarray(np.stack(T), jnp.float32))
 
 
 def parallax(

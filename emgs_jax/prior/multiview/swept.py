@@ -7,16 +7,16 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.prior.multiview.dense import DenseConfig, Matched, Stereo
 from emgs_jax.prior.multiview.depth import DepthConfig, estimate_depth
 from emgs_jax.prior.multiview.lens import Lens, rectify
+from emgs_jax.prior.multiview.matched import Matched, MatchedConfig, Stereo
 from emgs_jax.prior.multiview.planar import PlanarConfig, fill_planes
 
 jitted_depth = eqx.filter_jit(estimate_depth)
 
 
 @dataclass(frozen=True)
-class SweptConfig(DenseConfig):
+class SweptConfig(MatchedConfig):
     """Depth by a plane sweep.
 
     Args:

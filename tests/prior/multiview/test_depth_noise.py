@@ -10,7 +10,7 @@ from scene import compose
 
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.multiview.depth import mean_difference, pixels_per_log_depth
-from emgs_jax.prior.multiview.depth_noise import DepthNoiseConfig, relative_std
+from emgs_jax.prior.multiview.depth_noise import DepthNoiseConfig, relative_std, surest
 
 FOCAL, WIDTH, HEIGHT = 55.0, 64, 48
 CONFIG = DepthNoiseConfig(pixel_std=0.5, spread_std=2.0, difference_std=3.0, max_std=0.1)
@@ -103,3 +103,14 @@ def test_both_ways_to_a_depth_name_their_factors_and_a_bound():
     for dense in ("sweep", "itermvs"):
         noise = hydra.utils.instantiate(compose("prior=multiview_stereo", f"prior/dense={dense}").prior.dense.noise)
         assert isinstance(noise, DepthNoiseConfig) and noise.pixel_std > 0 and 0 < noise.max_std < 1
+
+
+def test_of_two_estimates_the_surest_counts_and_what_agrees_with_it_moves_it():
+    depths = np.float32([[[2.0, 2.0, 0.0, 2.0, 0.0, 2.0]], [[2.02, 3.0, 3.0, 2.5, 0.0, 2.02]]])
+    stds = np.float32([[[0.01, 0.01, 0.01, np.inf, 0.01, 0.0]], [[0.02, 0.02, 0.02, 0.02, 0.01, 0.02]]])
+    depth, std = surest(depths, stds)
+    between = 2.0 * 1.01**0.2  # by 1/σ², 4 to 1
+    np.testing.assert_allclose(depth[0], [between, 2.0, 3.0, 2.5, 0.0, 2.0], rtol=1e-5)
+    np.testing.assert_allclose(std[0], [0.01, 0.01, 0.02, 0.02, np.inf, 0.0])
+    for values, alone in zip((depths[0], stds[0]), surest(depths[:1], stds[:1]), strict=True):
+        np.testing.assert_array_equal(alone[0, :2], values[0, :2])  # to the bit

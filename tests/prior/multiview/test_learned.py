@@ -1,4 +1,4 @@
-"""Depth by IterMVS within the classical prior: the camera of its images, and with published weights a painted plane."""
+"""Depth by a network within the classical prior: the camera of its images, and with real weights a painted plane."""
 
 import os
 import sys
@@ -15,11 +15,11 @@ from stereo_scene import matrix
 
 from emgs_jax.ops.camera import Camera, pixel_grid, rays
 from emgs_jax.prior.multiview import learned as module
-from emgs_jax.prior.multiview.dense import Matched
 from emgs_jax.prior.multiview.learned import grid_of, learned
 from emgs_jax.prior.multiview.lens import Lens
+from emgs_jax.prior.multiview.matched import Matched
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "itermvs"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "pretrained"))
 from random_weights import random_network
 
 BESIDE = Path(__file__).resolve().parents[3].parent
@@ -70,7 +70,7 @@ def test_the_networks_images_have_sizes_that_it_takes_and_their_edges_are_those_
 
 
 def test_every_pixel_of_the_view_has_a_depth_within_the_range_and_a_spread_whatever_the_weights(monkeypatch):
-    monkeypatch.setattr(module, "load_weights", lambda checkpoint, sha256: random_network())
+    monkeypatch.setattr(module, "load_network", lambda *given: random_network())
     depth, spread = estimate(learned(hydra.utils.instantiate(prior_node().dense)))
     assert depth.shape == spread.shape == (96, 128)
     assert depth.min() >= 1.2 - 1e-5 and depth.max() <= 5 + 1e-5
@@ -78,13 +78,25 @@ def test_every_pixel_of_the_view_has_a_depth_within_the_range_and_a_spread_whate
 
 
 def test_settings_say_which_weights_and_not_where_they_lie(monkeypatch):
-    monkeypatch.setattr(module, "load_weights", lambda checkpoint, sha256: random_network())
+    monkeypatch.setattr(module, "load_network", lambda *given: random_network())
     priors = [
         hydra.utils.instantiate(prior_node(*words))
         for words in ((), ("prior.dense.checkpoint=elsewhere",), ("prior.dense.sha256=0f",))
     ]
     settings = [prior.provenance.settings for prior in priors]
     assert settings[0] == settings[1] != settings[2] and settings[2]["dense"]["sha256"] == "0f"
+
+
+def test_settings_say_what_is_beside_the_network(monkeypatch):
+    monkeypatch.setattr(module, "load_network", lambda *given: random_network())
+
+    def dense(*words):
+        node = compose("prior=multiview_stereo", "prior/dense=effimvs", *words).prior
+        return hydra.utils.instantiate(node).provenance.settings["dense"]
+
+    alone = hydra.utils.instantiate(compose("prior=multiview_stereo").prior).provenance.settings["dense"]
+    assert dense()["beside"] == alone
+    assert "beside" not in dense("prior.dense.beside=null") and "beside" not in alone
 
 
 def test_without_its_file_the_prior_is_refused_with_the_place_where_it_is_published():

@@ -7,21 +7,33 @@ GRU sees how well depths around the present one fit, at three scales, and says a
 from 0 (farthest) to 1 (nearest), linear in 1/z, so the unit of poses and range does not matter.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from emgs_jax.ops.camera import Camera, downscale, pixel_grid, rays
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static
 from emgs_jax.ops.ranges import ranged
-from emgs_jax.prior.itermvs.layers import Conv, chain, convolve, resize, sample
+from emgs_jax.prior.pretrained.layers import Conv, chain, convolve, resize
+from emgs_jax.prior.pretrained.matching import (
+    COARSEST,
+    FINEST,
+    MIDDLE,
+    Features,
+    Gru,
+    Sources,
+    correlation,
+    seen_from,
+    turn,
+    upsample,
+)
+from emgs_jax.prior.pretrained.weights import Tensors, conv
 
-FINEST, MIDDLE, COARSEST = 2, 4, 8  # pixels of the image to one of the features
+SOURCE = "https://github.com/FangjinhuaWang/IterMVS (MIT), checkpoints/blendedmvs/model_000015.ckpt"
 
 
 def _steps() -> Any:
@@ -66,14 +78,6 @@ class FeatureNet(eqx.Module):
     out: tuple[Conv, ...]
 
 
-class Gru(eqx.Module):
-    """Gates and candidate of a convolutional gated recurrent unit."""
-
-    update: Conv
-    reset: Conv
-    candidate: Conv
-
-
 class IterMVS(eqx.Module):
     """Weights of the whole network; tuples of three are for the finest, middle and coarsest features."""
 
@@ -87,35 +91,14 @@ class IterMVS(eqx.Module):
     upsampling: tuple[Conv, ...]
 
 
-class Features(NamedTuple):
-    """Of one image, at 1/2, 1/4 and 1/8 of its size."""
-
-    finest: Float[Array, "*b h2 w2 c2"]
-    middle: Float[Array, "*b h4 w4 c4"]
-    coarsest: Float[Array, "*b h8 w8 c8"]
-
-
-class Sources(NamedTuple):
-    """The views that a depth is matched with.
-
-    Args:
-        features: batched.
-        T_source_reference: reference camera -> source camera, batched likewise.
-        is_used: sources that count.
-    """
-
-    features: Features
-    T_source_reference: jaxlie.SE3
-    is_used: Bool[Array, "s"]
-
-
 def _double(image: Float[Array, "h w c"]) -> Float[Array, "h2 w2 c"]:
     return resize(image, (2 * image.shape[0], 2 * image.shape[1]))
 
 
 @full_precision
-def extract(network: FeatureNet, image: Float[Array, "h w 3"]) -> Features:
+def extract(network: IterMVS, image: Float[Array, "h w 3"]) -> Features:
     """Features of an RGB image in [0, 1] whose height and width are multiples of 32."""
+    network = network.features
     image = jax.nn.relu(convolve(2.0 * image - 1.0, network.first))
     scales = []
     for block in network.blocks:
@@ -125,34 +108,13 @@ def extract(network: FeatureNet, image: Float[Array, "h w 3"]) -> Features:
     half, quarter, eighth = scales[1::2]
     middle = _double(eighth) + convolve(quarter, network.lateral[1])
     finest = _double(middle) + convolve(half, network.lateral[0])
-    return Features(*(convolve(image, conv) for image, conv in zip((finest, middle, eighth), network.out, strict=True)))
+    return Features(*(convolve(image, last) for image, last in zip((finest, middle, eighth), network.out, strict=True)))
 
 
 def _from_unit(values: Array, depth_range: Float[Array, "2"]) -> Array:
     """0 (farthest) to 1 (nearest) -> depth z."""
     near, far = 1.0 / depth_range[0], 1.0 / depth_range[1]
     return 1.0 / (far + values * (near - far))
-
-
-def _correlation(
-    reference: Float[Array, "h w c"],
-    source: Float[Array, "h2 w2 c"],
-    points: Float[Array, "n h w 3"],
-    camera: Camera,
-    num_groups: int,
-) -> Float[Array, "n h w g"]:
-    """Mean product of the channels of each group, where the source shows the points; zero where it does not.
-
-    Args:
-        reference: features of the pixels whose points they are.
-        source: features of the other view.
-        points: in its camera.
-        camera: of its features.
-    """
-    is_ahead = points[..., 2] > 0
-    pixels = camera.focal * points[..., :2] / jnp.where(is_ahead, points[..., 2], 1.0)[..., None] + camera.center
-    product = sample(source, pixels, is_ahead) * reference
-    return jnp.mean(product.reshape(*product.shape[:-1], num_groups, -1), axis=-1)
 
 
 def _match(convs: tuple[Conv, ...], correlation: Float[Array, "n h w g"]) -> Float[Array, "h w n"]:
@@ -172,23 +134,6 @@ def _regress(logits: Float[Array, "h w d"], window: int) -> Float[Array, "h w"]:
     return jnp.sum(bins * weights, axis=-1) / (jnp.sum(weights, axis=-1) + 1e-6) / last
 
 
-def _upsample(values: Float[Array, "h w"], logits: Float[Array, "h w k"]) -> Float[Array, "h4 w4"]:
-    """Each of 4×4 pixels is a convex combination of nine values around it (Teed and Deng, ECCV 2020)."""
-    height, width = values.shape
-    padded = jnp.pad(values, 1, mode="edge")
-    around = jnp.stack([padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], axis=-1)
-    weights = jax.nn.softmax(logits.reshape(height, width, 9, 4, 4), axis=2)
-    return jnp.einsum("hwk,hwkyx->hywx", around, weights).reshape(4 * height, 4 * width)
-
-
-def _turn(hidden: Float[Array, "h w c"], seen: Float[Array, "h w i"], gru: Gru) -> Float[Array, "h w c"]:
-    """One step of the recurrent unit."""
-    both = jnp.concatenate([hidden, seen], axis=-1)
-    update, reset = jax.nn.sigmoid(convolve(both, gru.update)), jax.nn.sigmoid(convolve(both, gru.reset))
-    candidate = jnp.tanh(convolve(jnp.concatenate([reset * hidden, seen], axis=-1), gru.candidate))
-    return (1.0 - update) * hidden + update * candidate
-
-
 def _initial(
     network: IterMVS,
     reference: Float[Array, "h w c"],
@@ -203,8 +148,8 @@ def _initial(
     points = depths[:, None, None, None] * rays(camera, pixel_grid(camera))
 
     def add(total: tuple[Array, Array], source: Sources) -> tuple[tuple[Array, Array], Array]:
-        seen = _seen(points, source)
-        found = _correlation(reference, source.features.coarsest, seen, camera, config.num_groups)
+        seen = seen_from(points, source)
+        found = correlation(reference, source.features.coarsest, seen, camera, config.num_groups)
         scores = chain(found, network.visibility)[..., 0]
         weight = jnp.max(jax.nn.softmax(scores, axis=0), axis=0) * source.is_used
         return (total[0] + weight[..., None] * found, total[1] + weight), weight
@@ -212,11 +157,6 @@ def _initial(
     empty = jnp.zeros((*points.shape[:3], config.num_groups)), jnp.full(points.shape[1:3], 1e-5)
     (total, weights), each = jax.lax.scan(add, empty, sources)
     return _match(network.matching[2], total / weights[..., None]), each
-
-
-def _seen(points: Float[Array, "*b 3"], source: Sources) -> Float[Array, "*b 3"]:
-    """Points of the reference camera in that of a source."""
-    return points @ source.T_source_reference.rotation().as_matrix().T + source.T_source_reference.translation()
 
 
 def _around(
@@ -240,7 +180,7 @@ def _around(
     def add(total: tuple[Array, ...], given: tuple[Sources, Array]) -> tuple[tuple[Array, ...], None]:
         source, weight = given
         scales = zip(references, source.features, points, cameras, strict=True)
-        found = (_correlation(r, s, _seen(p, source), c, config.num_groups) for r, s, p, c in scales)
+        found = (correlation(r, s, seen_from(p, source), c, config.num_groups) for r, s, p, c in scales)
         return tuple(t + weight[..., None] * f for t, f in zip(total, found, strict=True)), None
 
     empty = tuple(jnp.zeros((*scale.shape[:3], config.num_groups)) for scale in points)
@@ -282,11 +222,57 @@ def estimate(
         hidden, unit = state
         points = tuple(points_around(unit, steps) for steps in all_steps)
         fits = _around(network, references, (sources, weights), points, camera, config)
-        hidden = _turn(hidden, jnp.concatenate([unit[..., None], fits], axis=-1), network.gru)
+        hidden = turn(hidden, jnp.concatenate([unit[..., None], fits], axis=-1), network.gru)
         return (hidden, _regress(chain(hidden, network.depth), config.window)), None
 
     unit = _regress(chain(hidden, network.depth), config.window)
     (hidden, unit), _ = jax.lax.scan(iterate, (hidden, unit), length=config.num_iterations)
-    depth = _from_unit(_upsample(unit, chain(reference.middle, network.upsampling)), depth_range)
+    depth = _from_unit(upsample(unit, chain(reference.middle, network.upsampling), "edge"), depth_range)
     confidence = jax.nn.sigmoid(chain(hidden, network.confidence))
     return depth, resize(confidence, depth.shape)[..., 0]
+
+
+def build_network(tensors: Tensors) -> IterMVS:
+    """The network of tensors that are named as in the published file; KeyError names one that is missing."""
+    part = {name.removeprefix("module."): value for name, value in tensors.items()}
+    update, match = "iter_mvs.update", "iter_mvs.evaluation.corr_conv1"
+    visibility = "iter_mvs.evaluation.pixel_view_weight.conv"
+    return IterMVS(
+        features=_feature_net(part, "feature_net"),
+        visibility=(conv(part, f"{visibility}.0.conv"), conv(part, f"{visibility}.1")),
+        matching=tuple(_matching(part, f"{match}.{scale}") for scale in range(3)),
+        hidden=_convs(part, f"{update}.hidden_init_head", (0, 2)),
+        gru=Gru(*(conv(part, f"{update}.gru.conv{name}", dilation=2) for name in "zrq")),
+        depth=_convs(part, f"{update}.depth_head", (0, 2, 4), dilation=2),
+        confidence=_convs(part, f"{update}.confidence_head", (0, 2), dilation=2),
+        upsampling=_convs(part, "iter_mvs.upsample", (0, 2)),
+    )
+
+
+def _convs(part: Tensors, name: str, numbers: tuple[int, ...], dilation: int = 1) -> tuple[Conv, ...]:
+    """A chain of which the first is dilated."""
+    return tuple(conv(part, f"{name}.{n}", dilation=dilation if n == 0 else 1) for n in numbers)
+
+
+def _normalised(part: Tensors, name: str, stride: int = 1) -> Conv:
+    return conv(part, f"{name}.conv", f"{name}.bn", stride)
+
+
+def _matching(part: Tensors, name: str) -> tuple[Conv, ...]:
+    down = (conv(part, f"{name}.conv{number}.conv", stride=min(number + 1, 2)) for number in range(3))
+    up = (conv(part, f"{name}.conv{number}", expansion=2) for number in (3, 4))
+    return (*down, *up, conv(part, f"{name}.conv5"))
+
+
+def _residual(part: Tensors, name: str, stride: int) -> Residual:
+    convs = _normalised(part, f"{name}.conv1", stride), _normalised(part, f"{name}.conv2")
+    return Residual(convs, _normalised(part, f"{name}.downsample", stride) if stride > 1 else None)
+
+
+def _feature_net(part: Tensors, name: str) -> FeatureNet:
+    return FeatureNet(
+        first=_normalised(part, f"{name}.conv1"),
+        blocks=tuple(_residual(part, f"{name}.layer{layer}.{n}", 2 - n) for layer in (1, 2, 3) for n in (0, 1)),
+        lateral=tuple(conv(part, f"{name}.inner{scale}") for scale in (1, 2)),
+        out=tuple(conv(part, f"{name}.output{scale}") for scale in (1, 2, 3)),
+    )

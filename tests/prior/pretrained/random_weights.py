@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from emgs_jax.prior.itermvs.network import IterMVS
-from emgs_jax.prior.itermvs.weights import build_network
+from emgs_jax.prior.pretrained.itermvs import IterMVS, build_network
 
 
 def _norm(channels: int) -> dict[str, tuple[int, ...]]:

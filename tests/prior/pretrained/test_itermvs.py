@@ -10,7 +10,6 @@ import sys
 from functools import cache
 from pathlib import Path
 
-import cv2
 import hydra
 import jax
 import jaxlie
@@ -19,18 +18,16 @@ import pytest
 import scipy.ndimage
 from random_weights import random_network, random_tensors
 from scene import compose, device, on_host
-from scipy.spatial.transform import Rotation
+from views import BESIDE, RANGE, SIZE, camera, random_views, real_views
 
-from emgs_jax.ops.camera import Camera
-from emgs_jax.prior.itermvs.layers import Conv, convolve, resize, sample
-from emgs_jax.prior.itermvs.network import Sources, estimate, extract
-from emgs_jax.prior.itermvs.weights import build_network, load_weights
+from emgs_jax.prior.pretrained.itermvs import SOURCE, build_network, estimate, extract
+from emgs_jax.prior.pretrained.layers import Conv, convolve, resize, sample
+from emgs_jax.prior.pretrained.matching import Sources
+from emgs_jax.prior.pretrained.weights import load_network
 
-BESIDE = Path(__file__).resolve().parents[3].parent
 CHECKPOINT = Path(os.environ.get("ITERMVS_CHECKPOINT", BESIDE / "shared/weights/itermvs_blendedmvs_model_000015.ckpt"))
 ORIGINAL = Path(os.environ.get("ITERMVS", BESIDE / "IterMVS"))
-SIZE, RANGE = (64, 96), (0.8, 5.0)  # rows and columns
-_extract = on_host(lambda network, images: jax.vmap(lambda image: extract(network.features, image))(images))
+_extract = on_host(lambda network, images: jax.vmap(lambda image: extract(network, image))(images))
 _estimate = on_host(estimate)
 
 
@@ -39,19 +36,8 @@ def dense_config():
     return hydra.utils.instantiate(compose("prior=multiview_stereo", "prior/dense=itermvs").prior.dense)
 
 
-def camera(size=SIZE):
-    height, width = size
-    return Camera([0.82 * width, 1.09 * height], [0.5 * width - 0.5, 0.5 * height - 0.5], width, height)
-
-
-def random_views(size=SIZE, seed=0, count=4):
-    """Images of a view and `count` others, and where these are."""
-    rng = np.random.default_rng(seed)
-    images = [cv2.GaussianBlur(rng.uniform(size=(*size, 3)), (0, 0), 1.5) for _ in range(count + 1)]
-    T = np.tile(np.eye(4), (count, 1, 1))
-    T[:, :3, :3] = Rotation.from_rotvec(0.05 * rng.normal(size=(count, 3))).as_matrix()
-    T[:, :3, 3] = 0.2 * rng.normal(size=(count, 3))
-    return np.float32(images), np.float32(T)
+def load(checkpoint, sha256):
+    return load_network(checkpoint, sha256, SOURCE, "model", build_network)
 
 
 def found(network, images, T_source_view, depth_range=RANGE, is_used=None):
@@ -142,11 +128,11 @@ def test_weights_that_are_missing_or_others_are_refused_by_name(tmp_path):
     other.write_bytes(b"nothing")
     digest = dense_config().sha256
     with pytest.raises(ValueError, match=r"prior.dense.checkpoint=None .* https://github.com/FangjinhuaWang/IterMVS"):
-        load_weights(None, digest)
+        load(None, digest)
     with pytest.raises(ValueError, match=f"SHA-256 {_digest(other)}, expected {digest}"):
-        load_weights(str(other), digest)
-    with pytest.raises(ValueError, match="has no weights of IterMVS"):
-        load_weights(str(other), _digest(other))
+        load(str(other), digest)
+    with pytest.raises(ValueError, match="has not the weights of https://github.com/FangjinhuaWang/IterMVS"):
+        load(str(other), _digest(other))
     tensors = random_tensors()
     del tensors["module.iter_mvs.update.gru.convr.bias"], tensors["module.iter_mvs.upsample.2.weight"]
     with pytest.raises(KeyError, match=r"iter_mvs.upsample.2.weight"):
@@ -161,7 +147,7 @@ def _digest(path):
 def published():
     if not CHECKPOINT.is_file():
         pytest.skip(f"the published weights are not at {CHECKPOINT}")
-    return load_weights(str(CHECKPOINT), dense_config().sha256)
+    return load(str(CHECKPOINT), dense_config().sha256)
 
 
 def original(images, T_source_view, size):
@@ -189,20 +175,6 @@ def original(images, T_source_view, size):
     with torch.no_grad():
         found = network({"level_0": shown, "level_2": shown}, projections, *(torch.tensor([end]) for end in RANGE))
     return tuple(found[name][0, 0].numpy() for name in ("depths_upsampled", "confidence_upsampled"))
-
-
-def real_views(size):
-    """Redkitchen at the poses of its release, whose rotations are rounded to seven digits."""
-    folder = BESIDE / "shared/data/7scenes/redkitchen/seq-01"
-    if not folder.is_dir():
-        pytest.skip(f"redkitchen of 7-Scenes is not at {folder}")
-    stems = [folder / f"frame-{number:06d}" for number in (100, 80, 90, 110, 120)]
-    images = [cv2.cvtColor(cv2.imread(f"{stem}.color.jpg"), cv2.COLOR_BGR2RGB) for stem in stems]
-    images = [cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA) / np.float32(255) for image in images]
-    T = np.stack([np.linalg.inv(np.loadtxt(f"{stem}.pose.txt")) for stem in stems])
-    T = T[1:] @ np.linalg.inv(T[0])
-    T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
-    return np.float32(images), np.float32(T)
 
 
 @pytest.mark.parametrize("kind", ["random", "real"])

@@ -1,0 +1,179 @@
+"""Depths of any network in files, as the programs write them: one file a frame, or one for all.
+
+Video-Depth-Anything and DepthCrafter write an .npz of a whole video, Depth Anything and MiDaS pictures of 8 or 16 bits
+(each stretched to its range, which a scale and a shift a frame undo) or .pfm, Marigold .npy. Files are of the frames
+whose names they have, with what a program adds to all of them (`_depth`), or in order.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from emgs_jax.data.base import Dataset
+from emgs_jax.data.reading import check_depth_scale, decode, fingerprint
+from emgs_jax.ops.ranges import number
+from emgs_jax.prior.files.arrays import files_of, load_exr, load_npy, load_npz, names_in
+from emgs_jax.prior.files.view import Camera, View, whole_image
+from emgs_jax.prior.multiview.dense import Depths, Scene, Way
+from emgs_jax.prior.multiview.lens import rectify
+from emgs_jax.prior.multiview.monocular import MonocularConfig, begin_monocular
+from emgs_jax.structure.model import Structure
+
+SUFFIXES = (".npz", ".npy", ".pfm", ".exr", ".png")  # the first that is there is read
+KEYS = ("depth", "depths", "disparity", "disparities", "inverse_depth", "prediction")  # of an .npz with several arrays
+
+
+@dataclass(frozen=True)
+class DepthFilesConfig(MonocularConfig):
+    """Depths in files.
+
+    Args:
+        folder: of the files, or the one file of all frames.
+        depth_scale: units of a metre in 16-bit .png files of metric depths.
+    """
+
+    folder: str
+    depth_scale: float = number(low=1e-3, high=1e6)
+
+
+class DepthFiles(NamedTuple):
+    """What a folder holds.
+
+    Args:
+        names: of each frame's file without its suffix; numbers where one file has all.
+        read: values (gh, gw) of one, NaN where there are none.
+    """
+
+    files: Sequence[Path]
+    names: Sequence[str]
+    read: Callable[[int], np.ndarray]
+
+
+def way_of_files(config: DepthFilesConfig) -> Way:
+    """The way to depth that reads it.
+
+    Raises:
+        ValueError: no files, or none that can be read.
+    """
+    folder = Path(config.folder).expanduser()
+    found = open_depths(folder, config.kind, check_depth_scale(config.depth_scale, "prior.dense.depth_scale"))
+
+    def check(dataset: Dataset) -> None:
+        read = _reader(dataset, found, folder)
+        read(0)
+
+    def begin(scene: Scene) -> tuple[Structure, Depths]:
+        read = _reader(scene.dataset, found, folder)
+
+        def values(frame: int) -> np.ndarray:
+            return rectify(read(frame), scene.lenses[scene.structure.world[frame]])
+
+        return begin_monocular(scene, values, config)
+
+    root = folder if folder.is_dir() else folder.parent
+    return Way(begin, check, {"fingerprint": fingerprint(root, found.files, {})}, ("folder",))
+
+
+def open_depths(folder: Path, kind: str, depth_scale: float) -> DepthFiles:
+    """The depths in a folder, or in one file."""
+    if folder.is_file():
+        paths = [folder]
+    else:
+        paths = next((found for suffix in SUFFIXES if (found := files_of(folder, suffix))), [])
+    if not paths or paths[0].suffix not in SUFFIXES:
+        below = sorted(path.name for path in folder.glob("*/") if path.is_dir())
+        remedy = f"; it has the folders {', '.join(below[:5])}: give one of them" if below else ""
+        raise ValueError(f"prior.dense.folder={folder} has no file *{', *'.join(SUFFIXES)}{remedy}")
+    load = {
+        ".npz": _load_npz,
+        ".npy": load_npy,
+        ".pfm": partial(decode, flags=cv2.IMREAD_UNCHANGED),
+        ".exr": load_exr,
+        ".png": partial(_load_png, kind=kind, depth_scale=depth_scale),
+    }[paths[0].suffix]
+    if len(paths) > 1:
+        return DepthFiles(paths, [path.stem for path in paths], lambda row: _image(load(paths[row]), kind, paths[row]))
+    stack = np.asarray(load(paths[0]))
+    stack = stack.squeeze() if stack.ndim > 3 else stack
+    if stack.ndim != 3 or stack.dtype.kind not in "fui":
+        raise ValueError(f"{paths[0]} must be depths (frames, h, w) of all frames, got {stack.shape}")
+    return DepthFiles(paths, [f"{row}" for row in range(len(stack))], lambda row: _image(stack[row], kind, paths[0]))
+
+
+def _load_npz(path: Path) -> np.ndarray:
+    """The one array of an .npz, or that with a name that says depth."""
+    names = names_in(path)
+    key = names[0] if len(names) == 1 else next((key for key in KEYS if key in names), None)
+    if names and key is None:
+        raise ValueError(f"{path} has {', '.join(names)}: name the depths one of {', '.join(KEYS)}")
+    return load_npz(path, names=(key or KEYS[0],))[key or KEYS[0]]
+
+
+def _load_png(path: Path, kind: str, depth_scale: float) -> np.ndarray:
+    raw = decode(path, cv2.IMREAD_UNCHANGED)
+    if raw.ndim == 3 and (raw[..., :3] != raw[..., :1]).any():
+        raise ValueError(
+            f"{path} is a coloured picture of depth, which tells none: let the program write values (--grayscale "
+            "--pred-only, --save_npz, .npy)"
+        )
+    raw = np.float32(raw[..., 0] if raw.ndim == 3 else raw)
+    return raw / np.float32(depth_scale) if kind == "metric" else raw
+
+
+def _image(values: np.ndarray, kind: str, path: Path) -> np.ndarray:
+    """Values (h, w) in float32, NaN where there are none: not finite, or a depth that is not above 0."""
+    values = np.squeeze(values)
+    if values.ndim != 2 or values.dtype.kind not in "fui" or min(values.shape) < 2:
+        raise ValueError(f"{path} must be depths (h, w), got {values.dtype} {values.shape}")
+    values = np.float32(values)
+    is_known = np.isfinite(values) & ((values > 0) | (kind not in ("metric", "up_to_scale")))
+    return np.where(is_known, values, np.float32(np.nan))
+
+
+def _reader(dataset: Dataset, found: DepthFiles, folder: Path) -> Callable[[int], np.ndarray]:
+    """Values of a frame at its pixels."""
+    rows, size = rows_of(dataset, found.names, folder), (dataset.size[0], dataset.size[1])
+    camera = Camera(size, dataset.intrinsics)
+
+    def read(frame: int) -> np.ndarray:
+        values = found.read(rows[frame])
+        whole_image(camera, View(f"{found.files[min(rows[frame], len(found.files) - 1)]}", values))
+        # Nothing is mixed across an edge of depth where the file has a value for every pixel.
+        way = cv2.INTER_LINEAR if values.shape[1] < size[0] else cv2.INTER_NEAREST_EXACT
+        return cv2.resize(values, size, interpolation=way)
+
+    return read
+
+
+def rows_of(dataset: Dataset, names: Sequence[str], folder: Path) -> list[int]:
+    """Row of every frame: by the names of the images, which all files may go on in one way, else in order.
+
+    Raises:
+        ValueError: a frame has no file, or there are not as many files as frames.
+    """
+    files = [dataset.files(index)[:1] for index in range(len(dataset))]
+    stems = [file[0].stem if file else "" for file in files]
+    rows = {name: row for row, name in enumerate(names)}
+    if all(stems) and len({*stems}) == len(stems):
+        ends = {name[len(stems[0]) :] for name in names if name.startswith(stems[0])}
+        ends = {end for end in ends if not end or not end[0].isalnum()} | {""}
+        end = max(sorted(ends), key=lambda end: sum(stem + end in rows for stem in stems))
+        missing = [stem for stem in stems if stem + end not in rows]
+        if not missing:
+            return [rows[stem + end] for stem in stems]
+        if len(missing) < len(stems):
+            raise ValueError(
+                f"{folder} has no depth for {len(missing)} of {len(stems)} frames, the first is {missing[0]}{end}: "
+                "predict it, or leave the frame out (dataset.start, stop, stride)"
+            )
+    if len(names) != len(stems):
+        raise ValueError(
+            f"{folder} has depths of {len(names)} frames and the data set {len(stems)} frames, and names do not tell "
+            "which is whose: predict all frames in use, or choose those that were (dataset.start, stop, stride)"
+        )
+    return list(range(len(stems)))

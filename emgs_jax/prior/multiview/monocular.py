@@ -1,0 +1,91 @@
+"""Depth of a network that looks at one image, or at a video, on the poses of a structure and at its scale."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+from tqdm import tqdm
+
+from emgs_jax.ops.ranges import number
+from emgs_jax.prior.multiview.dense import DenseConfig, Depth, Depths, Scene, tried_depths
+from emgs_jax.prior.multiview.landmark_fit import KINDS, LandmarkFit, LandmarkFitConfig, fit_to_landmarks, to_depth
+from emgs_jax.prior.multiview.landmarks import landmarks_of, point_information
+from emgs_jax.structure.model import Structure, scaled
+
+
+@dataclass(frozen=True)
+class MonocularConfig(DenseConfig):
+    """Depth that is brought to the scale of landmarks.
+
+    Args:
+        fit: scale and shift of each frame.
+        kind: `metric` depths in metres, which the structure takes over; depths `up_to_scale`; `affine` depths, up to a
+            scale and a shift; `affine_inverse` depths, likewise.
+        cell: side of the part of an image where a network's errors are alike, as a share of its longer side.
+        pixel_std: of a landmark, in pixels of the images that the structure was made of.
+    """
+
+    fit: LandmarkFitConfig
+    kind: str = field(metadata={"choices": KINDS})
+    cell: float = number(low=1e-3, high=1)
+    pixel_std: float = number(low=1e-3, high=100)
+
+
+def begin_monocular(
+    scene: Scene, values: Callable[[int], Float[np.ndarray, "h w"]], config: MonocularConfig
+) -> tuple[Structure, Depths]:
+    """The structure, in metres where the network's depths are metric, and the depth of each frame.
+
+    Args:
+        values: of a frame, what the network says at the pixels of the pinhole camera; NaN where it says nothing.
+
+    Raises:
+        ValueError: see `fit_to_landmarks`.
+    """
+    found, fits, rows = scene.structure, [], {}
+    for world in range(len(found.worlds)):
+        frames = np.flatnonzero((found.world == world) & ~found.is_interpolated)
+        rows |= {int(frame): row for row, frame in enumerate(frames)}
+        fits.append(_fit(scene, world, frames, values, config))
+    factors = [1.0] * len(fits)
+    if config.kind == "metric":
+        factors = [float(1.0 / (fit.base[0] * np.exp(fit.parameters[:, 0].mean()))) for fit in fits]
+        found = scaled(found, factors)
+    ranges = [tried_depths(_depths(found, world), config.depth_margin) for world in range(len(found.worlds))]
+
+    def depth_of(frame: int) -> Depth:
+        world = found.world[frame]
+        depth, std = to_depth(values(frame), fits[world], rows[frame])
+        depth *= np.float32(factors[world])
+        near, far = ranges[world]
+        is_near = (depth >= near) & (depth <= far)
+        return Depth(np.where(is_near, depth, 0.0), std, np.float32(is_near))
+
+    return found, depth_of
+
+
+def _depths(found: Structure, world: int) -> np.ndarray:
+    """Depths of all landmarks of a world, in all frames that show them."""
+    z = np.concatenate([found.depths(frame) for frame in np.flatnonzero(found.world == world)])
+    return z[z > 0]
+
+
+def _fit(
+    scene: Scene, world: int, frames: np.ndarray, values: Callable[[int], np.ndarray], config: MonocularConfig
+) -> LandmarkFit:
+    """Scale and shift of the frames of a world; says how well they fit."""
+    information = point_information(scene.structure, world, config.pixel_std)
+    landmarks = [landmarks_of(scene.structure, frame, information, scene.camera, config.cell) for frame in frames]
+    said = []
+    for frame, found in zip(frames, landmarks, strict=True):
+        column, row = np.rint(found.pixels).astype(int).T
+        said.append(values(int(frame))[row, column])
+    fit = fit_to_landmarks(said, landmarks, frames, config.kind, config.fit)
+    log_scale = fit.parameters[:, 0] - fit.parameters[:, 0].mean()
+    tqdm.write(
+        f"prior.dense: {config.kind} depths of {len(frames)} frames on {np.median([len(s) for s in said]):.0f} "
+        f"landmarks each: they differ by {100 * np.median(fit.std):.1f} %, scale from {np.exp(log_scale.min()):.3f} to "
+        f"{np.exp(log_scale.max()):.3f}, {100 * fit.step_std[0]:.2f} % from frame to frame"
+    )
+    return fit

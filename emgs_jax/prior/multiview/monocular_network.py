@@ -1,0 +1,60 @@
+"""Dense depth by METER, a small network that looks at one image, whose weights the user brings."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from emgs_jax.ops.ranges import number
+from emgs_jax.prior.multiview.dense import Depths, Scene, Way
+from emgs_jax.prior.multiview.lens import rectify
+from emgs_jax.prior.multiview.monocular import MonocularConfig, begin_monocular
+from emgs_jax.prior.pretrained.meter import SOURCE, build_network, predict
+from emgs_jax.prior.pretrained.weights import load_network
+from emgs_jax.structure.model import Structure
+
+NUM_KEPT = 64  # frames whose depths are at hand
+jitted_predict = eqx.filter_jit(predict)
+
+
+@dataclass(frozen=True)
+class MeterConfig(MonocularConfig):
+    """Depth by METER.
+
+    Args:
+        width: of the images that it is shown, in pixels; a multiple of 64.
+        height: likewise.
+        checkpoint: path of its weights.
+        sha256: of that file, in hexadecimal digits.
+    """
+
+    width: int = number(low=64, high=4096)
+    height: int = number(low=64, high=4096)
+    checkpoint: str | None
+    sha256: str
+
+
+def way_of_meter(config: MeterConfig) -> Way:
+    """The way to depth that shows it each image.
+
+    Raises:
+        ValueError: the file is not that of the published weights.
+    """
+    network = load_network(config.checkpoint, config.sha256, SOURCE, None, build_network)
+
+    def begin(scene: Scene) -> tuple[Structure, Depths]:
+        size = scene.camera.width, scene.camera.height
+
+        @lru_cache(NUM_KEPT)
+        def values(frame: int) -> np.ndarray:
+            lens = scene.lenses[scene.structure.world[frame]]
+            shown = rectify(np.float32(scene.dataset[frame].image), lens) / 255.0
+            shown = cv2.resize(shown, (config.width, config.height), interpolation=cv2.INTER_AREA)
+            return cv2.resize(np.asarray(jitted_predict(network, jnp.asarray(shown))), size)
+
+        return begin_monocular(scene, values, config)
+
+    return Way(begin, paths=("checkpoint",))
