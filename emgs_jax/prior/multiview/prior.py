@@ -201,7 +201,7 @@ class MultiviewStereo(Prior):
 
     def _std(self, frame: int, depths: Depths, config: DenseConfig) -> np.ndarray:
         """Standard deviation of the logarithm of each depth; inf where there is no telling."""
-        depth, spread, pixels = depths(frame)
+        depth, spread, pixels, _ = depths(frame)
         count = config.num_checks
         others = [int(other) for other in placed_beside(self._found, frame)[:count]]
         if not others:
