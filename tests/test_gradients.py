@@ -147,7 +147,7 @@ def test_a_derivative_by_one_kind_of_input_is_that_of_float64_differences(name):
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True):
         if other.dtype.kind != "f":
             continue
-        for i, (a, b) in enumerate(zip(one, other)):
+        for i, (a, b) in enumerate(zip(one, other, strict=True)):
             assert np.isfinite(a).all()
             scale = np.sqrt(np.mean(np.square(b)))
             err = np.abs(a - b)
