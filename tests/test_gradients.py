@@ -1,7 +1,4 @@
-"""Derivatives in float32 are those of differences in float64, by each kind of input alone: points, noise, pose, prior.
-
-A row of which the two precisions choose another neighbour has other values; few do.
-"""
+"""Derivatives in float32 are those of differences in float64, by each kind of input alone: points, noise, pose, prior."""
 
 from dataclasses import replace
 
@@ -15,14 +12,16 @@ import scene as sc
 from verbs import CAMERA, CONFIG, NOISE, ROWS, close, looking, map_of
 
 from emgs_jax import em, surface_extrapolation
-from emgs_jax.ops import neighbours
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.registration import icp, problem
 from emgs_jax.render import composite
 
 pytestmark = pytest.mark.slow
 STEP = 1e-6  # of float64, in m, rad and parts
-SHARP = replace(CONFIG, localization=replace(CONFIG.localization, icp=replace(CONFIG.localization.icp, tolerance=1e-6)))
+SHARP = replace(
+    CONFIG,
+    localization=replace(CONFIG.localization, icp=replace(CONFIG.localization.icp, tolerance=1e-6, max_steps=64)),
+)
 
 
 def turned(T, xi):
@@ -54,9 +53,9 @@ def continued(given, points, noise, pose, weight):
     extrapolation = config.extrapolation
     observation = at(observation, points=points)
     is_fused = jnp.asarray(ROWS % 3 > 0)
-    return surface_extrapolation.extrapolate(
-        observation, map, is_fused, noise, turned(T, pose), CAMERA, extrapolation
-    ).points
+    T = turned(T, pose)
+    moved = surface_extrapolation.extrapolate(observation, map, is_fused, noise, T, CAMERA, extrapolation)
+    return (moved.points,)
 
 
 def drawn(given, means, covs, pose):
@@ -89,9 +88,10 @@ def case(name):
 def in_float64(function, *arguments):
     """Its results where every float is one of float64."""
     wide = jax.tree.map(lambda x: np.float64(x) if np.asarray(x).dtype.kind == "f" else x, jax.device_get(arguments))
+    bits = jax.lax.bitcast_convert_type
     with pytest.MonkeyPatch.context() as patch, jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
-        # The bits of a float32 rank it there.
-        patch.setattr(neighbours, "ranks", lambda values: jnp.argsort(jnp.argsort(values, axis=-1), axis=-1))
+        # By the bits of a float32 things are ordered, there too.
+        patch.setattr(jax.lax, "bitcast_convert_type", lambda x, to: bits(jnp.float32(x), to))
         return jax.device_get(eqx.filter_jit(function)(*wide))
 
 
@@ -131,7 +131,10 @@ def differences(function):
     return of
 
 
-@pytest.mark.parametrize("name", ["em", "icp", "extrapolation", "render"])
+ICP = pytest.mark.xfail(strict=True, reason="issue 52.4: of a pose by points it is off by a sixth")
+
+
+@pytest.mark.parametrize("name", ["em", pytest.param("icp", marks=ICP), "extrapolation", "render"])
 def test_a_derivative_by_one_kind_of_input_is_that_of_float64_differences(name):
     """The solver has a loop, which has forward mode only, and the renderer a reverse mode of its own."""
     function, given, inputs = case(name)
@@ -141,17 +144,6 @@ def test_a_derivative_by_one_kind_of_input_is_that_of_float64_differences(name):
     exact = in_float64(differences(function), given, inputs, directions)
     for one, other in zip(found, exact, strict=True):
         assert np.isfinite(one).all()
-        for i, (a, b) in enumerate(zip(one, other, strict=True)):
-            err = np.abs(a - b)
-            scale = np.sqrt(np.mean(np.square(b)))
-            print(
-                name,
-                i,
-                a.shape,
-                "scale",
-                scale,
-                "rms",
-                np.sqrt(np.mean(err**2)) / max(scale, 1e-12),
-                "q98",
-                np.quantile(err, 0.98) / max(scale, 1e-12),
-            )
+        for a, b in zip(one, other, strict=True):
+            wrong, size = (np.sqrt(np.mean(np.square(x))) for x in (a - b, b))
+            assert wrong <= 1e-3 * size + 1e-9, (wrong, size)
