@@ -1,4 +1,4 @@
-"""Derivatives in float32 are those of differences in float64, by each kind of input alone: points, noise, pose, prior."""
+"""Derivatives in float32 are those of differences in float64, by each input alone: points, noise, pose, prior."""
 
 from dataclasses import replace
 
