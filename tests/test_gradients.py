@@ -134,7 +134,10 @@ def test_a_derivative_by_one_kind_of_input_is_that_of_float64_differences(name):
 
     def differences(given, inputs, directions):
         def along(direction):
-            ends = [function(given, *(x + sign * STEP * d for x, d in zip(inputs, direction, strict=True))) for sign in (1, -1)]
+            ends = [
+                function(given, *(x + sign * STEP * d for x, d in zip(inputs, direction, strict=True)))
+                for sign in (1, -1)
+            ]
             return jax.tree.map(lambda a, b: (a - b) / (2 * STEP), *ends)
 
         return jax.vmap(along)(directions)
@@ -142,9 +145,22 @@ def test_a_derivative_by_one_kind_of_input_is_that_of_float64_differences(name):
     found = jax.device_get(eqx.filter_jit(slopes)(given, inputs, directions))
     exact = in_float64(differences, given, inputs, directions)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True):
-        if other.dtype.kind != "f": continue
+        if other.dtype.kind != "f":
+            continue
         for i, (a, b) in enumerate(zip(one, other)):
             assert np.isfinite(a).all()
             scale = np.sqrt(np.mean(np.square(b)))
-            err = np.abs(a - b) 
-            print(name, i, a.shape, "scale", scale, "max rel", err.max() / max(scale,1e-12), "q99", np.quantile(err,.99)/max(scale,1e-12), "rms", np.sqrt(np.mean(err**2))/max(scale,1e-12))
+            err = np.abs(a - b)
+            print(
+                name,
+                i,
+                a.shape,
+                "scale",
+                scale,
+                "max rel",
+                err.max() / max(scale, 1e-12),
+                "q99",
+                np.quantile(err, 0.99) / max(scale, 1e-12),
+                "rms",
+                np.sqrt(np.mean(err**2)) / max(scale, 1e-12),
+            )

@@ -159,9 +159,12 @@ def _check_kind(samples: Sequence[_Sample], kind: str, config: LandmarkFitConfig
     said = f"prior.dense.kind={kind}, but the landmarks' {'inverse depths' if kind == 'affine_inverse' else 'depths'}"
     if found <= -config.min_correlation:
         other = (
-            "depths (affine, up_to_scale or metric)" if kind == "affine_inverse" else "inverse depths (affine_inverse)"
+            "depths (affine, up_to_scale, metric)" if kind == "affine_inverse" else "inverse depths (affine_inverse)"
         )
-        raise ValueError(f"{said} fall where these values grow (rank correlation {found:.2f}): they are {other}")
+        raise ValueError(
+            f"{said} fall where these values grow (rank correlation {found:.2f}): they are {other}, or the "
+            "structure is inside out, as one of images from nearly one place may be (give more of them)"
+        )
     raise ValueError(
         f"{said} have nothing to do with these values (rank correlation {found:.2f}): are they of these frames, in "
         "their order, and of the whole image?"
