@@ -131,7 +131,9 @@ def differences(function):
     return of
 
 
-ICP = pytest.mark.xfail(strict=True, reason="issue 52.4: of a pose by points it is off by a sixth")
+ICP = pytest.mark.xfail(
+    strict=True, reason="residuals times derivatives of their Jacobian are left out, see `residuals`"
+)
 
 
 @pytest.mark.parametrize("name", ["em", pytest.param("icp", marks=ICP), "extrapolation", "render"])
