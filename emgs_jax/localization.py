@@ -202,6 +202,7 @@ def _correct_by_prior(
     scale: Float[Array, ""],
     anchored: tuple[jaxlie.SE3, Float[Array, "6 6"]],
     estimate: PoseEstimate,
+    scale_std: Float[Array, ""],
     config: LocalizationConfig,
 ) -> tuple[jaxlie.SE3, Float[Array, ""], PoseEstimate]:
     """Correct pose, scale and their estimate by the prior's own pose (`fused` only) and the prior's own unit.
@@ -213,6 +214,7 @@ def _correct_by_prior(
         T_world_camera: estimate before the measurement.
         scale: likewise.
         anchored: the prior's own pose, and its covariance.
+        scale_std: of the logarithm of the scale, about that of the prior's own unit.
     """
     pose, covariance = anchored
     apart = (T_world_camera.inverse() @ pose).log()
@@ -221,7 +223,7 @@ def _correct_by_prior(
     innovation, root = (root_information(P) for P in (estimate.covariance[:-1, :-1] + covariance, covariance))
     weight = is_used / (1.0 + jnp.sum((innovation @ apart) ** 2) / apart.shape[0])
     difference = jnp.append(apart, estimate.log_scale - jnp.log(scale))
-    information = jnp.zeros((7, 7)).at[:6, :6].set(weight * root.T @ root).at[6, 6].set(config.scale_std**-2)
+    information = jnp.zeros((7, 7)).at[:6, :6].set(weight * root.T @ root).at[6, 6].set(scale_std**-2)
     step, estimate = correct(estimate, difference, information)
     return T_world_camera @ jaxlie.SE3.exp(step[:-1]), scale * jnp.exp(step[-1]), estimate
 
@@ -266,7 +268,9 @@ def localize_coarse(
     repeats = jax.tree.map(partial(jnp.where, is_given), no_repeats(), repeats)
     estimate = eqx.tree_at(lambda b: (b.repeats, b.is_given), estimate, (repeats, is_given))
     known = pose_row(forms, config.coarse.astype(jnp.int32)), scale
-    coarse, scale, estimate = _correct_by_prior(*known, (anchored, of_pose), estimate, config)
+    is_sure = is_given & jnp.isfinite(prediction.scale_std)
+    scale_std = jnp.where(is_sure, jnp.maximum(prediction.scale_std, LEAST_NOISE), config.scale_std)
+    coarse, scale, estimate = _correct_by_prior(*known, (anchored, of_pose), estimate, scale_std, config)
     unit = jnp.where(is_given, own_unit, scale)
     is_finite = jnp.all(jnp.isfinite(coarse.wxyz_xyz))
     coarse = jaxlie.SE3(jnp.where(is_finite, coarse.wxyz_xyz, T_world_previous.wxyz_xyz))

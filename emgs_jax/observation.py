@@ -38,6 +38,8 @@ class Prediction(eqx.Module):
         T_world_anchor: pose of the anchor, about which the scale of this call acts.
         pose_covariance: of ξ where the true pose is T Exp(ξ), translation (unit of the prediction), rotation (rad);
             rows: motion from the previous frame, own pose. NaN where the prior does not say how sure it is.
+        scale_std: of the logarithm of the factor between the lengths of the current frame's points and of its pose. NaN
+            where the prior does not say how sure it is.
         has_newest: False at the end of a sequence, where there is no newer image.
         is_repeat: False where the frame before is of the same call, so that nothing of it is said twice.
     """
@@ -47,6 +49,7 @@ class Prediction(eqx.Module):
     T_world_views: jaxlie.SE3
     T_world_anchor: jaxlie.SE3
     pose_covariance: Float[Array, "*b 2 6 6"]
+    scale_std: Float[Array, "*b"]
     has_newest: Bool[Array, "*b"]
     is_repeat: Bool[Array, "*b"]
 

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, ListConfig
 
 from emgs_jax.config.configure import build
 from emgs_jax.data.class_file import read_classes
-from emgs_jax.evaluation.segmentation import LabelledPoints, label_cells, read_labelled_mesh, true_labels
+from emgs_jax.evaluation.segmentation import DistinctCells, LabelledPoints, label_cells, read_labelled_mesh, true_labels
 from emgs_jax.io.files import write_file, write_json
 from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.segmentation_table import Placement, SceneResult, score_scene, summary, table
@@ -72,10 +72,9 @@ def true_points(config: DictConfig, run: RecordedRun, scene: str) -> LabelledPoi
     dataset, note = images_of(run)
     if dataset is None:
         raise ValueError(f"truth=frames: the frames of {run.folder} cannot be read again. {note}")
-    cells = [
-        label_cells(dataset[row], dataset, config.voxel_m, config.max_depth_m)
-        for row in range(len(dataset) if dataset.classes else 0)
-    ]
+    cells = DistinctCells()
+    for row in range(len(dataset) if dataset.classes else 0):
+        cells.append(label_cells(dataset[row], dataset, config.voxel_m, config.max_depth_m))
     truth = true_labels(cells, dataset, config.voxel_m)
     if truth is None:
         raise ValueError(

@@ -42,9 +42,14 @@ def implied(path: Path, given: dict[str, str]) -> list[str]:
     if given.get("dataset", "images") != "images":
         return [f"dataset.root={written(str(path))}"]
     found = {"dataset": "images", "dataset.root": written(str(path)), "dataset.intrinsics": "estimate"}
-    if "dataset.size" not in given:
-        size = _size(path)
-        found["dataset.size"] = f"[{size[0]},{size[1]}]"
+    size = _size(path)
+    found["dataset.size"] = "[{},{}]".format(*frame_size(*size))
+    if given.get("prior") == "files" and "prior.folder" in given and "dataset.intrinsics" not in given:
+        from emgs_jax.prior.files.prior import image_intrinsics
+
+        camera = image_intrinsics(Path(given["prior.folder"].strip("'\"")).expanduser(), size)
+        if camera is not None:  # what points lie by
+            found["dataset.intrinsics"] = "[{:.6g},{:.6g},{:.6g},{:.6g}]".format(*camera)
     if given.get("prior", "multiview_stereo") == "multiview_stereo":
         found["prior"] = "multiview_stereo"
         if "baseline" not in given:  # it fuses frames where they were placed, the back end moves them afterwards
@@ -59,14 +64,14 @@ def frame_size(width: int, height: int) -> tuple[int, int]:
 
 
 def _size(path: Path) -> tuple[int, int]:
-    """The size of frames of a video or a folder of images."""
+    """(width, height) of a video or a folder of images, as they are shown."""
     from emgs_jax.data.images import Folder
     from emgs_jax.data.video import VIDEO_SUFFIXES, Video
 
     if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
-        return frame_size(*Video(path, 1).find_size(range(1)))
+        return Video(path, 1).find_size(range(1))
     images = Folder(path)
-    return frame_size(*images.find_size(range(images.count)))
+    return images.find_size(range(images.count))
 
 
 def _is_path(word: str, before: Sequence[str]) -> bool:

@@ -194,7 +194,8 @@ def stack_poses(poses: list[jaxlie.SE3]) -> jaxlie.SE3:
 
 def first_window(views: Observation, T_world_views: jaxlie.SE3) -> FirstWindow:
     """The first window of a prior that does not say how sure its poses are."""
-    return FirstWindow(views, T_world_views, jnp.tile(no_covariance(), (len(views.valid), 1, 1, 1)))
+    unknown = jnp.tile(no_covariance(), (len(views.valid), 1, 1, 1)), jnp.asarray(jnp.nan)
+    return FirstWindow(views, T_world_views, *unknown)
 
 
 def predict_room(
@@ -213,6 +214,7 @@ def predict_room(
         T_world_views=stack_poses(poses),
         T_world_anchor=path_pose(0),
         pose_covariance=no_covariance(),
+        scale_std=jnp.asarray(jnp.nan),
         has_newest=jnp.asarray(has_newest),
         is_repeat=jnp.asarray(True),
     )

@@ -217,6 +217,21 @@ def test_the_scale_of_the_depths_moves_no_pose_that_is_given(wide, printed):
     assert sc.pose_error(coarse_of(mixed, wide, config).T_world_camera, sc.path_pose(FRAME))[0] > 3e-3
 
 
+@pytest.mark.parametrize("std", [0.0, 0.03, np.nan])
+def test_the_scale_of_depths_is_as_sure_as_the_prior_says(wide, printed, std):
+    """Depths 10 % too small beside a map whose scale is known to 10 %: as in a Kalman filter."""
+    right, small = sc.predict_room(FRAME, wide), sc.predict_room(FRAME, wide, scale=0.9)
+    mixed = eqx.tree_at(lambda p: (p.T_world_views, p.scale_std), small, (right.T_world_views, sc.device(std)))
+    known = {"coarse": COARSE["fused"], "coarse_scale": SCALES["ratio"], "icp.prior_information": 30.0}
+    config = sc.changed(printed, scale_std=np.inf, **known)
+    before = eqx.tree_at(lambda b: b.covariance, CERTAIN, sc.device(np.diag([0.0] * 6 + [0.1**2])))
+    found = np.log(coarse_of(given(mixed, 1e-3, 1e-3), wide, config, estimate=before).scale)
+    expected = 0.0 if np.isnan(std) else 0.1**2 / (0.1**2 + max(std, 2e-4) ** 2)
+    assert found == pytest.approx(-np.log(0.9) * (1 - expected), abs=2e-3)
+    # Of poses that are not known nothing ties the depths to them.
+    assert coarse_of(mixed, wide, config, estimate=before).scale == pytest.approx(1 / 0.9, rel=2e-3)
+
+
 def test_points_that_are_too_far_apart_are_no_pair(wide, printed):
     """Three in five points of the previous image are half a metre off in both of its predictions, so they agree.
 
@@ -512,7 +527,7 @@ def prediction_in(unit: float, prediction):
     poses = longer(prediction.T_world_views, unit), longer(prediction.T_world_anchor, unit)
     covariance = sc.device(units[:, None] * np.asarray(prediction.pose_covariance) * units)
     flags = prediction.has_newest, prediction.is_repeat
-    return type(prediction)(*seen, *poses, covariance, *flags)
+    return type(prediction)(*seen, *poses, covariance, prediction.scale_std, *flags)
 
 
 @pytest.mark.parametrize("is_given", [False, True])

@@ -6,16 +6,20 @@ import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from PIL import ExifTags, Image
 
-from emgs_jax.data.timestamps import UNITS, unit_of
+from emgs_jax.data.timestamps import MIN_CLOCK, UNITS, unit_of
 
 # 20261127_142233, 2026-11-27 14.22.33.250: year, month, day, hour, minute, second and maybe milliseconds.
 DATE = re.compile(r"(?<!\d)(20\d\d)([-_.]?)(\d\d)\2(\d\d)[-_.T ]?(\d\d)([-_.:]?)(\d\d)\6(\d\d)(?:[-_.]?(\d{3}))?(?!\d)")
 PARTS = re.compile(r"(\d{10})[-_](\d{9})$")  # seconds since 1970 and nanoseconds, as drivers of ROS write them
+DECIMAL = re.compile(r"(.*?)(?<![0-9.])([0-9]+)(?:\.([0-9]+))?$")  # a name that ends with a number
 
 
+MAX_TAKEN = 64  # images whose EXIF is read, evenly spread
 MAX_KINDS, MIN_NUMBERS = 4, 3  # of images in one folder that are told apart by their names
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 OTHER_SUFFIXES = (".heic", ".heif", ".avif", ".jxl", ".gif", ".exr", ".hdr", ".ppm", ".pgm", ".dng", ".cr2", ".cr3")
@@ -79,6 +83,56 @@ def natural_key(path: Path) -> list[list[tuple[int, int, str]]]:
     return [key(name) for name in path.parts]
 
 
+def natural_order(paths: Sequence[Path]) -> tuple[list[int], str | None]:
+    """Rows of image files in natural order, and a note where that is of decimal numbers.
+
+    A program that writes seconds as they are printed drops zeros at their end: 1.9, 1.93, 2.0 and 2.05, where 05 is
+    less than 1 of 2.1. A counter after a point, of which 1.10 follows 1.9, has such zeros.
+    """
+    found = [DECIMAL.fullmatch(path.stem) for path in paths]
+    ends = [match and match[3] for match in found]
+    is_dropped = None not in found and len({len(end or "") for end in ends}) > 1
+    is_dropped = is_dropped and not any(end and end != "0" and end.endswith("0") for end in ends)
+
+    def plain(row: int) -> Any:
+        return natural_key(paths[row]), paths[row].name
+
+    def decimal(row: int) -> Any:
+        before, whole, end = found[row].groups()
+        return natural_key(paths[row].with_name(before + "_")), int(whole), end or "", paths[row].name
+
+    order = sorted(range(len(paths)), key=plain)
+    if not is_dropped or (decimals := sorted(order, key=decimal)) == order:
+        return order, None
+    return decimals, "names are ordered as decimal numbers, whose last zeros are left out"
+
+
+def taken_note(paths: Sequence[Path]) -> str | None:
+    """Words where images in their order were taken in another one, as their EXIF says: a counter that began anew."""
+    rows = dict.fromkeys(np.linspace(0, len(paths) - 1, min(len(paths), MAX_TAKEN)).astype(int).tolist())
+    taken = [(when, paths[row].name) for row in rows if (when := _taken(paths[row]))]
+    back = next(((a[1], b[1]) for a, b in itertools.pairwise(taken) if b[0] < a[0]), None)
+    if back is None:
+        return None
+    return (
+        f"{back[1]} comes after {back[0]} by its name and was taken before it, as EXIF says: where a counter began "
+        "anew or a clock was set back, rename the images in the order in which they were taken"
+    )
+
+
+def _taken(path: Path) -> str | None:
+    """DateTimeOriginal and its fraction, which sort as text; None where there is none."""
+    if path.suffix.lower() not in (".jpg", ".jpeg"):
+        return None
+    try:
+        with Image.open(path) as image:
+            tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    except (OSError, ValueError, SyntaxError):
+        return None
+    date = str(tags.get(ExifTags.Base.DateTimeOriginal, ""))
+    return date + str(tags.get(ExifTags.Base.SubsecTimeOriginal, "")) if re.match(r"[12]\d{3}:", date) else None
+
+
 def times_of(paths: Sequence[Path]) -> tuple[list[float], str | None]:
     """Seconds of image files in their order, and a note where their names are not read as they stand.
 
@@ -91,7 +145,7 @@ def times_of(paths: Sequence[Path]) -> tuple[list[float], str | None]:
         return dates, "times are the dates in the names of the images"
     numbers = [last_number(name) for name in names]
     if not _ascend(numbers):
-        return [float(i) for i in range(len(paths))], None
+        return [float(i) for i in range(len(paths))], _back_note(paths, dates) or _back_note(paths, numbers)
     unit = unit_of(np.array(numbers, np.float64))
     note = None if unit == "seconds" else f"times are the names of the images, in {unit}"
     return [number / UNITS[unit] for number in numbers], note
@@ -105,6 +159,17 @@ def last_number(name: str) -> int | float | None:
     if not found:
         return None
     return float(found[-1]) if "." in found[-1] or len(found[-1]) > 300 else int(found[-1])
+
+
+def _back_note(paths: Sequence[Path], times: Sequence[float | None]) -> str | None:
+    """Words where what are times go back in the order of the files; None where they may be other numbers."""
+    known = [time for time in times if time is not None and time >= MIN_CLOCK]
+    if len(known) < len(times):
+        return None
+    for (a, before), (b, after) in itertools.pairwise(zip(paths, known, strict=True)):
+        if after < before:
+            return f"times are the positions of the images: those in their names go back from {a.name} to {b.name}"
+    return None
 
 
 def _ascend(times: Sequence[float | None]) -> bool:

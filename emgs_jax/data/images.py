@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from emgs_jax.data import reading
-from emgs_jax.data.file_names import IMAGE_SUFFIXES, check_one_kind, natural_key, times_of, unread_note
+from emgs_jax.data.file_names import IMAGE_SUFFIXES, check_one_kind, natural_order, taken_note, times_of, unread_note
 from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens
 from emgs_jax.data.reading import Size
 from emgs_jax.data.straightened import Straightened
@@ -92,17 +92,18 @@ class Folder:
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
             raise ValueError(f"{folder} is neither a folder nor a video file; expected {LAYOUT}")
-        found = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+        found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
         self.folder = folder
-        self._paths = sorted(found, key=lambda p: (natural_key(p), p.name))
+        order, of_order = natural_order(found)
+        self._paths = [found[row] for row in order]
         self.count = len(self._paths)
         check_one_kind(self._paths)
         self._times, note = times_of(self._paths)
-        self.notes: list[str | None] = [note, unread_note(folder)]
+        self.notes: list[str | None] = [of_order, note, taken_note(self._paths), unread_note(folder)]
         if not self._paths:
             folders = [path.name for path in sorted(folder.iterdir()) if path.is_dir()]
             below = f"it has the folders {', '.join(folders[:5])}: give one of them" if folders else None
-            raise ValueError("; ".join(filter(None, (f"{folder} ({LAYOUT}) has no images", below, self.notes[1]))))
+            raise ValueError("; ".join(filter(None, (f"{folder} ({LAYOUT}) has no images", below, self.notes[-1]))))
         self.tones: Tones | None = None  # of the images in use
 
     def find_size(self, rows: range) -> Size:

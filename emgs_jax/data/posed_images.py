@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 from emgs_jax.data import reading
 from emgs_jax.data.calibration_files import Calibration, read_calibration
 from emgs_jax.data.colmap_model import BINARY, TEXT, SparseModel, load_colmap
-from emgs_jax.data.file_names import IMAGE_SUFFIXES, find_image, natural_key, times_of
+from emgs_jax.data.file_names import IMAGE_SUFFIXES, find_image, natural_order, times_of
 from emgs_jax.data.intrinsics import to_lens
 from emgs_jax.data.straightened import Straightened
 from emgs_jax.data.tones import read_shown, tones_of
@@ -97,8 +97,9 @@ def in_order(solved: Solved) -> tuple[list[int], list[float], str | None]:
     """Rows of the images in their order, the seconds of these, and a note on where those come from."""
     if solved.times is not None:
         return [*range(len(solved.images))], solved.times, None
-    order = sorted(range(len(solved.images)), key=lambda row: (natural_key(solved.images[row]), row))
-    return order, *times_of([solved.images[row] for row in order])
+    order, of_order = natural_order(solved.images)
+    times, note = times_of([solved.images[row] for row in order])
+    return order, times, "; ".join(filter(None, (of_order, note))) or None
 
 
 class Colmap(PosedImages):

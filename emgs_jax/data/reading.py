@@ -23,7 +23,9 @@ MAX_POSITION_M = 1000.0  # from the origin: steps of float32 are .06 mm there, a
 RIGID_TOLERANCE = 1e-2  # text files round; a flipped digit moves R^T R by more
 SAME_SURFACE = 0.05  # relative inverse-depth step to the next pixel up to which two depths are of one surface
 AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION  # not turned by EXIF: other programs solve for the pixels of the file
+HEIC = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"miaf", b"MiHE"}
 OWN_BITS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH  # BGR in 8 or 16 bits, or float
+EIGHT_BITS = b"\xff\xd8", b"BM", b"RIFF", b"GIF8"  # how files begin that have no more
 REMEDY = "fetch the file again or set on_bad_frame=skip"
 
 
@@ -216,27 +218,33 @@ def decode(path: Path, flags: int) -> np.ndarray:
             reason = f"cannot be decoded ({error.err})"
     if image is None:
         other = other_kind(data)
-        remedy = f"convert it to png or jpg, {REMEDY}" if other else REMEDY
+        remedy = f"convert it to png or jpg, {REMEDY}" if (other or "").startswith("an image") else REMEDY
         raise BadFrameError(f"{path} is {other or reason or 'not a readable image'}: {remedy}")
     return image
 
 
-def is_turned(path: Path) -> bool:
-    """Test whether an image is shown otherwise than it is stored, by its EXIF orientation; False where it has none."""
+def orientation(path: Path) -> int:
+    """The EXIF orientation of an image, 1 (as it is stored) to 8; 1 where it has none."""
     try:
         with Image.open(path) as image:
-            return image.getexif().get(ExifTags.Base.Orientation, 1) not in (0, 1)
+            found = image.getexif().get(ExifTags.Base.Orientation, 1)
     except (OSError, ValueError, SyntaxError):
-        return False
+        return 1
+    return found if found in range(2, 9) else 1
 
 
 def other_kind(data: bytes) -> str | None:
     """What a file is by its content, of what OpenCV reads as no image; None where that is not known."""
     if data[4:8] == b"ftyp":
-        brand = data[8:12]
-        if brand in (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1"):
-            return "an image in HEIC, whatever its name says"
-        return "a video" if brand != b"avif" else "an image in AVIF, whatever its name says"
+        box = data[8 : max(int.from_bytes(data[:4], "big"), 12)]
+        brands = {box[at : at + 4] for at in range(0, min(len(box), 128), 4) if at != 4}  # at 4 is a version
+        kinds = {"AVIF": {b"avif", b"avis"}, "Canon's raw format": {b"crx "}, "HEIC": HEIC}
+        kind = next((kind for kind, own in kinds.items() if brands & own), None)
+        return f"an image in {kind}, whatever its name says" if kind else "a video"
+    if data.startswith((b"\xff\x0a", b"\0\0\0\x0cJXL ")):
+        return "an image in JPEG XL, whatever its name says"
+    if data.startswith(b"version https://git-lfs"):
+        return "a pointer of Git LFS and no image (git lfs pull fetches it)"
     if data[:4] == b"%PDF":
         return "a PDF"
     return "a web page" if data.lstrip()[:1] == b"<" else None
@@ -284,24 +292,35 @@ def transparency_note(paths: Iterable[Path]) -> str | None:
     return next((note for path in paths if _may_be_transparent(path) and (note := _transparency(path))), None)
 
 
-def _may_be_transparent(path: Path) -> bool:
-    """Test by its first bytes whether a file may have an alpha channel; only these are decoded."""
+def _head(path: Path) -> bytes:
+    """The first bytes of a file, with the header and the tables of a PNG; none where it cannot be read."""
     try:
         with open(path, "rb") as file:
-            head = file.read(26)
+            return file.read(2048)
     except OSError:
-        return False
-    is_png = head.startswith(b"\x89PNG")
-    return head[25:26] in (b"\x03", b"\x04", b"\x06") if is_png else not head.startswith((b"\xff\xd8", b"BM"))
+        return b""
+
+
+def may_be_deep(path: Path) -> bool:
+    """Test by its first bytes whether an image may have more than 8 bits; only these are decoded to look."""
+    head = _head(path)
+    return head[24:25] == b"\x10" if head.startswith(b"\x89PNG") else not head.startswith(EIGHT_BITS)
+
+
+def _may_be_transparent(path: Path) -> bool:
+    """Test likewise whether a file may have an alpha channel, or a colour that stands for nothing (a PNG's tRNS)."""
+    head = _head(path)
+    if head.startswith(b"\x89PNG"):
+        return head[25:26] in (b"\x04", b"\x06") or b"tRNS" in head.partition(b"IDAT")[0]
+    return not head.startswith((b"\xff\xd8", b"BM"))
 
 
 def _transparency(path: Path) -> str | None:
     try:
-        image = decode(path, cv2.IMREAD_UNCHANGED)
-    except BadFrameError:
-        return None
-    opaque = np.iinfo(image.dtype).max if image.dtype.kind in "iu" else 1.0
-    if image.ndim < 3 or image.shape[2] != 4 or image[..., 3].min() >= opaque:
+        with Image.open(path) as image:
+            if image.mode == "F" or image.convert("RGBA").getchannel("A").getextrema()[0] >= 255:
+                return None
+    except (OSError, ValueError, SyntaxError):  # a damaged image, whose turn comes when it is read
         return None
     return (
         f"{path.name} is transparent in places, and maybe others: what is there is mapped in the colour that the file "

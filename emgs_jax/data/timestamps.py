@@ -1,5 +1,6 @@
 """Times as programs write them (seconds, or clocks that count smaller units), and what is nearest to them in time."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -8,18 +9,25 @@ from jaxtyping import Float
 UNITS = {"seconds": 1, "milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}  # how many are a second
 EPOCH = 1e9, 4.2e9  # seconds since 1970, from 2001 to 2103
 MIN_STEP_US, MIN_STEP_NS = 1e4, 1e6  # between two images; as seconds that would be hours
+MIN_CLOCK = 1e7  # no count of frames is so high; it is of a clock
+MAX_UPTIME_S, TYPICAL_STEP_S = 4e7, 1 / 30  # since a boot, and between two images
 
 
 def unit_of(times: np.ndarray) -> str:
     """The unit in which numbers (n,), ascending, are times: one of UNITS; "seconds" too where they may be no times.
 
     What counts from 1970 says its unit by its size. What counts from elsewhere (a boot) does by the step from one image
-    to the next, for microseconds and nanoseconds; steps of 33 may be those of frame numbers.
+    to the next: it is the unit in which that is most like the step of a video. Below `MIN_CLOCK` that is said of
+    microseconds and nanoseconds only, as steps of 33 may be those of frame numbers.
     """
     for unit, per_second in UNITS.items():
         if len(times) and EPOCH[0] <= np.min(times) / per_second and np.max(times) / per_second <= EPOCH[1]:
             return unit
     step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    if step > 0 and np.min(times) >= MIN_CLOCK:
+        fits = {unit: abs(math.log(step / per / TYPICAL_STEP_S)) for unit, per in UNITS.items()}
+        likely = [unit for unit, per_second in UNITS.items() if np.max(times) / per_second <= MAX_UPTIME_S]
+        return min(likely or ["nanoseconds"], key=lambda unit: fits[unit])
     return "nanoseconds" if step >= MIN_STEP_NS else "microseconds" if step >= MIN_STEP_US else "seconds"
 
 

@@ -46,6 +46,7 @@ def find_tones(read: Callable[[int], np.ndarray], count: int) -> Tones | None:
 
     Returns:
         None for images of 8 bits, for 16 bits of which more than MIN_SPAN is used, and where no image can be read.
+        Among others those of 8 bits do not count: they stay as they are.
     """
     ends, dtype = [], None
     for row in dict.fromkeys(np.linspace(0, count - 1, min(count, MAX_LOOKED_AT)).astype(int).tolist()):
@@ -54,7 +55,7 @@ def find_tones(read: Callable[[int], np.ndarray], count: int) -> Tones | None:
         except BadFrameError:
             continue
         if image.dtype == np.uint8:
-            return None
+            continue
         dtype = image.dtype
         ends.append(np.nanpercentile(image, (OUTLIERS_PERCENT, 100 - OUTLIERS_PERCENT)))
     if not ends:
@@ -67,8 +68,9 @@ def find_tones(read: Callable[[int], np.ndarray], count: int) -> Tones | None:
 
 
 def tones_of(files: Sequence[Path]) -> Tones | None:
-    """Those of image files."""
-    return find_tones(lambda row: reading.decode(files[row], reading.OWN_BITS), len(files))
+    """Those of image files, of which some may have more bits than others."""
+    deep = [path for path in files if reading.may_be_deep(path)]
+    return find_tones(lambda row: reading.decode(deep[row], reading.OWN_BITS), len(deep))
 
 
 def read_shown(

@@ -77,7 +77,7 @@ class Tum(Straightened):
         unknown: Sequence[int] | None = None,
     ) -> None:
         self._folder = reading.find_sequence(root, sequence, LAYOUT, self.source)
-        times, names, _ = read_list(self._folder / "rgb.txt", 2)
+        times, names, lines = read_list(self._folder / "rgb.txt", 2)
         chosen = reading.select(len(times), start, stop, stride, f"{self._folder / 'rgb.txt'} (layout {LAYOUT})")
         self._times, self._images = times[chosen], [find_image(self._folder, names[i][0]) for i in chosen]
         self.sequence = str(sequence)
@@ -88,7 +88,9 @@ class Tum(Straightened):
         given = find_calibration(self.sequence, intrinsics, distortion, self.calibrations)
         raw_size = RAW_SIZE if intrinsics is None else reading.first_size(self._images, self._folder)
         self._tones = tones_of(self._images)
-        self._use(find_lens(given, pictures_of(self._images, raw_size, self._tones)), raw_size, size)
+        lens = find_lens(given, pictures_of(self._images, raw_size, self._tones))
+        said = back_note(self._folder / "rgb.txt", times, lines), reading.transparency_note(self._images)
+        self._use(lens, raw_size, size, *said)
         self._labels = None
         if labels is not None:
             ids = as_unknown(unknown, "dataset.unknown")
@@ -182,6 +184,19 @@ def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[l
         numbers.append(number)
     order = np.argsort(times, kind="stable")
     return in_seconds(np.array(times, np.float64)[order]), [words[i] for i in order], [numbers[i] for i in order]
+
+
+def back_note(path: Path, times: Float[np.ndarray, " n"], lines: Sequence[int]) -> str | None:
+    """Words where times of a `read_list` go back from one line to the next, as where a clock was set."""
+    written = np.argsort(lines)
+    steps = np.diff(times[written])
+    if not len(steps) or steps.min() >= 0:
+        return None
+    line = np.asarray(lines)[written][steps.argmin() + 1]
+    return (
+        f"{path.name}, line {line}: time goes back by {-steps.min():.3f} s, and all lines are taken in order of time: "
+        "where a clock was set back, add what it lost to the times from there on"
+    )
 
 
 def _file_name(line: str, first_word: str, folder: Path) -> str:

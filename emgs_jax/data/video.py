@@ -12,6 +12,7 @@ from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.reading import Size
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+MIN_ASPECT = 0.2  # of a pixel: what is thinner is no format but a damaged header
 
 
 class Video:
@@ -37,6 +38,13 @@ class Video:
             raise ValueError(self._nothing_decoded())
         is_short = math.isfinite(announced) and self.count < (announced if stop is None else min(announced, stop))
         self.notes = [f"{path} announces {announced:.0f} frames, {self.count} can be read"] if is_short else []
+        self._aspect = _pixel_aspect(self._capture)
+        if self._aspect != 1:
+            (height, width), (_, shown) = self._decoded(0).shape[:2], self.find_size(range(1))[::-1]
+            self.notes.append(
+                f"pixels of {path} are {self._aspect:.4g} times as wide as high: its {width}x{height} frames are shown "
+                f"as {shown}x{height}, and intrinsics are of these"
+            )
 
     def _open(self) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(str(self._path))
@@ -57,6 +65,12 @@ class Video:
         return self.read(rows[0]).shape[1::-1]
 
     def read(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        """The frame as a player shows it, of square pixels."""
+        image = self._decoded(row)
+        height, width = image.shape[:2]
+        return image if self._aspect == 1 else cv2.resize(image, (max(round(width * self._aspect), 1), height))
+
+    def _decoded(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:
         if row < self._next:
             self._capture, self._next = self._open(), 0
         while self._next < row and self._capture.grab():
@@ -81,6 +95,14 @@ class Video:
 
     def label(self, row: int) -> str:
         return f"{self._path}, frame {row}"
+
+
+def _pixel_aspect(capture: cv2.VideoCapture) -> float:
+    """Width of a pixel over its height, of the frames as they are decoded; 1 where the file does not say."""
+    across, down = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+    if not (across > 0 and down > 0 and MIN_ASPECT <= across / down <= 1 / MIN_ASPECT):
+        return 1.0
+    return down / across if capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180 == 90 else across / down
 
 
 def damage(path: Path) -> str | None:

@@ -11,10 +11,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from emgs_jax.data.backprojection import backproject
-from emgs_jax.evaluation.clouds import PointCloud, SpooledCloud, transform_cloud
+from emgs_jax.evaluation.clouds import PointCloud, SpooledCloud, cell_centers, cell_numbers, transform_cloud
 from emgs_jax.geometry import Sim3, rotated
 from emgs_jax.ops.ranges import number
 
+_BLOCK_VOXELS = 32  # a side of the cubes that a camera sees or not
 Image = tuple[np.ndarray, np.ndarray]  # camera-space z (h, w), 0 where there is none, and RGB in [0, 1], (h, w, 3)
 Draw = Callable[[np.ndarray], Image]  # from the pose T_world_camera (4, 4)
 
@@ -128,8 +129,14 @@ class _Voxels:
 
     def renderer(self) -> Draw:
         means = self._points.averaged(self._config.voxel_m)
-        cloud, counts = means.cloud(), means.counts()
-        return lambda T: draw_voxels(cloud, counts, T, self._pinhole, self._config)
+        blocks = _Blocks(means.cloud(), means.counts(), _BLOCK_VOXELS * self._config.voxel_m)
+
+        def draw(T_world_camera: np.ndarray) -> Image:
+            rows = blocks.before(T_world_camera, self._pinhole, self._config)
+            some = PointCloud(*(values[rows] for values in vars(blocks.cloud).values()))
+            return draw_voxels(some, blocks.counts[rows], T_world_camera, self._pinhole, self._config)
+
+        return draw
 
 
 class _Tsdf:
@@ -206,6 +213,33 @@ class _Tsdf:
 
     def _tensor(self, values: Any) -> Any:
         return self._o3d.core.Tensor(np.asarray(values, np.float64))
+
+
+class _Blocks:
+    """Points of a cloud by cubes of the world, of which a camera sees few: a view costs what it shows."""
+
+    def __init__(self, cloud: PointCloud, counts: np.ndarray, side: float) -> None:
+        self.cloud, self.counts, self._side = cloud, counts, side
+        numbers = cell_numbers(cloud.points, side)
+        self._order = np.argsort(numbers, kind="stable")
+        found, begins = np.unique(numbers[self._order], return_index=True)
+        self._centers, self._parts = cell_centers(found, side), np.split(self._order, begins[1:])
+
+    def before(self, T_world_camera: np.ndarray, pinhole: Pinhole, config: VoxelConfig) -> np.ndarray:
+        """Rows, ascending, of the cubes whose surrounding sphere reaches into what the camera sees."""
+        radius = 0.5 * np.sqrt(3.0) * self._side + np.sqrt(2.0) * config.voxel_m
+        centers = rotated(self._centers - T_world_camera[:3, 3], T_world_camera[:3, :3].T)
+        is_near = centers[:, 2] > -radius
+        fx, fy, cx, cy = pinhole.intrinsics
+        margin = config.max_footprint_px + 1.0
+        for axis, focal, low, high in (
+            (0, fx, -margin - cx, pinhole.width + margin - cx),
+            (1, fy, -margin - cy, pinhole.height + margin - cy),
+        ):
+            for end, sign in ((low, 1.0), (high, -1.0)):  # planes through the camera, along the sides of the image
+                inside = sign * (focal * centers[:, axis] - end * centers[:, 2])
+                is_near &= inside >= -radius * np.hypot(focal, end)
+        return np.sort(np.concatenate([np.empty(0, np.int64), *(self._parts[i] for i in np.flatnonzero(is_near))]))
 
 
 def draw_voxels(

@@ -50,11 +50,28 @@ def label_cells(frame: Frame, dataset: Dataset, voxel: float, max_depth: float) 
     return _distinct(np.column_stack([frame.labels[known].astype(np.int64), cell_numbers(points, voxel)]))
 
 
-def true_labels(cells: Sequence[np.ndarray], dataset: Dataset, voxel: float) -> LabelledPoints | None:
+class DistinctCells:
+    """The `label_cells` of many frames, each once: it grows with what is seen, not with the frames."""
+
+    def __init__(self) -> None:
+        self._rows = [np.empty((0, 2), np.int64)]  # the first is what was merged
+
+    def append(self, cells: np.ndarray) -> None:
+        """Add those of a frame."""
+        self._rows.append(cells)
+        if sum(map(len, self._rows[1:])) > max(_MERGE_ROWS, len(self._rows[0])):
+            self._rows = [self.rows()]
+
+    def rows(self) -> np.ndarray:
+        """All of them (n, 2), ordered by cell."""
+        return _distinct(np.concatenate(self._rows))
+
+
+def true_labels(cells: DistinctCells, dataset: Dataset, voxel: float) -> LabelledPoints | None:
     """A point for every class that is seen in a voxel [m]: its centre; None where no frame has `label_cells`."""
-    if not any(map(len, cells)):
+    rows = cells.rows()
+    if not len(rows):
         return None
-    rows = _distinct(np.concatenate(cells))
     return LabelledPoints(cell_centers(rows[:, 1], voxel), rows[:, 0], tuple(dataset.classes))
 
 

@@ -100,6 +100,7 @@ def prepare_step(first: FirstWindow, camera: Camera, config: SlamConfig) -> None
         T_world_views=poses,
         T_world_anchor=pose,
         pose_covariance=no_covariance(),
+        scale_std=on_device(np.float32(np.nan)),
         has_newest=unknown,
         is_repeat=unknown,
     )

@@ -24,11 +24,13 @@ class FirstWindow(eqx.Module):
 
     Args:
         pose_covariance: (n, 2, 6, 6), see `Prediction`.
+        scale_std: of all views, likewise.
     """
 
     views: Observation
     T_world_views: jaxlie.SE3
     pose_covariance: jax.Array
+    scale_std: jax.Array
 
 
 def to_camera(dataset: Dataset) -> Camera:
@@ -59,7 +61,12 @@ def _check(prediction: PriorPrediction, frames: Mapping[int, Frame]) -> None:
 
 
 def _check_covariance(prediction: PriorPrediction) -> None:
-    covariance, window = prediction.pose_covariance, prediction.window
+    covariance, window, scale_std = prediction.pose_covariance, prediction.window, prediction.scale_std
+    if scale_std is not None and not scale_std >= 0:
+        raise ValueError(
+            f"the prior's scale_std at frame {window.current} must be a number from 0, got {scale_std}: give None "
+            "where nothing is known"
+        )
     if covariance is None:
         return
     known = covariance[np.isfinite(covariance).all((-2, -1))] if covariance.ndim == 3 else covariance
@@ -93,6 +100,10 @@ def _pose_covariance(prediction: PriorPrediction, previous: int, current: int) -
     before, here = prediction.pose_covariance[[previous, current]]
     T_previous, T_current = prediction.T_anchor_view[[previous, current]]
     return np.stack([here + seen_from(before, T_previous, T_current[None])[0], here])
+
+
+def _scale_std(prediction: PriorPrediction) -> jax.Array:
+    return on_device(np.float32(np.nan if prediction.scale_std is None else prediction.scale_std))
 
 
 def to_first_window(
@@ -129,7 +140,8 @@ def to_first_window(
     together = jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(views[first:]))
     pairs = zip(places[first:][:1] + places[first:], places[first:], strict=False)
     covariances = np.stack([_pose_covariance(prediction, *pair) for pair in pairs]).astype(np.float32)
-    return FirstWindow(on_device(together), to_se3(poses[first:]), on_device(covariances)), tuple(dense[first:])
+    known = to_se3(poses[first:]), on_device(covariances), _scale_std(prediction)
+    return FirstWindow(on_device(together), *known), tuple(dense[first:])
 
 
 def to_prediction(
@@ -154,6 +166,7 @@ def to_prediction(
         T_world_views=to_se3(np.asarray(T_world_anchor) @ prediction.T_anchor_view[rows]),
         T_world_anchor=to_se3(T_world_anchor),
         pose_covariance=on_device(_pose_covariance(prediction, *rows[:2]).astype(np.float32)),
+        scale_std=_scale_std(prediction),
         has_newest=on_device(np.bool_(has_newest)),
         is_repeat=on_device(np.bool_(True)),
     )
@@ -186,9 +199,10 @@ def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[
             T_world_views=jaxlie.SE3(on_device(poses[[i - 1, i, min(i + 1, num_views - 1)]])),
             T_world_anchor=jaxlie.SE3(on_device(poses[0])),
             pose_covariance=on_device(found.pose_covariance[i]),
+            scale_std=on_device(found.scale_std),
             has_newest=on_device(np.bool_(i + 1 < num_views)),
             is_repeat=on_device(np.bool_(False)),
         )
         for i in range(1, num_views)
     ]
-    return on_device(jax.tree.map(lambda leaf: leaf[:1], found)), following
+    return on_device(jax.tree.map(lambda leaf: leaf[:1] if leaf.ndim else leaf, found)), following

@@ -112,8 +112,14 @@ def new_run(
     """Make a run of `dataset` before its first frame; `graph` gives it a back end, `saved` that of an earlier run.
 
     Raises:
-        ValueError: `saved`, and the map of the first window is to be made from all of its views at once.
+        ValueError: `saved`, and the map of the first window is to be made from all of its views at once; or JAX
+            computes in float64.
     """
+    if jax.config.jax_enable_x64:
+        raise ValueError(
+            'JAX_ENABLE_X64 is set, and maps are made in float32: jax.config.update("jax_enable_x64", False) turns it '
+            "off, or unset JAX_ENABLE_X64"
+        )
     back_end = None if graph is None else BackEnd(graph, tuple(dataset.intrinsics), float(config.fit.min_std))
     clock, camera = Clock() if clock is None else clock, to_camera(dataset)
     for words in clamped(config, camera):

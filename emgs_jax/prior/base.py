@@ -49,6 +49,9 @@ class PriorPrediction:
             What a view errs like those before it, of which the map is made, counts for nothing. NaN for a view of which
             nothing is known, None where the prior does not say: then the map finds out. Poses that are known lie in one
             world: the scale of a frame's depths does not move them.
+        scale_std: how sure the scale of the current frame's depths is: of the logarithm of their common factor, in the
+            unit of the poses. 0 where they are triangulated from these poses. None where the prior does not say; it
+            counts only where `pose_covariance` is known.
         world: number of the frame of reference that the poses are in, of a prior that tells: 0 is that of the first
             frames with a pose, and it may come back. None: a new one begins where no view has a pose as before.
     """
@@ -60,6 +63,7 @@ class PriorPrediction:
     mask: np.ndarray
     features: np.ndarray
     pose_covariance: np.ndarray | None = None
+    scale_std: float | None = None
     world: int | None = None
 
 

@@ -10,7 +10,7 @@ The format `emgs_jax.predictions`, version 3, is a folder; nothing in it is ever
 - `visits_A_…_B.npz`, for pairs of frames that show one place twice, named by all its views: as below, of one more
   inference with views of both visits (`recorded_visits`). A folder may have none.
 - `000000.npz`, …, one file per inference: `inference` (), `views` (v,), `dense` (d,), `current` () and the arrays of
-  `PriorPrediction` in the dtypes stated there, `pose_covariance` and `world` only where the prior gives
+  `PriorPrediction` in the dtypes stated there, `pose_covariance`, `scale_std` and `world` only where the prior gives
   them: about d·(17·h·w + 2·y·x·f) bytes. Features are float16; points are not, because a float16
   step is 2 mm at 2 to 4 m. Versions 1, whose features have one cell per pixel, and 2, without these two, are read, too.
 
@@ -169,7 +169,8 @@ class Recorded(Prior):
         given = equal_covariances(self._pose_std, arrays["T_anchor_view"])
         covariance = arrays.get("pose_covariance") if given is None else given
         world = int(arrays["world"]) if "world" in arrays else None
-        return PriorPrediction(window, *(arrays[key] for key in FIELDS), covariance, world)
+        scale_std = float(arrays["scale_std"]) if "scale_std" in arrays else None
+        return PriorPrediction(window, *(arrays[key] for key in FIELDS), covariance, scale_std, world)
 
     def _load(self, name: str, keys: Sequence[str], optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
         """Read and verify one file of the recording."""

@@ -15,7 +15,7 @@ FIELDS = {  # array -> dtype and the axes that it has; d, v, h, w, i, j, c, k, l
     "mask": (np.bool_, "dhw"),
     "features": (np.float16, "dyxf"),
 }
-OPTIONAL = {"pose_covariance": (np.float64, "vkl"), "world": (np.int64, "")}
+OPTIONAL = {"pose_covariance": (np.float64, "vkl"), "scale_std": (np.float64, ""), "world": (np.int64, "")}
 MAX_LENGTH = 1e6  # of positions, in the prior's unit: more is no room
 MANIFEST = {
     "dataset": dict,

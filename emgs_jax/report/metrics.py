@@ -24,6 +24,7 @@ from emgs_jax.evaluation.reconstruction import (
 )
 from emgs_jax.evaluation.rendering import Rendered
 from emgs_jax.evaluation.segmentation import (
+    DistinctCells,
     LabelledPoints,
     SpooledLabels,
     align_labels,
@@ -69,7 +70,7 @@ class Scorer:
 
 def new_scorer(dataset: ReadableFrames, evaluation: EvaluationConfig, prior: Prior) -> Scorer:
     """Read the truth of a data set, each frame once."""
-    cells: list[np.ndarray] | None = None if compared_text(dataset, prior) is None else []
+    cells = None if compared_text(dataset, prior) is None else DistinctCells()
     truth = true_cloud(dataset, evaluation, cells)
     labels = None if cells is None else true_labels(cells, dataset, evaluation.voxel_m)
     return Scorer(dataset, evaluation, truth, labels, prior)
@@ -80,7 +81,7 @@ def compared_text(dataset: ReadableFrames, prior: Prior) -> Text | None:
     return (tuple(prior.feature_names), prior.text_features) if dataset.classes and prior.feature_names else None
 
 
-def true_cloud(dataset: ReadableFrames, config: EvaluationConfig, cells: list[np.ndarray] | None = None) -> Reference:
+def true_cloud(dataset: ReadableFrames, config: EvaluationConfig, cells: DistinctCells | None = None) -> Reference:
     """The true points of the frames whose pose is known; `cells` takes the `label_cells` of each frame on the way."""
 
     def frames() -> Iterator[Frame]:

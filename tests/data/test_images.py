@@ -205,6 +205,22 @@ def test_a_video_whose_rate_changes_has_all_its_frames_at_the_times_that_the_fil
     np.testing.assert_allclose([frame.timestamp for frame in dataset], np.array(times) / 1000, atol=1e-6)
 
 
+def test_a_video_of_oblong_pixels_is_shown_as_players_show_it(tmp_path):
+    """PAL and anamorphic recordings; one focal length was estimated for both directions of what is squeezed."""
+    av = pytest.importorskip("av")
+    path = tmp_path / "clip.mp4"
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("mpeg4", rate=15)
+        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+        for i in range(3):
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(color_image(i, SIZE), format="bgr24")))
+        out.mux(stream.encode())
+    dataset = load(path, size=(213, 120), intrinsics=(128.0, 128.0, 106.0, 59.5))
+    assert [number_of(frame) for frame in dataset] == [0, 1, 2] and dataset.full(0).shape == (120, 213, 3)
+    assert "are shown as 213x120" in dataset.calibration["note"]
+
+
 class StreamWithoutTimes:
     """A capture of a bare h264 stream: three frames, all of them at 0."""
 

@@ -171,23 +171,44 @@ def test_what_is_no_image_is_named_by_its_content_and_a_folder_of_it_by_its_firs
         reading.first_size([tmp_path / "a.jpg", tmp_path / "b.jpg"], "folder")
 
 
-def test_transparency_of_any_image_is_told(tmp_path):
-    paths = [tmp_path / name for name in ("a.jpg", "b.png", "c.png")]
-    alpha = np.where(np.arange(64) < 32, 0, 255) * np.ones((48, 1))
-    for path, image in zip(paths, (RAMP, RAMP, np.dstack([RAMP, alpha])), strict=True):
-        cv2.imwrite(str(path), image)
-    assert reading.transparency_note(paths[:2]) is None
-    assert reading.transparency_note(paths).startswith("c.png is transparent")
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"\0\0\0\x18ftyphevx\0\0\0\0mif1heic", "an image in HEIC"),
+        (b"\0\0\0\x18ftypisom\0\0\0\0isommp42", "a video"),
+        (b"\0\0\0\x18ftypavis\0\0\0\0avifmif1", "an image in AVIF"),
+        (b"\0\0\0\x0cJXL \r\n\x87\n", "an image in JPEG XL"),
+        (b"version https://git-lfs.github.com/spec/v1", "a pointer of Git LFS"),
+    ],
+)
+def test_a_file_is_what_it_holds_whatever_its_name_says(content, words):
+    assert reading.other_kind(content + bytes(99)).startswith(words)
 
 
-def test_an_image_that_is_shown_otherwise_than_stored_is_known(tmp_path):
+@pytest.mark.parametrize("kind", ["RGBA", "LA", "RGB", "L", "P"])  # the last three have a colour that is none (tRNS)
+def test_transparency_of_any_image_is_told(kind, tmp_path):
+    paths = [tmp_path / name for name in ("a.jpg", "b.png", "c.png", "d.png")]
+    image = Image.fromarray(np.zeros((48, 64, 3), np.uint8)).convert(kind)
+    some = {"RGB": (0, 0, 0)}.get(kind, 0)
+    Image.fromarray(RAMP).save(paths[0]), Image.fromarray(RAMP).save(paths[1])
+    image.save(paths[2])
+    if "A" in kind:
+        image.putalpha(
+            Image.fromarray(np.where(np.arange(64) < 32, 0, 255).astype(np.uint8) * np.ones((48, 1), np.uint8))
+        )
+    image.save(paths[3], **({} if "A" in kind else {"transparency": some}))
+    assert reading.transparency_note(paths[:3]) is None
+    assert reading.transparency_note(paths).startswith("d.png is transparent")
+
+
+def test_the_orientation_of_an_image_is_that_of_its_exif(tmp_path):
     image = Image.fromarray(RAMP)
-    for orientation in (1, 3, 6):
+    for number in (1, 3, 6, 9):
         exif = image.getexif()
-        exif[0x0112] = orientation
+        exif[0x0112] = number
         image.save(tmp_path / "a.jpg", exif=exif)
-        assert reading.is_turned(tmp_path / "a.jpg") == (orientation > 1)
-    assert not reading.is_turned(tmp_path / "none.jpg")
+        assert reading.orientation(tmp_path / "a.jpg") == (number if number < 9 else 1)
+    assert reading.orientation(tmp_path / "none.jpg") == 1
 
 
 def test_a_pose_with_a_scale_is_named_as_such():

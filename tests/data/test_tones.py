@@ -56,6 +56,16 @@ def test_8_bits_and_all_of_16_stay_as_they_are(tmp_path):
     np.testing.assert_allclose(full[1].image, color_image(1, SIZE)[..., ::-1] * 2.0, atol=1)
 
 
+@pytest.mark.parametrize("deep", [0, 7, 19])
+def test_one_image_of_more_bits_among_others_is_as_bright_as_they_are(deep, tmp_path):
+    """It was an almost black one, and where it was looked at first nothing was said of the others."""
+    write(tmp_path, lambda image: image, 20)
+    cv2.imwrite(str(tmp_path / f"{deep}.png"), color_image(deep, SIZE).astype(np.uint16) << 4)
+    dataset = loaded(tmp_path)
+    assert dataset[deep].image.max() > 100 and "more than 8 bits" in dataset.calibration["note"]
+    np.testing.assert_array_equal(dataset[1].image, color_image(1, SIZE)[..., ::-1])
+
+
 def test_other_data_sets_show_them_likewise(tum_root, tmp_path):
     (folder,) = tum_root.iterdir()
     for path in (folder / "rgb").iterdir():

@@ -174,3 +174,12 @@ def test_lists_may_have_backslashes_spaces_quotes_and_more_columns(line, tum_roo
     dataset = Tum(str(tum_root), folder.name, stride=1)
     assert [frame.timestamp for frame in dataset] == [100.0, 101.0, 102.0]
     assert all(frame.image.mean() > 0 and (frame.depth > 0).any() for frame in dataset)
+
+
+def test_a_clock_that_was_set_back_is_told_with_its_line(tum_root):
+    (folder,) = tum_root.iterdir()
+    lines = (folder / "rgb.txt").read_text().splitlines()
+    assert "note" not in Tum(str(tum_root), folder.name, stride=1).calibration
+    (folder / "rgb.txt").write_text("\n".join([*lines[:-2], lines[-1], lines[-2]]))
+    said = Tum(str(tum_root), folder.name, stride=1).calibration["note"]
+    assert f"rgb.txt, line {len(lines)}: time goes back by 1.000 s" in said

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.config.configure import baseline_configs
 from emgs_jax.data.backprojection import backproject
-from emgs_jax.evaluation.baselines import Pinhole, TsdfConfig, View, VoxelConfig, draw_voxels
+from emgs_jax.evaluation.baselines import Pinhole, TsdfConfig, View, VoxelConfig, _Blocks, draw_voxels
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, transform_cloud
 from emgs_jax.evaluation.reconstruction import camera_cloud
 from emgs_jax.geometry import Sim3
@@ -153,6 +153,27 @@ def test_the_nearest_point_is_drawn_in_every_pixel_of_its_footprint():
     np.testing.assert_array_equal(colors[..., 0], expected == 1.0)
     wide, _ = draw_voxels(cloud, np.ones(2), pose(), pinhole, VoxelConfig(10.0, 1, 0.1, 1))
     np.testing.assert_allclose(wide, expected, err_msg="farther than the largest footprint")
+
+
+def test_what_a_camera_cannot_see_is_not_drawn_and_changes_no_pixel():
+    """A view of 1,000 frames' cloud cost as much as the cloud."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-4, 4, (20_000, 3))
+    cloud, counts = PointCloud(points, np.zeros_like(points), np.abs(points) / 4), rng.integers(1, 9, len(points))
+    config, pinhole = VoxelConfig(0.02, 8, 0.1, 4), Pinhole((60.0, 60.0, 31.5, 23.5), 64, 48)
+    blocks = _Blocks(cloud, counts, 0.64)
+    for turn in ([0, 0, 0], [0.4, 2.0, -1.0], [-1.2, 0.3, 3.0]):
+        camera = pose()
+        camera[:3, :3], camera[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), turn
+        rows = blocks.before(camera, pinhole, config)
+        assert 0 < len(rows) < 0.5 * len(points)
+        some = PointCloud(*(values[rows] for values in vars(cloud).values()))
+        for own, of_all in zip(
+            draw_voxels(some, counts[rows], camera, pinhole, config),
+            draw_voxels(cloud, counts, camera, pinhole, config),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(own, of_all)
 
 
 @pytest.mark.parametrize(

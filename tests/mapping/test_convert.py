@@ -107,6 +107,19 @@ def test_a_step_knows_its_motion_as_well_as_both_poses_together_and_its_own_pose
     assert np.isnan(to_prediction(prediction, frames, ANCHOR, CONFIG).pose_covariance).all()
 
 
+def test_how_sure_a_scale_is_comes_with_every_step():
+    prediction, frames = predicted(Window(3, (0, 3, 4, 5, 6), (4, 5), 5))
+    assert np.isnan(to_prediction(prediction, frames, ANCHOR, CONFIG).scale_std)
+    assert to_prediction(replace(prediction, scale_std=0.02), frames, ANCHOR, CONFIG).scale_std == np.float32(0.02)
+    first, images = predicted(FIRST)
+    window, _ = to_first_window(replace(first, scale_std=0.02), images, ANCHOR, CONFIG)
+    _, steps = opening(window, SimpleNamespace(initialization="incremental"))
+    assert {float(step.scale_std) for step in steps} == {float(np.float32(0.02))}
+    for wrong in (-0.1, np.nan):
+        with pytest.raises(ValueError, match="scale_std"):
+            to_prediction(replace(prediction, scale_std=wrong), frames, ANCHOR, CONFIG)
+
+
 def test_the_steps_of_the_first_window_know_their_poses_as_well():
     prediction, frames = predicted(FIRST)
     sure = replace(prediction, pose_covariance=covariances(len(FIRST.views)))

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, EditedPrior, at_inference, compose, dataset, exact, map_tiny
 
+from emgs_jax.config.configure import build
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
 from emgs_jax.device.clock import Clock
@@ -49,6 +50,14 @@ class Echo(Prior):
 
     def predict(self, window, frames, intrinsics):
         return window, frames
+
+
+def test_a_run_in_float64_is_refused_before_its_first_frame():
+    """A notebook with JAX_ENABLE_X64=1 ended in "Incompatible shapes for broadcasting", after compiling."""
+    data, config = dataset(), build(compose(), "slam")
+    with jax.enable_x64(True), pytest.raises(ValueError, match="JAX_ENABLE_X64 is set, and maps are made in float32"):
+        new_run(data, config)
+    assert new_run(data, config).camera.width == data.size[0]
 
 
 def test_each_frame_is_read_once_just_before_it_is_needed_and_kept_only_while_a_window_holds_it():

@@ -52,6 +52,7 @@ def prediction() -> Prediction:
         T_world_views=to_se3(np.stack(poses)),
         T_world_anchor=to_se3(matrix((0, 0, 30), (1, 1, 1))),
         pose_covariance=jnp.tile(1e-4 * jnp.eye(6), (2, 1, 1)),
+        scale_std=jnp.asarray(0.01),
         has_newest=jnp.asarray(True),
         is_repeat=jnp.asarray(True),
     )

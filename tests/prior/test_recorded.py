@@ -100,11 +100,12 @@ def test_replay_is_the_live_prior_bit_for_bit_in_older_versions_as_well(folder, 
 
 
 class Sure(Simulated):
-    """The simulated prior, which says how sure it is of its poses."""
+    """The simulated prior, which says how sure it is of its poses and of its scale."""
 
     def predict(self, window, frames, intrinsics):
         found = super().predict(window, frames, intrinsics)
-        return replace(found, pose_covariance=np.multiply.outer(1.0 + np.arange(len(window.views)), 1e-4 * np.eye(6)))
+        covariance = np.multiply.outer(1.0 + np.arange(len(window.views)), 1e-4 * np.eye(6))
+        return replace(found, pose_covariance=covariance, scale_std=np.float64(0.02))
 
 
 def test_how_sure_poses_are_is_replayed_and_what_the_key_says_stands_in_its_place(tmp_path, room):
@@ -114,6 +115,7 @@ def test_how_sure_poses_are_is_replayed_and_what_the_key_says_stands_in_its_plac
     live = prior.predict(window, frames, room.intrinsics)
     found = Recorded(tmp_path).predict(window, frames, room.intrinsics)
     np.testing.assert_array_equal(found.pose_covariance, live.pose_covariance)
+    assert found.scale_std == 0.02
     other = Recorded(tmp_path, pose_std=[0.02, 3.0])
     found = other.predict(window, frames, room.intrinsics)
     expected = np.diag(np.repeat([0.02, np.radians(3.0)], 3) ** 2)

@@ -58,6 +58,7 @@ def answer(
         stack_poses([product(anchor, scaled(T, scale)) for T in views]),
         anchor,
         no_covariance(),
+        device(np.float32(np.nan)),
         *(device(flags[name]) for name in ("has_newest", "is_repeat")),
     )
 

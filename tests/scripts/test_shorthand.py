@@ -66,6 +66,21 @@ def test_keys_that_are_given_win(video):
     assert "graph" not in keys_of(with_source([str(video), "baseline=voxel"]))
 
 
+def test_predictions_that_hold_a_camera_are_not_given_another(video, tmp_path):
+    for row in range(5):
+        arrays = {"depth": np.ones((32, 48)), "T_world_camera": np.eye(4), "intrinsics": [40.0, 41.0, 23.5, 15.5]}
+        np.savez(tmp_path / f"{row}.npz", **arrays)
+    words = [str(video), "prior=files", f"prior.folder={tmp_path}"]
+    assert keys_of(with_source(words))["dataset.intrinsics"] == "[80,82,47.5,31.5]"
+    own = with_source([*words, "dataset.intrinsics=estimate"])
+    assert keys_of(own)["dataset.intrinsics"] == "estimate"
+    for other in ({"depth": np.ones((48, 48))}, {"intrinsics": None}):  # of other images, and without a camera
+        held = {key: value for key, value in (arrays | other).items() if value is not None}
+        for row in range(5):
+            np.savez(tmp_path / f"{row}.npz", **held)
+        assert keys_of(with_source(words))["dataset.intrinsics"] == "estimate"
+
+
 def test_what_is_no_path_is_left_alone():
     for words in (["--cfg", "job", "prior=recorded"], ["-m", "slam.em.noise=0,1"], ["~graph"], []):
         assert with_source(words) == words

@@ -78,7 +78,7 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
         "T[:3, :3] = Rotation.from_rotvec(translation * ",
         "metres for radians",
     ),
-    ("back_end/g2o", "[6, 3, 4, 5, 0, 1, 2]", "[3, 4, 5, 6, 0, 1, 2]", "quaternions with w first are read"),
+    ("back_end/g2o", "[4, 5, 6, 1, 2, 3, 0]", "[4, 5, 6, 0, 1, 2, 3]", "quaternions are written with w first"),
     (
         "io/trajectory",
         "Rotation.from_quat(values[is_finite, 3:])",

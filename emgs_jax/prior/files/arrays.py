@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from emgs_jax.data.file_names import natural_key
+from emgs_jax.data.file_names import natural_order
 from emgs_jax.data.reading import decode, is_rigid
 from emgs_jax.io.npz import npz_names, read_npz
 from emgs_jax.io.packages import extra
@@ -20,8 +20,8 @@ EXR_CHANNELS = ("Z", "Y", "R", "V")  # of which the first that is there is the d
 
 def files_of(folder: Path, suffix: str) -> list[Path]:
     """The files of a folder with a suffix, in natural order."""
-    found = (path for path in folder.glob(f"*{suffix}") if not path.name.startswith("."))
-    return sorted(found, key=lambda path: (natural_key(path), path.name))
+    found = [path for path in folder.glob(f"*{suffix}") if not path.name.startswith(".")]
+    return [found[row] for row in natural_order(found)[0]]
 
 
 def load_npz(path: Path, names: Sequence[str] = (), optional: Sequence[str] = ()) -> dict[str, np.ndarray]:

@@ -11,14 +11,14 @@ intrinsics have them; without, on the rays of the data set's camera. Only sensor
 (ScanNet) are looked up ray by ray.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
 from emgs_jax.data.base import Dataset, Frame
-from emgs_jax.data.reading import check_depth_scale, fingerprint, is_turned
+from emgs_jax.data.reading import Size, check_depth_scale, fingerprint, orientation, resize_intrinsics
 from emgs_jax.prior.base import (
     Prior,
     PriorPrediction,
@@ -28,17 +28,19 @@ from emgs_jax.prior.base import (
     equal_covariances,
     relative_poses,
 )
-from emgs_jax.prior.files.conventions import Sight, check_conventions, median_misfit
+from emgs_jax.prior.files.conventions import MIN_GAIN, Sight, check_conventions, median_misfit
 from emgs_jax.prior.files.exports import find_export, read_cut3r, read_export
 from emgs_jax.prior.files.own import GIVES_POSES, read_own
 from emgs_jax.prior.files.pose_error import pose_angle
 from emgs_jax.prior.files.scans import DEPTH_MAPS, read_colmap_workspace, read_record3d, read_scannet
-from emgs_jax.prior.files.view import Camera, Predictions, View, at_frame, grid_intrinsics, usable
+from emgs_jax.prior.files.view import Camera, Intrinsics, Predictions, View, at_frame, by_rays, grid_intrinsics, usable
 
 AUTO = "auto"
 SCALES = ("auto", "metric", "arbitrary")
 ROOM = (0.05, 100.0)  # m, median depth of a view that is metric
+TURNS = {3: [[-1, 0], [0, -1]], 6: [[0, 1], [-1, 0]], 8: [[0, -1], [1, 0]]}  # R_stored_shown of an EXIF orientation
 FOCAL_NOTE, FOCAL_ERROR = 1.03, 1.5  # ratio of the files' focal length and the data set's
+NUM_CAMERAS = 16  # views whose intrinsics are looked at for the camera of the images
 NUM_PAIRS, PAIR_GAP = 5, 5  # of views that are compared, and how many frames apart they are
 
 
@@ -63,8 +65,8 @@ class Files(Prior):
         median_depth: float,
         depth_scale: float,
         max_depth_step: float,
-        pose_std: Sequence[float] | str | None,
-        max_misfit: float,
+        pose_std: Sequence[float] | str | None = AUTO,
+        max_misfit: float = 0.1,
     ) -> None:
         if scale not in SCALES:
             raise ValueError(f"prior.scale must be one of {', '.join(SCALES)}, got {scale!r}")
@@ -100,13 +102,20 @@ class Files(Prior):
                 f"{view.source} has a median of {depth:.4g}, which is no depth in metres: write metres, give "
                 "prior.depth_scale (units of a metre in .png files; 1000: mm), or prior.scale=arbitrary"
             )
+        turned = turned_files(dataset)
+        poses = {index: self._pose(index) for index in known}
+        poses = {index: pose for index, pose in poses.items() if np.isfinite(pose).all()}
+        angle = pose_angle(dataset, poses) if self._is_measured or turned else None
+        if angle is not None and (words := _stored_words(dataset, poses, turned, angle)):
+            raise ValueError(f"{self.folder}: {words}")
         if self._is_measured:
-            poses = {index: self._pose(index) for index in known}
-            angle = pose_angle(dataset, {i: T for i, T in poses.items() if np.isfinite(T).all()})
             self._pose_std = None if angle is None else (angle * depth, float(np.degrees(angle)))
         scale = "metres" if self._is_metric else f"up to scale, times {self._factor:.4g}"
         lacking = f", {len(self._rows) - len(known)} frames have none" if len(known) < len(self._rows) else ""
-        note = _focal_note(view, camera, found) + _turned_note(dataset)
+        try:
+            note = _focal_note(view, camera, found) + _turned_note(turned)
+        except ValueError as error:
+            raise ValueError(f"{error}{_turned_note(turned)}") from error
         pairs = self._pairs(known, camera)
         if not np.isfinite(median_misfit(pairs, dataset.intrinsics, lambda sight: sight)):  # the camera turns fast
             pairs = self._pairs(known, camera, gap=1) or pairs
@@ -190,6 +199,29 @@ def read_predictions(folder: Path, units_per_metre: float) -> Predictions:
     return read_own(folder, units_per_metre)
 
 
+def image_intrinsics(folder: Path, size: Size) -> Intrinsics | None:
+    """The camera of images of a size, which predictions of them hold: the median of `NUM_CAMERAS` views, evenly spread.
+
+    None where they hold none, do not show the images, or are a sensor's with another camera.
+    """
+    (width, height), longest = size, float(max(size))
+    camera, found = Camera(size, (longest, longest, (width - 1) / 2, (height - 1) / 2)), []
+    predictions = read_predictions(folder, 1.0)
+    if predictions.place is by_rays:
+        return None
+    for row in np.unique(np.linspace(0, len(predictions.names) - 1, NUM_CAMERAS).astype(int)).tolist():
+        view = predictions.read(row)
+        if view.intrinsics is None:
+            return None
+        try:
+            (x, y), (left, top) = predictions.place(camera, view)
+        except ValueError:
+            return None
+        fx, fy, cx, cy = view.intrinsics
+        found.append(resize_intrinsics((fx, fy, cx + left, cy + top), (x, y), size))
+    return tuple(float(value) for value in np.median(found, axis=0)) if found else None
+
+
 def rows_of(dataset: Dataset, found: Predictions, folder: Path) -> list[int | None]:
     """Row of every frame: by the names of the images, or in order where these say nothing.
 
@@ -238,13 +270,36 @@ def _focal_note(view: View, camera: Camera, found: Predictions) -> str:
     return f"; {words}: points lie where the files' have them; dataset.intrinsics times {ratio:.3f} would agree"
 
 
-def _turned_note(dataset: Dataset) -> str:
-    """Words where images are turned by their EXIF orientation, as dataset=images does and not all programs do."""
+def turned_files(dataset: Dataset) -> dict[int, Path]:
+    """The first image of each EXIF orientation that dataset=images turns, as not all programs do."""
+    if dataset.name != "images":
+        return {}
     files = [file for index in range(len(dataset)) for file in dataset.files(index)[:1]]
-    turned = [file.name for file in files if dataset.name == "images" and is_turned(file)]
+    return {turn: file for file in reversed(files) if (turn := orientation(file)) > 1}
+
+
+def _turned_note(turned: Mapping[int, Path]) -> str:
     if not turned:
         return ""
     return (
-        f"; {len(turned)} images are shown turned by their EXIF orientation ({turned[0]}), and predictions must be of "
-        "the turned images: VGGT and others take the pixels as they are stored (save the images upright for these)"
+        f"; images are shown turned by their EXIF orientation ({[*turned.values()][0].name}), and predictions must be "
+        "of the turned images: VGGT and others take the pixels as they are stored (save the images upright for these)"
+    )
+
+
+def _stored_words(
+    dataset: Dataset, poses: Mapping[int, np.ndarray], turned: Mapping[int, Path], angle: float
+) -> str | None:
+    """Words where poses that err by `angle` fit much better as those of the pixels as they are stored."""
+    if len(turned) != 1 or (turn := [*turned][0]) not in TURNS:
+        return None
+    upright = np.eye(4)
+    upright[:2, :2] = TURNS[turn]
+    found = pose_angle(dataset, {index: pose @ upright for index, pose in poses.items()})
+    if found is None or MIN_GAIN * found > angle:
+        return None
+    return (
+        f"poses err by {np.degrees(angle):.2g} degrees, and by {np.degrees(found):.2g} as those of images that are "
+        f"not turned, while {turned[turn].name} is shown turned by its EXIF orientation: save the images upright and "
+        "predict from these"
     )

@@ -52,11 +52,13 @@ class Depth(NamedTuple):
         depth: (h, w) z in the unit of the structure, 0 where it is not known.
         spread: (h, w) a multiple of the standard deviation of log z, as the way to it has it.
         pixels: (h, w), see `pixels_per_log_depth`; 1 where nothing was matched, 0 where there is no telling.
+        scale_std: of the logarithm of a factor that all depths have in common; 0 where they are triangulated.
     """
 
     depth: np.ndarray
     spread: np.ndarray
     pixels: np.ndarray
+    scale_std: float = 0.0
 
 
 Depths = Callable[[int], Depth]  # of a frame that the structure has placed

@@ -60,7 +60,8 @@ def begin_monocular(
         depth *= np.float32(factors[world])
         near, far = ranges[world]
         is_near = (depth >= near) & (depth <= far)
-        return Depth(np.where(is_near, depth, 0.0), std, np.float32(is_near))
+        scale_std = float(np.sqrt(fits[world].covariance[rows[frame], 0, 0]))
+        return Depth(np.where(is_near, depth, 0.0), std, np.float32(is_near), scale_std)
 
     return found, depth_of
 

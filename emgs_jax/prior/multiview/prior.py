@@ -87,7 +87,7 @@ class MultiviewStereo(Prior):
         settings = {"structure": _values(structure), "dense": _described(*self._ways[0])}
         if len(self._ways) > 1:
             settings["dense"]["beside"] = _described(*self._ways[1])
-        self.provenance = Provenance("multiview_stereo", {"version": 12} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 13} | settings)
         self._dataset: Dataset | None = None
         self._folder: Path | None = None
         self._found: Structure | None = None
@@ -138,7 +138,8 @@ class MultiviewStereo(Prior):
                 T[row] = np.eye(4) if frame == anchor else T_anchor_world @ structure.T_world_camera[frame]
                 spread[row] = structure.covariance[frame]
         features = np.zeros((*mask.shape, 0), np.float16)
-        return PriorPrediction(window, T, points, confidence, mask, features, pose_covariance=spread, world=world)
+        known = {"pose_covariance": spread, "scale_std": self._scale_std(window.current), "world": world}
+        return PriorPrediction(window, T, points, confidence, mask, features, **known)
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
         """Predict for views of two visits of a place; None where they are not in one world."""
@@ -192,9 +193,15 @@ class MultiviewStereo(Prior):
         confidence = np.maximum(1.0 / np.where(mask, std, 1.0), np.float32(1.0))
         return points_shown(np.where(mask, depth, 0.0), lens), confidence, mask
 
+    def _scale_std(self, frame: int) -> np.float64 | None:
+        """That of a frame's depths; the surest of two ways holds both."""
+        if self._found.world[frame] == NONE or self._found.is_interpolated[frame]:
+            return None
+        return np.float64(min(depths(frame).scale_std for depths in self._depths))
+
     def _std(self, frame: int, depths: Depths, config: DenseConfig) -> np.ndarray:
         """Standard deviation of the logarithm of each depth; inf where there is no telling."""
-        depth, spread, pixels = depths(frame)
+        depth, spread, pixels, _ = depths(frame)
         count = config.num_checks
         others = [int(other) for other in placed_beside(self._found, frame)[:count]]
         if not others:

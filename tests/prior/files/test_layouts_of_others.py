@@ -14,6 +14,7 @@ from written_predictions import Named, asked, truth, write_npz
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.prior.base import relative_poses
 from emgs_jax.prior.files.exports import dust3r_crop, mapanything_crop, read_export, vggt_place
+from emgs_jax.prior.files.prior import image_intrinsics
 from emgs_jax.prior.files.view import Camera, View, at_frame
 
 NUMBERS = Named(names=[str(index) for index in range(tiny_run.NUM_FRAMES)])
@@ -190,6 +191,14 @@ def test_what_a_network_sees_of_an_image_is_found_by_its_own_rule(camera, scaled
     np.testing.assert_allclose(points[mask] @ [0.2, 0, 1], 2, atol=1e-4)
     share = min(grid[0] * grid[1] / (scaled[0] * scaled[1]), 1.0)
     assert mask.mean() == pytest.approx(share, abs=2 / min(camera.size))
+
+
+@pytest.mark.parametrize(("camera", "scaled", "grid"), [row[:3] for row in CROPS if row[3] is vggt_place][:4])
+def test_the_camera_of_images_is_that_which_their_predictions_hold(camera, scaled, grid, tmp_path):
+    depth, matrix = seen(camera, scaled, grid)
+    arrays = {"pose_enc": np.zeros((3, 9)), "depth": np.tile(depth, (3, 1, 1)), "intrinsic": np.tile(matrix, (3, 1, 1))}
+    np.savez(tmp_path / "predictions.npz", extrinsic=np.tile(np.eye(4)[:3], (3, 1, 1)), **arrays)
+    assert image_intrinsics(tmp_path, camera.size) == pytest.approx(camera.intrinsics, abs=0.3)
 
 
 def test_vggts_file_is_read_with_its_own_crop(tmp_path):

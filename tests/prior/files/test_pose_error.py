@@ -1,6 +1,7 @@
 """How far off poses are, as the images say: against disturbances that are drawn."""
 
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.config.configure import build_dataset, compose
 from emgs_jax.prior.files import pose_error
 from emgs_jax.prior.files.pose_error import calibration, pair_error, pose_angle, sampson
+from emgs_jax.prior.files.prior import _stored_words
 
 
 @cache
@@ -89,3 +91,15 @@ def test_images_without_points_and_a_camera_that_rests_say_nothing():
     assert pair_error([blank, blank], moved, room().intrinsics) is None
     assert pair_error([image, image], np.eye(4), room().intrinsics) is None
     assert pose_angle(Frames(), {0: np.eye(4)}) is None
+
+
+@pytest.mark.parametrize(("orientation", "turn"), [(3, 180), (6, 90), (8, -90)])
+def test_poses_of_images_as_they_are_stored_are_told_from_those_as_they_are_shown(orientation, turn):
+    """Turned by 180 degrees all sides fit, and each pixel got the depth of the one across the middle."""
+    stored = np.eye(4)
+    stored[:3, :3] = Rotation.from_euler("z", turn, degrees=True).as_matrix().round()
+    shown, turned = poses(1e-3), {orientation: Path("a.jpg")}
+    of_stored = {index: pose @ stored for index, pose in shown.items()}
+    words = _stored_words(Frames(), of_stored, turned, pose_angle(Frames(), of_stored))
+    assert "a.jpg is shown turned by its EXIF orientation" in words
+    assert _stored_words(Frames(), shown, turned, pose_angle(Frames(), shown)) is None

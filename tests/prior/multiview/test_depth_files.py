@@ -226,7 +226,8 @@ def test_depths_of_the_room_come_back_in_the_unit_of_the_structure_or_in_metres(
         structure.T_world_camera[-1, :3, 3], factor / 0.4 * found.T_world_camera[-1, :3, 3], rtol=1e-2
     )
     for index, frame in enumerate(frames):
-        depth, std, _ = depth_of(index)
+        depth, std, _, scale_std = depth_of(index)
+        assert 0 < scale_std < 0.05  # of a scale that landmarks tell
         is_known = depth > 0
         assert is_known.mean() > 0.9
         ratio = depth[is_known] / frame.depth[is_known] / factor
