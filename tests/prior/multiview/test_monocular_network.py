@@ -16,7 +16,9 @@ from emgs_jax.prior.multiview.lens import Lens
 def test_the_network_is_shown_the_whole_image_and_its_depths_lie_at_the_images_pixels(monkeypatch):
     """A network that says what is red in every fourth row and column."""
     monkeypatch.setattr(module, "load_network", lambda *given: None)
-    monkeypatch.setattr(module, "jitted_predict", lambda network, image: cv2.resize(image[..., 0], (64, 48)))
+    monkeypatch.setattr(
+        module, "jitted_predict", lambda network, image: cv2.resize(np.asarray(image)[..., 0], (64, 48))
+    )
     monkeypatch.setattr(module, "begin_monocular", lambda scene, values, config: values)
     config = hydra.utils.instantiate(compose("prior=multiview_stereo", "prior/dense=meter").prior.dense)
     image = np.zeros((240, 400, 3), np.uint8)
