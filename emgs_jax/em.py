@@ -118,10 +118,20 @@ def e_step(
         noise: m; standard deviation of every point along its viewing ray, as a vector.
         index: of the Gaussians; None makes it here.
     """
-    index = index_of(gaussians) if index is None else index
+    return _e_step(gaussians, *_sound(points, noise), config, index_of(gaussians) if index is None else index)
+
+
+def _sound(points: Observation, noise: Float[Array, "m 3"]) -> tuple[Observation, Float[Array, "m 3"]]:
+    """Points and their noise; one whose noise is not finite is invalid."""
     has_noise = jnp.all(jnp.isfinite(noise), axis=-1)
     points = sound(eqx.tree_at(lambda o: o.valid, points, points.valid & has_noise))
-    noise = jnp.where(points.valid[:, None], noise, 0.0)
+    return points, jnp.where(points.valid[:, None], noise, 0.0)
+
+
+def _e_step(
+    gaussians: Gaussians, points: Observation, noise: Float[Array, "m 3"], config: EmConfig, index: GaussianIndex
+) -> tuple[EStep, Float[Array, "m"]]:
+    """`e_step` of points that are sound."""
     near = nearby(points.points, points.valid, index.groups, config.num_candidates, BLOCK)
     meaning = eqx.tree_at(lambda g: g.features, gaussians, safe_normalize(gaussians.features))
     table = meaning, index.white
@@ -272,9 +282,9 @@ def em_update(
     Returns:
         The updated submap, what explains which point, and counts. Without any fused point the submap is unchanged.
     """
-    gaussians, aligned = submap.gaussians, sound(aligned)
-    noise = jnp.where(jnp.isfinite(noise), noise, 0.0)
-    step, best = e_step(gaussians, aligned, noise, config, index)
+    gaussians, (aligned, noise) = submap.gaussians, _sound(aligned, noise)
+    index = index_of(gaussians) if index is None else index
+    step, best = _e_step(gaussians, aligned, noise, config, index)
     new, total = m_step(gaussians, aligned, precision(noise, config), step, config)
     evidence = jnp.where(total > 0, support(gaussians, aligned, step, config), 0.0)
     updated, gain = update_average(submap, new, evidence, config.average)

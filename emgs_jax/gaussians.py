@@ -98,7 +98,12 @@ def fit_to_points(
     The covariance has min_std² added on the diagonal, which keeps every eigenvalue at or above the floor. A centre
     with fewer than four points becomes invalid.
     """
-    observation = sound(observation)
+    return _fit_to_sound(centers, exists, sound(observation), config)
+
+
+def _fit_to_sound(
+    centers: Float[Array, "k 3"], exists: Bool[Array, "k"], observation: Observation, config: FitConfig
+) -> Gaussians:
     points, num = observation.points, config.num_fit_neighbours
     groups = group_points(points, observation.valid)
     # A centre stands for several points: few centres share a list, and that is long.
@@ -153,7 +158,7 @@ def cluster(
     rows, row_exists = strided_seeds(observation.valid, order, stride, -(-num_points // stride))
     even = take_rows(observation, rows)
     even = eqx.tree_at(lambda o: o.valid, even, even.valid & row_exists)
-    fitted = fit_to_points(centers, exists, even, config)
+    fitted = _fit_to_sound(centers, exists, even, config)
     evidence = jnp.where(config.feature > 0, count, 1.0)[:, None] * fitted.features
     fitted = eqx.tree_at(lambda g: g.features, fitted, jnp.where(fitted.valid[:, None], evidence, 0.0))
     return fitted, jnp.where(fitted.valid, count / spacing, 0.0)

@@ -148,7 +148,8 @@ def sound(observation: Observation) -> Observation:
     """The observation with every row invalid, and 0, in which a number is not finite or a point beyond any map."""
     o = observation
     is_sound = is_within_reach(o.points) & jnp.isfinite(o.confidence)
-    is_sound &= jnp.all(jnp.isfinite(jnp.concatenate([o.colors, o.normals, o.features], axis=-1)), axis=-1)
+    for vectors in (o.colors, o.normals, o.features):
+        is_sound &= jnp.all(jnp.isfinite(vectors), axis=-1)
     o = where_rows(is_sound, o, jax.tree.map(jnp.zeros_like, o))
     return eqx.tree_at(lambda o: o.confidence, o, jnp.where(is_sound, o.confidence, 1.0))
 

@@ -355,6 +355,10 @@ def as_motion(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
                 f"{where} has a rotation times {scale:.4g}, of an alignment with a scale: divide the first three "
                 "columns by it, and give depth and positions in one unit"
             )
+        if scale < 0 and is_rigid(pose * np.where(np.arange(4) == 0, -1.0, 1.0)):
+            raise BadFrameError(
+                f"{where} has a mirrored pose, as where one axis was flipped: flip two of them, or none"
+            )
         raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded

@@ -178,7 +178,9 @@ def residuals(
     """Rows of every point and of the prior, in standard deviations.
 
     The matches carry no gradient. The derivative is made here, once, and the solver gets rows that are linear in y:
-    otherwise each of its uses of the derivative would be compiled, and computed, anew.
+    otherwise each of its uses of the derivative would be compiled, and computed, anew. So the derivatives of a solution
+    are Gauss-Newton's as well: they leave out the residuals times the derivatives of their Jacobian, and are right
+    where points fit their Gaussians.
     """
     candidates, problem, config = args
     fixed = jax.lax.stop_gradient(y)

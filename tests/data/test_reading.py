@@ -217,3 +217,7 @@ def test_a_pose_with_a_scale_is_named_as_such():
     pose[:3, 3] = 1.0, 2.0, 3.0
     with pytest.raises(BadFrameError, match="pose.txt has a rotation times 2, of an alignment"):
         reading.as_motion(" ".join(map(str, pose.ravel())), "pose.txt")
+    mirrored, flipped = np.diag([1.0, -1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0, 1.0])
+    with pytest.raises(BadFrameError, match="pose.txt has a mirrored pose"):
+        reading.as_motion(" ".join(map(str, mirrored.ravel())), "pose.txt")
+    assert reading.as_motion(" ".join(map(str, flipped.ravel())), "pose.txt") is not None, "the advice, followed"
