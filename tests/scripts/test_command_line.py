@@ -106,6 +106,8 @@ def test_the_help_of_a_run_lists_exactly_the_choices_that_there_are(monkeypatch,
         if name in own
     }
     own["baseline"].remove("smoke")  # a file of the gate, which is no option
+    for shared in ("checked", "matched", "monocular"):  # what ways to depth have in common
+        own["prior/dense"].remove(shared)
     of_other_commands = {"densify_on", "experiment_on", "protocol", "suite", "sweep", "tune"}
     stages = {name for name in own if name.startswith("slam/")}
     assert listed == {name: own[name] for name in {*own} - of_other_commands - stages | {"slam/em"}}

@@ -225,10 +225,12 @@ def test_the_committed_baseline_holds_every_metric_of_the_suite_and_the_protocol
 @pytest.mark.parametrize("name", groups()["suite"])
 def test_every_suite_makes_jobs_that_know_their_sequence_and_name_no_path_of_a_machine(name):
     assert "/" not in yaml.safe_load((CONF / "suite" / f"{name}.yaml").read_text()).get("root", "???")
-    jobs = jobs_of(f"suite={name}", *([] if name == "smoke" else ["suite.root=some folder"]))
+    keys = {"smoke": [], "learned": ["root", "weights"]}.get(name, ["root"])
+    jobs = jobs_of(f"suite={name}", *(f"suite.{key}=some folder" for key in keys))
     sequences = [job.config.dataset.get("sequence", job.config.dataset.get("seed")) for job in jobs]
-    count = {"seven_scenes": 7, "tum": 9, "tum_loops": 3, "replica": 8, "slices": 4, "smoke": 1}[name]
-    assert len({job.folder for job in jobs}) == len(set(sequences)) == count
+    count = {"seven_scenes": 7, "tum": 9, "tum_loops": 3, "replica": 8, "slices": 4, "smoke": 1, "learned": 1}[name]
+    num_variants = 6 if name == "learned" else 1
+    assert len({job.folder for job in jobs}) == num_variants * len(set(sequences)) == num_variants * count
     assert all(job.config.dataset.get("root", "some folder").startswith("some folder") for job in jobs)
 
 
