@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from scene import CONF, compose
 
 ROOT = CONF.parent
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 GROUPS = ("dataset", "prior", "features", "evaluation", "experiment", "suite", "sweep", "tune", "protocol")
 pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
