@@ -131,7 +131,9 @@ def differences(function):
     return of
 
 
-ICP = pytest.mark.xfail(strict=True, reason="residuals times derivatives of their Jacobian are left out, see `residuals`")
+ICP = pytest.mark.xfail(
+    strict=True, reason="residuals times derivatives of their Jacobian are left out, see `residuals`"
+)
 
 
 @pytest.mark.parametrize("name", ["em", pytest.param("icp", marks=ICP), "extrapolation", "render"])
