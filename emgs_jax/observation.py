@@ -59,6 +59,11 @@ def no_covariance() -> Float[Array, "2 6 6"]:
     return jnp.full((2, 6, 6), jnp.nan)
 
 
+def unknown_scale() -> Float[Array, ""]:
+    """`Prediction.scale_std` where the prior does not say how sure it is."""
+    return jnp.asarray(jnp.nan, jnp.float32)
+
+
 class ObservationConfig(eqx.Module):
     """Conversion of a point map into an observation: thinning, normals and masking.
 

@@ -16,7 +16,7 @@ from emgs_jax.em import EStep
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.mapping.convert import FirstWindow
-from emgs_jax.observation import Observation, Prediction, no_covariance
+from emgs_jax.observation import Observation, Prediction, no_covariance, unknown_scale
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.neighbours import Nearby
 
@@ -194,7 +194,7 @@ def stack_poses(poses: list[jaxlie.SE3]) -> jaxlie.SE3:
 
 def first_window(views: Observation, T_world_views: jaxlie.SE3) -> FirstWindow:
     """The first window of a prior that does not say how sure its poses are."""
-    unknown = jnp.tile(no_covariance(), (len(views.valid), 1, 1, 1)), jnp.asarray(jnp.nan)
+    unknown = jnp.tile(no_covariance(), (len(views.valid), 1, 1, 1)), unknown_scale()
     return FirstWindow(views, T_world_views, *unknown)
 
 
@@ -214,7 +214,7 @@ def predict_room(
         T_world_views=stack_poses(poses),
         T_world_anchor=path_pose(0),
         pose_covariance=no_covariance(),
-        scale_std=jnp.asarray(jnp.nan),
+        scale_std=unknown_scale(),
         has_newest=jnp.asarray(has_newest),
         is_repeat=jnp.asarray(True),
     )

@@ -17,7 +17,7 @@ from emgs_jax.device.executables import call, outputs, ready
 from emgs_jax.device.fingerprint import fingerprint
 from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert
 from emgs_jax.mapping.convert import FirstWindow
-from emgs_jax.observation import Prediction, no_covariance, transform
+from emgs_jax.observation import Prediction, no_covariance, transform, unknown_scale
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
 from emgs_jax.ops.precision import full_precision
@@ -59,7 +59,7 @@ def restart_map(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[S
     """
     T = state.T_world_previous
     view = transform(T.inverse(), state.previous, jnp.ones(()))
-    first = FirstWindow(*jax.tree.map(lambda leaf: leaf[None], (view, T, no_covariance())))
+    first = FirstWindow(*jax.tree.map(lambda leaf: leaf[None], (view, T, no_covariance())), unknown_scale())
     alone, _ = start(first, camera, config)
     new = replace(alone.map, birth=jnp.full_like(alone.map.birth, state.time - 1))
     map, config = add_map(state.map, new, config)
@@ -100,7 +100,7 @@ def prepare_step(first: FirstWindow, camera: Camera, config: SlamConfig) -> None
         T_world_views=poses,
         T_world_anchor=pose,
         pose_covariance=no_covariance(),
-        scale_std=on_device(np.float32(np.nan)),
+        scale_std=unknown_scale(),
         has_newest=unknown,
         is_repeat=unknown,
     )

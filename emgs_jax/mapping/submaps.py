@@ -33,7 +33,7 @@ from emgs_jax.mapping.relocalization import (
 )
 from emgs_jax.mapping.run import LeftWorld, MappingRun, TrackedFrame, row_of_first_node
 from emgs_jax.mapping.window_input import WindowInput
-from emgs_jax.observation import no_covariance
+from emgs_jax.observation import no_covariance, unknown_scale
 from emgs_jax.registration.pose_estimate import rescale_estimate
 from emgs_jax.slam import StepInfo
 
@@ -48,7 +48,7 @@ def start_submap(run: MappingRun, window: WindowInput) -> MappingRun | None:
     if not is_new or pose is None or not np.isfinite(pose).all():
         return None
     view = jax.tree.map(lambda leaf: leaf[None], as_step_prediction(window.prediction).current)
-    first = FirstWindow(view, to_se3(run.records[-1].pose[None]), no_covariance()[None])
+    first = FirstWindow(view, to_se3(run.records[-1].pose[None]), no_covariance()[None], unknown_scale())
     alone, config = start(first, run.camera, run.config)
     if not bool(alone.map.gaussians.valid.any()):
         return None
