@@ -45,7 +45,7 @@ def test_links_lead_to_files_and_headings_that_are_there(page):
 @pages
 def test_commands_options_and_files_are_there(page):
     """And infinity is `inf`, as a command line reads it; YAML's own `.inf` would be text there."""
-    for name in re.findall(r"python -m experiments\.([a-z]\w*)", code(page)):
+    for name in re.findall(r"(?:python -m experiments\.|\bemgs )([a-z]\w*)", code(page)):
         assert importlib.util.find_spec(f"experiments.{name}"), name
     for group, option in re.findall(rf"(?<![\w./])({'|'.join(GROUPS)}|slam/\w+)=([a-z]\w*)", code(page)):
         assert (CONF / group / f"{option}.yaml").is_file(), f"{group}={option}"
