@@ -184,7 +184,7 @@ class Files(Prior):
 def read_predictions(folder: Path, units_per_metre: float) -> Predictions:
     """Read the predictions in a folder; the layout follows from the files that are there."""
     if not folder.exists():
-        raise ValueError(f"prior.folder={folder} does not exist: give that of the predictions (docs/predictions.md)")
+        raise ValueError(f"prior.folder={folder} does not exist: give the folder of predictions (docs/predictions.md)")
     export = find_export(folder)
     if export is not None:
         return read_export(export)
