@@ -1,4 +1,4 @@
-"""Write the tables of README.md and docs/results.md: `python -m experiments.tables root=FOLDER`.
+"""Write the tables of README.md and docs/measurements/results.md: `python -m experiments.tables root=FOLDER`.
 
 The rows are the evaluations of conf/tables.yaml; what is finished is not run again. Nothing is written unless all of
 them are finished and of the same commit. The line above a table says where it comes from. The first page has the rows

@@ -2,6 +2,8 @@
 
 import importlib.util
 import re
+import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 
@@ -10,7 +12,7 @@ from omegaconf import OmegaConf
 from scene import CONF, compose
 
 ROOT = CONF.parent
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 GROUPS = ("dataset", "prior", "features", "evaluation", "experiment", "suite", "sweep", "tune", "protocol")
 pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
@@ -43,7 +45,7 @@ def test_links_lead_to_files_and_headings_that_are_there(page):
 @pages
 def test_commands_options_and_files_are_there(page):
     """And infinity is `inf`, as a command line reads it; YAML's own `.inf` would be text there."""
-    for name in re.findall(r"python -m experiments\.([a-z]\w*)", code(page)):
+    for name in re.findall(r"(?:python -m experiments\.|\bemgs )([a-z]\w*)", code(page)):
         assert importlib.util.find_spec(f"experiments.{name}"), name
     for group, option in re.findall(rf"(?<![\w./])({'|'.join(GROUPS)}|slam/\w+)=([a-z]\w*)", code(page)):
         assert (CONF / group / f"{option}.yaml").is_file(), f"{group}={option}"
@@ -78,3 +80,21 @@ def test_nothing_refers_to_pages_that_users_do_not_have():
         for path in (ROOT / folder).rglob("*"):
             if path.suffix in (".py", ".yaml", ".md", ".ipynb"):
                 assert not re.search(r"\b(design|reference)/\w|\bmethod\.md|/work/|\.\./shared", path.read_text()), path
+
+
+def test_instructions_are_short_and_have_no_history():
+    """Measurements are dated and name their commits; they stand in docs/measurements/."""
+    for page in (ROOT / "docs").glob("*.md"):
+        text = page.read_text()
+        assert len(text.split()) <= 1500, page
+        assert not re.search(r"`(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,12}`", text), page
+
+
+def test_the_site_builds_without_a_warning_and_has_every_key(tmp_path):
+    """As `mkdocs build --strict` does: every link and anchor is there, and so is every page of the navigation."""
+    pytest.importorskip("mkdocs")
+    words = ["build", "--strict", "--quiet", "--config-file", str(ROOT / "mkdocs.yml"), "--site-dir", str(tmp_path)]
+    done = subprocess.run([sys.executable, "-m", "mkdocs", *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    keys = (tmp_path / "keys.html").read_text()
+    assert all(str(path.relative_to(CONF)) in keys for path in CONF.rglob("*.yaml"))

@@ -89,7 +89,7 @@ def licence_words(name: str, prior: str) -> str:
     """Name the licences of the program, a data set and a prior."""
     data = DATA_LICENCES.get(name, f"{name}: see its publisher")
     is_own = prior.startswith(("simulated", "multiview_stereo"))
-    network = "" if is_own else "; its weights have a licence of their own: docs/priors.md"
+    network = "" if is_own else "; its weights have a licence of their own: docs/networks.md"
     return f"Licences. Page and program: emgs_jax, Apache-2.0. Data: {data}. Prior: {prior}{network}."
 
 

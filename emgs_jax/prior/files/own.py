@@ -1,4 +1,4 @@
-"""The layout of one's own: a file a frame, as docs/priors.md has it."""
+"""The layout of one's own: a file a frame, as docs/predictions.md has it."""
 
 from functools import partial
 from pathlib import Path
@@ -37,7 +37,7 @@ def read_own(folder: Path, units_per_metre: float) -> Predictions:
     suffix = next((suffix for suffix in SUFFIXES if files_of(folder, suffix)), None)
     if suffix is None:
         raise ValueError(
-            f"prior.folder={folder} has no file *{', *'.join(SUFFIXES)} and no layout that is known (docs/priors.md)"
+            f"prior.folder={folder} has no file *{', *'.join(SUFFIXES)} and no known layout (docs/predictions.md)"
         )
     paths = files_of(folder, suffix)
     names = [path.stem for path in paths]

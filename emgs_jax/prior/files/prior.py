@@ -48,7 +48,7 @@ class Files(Prior):
     """A prior that reads its answers from files.
 
     Args:
-        folder: of one of the layouts that docs/priors.md lists, or an .npz with all images.
+        folder: of one of the layouts that docs/predictions.md lists, or an .npz with all images.
         scale: `metric`, `arbitrary` (right up to one factor), or `auto`: what the layout is known to be.
         median_depth: m, of the first view where the scale is arbitrary.
         depth_scale: units of a metre in 16-bit .png files.
@@ -184,7 +184,7 @@ class Files(Prior):
 def read_predictions(folder: Path, units_per_metre: float) -> Predictions:
     """Read the predictions in a folder; the layout follows from the files that are there."""
     if not folder.exists():
-        raise ValueError(f"prior.folder={folder} does not exist: give the folder of the predictions (docs/priors.md)")
+        raise ValueError(f"prior.folder={folder} does not exist: give the folder of predictions (docs/predictions.md)")
     export = find_export(folder)
     if export is not None:
         return read_export(export)

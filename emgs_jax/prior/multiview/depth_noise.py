@@ -19,7 +19,7 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class DepthNoiseConfig:
-    """Its parts, as numbers that `docs/priors.md` tells the origin of, and what is too much.
+    """Its parts, as numbers that `docs/measurements/depth_noise.md` tells the origin of, and what is too much.
 
     Args:
         pixel_std: pixels; of a match.

@@ -216,8 +216,8 @@ def test_an_uncertainty_that_is_no_length_and_angle_is_refused(wrong, own):
 
 def test_the_script_of_the_documentation_writes_what_the_prior_reads(tmp_path, monkeypatch):
     """Against the truth, with a model that knows it."""
-    page = (tiny_run.CONF.parent / "docs" / "priors.md").read_text()
-    section = page[page.index("### Files: predictions of your own") :]
+    page = (tiny_run.CONF.parent / "docs" / "predictions.md").read_text()
+    section = page[page.index("## One file a frame") :]
     script = section[section.index("```python\n") + 10 :].partition("```")[0]
     assert len([line for line in script.splitlines() if line]) <= 10
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""The simulated prior against docs/priors.md: exact at level 0, and the stated statistics at level 1.
+"""The simulated prior against docs/simulated.md: exact at level 0, and the stated statistics at level 1.
 
 The tolerances of the empirical figures are three to four standard errors of the number of draws, with fixed seeds.
 """

@@ -1,4 +1,4 @@
-"""Version 2 of the simulated prior against docs/priors.md: version 1 while the anchor is seen, drift beyond it.
+"""Version 2 of the simulated prior against docs/simulated.md: version 1 while the anchor is seen, drift beyond it.
 
 The tolerances of the empirical figures are three to four standard errors of the number of draws, with fixed seeds.
 """

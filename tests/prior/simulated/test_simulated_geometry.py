@@ -1,4 +1,4 @@
-"""Depth, confidence and features of the simulated prior against docs/priors.md."""
+"""Depth, confidence and features of the simulated prior against docs/simulated.md."""
 
 import math
 from dataclasses import replace
