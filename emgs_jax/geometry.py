@@ -59,19 +59,23 @@ def rotated(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 
 def scale_covariance(covariance: np.ndarray, scale: float) -> np.ndarray:
-    """Covariance of (translation, rotation, ...), (d, d), after lengths are multiplied by `scale`."""
-    units = np.ones(len(covariance))
+    """Covariance of (translation, rotation, ...), (..., d, d), after lengths are multiplied by `scale`."""
+    units = np.ones(covariance.shape[-1])
     units[:3] = scale
     return units[:, None] * covariance * units
+
+
+def adjoint(T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 6 6"]:
+    """Ad of poses: T Exp(xi) = Exp(Ad xi) T, translation first."""
+    rotations, across = T[:, :3, :3], np.cross(T[:, None, :3, 3], T[:, :3, :3], axisb=1, axisc=1)
+    return np.block([[rotations, across], [np.zeros_like(rotations), rotations]])
 
 
 def seen_from(
     covariance: Float[np.ndarray, "6 6"], T_world_there: Float[np.ndarray, "4 4"], T_world: Float[np.ndarray, "n 4 4"]
 ) -> Float[np.ndarray, "n 6 6"]:
     """Covariances of other poses that err with the one there as one rigid body: Ad Σ Adᵀ, each in its own axes."""
-    T = np.linalg.inv(T_world) @ T_world_there
-    rotations, across = T[:, :3, :3], np.cross(T[:, None, :3, 3], T[:, :3, :3], axisb=1, axisc=1)
-    adjoints = np.block([[rotations, across], [np.zeros_like(rotations), rotations]])
+    adjoints = adjoint(np.linalg.inv(T_world) @ T_world_there)
     return adjoints @ covariance @ adjoints.transpose(0, 2, 1)
 
 

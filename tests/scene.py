@@ -194,7 +194,7 @@ def stack_poses(poses: list[jaxlie.SE3]) -> jaxlie.SE3:
 
 def first_window(views: Observation, T_world_views: jaxlie.SE3) -> FirstWindow:
     """The first window of a prior that does not say how sure its poses are."""
-    unknown = jnp.tile(no_covariance(), (len(views.valid), 1, 1, 1)), unknown_scale()
+    unknown = (jnp.tile(one, (len(views.valid), *[1] * one.ndim)) for one in (no_covariance(), unknown_scale()))
     return FirstWindow(views, T_world_views, *unknown)
 
 

@@ -59,7 +59,7 @@ def restart_map(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[S
     """
     T = state.T_world_previous
     view = transform(T.inverse(), state.previous, jnp.ones(()))
-    first = FirstWindow(*jax.tree.map(lambda leaf: leaf[None], (view, T, no_covariance())), unknown_scale())
+    first = FirstWindow(*jax.tree.map(lambda leaf: leaf[None], (view, T, no_covariance(), unknown_scale())))
     alone, _ = start(first, camera, config)
     new = replace(alone.map, birth=jnp.full_like(alone.map.birth, state.time - 1))
     map, config = add_map(state.map, new, config)

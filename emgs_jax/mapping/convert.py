@@ -24,7 +24,7 @@ class FirstWindow(eqx.Module):
 
     Args:
         pose_covariance: (n, 2, 6, 6), see `Prediction`.
-        scale_std: of all views, likewise.
+        scale_std: (n,), likewise.
     """
 
     views: Observation
@@ -102,8 +102,8 @@ def _pose_covariance(prediction: PriorPrediction, previous: int, current: int) -
     return np.stack([here + seen_from(before, T_previous, T_current[None])[0], here])
 
 
-def _scale_std(prediction: PriorPrediction) -> jax.Array:
-    return on_device(np.float32(np.nan if prediction.scale_std is None else prediction.scale_std))
+def _scale_std(prediction: PriorPrediction) -> np.float32:
+    return np.float32(np.nan if prediction.scale_std is None else prediction.scale_std)
 
 
 def to_first_window(
@@ -140,8 +140,8 @@ def to_first_window(
     together = jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(views[first:]))
     pairs = zip(places[first:][:1] + places[first:], places[first:], strict=False)
     covariances = np.stack([_pose_covariance(prediction, *pair) for pair in pairs]).astype(np.float32)
-    known = to_se3(poses[first:]), on_device(covariances), _scale_std(prediction)
-    return FirstWindow(on_device(together), *known), tuple(dense[first:])
+    known = on_device(covariances), on_device(np.full(len(covariances), _scale_std(prediction)))
+    return FirstWindow(on_device(together), to_se3(poses[first:]), *known), tuple(dense[first:])
 
 
 def to_prediction(
@@ -166,7 +166,7 @@ def to_prediction(
         T_world_views=to_se3(np.asarray(T_world_anchor) @ prediction.T_anchor_view[rows]),
         T_world_anchor=to_se3(T_world_anchor),
         pose_covariance=on_device(_pose_covariance(prediction, *rows[:2]).astype(np.float32)),
-        scale_std=_scale_std(prediction),
+        scale_std=on_device(_scale_std(prediction)),
         has_newest=on_device(np.bool_(has_newest)),
         is_repeat=on_device(np.bool_(True)),
     )
@@ -199,10 +199,10 @@ def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[
             T_world_views=jaxlie.SE3(on_device(poses[[i - 1, i, min(i + 1, num_views - 1)]])),
             T_world_anchor=jaxlie.SE3(on_device(poses[0])),
             pose_covariance=on_device(found.pose_covariance[i]),
-            scale_std=on_device(found.scale_std),
+            scale_std=on_device(found.scale_std[i]),
             has_newest=on_device(np.bool_(i + 1 < num_views)),
             is_repeat=on_device(np.bool_(False)),
         )
         for i in range(1, num_views)
     ]
-    return on_device(jax.tree.map(lambda leaf: leaf[:1] if leaf.ndim else leaf, found)), following
+    return on_device(jax.tree.map(lambda leaf: leaf[:1], found)), following

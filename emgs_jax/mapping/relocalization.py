@@ -164,7 +164,7 @@ def as_step_prediction(opening: FirstWindow | Prediction) -> Prediction:
         T_world_views=jaxlie.SE3(jnp.stack([T.wxyz_xyz] * 3)),
         T_world_anchor=T,
         pose_covariance=opening.pose_covariance[0],
-        scale_std=opening.scale_std,
+        scale_std=opening.scale_std[0],
         has_newest=jnp.asarray(False),
         is_repeat=jnp.asarray(False),
     )

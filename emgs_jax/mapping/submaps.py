@@ -48,7 +48,7 @@ def start_submap(run: MappingRun, window: WindowInput) -> MappingRun | None:
     if not is_new or pose is None or not np.isfinite(pose).all():
         return None
     view = jax.tree.map(lambda leaf: leaf[None], as_step_prediction(window.prediction).current)
-    first = FirstWindow(view, to_se3(run.records[-1].pose[None]), no_covariance()[None], unknown_scale())
+    first = FirstWindow(view, to_se3(run.records[-1].pose[None]), no_covariance()[None], unknown_scale()[None])
     alone, config = start(first, run.camera, run.config)
     if not bool(alone.map.gaussians.valid.any()):
         return None

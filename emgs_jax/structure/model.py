@@ -37,8 +37,8 @@ class Structure:
         worlds: in the order of their first frames.
         world: (n,) row of the world that holds each frame, or NONE.
         T_world_camera: (n, 4, 4), NaN where there is none.
-        covariance: (n, 6, 6) of xi, relative to the first frame of its world: the true pose is T Exp(xi), translation
-            first, in the axes of the camera; NaN where it is not known.
+        covariance: (n, 6, 6) of xi, relative to the frame before it in its world: the true pose is T Exp(xi),
+            translation first, in the axes of the camera; NaN where it is not known.
         landmarks: of each frame, the rows of its world's points that it shows.
         is_interpolated: (n,) the pose is a guess between neighbours; it shows no landmarks.
     """
@@ -49,6 +49,11 @@ class Structure:
     covariance: np.ndarray
     landmarks: Sequence[np.ndarray]
     is_interpolated: np.ndarray
+
+    @property
+    def is_placed(self) -> np.ndarray:
+        """(n,) frames that a world holds by what they show."""
+        return (self.world != NONE) & ~self.is_interpolated
 
     def shown(self, frame: int) -> np.ndarray:
         """The landmarks (k, 3) that a frame shows, in its world."""
@@ -120,7 +125,7 @@ def scaled(structure: Structure, factors: Sequence[float]) -> Structure:
     for number, factor in enumerate(factors):
         frames = np.flatnonzero(structure.world == number)
         T[frames, :3, 3] *= factor
-        covariance[frames] = [scale_covariance(one, factor) for one in covariance[frames]]
+        covariance[frames] = scale_covariance(covariance[frames], factor)
     worlds = [replace(w, points=factor * w.points) for w, factor in zip(structure.worlds, factors, strict=True)]
     return replace(structure, worlds=worlds, T_world_camera=T, covariance=covariance)
 

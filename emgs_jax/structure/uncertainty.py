@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from emgs_jax.geometry import adjoint
 from emgs_jax.structure.library import bundle_of, load, options_of
 
 NUM_REFERENCES = 32  # frames that determine the unit
@@ -70,7 +71,7 @@ def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict
     scale = max(2 / np.pi * model.compute_mean_reprojection_error() ** 2, pixel_std**2)
     spread = {first: np.zeros((6, 6))}
     for before, frame in pairwise(frames):
-        moved = _adjoint(np.linalg.inv(T[frame]) @ T[before])
+        moved = adjoint((np.linalg.inv(T[frame]) @ T[before])[None])[0]
         mixed = moved @ free(before, frame)
         motion = free(frame, frame) - mixed - mixed.T + moved @ free(before, before) @ moved.T
         spread[frame] = scale * 0.5 * (motion + motion.T)
@@ -105,17 +106,8 @@ def _spread(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(1, count - 1, min(count - 1, most)).astype(int))
 
 
-def _adjoint(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
-    """Ad of a pose: T Exp(xi) = Exp(Ad xi) T, translation first."""
-    R, t = T[:3, :3], T[:3, 3]
-    return np.block([[R, _cross(t) @ R], [np.zeros((3, 3)), R]])
-
-
-def _cross(t: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """[t]x, with [t]x v the cross product of t and v."""
-    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-
-
 def _to_xi(T_camera_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
     """Derivative of xi by z."""
-    return np.block([[-2 * _cross(T_camera_world[:3, 3]), -np.eye(3)], [-2 * np.eye(3), np.zeros((3, 3))]])
+    t = T_camera_world[:3, 3]
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    return np.block([[-2 * cross, -np.eye(3)], [-2 * np.eye(3), np.zeros((3, 3))]])

@@ -35,7 +35,7 @@ def point_information(structure: Structure, world: int, pixel_std: float) -> Flo
     """
     points = structure.worlds[world].points
     found, focal = np.zeros((len(points), 3, 3)), structure.worlds[world].camera.mean_focal_length()
-    for frame in np.flatnonzero((structure.world == world) & ~structure.is_interpolated):
+    for frame in np.flatnonzero((structure.world == world) & structure.is_placed):
         rows = structure.landmarks[frame]
         ray = points[rows] - structure.T_world_camera[frame, :3, 3]
         squared = np.sum(ray**2, axis=1)[:, None, None]

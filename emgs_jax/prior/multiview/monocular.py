@@ -45,7 +45,7 @@ def begin_monocular(
     """
     found, fits, rows = scene.structure, [], {}
     for world in range(len(found.worlds)):
-        frames = np.flatnonzero((found.world == world) & ~found.is_interpolated)
+        frames = np.flatnonzero((found.world == world) & found.is_placed)
         rows |= {int(frame): row for row, frame in enumerate(frames)}
         fits.append(_fit(scene, world, frames, values, config))
     factors = [1.0] * len(fits)

@@ -120,8 +120,10 @@ class MultiviewStereo(Prior):
         """`prior/placed_percent`: frames with a pose in a model; `prior/num_worlds`: models that hold them."""
         if self._found is None:
             return {}
-        is_placed = (self._found.world != NONE) & ~self._found.is_interpolated
-        return {"prior/placed_percent": 100 * float(is_placed.mean()), "prior/num_worlds": len(self._found.worlds)}
+        return {
+            "prior/placed_percent": 100 * float(self._found.is_placed.mean()),
+            "prior/num_worlds": len(self._found.worlds),
+        }
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Poses of all views and depth of `window.dense`; a view that no model holds has NaN and no valid point."""
@@ -176,18 +178,14 @@ class MultiviewStereo(Prior):
 
     def _answer(self, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points (h, w, 3), confidence and mask of a frame's pixels."""
-        world, (height, width) = self._found.world[frame], (self._camera.height, self._camera.width)
-        if world == NONE or self._found.is_interpolated[frame]:
-            nothing = np.zeros((height, width), np.float32)
-            return np.zeros((height, width, 3), np.float32), nothing + 1, nothing > 0
-        lens = self._lenses[world]
-        ways = [(depths, config) for depths, (config, _) in zip(self._depths, self._ways, strict=True)]
-        estimates = [(depths(frame).depth, self._std(frame, depths, config)) for depths, config in ways]
-        # What exceeds the noise that its own way accepts is none.
-        accepted = [
-            (np.where(std <= config.noise.max_std, depth, 0.0), std)
-            for (depth, std), (_, config) in zip(estimates, ways, strict=True)
-        ]
+        if not self._found.is_placed[frame]:
+            nothing = np.zeros((self._camera.height, self._camera.width), np.float32)
+            return np.zeros((*nothing.shape, 3), np.float32), nothing + 1, nothing > 0
+        lens, accepted = self._lenses[self._found.world[frame]], []
+        for depths, (config, _) in zip(self._depths, self._ways, strict=True):
+            std = self._std(frame, depths, config)
+            # What exceeds the noise that its own way accepts is none.
+            accepted.append((np.where(std <= config.noise.max_std, depths(frame).depth, 0.0), std))
         depth, std = (as_shown(values, lens) for values in surest(*zip(*accepted, strict=True)))
         mask = depth > 0
         confidence = np.maximum(1.0 / np.where(mask, std, 1.0), np.float32(1.0))
@@ -195,7 +193,7 @@ class MultiviewStereo(Prior):
 
     def _scale_std(self, frame: int) -> np.float64 | None:
         """That of a frame's depths; the surest of two ways holds both."""
-        if self._found.world[frame] == NONE or self._found.is_interpolated[frame]:
+        if not self._found.is_placed[frame]:
             return None
         return np.float64(min(depths(frame).scale_std for depths in self._depths))
 

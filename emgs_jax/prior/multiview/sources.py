@@ -12,7 +12,7 @@ from emgs_jax.structure.model import Structure
 
 def placed_beside(found: Structure, frame: int) -> np.ndarray:
     """Frames of the same world that show landmarks, without this one, the nearest in time first."""
-    others = np.flatnonzero((found.world == found.world[frame]) & ~found.is_interpolated)
+    others = np.flatnonzero((found.world == found.world[frame]) & found.is_placed)
     others = others[others != frame]
     return others[np.argsort(np.abs(others - frame), kind="stable")]
 
