@@ -382,7 +382,8 @@ def test_a_signal_is_not_lost_wherever_the_program_is(number, code, place, monke
         match place:
             case "collector":
                 gc.callbacks.append(callback)
-                gc.collect()
+                while not sent:  # nothing happens while another thread collects
+                    gc.collect()
             case "object":
                 Going(number)
             case "program":
@@ -397,7 +398,8 @@ THREADS = {  # which Python does not wait for as it ends, or does
     "of SciPy, which are daemons": "tree = cKDTree(np.random.default_rng(0).random((400000, 3)))\n"
     " os.write(1, b'begun\\n')\n while True: tree.query(tree.data + .01, workers=2)",
     "that are waited for": "os.write(1, b'begun\\n')\n"
-    " thread = threading.Thread(target=time.sleep, args=(90,)); thread.start(); thread.join()",
+    " thread = threading.Thread(target=time.sleep, args=(90,)); thread.start()\n"
+    " while True: thread.join(.1)",  # a signal just before one long wait is heard when that is over
 }
 
 
@@ -428,8 +430,9 @@ def begun(program: str):
 def test_a_signal_after_the_work_is_done_is_no_traceback():
     """Found by the kills: SIGTERM while JAX cleaned up, in a callback that Python calls as it ends."""
     words = "import atexit, time\nfrom experiments.interrupt import clear_interrupt, end_clearly\nend_clearly()\n"
-    words += "with clear_interrupt(): pass\n"
-    with begun(words + "atexit.register(lambda: (print('begun', flush=True), time.sleep(90)))") as (process, _):
+    words += "with clear_interrupt(): pass\ndef end():\n print('begun', flush=True)\n"
+    words += " for _ in range(900): time.sleep(.1)\n"  # one long sleep hears no signal that came just before it
+    with begun(words + "atexit.register(end)") as (process, _):
         process.send_signal(signal.SIGTERM)
         assert (process.wait(60), process.stderr.read()) == (143, b"terminated\n")
 
