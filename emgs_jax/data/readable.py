@@ -14,7 +14,7 @@ from emgs_jax.data.checksums import find_checksums
 from emgs_jax.data.spool import Spool
 
 MAX_KEPT_BYTES = 2**30  # of frames that were read, uncompressed; the others are read anew
-ARRAYS = ("image", "depth", "labels")  # of a frame
+ARRAYS = ("image", "depth", "labels", "moving")  # of a frame
 MAX_STEP_M = 100.0  # from one frame in use to the next: two that are farther apart show nothing in common
 
 
