@@ -68,7 +68,7 @@ class Apartment(RayCast):
     ) -> None:
         if seed < 0 or movers < 0 or (num_frames is not None and num_frames < 1):
             raise ValueError(
-                "dataset.seed must be 0 or more, dataset.movers likewise, and dataset.num_frames 1 or more, or null "
+                "dataset.seed must be 0 or more (dataset.movers likewise) and dataset.num_frames 1 or more, or null "
                 f"(7 cm from frame to frame), got {seed}, {movers}, {num_frames}"
             )
         if walk not in WALKS:

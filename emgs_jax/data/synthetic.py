@@ -42,7 +42,7 @@ class Synthetic(RayCast):
     ) -> None:
         if seed < 0 or num_frames < 1 or movers < 0:
             raise ValueError(
-                "dataset.seed must be 0 or more, dataset.movers likewise, and dataset.num_frames 1 or more, got "
+                "dataset.seed must be 0 or more (dataset.movers likewise) and dataset.num_frames 1 or more, got "
                 f"{seed}, {movers}, {num_frames}"
             )
         sequence = f"room{seed}"

@@ -77,5 +77,5 @@ def test_a_person_walks_a_chair_is_moved_once_and_a_door_opens():
 
 @pytest.mark.parametrize("make", [Synthetic, Apartment])
 def test_fewer_than_no_movers_are_refused(make):
-    with pytest.raises(ValueError, match="must be 0 or more, dataset.movers likewise, .* got 0, -1"):
+    with pytest.raises(ValueError, match="must be 0 or more .dataset.movers likewise. .* got 0, -1"):
         make(movers=-1)
