@@ -29,6 +29,7 @@ class Frame:
         T_world_camera: true pose of the colour camera, OpenCV axes, float64 (4, 4); None without ground truth.
         labels: semantic class per pixel, int32 (h, w), -1 = none; None without labels.
         moving: what each pixel shows: STAYS, MOVES or ELSEWHERE, uint8 (h, w); None where all stays.
+        mask: True where nothing of the image is used, bool (h, w); None without masks.
     """
 
     index: int
@@ -39,6 +40,7 @@ class Frame:
     T_world_camera: np.ndarray | None = None
     labels: np.ndarray | None = None
     moving: np.ndarray | None = None
+    mask: np.ndarray | None = None
 
     @property
     def static_depth(self) -> np.ndarray | None:
