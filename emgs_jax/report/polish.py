@@ -69,7 +69,12 @@ def polish(
 
     def seen(row: int) -> Seen:
         view = jax.device_get(_densify(gaussians, to_se3(run.poses[row]), run.camera, densify_config))
-        return dataset[row].image / np.float32(255), eqx.tree_at(lambda v: v.rendering, view, None)
+        view, frame = eqx.tree_at(lambda v: v.rendering, view, None), dataset[row]
+        image = frame.image / np.float32(255)
+        if frame.mask is not None:  # what is left out is as the map has it, and holds no splat
+            image = np.where(frame.mask[..., None], view.colors, image)
+            view = eqx.tree_at(lambda v: v.valid, view, view.valid & ~frame.mask)
+        return image, view
 
     nearest = _nearest(gaussians)
     seeds, targets, gains = Seeds(run.camera, config.pixels_per_splat), Spool(), []
