@@ -7,7 +7,7 @@ import jaxlie
 import numpy as np
 import pytest
 import reference
-from scene import assert_same, at, moved_points, observe_room, on_host, path_pose, pose
+from scene import assert_same, at, moved_points, observe_room, on_host, path_pose, pose, random_observation, replace
 
 from emgs_jax import observation
 from emgs_jax.config.values import check_value, declared
