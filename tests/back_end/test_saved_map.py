@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from loop_scene import keyframe, matrix, room
 from scene import random_gaussians
-from test_back_end import loop, ring, walked
+from test_back_end import changed, loop, ring, walked
 
 from emgs_jax import load_config, save_map
 from emgs_jax.back_end.optimization import nodes_of
@@ -36,9 +36,8 @@ def end(graph) -> BackEnd:
         one = keyframe(room(), matrix((0, frame / 10, 0)), frame)
         database = add_keyframe(database, one, graph.place_recognition)
     return replace(
-        walked(graph, poses),
+        changed(walked(graph, poses), is_placed=[row != 7 for row in range(len(poses))]),
         database=database,
-        is_placed=[row != 7 for row in range(len(poses))],
         verified=[loop(poses), loop(poses, 2)],
         violating=[loop(poses, 3)],
         accepted=[loop(poses)],
