@@ -331,7 +331,7 @@ def test_a_covariance_that_is_none_is_unknown_and_one_of_a_single_error_is_known
 
 def test_a_colour_is_one_of_an_image():
     given = random_observation(4)
-    colors = np.float32([[0, 0.5, 1], [1e30, 0.5, 0.5], [-3, 0, 0.2], [np.nan, 0, 0]])
+    colors = np.float32([[0, 0.5, 1], [1e30, 0.5, 0.5], [-3, 0, 0.25], [np.nan, 0, 0]])
     found = on_host(observation.sound)(replace(given, colors=colors))
-    np.testing.assert_array_equal(found.colors, [[0, 0.5, 1], [1, 0.5, 0.5], [0, 0, 0.2], [0, 0, 0]])
+    np.testing.assert_array_equal(found.colors, [[0, 0.5, 1], [1, 0.5, 0.5], [0, 0, 0.25], [0, 0, 0]])
     assert found.valid.tolist() == [True, True, True, False]
