@@ -320,6 +320,11 @@ OF_SEVEN = [
 CAM, TRAJECTORY = "cam_params.json", "office9/traj.txt"
 OF_REPLICA = [
     (edit(CAM, ('"w"', '"width"')), 'must hold {"camera": {w, h, fx, fy, cx, cy, scale}}', fetched(CAM)),
+    (
+        (edit(TRAJECTORY, ("\n", "\n\n")), {"stop": 2}),
+        "blank lines among its poses.*: take the lines out, or where an image has no pose write 16 times nan",
+        *(fetched(TRAJECTORY), edit(TRAJECTORY, ("\n\n", f"\n{'nan ' * 16}\n"))),
+    ),
     (put(TRAJECTORY, "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n"), "1 poses, .*: fetch traj.txt again", fetched(TRAJECTORY)),
 ]
 
@@ -648,6 +653,11 @@ OF_PREDICTIONS = [
     (
         (own(".npy"), listed_poses(5)),
         "must have one for each, in the order of their names; or give poses.json, which has them by name",
+        *(listed_poses(), (gone("own/poses.txt"), named_poses())),
+    ),
+    (
+        (own(".npy"), listed_poses(), lines("own/poses.txt", lambda words: [f"{9 - float(words[0])}", *words[1:]])),
+        r"not in order of time, .*: write the lines in the order IMG_8, IMG_9, IMG_10, …, or give poses.json",
         *(listed_poses(), (gone("own/poses.txt"), named_poses())),
     ),
     ((own(".npy"), named_poses(1)), "lacks T_world_camera of 5 of 6 files", named_poses()),

@@ -107,10 +107,15 @@ def depth_path(path: Path) -> Path:
 def read_rows(path: Path, images: list[Path]) -> list[str]:
     """The row of traj.txt for every image, still as text: image frame000012 belongs to row 12, from 0."""
     try:
-        rows = reading.read_text(path).rstrip().splitlines()
+        text = reading.read_text(path).rstrip()
     except BadFrameError as error:
         raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
-    last = max(number_of(p) for p in images)
+    rows, last = [row for row in text.splitlines() if not row.lstrip().startswith("#")], max(map(number_of, images))
+    if not all(map(str.strip, rows)) and last < sum(map(bool, map(str.strip, rows))):
+        raise ValueError(
+            f"{path} has blank lines among its poses, so it is open which image those behind them are of: take the "
+            "lines out, or where an image has no pose write 16 times nan"
+        )
     if last >= len(rows):
         raise ValueError(f"{path} has {len(rows)} poses, but there is an image number {last}: fetch traj.txt again")
     return [rows[number_of(p)] for p in images]

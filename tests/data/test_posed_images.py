@@ -36,6 +36,10 @@ def test_an_angle_of_view_is_a_camera_as_in_blenders_files(has_size, tmp_path):
     dataset = Nerfstudio(str(tmp_path), size=SIZE)
     np.testing.assert_allclose(dataset.intrinsics, (160, 160, 79.5, 59.5))
     np.testing.assert_array_equal(dataset[0].image[..., ::-1], color_image(1, SIZE))
+    (tmp_path / "transforms.json").write_text(json.dumps(values | {"camera_angle_y": 2 * np.arctan(0.4)}))
+    np.testing.assert_allclose(
+        Nerfstudio(str(tmp_path), size=SIZE).intrinsics, (160, 150, 79.5, 59.5)
+    )  # as instant-ngp
 
 
 def test_clips_in_folders_follow_each_other(tmp_path):

@@ -11,6 +11,7 @@ intrinsics have them; without, on the rays of the data set's camera. Only sensor
 (ScanNet) are looked up ray by ray.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -231,6 +232,12 @@ def rows_of(dataset: Dataset, found: Predictions, folder: Path) -> list[int | No
     files = [dataset.files(index)[:1] for index in range(len(dataset))]
     stems = [file[0].stem if file else "" for file in files]
     rows = {name: row for row, name in enumerate(found.names)}
+    counts = Counter(found.names)
+    if twice := sorted(name for name in {*stems} & rows.keys() if counts[name] > 1):
+        raise ValueError(
+            f"{folder} has several predictions of the name {twice[0]}, of which one is of the frame: give images and "
+            "predictions of one folder, or names of which each is there once"
+        )
     if len({*stems}) == len(stems) and {*stems} & rows.keys():
         missing = [stem for stem in stems if stem not in rows]
         if missing and not found.may_lack:

@@ -162,7 +162,13 @@ def rows_of(dataset: Dataset, names: Sequence[str], folder: Path) -> list[int]:
     if all(stems) and len({*stems}) == len(stems):
         ends = {name[len(stems[0]) :] for name in names if name.startswith(stems[0])}
         ends = {end for end in ends if not end or not end[0].isalnum()} | {""}
-        end = max(sorted(ends), key=lambda end: sum(stem + end in rows for stem in stems))
+        counts = {end: sum(stem + end in rows for stem in stems) for end in sorted(ends)}
+        best = [end for end, count in counts.items() if count == max(counts.values())]
+        if max(counts.values()) and len(best) > 1:
+            raise ValueError(
+                f"{folder} has files of several kinds for each frame, *{', *'.join(best)}: leave those of the depths"
+            )
+        end = best[0]
         missing = [stem for stem in stems if stem + end not in rows]
         if not missing:
             return [rows[stem + end] for stem in stems]

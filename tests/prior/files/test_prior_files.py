@@ -13,7 +13,7 @@ from written_predictions import KEYS, NAMES, Named, asked, by_frame, truth, writ
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.prior.base import Prior, relative_poses
-from emgs_jax.prior.files.prior import Files
+from emgs_jax.prior.files.prior import Files, read_predictions, rows_of
 from emgs_jax.prior.files.view import Camera, View, at_frame, whole_image
 
 SIZE = (48, 64)
@@ -169,6 +169,23 @@ def test_files_are_found_by_the_name_of_the_image_and_else_by_their_order(own, t
     video = Named(names=["walk"] * len(NAMES), suffix=".mp4")
     for index, (points, *_) in by_frame(asked(own, video)[1]).items():
         np.testing.assert_array_equal(points, expected[index][0])
+
+
+def test_listed_poses_are_of_the_files_whose_numbers_are_their_times(own, tmp_path):
+    """A script lists IMG_10 before IMG_8, and files are read by their numbers: each had another one's pose."""
+    write_depths(tmp_path / "images", ".npy")
+    rows = sorted(range(len(NAMES)), key=lambda row: NAMES[row])
+    poses = [truth()[row].T_world_camera for row in rows]
+    save_trajectory_tum(tmp_path / "images" / "poses.txt", [int(NAMES[row][4:]) for row in rows], poses)
+    for one, other in zip(asked(tmp_path / "images")[1], asked(own)[1], strict=True):
+        np.testing.assert_allclose(one.T_anchor_view, other.T_anchor_view, atol=1e-8)
+
+
+def test_of_two_predictions_with_the_name_of_one_image_none_is_chosen(own):
+    """COLMAP's a/1.jpg and b/1.jpg: the images of the one were mapped with depths of the other."""
+    found = read_predictions(own, 1000.0)
+    with pytest.raises(ValueError, match="several predictions of the name IMG_9, of which one is of the frame"):
+        rows_of(Named(), replace(found, names=[*NAMES[:2], NAMES[1], *NAMES[3:]]), own)
 
 
 def test_the_provenance_tells_files_apart_by_what_they_hold(own, tmp_path):

@@ -112,6 +112,13 @@ def test_more_files_than_frames_are_no_error_by_name_and_a_frame_without_a_file_
         "a 10_depth",
         "a 2_depth",
     ]
+    each(tmp_path, save, "_conf.npy")  # was read as depth, as it comes first
+    found = open_depths(tmp_path, "affine_inverse", 1000.0)
+    with pytest.raises(ValueError, match=r"several kinds for each frame, \*_conf, \*_depth: leave those of the depths"):
+        rows_of(Frames(["a 10", "a 2"]), found.names, tmp_path)
+    for path in tmp_path.glob("*_conf.npy"):
+        path.unlink()
+    found = open_depths(tmp_path, "affine_inverse", 1000.0)
     with pytest.raises(ValueError, match="no depth for 1 of 3 frames, the first is a 3_depth"):
         rows_of(Frames(["a 1", "a 2", "a 3"]), found.names, tmp_path)
 
