@@ -577,6 +577,8 @@ def unseen(frame) -> np.ndarray:
     return np.where(np.arange(frame.depth.shape[1]) < 48, frame.depth, 0)
 
 
+FX, FY, CX, CY = tiny_run.dataset().intrinsics
+K = [[FX, 0, CX], [0, FY, CY], [0, 0, 1]]
 INVERSE, FLIP = np.linalg.inv, [1, -1, -1, 1]
 OF_PREDICTIONS = [
     ({"folder": "{root}"}, r"has no file \*.npz, .* and no known layout \(docs", {"folder": "{root}/own"}),
@@ -627,6 +629,11 @@ OF_PREDICTIONS = [
     ),
     (own(confidence=lambda frame: np.ones((4, 5))), r"confidence must be numbers \(48, 64\), as what it is of", own()),
     (own(intrinsics=lambda frame: [999, 999, 320, 240]), r"give those of the file's own size \(64x48\)", own()),
+    (
+        own(intrinsics=lambda frame: np.array(K).T),
+        "must be fx 0 cx, 0 fy cy, 0 0 1, row by row, .*: transpose it",
+        own(intrinsics=lambda frame: K),
+    ),
     (own(intrinsics=lambda frame: [1, 2, 3]), r"must be \[fx, fy, cx, cy\] or a camera matrix", own()),
     (own(depth=lambda frame: frame.depth * np.nan), "none of its 6 files has a depth above 0", own()),
     (

@@ -139,6 +139,9 @@ def test_binary_and_text_of_pycolmap_are_read_alike(second, tmp_path):
         for index in range(3):
             np.testing.assert_allclose(dataset.pose(index), text.pose(index), atol=1e-12)
             assert dataset[index].name == text[index].name
+    (tmp_path / "binary" / "images.txt").write_text("# what an earlier solution has left")
+    (tmp_path / "binary" / "cameras.txt").write_text("")
+    assert len(Colmap(str(tmp_path), model="binary", size=SIZE)) == 3, "the binary files count, as in COLMAP"
     for image in found.images.values():
         row = sorted(NAMES, key=lambda name: int(name[3:-4])).index(image.name)
         np.testing.assert_allclose(text.pose(row)[:3, 3], image.projection_center(), atol=1e-9)
