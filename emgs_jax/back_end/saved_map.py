@@ -180,7 +180,7 @@ def _keyframes(arrays: Mapping[str, np.ndarray]) -> tuple[Keyframe, ...]:
     parts = [np.split(array, np.cumsum(counts)[:-1]) for array in (pixels, descriptors, points)]
     frames, intrinsics, sizes, depths = (arrays[f"keyframes.{name}"] for name in OF_KEYFRAMES)
     return tuple(
-        Keyframe(int(frame), *of_points, tuple(map(float, camera)), tuple(map(int, size)), depth)
+        Keyframe(int(frame), *of_points, tuple(map(float, camera)), tuple(map(int, size)), np.float32(depth))
         for frame, *of_points, camera, size, depth in zip(frames, *parts, intrinsics, sizes, depths, strict=True)
     )
 

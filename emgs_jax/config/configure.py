@@ -25,10 +25,12 @@ from tqdm import tqdm
 
 from emgs_jax.config.overrides import readable
 from emgs_jax.config.values import check_values
+from emgs_jax.data.masks import Masks
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.featured import Featured, Requeried
 from emgs_jax.prior.files.truth import check_truth
+from emgs_jax.prior.masked import Masked
 
 if TYPE_CHECKING:
     from emgs_jax.back_end.state import BackEndConfig
@@ -53,6 +55,7 @@ RENAMED = {  # keys of earlier versions; of two that fit the longer one counts
     "graph.revisit.num_asked": "graph.prior_query.max_queries",
     "graph.location": "graph.relocalization",
     "graph.max_known": "graph.min_violation",
+    "prior.structure.masks": "masks.folder",
     "prior.dense.depth.depth_step": "prior.dense.depth_step",
 }
 NO_WORD = (ValueError, TypeError, AssertionError)  # what Hydra raises where an option of a group is no word
@@ -219,7 +222,8 @@ def build_dataset(config: DictConfig, folder: Path | None = None) -> ReadableFra
     if "note" in dataset.calibration:
         tqdm.write(dataset.calibration["note"])
     progress = partial(tqdm, desc="checking", unit="frame")
-    frames = ReadableFrames(dataset, config.on_bad_frame, config.checksums, progress)
+    masks = build(config, "masks", _convert_="all") if "masks" in config else Masks()
+    frames = ReadableFrames(dataset, config.on_bad_frame, config.checksums, progress, masks)
     if "depth_scale" in config.dataset:  # files of depths; None: the data set knows
         scale = config.dataset.depth_scale
         check_truth(frames, None if scale is None else float(scale))
@@ -229,7 +233,8 @@ def build_dataset(config: DictConfig, folder: Path | None = None) -> ReadableFra
 def structure_config(config: DictConfig) -> "StructureConfig":
     """How a structure of the images is made: that of the prior, else the default."""
     has_own = OmegaConf.select(config, "prior.structure") is not None
-    return build(config if has_own else compose("prior=multiview_stereo"), "prior.structure", _convert_="all")
+    own = config if has_own else OmegaConf.merge(compose("prior=multiview_stereo"), {"masks": config.masks})
+    return build(own, "prior.structure", _convert_="all")
 
 
 def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
@@ -237,7 +242,7 @@ def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
     known = {"classes": list(dataset.classes)} if "classes" in config.prior else {}
     prior = attach_features(config, dataset, build(config, "prior", **known))
     prior.check(dataset, config.slam.window_size)
-    return prior
+    return prior if config.masks.folder is None else Masked(prior)
 
 
 def baseline_configs(config: DictConfig) -> dict[str, "BaselineConfig"]:

@@ -57,6 +57,7 @@ def parsed(word: str) -> Override | None:
 
 
 def _readable(word: str) -> str:
+    word = re.sub(r"^masks=", "masks.folder=", word)
     key = KEY.match(word)[0]
     value = HOME.sub(lambda found: f"{found[1]}{Path.home()}", word[len(key) :])
     word = key + value

@@ -9,9 +9,11 @@ from emgs_jax.data import furniture, reading, room
 from emgs_jax.data.furnishing import at_wall, furnish
 from emgs_jax.data.furniture import Part, moved
 from emgs_jax.data.looks import copied, draw_looks
+from emgs_jax.data.movers import Doorway, Lane, build_movers
 from emgs_jax.data.plan import (
     APART,
     BAY,
+    DOOR_WIDTH,
     EAST,
     HALF_HALL,
     HEIGHT,
@@ -20,6 +22,7 @@ from emgs_jax.data.plan import (
     WALL,
     WEST,
     Plan,
+    Point,
     draw_plan,
     lining,
     shell,
@@ -27,6 +30,10 @@ from emgs_jax.data.plan import (
 from emgs_jax.data.raycast import RayCast, Scene
 from emgs_jax.data.reading import Number
 from emgs_jax.data.walks import RADIUS, WALKS, carry, rounded, table_of
+
+AHEAD = 2.4  # m from the camera to the middle of the way that a person goes to and fro
+AHEAD_OF_DOOR = 4.0  # m from a door to the camera when it opens
+CHAIR_AT = 0.3  # of the path: where a second lap, or the way back, comes by again
 
 Copies = list[Float[np.ndarray, " 3"]]  # where the copies of a group of objects stand, from where it was built
 
@@ -40,6 +47,7 @@ class Apartment(RayCast):
             the other side; twin_rooms, two that look alike; corridor, which looks the same every 3 m.
         num_frames: images along the walk, which stays the same; None = 7 cm apart, some 280 to 560.
         intrinsics: fx, fy, cx, cy at `size`; None = .82 times the width and the centre.
+        movers: how many things move, see `build_movers`.
     """
 
     name = "apartment"
@@ -56,11 +64,12 @@ class Apartment(RayCast):
         stride: int = 1,
         size: Sequence[int] = (320, 240),
         intrinsics: Sequence[Number] | None = None,
+        movers: int = 0,
     ) -> None:
-        if seed < 0 or (num_frames is not None and num_frames < 1):
+        if seed < 0 or movers < 0 or (num_frames is not None and num_frames < 1):
             raise ValueError(
-                "dataset.seed must be 0 or more and dataset.num_frames 1 or more, or null (7 cm from frame to frame), "
-                f"got {seed}, {num_frames}"
+                "dataset.seed must be 0 or more (dataset.movers likewise) and dataset.num_frames 1 or more, or null "
+                f"(7 cm from frame to frame), got {seed}, {movers}, {num_frames}"
             )
         if walk not in WALKS:
             raise ValueError(f"dataset.walk must be one of {', '.join(WALKS)}, got {walk!r}")
@@ -69,7 +78,31 @@ class Apartment(RayCast):
         self.plan = draw_plan(of_plan)
         poses = carry(WALKS[walk](self.plan), num_frames, of_walk)
         numbers = reading.select(len(poses), start, stop, stride, f"{self.name} {sequence}")
-        super().__init__(sequence, build_apartment(self.plan, of_scene), poses, numbers, size, intrinsics)
+        things = build_movers(movers, lane_ahead(self.plan, poses[:, :2, 3]), np.random.default_rng((seed, 1)))
+        super().__init__(sequence, build_apartment(self.plan, of_scene), poses, numbers, size, intrinsics, things)
+
+
+def lane_ahead(plan: Plan, camera: Float[np.ndarray, "n 2"]) -> Lane:
+    """The camera's own path. The leaf hangs in the doorway on it that is nearest to its middle, or beside the path."""
+    walked = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(camera, axis=0), axis=1)))
+    gaps = np.linalg.norm(camera[:, None] - [at for _, at in doorways(plan)], axis=-1)
+    row = int(np.argmin(gaps.min(axis=1) + 0.02 * np.abs(walked - walked[-1] / 2)))
+    wall, at = doorways(plan)[int(np.argmin(gaps[row]))]
+    if gaps[row].min() > DOOR_WIDTH / 2:
+        at, wall = camera[row] + np.array([DOOR_WIDTH / 2, 0.0]), EAST
+    across = (wall + 1) * np.pi / 2
+    hinge = np.array(at) - (DOOR_WIDTH / 2 - 0.06) * np.array([np.cos(across), np.sin(across)])
+    doorway = Doorway((hinge[0], hinge[1]), across, DOOR_WIDTH - 0.14)
+    opens = int(np.searchsorted(walked, walked[row] - AHEAD_OF_DOOR))
+    return Lane(camera, walked, AHEAD, CHAIR_AT * walked[-1], doorway, opens)
+
+
+def doorways(plan: Plan) -> list[tuple[int, Point]]:
+    """Wall and middle of every doorway."""
+    middle = HALF_HALL + WALL
+    found = [(EAST, plan.north_door), (EAST, plan.south_door)]
+    found += [(NORTH, (x, y)) for x in (plan.west, plan.east) for y in (middle, -middle)]
+    return [*found, (NORTH, (plan.twin_door, middle)), (NORTH, (plan.twin_door + APART, middle))]
 
 
 def build_apartment(plan: Plan, rng: np.random.Generator) -> Scene:
@@ -108,10 +141,7 @@ def _rooms(plan: Plan, lanes: Float[np.ndarray, "p 2"], rng: np.random.Generator
     parts = [part for area in inside for part in shell(area)]
     for area, (pieces, middle) in inside.items():
         parts += furnish(area, pieces, middle, lanes, rng)
-    middle = HALF_HALL + WALL
-    doorways = [(EAST, plan.north_door), (EAST, plan.south_door)]
-    doorways += [(NORTH, (x, y)) for x in (plan.west, plan.east) for y in (middle, -middle)]
-    return parts + [part for wall, at in doorways for part in lining(wall, at)]
+    return parts + [part for wall, at in doorways(plan)[:-2] for part in lining(wall, at)]  # twins have their own
 
 
 def _twin(plan: Plan, lanes: Float[np.ndarray, "p 2"], rng: np.random.Generator) -> list[Part]:

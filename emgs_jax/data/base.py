@@ -8,6 +8,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+# Values of `Frame.moving`: what a pixel shows stands where it stays, moves, or stands elsewhere later.
+STAYS, MOVES, ELSEWHERE = range(3)
+
 
 class BadFrameError(ValueError):
     """A frame that is there but cannot be used: unreadable, truncated or of the wrong size. Names the file."""
@@ -25,6 +28,8 @@ class Frame:
         depth: camera-space z in metres, float32 (h, w), 0 = no value; None without ground truth.
         T_world_camera: true pose of the colour camera, OpenCV axes, float64 (4, 4); None without ground truth.
         labels: semantic class per pixel, int32 (h, w), -1 = none; None without labels.
+        moving: what each pixel shows: STAYS, MOVES or ELSEWHERE, uint8 (h, w); None where all stays.
+        mask: True where nothing of the image is used, bool (h, w); None without masks.
     """
 
     index: int
@@ -34,6 +39,13 @@ class Frame:
     depth: np.ndarray | None = None
     T_world_camera: np.ndarray | None = None
     labels: np.ndarray | None = None
+    moving: np.ndarray | None = None
+    mask: np.ndarray | None = None
+
+    @property
+    def static_depth(self) -> np.ndarray | None:
+        """`depth` of what stays, 0 elsewhere: what maps are compared with."""
+        return self.depth if self.moving is None else np.where(self.moving == STAYS, self.depth, np.float32(0.0))
 
 
 @runtime_checkable

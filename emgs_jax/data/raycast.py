@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
+import trimesh
 from jaxtyping import Float, Float32
 
 from emgs_jax.data import reading
-from emgs_jax.data.base import Frame
+from emgs_jax.data.base import STAYS, Frame
 from emgs_jax.data.furniture import Part
-from emgs_jax.data.looks import Looks, paint
+from emgs_jax.data.looks import Looks, draw_looks, paint
+from emgs_jax.data.movers import Mover
 from emgs_jax.data.reading import Number
 
 FOCAL_PER_WIDTH = 0.82  # 63 degrees across, as a Kinect
@@ -37,6 +39,7 @@ class RayCast:
         numbers: which of these images are in use.
         size: (width, height).
         intrinsics: fx, fy, cx, cy at `size`; None = .82 times the width and the centre.
+        movers: what moves in it, with a place for each image along the path.
     """
 
     name: str
@@ -52,6 +55,7 @@ class RayCast:
         numbers: range,
         size: Sequence[int],
         intrinsics: Sequence[Number] | None,
+        movers: Sequence[Mover] = (),
     ) -> None:
         self.sequence, self.parts = sequence, scene.parts
         self._looks, self._poses, self._numbers = scene.looks, poses, numbers
@@ -60,25 +64,30 @@ class RayCast:
         default = (FOCAL_PER_WIDTH * w, FOCAL_PER_WIDTH * w, (w - 1) / 2, (h - 1) / 2)
         self.intrinsics = reading.check_intrinsics(default if intrinsics is None else intrinsics, self.size)
         self.calibration = {"source": "rendered", "size": [w, h], "intrinsics": [*self.intrinsics], "distortion": []}
-        self._labels = np.array([self.classes.index(name) for name, _ in self.parts], np.int32)
-        self._scene = o3d.t.geometry.RaycastingScene()
-        for _, mesh in self.parts:
-            vertices, faces = np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.uint32)
-            self._scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
+        moving = [mover.part for mover in movers]
+        self._movers, self._moving_looks = movers, draw_looks(moving, np.random.default_rng(len(moving)))
+        self.classes = (*self.classes, *dict.fromkeys(name for name, _ in moving if name not in self.classes))
+        self._labels = np.array([self.classes.index(name) for name, _ in [*self.parts, *moving]], np.int32)
+        self._scene = _scene([mesh for _, mesh in self.parts])
 
     def __len__(self) -> int:
         return len(self._numbers)
 
     def __getitem__(self, index: int) -> Frame:
         depth, objects, normals, rays = self._cast(index)
-        pose = self._poses[self._numbers[index]]
-        points = pose[:3, 3] + rays.reshape(-1, 6)[:, 3:] * depth.reshape(-1, 1)
-        image = paint(points, normals.reshape(-1, 3), objects.reshape(-1), self._looks)
-        number = self._numbers[index]
+        number, first = self._numbers[index], len(self.parts)
+        points = self._poses[number][:3, 3] + rays[..., 3:] * depth[..., None]
+        is_static = objects < first
+        image = np.zeros(points.shape, np.uint8)
+        image[is_static] = paint(points[is_static], normals[is_static], objects[is_static], self._looks)
+        moving = np.full(objects.shape, STAYS, np.uint8) if self._movers else None
+        for row, mover in enumerate(self._movers):
+            here, T_mover_world = objects == first + row, np.linalg.inv(mover.poses[number])
+            own = points[here] @ T_mover_world[:3, :3].T + T_mover_world[:3, 3]  # its pattern goes with it
+            image[here] = paint(own, normals[here], objects[here] - first, self._moving_looks)
+            moving[here] = mover.states[number]
         name = f"{self.name} {self.sequence}, frame {number}"
-        return Frame(
-            index, float(number), name, image.reshape(*depth.shape, 3), depth, self.pose(index), self._labels[objects]
-        )
+        return Frame(index, float(number), name, image, depth, self.pose(index), self._labels[objects], moving)
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"]:
         return self._poses[self._numbers[index]].copy()
@@ -98,9 +107,15 @@ class RayCast:
         # In the camera a direction's z is 1, so the hit's parameter is the depth.
         directions = np.einsum("hwj,ij->hwi", np.stack([u, v, np.ones_like(u)], axis=-1), pose[:3, :3])
         rays = np.concatenate([np.broadcast_to(pose[:3, 3], directions.shape), directions], axis=-1).astype(np.float32)
-        hit = self._scene.cast_rays(o3d.core.Tensor(rays))
-        objects = hit["geometry_ids"].numpy().astype(np.int64)
-        return hit["t_hit"].numpy(), objects, hit["primitive_normals"].numpy(), rays
+        depth, objects, normals = _first_hits(self._scene, rays)
+        if self._movers:
+            number = self._numbers[index]
+            meshes = [mover.part[1].copy().apply_transform(mover.poses[number]) for mover in self._movers]
+            near, rows, facing = _first_hits(_scene(meshes), rays)
+            is_hidden = near < depth
+            depth, objects = np.where(is_hidden, near, depth), np.where(is_hidden, len(self.parts) + rows, objects)
+            normals = np.where(is_hidden[..., None], facing, normals)
+        return depth, objects, normals, rays
 
     def files(self, index: int) -> tuple[()]:
         return ()
@@ -115,7 +130,24 @@ class RayCast:
             "size": self.size,
             "intrinsics": self.intrinsics,
         }
+        options |= {"movers": len(self._movers)} if self._movers else {}
         return reading.fingerprint(Path(), (), options)
+
+
+def _scene(meshes: Sequence[trimesh.Trimesh]) -> o3d.t.geometry.RaycastingScene:
+    scene = o3d.t.geometry.RaycastingScene()
+    for mesh in meshes:
+        vertices, faces = np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.uint32)
+        scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
+    return scene
+
+
+def _first_hits(
+    scene: o3d.t.geometry.RaycastingScene, rays: Float32[np.ndarray, "h w 6"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth (infinite where there is none), object and normal where each ray ends."""
+    hit = scene.cast_rays(o3d.core.Tensor(rays))
+    return hit["t_hit"].numpy(), hit["geometry_ids"].numpy().astype(np.int64), hit["primitive_normals"].numpy()
 
 
 def level_poses(

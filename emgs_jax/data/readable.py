@@ -11,10 +11,11 @@ import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
 from emgs_jax.data.checksums import find_checksums
+from emgs_jax.data.masks import Masks, masked, names_of
 from emgs_jax.data.spool import Spool
 
 MAX_KEPT_BYTES = 2**30  # of frames that were read, uncompressed; the others are read anew
-ARRAYS = ("image", "depth", "labels")  # of a frame
+ARRAYS = ("image", "depth", "labels", "moving", "mask")  # of a frame
 MAX_STEP_M = 100.0  # from one frame in use to the next: two that are farther apart show nothing in common
 
 
@@ -30,6 +31,7 @@ class ReadableFrames:
         checksums: of the files of the frames: `auto`, a file or `off`, see `find_checksums`. A file that is not the
             listed one is a frame that cannot be read.
         progress: wraps the frame numbers of that first pass, e.g. tqdm.
+        masks: of the frames; what they leave out has no truth either.
 
     Attributes:
         kept: for each frame in use its index in `dataset`.
@@ -42,6 +44,7 @@ class ReadableFrames:
         on_bad_frame: str = "error",
         checksums: str | None = "off",
         progress: Callable[[Iterable[int]], Iterable[int]] = iter,
+        masks: Masks = Masks(),  # noqa: B008 (it is frozen)
     ) -> None:
         if on_bad_frame not in ("error", "skip"):
             raise ValueError(f"on_bad_frame must be error or skip, got {on_bad_frame!r}")
@@ -53,6 +56,13 @@ class ReadableFrames:
             dataset.has_ground_truth,
             getattr(dataset, "full_intrinsics", None),
         )
+        self._masks, self._names = masks, () if masks.folder is None else names_of(dataset)
+        masks.check(self._names)
+        if masks.folder is not None and any(dataset.calibration.get("distortion") or ()):
+            raise ValueError(
+                f"{dataset.name} straightens its images, and the masks of {masks.folder} are of the distorted ones: "
+                "straighten both beforehand and give the intrinsics of the straight ones"
+            )
         indices = range(len(dataset))
         self.skipped = _unreadable(self._read, progress(indices)) if on_bad_frame == "skip" else {}
         self.kept = tuple(index for index in indices if index not in self.skipped)
@@ -76,6 +86,8 @@ class ReadableFrames:
             for file in self._dataset.files(index):
                 self._checksums.check(file)
         frame = self._dataset[index]
+        if self._masks.folder is not None:
+            frame = masked(frame, self._masks.read(self._names[index], self.size))
         self._keep(index, frame)
         return frame
 

@@ -7,9 +7,11 @@ from jaxtyping import Float
 
 from emgs_jax.data import reading, room
 from emgs_jax.data.looks import draw_looks
+from emgs_jax.data.movers import Doorway, Lane, build_movers
 from emgs_jax.data.raycast import RayCast, Scene, level_poses
 from emgs_jax.data.reading import Number
 
+MARGIN = np.array([1.25, 1.05])  # from the walls to the camera's ellipse
 ARC = np.radians(140.0)  # of the round that the camera goes
 
 
@@ -20,6 +22,7 @@ class Synthetic(RayCast):
         seed: room, furniture, colours and path.
         num_frames: images along the path, which stays the same: more frames are nearer to each other.
         intrinsics: fx, fy, cx, cy at `size`; None = .82 times the width and the centre.
+        movers: how many things move, see `build_movers`.
     """
 
     name = "synthetic"
@@ -35,17 +38,39 @@ class Synthetic(RayCast):
         stride: int = 1,
         size: Sequence[int] = (320, 240),
         intrinsics: Sequence[Number] | None = None,
+        movers: int = 0,
     ) -> None:
-        if seed < 0 or num_frames < 1:
+        if seed < 0 or num_frames < 1 or movers < 0:
             raise ValueError(
-                f"dataset.seed must be 0 or more and dataset.num_frames 1 or more, got {seed}, {num_frames}"
+                "dataset.seed must be 0 or more (dataset.movers likewise) and dataset.num_frames 1 or more, got "
+                f"{seed}, {movers}, {num_frames}"
             )
         sequence = f"room{seed}"
         numbers = reading.select(num_frames, start, stop, stride, f"{self.name} {sequence}")
         rng = np.random.default_rng(seed)
         parts, room_size = room.build_room(rng)
         scene = Scene(parts, draw_looks(parts, rng))
-        super().__init__(sequence, scene, camera_path(num_frames, room_size, rng), numbers, size, intrinsics)
+        poses = camera_path(num_frames, room_size, rng)
+        lane = lane_around(room_size, poses[:, :2, 3])
+        things = build_movers(movers, lane, np.random.default_rng((seed, 1)))
+        super().__init__(sequence, scene, poses, numbers, size, intrinsics, things)
+
+
+def lane_around(room_size: Float[np.ndarray, " 3"], camera: Float[np.ndarray, "n 2"]) -> Lane:
+    """The camera's ellipse all the way round; the camera looks across it. A leaf swings from the wall that it faces."""
+    radii = room_size[:2] / 2 - MARGIN
+    angle = np.unwrap(np.arctan2(*(camera / radii).T[::-1]))
+    sense = 1.0 if angle[-1] >= angle[0] else -1.0
+    turn = angle[0] + sense * np.linspace(0, 2 * np.pi, 721)
+    line = radii * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    length = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    walked = np.interp(np.abs(angle - angle[0]), np.linspace(0, 2 * np.pi, 721), np.append(0.0, np.cumsum(length)))
+    middle = len(camera) // 2
+    wall = round((angle[middle] + np.pi) / (np.pi / 2)) % 4
+    out, side = (np.round([np.cos(turn), np.sin(turn)]) for turn in (wall * np.pi / 2, (wall + 1) * np.pi / 2))
+    hinge = out * (room_size[wall % 2] / 2 - 0.05) - side * 0.3
+    doorway = Doorway((hinge[0], hinge[1]), (wall + 1) * np.pi / 2, 0.8)
+    return Lane(line, walked, length.sum() / 2, length.sum() / 2 + 0.3 * walked[-1], doorway, middle)
 
 
 def camera_path(
@@ -55,7 +80,7 @@ def camera_path(
     begin, sense, phase = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0]), rng.uniform(0, 2 * np.pi)
     round_ = np.linspace(0, ARC, num_frames)
     angle = begin + sense * round_
-    a, b = room_size[0] / 2 - 1.25, room_size[1] / 2 - 1.05
+    a, b = room_size[:2] / 2 - MARGIN
     height = 1.5 + 0.06 * np.sin(2 * round_ + phase)
     positions = np.stack([a * np.cos(angle), b * np.sin(angle), height], axis=-1)
     yaw = angle + np.pi + np.radians(5) * np.sin(2 * round_ + phase)

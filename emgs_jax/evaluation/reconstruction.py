@@ -113,8 +113,9 @@ def ground_truth_cloud(
     def clouds():
         for frame in frames:
             if frame.depth is not None and frame.T_world_camera is not None:
-                points = backproject(frame.depth, intrinsics)
-                known = (frame.depth > 0) & (frame.depth <= config.max_depth_m)
+                depth = frame.static_depth
+                known = (depth > 0) & (depth <= config.max_depth_m)
+                points = backproject(depth, intrinsics)
                 yield posed_cloud(points, known, frame.image, frame.T_world_camera, config)
 
     return fuse_clouds(clouds(), config.voxel_m)

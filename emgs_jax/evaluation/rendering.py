@@ -94,14 +94,15 @@ def score_view(
         scale: `depth_scale` of the estimate.
         max_depth: m.
     """
-    if frame.depth is None:
+    truth = frame.static_depth
+    if truth is None:
         return None
-    is_known = (frame.depth > 0) & (frame.depth <= max_depth)
+    is_known = (truth > 0) & (truth <= max_depth)
     if not is_known.any():
         return None
     if depth is None:
         return ViewScore(0.0, 0.0)
-    true, found = frame.depth[is_known].astype(np.float64), scale * depth[is_known].astype(np.float64)
+    true, found = truth[is_known].astype(np.float64), scale * depth[is_known].astype(np.float64)
     is_covered = np.isfinite(found) & (found > 0)
     error = np.abs(found - true)[is_covered]
     score = {"squared_error": 0.0, "num_colors": 0}

@@ -44,7 +44,7 @@ def label_cells(frame: Frame, dataset: Dataset, voxel: float, max_depth: float) 
     """
     if frame.labels is None or frame.depth is None or frame.T_world_camera is None:
         return np.empty((0, 2), np.int64)
-    known = (frame.labels >= 0) & (frame.depth > 0) & (frame.depth <= max_depth)
+    known = (frame.labels >= 0) & (frame.static_depth > 0) & (frame.depth <= max_depth)
     points = backproject(frame.depth, dataset.intrinsics)[known]
     points = rotated(points, frame.T_world_camera[:3, :3]) + frame.T_world_camera[:3, 3]
     return _distinct(np.column_stack([frame.labels[known].astype(np.int64), cell_numbers(points, voxel)]))

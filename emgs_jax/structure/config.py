@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from emgs_jax.data.masks import Masks
 from emgs_jax.ops.ranges import number
 
 PARTS = ("extraction", "matching", "verification", "incremental", "global")  # of the options
@@ -21,7 +22,7 @@ class StructureConfig:
         mapper: `incremental` or `global`.
         camera_model: of the lens, where its distortion is refined.
         refine_distortion: of a camera that is given; one that is estimated is refined as a whole.
-        masks: folder of one image for each, named as it; where it is black nothing is looked for.
+        masks: in what they leave out nothing is looked for.
         seed: of all that is drawn.
         num_threads: -1: all.
         max_image_size: pixels of the longer side; larger images are searched smaller.
@@ -42,7 +43,7 @@ class StructureConfig:
     mapper: str = field(metadata={"choices": ("incremental", "global")})
     camera_model: str
     refine_distortion: bool
-    masks: str | None
+    masks: Masks
     seed: int = number(low=0, high=2**31 - 1)
     num_threads: int = number(low=-1, high=1024)
     max_image_size: int = number(low=64, high=16384)
@@ -56,6 +57,8 @@ class StructureConfig:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.masks, Masks):
+            raise ValueError(f"prior.structure.masks={self.masks} is masks.folder={self.masks} now")
         for part, values in self.options.items():
             if part not in PARTS or not isinstance(values, Mapping):
                 raise ValueError(

@@ -1,7 +1,6 @@
 """What COLMAP found, as arrays: poses with their covariances, points, which frame shows which, and the lens."""
 
 import copy
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from emgs_jax.data.masks import stem
 from emgs_jax.geometry import scale_covariance
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.uncertainty import camera_in_world, covariances
@@ -102,11 +102,6 @@ def to_structure(models: Sequence[Any], names: Sequence[str], config: StructureC
             landmarks[frame] = np.array(sorted(shown), int)
     structure = Structure(worlds, world, T, covariance, landmarks, np.zeros(count, bool))
     return interpolated(in_unit(structure, config.median_depth), config.max_gap)
-
-
-def stem(name: str) -> str:
-    """Name of an image without folder and suffix, and without what COLMAP's lists of pairs cannot hold."""
-    return re.sub(r"[\s#]", "_", name.rpartition("/")[2].rpartition(".")[0] or name)
 
 
 def in_unit(structure: Structure, median_depth: float) -> Structure:

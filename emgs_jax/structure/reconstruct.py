@@ -11,7 +11,6 @@ from tqdm import tqdm
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.library import bundle_of, check_kinds, load, member, options_of
-from emgs_jax.structure.model import stem
 from emgs_jax.structure.pairs import choose_pairs
 
 BATCH = 8  # images of one call of COLMAP, so that the bar moves
@@ -143,25 +142,13 @@ def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
     Raises:
         ValueError: there are none, or one has another size than its image.
     """
-    if config.masks is None:
+    if config.masks.folder is None:
         return ""
-    given, own = Path(config.masks).expanduser(), folder / "masks"
-    found = {stem(path.name): path for path in given.iterdir()} if given.is_dir() else {}
-    missing = [name for name in shots.names if name not in found and f"{name}.png" not in found]
-    if missing:
-        raise ValueError(
-            f"prior.structure.masks={config.masks} has no mask for {missing[0]} (and {len(missing) - 1} more): give a "
-            f"folder with one image for each frame, {missing[0]}.png"
-        )
+    own = folder / "masks"
+    config.masks.check(shots.names)
     own.mkdir(exist_ok=True)
     for name in shots.names:
-        path = found.get(name, found.get(f"{name}.png"))
-        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if mask is None or mask.shape[::-1] != tuple(shots.size):
-            size = "unreadable" if mask is None else f"{mask.shape[1]}x{mask.shape[0]}"
-            raise ValueError(
-                f"{path} is {size}, but its image is {shots.size[0]}x{shots.size[1]}: make it of that size"
-            )
+        mask = np.uint8(255 * ~config.masks.read(name, shots.size))
         cv2.imwrite(str(own / f"{name}.png.png"), mask)
     return str(own)
 
@@ -325,7 +312,7 @@ def check_found(found: Sequence[Any], shots: Shots, config: StructureConfig, fol
     if count < 3:
         reason = f"{count} images are too few: give 3 or more of one place (dataset.stop, dataset.stride)"
     elif few > count / 2:
-        masked = " and prior.structure.masks" if config.masks is not None else ""
+        masked = " and masks.folder" if config.masks.folder is not None else ""
         reason = f"{few} of {len(keypoints)} images show hardly anything to recognise: check the images{masked}"
     elif not geometries:
         reason = "no two images share enough: take them closer together (dataset.stride)"

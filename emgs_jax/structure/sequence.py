@@ -10,8 +10,9 @@ import numpy as np
 from emgs_jax.data.base import Dataset
 from emgs_jax.data.camera_models import PERSPECTIVE, Calibration, from_colmap
 from emgs_jax.data.intrinsics import Pictures, from_exif
+from emgs_jax.data.masks import image_names, names_of
 from emgs_jax.structure.config import StructureConfig
-from emgs_jax.structure.model import Structure, stem, to_structure
+from emgs_jax.structure.model import Structure, to_structure
 from emgs_jax.structure.reconstruct import Shots
 from emgs_jax.structure.store import make_models, models_of
 
@@ -71,19 +72,6 @@ def _exif_focal(pictures: Pictures) -> float | None:
         return from_exif(replace(pictures, files=pictures.files[:1])).intrinsics[0]
     except ValueError:
         return None
-
-
-def names_of(dataset: Dataset) -> list[str]:
-    """A name for each frame in use: that of its file, or its number in the data set where files have no name each."""
-    kept = getattr(dataset, "kept", range(len(dataset)))
-    files = [dataset.files(index) for index in range(len(dataset))]
-    return image_names([found[0] if found else None for found in files], kept)
-
-
-def image_names(files: Sequence[Path | None], numbers: Sequence[int]) -> list[str]:
-    """Stems of the files if each has its own, else the numbers."""
-    stems = [stem(path.name) if path is not None else "" for path in files]
-    return stems if all(stems) and len({*stems}) == len(stems) else [f"{number:06d}" for number in numbers]
 
 
 def full_images(dataset: Dataset) -> tuple[Callable[[int], np.ndarray], tuple[int, int], tuple[float, ...]]:

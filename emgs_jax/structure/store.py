@@ -16,10 +16,10 @@ from tqdm import tqdm
 
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.colmap_model import check_whole
+from emgs_jax.data.masks import stem
 from emgs_jax.io.files import write_file
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.library import load
-from emgs_jax.structure.model import stem
 from emgs_jax.structure.reconstruct import DATABASE, Shots, map_database, map_images
 
 ABOUT = "structure.json"
@@ -31,6 +31,7 @@ CACHE = Path("~/.cache/emgs_jax/structure")
 def key_of(shots: Shots, config: StructureConfig) -> str:
     """Hex digest of the images' pixels, the camera, the settings and COLMAP's version."""
     settings = {name: value for name, value in asdict(config).items() if name not in NOT_OF_MODELS}
+    settings["masks"] = settings["masks"] if config.masks.folder is not None else None
     about = [settings, shots.camera, shots.is_calibrated, [*shots.names], load().__version__]
     digest = hashlib.blake2b(json.dumps(about, sort_keys=True, default=str).encode(), digest_size=16)
     for index in range(len(shots.names)):

@@ -354,7 +354,7 @@ def told_again(poses: np.ndarray, off: float = 0.0):
 def with_keyframes(end: BackEnd) -> BackEnd:
     """All nodes are keyframes that show a wall 2 m away."""
     none = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32)
-    wall = np.full((60, 80), 2.0, np.float16)
+    wall = np.full((60, 80), 2.0, np.float32)
     keyframes = tuple(Keyframe(row, *none, end.intrinsics, (64, 48), wall) for row in range(len(end.poses)))
     return replace(end, database=Database(keyframes))
 

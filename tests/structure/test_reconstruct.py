@@ -114,7 +114,7 @@ def test_nothing_is_looked_for_where_a_mask_is_black(tmp_path, images):
     masks.mkdir()
     for name in names:
         cv2.imwrite(str(masks / f"{name.replace('_', ' ')}.png"), np.uint8(255 * (np.indices((120, 160))[1] >= 80)))
-    found = made(images, tmp_path / "structure", f"prior.structure.masks={masks}", names=names)
+    found = made(images, tmp_path / "structure", f"masks.folder={masks}", "masks.border=0", names=names)
     assert (found.world == 0).all()
     for frame in range(8):
         local = (found.shown(frame) - found.T_world_camera[frame, :3, 3]) @ found.T_world_camera[frame, :3, :3]
@@ -142,7 +142,7 @@ BAD = {
     "a rotation": (lambda images: turned(5), (), "pairs of images differ by a rotation or show one plane"),
     "blank": (lambda images: [np.full_like(images[0], 9)] * 4, (), "4 of 4 images show hardly anything"),
     "noise": (lambda images: [*NOISE[:4]], (), "no two images share enough: take them closer together"),
-    "no mask": (lambda images: images, ("prior.structure.masks=nowhere",), "has no mask for 000 .and 7 more"),
+    "no mask": (lambda images: images, ("masks.folder=nowhere",), "has no mask for 000 .and 7 more"),
     "features": (lambda images: images, ("prior.structure.features=surf",), "features=surf is unknown: .* sift"),
     "matcher": (lambda images: images, ("prior.structure.matcher=x",), "matcher=x is unknown: .* sift_bruteforce"),
     "a network": (lambda images: images, ("prior.structure.features=aliked_n32",), "ONNX.*use features=sift"),
@@ -169,13 +169,13 @@ def test_what_determines_no_structure_is_one_error_with_its_remedy(tmp_path, ima
 
 def test_masks_that_hide_all_are_named_and_one_of_another_size(tmp_path, images):
     for shape, message in (
-        ((120, 160), "hardly anything to recognise.*prior.structure.masks"),
+        ((120, 160), "hardly anything to recognise.*masks.folder"),
         ((9, 9), "is 9x9, but"),
     ):
         for row in range(4):
             cv2.imwrite(str(tmp_path / f"{row:03d}.png"), np.zeros(shape, np.uint8))
         with pytest.raises(ValueError, match=message):
-            made(images[:4], tmp_path / "structure", f"prior.structure.masks={tmp_path}")
+            made(images[:4], tmp_path / "structure", f"masks.folder={tmp_path}")
 
 
 def test_a_folder_that_cannot_be_written_is_done_without(tmp_path, images, monkeypatch, capsys):

@@ -1,0 +1,121 @@
+"""Things that move in the built-in scenes: people who walk, chairs that are moved between two visits, doors that open.
+
+Where each is depends on the image's place along the camera's path only. z is up; metres, radians.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, UInt8
+
+from emgs_jax.data import furniture
+from emgs_jax.data.base import ELSEWHERE, MOVES, STAYS
+from emgs_jax.data.furniture import Part
+
+CLASSES = ("person", "chair", "door")  # in this order a scene gets them
+SPEED = 0.5  # m/s of the camera: what gives its images a time
+STRIDE, PERIOD = 1.0, 4.0  # a person goes to and fro about a point that keeps its distance from the camera
+ASIDE = 0.45  # m from the lane to a second person, and to a chair
+CHAIR_SHIFT = 0.8  # m from its old place to its new one
+SWING, SWING_TIME = np.radians(100.0), 2.0  # of a door
+
+
+@dataclass(frozen=True)
+class Doorway:
+    """Where a leaf hangs: its hinge, and the direction of the leaf from there while it is shut."""
+
+    hinge: tuple[float, float]
+    shut: float
+    width: float
+
+
+@dataclass(frozen=True)
+class Lane:
+    """A line that is free to walk on.
+
+    Args:
+        line: its points; the first again at the end where it is closed.
+        walked: distance along it of the camera, for each image.
+        lead: distance along it from the camera to what it looks at.
+        chair: distance along it to the old place of a chair.
+        doorway: and from which image on the leaf swings open.
+    """
+
+    line: Float[np.ndarray, "m 2"]
+    walked: Float[np.ndarray, " n"]
+    lead: float
+    chair: float
+    doorway: Doorway
+    opens: int
+
+    def at(self, distance: Float[np.ndarray, " k"], aside: float = 0.0) -> Float[np.ndarray, "k 2"]:
+        """Points so far along the line and to its left; an open line goes straight on beyond its ends."""
+        ends = np.cumsum(np.linalg.norm(np.diff(self.line, axis=0), axis=1))
+        along = np.concatenate([[0.0], ends])
+        if np.allclose(self.line[0], self.line[-1]):
+            distance = distance % along[-1]
+        tangent = np.gradient(self.line, axis=0)
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        inside = np.clip(distance, 0.0, along[-1])
+        x, y, dx, dy = (np.interp(inside, along, values) for values in (*self.line.T, *tangent.T))
+        return np.stack([x + (distance - inside) * dx - aside * dy, y + (distance - inside) * dy + aside * dx], -1)
+
+
+@dataclass(frozen=True)
+class Mover:
+    """One thing and where it is.
+
+    Args:
+        part: class and mesh, in axes of its own.
+        poses: T_world_mover of each image.
+        states: of each image: MOVES, ELSEWHERE (it stands, not where it stays in the end) or STAYS.
+    """
+
+    part: Part
+    poses: Float[np.ndarray, "n 4 4"]
+    states: UInt8[np.ndarray, " n"]
+
+
+def build_movers(count: int, lane: Lane, rng: np.random.Generator) -> list[Mover]:
+    """`count` things: a person, a chair and a door, then a second person, and so on."""
+    builders = (_person, _chair, _door)
+    return [builders[number % 3](lane, number // 3, rng) for number in range(count)]
+
+
+def _person(lane: Lane, number: int, rng: np.random.Generator) -> Mover:
+    """A person of 1.7 m who goes to and fro where the camera looks."""
+    seconds = lane.walked / SPEED
+    phase = 2 * np.pi * seconds / (PERIOD * (1.0 + 0.3 * number)) + rng.uniform(0, 2 * np.pi)
+    place = lane.at(lane.walked + lane.lead + STRIDE * np.sin(phase), ASIDE * number)
+    yaw = rng.uniform(0, 2 * np.pi) + 0.6 * np.cos(phase)
+    legs = [furniture.cylinder(0.08, 0.85, 0.0).apply_translation((0.0, side, 0.0)) for side in (-0.1, 0.1)]
+    body, head = furniture.box((0.24, 0.46, 0.6), (0, 0, 0.82)), furniture.sphere(0.13)[0][1]
+    (part,) = furniture.join("person", *legs, body, head.apply_translation((0.0, 0.0, 1.44)))
+    return Mover(part, _placed(place, yaw), np.full(len(place), MOVES, np.uint8))
+
+
+def _chair(lane: Lane, number: int, rng: np.random.Generator) -> Mover:
+    """A chair that stands elsewhere in the second half of the path."""
+    distance, yaw = lane.chair + 0.9 * number, rng.uniform(0, 2 * np.pi)
+    before, after = lane.at(np.array([distance, distance + CHAIR_SHIFT]), -ASIDE)
+    is_moved = np.arange(len(lane.walked)) >= len(lane.walked) / 2
+    place, yaws = np.where(is_moved[:, None], after, before), np.where(is_moved, yaw + 1.0, yaw)
+    return Mover(furniture.chair()[0], _placed(place, yaws), np.where(is_moved, STAYS, ELSEWHERE).astype(np.uint8))
+
+
+def _door(lane: Lane, number: int, rng: np.random.Generator) -> Mover:
+    """A leaf that swings open once; each further one hangs in the same frame and opens a little later."""
+    door, seconds = lane.doorway, lane.walked / SPEED
+    opened = (seconds - seconds[lane.opens]) / SWING_TIME - 0.5 * number
+    share = np.clip(opened, 0.0, 1.0)
+    leaf = furniture.box((door.width, 0.04, 2.0), (door.width / 2, 0, 0.02))
+    poses = _placed(np.tile(np.array(door.hinge), (len(share), 1)), door.shut + SWING * share)
+    states = np.select([share == 0, share < 1], [ELSEWHERE, MOVES], STAYS).astype(np.uint8)
+    return Mover(furniture.join("door", leaf)[0], poses, states)
+
+
+def _placed(place: Float[np.ndarray, "n 2"], yaw: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
+    poses = np.stack([trimesh.transformations.rotation_matrix(angle, (0, 0, 1)) for angle in yaw])
+    poses[:, :2, 3] = place
+    return poses
