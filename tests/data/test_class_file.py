@@ -23,9 +23,13 @@ def test_a_name_a_line_has_no_ids_and_an_id_and_a_name_a_line_has_and_0_is_undef
     assert (found.names, found.positions) == (("wall", "tv screen", "2 seater sofa"), None)
     with pytest.raises(ValueError, match=r"classes.txt has names without ids, which x.txt needs: .*`id name`"):
         found.positions_of(np.array([1]), "x.txt")
-    found = read_classes(written(tmp_path, "7 tv screen\n3 wall\n"))
-    assert found.names == ("tv screen", "wall")
-    np.testing.assert_array_equal(found.positions_of(np.array([3, 7, 0, 3]), "x"), [1, 0, -1, 1])
+    for text in (
+        "7 tv screen\n3 wall\n",
+        "7,tv screen\n3, wall\n",
+    ):  # as names, 3 was the fourth
+        found = read_classes(written(tmp_path, text))
+        assert found.names == ("tv screen", "wall")
+        np.testing.assert_array_equal(found.positions_of(np.array([3, 7, 0, 3]), "x"), [1, 0, -1, 1])
     named = read_classes(written(tmp_path, "0 wall\n1 floor\n"))
     np.testing.assert_array_equal(named.positions_of(np.array([0, 1]), "x"), [0, 1])
 

@@ -112,6 +112,7 @@ class Files(Prior):
         if self._is_measured:
             self._pose_std = None if angle is None else (angle * depth, float(np.degrees(angle)))
         scale = "metres" if self._is_metric else f"up to scale, times {self._factor:.4g}"
+        unread = f"; not read: {', '.join(found.unread)}" if found.unread else ""
         lacking = f", {len(self._rows) - len(known)} frames have none" if len(known) < len(self._rows) else ""
         try:
             note = _focal_note(view, camera, found) + _turned_note(turned)
@@ -123,7 +124,7 @@ class Files(Prior):
         fit = check_conventions(pairs, dataset.intrinsics, found.pose_source, self._max_misfit)
         tqdm.write(
             f"prior=files: {self.folder}, layout {found.layout}, {scale}{lacking}; {fit}, "
-            f"{_pose_note(self._pose_std)}{note}"
+            f"{_pose_note(self._pose_std)}{unread}{note}"
         )
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:

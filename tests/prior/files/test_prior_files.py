@@ -1,6 +1,7 @@
 """`prior=files`: against the exact prior, the truth that was written, and analytic planes."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -179,6 +180,10 @@ def test_listed_poses_are_of_the_files_whose_numbers_are_their_times(own, tmp_pa
     save_trajectory_tum(tmp_path / "images" / "poses.txt", [int(NAMES[row][4:]) for row in rows], poses)
     for one, other in zip(asked(tmp_path / "images")[1], asked(own)[1], strict=True):
         np.testing.assert_allclose(one.T_anchor_view, other.T_anchor_view, atol=1e-8)
+    path = tmp_path / "images" / "poses.txt"
+    path.write_text(re.sub(r"\n8\.0+ .*\n", "\n8 nan nan nan nan nan nan nan\n", path.read_text()))
+    lost = np.isnan(read_predictions(path.parent, 1000.0).poses).all((1, 2))
+    np.testing.assert_array_equal(lost, [name == "IMG_8" for name in NAMES])
 
 
 def test_of_two_predictions_with_the_name_of_one_image_none_is_chosen(own):
@@ -201,6 +206,8 @@ def test_what_was_found_is_one_line_and_says_by_how_much_focal_lengths_differ(tm
     asked(near)
     fit = "the depths of two views differ by 0.3 %"
     assert capsys.readouterr().out.splitlines() == [f"prior=files: {near}, layout npz, metres; {fit}, {UNKNOWN}"]
+    asked(write_npz(tmp_path / "more", NAMES, mask=lambda f: f.depth > 2))  # depths that it marks were taken in silence
+    assert f"{UNKNOWN}; not read: mask" in capsys.readouterr().out
     far = write_npz(tmp_path / "far", NAMES, intrinsics=lambda f: np.diag([fx * 1.1, fy * 1.1, 1]) + [[0, 0, cx]] * 3)
     with pytest.raises(ValueError, match=r"camera matrix|intrinsics"):  # a matrix with numbers below the diagonal
         asked(write_npz(tmp_path / "no", NAMES, intrinsics=lambda f: [fx, fy, cx]))
