@@ -14,7 +14,8 @@ from written_predictions import KEYS, NAMES, Named, asked, by_frame, truth, writ
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.prior.base import Prior, relative_poses
-from emgs_jax.prior.files.prior import Files, read_predictions, rows_of
+from emgs_jax.prior.files.naming import rows_of
+from emgs_jax.prior.files.prior import Files, read_predictions
 from emgs_jax.prior.files.view import Camera, View, at_frame, whole_image
 
 SIZE = (48, 64)
@@ -188,9 +189,8 @@ def test_listed_poses_are_of_the_files_whose_numbers_are_their_times(own, tmp_pa
 
 def test_of_two_predictions_with_the_name_of_one_image_none_is_chosen(own):
     """COLMAP's a/1.jpg and b/1.jpg: the images of the one were mapped with depths of the other."""
-    found = read_predictions(own, 1000.0)
     with pytest.raises(ValueError, match="several predictions of the name IMG_9, of which one is of the frame"):
-        rows_of(Named(), replace(found, names=[*NAMES[:2], NAMES[1], *NAMES[3:]]), own)
+        rows_of(Named(), [*NAMES[:2], NAMES[1], *NAMES[3:]], own)
 
 
 def test_the_provenance_tells_files_apart_by_what_they_hold(own, tmp_path):
