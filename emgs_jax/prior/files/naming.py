@@ -31,6 +31,7 @@ def rows_of(
         ends |= {end for name in names if (end := name.removeprefix(stems[0])) != name and end and not end[0].isalnum()}
     counts = {end: sum(stem + end in rows for stem in stems) for end in sorted(ends)}
     best = [end for end in counts if counts[end] == max(counts.values())]
+    best = [""] if "" in best else best  # names as they are say most
     if not has_names or not counts[best[0]]:
         if len(names) != len(stems):
             raise ValueError(
