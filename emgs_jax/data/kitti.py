@@ -85,9 +85,8 @@ def read_rows(path: Path, count: int) -> list[str]:
 
 def read_projection(path: Path, key: str) -> tuple[Calibration, Float[np.ndarray, "4 4"]]:
     """The camera with the projection K [I | t] of calib.txt, and its pose T_first_camera beside the left grey one."""
-    lines = dict(
-        line.split(":", 1) for line in reading.layout_text(path, f"{LAYOUT} ({SOURCE})").splitlines() if ":" in line
-    )
+    text = reading.layout_text(path, f"{LAYOUT} ({SOURCE})")
+    lines = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
     if key not in lines:
         raise ValueError(f"{path} has no {key}: fetch the calibration files of the odometry benchmark")
     P = _numbers(lines[key], 12, f"{path}: {key}").reshape(3, 4)

@@ -22,11 +22,8 @@ def rows_of(
     """
     files = [dataset.files(index)[:1] for index in range(len(dataset))]
     stems = [file[0].stem if file else "" for file in files]
-    rows, ends, has_names = (
-        {name: row for row, name in enumerate(names)},
-        {""},
-        len({*filter(None, stems)}) == len(stems),
-    )
+    rows, ends = {name: row for row, name in enumerate(names)}, {""}
+    has_names = len({*filter(None, stems)}) == len(stems)
     if has_names:
         ends |= {end for name in names if (end := name.removeprefix(stems[0])) != name and end and not end[0].isalnum()}
     counts = {end: sum(stem + end in rows for stem in stems) for end in sorted(ends)}
