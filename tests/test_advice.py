@@ -187,7 +187,7 @@ OF_TUM = [
     ({"intrinsics": [*FR3, 0.1, -900, 0, 0]}, "check the order .OPENCV", {"intrinsics": [*FR3, 0.1, -0.2, 0, 0]}),
     (
         (moved(TUM, "desk"), {"sequence": "desk"}),
-        r"names no *: give dataset.intrinsics=\[fx,fy,cx,cy\] .* k1,k2,p1,p2 and maybe k3 .* \[MODEL,…\]",
+        r"names no calibration.*: give dataset.intrinsics=\[fx,fy,cx,cy\] .* k1,k2,p1,p2 and maybe k3 .* \[MODEL,…\]",
         *({"intrinsics": [*FR3, *lens]} for lens in ((), (0.1, 0, 0, 0), (0.1, 0, 0, 0, 0))),
         {"intrinsics": ["SIMPLE_RADIAL", 535.4, 320, 240, 0.1]},
     ),
@@ -583,12 +583,7 @@ INVERSE, FLIP = np.linalg.inv, [1, -1, -1, 1]
 OF_PREDICTIONS = [
     ({"folder": "{root}"}, r"has no file \*.npz, .* and no known layout \(docs", {"folder": "{root}/own"}),
     ({"folder": "{root}/nowhere"}, "does not exist: give the folder of predictions", {"folder": "{root}/own"}),
-    (
-        own(T_world_camera=None),
-        "npz lacks T_world_camera; it has depth",
-        own(),
-        named_poses(),
-    ),
+    (own(T_world_camera=None), "npz lacks T_world_camera; it has depth", own(), named_poses()),
     (own(depth=None), "must have depth or points, one of them", own()),
     (own(depth=lambda frame: frame.depth.ravel()), r"depth must be \(h, w\)", own()),
     (
