@@ -402,7 +402,7 @@ OF_COLMAP = [
     (
         (moved(CAMERA, f"{CAMERA[:-3]}bin"), moved(MODEL, f"{MODEL[:-3]}bin")),
         r"cameras.bin is damaged: .*export",
-        *((fetched(CAMERA), fetched(MODEL)),),
+        tuple(moved(f"{file[:-3]}bin", file) for file in (CAMERA, MODEL)),
     ),
     (gone("images/img2.png"), "is missing: fetch the file again or set on_bad_frame=skip", SKIP),
 ]
