@@ -1,14 +1,15 @@
 """Depth field: the part of a frame's depth error that is smooth over its image."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.registration.noise import robust_std
 
 NUM_NODES = 5  # along each side of the image
+NUM_ROUNDS = 3  # of weights and field in turn
 NUM_ALIKE = 20.0  # neighbouring points that err alike, beside the field: so many count as one
 LEAST_SIDE = 1e-6  # of the image, in focal lengths
 
@@ -68,22 +69,24 @@ def node_weights(points: Float[Array, "p 3"], low: Float[Array, "2"], high: Floa
 def depth_field(
     points: Float[Array, "p 3"],
     errors: Float[Array, "p"],
+    noise: Float[Array, "p"],
     valid: Bool[Array, "p"],
     length: Float[Array, ""],
 ) -> DepthField:
     """Estimate the field of a frame from how far its points are from the map, as a Gaussian process on the nodes.
 
-    A network errs by a scale that drifts and by a field that is smooth over the image. Errors ρ of points around a node
-    have the mean m, by bilinear and robust weights of sum n, with the variance s² = σ² `NUM_ALIKE` / n, where σ is
-    their robust standard deviation. What the means differ from 0 beyond that is the field's own variance v, and
+    A network errs by a scale that drifts and by a field that is smooth over the image, ρ = B f + noise, with bilinear
+    weights B and the precision W = 1 / (σ² + (ρ - B f)²/4) / `NUM_ALIKE` of each point, Cauchy's:
 
-        f = K (K + diag(s²))⁻¹ m,   K = v exp(-½ |i - j|² / length²)
+        f = K (1 + B'WB K)⁻¹ B'W ρ,   K = v exp(-½ |i - j|² / length²)
 
+    v is the variance of the nodes' weighted means beyond that by chance.
     Where errors are not alike v is 0, and nothing is corrected. The matching with the map is the caller's.
 
     Args:
         points: camera frame.
         errors: ρ, log of each point's depth over that of the map along its ray.
+        noise: σ of each error beside the field; above 0.
         valid: which errors are known.
         length: over which the field is alike, as a fraction of the image's side.
     """
@@ -94,22 +97,25 @@ def depth_field(
     has_any = jnp.any(is_before)
     low, high = jnp.where(has_any, low, 0.0), jnp.where(has_any, high, 0.0)
 
-    errors = jnp.where(is_before, errors, 0.0)
-    std = robust_std(errors, is_before)
-    std = jnp.where(std > 0, std, 1.0)
-    robust = is_before / (1.0 + (0.5 * errors / std) ** 2)
-    weights = node_weights(points, low, high).reshape(-1, NUM_NODES**2) * robust[:, None]
-    count = jnp.sum(weights, axis=0)
-    mean = errors @ weights / jnp.where(count > 0, count, 1.0)
-    known = count / (NUM_ALIKE * std**2)  # 1 / s²
-    share = count / jnp.maximum(jnp.sum(count), 1.0)
-    noise = jnp.sum(share * jnp.where(count > 0, 1.0 / jnp.where(count > 0, known, 1.0), 0.0))
-    variance = jnp.maximum(jnp.sum(share * mean**2) - noise, 0.0)
-
+    errors, noise = jnp.where(is_before, errors, 0.0), jnp.where(is_before, noise, 1.0)
+    basis = node_weights(points, low, high).reshape(-1, NUM_NODES**2)
     place = jnp.stack(jnp.meshgrid(*[jnp.linspace(0.0, 1.0, NUM_NODES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
     apart = jnp.sum((place - place[:, None]) ** 2, axis=-1)
-    prior = variance * jnp.exp(-0.5 * apart / length**2)
-    nodes = prior @ jnp.linalg.solve(jnp.eye(NUM_NODES**2) + known[:, None] * prior, known * mean)
+
+    def fit(nodes: Float[Array, "n"], _: None) -> tuple[Float[Array, "n"], None]:
+        precision = is_before / (noise**2 + (0.5 * (errors - basis @ nodes)) ** 2) / NUM_ALIKE
+        weighted = basis * precision[:, None]
+        total = jnp.sum(weighted, axis=0)
+        is_seen = total > 0
+        mean = errors @ weighted / jnp.where(is_seen, total, 1.0)
+        share = total / jnp.where(has_any, jnp.sum(total), 1.0)
+        chance = jnp.sum(share * is_seen / jnp.where(is_seen, total, 1.0))
+        variance = jnp.maximum(jnp.sum(share * mean**2) - chance, 0.0)
+        prior = variance * jnp.exp(-0.5 * apart / length**2)
+        known = weighted.T @ basis @ prior
+        return prior @ jnp.linalg.solve(jnp.eye(NUM_NODES**2) + known, errors @ weighted), None
+
+    nodes, _ = jax.lax.scan(fit, jnp.zeros(NUM_NODES**2), length=NUM_ROUNDS)
     return DepthField(nodes.reshape(NUM_NODES, NUM_NODES), low, high)
 
 

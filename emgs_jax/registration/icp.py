@@ -136,7 +136,7 @@ def _field(T: jaxlie.SE3, scale: Float[Array, ""], matches: Matches, problem: Pr
     placed = transform(T, problem.source, scale)
     errors, is_known = depth_errors(placed.points, matches.means, matches.normals, T.translation(), MIN_COS)
     is_known &= placed.valid & (jnp.abs(errors) < config.max_field)
-    return depth_field(problem.source.points, errors, is_known, config.field_length)
+    return depth_field(problem.source.points, errors, problem.depth_noise, is_known, config.field_length)
 
 
 @full_precision
