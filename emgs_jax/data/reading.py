@@ -165,6 +165,14 @@ def read_text(path: Path) -> str:
     return read_bytes(path).decode("utf-8-sig", "replace")  # some editors put a mark before the first letter
 
 
+def layout_text(path: Path, layout: str) -> str:
+    """The text of a file of a data set's layout; FileNotFoundError, which says the layout, where it cannot be read."""
+    try:
+        return read_text(path)
+    except BadFrameError as error:
+        raise FileNotFoundError(f"{error}; expected the layout {layout}") from error
+
+
 def damage(data: bytes) -> str | None:
     """Describe the damage of an encoded image; None if its format shows none. Decoders fill missing parts with grey."""
     if data.startswith(b"\x89PNG\r\n\x1a\n"):

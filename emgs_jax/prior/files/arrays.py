@@ -115,6 +115,8 @@ def as_intrinsics(values: Any, where: str) -> Intrinsics:
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where} must be [fx, fy, cx, cy] or a camera matrix") from error
     if given.shape in ((3, 3), (4, 4)):
+        if not np.allclose(given[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1), atol=1e-3):
+            raise ValueError(f"{where} must be fx 0 cx, 0 fy cy, 0 0 1, row by row, got {given.tolist()}: transpose it")
         given = given[[0, 1, 0, 1], [0, 1, 2, 2]]
     if given.shape != (4,) or not np.isfinite(given).all() or min(given[:2]) <= 0:
         raise ValueError(f"{where} must be [fx, fy, cx, cy] or a camera matrix, in pixels of the file, got {values}")
