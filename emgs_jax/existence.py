@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import GaussianMap, without
 from emgs_jax.gaussians import blend, has_feature
-from emgs_jax.observation import Observation, depth_in
+from emgs_jax.observation import Observation, depth_range
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.linalg import (
     dot,
@@ -80,20 +80,6 @@ class Look(NamedTuple):
     T_world_camera: jaxlie.SE3
     camera: Camera
     depth_noise: Float[Array, ""]
-
-
-def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -> Float[Array, "2 p"]:
-    """Nearest and farthest depth z (m) among each pixel and its eight neighbours; NaN where the pixel itself has none.
-
-    A pose that is wrong by a pixel must not show what is behind a thin pole.
-    """
-    depth = depth_in(T_world_camera, view).reshape(camera.height, camera.width)
-    valid = view.valid.reshape(depth.shape)
-
-    def least(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
-        return jax.lax.reduce_window(jnp.where(valid, depth, jnp.inf), jnp.inf, jax.lax.min, (3, 3), (1, 1), "SAME")
-
-    return jnp.where(valid, jnp.stack([least(depth), -least(-depth)]), jnp.nan).reshape(2, -1)
 
 
 def fusion_evidence(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> Int[Array, "n"]:
