@@ -40,7 +40,7 @@ AWAY = np.array([0.0, 0.0, -5.0])  # behind the camera
 TIME = np.arange(NUM_FRAMES)[:, None]
 CASES = {
     "walks by": ((0.5, 1.6), np.array([-2.0, 0, 1.3]) + TIME * [0.22, 0, 0]),
-    "fills the view": ((4.0, 3.0), np.where((TIME >= HIDING[0]) & (TIME <= HIDING[-1]), [0, 0, 0.6], AWAY)),
+    "fills the view": ((4.0, 3.0), np.where((HIDING[0] <= TIME) & (HIDING[-1] >= TIME), [0, 0, 0.6], AWAY)),
     "is there at first": ((0.6, 1.6), np.where(TIME < 5, [0.3, 0, 1.2], AWAY)),
 }
 
