@@ -69,7 +69,7 @@ def keyframe(
     is_seen = (local[:, 2] > 0.1) & (pixels >= 0).all(axis=1) & (pixels <= np.array(SIZE) - 1).all(axis=1)
     rows = rng.permutation(np.flatnonzero(is_seen))
     predicted = scale * local[rows] * np.exp(noise * rng.normal(size=(len(rows), 1)))
-    no_depths = np.zeros((6, 8), np.float16)
+    no_depths = np.zeros((6, 8), np.float32)
     return Keyframe(
         frame, np.float32(pixels[rows]), looks(len(points))[rows], np.float32(predicted), INTRINSICS, SIZE, no_depths
     )

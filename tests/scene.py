@@ -41,6 +41,7 @@ SMALL = (
 )
 # For whole steps. Every second row and column of the full images is kept; 32 of their pixels make 8 rows.
 FULL, ROOM = Camera([40.0, 46.0], [29.0, 24.5], 64, 48), 200  # rows of the map
+THINNED = Camera([20.0, 23.0], [14.5, 12.25], 32, 24)  # of its rows
 WHOLE = (
     *("slam.submap.margin=100", "slam.observation.thin=2", "slam.fit.points_per_gaussian=2116"),
     *(f"slam.submap.map_capacity={ROOM}", "slam.submap.submap_capacity=256"),  # the whole map
@@ -218,6 +219,36 @@ def predict_room(
         has_newest=jnp.asarray(has_newest),
         is_repeat=jnp.asarray(True),
     )
+
+
+def exact(i, **more) -> Prediction:
+    """`predict_room` with two features, for whole steps."""
+    return predict_room(i, THINNED, num_features=2, **more)
+
+
+def errors_of(shape, rng):
+    """A smooth image of errors of deviation 1, as predictions have them."""
+    y, x = np.meshgrid(np.linspace(0, np.pi, shape[0]), np.linspace(0, np.pi, shape[1]), indexing="ij")
+    waves = [(v, u) for v in range(3) for u in range(3)]
+    weights = rng.normal(size=len(waves))
+    image = sum(w * np.cos(v * y) * np.cos(u * x) for w, (v, u) in zip(weights, waves, strict=True))
+    return (image / np.linalg.norm(weights) * 2).reshape(-1, 1)
+
+
+def noisy(observation, camera, rng, depth_noise):
+    """Depths that are wrong by a fraction, smoothly over the image."""
+    factor = 1 + depth_noise * errors_of((camera.height, camera.width), rng)
+    return replace(observation, points=observation.points * factor)
+
+
+def noisy_prediction(i, camera, rng, depth_noise=0.02, scale_noise=0.02, pose_noise=(0.01, 0.005)):
+    """One call's errors: a scale, depths of each image, and poses by centimetres and milliradians."""
+    given = exact(i, scale=1 + scale_noise * rng.normal())
+    off = [pose(pose_noise[1] * rng.normal(size=3), pose_noise[0] * rng.normal(size=3)) for _ in range(3)]
+    views = map(jaxlie.SE3, np.asarray(given.T_world_views.wxyz_xyz))
+    poses = stack_poses([product(T, error) for T, error in zip(views, off, strict=True)])
+    images = (noisy(o, camera, rng, depth_noise) for o in (given.current, given.previous))
+    return eqx.tree_at(lambda p: (p.current, p.previous, p.T_world_views), given, (*images, poses))
 
 
 def random_gaussians(count: int, seed: int = 0, num_features: int = 0, low=(-1, -1, 1), high=(1, 1, 3)) -> Gaussians:

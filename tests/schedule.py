@@ -26,7 +26,12 @@ GROUPS = {
     ),
     "smoke": ("mapping/test_coming_back.py", "mapping/test_disconnected_submaps.py", "scripts/test_walk.py"),
     "browser": ("report/test_page_browser.py", "report/test_table_page.py", "report/test_viewer.py"),  # one Chromium
-    "small": ("mapping/test_capacity.py", "test_slam.py", "mapping/test_batch.py"),  # the first counts, as above
+    "small": (
+        "mapping/test_capacity.py",
+        "test_slam.py",
+        "test_worlds.py",
+        "mapping/test_batch.py",
+    ),  # the first counts, as above
 }
 # What the quick subset (-m "not slow") takes nothing of, beside the marked tests: some five CPU seconds and more each.
 SLOW = {

@@ -1,8 +1,6 @@
 """Whole steps and runs on the box room: exact poses, nothing fused when not tracked, growth that changes nothing, and a
 map of noisy predictions that is better than they are."""
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jaxlie
@@ -10,16 +8,15 @@ import numpy as np
 import pytest
 import reference
 import scene as sc
-from scene import FULL, ROOM, WHOLE
+from scene import FULL, ROOM, WHOLE, exact, noisy, noisy_prediction
 
 from emgs_jax import slam
 from emgs_jax.device.executables import call
 from emgs_jax.mapping.capacity import advance, grow_capacities, start
 from emgs_jax.mapping.convert import opening
 from emgs_jax.observation import Prediction
-from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
-from emgs_jax.slam import Overflow, SlamState, StepInfo
+from emgs_jax.slam import Overflow, StepInfo
 
 FRAME = 3
 pytestmark = pytest.mark.slow  # one compilation of the whole step is half a minute
@@ -32,10 +29,6 @@ LENIENT = {"localization.max_residual": 1.0, "localization.max_pose_std": np.inf
 def lenient(*overrides: str, **values):
     chosen = sc.slam_config(*WHOLE, "slam.localization.coarse=same_image", "slam.em.average.gain=count", *overrides)
     return sc.changed(chosen, **LENIENT, **values)
-
-
-def exact(i, **more) -> Prediction:
-    return sc.predict_room(i, Camera([20.0, 23.0], [14.5, 12.25], 32, 24), num_features=2, **more)
 
 
 @pytest.fixture(scope="module")
@@ -206,111 +199,6 @@ def test_a_step_after_a_lost_frame_is_tracked_again(state, settings):
     assert info.localization.is_tracked
     # Over two frames, and the scale is not known either.
     assert sc.pose_error(info.T_world_camera, sc.path_pose(FRAME + 1))[0] < 0.07
-
-
-def errors_of(shape, rng):
-    """A smooth image of errors of deviation 1, as predictions have them."""
-    y, x = np.meshgrid(np.linspace(0, np.pi, shape[0]), np.linspace(0, np.pi, shape[1]), indexing="ij")
-    waves = [(v, u) for v in range(3) for u in range(3)]
-    weights = rng.normal(size=len(waves))
-    image = sum(w * np.cos(v * y) * np.cos(u * x) for w, (v, u) in zip(weights, waves, strict=True))
-    return (image / np.linalg.norm(weights) * 2).reshape(-1, 1)
-
-
-def noisy(observation, camera, rng, depth_noise):
-    """Depths that are wrong by a fraction, smoothly over the image."""
-    factor = 1 + depth_noise * errors_of((camera.height, camera.width), rng)
-    return sc.replace(observation, points=observation.points * factor)
-
-
-def noisy_prediction(i, camera, rng, depth_noise=0.02, scale_noise=0.02, pose_noise=(0.01, 0.005)):
-    """One call's errors: a scale, depths of each image, and poses by centimetres and milliradians."""
-    given = exact(i, scale=1 + scale_noise * rng.normal())
-    off = [sc.pose(pose_noise[1] * rng.normal(size=3), pose_noise[0] * rng.normal(size=3)) for _ in range(3)]
-    views = map(jaxlie.SE3, np.asarray(given.T_world_views.wxyz_xyz))
-    poses = sc.stack_poses([sc.product(T, error) for T, error in zip(views, off, strict=True)])
-    images = (noisy(o, camera, rng, depth_noise) for o in (given.current, given.previous))
-    return eqx.tree_at(lambda p: (p.current, p.previous, p.T_world_views), given, (*images, poses))
-
-
-def every_pose(change, poses: jaxlie.SE3) -> jaxlie.SE3:
-    return sc.stack_poses([change(jaxlie.SE3(values)) for values in np.asarray(poses.wxyz_xyz)])
-
-
-@pytest.mark.parametrize("translation", [(1.0, -2.0, 0.5), (600.0, -700.0, 400.0)])
-def test_a_step_moves_with_a_rigid_motion_of_the_world(state, camera, settings, translation):
-    """With noisy depths, so that the noise along the rays from the camera, wherever that is, decides what is fused.
-
-    A kilometre away float32 has steps of .06 mm.
-    """
-    motion = sc.pose((0.7, 0.2, -0.4), translation)
-    prediction = noisy_prediction(FRAME, camera, np.random.default_rng(0))
-    stepped = step(state, prediction, FULL, settings)
-    quiet = step(state, prediction, FULL, sc.at(settings, "em.noise", 0.0))[1]
-    assert stepped[1].localization.is_tracked and quiet.em.num_fused < stepped[1].em.num_fused
-    views = every_pose(lambda T: sc.product(motion, T), prediction.T_world_views)
-    poses = views, sc.product(motion, prediction.T_world_anchor)
-    moved_prediction = eqx.tree_at(lambda p: (p.T_world_views, p.T_world_anchor), prediction, poses)
-    moved_state = eqx.tree_at(
-        lambda s: (s.map.gaussians, s.previous, s.T_world_previous),
-        state,
-        (
-            sc.move_gaussians(motion, state.map.gaussians),
-            sc.moved_points(motion, state.previous),
-            sc.product(motion, state.T_world_previous),
-        ),
-    )
-    new, info = step(moved_state, moved_prediction, FULL, settings)
-    # The solver ends within its tolerance of the same pose; points near a gate may pass it or not.
-    assert max(sc.pose_error(info.T_world_camera, sc.product(motion, stepped[1].T_world_camera))) < 2e-3
-    assert abs(int(info.em.num_fused) - int(stepped[1].em.num_fused)) <= 0.02 * 768
-    old = np.asarray(state.map.gaussians.valid)
-    expected = sc.move_gaussians(motion, stepped[0].map.gaussians)
-    error = np.linalg.norm(np.asarray(new.map.gaussians.means) - expected.means, axis=1)[old]
-    assert np.median(error) < 2e-3 and np.quantile(error, 0.95) < 0.02
-
-
-def larger_pose(T: jaxlie.SE3, factor: float) -> jaxlie.SE3:
-    return jaxlie.SE3(sc.device(np.asarray(T.wxyz_xyz) * ([1.0] * 4 + [factor] * 3)))
-
-
-# Powers of two, so that floats are scaled without rounding.
-@pytest.mark.parametrize("larger_by", [2.0**power for power in (-10, 2, 10)])
-def test_in_a_world_so_many_times_as_large_a_step_makes_a_map_as_many_times_as_large(
-    state, camera, settings, larger_by
-):
-    """With the lengths of the config, too; fractions of the depth, angles and pixels stay."""
-    lengths = "fit.min_std", "em.min_std", "splitting.min_std", "submap.voxel_size", "submap.margin"
-    config, larger_of = settings, partial(larger_pose, factor=larger_by)
-    for path in lengths:
-        group, name = path.split(".")
-        config = sc.at(config, path, larger_by * float(getattr(getattr(settings, group), name)))
-    points = lambda p: (p.current.points, p.previous.points, p.T_world_views, p.T_world_anchor)  # noqa: E731
-    prediction = noisy_prediction(FRAME, camera, np.random.default_rng(0))
-    current, previous, views, anchor = points(prediction)
-    grown = sc.device(larger_by * np.asarray(current)), sc.device(larger_by * np.asarray(previous))
-    large = eqx.tree_at(points, prediction, (*grown, every_pose(larger_of, views), larger_of(anchor)))
-
-    def larger(state: SlamState) -> SlamState:
-        parts = lambda s: (s.map.gaussians.means, s.map.gaussians.covs, s.previous.points, s.T_world_previous)  # noqa: E731
-        means, covs, seen, T = parts(state)
-        arrays = larger_by * np.asarray(means), larger_by**2 * np.asarray(covs), larger_by * np.asarray(seen)
-        return eqx.tree_at(parts, state, (*map(sc.device, arrays), larger_of(T)))
-
-    expected, said = step(state, prediction, FULL, settings)
-    new, info = step(larger(state), large, FULL, config)
-    assert info.localization.is_tracked
-    distance, angle = sc.pose_error(info.T_world_camera, larger_of(said.T_world_camera))
-    assert distance < larger_by * 1e-3 and angle < 1e-3  # the solver's tolerance
-    np.testing.assert_allclose(info.localization.scale, said.localization.scale, rtol=1e-3)
-    np.testing.assert_allclose(info.localization.depth_noise, said.localization.depth_noise, rtol=1e-2)
-    assert abs(int(info.em.num_fused) - int(said.em.num_fused)) <= 0.02 * 768  # at a gate a point may pass or not
-    assert abs(int(info.num_gaussians) - int(said.num_gaussians)) <= 5
-    old, g, h = np.asarray(state.map.gaussians.valid), new.map.gaussians, expected.map.gaussians
-    error = np.linalg.norm(np.asarray(g.means) / larger_by - h.means, axis=1)[old]
-    assert np.median(error) < 1e-3 and np.quantile(error, 0.95) < 0.01
-    error = np.abs(np.asarray(g.covs) / larger_by**2 - h.covs).max(axis=(1, 2))[old]
-    assert np.median(error) < 1e-4 and np.quantile(error, 0.95) < 1e-3
 
 
 @pytest.mark.parametrize(

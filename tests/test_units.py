@@ -1,10 +1,8 @@
 """Nothing depends on the unit of length: in a world 1024 times as small or large the same comes out, scaled.
 
 The factors are powers of two, so that floats are scaled without rounding: what differs is a length in the code. Lengths
-of the config scale with the world. A whole step is in test_slam.py.
+of the config scale with the world. All of them together are in test_worlds.py.
 """
-
-import dataclasses
 
 import equinox as eqx
 import jax
@@ -13,13 +11,11 @@ import jaxlie
 import numpy as np
 import pytest
 import scene as sc
-from loop_scene import keyframe, matrix, neighbours_of, room, verification_config
 from verbs import CAMERA, CONFIG, DENSIFY, ROWS, graph_of, map_of
 
 from emgs_jax import em, existence, gaussians, splitting, surface_extrapolation
 from emgs_jax.evaluation.loops import double_wall_share
 from emgs_jax.initialization import initialize
-from emgs_jax.loop_closure.verification import verify
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.pose_graph import deform
 from emgs_jax.pose_graph.optimize import PoseGraphConfig, optimize
@@ -138,24 +134,6 @@ def pose_graph(s):
     return nodes, np.float32([info.cost, info.num_iterations])
 
 
-def loop_closure(s):
-    a, b = matrix((0, 10, 0), (0.1, 0.0, 0.2)), matrix((3, -4, 2), (0.4, 0.1, -0.1))
-    views = [keyframe(room(), T, row, s) for T, row in ((b, 500), (a, 3))]
-    beside = [
-        dataclasses.replace(
-            one,
-            keyframe=dataclasses.replace(one.keyframe, points=s * one.keyframe.points),
-            log_ratio=one.log_ratio - np.log(s),
-        )
-        for one in neighbours_of(room(), a, s)
-    ]
-    words = (f"alignment.min_extent={s * verification_config().alignment.min_extent}", "alignment.scale_std=.inf")
-    words += (f"max_neighbour_distance={s * verification_config().max_neighbour_distance}",)
-    loop, info = verify(*views, beside, verification_config(*words))
-    assert info.refused_by is None
-    return {"means": np.float32(loop.Z_a_b[:3, 3]), "turn": np.float32(loop.Z_a_b[:3, :3]), "count": loop.num_inliers}
-
-
 def double_walls(s):
     g = lengths(sc.random_gaussians(400, 0, high=(1, 1, 1.4)), s)
     arrays = (np.asarray(x, float) for x in (g.means, g.normals, g.covs))
@@ -164,7 +142,7 @@ def double_walls(s):
 
 
 STAGES = initialization, colour_gradients, fusion, refinement, looks, extrapolation, rendering, densification
-STAGES += deformation, pose_graph, loop_closure, double_walls
+STAGES += deformation, pose_graph, double_walls
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.__name__)

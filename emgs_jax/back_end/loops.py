@@ -29,7 +29,7 @@ MEASURED, SILENT, UNUSABLE = "measured", "silent", "unusable"
 
 def detect_loops(end: BackEnd, frame: FrameData) -> BackEnd:
     """Add the last node as a keyframe, and verify its loop candidates."""
-    time, config = len(end.poses) - 1, end.config.place_recognition
+    time, config = len(end.nodes) - 1, end.config.place_recognition
     if time % end.config.every:
         return end
     end = replace(end, database=add_keyframe(end.database, _keyframe(end, time, frame), config))
@@ -42,7 +42,7 @@ def detect_loops(end: BackEnd, frame: FrameData) -> BackEnd:
 
 def recent_loops(end: BackEnd) -> list[LoopMeasurement]:
     """Select spatially consistent loops of the last queries that are not in the pose graph yet, after a keyframe."""
-    time = len(end.poses) - 1
+    time = len(end.nodes) - 1
     if time % end.config.every:
         return []
     return not_in_graph(end, consistent_loops(end, since=time - end.config.consistency.max_query_gap))
@@ -61,11 +61,11 @@ def relocalize_frame(
         frame: of a frame that is no node yet, or is no keyframe.
         in_other_submap: search the other submap that has the most similar keyframe, with a free ratio of units.
     """
-    query = _keyframe(end, len(end.poses), frame)
+    query = _keyframe(end, len(end.nodes), frame)
     submap_id = _most_similar_submap(end, query) if in_other_submap else end.submap_id
     if submap_id is None:
         return None, NO_CANDIDATE
-    is_there = [placed and one == submap_id for placed, one in zip(end.is_placed, end.submap_ids, strict=True)]
+    is_there = [node.is_placed and node.submap == submap_id for node in end.nodes]
     known = PosedKeyframes(end.database, end.poses, end.log_scales, is_there)
     verification = _verification_config(end, in_other_submap)
     return relocalize(query, known, end.config.place_recognition, verification, end.config.relocalization)
@@ -75,14 +75,14 @@ def _most_similar_submap(end: BackEnd, query: Keyframe) -> int | None:
     """Find the other submap with the most similar keyframe that is in the map; None without one."""
     keyframes = end.database.keyframes
     others = [row for row in range(len(keyframes)) if _submap_id_of(end, row) != end.submap_id]
-    others = [row for row in others if end.is_placed[keyframes[row].frame]]
+    others = [row for row in others if end.nodes[keyframes[row].frame].is_placed]
     found = most_similar(end.database, query, others, 1, end.config.place_recognition)
     return _submap_id_of(end, found[0].row) if found else None
 
 
 def _submap_id_of(end: BackEnd, row: int) -> int:
     """Submap of a keyframe, a row of the database."""
-    return end.submap_ids[end.database.keyframes[row].frame]
+    return end.nodes[end.database.keyframes[row].frame].submap
 
 
 def _verification_config(end: BackEnd, is_free: bool) -> VerificationConfig:
@@ -133,7 +133,7 @@ def _verify_candidate(end: BackEnd, row: int, other: int) -> BackEnd:
 def is_closure_due(end: BackEnd, loops: Sequence[LoopMeasurement]) -> bool:
     """Test whether a closure is due: a loop violates the current poses, and the last closure is long enough ago."""
     last = end.closures[-1].time if end.closures else -end.config.min_frames
-    return len(end.poses) - 1 - last >= end.config.min_frames and bool(violated(end, loops))
+    return len(end.nodes) - 1 - last >= end.config.min_frames and bool(violated(end, loops))
 
 
 def violated(end: BackEnd, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
@@ -143,11 +143,13 @@ def violated(end: BackEnd, loops: Sequence[LoopMeasurement]) -> list[LoopMeasure
 
 def loop_chi2(end: BackEnd, loop: LoopMeasurement) -> float:
     """Compute χ² of a loop at the current poses and scales."""
-    scale, other = end.log_scales[loop.a], end.log_scales[loop.b]
-    now = scale_pose(np.linalg.inv(end.poses[loop.a]) @ end.poses[loop.b], np.exp(-scale))
+    here, there = end.nodes[loop.a], end.nodes[loop.b]
+    now = scale_pose(np.linalg.inv(here.pose) @ there.pose, np.exp(-here.log_scale))
     error = np.linalg.inv(loop.Z_a_b) @ now
     turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
-    return float(np.sum((loop.sqrt_info @ [*error[:3, 3], *turn, other - scale - loop.log_ratio]) ** 2))
+    return float(
+        np.sum((loop.sqrt_info @ [*error[:3, 3], *turn, there.log_scale - here.log_scale - loop.log_ratio]) ** 2)
+    )
 
 
 def query_prior(end: BackEnd, loops: Sequence[LoopMeasurement], query: PriorQuery) -> BackEnd:
@@ -159,7 +161,7 @@ def query_prior(end: BackEnd, loops: Sequence[LoopMeasurement], query: PriorQuer
     keyframes = {keyframe.frame: keyframe for keyframe in end.database.keyframes}
     for loop in _loops_to_query(end, loops):
         pair = loop.a, loop.b
-        answer = query(*(end.frames[node] for node in pair))
+        answer = query(*(end.nodes[row].frame for row in pair))
         other = (
             None
             if answer is None

@@ -35,17 +35,16 @@ def close_loops(end: BackEnd, state: SlamState, loops: Sequence[LoopMeasurement]
     if not end.has_one_unit:  # the scales are not all about 1
         solver = replace(solver, scale_std=jnp.asarray(math.inf))
     after, info = optimize(PoseGraph(before, stack_factors(factors)), solver)
-    end = replace(end, closures=[*end.closures, Closure(len(end.poses) - 1, tuple(loops), info)])
+    end = replace(end, closures=[*end.closures, Closure(len(end.nodes) - 1, tuple(loops), info)])
     if info.reason:
         return end, state
-    count = len(end.poses)
-    end = replace(
-        end,
-        factors=factors,
-        accepted=[*end.accepted, *loops],
-        poses=list(np.asarray(after.T_world.as_matrix(), np.float64)[:count]),
-        log_scales=list(np.asarray(after.log_scale, np.float64)[:count]),
+    found = (
+        np.asarray(values, np.float64)[: len(end.nodes)] for values in (after.T_world.as_matrix(), after.log_scale)
     )
+    nodes = tuple(
+        replace(node, pose=pose, log_scale=scale) for node, pose, scale in zip(end.nodes, *found, strict=True)
+    )
+    end = replace(end, factors=factors, accepted=[*end.accepted, *loops], nodes=nodes)
     change = jnp.mean(after.log_scale - before.log_scale, where=before.valid)
     state = replace(state, estimate=rescale_estimate(state.estimate, jnp.exp(change)))
     return end, deform_state(state, before, after, end.min_std, end.config.deform)
@@ -53,11 +52,11 @@ def close_loops(end: BackEnd, state: SlamState, loops: Sequence[LoopMeasurement]
 
 def nodes_of(end: BackEnd, submap_id: int | None = None) -> Nodes:
     """Stack all nodes, or mark those of a submap as valid; padded to a power of two, so that it compiles rarely."""
-    count = len(end.poses)
+    count = len(end.nodes)
     size = bucket(count)
     poses = to_se3(np.stack([*end.poses, *[np.eye(4)] * (size - count)]))
     scales = jnp.asarray([*end.log_scales, *[0.0] * (size - count)], jnp.float32)
-    is_valid = [submap_id in (None, one) for one in end.submap_ids]
+    is_valid = [submap_id in (None, node.submap) for node in end.nodes]
     return Nodes(poses, scales, jnp.asarray(is_valid + [False] * (size - count)))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from emgs_jax.back_end.factors import Factor
-from emgs_jax.back_end.state import BackEnd, BackEndConfig
+from emgs_jax.back_end.state import BackEnd, BackEndConfig, Node
 from emgs_jax.data.reading import fingerprint
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.map_file import load_map
@@ -24,7 +24,12 @@ PLACES_FILE, MAP_FILE, METRICS_FILE = "places.npz", "map.npz", "metrics.json"
 HEADER = {"format": "emgs_jax.places", "version": 1, "descriptors": "rootsift"}
 MODES = ("extend", "localize")
 LEFT_OUT = -1  # submap of nodes that were never joined with the map
-NODES = ("poses", "log_scales", "frames", "is_placed")
+NODES = {
+    "poses": "pose",
+    "log_scales": "log_scale",
+    "frames": "frame",
+    "is_placed": "is_placed",
+}  # in the file: of a node
 LOOPS = {"verified": "verified", "contradicted": "violating", "accepted": "accepted"}  # in the file: in a back end
 OF_POINTS, OF_KEYFRAMES = ("pixels", "descriptors", "points"), ("frame", "intrinsics", "size", "depths")
 
@@ -61,8 +66,10 @@ def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
         "num_trained": end.database.num_trained,
         "has_one_unit": end.has_one_unit,
     }
-    arrays = {name: np.asarray(getattr(end, name)) for name in NODES} | {"words": end.database.words}
-    arrays["is_kept"] = np.array(end.submap_ids) == end.submap_id
+    arrays = {name: np.array([getattr(node, field) for node in end.nodes]) for name, field in NODES.items()} | {
+        "words": end.database.words
+    }
+    arrays["is_kept"] = np.array([node.submap == end.submap_id for node in end.nodes])
     arrays |= {f"keyframes.{name}": np.stack([getattr(one, name) for one in keyframes]) for name in OF_KEYFRAMES}
     arrays |= {f"keyframes.{name}": np.concatenate([getattr(one, name) for one in keyframes]) for name in OF_POINTS}
     arrays["keyframes.num_points"] = np.array([len(one.pixels) for one in keyframes])
@@ -131,7 +138,7 @@ def load_saved_map(
         )
     map = load_map(folder / MAP_FILE)
     births = np.asarray(map.birth)[np.asarray(map.gaussians.valid)]
-    if len(births) == 0 or births.min() < 0 or births.max() >= len(end.poses):
+    if len(births) == 0 or births.min() < 0 or births.max() >= len(end.nodes):
         raise ValueError(f"{folder}: {MAP_FILE} and {PLACES_FILE} are not of one run: map again")
     files = folder / MAP_FILE, folder / PLACES_FILE
     return SavedMap(map, end, depth_noise, mode == "localize", fingerprint(folder, files, {}))
@@ -151,18 +158,19 @@ def _fields(arrays: Mapping[str, np.ndarray], num_trained: int) -> dict[str, Any
         raise ValueError("keyframes are not nodes in their order")
     vectors = np.stack([vlad(unit_descriptors(one), words) for one in keyframes])
     edges = {**arrays, "edges.is_loop": arrays["edges.kind"] == 1}
-    is_kept = arrays.get("is_kept", np.ones(count, bool))  # older files do not have it
+    submaps = np.where(arrays.get("is_kept", np.ones(count, bool)), 0, LEFT_OUT)  # older files do not have it
     loops = {
         field: [LoopMeasurement(**row) for row in _rows(name, arrays, LoopMeasurement.__annotations__, count)]
         for name, field in LOOPS.items()
     }
     return {
-        "poses": list(np.float64(poses)),
-        "online": list(np.float64(poses)),
-        "log_scales": log_scales.tolist(),
-        "frames": frames.tolist(),
-        "is_placed": is_placed.tolist(),
-        "submap_ids": np.where(is_kept, 0, LEFT_OUT).tolist(),
+        "nodes": tuple(
+            map(
+                Node,
+                *[np.float64(poses)] * 2,
+                *(values.tolist() for values in (log_scales, frames, submaps, is_placed)),
+            )
+        ),
         "factors": [Factor(**row) for row in _rows("edges", edges, Factor.__annotations__, count)],
         "database": Database(keyframes, words, vectors, num_trained),
         "first_node": count,
@@ -180,7 +188,7 @@ def _keyframes(arrays: Mapping[str, np.ndarray]) -> tuple[Keyframe, ...]:
     parts = [np.split(array, np.cumsum(counts)[:-1]) for array in (pixels, descriptors, points)]
     frames, intrinsics, sizes, depths = (arrays[f"keyframes.{name}"] for name in OF_KEYFRAMES)
     return tuple(
-        Keyframe(int(frame), *of_points, tuple(map(float, camera)), tuple(map(int, size)), depth)
+        Keyframe(int(frame), *of_points, tuple(map(float, camera)), tuple(map(int, size)), np.float32(depth))
         for frame, *of_points, camera, size, depth in zip(frames, *parts, intrinsics, sizes, depths, strict=True)
     )
 

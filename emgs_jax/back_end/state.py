@@ -49,6 +49,27 @@ class BackEndConfig:
 
 
 @dataclass(frozen=True)
+class Node:
+    """A frame in the pose graph.
+
+    Args:
+        pose: current T_world_camera (4, 4).
+        online: the same as first estimated, in the unit of `pose`.
+        log_scale: σ of its inference.
+        frame: index in the data set.
+        submap: disconnected submap that holds it; the relative pose of two submaps is not known.
+        is_placed: True in the map: the frame is neither degraded nor lost.
+    """
+
+    pose: np.ndarray
+    online: np.ndarray
+    log_scale: float
+    frame: int
+    submap: int = 0
+    is_placed: bool = True
+
+
+@dataclass(frozen=True)
 class Closure:
     """One pose-graph optimization: its node, the new loops, and the solver's result."""
 
@@ -72,12 +93,6 @@ class BackEnd:
 
     Args:
         min_std: floor of the map's covariances.
-        poses: current T_world_camera (4, 4) of the nodes.
-        log_scales: σ of their inferences, likewise.
-        online: poses as first estimated, in the unit of `poses`.
-        frames: index in the data set of every node.
-        is_placed: True for nodes in the map: those that are neither degraded nor lost.
-        submap_ids: disconnected submap of every node; the relative pose of two submaps is not known.
         database: keyframes; their `frame` is the node.
         verified: loops that passed every gate of two keyframes.
         violating: loops with a free-space violation.
@@ -94,12 +109,7 @@ class BackEnd:
     config: BackEndConfig
     intrinsics: tuple[float, float, float, float]
     min_std: float
-    poses: Sequence[np.ndarray] = field(default_factory=list)
-    log_scales: Sequence[float] = field(default_factory=list)
-    online: Sequence[np.ndarray] = field(default_factory=list)
-    frames: Sequence[int] = field(default_factory=list)
-    is_placed: Sequence[bool] = field(default_factory=list)
-    submap_ids: Sequence[int] = field(default_factory=list)
+    nodes: Sequence[Node] = ()
     factors: Sequence[Factor] = field(default_factory=list)
     database: Database = field(default_factory=Database)
     verified: Sequence[LoopMeasurement] = field(default_factory=list)
@@ -113,6 +123,16 @@ class BackEnd:
     submap_id: int = 0
     has_one_unit: bool = True
 
+    @property
+    def poses(self) -> list[np.ndarray]:
+        """Current T_world_camera (4, 4) of the nodes."""
+        return [node.pose for node in self.nodes]
+
+    @property
+    def log_scales(self) -> list[float]:
+        """σ of the nodes' inferences."""
+        return [node.log_scale for node in self.nodes]
+
 
 def add_node(
     end: BackEnd, frame: FrameData, pose: np.ndarray, scale: float, origin: int | None, is_placed: bool = True
@@ -124,16 +144,9 @@ def add_node(
         origin: node whose Gaussians it was registered to; None where it was not registered to the map.
         is_placed: the map holds it: it was registered to it, or the map was made from it.
     """
-    time, pose = len(end.poses), np.asarray(pose, np.float64)
-    end = replace(
-        end,
-        poses=[*end.poses, pose],
-        online=[*end.online, pose],
-        log_scales=[*end.log_scales, float(np.log(scale))],
-        frames=[*end.frames, frame.index],
-        is_placed=[*end.is_placed, is_placed],
-        submap_ids=[*end.submap_ids, end.submap_id],
-    )
+    time, pose = len(end.nodes), np.asarray(pose, np.float64)
+    node = Node(pose, pose, float(np.log(scale)), frame.index, end.submap_id, is_placed)
+    end = replace(end, nodes=(*end.nodes, node))
     sequential = sequential_factor(frame, end.poses, end.log_scales, partial(_is_connected, end), end.config.noise)
     factors = [] if sequential is None else [sequential]
     if origin is not None and origin < time:
@@ -144,15 +157,14 @@ def add_node(
 def _is_connected(end: BackEnd, row: int) -> bool:
     """Test whether a node is in the map or has a factor other than loops; False before the camera was found."""
     has_factor = any(factor.a == row and not factor.is_loop for factor in end.factors)
-    return row >= end.connected_since and (end.is_placed[row] or has_factor)
+    return row >= end.connected_since and (end.nodes[row].is_placed or has_factor)
 
 
 def transform_nodes(end: BackEnd, rows: Collection[int], similarity: Sim3) -> BackEnd:
     """Map the poses and scales of some nodes to another world."""
 
-    def moved(poses: Sequence[np.ndarray]) -> list[np.ndarray]:
-        return [similarity.apply_to_poses(pose) if row in rows else pose for row, pose in enumerate(poses)]
+    def moved(node: Node) -> Node:
+        pose, online = map(similarity.apply_to_poses, (node.pose, node.online))
+        return replace(node, pose=pose, online=online, log_scale=node.log_scale + float(np.log(similarity.scale)))
 
-    change = float(np.log(similarity.scale))
-    log_scales = [scale + change if row in rows else scale for row, scale in enumerate(end.log_scales)]
-    return replace(end, poses=moved(end.poses), online=moved(end.online), log_scales=log_scales)
+    return replace(end, nodes=tuple(moved(node) if row in rows else node for row, node in enumerate(end.nodes)))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float16, Float32, Int, UInt8
+from jaxtyping import Bool, Float32, Int, UInt8
 
 from emgs_jax.keypoints import sift
 from emgs_jax.ops.ranges import number
@@ -59,7 +59,7 @@ class PlaceRecognitionConfig:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """Description of an image for place recognition; some 85 kB with 500 keypoints and 80 by 60 depths.
+    """Description of an image for place recognition; some 95 kB with 500 keypoints and 80 by 60 depths.
 
     Args:
         pixels: of the keypoints, centres at integers.
@@ -75,7 +75,7 @@ class Keyframe:
     points: Float32[np.ndarray, "n 3"]
     intrinsics: tuple[float, float, float, float]
     size: tuple[int, int]
-    depths: Float16[np.ndarray, "y x"]
+    depths: Float32[np.ndarray, "y x"]
 
 
 @dataclass(frozen=True)
@@ -136,10 +136,10 @@ def grid_pixels(size: tuple[int, int], grid: tuple[int, int]) -> tuple[Int[np.nd
 
 def sampled_depths(
     points: Float32[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], grid: tuple[int, int]
-) -> Float16[np.ndarray, "y x"]:
+) -> Float32[np.ndarray, "y x"]:
     """Depth of camera-frame points at the centres of a grid of so many columns and rows; 0 where the mask is off."""
     x, y = grid_pixels(mask.shape[::-1], grid)
-    return np.float16(np.where(mask, points[..., 2], 0.0)[np.ix_(y, x)])
+    return np.float32(np.where(mask, points[..., 2], 0.0)[np.ix_(y, x)])
 
 
 def _interpolated(

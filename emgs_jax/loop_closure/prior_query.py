@@ -77,7 +77,7 @@ def measure_by_prior(joint: JointPrediction, a: Keyframe, b: Keyframe, config: P
     ratios = []
     for keyframe, points, mask in zip((a, b), joint.points, joint.masks, strict=True):
         new, own = np.float64(sampled_depths(points, mask, keyframe.depths.shape[::-1])), np.float64(keyframe.depths)
-        both = (new > 0) & (own > 0) & np.isfinite(new) & np.isfinite(own)  # float16 ends at 65504
+        both = (new > 0) & (own > 0) & np.isfinite(new) & np.isfinite(own)
         if both.sum() < config.min_cells:
             return None
         ratios.append(float(np.median(np.log(new[both] / own[both]))))

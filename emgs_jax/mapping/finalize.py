@@ -102,7 +102,7 @@ def rescale_run(run: MappingRun) -> MappingRun:
         run,
         state=in_prior_unit(run.state, origin),
         records=tuple(transform_record(record, similarity) for record in run.records),
-        back_end=end and transform_nodes(end, range(len(end.poses)), similarity),
+        back_end=end and transform_nodes(end, range(len(end.nodes)), similarity),
     )
 
 

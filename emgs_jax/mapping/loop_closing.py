@@ -29,7 +29,7 @@ def add_frames(run: MappingRun, window: WindowInput) -> MappingRun:
     end = run.back_end
     for frame, record in zip(window.data, run.records[-len(window.frames) :], strict=True):
         if record.location in (RELOCALIZED, NEW_SUBMAP):
-            end = replace(end, connected_since=len(end.poses))
+            end = replace(end, connected_since=len(end.nodes))
         frame = replace(frame, depth_noise=record.depth_noise if record.status == "tracked" else None)
         is_placed = record.status in IN_MAP
         end = add_node(end, frame, record.pose, record.scale or 1.0, record.origin, is_placed)
@@ -88,7 +88,7 @@ def _with_updated_records(run: MappingRun) -> MappingRun:
     """
     end, first, motion = run.back_end, row_of_first_node(run), run.prior_motion
     if motion is not None:
-        motion = to_se3(end.poses[-1] @ np.linalg.inv(run.records[-1].pose)) @ motion
+        motion = to_se3(end.nodes[-1].pose @ np.linalg.inv(run.records[-1].pose)) @ motion
     found = zip(end.poses[end.first_node :], np.exp(end.log_scales[end.first_node :]).tolist(), strict=True)
     moved = [
         replace(record, pose=pose, scale=None if record.scale is None else scale)

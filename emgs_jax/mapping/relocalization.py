@@ -102,8 +102,8 @@ def _is_connected(end: BackEnd, window: WindowInput) -> bool:
     if here is None or before is None or not np.isfinite([here, before]).all():
         return False
     parents = {e.a: e.b for e in end.factors if not e.is_loop and (e.b > end.first_node or e.a == e.b + 1)}
-    node = len(end.poses) - 1
-    while not end.is_placed[node]:
+    node = len(end.nodes) - 1
+    while not end.nodes[node].is_placed:
         if node not in parents:
             return False
         node = parents[node]
@@ -173,7 +173,7 @@ def as_step_prediction(opening: FirstWindow | Prediction) -> Prediction:
 
 def state_in_saved_map(run: MappingRun, prediction: Prediction) -> SlamState:
     """Return a state in the saved map, with the structure that a checkpoint's state needs."""
-    time = jnp.asarray(len(run.back_end.poses), jnp.int32)
+    time = jnp.asarray(len(run.back_end.nodes), jnp.int32)
     looks = no_looks(prediction.current, run.config.motion)
     return SlamState(run.saved.map, prediction.current, prediction.T_world_anchor, exact_estimate(), time, looks)
 

@@ -176,7 +176,7 @@ def record_lost(run: MappingRun, window: WindowInput, location: str | None = Non
     """Record a lost frame before a map can start; its pose is the anchor's or the last one, a placeholder."""
     reason, pose = REASONS[0] if location is None else NOT_FOUND, window.T_world_anchor
     if run.saved is not None:
-        pose = run.records[-1].pose if run.records else run.saved.back_end.poses[-1]
+        pose = run.records[-1].pose if run.records else run.saved.back_end.nodes[-1].pose
     return _add(run, window, 0, status="lost", reason=reason, location=location, pose=pose)
 
 
@@ -290,7 +290,7 @@ def _step_fields(info: StepInfo) -> dict[str, Any]:
 
 def row_of_first_node(run: MappingRun) -> int:
     """Return the row of the first record that is a node of the back end; all later ones are nodes, too."""
-    return len(run.records) - (len(run.back_end.poses) - run.back_end.first_node)
+    return len(run.records) - (len(run.back_end.nodes) - run.back_end.first_node)
 
 
 def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

@@ -112,7 +112,7 @@ def match_submap(run: MappingRun, window: WindowInput, frame: TrackedFrame) -> T
     place, _ = relocalize_frame(run.back_end, window.data[0], in_other_submap=True)
     if place is None:
         return frame
-    other = run.inactive[run.back_end.submap_ids[place.keyframe]]
+    other = run.inactive[run.back_end.nodes[place.keyframe].submap]
     # This frame determines the prior's unit in that map.
     estimate = replace(other.estimate, log_scale=jnp.asarray(place.log_scale, jnp.float32))
     visiting = replace(run, state=replace(other, estimate=estimate))
@@ -137,20 +137,20 @@ def join_submaps(run: MappingRun, window: WindowInput) -> MappingRun:
     """
     end, similarity = run.back_end, Sim3.from_matrix(run.records[-1].similarity)
     place, _ = relocalize_frame(end, window.data[-1], in_other_submap=True)  # where `match_submap` has found it
-    here, there = end.submap_id, end.submap_ids[place.keyframe]
+    here, there = end.submap_id, end.nodes[place.keyframe].submap
     if here < there:
         similarity = similarity.inverse()
     newer, older, before = max(here, there), min(here, there), nodes_of(end)
-    unit = np.exp(end.log_scales[place.keyframe])  # of the place's covariance: its map may be the one that moves
-    rows = [row for row, one in enumerate(end.submap_ids) if one == newer]
+    unit = np.exp(end.nodes[place.keyframe].log_scale)  # of the place's covariance: its map may be the one that moves
+    rows = [row for row, node in enumerate(end.nodes) if node.submap == newer]
     end = transform_nodes(end, rows, similarity)
     after, first = nodes_of(end), row_of_first_node(run) - end.first_node
     records = list(run.records)
     for row in rows:
         records[first + row] = transform_record(records[first + row], similarity)
-    submap_ids = [older if one == newer else one for one in end.submap_ids]
+    nodes = tuple(replace(node, submap=older) if node.submap == newer else node for node in end.nodes)
     factors = [*end.factors, join_factor(end, place, unit)]
-    end = replace(end, submap_ids=submap_ids, submap_id=older, has_one_unit=False, factors=factors)
+    end = replace(end, nodes=nodes, submap_id=older, has_one_unit=False, factors=factors)
     other = run.inactive[there]
     state = deform_state(run.state, before, after, end.min_std, end.config.deform)
     moved = move_map(other.map, before, after, jnp.asarray(end.min_std, jnp.float32), end.config.deform)
@@ -173,11 +173,12 @@ def join_factor(end: BackEnd, place: RelocalizedPose, unit: float) -> Factor:
 
     `unit` is a length of that keyframe's inference in the map in which the pose was found.
     """
-    a, b = place.keyframe, len(end.poses) - 1
-    scale = np.exp(end.log_scales[a])
+    a, b = place.keyframe, len(end.nodes) - 1
+    here, there = end.nodes[a], end.nodes[b]
+    scale = np.exp(here.log_scale)
     information = np.linalg.inv(scale_covariance(place.covariance, 1.0 / unit))
-    measured = scale_pose(np.linalg.inv(end.poses[a]) @ end.poses[b], 1.0 / scale)
-    ratio = end.log_scales[b] - end.log_scales[a]
+    measured = scale_pose(np.linalg.inv(here.pose) @ there.pose, 1.0 / scale)
+    ratio = there.log_scale - here.log_scale
     return Factor(a, b, measured, ratio, np.linalg.cholesky(information).T, is_loop=False)
 
 
@@ -186,9 +187,9 @@ def set_unjoined_apart(run: MappingRun) -> MappingRun:
     if not run.inactive:
         return run
     end = run.back_end
-    counts = Counter(one for one, is_placed in zip(end.submap_ids, end.is_placed, strict=True) if is_placed)
+    counts = Counter(node.submap for node in end.nodes if node.is_placed)
     kept = 0 if run.saved is not None else max(sorted(counts), key=lambda one: counts[one])
-    is_kept = [one == kept for one in end.submap_ids]
+    is_kept = [node.submap == kept for node in end.nodes]
     between = {
         name: [one for one in getattr(end, name) if is_kept[one.a] and is_kept[one.b]]
         for name in ("factors", "verified", "violating", "accepted")
@@ -197,7 +198,7 @@ def set_unjoined_apart(run: MappingRun) -> MappingRun:
     rows = [row for row, one in enumerate(known.keyframes) if is_kept[one.frame]]
     end = replace(
         end,
-        is_placed=[placed and here for placed, here in zip(end.is_placed, is_kept, strict=True)],
+        nodes=tuple(replace(node, is_placed=node.is_placed and node.submap == kept) for node in end.nodes),
         submap_id=kept,
         database=replace(known, keyframes=tuple(known.keyframes[row] for row in rows), vectors=known.vectors[rows]),
         **between,
@@ -207,7 +208,7 @@ def set_unjoined_apart(run: MappingRun) -> MappingRun:
         if not is_kept[row]:
             record = records[first + row]
             status = APART if record.status in IN_MAP else "lost"
-            known = {"submap": end.submap_ids[row], "covariance": record.covariance if status == APART else None}
+            known = {"submap": end.nodes[row].submap, "covariance": record.covariance if status == APART else None}
             records[first + row] = replace(record, status=status, reason=UNJOINED, **known)
     states = {run.back_end.submap_id: run.state, **run.inactive}
     state = states.pop(kept)

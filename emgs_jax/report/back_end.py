@@ -22,7 +22,7 @@ def metric_graph(end: BackEnd) -> PoseGraph:
     """Poses and measurements in the map's scale, without scales of their own: what other solvers read."""
 
     def scaled(edge: Factor) -> Factor:
-        scale = np.exp(end.log_scales[edge.a])
+        scale = np.exp(end.nodes[edge.a].log_scale)
         sqrt_info = edge.sqrt_info / np.array([scale] * 3 + [1.0] * 4)
         return edge._replace(Z_a_b=scale_pose(edge.Z_a_b, scale), log_ratio=0.0, sqrt_info=sqrt_info)
 
@@ -44,7 +44,7 @@ def loop_list(end: BackEnd) -> list[dict[str, Any]]:
     known = (item for item in [*found, *end.refusals] if item.a >= end.first_node)  # what is older is of another run
     for a, b, gate, measured in sorted(known, key=lambda item: (item.b, item.a)):
         outcome = "refused" if gate else outcomes[a, b]
-        line = {"frame": end.frames[b], "other": end.frames[a], "outcome": outcome}
+        line = {"frame": end.nodes[b].frame, "other": end.nodes[a].frame, "outcome": outcome}
         line |= {"reason": unsolved[a, b]} if line["outcome"] == "unsolved" else {}
         lines.append(line | ({"gate": gate, "measured": measured} if gate else {}))
     return lines

@@ -260,7 +260,8 @@ def score_back_end(run: MappingRun) -> Metrics:
     """Score loop closures, relocalization, and the online poses (as first estimated); empty without a back end."""
     if run.back_end is None:
         return {}
-    end, online = run.back_end, run.back_end.online[run.back_end.first_node :]
+    end = run.back_end
+    online = [node.online for node in end.nodes[end.first_node :]]
     before = [record.pose for record in run.records[: row_of_first_node(run)]]
     poses = with_truth(run, np.stack([*before, *online])) if online else None
     causal = {} if poses is None else trajectory_metrics(*poses)
@@ -276,7 +277,8 @@ def _loops(run: MappingRun) -> tuple[list[tuple[int, int, np.ndarray]], list[np.
     compared = with_truth(run, run.poses)
     unit = (None if compared is None else trajectory_metrics(*compared)["trajectory/scale"]) or 1.0
     loops = [
-        (loop.a, loop.b, scale_pose(loop.Z_a_b, unit * np.exp(end.log_scales[loop.a]))) for loop in found_loops(end)
+        (loop.a, loop.b, scale_pose(loop.Z_a_b, unit * np.exp(end.nodes[loop.a].log_scale)))
+        for loop in found_loops(end)
     ]
     of_saved: list[np.ndarray | None] = [None] * end.first_node
     return loops, of_saved + run.true_poses[row_of_first_node(run) :]

@@ -81,7 +81,7 @@ def polish(
     for row in tqdm(fitted_rows, desc="splats", unit="frame"):
         image, view = seen(row)
         seeds.add(view, image, run.poses[row])
-        targets.append(_target(image, view))
+        targets.append(target_of(image, view))
         gains.append(np.asarray(_gain(view.colors, image, view.valid)) ** config.exposures)
     for row in held:  # what only these see is as the map has it: their images stay out
         view = seen(row)[1]
@@ -95,7 +95,7 @@ def polish(
     if config.poses:
         targets = Spool()
         for row in held:
-            targets.append(_target(*seen(row)))
+            targets.append(target_of(*seen(row)))
         views = Views(targets, run.poses[held], _spreads(run, held, config), all_gains[held])
         poses[held] = locate(anchors, fitted, views, run.camera, config)
         save_trajectory_tum(run.folder / PATH_FILE, [line["timestamp"] for line in run.frames], poses)
@@ -137,9 +137,10 @@ def _save_splats(run: RecordedRun, splats: Gaussians, opacity: jax.Array, neares
     return save_gaussians_ply(run.folder / SPLATS_FILE, splats.means, splats.covs, *shown)
 
 
-def _target(image: np.ndarray, view: DenseView) -> np.ndarray:
-    """Target of `loss`, (h, w, 4)."""
-    return np.concatenate([image, np.where(view.valid, view.depth, 0.0)[..., None]], axis=-1).astype(np.float16)
+def target_of(image: np.ndarray, view: DenseView) -> np.ndarray:
+    """Target of `loss`, (h, w, 4), in half floats; a depth beyond these counts as none."""
+    has_depth = view.valid & (view.depth < np.finfo(np.float16).max)
+    return np.concatenate([image, np.where(has_depth, view.depth, 0.0)[..., None]], axis=-1).astype(np.float16)
 
 
 def _spreads(run: RecordedRun, rows: list[int], config: PolishConfig) -> np.ndarray:

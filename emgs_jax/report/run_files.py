@@ -76,8 +76,8 @@ def save_progress(folder: Path, run: MappingRun) -> None:
     end = run.back_end
     if end is not None and end.database.keyframes and run.state is not None:
         save_places(folder / "places.npz", end, float(run.state.estimate.depth_noise))
-    if end is not None and len(end.online) > end.first_node:
-        online = end.online[end.first_node :]
+    online = [] if end is None else [node.online for node in end.nodes[end.first_node :]]
+    if online:
         placed = [record.timestamp for record in run.records[-len(online) :]]
         save_trajectory_tum(folder / "trajectory_online.txt", placed, np.stack(online))
         write_json(folder / LOOPS_FILE, loop_list(end))
@@ -194,4 +194,4 @@ def _moved(run: MappingRun) -> tuple[np.ndarray | None, tuple[tuple[int, int], .
         return None, ()
     shift = row_of_first_node(run) - end.first_node  # from a node to the row of its record
     loops = tuple((shift + loop.a, shift + loop.b) for loop in end.accepted if min(loop.a, loop.b) >= end.first_node)
-    return np.stack(end.online[end.first_node :]), loops
+    return np.stack([node.online for node in end.nodes[end.first_node :]]), loops

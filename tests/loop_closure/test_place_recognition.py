@@ -112,7 +112,7 @@ def as_keyframe(frame, rows, grid=(6, 8)):
     rows = np.asarray(rows)
     return Keyframe(
         *(frame, np.zeros((len(rows), 2), np.float32), looks(2000)[rows], np.zeros((len(rows), 3), np.float32)),
-        *(INTRINSICS, SIZE, np.zeros(grid, np.float16)),
+        *(INTRINSICS, SIZE, np.zeros(grid, np.float32)),
     )
 
 

@@ -68,8 +68,8 @@ def test_without_a_pose_or_depths_in_common_nothing_is_said():
         assert measure_by_prior(JointPrediction(T_A_B, (points, points), masks), a, b, CONFIG) is None
     assert measure_by_prior(told(), a, b, replace(CONFIG, min_cells=4801)) is None
     points = points.copy()
-    points[100:, 100:] = np.inf  # as a sky of 70,000 units is in float16
-    far = replace(a, depths=np.where(np.arange(80) > 40, np.float16(np.inf), a.depths))
+    points[100:, 100:] = np.inf  # as a sky
+    far = replace(a, depths=np.where(np.arange(80) > 40, np.float32(np.inf), a.depths))
     found = measure_by_prior(JointPrediction(T_A_B, (points, points), (mask, mask)), far, b, CONFIG)
     np.testing.assert_allclose(found.T_a_b, T_A_B, atol=1e-3)
 

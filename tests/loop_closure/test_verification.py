@@ -107,7 +107,7 @@ def test_the_stated_uncertainty_holds_the_error():
 
 def test_another_place_blank_images_and_matches_that_no_motion_explains_are_refused():
     nothing = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32)
-    blank = Keyframe(3, *nothing, INTRINSICS, SIZE, np.zeros((6, 8), np.float16))
+    blank = Keyframe(3, *nothing, INTRINSICS, SIZE, np.zeros((6, 8), np.float32))
     a, b = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500)
     other = dataclasses.replace(b, descriptors=looks(300, 8)[: len(b.pixels)])
     for query, candidate in ((other, a), (b, blank), (blank, b)):
@@ -252,7 +252,7 @@ def test_a_statement_that_is_contradicted_falls_with_all_that_agree_one_after_th
 
 def showing(depths, scale=1.0):
     """A keyframe of which only the depths matter."""
-    return dataclasses.replace(keyframe(room(), np.eye(4)), depths=np.float16(scale * depths))
+    return dataclasses.replace(keyframe(room(), np.eye(4)), depths=np.float32(scale * depths))
 
 
 def at(T, log_ratio=0.0):
@@ -272,6 +272,8 @@ def test_a_wall_where_the_other_looks_through_is_a_contradiction_in_both_orders_
     assert free_space_violation(a, nearer, at(ahead, -np.log(2)), 0.15) == 0.0
     assert free_space_violation(a, nearer, at(np.eye(4), -np.log(2)), 0.15) == 1.0
     assert free_space_violation(a, nearer, at(ahead), 0.15) > 0.9
+    in_millimetres = [showing(depths, 2e4) for depths in (hall, shorter)]  # 120 m and 80 m
+    np.testing.assert_allclose(free_space_violation(*in_millimetres, at(np.eye(4)), 0.15), 0.25)
 
 
 def test_what_hides_behind_something_else_is_no_contradiction():

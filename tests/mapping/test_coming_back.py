@@ -45,15 +45,15 @@ def test_a_camera_that_was_carried_off_comes_back():
     assert_near(run.records[back:])
     assert score_back_end(run)["location/found"] == 1
     end = run.back_end
-    assert end.connected_since == back and not end.is_placed[first]
+    assert end.connected_since == back and not end.nodes[first].is_placed
     assert not any(edge.a >= end.connected_since > edge.b and edge.b >= first for edge in end.factors), (
         "lost frames hold nothing"
     )
     chain = [edge for edge in end.factors if edge.a == edge.b + 1 and edge.sqrt_info[6, 6]]  # none by the map
-    assert {end.is_placed[edge.a] for edge in chain} == {True, False}
+    assert {end.nodes[edge.a].is_placed for edge in chain} == {True, False}
     for edge in chain:
         record = run.records[edge.a]
-        told = max(record.depth_noise, LEAST_NOISE) if end.is_placed[edge.a] else noise.depth
+        told = max(record.depth_noise, LEAST_NOISE) if end.nodes[edge.a].is_placed else noise.depth
         assert edge.sqrt_info[5, 5] == pytest.approx(1 / (told * noise.pair)), "of a lost frame few points fit exactly"
 
 
@@ -78,7 +78,7 @@ def test_the_map_goes_on_where_the_prior_leads_when_the_camera_is_found_nowhere(
     births = np.asarray(run.map.birth)[np.asarray(run.map.gaussians.valid)]
     assert np.sum(births == anew) > first.new // 2  # some were joined with later ones
     assert not np.any((births >= cut) & (births < anew))
-    assert run.back_end.is_placed == [True] * cut + [False] * 3 + [True] * 5
+    assert [node.is_placed for node in run.back_end.nodes] == [True] * cut + [False] * 3 + [True] * 5
 
 
 @pytest.mark.long

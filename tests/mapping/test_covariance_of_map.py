@@ -74,7 +74,7 @@ def test_frames_are_counted_from_the_first_one_in_the_map():
 
 def test_a_saved_map_is_exact_and_what_a_run_adds_to_it_is_not():
     """Of 20 frames; two are lost before the camera is found, and then four are nodes."""
-    end = SimpleNamespace(first_node=20, poses=[np.eye(4)] * 24)
+    end = SimpleNamespace(first_node=20, nodes=[None] * 24)
     lost = [FrameRecord(row, None, None, "lost", pose=np.eye(4)) for row in range(2)]
     run = MappingRun(None, None, records=(*lost, *mapped().records[1:5]), saved=object(), back_end=end)
     there, T = run.records[3], walk()[6]

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from walks import NEVER_FOUND, Apart, Visited, config, mapped, prior_of, same_run, walk
 
 from emgs_jax.back_end.saved_map import load_saved_map
-from emgs_jax.back_end.state import BackEnd
+from emgs_jax.back_end.state import BackEnd, Node
 from emgs_jax.data.base import Frame
 from emgs_jax.geometry import Sim3, pose_difference
 from emgs_jax.io.map_file import load_map
@@ -48,14 +48,14 @@ def test_parts_of_other_frames_and_units_are_joined_where_they_meet_the_map():
     assert [row for row, location in enumerate(said) if location == "segment"] == list(STARTS)
     one, other = (row for row, location in enumerate(said) if location == "joined")
     assert STARTS[1] < one < other and "anew" not in said, "the prior knows the motion from 0 to 78"
-    for pose, online, record in zip(end.poses, end.online, run.records, strict=True):
-        for found in (pose, online, record.pose):
+    for node, record in zip(end.nodes, run.records, strict=True):
+        for found in (node.pose, node.online, record.pose):
             distance, turn = pose_difference(found, record.true_pose)
             assert distance < 0.03 and turn < 1.0, record.index
     np.testing.assert_allclose(np.exp(end.log_scales), 1 / np.array(UNITS)[PART], rtol=0.02)
     np.testing.assert_allclose(Sim3.from_matrix(run.records[one].similarity).scale, 1 / UNITS[2], rtol=0.02)
     np.testing.assert_allclose(Sim3.from_matrix(run.records[other].similarity).scale, UNITS[1], rtol=0.02)
-    assert not run.inactive and set(end.submap_ids) == {0}
+    assert not run.inactive and {node.submap for node in end.nodes} == {0}
     metrics = score_back_end(run)
     assert metrics["location/segment"] == metrics["location/joined"] == 2
 
@@ -111,7 +111,7 @@ def test_of_parts_that_never_meet_the_one_with_most_placed_frames_is_the_map(tmp
         assert (record.submap is None) == (row in kept)
     births = np.asarray(run.map.birth)[np.asarray(run.map.gaussians.valid)]
     assert len(births) > 0 and set(births) <= set(kept)
-    assert run.back_end.is_placed == [row in kept for row in range(len(numbers))]
+    assert [node.is_placed for node in run.back_end.nodes] == [row in kept for row in range(len(numbers))]
     assert {edge.a for edge in run.back_end.factors} <= set(kept)
     assert {one.frame for one in run.back_end.database.keyframes} == set(kept)
     save_progress(tmp_path, run)
@@ -160,10 +160,10 @@ def test_without_a_back_end_frames_without_a_relation_are_lost_as_those_of_which
 
 def test_what_holds_two_parts_together_is_as_sure_as_the_place_was_in_its_unit_then():
     """The place was found to 1 cm in the map as it was then, whichever of the two has moved since."""
-    poses, unit = [np.eye(4) for _ in range(3)], 0.4
-    poses[2][:3, 3] = 1.0, 2.0, 3.0
-    scales = [0.1, np.log(2.0), np.log(3.0)]
-    end = BackEnd(config().graph, (300.0, 300.0, 160.0, 120.0), 0.0, poses=poses, log_scales=scales)
+    poses, unit, scales = np.tile(np.eye(4), (3, 1, 1)), 0.4, (0.1, np.log(2.0), np.log(3.0))
+    poses[2, :3, 3] = 1.0, 2.0, 3.0
+    nodes = [Node(pose, pose, scale, row) for row, (pose, scale) in enumerate(zip(poses, scales, strict=True))]
+    end = BackEnd(config().graph, (300.0, 300.0, 160.0, 120.0), 0.0, nodes)
     edge = join_factor(end, RelocalizedPose(np.eye(4), 0.0, 1e-4 * np.eye(7), 1), unit)
     assert (edge.a, edge.b) == (1, 2) and edge.log_ratio == pytest.approx(np.log(1.5))
     np.testing.assert_allclose(edge.Z_a_b[:3, 3], [0.5, 1.0, 1.5])

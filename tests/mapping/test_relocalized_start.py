@@ -63,7 +63,7 @@ def some_map():
 
 
 def run(state: SlamState | None = None, saved_map=None, **more) -> SimpleNamespace:
-    end = SimpleNamespace(poses=[np.eye(4)] * 7, config=load_config("graph=default").graph)
+    end = SimpleNamespace(nodes=[None] * 7, config=load_config("graph=default").graph)
     saved = None if saved_map is None else SimpleNamespace(map=saved_map, back_end=end, depth_noise=0.02)
     return SimpleNamespace(state=state, saved=saved, back_end=end, **more)
 
@@ -174,9 +174,10 @@ def begins_anew(
     """The last five of eight frames, the given one included, are not tracked; without changes all speaks for it."""
     config = load_config("graph=default", f"graph.relocalization.max_patience={patience}")
     poses = np.stack([matrix((0, 0, 0), (0.1 * k, 0, 0)) for k in range(8)])
-    end = SimpleNamespace(poses=list(poses[:7]), config=config.graph)
+    end = SimpleNamespace(
+        nodes=[SimpleNamespace(is_placed=row < 3) for row in range(7)], config=config.graph, first_node=0
+    )
     end.factors = [SimpleNamespace(a=a, b=b, is_loop=False) for a, b in chain]
-    end.is_placed, end.first_node = [True] * 3 + [False] * 4, 0
     statuses = ["initialization", "tracked", "tracked", *["degraded"] * 4]
     records = [FrameRecord(row, None, None, status) for row, status in enumerate(statuses)]
     found = SimpleNamespace(is_tracked=False, repeat_rms=repeat_rms)

@@ -148,6 +148,6 @@ def same_run(one: MappingRun, other: MappingRun) -> None:
     assert_same(jax.device_get(one.state), jax.device_get(other.state))
     np.testing.assert_array_equal(one.poses, other.poses)
     np.testing.assert_array_equal(one.back_end.poses, other.back_end.poses)
-    assert one.back_end.submap_ids == other.back_end.submap_ids
+    assert [node.submap for node in one.back_end.nodes] == [node.submap for node in other.back_end.nodes]
     for name in ("location", "status"):
         assert [getattr(record, name) for record in one.records] == [getattr(record, name) for record in other.records]

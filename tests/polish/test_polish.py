@@ -23,7 +23,7 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.fit import Rates, Views, fit, is_held_out, locate
 from emgs_jax.polish.seeds import Seeds
 from emgs_jax.polish.splats import Anchors, Appearance, Shot, draw, gaussians_of, initial, loss, ssim
-from emgs_jax.report.polish import polish
+from emgs_jax.report.polish import polish, target_of
 from emgs_jax.report.printout import polish_lines
 from emgs_jax.report.recorded_run import read_run
 from experiments.polish import polish_run
@@ -242,6 +242,13 @@ def test_ssim_is_one_of_equal_images_and_that_of_the_formula_in_a_slow_loop():
             vp, vq, c = ((window * u * v).sum() - m for u, v, m in ((p, p, mp**2), (q, q, mq**2), (p, q, mp * mq)))
             values.append((2 * mp * mq + 1e-4) * (2 * c + 9e-4) / ((mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4)))
     np.testing.assert_allclose(ssim(a, b), np.mean(values), atol=1e-5)
+
+
+def test_a_depth_that_a_half_float_does_not_hold_is_none():
+    """A room in millimetres, and what lies 70 m away."""
+    depth = np.float32([[2000.0, 70000.0]])
+    target = target_of(np.zeros((1, 2, 3)), SimpleNamespace(valid=depth > 0, depth=depth))
+    np.testing.assert_array_equal(target[..., 3], [[2000.0, 0.0]])
 
 
 SHORT = ("polish.steps=2", "polish.held_out_every=3", "polish.loss.render.tile_capacity=256")

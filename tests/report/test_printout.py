@@ -64,7 +64,8 @@ def test_a_remedy_names_keys_that_there_are():
 
 
 def test_what_moves_is_said():
-    given = [FrameRecord(row, f"a/{row}.png", 0.0, "tracked", moving=share) for row, share in enumerate((0, 0.2, 0.004))]
+    shares = {"a/0.png": 0.0, "a/1.png": 0.2, "a/2.png": 0.004}
+    given = [FrameRecord(0, name, 0.0, "tracked", moving=share) for name, share in shares.items()]
     _, said = frame_lines(given, 0)
     assert said.startswith("in 1 frames something moves, most of it in 1.png (20 % of the pixels)")
 

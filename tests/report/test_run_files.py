@@ -154,9 +154,8 @@ def test_the_overview_shows_the_true_path_where_the_estimate_fits_it_best(with_s
 def test_the_overview_shows_loops_between_the_frames_of_the_back_end_and_the_path_before(tmp_path, drawn):
     run, later = finished(), poses_along(np.full(NUM_FRAMES - 2, 5.0))
     loops = [SimpleNamespace(a=3, b=5), SimpleNamespace(a=1, b=5)]  # the first three nodes are a saved map's
-    poses = [np.eye(4)] * 3 + [*later]
-    online = [pose + 1.0 for pose in poses]
-    run.back_end = SimpleNamespace(accepted=loops, closures=[None], poses=poses, online=online, first_node=3)
+    nodes = [SimpleNamespace(online=pose + 1.0) for pose in (*[np.eye(4)] * 3, *later)]
+    run.back_end = SimpleNamespace(accepted=loops, closures=[None], nodes=nodes, first_node=3)
     save_outputs(tmp_path, run, dense_map(), densify_config(), "a wall", True)
     run.back_end.closures = []  # as where frames are only located in a saved map: its loops are there, and no node
     save_outputs(tmp_path, run, dense_map(), densify_config(), "a wall", True)

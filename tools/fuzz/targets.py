@@ -354,8 +354,8 @@ def empty_back_end() -> BackEnd:
 
 def read_places(folder: Path) -> None:
     end, _ = load_places(folder / "places.npz", empty_back_end())
-    assert np.isfinite(end.poses).all() and len(end.poses) == len(end.is_placed) == end.first_node
-    assert all(0 <= one.frame < len(end.poses) for one in end.database.keyframes)
+    assert np.isfinite(end.poses).all() and len(end.nodes) == end.first_node
+    assert all(0 <= one.frame < len(end.nodes) for one in end.database.keyframes)
 
 
 def write_cloud(folder: Path) -> None:
