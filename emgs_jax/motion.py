@@ -39,7 +39,7 @@ class Looks(eqx.Module):
     """Free space of the last tracked frames, newest first.
 
     Args:
-        depth: of each, nearest and farthest z (m) among a pixel and its eight neighbours; NaN where it has none.
+        depth: of each, nearest and farthest z (m) among a pixel and its eight neighbours; 0 where it has none.
         moving: pixels that were taken for moving: they are no evidence that something stands there.
         T_previous_look: of each camera, in that of the last frame: however the map moves, they stay as they are.
     """
@@ -58,7 +58,7 @@ def no_looks(view: Observation, config: MotionConfig) -> Looks | None:
     if config.num_looks == 0:
         return None
     size, poses = view.valid.shape[-1], jnp.tile(jaxlie.SE3.identity().wxyz_xyz, (config.num_looks, 1))
-    depth, moving = jnp.full((config.num_looks, 2, size), jnp.nan), jnp.zeros((config.num_looks, size), bool)
+    depth, moving = jnp.zeros((config.num_looks, 2, size)), jnp.zeros((config.num_looks, size), bool)
     return Looks(depth, moving, jaxlie.SE3(poses))
 
 
@@ -80,7 +80,8 @@ def look_again(
     T_camera_previous = T_world_camera.inverse() @ T_world_previous
     old = jax.vmap(lambda look: (T_camera_previous @ jaxlie.SE3(look)).wxyz_xyz)(looks.T_previous_look.wxyz_xyz)
     poses = jnp.concatenate([jaxlie.SE3.identity().wxyz_xyz[None], old[:-1]])
-    depth = jnp.concatenate([depth_range(view, T_world_camera, camera)[None], looks.depth[:-1]])
+    newest = jnp.nan_to_num(depth_range(view, T_world_camera, camera))
+    depth = jnp.concatenate([newest[None], looks.depth[:-1]])
     marked = jnp.concatenate([moving[None], looks.moving[:-1]])
     is_look = jnp.any(view.valid)
     depth, marked = jnp.where(is_look, depth, looks.depth), jnp.where(is_look, marked, looks.moving)
@@ -121,7 +122,7 @@ def find_movers(
         gap = jnp.maximum(jnp.maximum(before, behind), 0.0) / jnp.maximum(std, NEAREST_DEPTH)
         found = jnp.maximum(config.hit - 0.5 * gap**2, jnp.where(before > 0, -config.miss, 0.0))
         found = jnp.where(moving[index], jnp.minimum(found, 0.0), found)
-        is_seen = inside & (z > NEAREST_DEPTH) & jnp.isfinite(nearest[index])
+        is_seen = inside & (z > NEAREST_DEPTH) & (nearest[index] > 0)
         return jnp.where(is_seen, found, 0.0)
 
     ratios = jax.vmap(ratio)((looks.depth, looks.moving, looks.T_previous_look.wxyz_xyz))

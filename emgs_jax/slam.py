@@ -253,7 +253,8 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
         prediction, state.previous, state.T_world_previous, state.estimate, view, config.localization
     )
     submap = _select(state.map, state.previous, guess, config.submap)
-    moving = _find_movers(current, state, coarse, view, config.motion)
+    noise = state.estimate.depth_noise
+    moving = _find_movers(state.looks, current, state.T_world_previous, coarse, noise, view, config.motion)
     frame = _localize_fine(current, moving, submap, coarse, state.time, config.localization)
     fused = _fuse(submap, frame, view, num_rows, config.fusion)
     candidates, weight = cluster(fused.unexplained, _order(view), num_rows, config.fit)
@@ -302,18 +303,9 @@ def _select(map: GaussianMap, previous: Observation, guess: Observation, config:
     return Submap(submap, rows, index_of(submap.gaussians), overflow)
 
 
-def _find_movers(
-    current: Observation, state: SlamState, coarse: CoarsePose, view: Camera, config: MotionConfig
-) -> Bool[Array, "p"]:
-    if state.looks is None:
-        return jnp.zeros(current.valid.shape, bool)
-    noise = state.estimate.depth_noise
-    return _movers(state.looks, current, state.T_world_previous, coarse, noise, view, config)
-
-
 @executable
-def _movers(
-    looks: Looks,
+def _find_movers(
+    looks: Looks | None,
     current: Observation,
     T_world_previous: jaxlie.SE3,
     coarse: CoarsePose,
@@ -322,6 +314,8 @@ def _movers(
     config: MotionConfig,
 ) -> Bool[Array, "p"]:
     """What moves in a frame at its coarse pose; `depth_noise` is that of the frame before."""
+    if looks is None:
+        return jnp.zeros(current.valid.shape, bool)
     points = transform(jaxlie.SE3.identity(), current, coarse.scale)
     estimate = replace(coarse.estimate, depth_noise=depth_noise)
     T_previous_camera = T_world_previous.inverse() @ coarse.T_world_camera

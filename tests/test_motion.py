@@ -90,7 +90,7 @@ def test_free_space_decides_what_moves(case, settings):
     views, now, more, expected = CASES[case]
     looks = after(views, settings, more.get("masks", ()))
     if case == "a place that no look shows":
-        looks = eqx.tree_at(lambda k: k.depth, looks, np.where(np.asarray(looks.depth) < 0.5, np.nan, looks.depth))
+        looks = eqx.tree_at(lambda k: k.depth, looks, np.where(np.asarray(looks.depth) < 0.5, 0.0, looks.depth))
     said = found(looks, now, settings, **{key: value for key, value in more.items() if key != "masks"})
     kernel = np.lib.stride_tricks.sliding_window_view(np.pad(expected, 2, mode="edge"), (5, 5))
     is_sure = kernel.all((2, 3)) | ~kernel.any((2, 3))  # the outline may be either
