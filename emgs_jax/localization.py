@@ -15,6 +15,7 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.linalg import safe_normalize
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
+from emgs_jax.registration.depth_field import DepthField, field_at
 from emgs_jax.registration.icp import IcpInfo, icp
 from emgs_jax.registration.noise import levels_of
 from emgs_jax.registration.pose_estimate import (
@@ -282,6 +283,12 @@ def localize_coarse(
     return CoarsePose(coarse, newest, scale, repeat_rms, mean_depth, depth_noise, estimate, is_finite, is_usable)
 
 
+def _corrected(current: Observation, field: DepthField, is_tracked: Bool[Array, ""]) -> Observation:
+    """The points of a frame without its field of depth errors: x exp(-f)."""
+    factor = jnp.exp(-jnp.where(is_tracked, field_at(field, current.points), 0.0))
+    return eqx.tree_at(lambda o: o.points, current, current.points * factor[:, None])
+
+
 @full_precision
 def localize_fine(
     current: Observation,
@@ -319,7 +326,7 @@ def localize_fine(
     is_tracked = ~jnp.any(failed)
     T = jaxlie.SE3(jnp.where(is_tracked, fine.wxyz_xyz, coarse.T_world_camera.wxyz_xyz))
     scale = coarse.scale * jnp.where(is_tracked, scale, 1.0)
-    aligned = transform(T, current, scale)
+    aligned = transform(T, _corrected(current, info.field, is_tracked), scale)
     aligned = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & coarse.is_usable)
     bits = jnp.sum(failed * 2 ** jnp.arange(failed.shape[0]))
     estimate, by_map = correct_by_points(coarse.estimate, info, coarse.depth_noise, scale, is_tracked, config.num_alike)

@@ -33,6 +33,7 @@ from emgs_jax.ops.neighbours import group_points, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, static_choice, take_rows
 from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
+from emgs_jax.registration.depth_field import moved_by_field
 from emgs_jax.registration.pose_estimate import PoseEstimate, exact_estimate
 from emgs_jax.registration.rigid import median, pose_row
 from emgs_jax.splitting import SplittingConfig, split
@@ -358,6 +359,14 @@ def _fuse(submap: Submap, frame: Frame, view: Camera, num_rows: int, config: Fus
     explained_by, noise = take_rows(submap.map, owned), frame.localization.noise
     moved = extrapolate(trusted, explained_by, explained.is_fused, noise, T, view, config.extrapolation)
     unexplained = eqx.tree_at(lambda o: o.valid, moved, trusted.valid & ~explained.is_fused)
+    # The frame was moved onto the map, the mean of W frames: 1 / (W + 1) of what they differ is the map's own error.
+    weight = median(explained_by.weight, explained.is_fused)
+    share = jnp.where(frame.localization.is_tracked & (info.num_fused > 0), 1.0 / (weight + 1.0), 0.0)
+    # All of the image alike, fused or not, so that no surface tears.
+    places = lambda s: (s[0].gaussians.means, s[1].gaussians.means, s[2].points)  # noqa: E731
+    surface = map, halves, unexplained
+    means = [moved_by_field(points, frame.localization.icp.field, share, T) for points in places(surface)]
+    map, halves, unexplained = eqx.tree_at(places, surface, tuple(means))
     return Fused(map, halves, unexplained, origin, info)
 
 

@@ -10,6 +10,7 @@ from emgs_jax.observation import Observation
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import traced
+from emgs_jax.registration.depth_field import depth_errors
 
 LEAST_POWER = 1e-18  # of errors, squared logarithms of depth; less are rounding, and say nothing of each other
 
@@ -37,16 +38,10 @@ def depth_error(
     center: Float[Array, "3"],
     config: ExtrapolationConfig,
 ) -> tuple[Float[Array, "p"], Bool[Array, "p"]]:
-    """log of each point's depth over that at which its ray meets the plane of its Gaussian, and where that is known.
-
-    ρ = log(n·(x - c) / n·(μ - c)), as in the fine step (R9); 0 where it is unknown.
-    """
-    gaussians, rays = explained_by.gaussians, points - center
-    seen = jnp.sum(gaussians.normals * rays, axis=-1)
-    expected = jnp.sum(gaussians.normals * (gaussians.means - center), axis=-1)
-    is_known = is_fused & (jnp.abs(seen) >= config.min_cos * jnp.linalg.norm(rays, axis=-1)) & (seen * expected > 0)
-    error = jnp.log(jnp.where(is_known, seen, 1.0) / jnp.where(is_known, expected, 1.0))
-    is_known &= jnp.abs(error) <= config.max_error
+    """`depth_errors` of the points that were fused, as far as they are no other surface, and where; 0 elsewhere."""
+    gaussians = explained_by.gaussians
+    error, is_known = depth_errors(points, gaussians.means, gaussians.normals, center, config.min_cos)
+    is_known &= is_fused & (jnp.abs(error) <= config.max_error)
     return jnp.where(is_known, error, 0.0), is_known
 
 

@@ -14,8 +14,9 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import GaussianIndex, Gaussians
-from emgs_jax.observation import Observation
+from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.precision import full_precision
+from emgs_jax.registration.depth_field import DepthField, depth_errors, depth_field
 from emgs_jax.registration.matching import Candidates, Matches, surface_of
 from emgs_jax.registration.noise import level_edges, levels_of, noise_of_levels, num_independent
 from emgs_jax.registration.problem import (
@@ -35,6 +36,8 @@ from emgs_jax.registration.problem import (
     residuals,
 )
 
+MIN_COS = 0.3  # of a point's ray and its Gaussian's normal, for its depth error to be known
+
 _Carry: TypeAlias = tuple[Float[Array, "7"], Uncertainty]
 
 
@@ -53,6 +56,7 @@ class IcpInfo(eqx.Module):
         num_effective: how many independent measurements the points are worth, see `num_independent`.
         min_eigenvalue: of the pose's information by prior, planes and colours together, for translations in median
             depths and rotations in rad: the variance of its least certain direction is one over it.
+        field: of the frame's depth errors, see `depth_field`.
         num_steps: of all solves.
         is_converged: False where the last solve reached `max_steps` or failed.
     """
@@ -66,6 +70,7 @@ class IcpInfo(eqx.Module):
     information: Float[Array, "7 7"]
     num_effective: Float[Array, ""]
     min_eigenvalue: Float[Array, ""]
+    field: DepthField
     num_steps: Int[Array, ""]
     is_converged: Bool[Array, ""]
 
@@ -126,6 +131,14 @@ def _search_and_solve(
     return (y, uncertainty), (candidates, solution.stats["num_steps"], is_converged)
 
 
+def _field(T: jaxlie.SE3, scale: Float[Array, ""], matches: Matches, problem: Problem, config: IcpConfig) -> DepthField:
+    """The smooth part of what the points differ from their Gaussians, also of those too far from them to fit."""
+    placed = transform(T, problem.source, scale)
+    errors, is_known = depth_errors(placed.points, matches.means, matches.normals, T.translation(), MIN_COS)
+    is_known &= placed.valid & (jnp.abs(errors) < config.max_field)
+    return depth_field(problem.source.points, errors, problem.depth_noise, is_known, config.field_length)
+
+
 @full_precision
 def icp(
     source: Observation,
@@ -182,6 +195,7 @@ def icp(
         information=data_information(y, matches, problem, config),
         num_effective=seen.num_effective,
         min_eigenvalue=least_information(information(T, scale, matches, problem, config), problem),
+        field=_field(T, scale, matches, problem, config),
         num_steps=jnp.sum(rounds[1]),
         is_converged=is_converged,
     )

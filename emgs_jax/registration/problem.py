@@ -39,6 +39,9 @@ class IcpConfig(eqx.Module):
             0 = no prior, the printed form.
         scale_noise: standard deviation of the logarithm of the scale about the coarse step's, in units of the points'
             depth noise, where nothing else is known of it; 0 = no scale (printed).
+        max_field: of a logarithm of depth; what differs more from the map is another surface, and says nothing of the
+            field of a frame's depth errors; 0: none is sought (printed).
+        field_length: over which these errors are alike, as a fraction of the image's side.
         num_points: how many points take part at least: every n-th of them, with the largest n that leaves so many.
         num_searches: how often the Gaussians near every point are looked up, each time with a solve after it.
         num_neighbours: Gaussians near a point, which every step of a solve compares.
@@ -54,6 +57,8 @@ class IcpConfig(eqx.Module):
     min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
     prior_information: Float[Array, "*b"] = traced(low=0, high=1e9)
     scale_noise: Float[Array, "*b"] = traced(low=0, high=1000)
+    max_field: Float[Array, "*b"] = traced(low=0, high=10)
+    field_length: Float[Array, "*b"] = traced(low=1e-3, high=100)
     num_points: int = static(low=1, high=2**24)
     num_searches: int = static(low=1, high=100)
     num_neighbours: int = static(low=1, high=256)

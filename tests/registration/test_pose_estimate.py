@@ -8,6 +8,7 @@ import pytest
 from scene import device, on_host, pose, replace
 
 from emgs_jax.registration import pose_estimate
+from emgs_jax.registration.depth_field import DepthField
 from emgs_jax.registration.icp import IcpInfo
 from emgs_jax.registration.pose_estimate import exact_estimate
 
@@ -104,7 +105,8 @@ def test_the_root_measures_the_mahalanobis_distance():
 def found_with(information: np.ndarray, misfit: float = 0.04) -> IcpInfo:
     zero, one = device(0.0), device(np.int32(1))
     numbers = zero, zero, device(misfit), device(np.zeros(8)), device(np.zeros(7)), device(information), zero, zero
-    return IcpInfo(one, *numbers, one, device(True))
+    field = DepthField(*map(device, (np.zeros((5, 5)), np.zeros(2), np.zeros(2))))
+    return IcpInfo(one, *numbers, field, one, device(True))
 
 
 def test_a_pose_that_is_given_keeps_its_weight_and_its_unit_and_has_little_of_the_maps_error():

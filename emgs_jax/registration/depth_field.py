@@ -1,0 +1,137 @@
+"""Depth field: the part of a frame's depth error that is smooth over its image."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float
+
+from emgs_jax.ops.precision import full_precision
+
+NUM_NODES = 5  # along each side of the image
+NUM_ROUNDS = 3  # of weights and field in turn
+NUM_ALIKE = 20.0  # neighbouring points that err alike, beside the field: so many count as one
+LEAST_SIDE = 1e-6  # of the image, in focal lengths
+
+
+class DepthField(eqx.Module):
+    """Field f of the logarithm of depth, bilinear between nodes over a part of the image plane; 0 corrects nothing.
+
+    Args:
+        nodes: f, by x and y.
+        low: (x/z, y/z) of the first node.
+        high: of the last one.
+    """
+
+    nodes: Float[Array, "*b n n"]
+    low: Float[Array, "*b 2"]
+    high: Float[Array, "*b 2"]
+
+
+def depth_errors(
+    points: Float[Array, "p 3"],
+    means: Float[Array, "p 3"],
+    normals: Float[Array, "p 3"],
+    center: Float[Array, "3"],
+    min_cos: Float[Array, ""] | float,
+) -> tuple[Float[Array, "p"], Bool[Array, "p"]]:
+    """Log of each point's depth over that at which its ray meets the plane of its Gaussian, and where that is known.
+
+    ρ = log(n·(x - c) / n·(μ - c)), as in the fine step (R9); 0 where it is unknown.
+
+    Args:
+        points: world frame.
+        means: of the Gaussian of every point.
+        center: of the camera.
+        min_cos: between normal and ray; a more grazing view does not show where along it the plane lies.
+    """
+    seen = jnp.sum(normals * (points - center), axis=-1)
+    expected = jnp.sum(normals * (means - center), axis=-1)
+    is_steep = jnp.abs(seen) >= min_cos * jnp.linalg.norm(points - center, axis=-1)
+    is_known = is_steep & (seen * expected > 0)
+    return jnp.log(jnp.where(is_known, seen, 1.0) / jnp.where(is_known, expected, 1.0)), is_known
+
+
+def image_plane(points: Float[Array, "p 3"]) -> Float[Array, "p 2"]:
+    """(x/z, y/z) of camera-frame points; of no meaning behind the camera."""
+    return points[:, :2] / jnp.where(points[:, 2:] > 0, points[:, 2:], 1.0)
+
+
+def node_weights(points: Float[Array, "p 3"], low: Float[Array, "2"], high: Float[Array, "2"]) -> Float[Array, "p n n"]:
+    """Bilinear weights of the nodes at camera-frame points; beyond the last node its value goes on."""
+    place = (image_plane(points) - low) / jnp.maximum(high - low, LEAST_SIDE)
+    place = jnp.clip(place, 0.0, 1.0) * (NUM_NODES - 1)
+    along = jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.arange(NUM_NODES)), 0.0)
+    return along[:, 0, :, None] * along[:, 1, None, :]
+
+
+@full_precision
+def depth_field(
+    points: Float[Array, "p 3"],
+    errors: Float[Array, "p"],
+    noise: Float[Array, "p"],
+    valid: Bool[Array, "p"],
+    length: Float[Array, ""],
+) -> DepthField:
+    """Estimate the field of a frame from how far its points are from the map, as a Gaussian process on the nodes.
+
+    A network errs by a scale that drifts and by a field that is smooth over the image, ρ = B f + noise, with bilinear
+    weights B and the precision W = 1 / (σ² + (ρ - B f)²/4) / `NUM_ALIKE` of each point, Cauchy's:
+
+        f = K (1 + B'WB K)⁻¹ B'W ρ,   K = v exp(-½ |i - j|² / length²)
+
+    v is the variance of the nodes' weighted means beyond that by chance.
+    Where errors are not alike v is 0, and nothing is corrected. The matching with the map is the caller's.
+
+    Args:
+        points: camera frame.
+        errors: ρ, log of each point's depth over that of the map along its ray.
+        noise: σ of each error beside the field; above 0.
+        valid: which errors are known.
+        length: over which the field is alike, as a fraction of the image's side.
+    """
+    is_before = valid & (points[:, 2] > 0)
+    plane = image_plane(points)
+    low = jnp.min(plane, axis=0, where=is_before[:, None], initial=jnp.inf)
+    high = jnp.max(plane, axis=0, where=is_before[:, None], initial=-jnp.inf)
+    has_any = jnp.any(is_before)
+    low, high = jnp.where(has_any, low, 0.0), jnp.where(has_any, high, 0.0)
+
+    errors, noise = jnp.where(is_before, errors, 0.0), jnp.where(is_before, noise, 1.0)
+    basis = node_weights(points, low, high).reshape(-1, NUM_NODES**2)
+    place = jnp.stack(jnp.meshgrid(*[jnp.linspace(0.0, 1.0, NUM_NODES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    apart = jnp.sum((place - place[:, None]) ** 2, axis=-1)
+
+    def fit(nodes: Float[Array, "n"], _: None) -> tuple[Float[Array, "n"], None]:
+        precision = is_before / (noise**2 + (0.5 * (errors - basis @ nodes)) ** 2) / NUM_ALIKE
+        weighted = basis * precision[:, None]
+        total = jnp.sum(weighted, axis=0)
+        is_seen = total > 0
+        mean = errors @ weighted / jnp.where(is_seen, total, 1.0)
+        share = total / jnp.where(has_any, jnp.sum(total), 1.0)
+        chance = jnp.sum(share * is_seen / jnp.where(is_seen, total, 1.0))
+        variance = jnp.maximum(jnp.sum(share * mean**2) - chance, 0.0)
+        prior = variance * jnp.exp(-0.5 * apart / length**2)
+        known = weighted.T @ basis @ prior
+        return prior @ jnp.linalg.solve(jnp.eye(NUM_NODES**2) + known, errors @ weighted), None
+
+    nodes, _ = jax.lax.scan(fit, jnp.zeros(NUM_NODES**2), length=NUM_ROUNDS)
+    return DepthField(nodes.reshape(NUM_NODES, NUM_NODES), low, high)
+
+
+def field_at(field: DepthField, points: Float[Array, "p 3"]) -> Float[Array, "p"]:
+    """f where camera-frame points are seen; 0 behind the camera."""
+    weights = node_weights(points, field.low, field.high)
+    return jnp.where(points[:, 2] > 0, jnp.einsum("pij,ij->p", weights, field.nodes), 0.0)
+
+
+@full_precision
+def moved_by_field(
+    points: Float[Array, "p 3"], field: DepthField, share: Float[Array, ""], T_world_camera: jaxlie.SE3
+) -> Float[Array, "p 3"]:
+    """Move world-frame points that the camera sees between the outermost nodes: x <- x + (x - c) (exp(f share) - 1)."""
+    rays = points - T_world_camera.translation()
+    seen = rays @ T_world_camera.rotation().as_matrix()
+    plane = image_plane(seen)
+    is_within = jnp.all((plane >= field.low) & (plane <= field.high), axis=-1)
+    return points + rays * jnp.expm1(share * jnp.where(is_within, field_at(field, seen), 0.0))[:, None]
