@@ -7,8 +7,10 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from emgs_jax.ops.precision import full_precision
+from emgs_jax.registration.noise import robust_std
 
 NUM_NODES = 5  # along each side of the image
+LEAST_SPREAD = 1e-3  # of errors beside the field, in units of their noise
 NUM_ROUNDS = 3  # of weights and field in turn
 NUM_ALIKE = 20.0  # neighbouring points that err alike, beside the field: so many count as one
 LEAST_SIDE = 1e-6  # of the image, in focal lengths
@@ -65,6 +67,12 @@ def node_weights(points: Float[Array, "p 3"], low: Float[Array, "2"], high: Floa
     return along[:, 0, :, None] * along[:, 1, None, :]
 
 
+def _node_means(errors: Float[Array, "p"], weights: Float[Array, "p n"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """Weighted mean of the errors around each node, 0 where there are none, and the sum of the weights."""
+    total = jnp.sum(weights, axis=0)
+    return errors @ weights / jnp.where(total > 0, total, 1.0), total
+
+
 @full_precision
 def depth_field(
     points: Float[Array, "p 3"],
@@ -76,7 +84,8 @@ def depth_field(
     """Estimate the field of a frame from how far its points are from the map, as a Gaussian process on the nodes.
 
     A network errs by a scale that drifts and by a field that is smooth over the image, ρ = B f + noise, with bilinear
-    weights B and the precision W = 1 / (σ² + (ρ - B f)²/4) / `NUM_ALIKE` of each point, Cauchy's:
+    weights B and the precision W = 1 / (σ² + (ρ - B f)²/4) / `NUM_ALIKE` of each point, Cauchy's, where σ is the given
+    noise, or a smaller multiple of it if that is how ρ - B f spreads:
 
         f = K (1 + B'WB K)⁻¹ B'W ρ,   K = v exp(-½ |i - j|² / length²)
 
@@ -103,19 +112,20 @@ def depth_field(
     apart = jnp.sum((place - place[:, None]) ** 2, axis=-1)
 
     def fit(nodes: Float[Array, "n"], _: None) -> tuple[Float[Array, "n"], None]:
-        precision = is_before / (noise**2 + (0.5 * (errors - basis @ nodes)) ** 2) / NUM_ALIKE
-        weighted = basis * precision[:, None]
-        total = jnp.sum(weighted, axis=0)
+        rest = (errors - basis @ nodes) / noise
+        spread = jnp.clip(robust_std(rest, is_before), LEAST_SPREAD, 1.0)
+        precision = is_before / (noise**2 * (spread**2 + (0.5 * rest) ** 2)) / NUM_ALIKE
+        mean, total = _node_means(errors, basis * precision[:, None])
         is_seen = total > 0
-        mean = errors @ weighted / jnp.where(is_seen, total, 1.0)
         share = total / jnp.where(has_any, jnp.sum(total), 1.0)
         chance = jnp.sum(share * is_seen / jnp.where(is_seen, total, 1.0))
         variance = jnp.maximum(jnp.sum(share * mean**2) - chance, 0.0)
         prior = variance * jnp.exp(-0.5 * apart / length**2)
-        known = weighted.T @ basis @ prior
-        return prior @ jnp.linalg.solve(jnp.eye(NUM_NODES**2) + known, errors @ weighted), None
+        known = basis.T @ (basis * precision[:, None]) @ prior
+        return prior @ jnp.linalg.solve(jnp.eye(NUM_NODES**2) + known, (errors * precision) @ basis), None
 
-    nodes, _ = jax.lax.scan(fit, jnp.zeros(NUM_NODES**2), length=NUM_ROUNDS)
+    first, _ = _node_means(errors, basis * (is_before / noise**2)[:, None])
+    nodes, _ = jax.lax.scan(fit, first, length=NUM_ROUNDS)
     return DepthField(nodes.reshape(NUM_NODES, NUM_NODES), low, high)
 
 
