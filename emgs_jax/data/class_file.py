@@ -1,7 +1,7 @@
 """Names of classes from a file, and which ids of a data set they stand for.
 
-Three layouts are read: a name a line; `id name` a line; and the YAML of OVO's evaluation (`class_names_reduced`,
-`map_to_reduced` and `class_names`). In text `#` begins a comment.
+Three layouts are read: a name a line; `id name` or `id,name` a line; and the YAML of OVO's evaluation
+(`class_names_reduced`, `map_to_reduced` and `class_names`). In text `#` begins a comment.
 """
 
 import os
@@ -97,7 +97,7 @@ def _of_yaml(text: str) -> tuple[list[str], dict[int, int]]:
 
 def _of_lines(text: str) -> tuple[list[str], dict[int, int] | None]:
     lines = [line for line in (raw.split("#")[0].strip() for raw in text.splitlines()) if line]
-    rows = [re.fullmatch(r"(-?[0-9]{1,9})\s+(.+)", line) for line in lines]
+    rows = [re.fullmatch(r"(-?[0-9]{1,9})(?:\s*[,;]\s*|\s+)(.+)", line) for line in lines]
     if 2 * sum(row is not None for row in rows) <= len(rows):  # a name may begin with a number
         return [_word(line) for line in lines], None
     odd = [line for line, row in zip(lines, rows, strict=True) if row is None]

@@ -39,12 +39,12 @@ class SparseModel:
 
 
 def load_colmap(folder: Path) -> SparseModel:
-    """Read the cameras and images of a model, from text or from binary files.
+    """Read the cameras and images of a model, from binary files where they are there, as COLMAP does, else from text.
 
     Raises:
         ValueError: a line or a record is damaged, or there is no image with a pose.
     """
-    return (_load_text if all((folder / name).is_file() for name in TEXT) else _load_binary)(folder)
+    return (_load_binary if all((folder / name).is_file() for name in BINARY) else _load_text)(folder)
 
 
 class _Records:

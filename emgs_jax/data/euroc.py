@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from emgs_jax.data import reading
-from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.calibration_files import Calibration, kalibr_camera, numbers_of, parse_keys
 from emgs_jax.data.posed_images import Pose, PosedImages, Solved
 from emgs_jax.data.reading import Number
@@ -85,10 +84,7 @@ def body_poses(path: Path, times: np.ndarray, tolerance: float) -> list[Pose | N
 
 def read_sensor(path: Path) -> tuple[Calibration, Pose]:
     """The camera of a sensor.yaml and T_body_camera, which it calls T_BS."""
-    try:
-        values = parse_keys(reading.read_text(path), path)
-    except BadFrameError as error:
-        raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
+    values = parse_keys(reading.layout_text(path, LAYOUT), path)
     if "T_BS" not in values:
         raise ValueError(f"{path} has no T_BS, which a camera of EuRoC has: fetch it again")
     mounted = numbers_of(values["T_BS"], "T_BS", path)

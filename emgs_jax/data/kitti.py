@@ -77,7 +77,7 @@ def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:
 
 def read_rows(path: Path, count: int) -> list[str]:
     """The lines of a list that has one for every image."""
-    rows = _text(path).rstrip().splitlines()
+    rows = reading.layout_text(path, f"{LAYOUT} ({SOURCE})").rstrip().splitlines()
     if len(rows) != count:
         raise ValueError(f"{path} has {len(rows)} lines for {count} images: fetch the sequence and this file again")
     return rows
@@ -85,7 +85,8 @@ def read_rows(path: Path, count: int) -> list[str]:
 
 def read_projection(path: Path, key: str) -> tuple[Calibration, Float[np.ndarray, "4 4"]]:
     """The camera with the projection K [I | t] of calib.txt, and its pose T_first_camera beside the left grey one."""
-    lines = dict(line.split(":", 1) for line in _text(path).splitlines() if ":" in line)
+    text = reading.layout_text(path, f"{LAYOUT} ({SOURCE})")
+    lines = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
     if key not in lines:
         raise ValueError(f"{path} has no {key}: fetch the calibration files of the odometry benchmark")
     P = _numbers(lines[key], 12, f"{path}: {key}").reshape(3, 4)
@@ -117,10 +118,3 @@ def _numbers(text: str, count: int, where: str) -> Float[np.ndarray, " n"]:
     if len(values) != count or not np.isfinite(values).all():
         raise ValueError(f"{where} must be {count} finite numbers, got {text.strip()[:80]!r}: fetch it again")
     return values
-
-
-def _text(path: Path) -> str:
-    try:
-        return reading.read_text(path)
-    except BadFrameError as error:
-        raise FileNotFoundError(f"{error}; expected the layout {LAYOUT} ({SOURCE})") from error

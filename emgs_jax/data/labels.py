@@ -73,6 +73,7 @@ def as_unknown(unknown: Sequence[int] | None, key: str) -> tuple[int, ...] | Non
     """The ids of a config, None where it leaves them open; a ValueError names `key` where one is no whole number."""
     if unknown is None:
         return None
-    if isinstance(unknown, str) or any(not isinstance(id_, int) or id_ < 0 for id_ in unknown):
+    is_list = isinstance(unknown, Sequence) and not isinstance(unknown, str)
+    if not is_list or any(not isinstance(id_, int) or id_ < 0 for id_ in unknown):
         raise ValueError(f"{key} must be a list of ids, whole numbers from 0, got {unknown}")
     return tuple(unknown)

@@ -165,6 +165,14 @@ def read_text(path: Path) -> str:
     return read_bytes(path).decode("utf-8-sig", "replace")  # some editors put a mark before the first letter
 
 
+def layout_text(path: Path, layout: str) -> str:
+    """The text of a file of a data set's layout; FileNotFoundError, which says the layout, where it cannot be read."""
+    try:
+        return read_text(path)
+    except BadFrameError as error:
+        raise FileNotFoundError(f"{error}; expected the layout {layout}") from error
+
+
 def damage(data: bytes) -> str | None:
     """Describe the damage of an encoded image; None if its format shows none. Decoders fill missing parts with grey."""
     if data.startswith(b"\x89PNG\r\n\x1a\n"):
@@ -257,7 +265,7 @@ def read_color(path: Path, raw_size: Size | None = None, flags: int = 0) -> UInt
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def read_depth(path: Path, depth_scale: float, raw_size: Size) -> Float32[np.ndarray, "_ _"]:
+def read_depth(path: Path, depth_scale: float, raw_size: Size | None = None) -> Float32[np.ndarray, "_ _"]:
     """Depth in metres from a 16-bit image, 0 where it has no value (raw 0 and 65535, the sensors' two marks)."""
     raw = decode(path, cv2.IMREAD_UNCHANGED)
     if raw.dtype != np.uint16 or raw.ndim != 2:

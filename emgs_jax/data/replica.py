@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from emgs_jax.data import reading
-from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.calibration_files import Calibration
 from emgs_jax.data.file_names import natural_key
 from emgs_jax.data.intrinsics import Given, find_lens, pictures_of, to_lens
@@ -106,11 +105,13 @@ def depth_path(path: Path) -> Path:
 
 def read_rows(path: Path, images: list[Path]) -> list[str]:
     """The row of traj.txt for every image, still as text: image frame000012 belongs to row 12, from 0."""
-    try:
-        rows = reading.read_text(path).rstrip().splitlines()
-    except BadFrameError as error:
-        raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
-    last = max(number_of(p) for p in images)
+    text = reading.layout_text(path, LAYOUT).rstrip()
+    rows, last = [row for row in text.splitlines() if not row.lstrip().startswith("#")], max(map(number_of, images))
+    if not all(map(str.strip, rows)) and last < sum(map(bool, map(str.strip, rows))):
+        raise ValueError(
+            f"{path} has blank lines among its poses, so it is open which image those behind them are of: take the "
+            "lines out, or where an image has no pose write 16 times nan"
+        )
     if last >= len(rows):
         raise ValueError(f"{path} has {len(rows)} poses, but there is an image number {last}: fetch traj.txt again")
     return [rows[number_of(p)] for p in images]
@@ -119,11 +120,9 @@ def read_rows(path: Path, images: list[Path]) -> list[str]:
 def read_calibration(path: Path) -> tuple[Size, Intrinsics, float]:
     """Image size, intrinsics and depth scale from cam_params.json."""
     try:
-        camera = json.loads(reading.read_text(path))["camera"]
+        camera = json.loads(reading.layout_text(path, LAYOUT))["camera"]
         size = int(camera["w"]), int(camera["h"])
         fx, fy, cx, cy, scale = (float(camera[key]) for key in ("fx", "fy", "cx", "cy", "scale"))
-    except BadFrameError as error:
-        raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise ValueError(f'{path} must hold {{"camera": {{w, h, fx, fy, cx, cy, scale}}}}: {error!r}') from error
     scale = reading.check_depth_scale(scale, f"{path}: scale")

@@ -67,7 +67,9 @@ def with_angle_of_view(values: Mapping[str, Any], path: Path) -> Mapping[str, An
         size = [*reading.first_size(files, path, reading.AS_STORED)]
     width, height = size
     focal = width / (2 * math.tan(angle / 2))
-    return {"fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2, "w": width, "h": height} | dict(values)
+    high = values.get("camera_angle_y")
+    focal_y = height / (2 * math.tan(high / 2)) if _is_number(high) and 0 < high < math.pi else focal
+    return {"fl_x": focal, "fl_y": focal_y, "cx": width / 2, "cy": height / 2, "w": width, "h": height} | dict(values)
 
 
 def _is_number(value: Any) -> bool:

@@ -164,12 +164,8 @@ def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[l
     Lines of a '#' comment and empty lines do not count. With two columns the second is the name of a file beside the
     list, which may have spaces or stand in quotes.
     """
-    try:
-        lines = reading.read_text(path).splitlines()
-    except BadFrameError as error:
-        raise FileNotFoundError(f"{error}; expected the layout {LAYOUT}") from error
     times, words, numbers = [], [], []
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(reading.layout_text(path, LAYOUT).splitlines(), 1):
         row = line.replace(",", " ").split()
         if not row or row[0].startswith("#"):
             continue

@@ -39,8 +39,12 @@ def from_tum(values: np.ndarray) -> np.ndarray:
     return poses
 
 
-def load_trajectory_tum(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """Read a TUM trajectory: timestamps (n,) and T_world_camera (n, 4, 4), float64; `#` starts a comment."""
+def load_trajectory_tum(path: str | os.PathLike, may_lack: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Read a TUM trajectory: timestamps (n,) and T_world_camera (n, 4, 4), float64; `#` starts a comment.
+
+    Args:
+        may_lack: a pose of nan is one that is not known.
+    """
     rows = []
     for number, line in enumerate(Path(path).read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
         fields = line.split("#")[0].split()
@@ -48,6 +52,9 @@ def load_trajectory_tum(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray
             values = [float(field) for field in fields]
         except ValueError:
             values = [np.nan]
+        if may_lack and len(values) == 8 and np.isnan(values[1:]).all():
+            rows.append(values)
+            continue
         if fields and (len(values) != 8 or not np.isfinite(values).all()):
             raise ValueError(f"{path}:{number}: expected `timestamp tx ty tz qx qy qz qw`, got {line[:80]!r}")
         if fields and (np.abs(values[1:]).max() > MAX_VALUE or abs(np.linalg.norm(values[4:]) - 1) > MAX_NORM_ERROR):

@@ -70,8 +70,8 @@ def is_finished(folder: Path, config: Mapping[str, Any]) -> bool:
     if changed := changes(read_metrics(path)["provenance"]["config"], jsonable(config), _PLACES):
         raise ValueError(
             f"{path} was made with other settings ({'; '.join(changed[:3])}{'; …' * (len(changed) > 3)}): "
-            "give these settings another name (+variants.NAME=[…], method=NAME), choose another out=FOLDER or move the "
-            "folder away"
+            "give these settings another name (+variants.NAME={KEY:VALUE} of emgs evaluate, method=NAME of emgs "
+            "score), choose another out=FOLDER or move the folder away"
         )
     return True
 

@@ -143,69 +143,6 @@ def test_colmaps_models_with_one_focal_length(tmp_path):
         assert camera.intrinsics == (500, 500, *K[2:]) and camera.distortion == lens
 
 
-OTHER_MODEL = "1 {} 640 480 500 500 320 240 0 0 0 0 0 0 0 0\n"
-LENS_OF_ROS = "[0.1, -0.2, 1e-3, -0.002, 0.05]"
-WRONG = [
-    *(
-        ("cameras.txt", OTHER_MODEL.format(model), f"the camera model {model} is not read.*image_undistorter")
-        for model in ("EQUIRECTANGULAR", "FISHEYE624")
-    ),
-    ("cameras.txt", "", "lines CAMERA_ID MODEL"),
-    ("cameras.txt", "1 PINHOLE 640 480 500 500 320\n", "PINHOLE has the parameters fx, fy, cx, cy, got 3"),
-    ("cameras.txt", "1 PINHOLE 640 480 500 nan 320 240\n", "fy must be a finite number, got 'nan'"),
-    ("cameras.txt", "1 PINHOLE 640.5 480 500 500 320 240\n", "width and height must be pixels"),
-    ("cameras.txt", "1 SIMPLE_PINHOLE 9 9 5 4 4\n2 SIMPLE_PINHOLE 9 9 6 4 4\n", "2 different cameras: leave that"),
-    ("cameras.bin", "\x01", "is damaged: it ends within a record"),
-    ("camera.xml", "<a/>", "none of the calibration files that are known: COLMAP"),
-    ("transforms.json", "{", "damaged or no json"),
-    ("transforms.json", "[1]", "must hold keys and values"),
-    ("transforms.json", '{"a": 1}', "has none of the keys"),
-    ("transforms.json", '{"fl_x": 1, "fl_y": 1, "cx": 1, "cy": 1, "h": 3}', "has no w: add"),
-    ("transforms.json", json.dumps(TRANSFORMS | {"k7": 1}), "unknown keys: k7.*remove"),
-    ("transforms.json", json.dumps(TRANSFORMS | {"k4": 1}), "OPENCV with k4 is not read"),
-    ("transforms.json", json.dumps(TRANSFORMS | {"camera_model": "FISHEYE624"}), "FISHEYE624 is not read"),
-    ("transforms.json", json.dumps(TRANSFORMS | {"is_fisheye": True, "p1": 0.1}), "OPENCV_FISHEYE with p1 is not read"),
-    (
-        "transforms.json",
-        json.dumps(TRANSFORMS | {"frames": [{}, {}, {"cx": 3}]}),
-        "different cameras: cx is .* in frame 0 and 3 in frame 2.*dataset=images",
-    ),
-    ("transforms.json", json.dumps(TRANSFORMS | {"fl_x": True}), "fl_x must be a finite number"),
-    ("info.yaml", ROS.replace("image_height: 480\n", ""), "has no image_height: add"),
-    ("info.yaml", ROS.replace("plumb_bob", "equidistant"), "OPENCV_FISHEYE has k1, k2, k3, k4, got 5 numbers"),
-    ("info.yaml", ROS.replace("camera_name", "lens_name"), "unknown keys: lens_name"),
-    ("info.yaml", ROS.replace("0, 502.25", "2, 502.25"), "camera_matrix must be fx 0 cx"),
-    ("info.yaml", ROS.replace(LENS_OF_ROS, "[0.1, .inf, 0, 0]"), "distortion_coefficients must be a"),
-    ("info.yaml", ROS.replace(LENS_OF_ROS, "[0.1, 1, 0]"), "3 distortion coefficients are no k1"),
-    ("info.yaml", ROS.replace("plumb_bob", "omni"), "omni is not read, only none, plumb_bob"),
-    ("info.yaml", ROS.replace("0.05]", "0.05, 1, 0, 0, 0, 0, 0, 1]"), "12 distortion coefficients are no k1"),
-    ("info.yaml", ROS.split("distortion_model")[0], "has no distortion_coefficients: add"),
-    ("info.yaml", "a: [1", "damaged or no yaml"),
-    ("info.yaml", "!!python/object/apply:os.getcwd []", "damaged or no yaml"),
-    ("orb.yaml", ORB.replace("PinHole", "KannalaBrandt8"), "OPENCV_FISHEYE with p1, p2 is not read"),
-    ("orb.yaml", ORB.replace("Camera.width: 640\n", ""), "has no Camera.width: add"),
-    ("orb.yaml", ORB + "Camera2.fx: 3\n", "more than one camera"),
-    ("orb.yaml", ORB + "Camera.model: equirectangular\n", "equirectangular is not read"),
-    ("camchain.yaml", KALIBR + KALIBR.replace("cam0:", "cam1:").replace("500.5", "501"), "2 different cameras"),
-    ("camchain.yaml", KALIBR.replace("pinhole", "omni"), "the camera model omni is not read, only pinhole"),
-    ("camchain.yaml", KALIBR.replace("resolution", "size"), "has no resolution: add"),
-    ("camchain.yaml", KALIBR.replace("[640, 480]", "[640]"), "resolution width, height: correct them"),
-    ("intrinsics.yaml", MAST3R.replace("width", "widht"), "unknown keys: widht"),
-    ("intrinsics.yaml", MAST3R.split("calib")[0] + "calibration: [1, 2, 3]\n", "must be fx, fy, cx, cy.*got 3"),
-    ("intrinsics.yaml", MAST3R.split("calib")[0] + "calibration: pinhole\n", r"must have data: \[numbers\]"),
-    ("vipe.json", json.dumps(PLAIN | {"fx": None}), "fx must be a finite number"),
-    ("vipe.json", json.dumps(PLAIN | {"k6": 0.1}), "unknown keys: k6"),
-]
-
-
-@pytest.mark.parametrize("name, text, message", WRONG)
-def test_what_cannot_be_read_names_the_file_the_key_and_the_remedy(name, text, message, tmp_path):
-    with pytest.raises(ValueError, match=f"(?s){name}.*{message}"):
-        read_calibration(write(tmp_path, name, text))
-    with pytest.raises(FileNotFoundError, match=r"none\.json cannot be read; it may be COLMAP"):
-        read_calibration(tmp_path / "none.json")
-
-
 def test_openvslams_yaml_is_read_as_orb_slams_with_its_own_names_of_size_and_model(tmp_path):
     plain, other = tmp_path / "orb.yaml", tmp_path / "openvslam.yaml"
     plain.write_text(ORB)

@@ -49,30 +49,3 @@ def test_without_the_truths_folder_there_are_no_poses(euroc_root):
     whole = load(euroc_root).fingerprint()
     (truth / "data.csv").unlink()
     assert load(euroc_root).pose(1) is None and load(euroc_root).fingerprint() != whole
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("radial-tangential", "omni", "sensor.yaml: the camera model omni is not read, only none, plumb_bob"),
-        ("[160, 120]", "[752, 480]", r"data.csv is for images of 752x480, but the images are 160x120"),
-        ("[160, 120]", "752", r"sensor.yaml: resolution must have data: \[numbers\]"),
-        ("T_BS:", "T_SB:", "sensor.yaml has no T_BS, which a camera of EuRoC has"),
-    ],
-)
-def test_a_camera_that_is_not_read_is_refused_with_its_file(euroc_root, old, new, said):
-    path = euroc_root / "MH_01_easy" / "mav0" / "cam0" / "sensor.yaml"
-    path.write_text(path.read_text().replace(old, new))
-    with pytest.raises(ValueError, match=said):
-        load(euroc_root)
-
-
-def test_what_is_missing_or_far_in_time_is_named(euroc_root):
-    with pytest.raises(FileNotFoundError, match=r"cam1/data.csv is missing; expected the layout root/SEQUENCE/mav0"):
-        load(euroc_root, camera="cam1")
-    with pytest.raises(ValueError, match=r"data.csv: 0 of 3 images have a pose \(max difference 0.0001 s\)"):
-        load(euroc_root, max_time_difference=1e-4)
-    path = euroc_root / "MH_01_easy" / "mav0" / "state_groundtruth_estimate0" / "data.csv"
-    path.write_text(path.read_text().replace(",0.", ",7.", 4))
-    with pytest.raises(ValueError, match=r"estimate0/data.csv, line 2: .* is no pose, as its quaternion has not"):
-        load(euroc_root)

@@ -52,16 +52,11 @@ def test_names_without_ascending_numbers_get_their_position_as_time(images_root)
 
 
 def test_what_is_no_sequence_says_what_to_give(images_root, tmp_path):
-    with pytest.raises(ValueError, match=r"dataset.intrinsics=\[fx,fy,cx,cy\]"):
-        load(images_root, intrinsics=None)
     for path in images_root.iterdir():
         path.unlink()
     with pytest.raises(ValueError, match="has no images"):
         load(images_root)
     path = tmp_path / "clip.mp4"
-    path.write_bytes(b"nothing")
-    with pytest.raises(ValueError, match="clip.mp4 is no video"):
-        load(path)
     write_video(path)  # a damaged header gave a video of 32x4, and the message named no file
     with pytest.raises(ValueError, match=r"principal point outside of the 160x120 images of .*clip\.mp4"):
         load(path, intrinsics=(128.0, 128.0, 500.0, 59.5))
@@ -77,14 +72,10 @@ def test_a_broken_first_image_and_one_of_another_size_are_bad_frames_and_hide_no
     assert number_of(dataset[1]) == 1
 
 
-def test_pictures_that_are_not_read_and_folders_below_are_named(images_root, tmp_path):
+def test_pictures_that_are_not_read_are_named(images_root):
     """A phone's folder with three JPEGs among its HEICs was a sequence of three images, without a word."""
     (images_root / "IMG_1.HEIC").write_bytes(b"")
     assert "has 1 .heic, which are not read: convert" in load(images_root).calibration["note"]
-    (tmp_path / "walk" / "rgb").mkdir(parents=True)
-    (tmp_path / "walk" / "1.DNG").write_bytes(b"")
-    with pytest.raises(ValueError, match=r"no images; it has the folders rgb: give one of them; .* has 1 \.dng, which"):
-        load(tmp_path / "walk")
 
 
 @pytest.mark.parametrize("second", ["{}_mask.png", "{}.depth.png", "{}.jpg", "right_{}.png"])

@@ -89,7 +89,6 @@ def test_a_point_is_where_opencv_undistorts_it_to_and_no_pixel_is_invented(lens,
         ((*CAMERA, 0, 0, 2, 0), "the distortion .* leaves . % of the 160x120 image"),
         ((*CAMERA, 0, -80, 0, 0), "the distortion .* leaves . % of the 160x120 image"),
         ([1, 2, 3], r"must be \[fx, fy, cx, cy\]"),
-        ([100, 100, 80, 60, 0.1], r"must be \[fx, fy, cx, cy\]"),
         ([np.nan, 100, 80, 60], r"must be \[fx, fy, cx, cy\]"),
         ([*CAMERA, np.inf, 0, 0, 0], r"must be \[fx, fy, cx, cy\]"),
         (["OPENCV_FISHEYE", *CAMERA, 0.1], "OPENCV_FISHEYE has the parameters fx, fy, cx, cy, k1, k2, k3, k4, got 5"),
@@ -121,20 +120,6 @@ def test_a_file_gives_the_camera_of_every_data_set_and_says_so(tum_root, seven_s
         np.testing.assert_allclose(dataset.intrinsics[:2], (250.25, 251.125))
 
 
-def test_a_file_for_images_of_another_size_or_that_is_not_there_is_refused(tmp_path):
-    path, folder = tmp_path / "cameras.txt", folder_of(tmp_path)
-    for camera, reason in (
-        ("320 240 100 60 60", "is for images of .* images are 160x120.*images in that size"),
-        ("120 160 100 60 60", "is for images of .* images are 160x120.*EXIF orientation"),
-        ("160 120 100 500 60", ".* principal point outside of the 160x120"),
-    ):
-        path.write_text(f"1 SIMPLE_PINHOLE {camera}\n")
-        with pytest.raises(ValueError, match=f"cameras.txt {reason}"):
-            load(folder, str(path))
-    with pytest.raises(FileNotFoundError, match="nothing.yaml cannot be read"):
-        load(folder, "nothing.yaml")
-
-
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
 def test_exif_follows_the_diagonal_and_a_turned_photo_has_the_middle_of_what_is_shown(orientation, tmp_path):
     """pycolmap: 26 mm at 4032x3024 are 3028 px, which are 120.2 at 160 wide; the centre is the middle."""
@@ -146,26 +131,6 @@ def test_exif_follows_the_diagonal_and_a_turned_photo_has_the_middle_of_what_is_
     np.testing.assert_allclose(dataset.intrinsics, (focal, focal, (w - 1) / 2, (h - 1) / 2), rtol=1e-3)
     (folder / "0.jpg").write_bytes((folder / "0.jpg").read_bytes()[:40])  # a damaged one does not hide the others'
     assert load(folder, "exif", size=size).intrinsics == dataset.intrinsics
-
-
-def test_exif_that_tells_no_focal_length_names_the_image_and_the_alternatives(tmp_path):
-    for tags in ({}, {"FocalLength": 4.2}, {"FocalLengthIn35mmFilm": 0}):
-        folder = folder_of(tmp_path, **tags)
-        with pytest.raises(ValueError, match=r"0.jpg has no EXIF FocalLengthIn35mmFilm.*calibration file, exif or est"):
-            load(folder, "exif")
-    folder_of(tmp_path, FocalLengthIn35mmFilm=26, ExifImageWidth=4032, ExifImageHeight=2268)
-    with pytest.raises(ValueError, match="0.jpg was taken with 4032x2268 and cut to 160x120"):
-        load(folder, "exif")
-    folder_of(tmp_path, FocalLengthIn35mmFilm=26)
-    write_photo(folder / "2.jpg", FocalLengthIn35mmFilm=27)  # a zoom
-    with pytest.raises(ValueError, match="several focal lengths .26 mm in 0.jpg, 27 mm in 2.jpg"):
-        load(folder, "exif")
-    assert load(folder, "exif", stop=2).calibration["source"] == "exif"
-    writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, SIZE)
-    writer.write(dots())
-    writer.release()
-    with pytest.raises(ValueError, match="a video has no EXIF: give dataset.intrinsics="):
-        load(tmp_path / "clip.avi", "exif")
 
 
 def test_true_depth_is_straightened_with_its_colour(tum_root, replica_root):
@@ -194,8 +159,6 @@ def test_registered_depth_is_that_of_the_straight_camera(seven_scenes_root, dept
     root, name = str(seven_scenes_root), "kitchen/seq-01"
     dataset = SevenScenes(root, name, stride=1, intrinsics=(525, 525, 320, 240, *lens))
     assert np.median(np.abs(depth_gaps(dataset, 0, 1))) < 0.005
-    with pytest.raises(ValueError, match="distortion is the colour camera's.*set dataset.register_depth=true"):
-        SevenScenes(root, name, stride=1, register_depth=False, intrinsics=(585, 585, 320, 240, *lens))
 
 
 def test_distortion_of_tum_stands_in_one_place(tum_root):
@@ -204,6 +167,3 @@ def test_distortion_of_tum_stands_in_one_place(tum_root):
     other = Tum(str(tum_root), TUM, stride=1, intrinsics=(*camera, *lens))
     np.testing.assert_array_equal(one[0].image, other[0].image)
     assert one.fingerprint() == other.fingerprint()
-    for given in ((*camera, *lens), "exif"):
-        with pytest.raises(ValueError, match="dataset.distortion goes with"):
-            Tum(str(tum_root), TUM, stride=1, intrinsics=given, distortion=lens)

@@ -162,15 +162,6 @@ def test_the_fingerprint_is_of_names_contents_and_options_not_of_the_place(tmp_p
     assert fingerprint("c", whole, whole) != fingerprint("c", whole, whole, b""), "a missing file is no empty one"
 
 
-def test_what_is_no_image_is_named_by_its_content_and_a_folder_of_it_by_its_first_file(tmp_path):
-    """Phones write HEIC under .jpg: of a folder of it was said to fetch it again, which changes nothing."""
-    (tmp_path / "a.jpg").write_bytes(b"\x00\x00\x00\x18ftypheic" + bytes(100))
-    (tmp_path / "b.jpg").write_text("<!DOCTYPE html>")
-    words = r"none of its 2 images.*a\.jpg is an image in HEIC.*convert.*b\.jpg is a web page"
-    with pytest.raises(ValueError, match=words):
-        reading.first_size([tmp_path / "a.jpg", tmp_path / "b.jpg"], "folder")
-
-
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -209,15 +200,3 @@ def test_the_orientation_of_an_image_is_that_of_its_exif(tmp_path):
         image.save(tmp_path / "a.jpg", exif=exif)
         assert reading.orientation(tmp_path / "a.jpg") == (number if number < 9 else 1)
     assert reading.orientation(tmp_path / "none.jpg") == 1
-
-
-def test_a_pose_with_a_scale_is_named_as_such():
-    """The advice was to fetch the file again."""
-    pose = np.diag([2.0, 2.0, 2.0, 1.0])
-    pose[:3, 3] = 1.0, 2.0, 3.0
-    with pytest.raises(BadFrameError, match="pose.txt has a rotation times 2, of an alignment"):
-        reading.as_motion(" ".join(map(str, pose.ravel())), "pose.txt")
-    mirrored, flipped = np.diag([1.0, -1.0, 1.0, 1.0]), np.diag([1.0, -1.0, -1.0, 1.0])
-    with pytest.raises(BadFrameError, match="pose.txt has a mirrored pose"):
-        reading.as_motion(" ".join(map(str, mirrored.ravel())), "pose.txt")
-    assert reading.as_motion(" ".join(map(str, flipped.ravel())), "pose.txt") is not None, "the advice, followed"

@@ -41,7 +41,7 @@ def test_a_row_that_is_no_pose_or_blank_is_a_bad_frame_and_moves_no_other(replic
     path = replica_root / "office9" / "traj.txt"
     rows = path.read_text().splitlines()
     for second in (rows[1][:40], rows[1].replace("e", "x", 1), ""):
-        path.write_text("\n".join([rows[0], second, rows[2], "", ""]))
+        path.write_text("\n".join(["# a comment moved all poses by one", rows[0], second, rows[2], "", ""]))
         dataset = load(replica_root)
         np.testing.assert_allclose(dataset[2].T_world_camera, scene_pose(2), atol=1e-8)
         with pytest.raises(BadFrameError, match="traj.txt, row 1"):

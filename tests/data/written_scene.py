@@ -1,9 +1,12 @@
 """The known scene that the tests write to disk: a slanted plane, seen from a camera that moves."""
 
+import json
 from pathlib import Path
 
 import cv2
 import numpy as np
+
+NUM_FRAMES = 3
 
 
 def scene_pose(index: int) -> np.ndarray:
@@ -42,3 +45,49 @@ def moved(dataset, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
     points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z, np.ones_like(z)])
     x, y, z = (np.linalg.inv(dataset[j].T_world_camera) @ a.T_world_camera @ points)[:3]
     return np.stack([v, u]), np.stack([fx * x / z + cx, fy * y / z + cy, z])
+
+
+def write_seven_scenes(root: Path) -> None:
+    folder = root / "kitchen" / "seq-01"
+    folder.mkdir(parents=True)
+    for i in range(NUM_FRAMES):
+        depth = plane_depth(scene_pose(i), (585, 585, 320, 240), (640, 480))
+        write_depth(folder / f"frame-{i:06d}.depth.png", depth, 1000)
+        cv2.imwrite(str(folder / f"frame-{i:06d}.color.{'jpg' if i else 'png'}"), color_image(i, (640, 480)))
+        np.savetxt(folder / f"frame-{i:06d}.pose.txt", scene_pose(i))
+
+
+def write_tum(root: Path) -> None:
+    folder = root / "rgbd_dataset_freiburg3_plane"
+    (folder / "rgb").mkdir(parents=True)
+    (folder / "depth").mkdir()
+    lists = {"rgb": "# color\n", "depth": "# depth\n", "groundtruth": "# t tx ty tz qx qy qz qw\n"}
+    for i in range(NUM_FRAMES):
+        time = 100.0 + i
+        cv2.imwrite(str(folder / "rgb" / f"{time:.6f}.png"), color_image(i, (640, 480)))
+        depth = plane_depth(scene_pose(i), (535.4, 539.2, 320.1, 247.6), (640, 480))
+        write_depth(folder / "depth" / f"{time + 0.01:.6f}.png", depth, 5000)
+        lists["rgb"] += f"{time:.6f} rgb/{time:.6f}.png\n"
+        lists["depth"] += f"{time + 0.01:.6f} depth/{time + 0.01:.6f}.png\n"
+        half = 0.05 * i / 2  # half of scene_pose's angle
+        x, y, z = scene_pose(i)[:3, 3]
+        lists["groundtruth"] += f"{time - 0.005:.4f} {x} {y} {z} 0 {np.sin(half)} 0 {np.cos(half)}\n"
+    for name, text in lists.items():
+        (folder / f"{name}.txt").write_text(text)
+
+
+def write_replica(root: Path) -> None:
+    folder = root / "office9" / "results"
+    folder.mkdir(parents=True)
+    camera = {"w": 120, "h": 68, "fx": 60.0, "fy": 60.0, "cx": 59.5, "cy": 33.5, "scale": 6553.5}
+    (root / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    for i in range(NUM_FRAMES):
+        cv2.imwrite(str(folder / f"frame{i:06d}.jpg"), color_image(i, (120, 68)))
+        write_depth(folder / f"depth{i:06d}.png", plane_depth(scene_pose(i), (60, 60, 59.5, 33.5), (120, 68)), 6553.5)
+    rows = [" ".join(f"{v:.9e}" for v in scene_pose(i).ravel()) for i in range(NUM_FRAMES)]
+    (root / "office9" / "traj.txt").write_text("\n".join(rows))
+
+
+def write_images(root: Path) -> None:
+    for i, name in enumerate(("img2.png", "img10.JPG", "IMG33.jpeg")):
+        cv2.imwrite(str(root / name), color_image(i, (160, 120)))

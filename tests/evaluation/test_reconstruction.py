@@ -1,6 +1,7 @@
 """Oracles: closed forms on planes and spheres, brute force, Open3D, equivariance, the real Replica mesh."""
 
 import dataclasses
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
-from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, transform_cloud
+from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, spooled, transform_cloud
 from emgs_jax.evaluation.reconstruction import (
     compare_clouds,
     compare_placements,
@@ -244,6 +245,31 @@ def test_a_sample_of_the_estimate_changes_its_accuracy_by_chance_and_its_complet
             np.testing.assert_allclose(found[f"reconstruction/{name}"], expected[f"reconstruction/{name}"], rtol=1e-9)
         accuracy = (other["reconstruction/accuracy_m"] for other in (found, expected))
         assert 1e-6 < abs(np.subtract(*accuracy)) < 0.05 * expected["reconstruction/accuracy_m"]
+
+
+def test_a_cloud_twice_as_long_takes_a_fraction_of_its_points_more(monkeypatch):
+    """A point is 36 bytes on the disk; two placements of all points and their searches took 580 in memory."""
+    monkeypatch.setattr("emgs_jax.evaluation.clouds._PART_ROWS", 5000)
+    config, rng = dataclasses.replace(CONFIG, num_sampled=1000), np.random.default_rng(0)
+
+    def wall(x):
+        points = np.column_stack([x + rng.random(2000) * 0.1, rng.random(2000) * 0.6, rng.normal(0, 0.02, 2000)])
+        return PointCloud(points, np.zeros((2000, 3)), np.zeros((2000, 3)))
+
+    truth, poses = reference(wall(0.0), config), np.tile(np.eye(4), (10, 1, 1))
+    poses[:, :3, 3] = rng.random((10, 3))
+
+    def peak(num_frames):
+        tracemalloc.start()
+        try:
+            cloud = spooled(wall(0.1 * frame) for frame in range(num_frames))
+            compare_placements(cloud, truth, (poses, poses), config, [0.0, 0.1])
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak(2)  # what is imported late
+    assert peak(40) - peak(20) < 12 * 40_000
 
 
 @pytest.mark.skipif(not REPLICA.exists(), reason="the shared Replica sequence is not here")

@@ -36,11 +36,6 @@ from experiments.report import positional
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["em.num_neighbours=4"], r"^em\.num_neighbours is no key of .*; near names: slam\.em\.num_neighbours,"),
-        (
-            ["graph=default", "graph.location.patience=2"],
-            r"^graph\.location\.patience is called graph\.relocalization\.patience now",
-        ),
         (
             ["graph=default", "graph.agreement.max_contradicted=1"],
             r" is called graph\.consistency\.max_violating_queries now",
@@ -50,7 +45,6 @@ from experiments.report import positional
         (["slam.refinement.render.opacity=0.3"], r"near names: .*\brender\.opacity"),
         (["dataset=tum", "dataset.num_frames=3"], r"dataset\.num_frames is no key of the config"),
         (["prior.nothing=2"], r"near names: prior\.version, prior\.classes, prior\.confusion, prior\.feature_size"),
-        (["slam.em=papre"], r"one of its options \(default, paper\) with slam/em=default$"),
         (["render=bright"], "render=bright is no option of render: there are default"),
         (["slam=paper"], r"slam is chosen by its parts: slam/em=…, slam/existence=…, slam/extrapolation=…"),
         (["dataset=scannetpp"], "dataset=scannetpp is no option of dataset: there are apartment, bonn, colmap"),
@@ -74,11 +68,6 @@ def test_a_word_in_the_place_of_a_group_is_an_error_for_every_group():
     for group in parts:
         with pytest.raises(ValueError, match=f"{group}=({'|'.join(groups()[group])})$"):
             compose("prior=multiview_stereo", f"{group.replace('/', '.')}={groups()[group][0]}")
-
-
-def test_a_group_of_another_option_is_an_error_that_names_the_option():
-    with pytest.raises(ValueError, match="^prior/dense is a choice of prior=multiview_stereo only$"):
-        compose("prior=simulated", "prior/dense=itermvs")
 
 
 def test_the_arguments_of_a_multirun_are_checked_and_those_of_hydra_are_left_to_it():

@@ -1,6 +1,7 @@
 """A peer under our protocol; oracles: the truth itself, a known similarity of it, evo's association, bad files."""
 
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -18,14 +19,17 @@ from experiments.score import coverage, score
 SIMILARITY = Sim3(0.4, Rotation.from_rotvec([0.3, -1.2, 0.5]).as_matrix(), np.array([3.0, -1.0, 7.0]))
 
 
-@pytest.fixture(scope="module")
-def truth():
+@cache
+def room():
     """True times, poses and cloud of the tiny room."""
     from scene import evaluation_config
 
     frames = list(dataset())
     cloud = ground_truth_cloud(frames, dataset().intrinsics, evaluation_config())
     return np.array([frame.timestamp for frame in frames]), np.stack([f.T_world_camera for f in frames]), cloud
+
+
+truth = pytest.fixture(scope="module")(lambda: room())
 
 
 def write_system(folder, times, poses, cloud, move=SIMILARITY, normals=None):
@@ -96,7 +100,6 @@ def test_numbers_of_frames_that_meet_half_of_the_timestamps_are_refused_and_both
     trajectory, _, out = write_system(tmp_path, 2.0 * times, poses, cloud)
     with pytest.raises(ValueError, match=r"3 of 6 poses.* 0.000 to 10.000, those of .* 0.000 to 5.000: .*numbers of"):
         scored(trajectory, out)
-    assert scored(trajectory, out, "min_associated_percent=50")[0]["trajectory/num_frames"] == 3
 
 
 @pytest.mark.parametrize(("matched", "warns"), [(18, False), (17, True)])
@@ -129,21 +132,8 @@ def test_another_result_is_never_replaced_but_the_same_one_may_be_made_again(tmp
     assert path.read_bytes() == before
 
 
-def times_of_another_clock(path, ply, truth):
-    save_trajectory_tum(path, truth[0] + 1000.0, truth[1])
-
-
 def world_to_camera(path, ply, truth):
     save_trajectory_tum(path, truth[0], np.linalg.inv(truth[1]))
-
-
-def two_paths(path, ply, truth):
-    """A file that was appended to."""
-    save_trajectory_tum(path, [*truth[0], *truth[0]], [*truth[1], *SIMILARITY.apply_to_poses(truth[1])])
-
-
-def no_points(path, ply, truth):
-    save_points_ply(ply, truth[2].points[:0], truth[2].normals[:0], truth[2].colors[:0])
 
 
 def points_that_are_not_finite(path, ply, truth):
@@ -156,17 +146,7 @@ def points_that_are_not_finite(path, ply, truth):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (
-            times_of_another_clock,
-            r"no pose is within 0.01 s .* are 1000.000 to 1005.000, .* 0.000 to 5.000: .*max_time_difference",
-        ),
         (world_to_camera, "path.txt: the motions .* and by 0.0 where the poses are taken as world -> camera"),
-        (two_paths, "path.txt has 6 poses at times at which it has another one, the first at 0.000000 s"),
-        (lambda path, *_: path.unlink(), "path.txt is no file: give a file with"),
-        (lambda path, *_: path.write_text("# nothing\n"), "no pose is within 0.01 s .* timestamps are none"),
-        (lambda path, ply, _: ply.unlink(), "cloud.ply is no file: give a PLY"),
-        (lambda path, ply, _: ply.write_text("# nothing\n"), "cloud.ply is no PLY file"),
-        (no_points, "cloud.ply has no points"),
         (points_that_are_not_finite, r"cloud.ply: 1 of [0-9]+ points are not finite"),
     ],
 )

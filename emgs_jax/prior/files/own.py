@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from emgs_jax.data.file_names import last_number
+from emgs_jax.data.reading import read_depth
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.prior.files.arrays import (
     as_intrinsics,
@@ -15,13 +17,13 @@ from emgs_jax.prior.files.arrays import (
     load_json,
     load_npy,
     load_npz,
-    load_png,
     names_in,
 )
 from emgs_jax.prior.files.view import Predictions, View, whole_image
 
 SUFFIXES = (".npz", ".exr", ".npy", ".png")  # the first that is there is read
 POSES = ("poses.txt", "poses.json")
+KEYS = ("depth", "points", "confidence", "intrinsics")  # of an .npz, beside the pose
 GIVES_POSES = (
     "prior=files needs poses beside depths, and finds none itself: prior=multiview_stereo finds poses and depths from "
     "the images alone, prior=mapanything by a network"
@@ -49,12 +51,12 @@ def read_own(folder: Path, units_per_metre: float) -> Predictions:
     else:
         raise ValueError(f"{folder} has {len(paths)} files *{suffix} and neither of {', '.join(POSES)}: {GIVES_POSES}")
     if suffix == ".npz":
-        return Predictions(
-            "npz", names, poses, source, lambda row: _read_npz(paths[row]), paths + lists, True, whole_image
-        )
+        unread = tuple(name for name in names_in(paths[0]) if name not in (*KEYS, "T_world_camera"))
+        read_npz, files = (lambda row: _read_npz(paths[row])), paths + lists
+        return Predictions("npz", names, poses, source, read_npz, files, True, whole_image, unread=unread)
     given = load_json(lists[0]).get("intrinsics") if lists[0].suffix == ".json" else None
     intrinsics = None if given is None else as_intrinsics(given, f"{lists[0]}: intrinsics")
-    load = {".exr": load_exr, ".npy": load_npy, ".png": partial(load_png, units_per_metre=units_per_metre)}[suffix]
+    load = {".exr": load_exr, ".npy": load_npy, ".png": partial(read_depth, depth_scale=units_per_metre)}[suffix]
 
     def read(row: int) -> View:
         return as_view(str(paths[row]), load(paths[row]), None, intrinsics)
@@ -71,7 +73,7 @@ def _own_pose(path: Path) -> np.ndarray:
 
 
 def _read_npz(path: Path) -> View:
-    arrays = load_npz(path, (), ("depth", "points", "confidence", "intrinsics"))
+    arrays = load_npz(path, (), KEYS)
     if ("depth" in arrays) == ("points" in arrays):
         raise ValueError(f"{path} must have depth or points, one of them; it has {', '.join(names_in(path))}")
     key = "depth" if "depth" in arrays else "points"
@@ -87,16 +89,34 @@ def _read_npz(path: Path) -> View:
     return as_view(f"{path}: {key}", arrays[key], arrays.get("confidence"), intrinsics)
 
 
+def _order(times: np.ndarray, names: list[str], path: Path) -> np.ndarray:
+    """Line of a list of poses for each file: that with the number in its name where all have one, else in order.
+
+    Raises:
+        ValueError: the lines are in another order than that of time, and no names say which.
+    """
+    numbers = [last_number(name) for name in names]
+    if None not in numbers and len({*numbers}) == len(names) and sorted(times) == sorted(numbers):
+        line = {time: row for row, time in enumerate(times)}
+        return np.array([line[number] for number in numbers])
+    if (np.diff(times) < 0).any():
+        raise ValueError(
+            f"{path} is not in order of time, and its times are not the numbers in the names of the files, so which "
+            f"pose is whose is not known: write the lines in the order {', '.join(names[:3])}, …, or give poses.json"
+        )
+    return np.arange(len(names))
+
+
 def _listed_poses(path: Path, names: list[str]) -> np.ndarray:
     """Poses of a list, in the order of `names`: of TUM's format row by row, of JSON by name."""
     if path.suffix == ".txt":
-        _, poses = load_trajectory_tum(path)
+        times, poses = load_trajectory_tum(path, may_lack=True)
         if len(poses) != len(names):
             raise ValueError(
                 f"{path} has {len(poses)} poses for {len(names)} files: it must have one for each, in the order of "
                 "their names; or give poses.json, which has them by name"
             )
-        return as_poses(poses, str(path))
+        return as_poses(poses[_order(times, names, path)], str(path))
     given = load_json(path)
     given = given.get("T_world_camera") if isinstance(given, dict) else None
     if not isinstance(given, dict):

@@ -30,6 +30,7 @@ from emgs_jax.prior.base import (
 )
 from emgs_jax.prior.files.conventions import MIN_GAIN, Sight, check_conventions, median_misfit
 from emgs_jax.prior.files.exports import find_export, read_cut3r, read_export
+from emgs_jax.prior.files.naming import rows_of
 from emgs_jax.prior.files.own import GIVES_POSES, read_own
 from emgs_jax.prior.files.pose_error import pose_angle
 from emgs_jax.prior.files.scans import DEPTH_MAPS, read_colmap_workspace, read_record3d, read_scannet
@@ -93,7 +94,8 @@ class Files(Prior):
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Say what was found; ValueError where it does not fit the data set or itself."""
         found = self._found
-        self._rows = rows_of(dataset, found, self.folder)
+        remedy = "predict it, write one whose T_world_camera is nan"
+        self._rows = rows_of(dataset, found.names, self.folder, found.may_lack, remedy)
         known = [index for index, row in enumerate(self._rows) if row is not None]
         camera = Camera((dataset.size[0], dataset.size[1]), dataset.intrinsics)
         view, depth = self._first_depth()
@@ -111,6 +113,7 @@ class Files(Prior):
         if self._is_measured:
             self._pose_std = None if angle is None else (angle * depth, float(np.degrees(angle)))
         scale = "metres" if self._is_metric else f"up to scale, times {self._factor:.4g}"
+        unread = f"; not read: {', '.join(found.unread)}" if found.unread else ""
         lacking = f", {len(self._rows) - len(known)} frames have none" if len(known) < len(self._rows) else ""
         try:
             note = _focal_note(view, camera, found) + _turned_note(turned)
@@ -122,7 +125,7 @@ class Files(Prior):
         fit = check_conventions(pairs, dataset.intrinsics, found.pose_source, self._max_misfit)
         tqdm.write(
             f"prior=files: {self.folder}, layout {found.layout}, {scale}{lacking}; {fit}, "
-            f"{_pose_note(self._pose_std)}{note}"
+            f"{_pose_note(self._pose_std)}{unread}{note}"
         )
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
@@ -220,32 +223,6 @@ def image_intrinsics(folder: Path, size: Size) -> Intrinsics | None:
         fx, fy, cx, cy = view.intrinsics
         found.append(resize_intrinsics((fx, fy, cx + left, cy + top), (x, y), size))
     return tuple(float(value) for value in np.median(found, axis=0)) if found else None
-
-
-def rows_of(dataset: Dataset, found: Predictions, folder: Path) -> list[int | None]:
-    """Row of every frame: by the names of the images, or in order where these say nothing.
-
-    Raises:
-        ValueError: a frame has no file, or there are not as many files as frames.
-    """
-    files = [dataset.files(index)[:1] for index in range(len(dataset))]
-    stems = [file[0].stem if file else "" for file in files]
-    rows = {name: row for row, name in enumerate(found.names)}
-    if len({*stems}) == len(stems) and {*stems} & rows.keys():
-        missing = [stem for stem in stems if stem not in rows]
-        if missing and not found.may_lack:
-            raise ValueError(
-                f"{folder} has no file for {len(missing)} of {len(stems)} frames, the first is {missing[0]}: predict "
-                "it, write one whose T_world_camera is nan, or leave the frame out (dataset.start, stop, stride)"
-            )
-        return [rows.get(stem) for stem in stems]
-    if len(found.names) != len(dataset):
-        raise ValueError(
-            f"{folder} has {len(found.names)} predictions ({found.names[0]} ...) and the data set {len(dataset)} "
-            f"frames ({stems[0] or 'without names'} ...), and their names do not tell which is whose: name the files "
-            "as the images, or choose the frames that were predicted (dataset.start, stop, stride)"
-        )
-    return list(range(len(dataset)))
 
 
 def _pose_note(pose_std: tuple[float, float] | None) -> str:

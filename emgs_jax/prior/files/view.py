@@ -71,6 +71,7 @@ class Predictions:
         poses: T_world_camera (n, 4, 4), NaN where it is not known.
         pose_source: file and key of the poses, for messages.
         may_lack: a frame without a view is one that the program could not solve.
+        unread: names of arrays in the first file that nothing is taken of.
         place: what the grids show of the image.
     """
 
@@ -83,6 +84,7 @@ class Predictions:
     is_metric: bool
     place: Place
     may_lack: bool = False
+    unread: tuple[str, ...] = ()
 
 
 def whole_image(camera: Camera, view: View) -> Part:

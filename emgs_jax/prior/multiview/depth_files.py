@@ -18,6 +18,7 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.data.reading import check_depth_scale, decode, fingerprint
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.files.arrays import files_of, load_exr, load_npy, load_npz, names_in
+from emgs_jax.prior.files.naming import rows_of
 from emgs_jax.prior.files.view import Camera, View, whole_image
 from emgs_jax.prior.multiview.dense import Depths, Scene, Way
 from emgs_jax.prior.multiview.lens import rectify
@@ -137,7 +138,8 @@ def _image(values: np.ndarray, kind: str, path: Path) -> np.ndarray:
 
 def _reader(dataset: Dataset, found: DepthFiles, folder: Path) -> Callable[[int], np.ndarray]:
     """Values of a frame at its pixels."""
-    rows, size = rows_of(dataset, found.names, folder), (dataset.size[0], dataset.size[1])
+    rows = [row for row in rows_of(dataset, found.names, folder) if row is not None]
+    size = dataset.size[0], dataset.size[1]
     camera = Camera(size, dataset.intrinsics)
 
     def read(frame: int) -> np.ndarray:
@@ -148,32 +150,3 @@ def _reader(dataset: Dataset, found: DepthFiles, folder: Path) -> Callable[[int]
         return cv2.resize(values, size, interpolation=way)
 
     return read
-
-
-def rows_of(dataset: Dataset, names: Sequence[str], folder: Path) -> list[int]:
-    """Row of every frame: by the names of the images, which all files may go on in one way, else in order.
-
-    Raises:
-        ValueError: a frame has no file, or there are not as many files as frames.
-    """
-    files = [dataset.files(index)[:1] for index in range(len(dataset))]
-    stems = [file[0].stem if file else "" for file in files]
-    rows = {name: row for row, name in enumerate(names)}
-    if all(stems) and len({*stems}) == len(stems):
-        ends = {name[len(stems[0]) :] for name in names if name.startswith(stems[0])}
-        ends = {end for end in ends if not end or not end[0].isalnum()} | {""}
-        end = max(sorted(ends), key=lambda end: sum(stem + end in rows for stem in stems))
-        missing = [stem for stem in stems if stem + end not in rows]
-        if not missing:
-            return [rows[stem + end] for stem in stems]
-        if len(missing) < len(stems):
-            raise ValueError(
-                f"{folder} has no depth for {len(missing)} of {len(stems)} frames, the first is {missing[0]}{end}: "
-                "predict it, or leave the frame out (dataset.start, stop, stride)"
-            )
-    if len(names) != len(stems):
-        raise ValueError(
-            f"{folder} has depths of {len(names)} frames and the data set {len(stems)} frames, and names do not tell "
-            "which is whose: predict all frames in use, or choose those that were (dataset.start, stop, stride)"
-        )
-    return list(range(len(stems)))

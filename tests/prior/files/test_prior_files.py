@@ -1,6 +1,7 @@
 """`prior=files`: against the exact prior, the truth that was written, and analytic planes."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from written_predictions import KEYS, NAMES, Named, asked, by_frame, truth, writ
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.prior.base import Prior, relative_poses
-from emgs_jax.prior.files.prior import Files
+from emgs_jax.prior.files.naming import rows_of
+from emgs_jax.prior.files.prior import Files, read_predictions
 from emgs_jax.prior.files.view import Camera, View, at_frame, whole_image
 
 SIZE = (48, 64)
@@ -171,6 +173,26 @@ def test_files_are_found_by_the_name_of_the_image_and_else_by_their_order(own, t
         np.testing.assert_array_equal(points, expected[index][0])
 
 
+def test_listed_poses_are_of_the_files_whose_numbers_are_their_times(own, tmp_path):
+    """A script lists IMG_10 before IMG_8, and files are read by their numbers: each had another one's pose."""
+    write_depths(tmp_path / "images", ".npy")
+    rows = sorted(range(len(NAMES)), key=lambda row: NAMES[row])
+    poses = [truth()[row].T_world_camera for row in rows]
+    save_trajectory_tum(tmp_path / "images" / "poses.txt", [int(NAMES[row][4:]) for row in rows], poses)
+    for one, other in zip(asked(tmp_path / "images")[1], asked(own)[1], strict=True):
+        np.testing.assert_allclose(one.T_anchor_view, other.T_anchor_view, atol=1e-8)
+    path = tmp_path / "images" / "poses.txt"
+    path.write_text(re.sub(r"\n8\.0+ .*\n", "\n8 nan nan nan nan nan nan nan\n", path.read_text()))
+    lost = np.isnan(read_predictions(path.parent, 1000.0).poses).all((1, 2))
+    np.testing.assert_array_equal(lost, [name == "IMG_8" for name in NAMES])
+
+
+def test_of_two_predictions_with_the_name_of_one_image_none_is_chosen(own):
+    """COLMAP's a/1.jpg and b/1.jpg: the images of the one were mapped with depths of the other."""
+    with pytest.raises(ValueError, match="several predictions of the name IMG_9, of which one is of the frame"):
+        rows_of(Named(), [*NAMES[:2], NAMES[1], *NAMES[3:]], own)
+
+
 def test_the_provenance_tells_files_apart_by_what_they_hold(own, tmp_path):
     other = write_npz(tmp_path / "other", NAMES, depth=lambda f: f.depth + 1e-3)
     same = write_npz(tmp_path / "same", NAMES)
@@ -184,7 +206,9 @@ def test_what_was_found_is_one_line_and_says_by_how_much_focal_lengths_differ(tm
     asked(near)
     fit = "the depths of two views differ by 0.3 %"
     assert capsys.readouterr().out.splitlines() == [f"prior=files: {near}, layout npz, metres; {fit}, {UNKNOWN}"]
-    far = write_npz(tmp_path / "far", NAMES, intrinsics=lambda f: np.diag([fx * 1.1, fy * 1.1, 1]) + [[0, 0, cx]] * 3)
+    asked(write_npz(tmp_path / "more", NAMES, mask=lambda f: f.depth > 2))  # depths that it marks were taken in silence
+    assert f"{UNKNOWN}; not read: mask" in capsys.readouterr().out
+    far = write_npz(tmp_path / "far", NAMES, intrinsics=lambda f: [[fx * 1.1, 0, cx], [0, fy * 1.1, cy], [0, 0, 1]])
     with pytest.raises(ValueError, match=r"camera matrix|intrinsics"):  # a matrix with numbers below the diagonal
         asked(write_npz(tmp_path / "no", NAMES, intrinsics=lambda f: [fx, fy, cx]))
     asked(far)

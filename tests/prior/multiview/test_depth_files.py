@@ -17,8 +17,9 @@ from scene import compose
 
 from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.ops.camera import Camera
+from emgs_jax.prior.files.naming import rows_of
 from emgs_jax.prior.multiview.dense import Scene
-from emgs_jax.prior.multiview.depth_files import open_depths, rows_of, way_of_files
+from emgs_jax.prior.multiview.depth_files import open_depths, way_of_files
 from emgs_jax.prior.multiview.landmarks import landmarks_of, point_information
 from emgs_jax.prior.multiview.lens import Lens
 from emgs_jax.structure.model import Structure, World
@@ -95,7 +96,7 @@ def test_files_without_the_frames_names_are_in_the_order_of_their_numbers(tmp_pa
     for stems in (["x", "y", "z"], [None] * 3):
         rows = rows_of(Frames(stems), found.names, tmp_path)
         np.testing.assert_array_equal([found.read(row) for row in rows], VALUES)
-    with pytest.raises(ValueError, match=r"depths of 3 frames and the data set 5 frames"):
+    with pytest.raises(ValueError, match=r"3 predictions \(frame2 ...\) and the data set 5 frames"):
         rows_of(Frames([None] * 5), found.names, tmp_path)
 
 
@@ -112,7 +113,14 @@ def test_more_files_than_frames_are_no_error_by_name_and_a_frame_without_a_file_
         "a 10_depth",
         "a 2_depth",
     ]
-    with pytest.raises(ValueError, match="no depth for 1 of 3 frames, the first is a 3_depth"):
+    each(tmp_path, save, "_conf.npy")  # was read as depth, as it comes first
+    found = open_depths(tmp_path, "affine_inverse", 1000.0)
+    with pytest.raises(ValueError, match=r"several kinds for each frame, \*_conf, \*_depth: leave one kind"):
+        rows_of(Frames(["a 10", "a 2"]), found.names, tmp_path)
+    for path in tmp_path.glob("*_conf.npy"):
+        path.unlink()
+    found = open_depths(tmp_path, "affine_inverse", 1000.0)
+    with pytest.raises(ValueError, match="no file for 1 of 3 frames, the first is a 3_depth"):
         rows_of(Frames(["a 1", "a 2", "a 3"]), found.names, tmp_path)
 
 
