@@ -10,9 +10,9 @@ from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.noise import robust_std
 
 NUM_NODES = 5  # along each side of the image
-LEAST_SPREAD = 1e-3  # of errors beside the field, in units of their noise
+LEAST_SPREAD = 0.5  # of errors beside the field, in units of their noise, which has the field in it
 NUM_ROUNDS = 3  # of weights and field in turn
-NUM_ALIKE = 20.0  # neighbouring points that err alike, beside the field: so many count as one
+NUM_INDEPENDENT = 160  # errors in an image beside the field: neighbouring points err alike
 LEAST_SIDE = 1e-6  # of the image, in focal lengths
 
 
@@ -84,8 +84,8 @@ def depth_field(
     """Estimate the field of a frame from how far its points are from the map, as a Gaussian process on the nodes.
 
     A network errs by a scale that drifts and by a field that is smooth over the image, ρ = B f + noise, with bilinear
-    weights B and the precision W = 1 / (σ² + (ρ - B f)²/4) / `NUM_ALIKE` of each point, Cauchy's, where σ is the given
-    noise, or a smaller multiple of it if that is how ρ - B f spreads:
+    weights B. The precision W of each point is Cauchy's, 1 / (σ² + (ρ - B f)²/4), over the number of points that err
+    alike; σ is the given noise, down to `LEAST_SPREAD` of it if that is how ρ - B f spreads:
 
         f = K (1 + B'WB K)⁻¹ B'W ρ,   K = v exp(-½ |i - j|² / length²)
 
@@ -111,10 +111,12 @@ def depth_field(
     place = jnp.stack(jnp.meshgrid(*[jnp.linspace(0.0, 1.0, NUM_NODES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
     apart = jnp.sum((place - place[:, None]) ** 2, axis=-1)
 
+    alike = jnp.maximum(jnp.sum(is_before) / NUM_INDEPENDENT, 1.0)
+
     def fit(nodes: Float[Array, "n"], _: None) -> tuple[Float[Array, "n"], None]:
         rest = (errors - basis @ nodes) / noise
         spread = jnp.clip(robust_std(rest, is_before), LEAST_SPREAD, 1.0)
-        precision = is_before / (noise**2 * (spread**2 + (0.5 * rest) ** 2)) / NUM_ALIKE
+        precision = is_before / (noise**2 * (spread**2 + (0.5 * rest) ** 2)) / alike
         mean, total = _node_means(errors, basis * precision[:, None])
         is_seen = total > 0
         share = total / jnp.where(has_any, jnp.sum(total), 1.0)
