@@ -7,10 +7,8 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.registration.noise import robust_std
 
 NUM_NODES = 5  # along each side of the image
-LEAST_SPREAD = 0.5  # of errors beside the field, in units of their noise, which has the field in it
 NUM_ROUNDS = 3  # of weights and field in turn
 NUM_INDEPENDENT = 160  # errors in an image beside the field: neighbouring points err alike
 LEAST_SIDE = 1e-6  # of the image, in focal lengths
@@ -67,12 +65,6 @@ def node_weights(points: Float[Array, "p 3"], low: Float[Array, "2"], high: Floa
     return along[:, 0, :, None] * along[:, 1, None, :]
 
 
-def _node_means(errors: Float[Array, "p"], weights: Float[Array, "p n"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Weighted mean of the errors around each node, 0 where there are none, and the sum of the weights."""
-    total = jnp.sum(weights, axis=0)
-    return errors @ weights / jnp.where(total > 0, total, 1.0), total
-
-
 @full_precision
 def depth_field(
     points: Float[Array, "p 3"],
@@ -85,7 +77,7 @@ def depth_field(
 
     A network errs by a scale that drifts and by a field that is smooth over the image, ρ = B f + noise, with bilinear
     weights B. The precision W of each point is Cauchy's, 1 / (σ² + (ρ - B f)²/4), over the number of points that err
-    alike; σ is the given noise, down to `LEAST_SPREAD` of it if that is how ρ - B f spreads:
+    alike:
 
         f = K (1 + B'WB K)⁻¹ B'W ρ,   K = v exp(-½ |i - j|² / length²)
 
@@ -95,7 +87,7 @@ def depth_field(
     Args:
         points: camera frame.
         errors: ρ, log of each point's depth over that of the map along its ray.
-        noise: σ of each error beside the field; above 0.
+        noise: σ of each error, that of the field included: a field has to be clear of it; above 0.
         valid: which errors are known.
         length: over which the field is alike, as a fraction of the image's side.
     """
@@ -114,20 +106,19 @@ def depth_field(
     alike = jnp.maximum(jnp.sum(is_before) / NUM_INDEPENDENT, 1.0)
 
     def fit(nodes: Float[Array, "n"], _: None) -> tuple[Float[Array, "n"], None]:
-        rest = (errors - basis @ nodes) / noise
-        spread = jnp.clip(robust_std(rest, is_before), LEAST_SPREAD, 1.0)
-        precision = is_before / (noise**2 * (spread**2 + (0.5 * rest) ** 2)) / alike
-        mean, total = _node_means(errors, basis * precision[:, None])
+        precision = is_before / (noise**2 + (0.5 * (errors - basis @ nodes)) ** 2) / alike
+        weighted = basis * precision[:, None]
+        total = jnp.sum(weighted, axis=0)
         is_seen = total > 0
+        mean = errors @ weighted / jnp.where(is_seen, total, 1.0)
         share = total / jnp.where(has_any, jnp.sum(total), 1.0)
         chance = jnp.sum(share * is_seen / jnp.where(is_seen, total, 1.0))
         variance = jnp.maximum(jnp.sum(share * mean**2) - chance, 0.0)
         prior = variance * jnp.exp(-0.5 * apart / length**2)
-        known = basis.T @ (basis * precision[:, None]) @ prior
-        return prior @ jnp.linalg.solve(jnp.eye(NUM_NODES**2) + known, (errors * precision) @ basis), None
+        known = basis.T @ weighted @ prior
+        return prior @ jnp.linalg.solve(jnp.eye(NUM_NODES**2) + known, errors @ weighted), None
 
-    first, _ = _node_means(errors, basis * (is_before / noise**2)[:, None])
-    nodes, _ = jax.lax.scan(fit, first, length=NUM_ROUNDS)
+    nodes, _ = jax.lax.scan(fit, jnp.zeros(NUM_NODES**2), length=NUM_ROUNDS)
     return DepthField(nodes.reshape(NUM_NODES, NUM_NODES), low, high)
 
 
