@@ -143,8 +143,9 @@ def test_candidates_come_from_the_points_that_em_left_over(stepped):
 def test_a_new_gaussian_weighs_as_many_images_as_its_points_amount_to_or_one_as_printed(state, settings):
     """Clusters hold some number of points, of which λ are one image's; in all no more than there are."""
     held = np.asarray(state.map.gaussians.valid)
-    # So that EM and the image plane fuse nothing.
+    # So that EM and the image plane fuse nothing, and no row becomes free.
     apart = sc.changed(settings, **{"em.max_mahalanobis_sq": 0.0, "refinement.max_mahalanobis_sq_2d": 0.0})
+    apart = sc.at(apart, "existence.refuted", -np.inf)
     new, info = step(state, exact(FRAME), FULL, apart)
     fresh = np.asarray(new.map.gaussians.valid) & ~held
     assert info.em.num_fused == 0 and fresh.sum() == info.refinement.num_fresh > 50

@@ -21,6 +21,7 @@ APART = "apart"  # status of a frame that a submap holds which was never joined 
 UNPLACED = ("lost", APART)  # statuses of frames whose pose says nothing in the map
 # Outcomes of relocalization, `FrameRecord.location`; files have these words.
 RELOCALIZED, RESTARTED, NEW_SUBMAP, JOINED = "found", "anew", "segment", "joined"
+HIDDEN = "moving things fill the view"
 NOT_FOUND = "its place in the saved map is not found"
 UNJOINED = "its submap was never joined with the map (unjoined)"
 MANY_IN_A_ROW = 10  # single frames fail in every long sequence, so many together do not
@@ -42,6 +43,7 @@ REMEDIES = dict(
         strict=True,
     )
 ) | {
+    HIDDEN: "nothing is mapped until they are gone, or are no longer seen to move",
     NOT_FOUND: "take images of the same place, or map it anew without map=",
     UNJOINED: "take images that lead from there to the rest, closer together (dataset.stride=…)",
 }
@@ -74,6 +76,7 @@ class FrameRecord:
         origin: frame whose Gaussians it was registered to (median of their births), counted from the map's first one.
         repeat_rms: robust standard deviation between the two predictions of the previous image, m.
         left_out: pixels with a prediction that is not finite, behind the camera or farther than a map can hold.
+        moving: share of the pixels that are taken for moving.
         fused: points that moved Gaussians.
         updated: Gaussians that they moved.
         mean_log_joint: of the fused points with their best Gaussians.
@@ -108,6 +111,7 @@ class FrameRecord:
     origin: int | None = None
     repeat_rms: float | None = None
     left_out: int = 0
+    moving: float | None = None
     fused: int | None = None
     updated: int | None = None
     mean_log_joint: float | None = None

@@ -21,6 +21,7 @@ from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.mapping.records import IN_MAP, RELOCALIZED, RESTARTED, FrameRecord
 from emgs_jax.mapping.run import MappingRun, TrackedFrame
 from emgs_jax.mapping.window_input import PlacedStructure, WindowInput
+from emgs_jax.motion import no_looks
 from emgs_jax.observation import Prediction, depth_in, transform
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.registration.rigid import pose_row, scale_translation
@@ -173,7 +174,8 @@ def as_step_prediction(opening: FirstWindow | Prediction) -> Prediction:
 def state_in_saved_map(run: MappingRun, prediction: Prediction) -> SlamState:
     """Return a state in the saved map, with the structure that a checkpoint's state needs."""
     time = jnp.asarray(len(run.back_end.nodes), jnp.int32)
-    return SlamState(run.saved.map, prediction.current, prediction.T_world_anchor, exact_estimate(), time)
+    looks = no_looks(prediction.current, run.config.motion)
+    return SlamState(run.saved.map, prediction.current, prediction.T_world_anchor, exact_estimate(), time, looks)
 
 
 def relocalized_start(

@@ -25,12 +25,13 @@ from emgs_jax.geometry import seen_from
 from emgs_jax.localization import REASONS
 from emgs_jax.loop_closure.prior_query import PriorQuery
 from emgs_jax.mapping.convert import to_camera
-from emgs_jax.mapping.records import APART, NEW_SUBMAP, NOT_FOUND, RESTARTED, FrameRecord
+from emgs_jax.mapping.records import APART, HIDDEN, NEW_SUBMAP, NOT_FOUND, RESTARTED, FrameRecord
 from emgs_jax.mapping.window_input import PlacedStructure, WindowInput
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
 
+MOST_MOVING = 0.5  # of the pixels; where more move it is they that hide the map
 Seconds = Mapping[str, float]  # as a `Timer` reads
 
 
@@ -259,6 +260,8 @@ def _step_fields(info: StepInfo) -> dict[str, Any]:
     """Return the fields of a record that a step fills; `info` is on the host."""
     localization, em, refinement = info.localization, info.em, info.refinement
     reasons = [words for bit, words in enumerate(REASONS) if int(localization.reason) >> bit & 1]
+    moving = float(np.mean(info.moving))
+    reasons = [HIDDEN] if reasons and moving > MOST_MOVING else reasons
     return {
         "status": "tracked" if localization.is_tracked else "lost" if localization.is_lost else "degraded",
         "reason": "; ".join(reasons) or None,
@@ -273,6 +276,7 @@ def _step_fields(info: StepInfo) -> dict[str, Any]:
         "step_rad": float(localization.step_rad),
         "origin": int(info.origin) if localization.is_tracked else None,
         "repeat_rms": float(localization.repeat_rms),
+        "moving": moving,
         "fused": int(em.num_fused),
         "updated": int(em.num_updated),
         "mean_log_joint": float(em.mean_log_joint) if em.num_fused else None,

@@ -63,9 +63,10 @@ def some_map():
 
 
 def run(state: SlamState | None = None, saved_map=None, **more) -> SimpleNamespace:
-    end = SimpleNamespace(nodes=[None] * 7, config=load_config("graph=default").graph)
+    config = load_config("graph=default")
+    end = SimpleNamespace(nodes=[None] * 7, config=config.graph)
     saved = None if saved_map is None else SimpleNamespace(map=saved_map, back_end=end, depth_noise=0.02)
-    return SimpleNamespace(state=state, saved=saved, back_end=end, **more)
+    return SimpleNamespace(**{"config": config.slam, "state": state, "saved": saved, "back_end": end} | more)
 
 
 def lost_state() -> SlamState:
