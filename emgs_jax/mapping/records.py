@@ -4,7 +4,7 @@ A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; file
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -77,6 +77,7 @@ class FrameRecord:
         repeat_rms: robust standard deviation between the two predictions of the previous image, m.
         left_out: pixels with a prediction that is not finite, behind the camera or farther than a map can hold.
         moving: share of the pixels that are taken for moving.
+        moving_pixels: which of the thinned image, see `to_run_lengths`; None where none is.
         fused: points that moved Gaussians.
         updated: Gaussians that they moved.
         mean_log_joint: of the fused points with their best Gaussians.
@@ -112,6 +113,7 @@ class FrameRecord:
     repeat_rms: float | None = None
     left_out: int = 0
     moving: float | None = None
+    moving_pixels: Mapping[str, Any] | None = None
     fused: int | None = None
     updated: int | None = None
     mean_log_joint: float | None = None

@@ -22,13 +22,14 @@ from emgs_jax.device.clock import Clock
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.gaussians import MIN_ROWS, REFERENCE
 from emgs_jax.geometry import seen_from
+from emgs_jax.io.run_lengths import to_run_lengths
 from emgs_jax.localization import REASONS
 from emgs_jax.loop_closure.prior_query import PriorQuery
 from emgs_jax.mapping.convert import to_camera
 from emgs_jax.mapping.records import APART, HIDDEN, NEW_SUBMAP, NOT_FOUND, RESTARTED, FrameRecord
 from emgs_jax.mapping.window_input import PlacedStructure, WindowInput
 from emgs_jax.observation import Prediction
-from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
 
 MOST_MOVING = 0.5  # of the pixels; where more move it is they that hide the map
@@ -211,7 +212,7 @@ def record_step(run: MappingRun, window: WindowInput, frame: TrackedFrame, secon
         count = int(np.asarray(run.map.gaussians.valid).sum())
         kept = {"status": "initialization", "new": count - int(info.num_gaussians), "num_gaussians": count}
     outcome = {"location": frame.location, "similarity": frame.similarity}
-    fields = _step_fields(info)
+    fields = _step_fields(info, downscale(run.camera, run.config.observation.thin))
     of_map, by_map = covariance_of_map(run, fields["pose"], fields["origin"]), info.localization.by_map
     fields["covariance"] = fields["covariance"] + by_map @ of_map @ by_map.T
     return _add(run, window, 0, **fields | kept | outcome, **seconds)
@@ -256,11 +257,12 @@ def _add(run: MappingRun, window: WindowInput, row: int, **described: Any) -> Ma
     return replace(run, records=(*run.records, record))
 
 
-def _step_fields(info: StepInfo) -> dict[str, Any]:
-    """Return the fields of a record that a step fills; `info` is on the host."""
+def _step_fields(info: StepInfo, view: Camera) -> dict[str, Any]:
+    """Return the fields of a record that a step fills; `info` is on the host, `view` the camera of its rows."""
     localization, em, refinement = info.localization, info.em, info.refinement
     reasons = [words for bit, words in enumerate(REASONS) if int(localization.reason) >> bit & 1]
     moving = float(np.mean(info.moving))
+    pixels = to_run_lengths(info.moving.reshape(view.height, view.width)) if moving else None
     reasons = [HIDDEN] if reasons and moving > MOST_MOVING else reasons
     return {
         "status": "tracked" if localization.is_tracked else "lost" if localization.is_lost else "degraded",
@@ -277,6 +279,7 @@ def _step_fields(info: StepInfo) -> dict[str, Any]:
         "origin": int(info.origin) if localization.is_tracked else None,
         "repeat_rms": float(localization.repeat_rms),
         "moving": moving,
+        "moving_pixels": pixels,
         "fused": int(em.num_fused),
         "updated": int(em.num_updated),
         "mean_log_joint": float(em.mean_log_joint) if em.num_fused else None,

@@ -9,6 +9,7 @@ from emgs_jax.mapping.records import APART
 from emgs_jax.report import columns, provenance
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Line, Table
 from emgs_jax.report.html import Head, commit_words
+from emgs_jax.report.moving import MUCH
 from emgs_jax.report.provenance import RAW_PRIOR
 from emgs_jax.report.recorded_run import POLISH, RecordedRun, sound
 from emgs_jax.report.repeat import Repeated
@@ -218,9 +219,10 @@ def frame_facts(line: Mapping[str, Any]) -> str:
         "inliers": lambda v: f"{v:,} inliers",
         "residual": lambda v: f"residual {100 * v:.1f} % of the depth",
         "scale": lambda v: f"scale {v:.3f}",
+        "moving": lambda v: f"{100 * v:.0f} % moving" if v >= MUCH else "",
         "new": lambda v: f"{v:,} new",
         "num_gaussians": lambda v: f"{v:,} Gaussians",
         "seconds": lambda v: f"{v:.2f} s",
     }
     found = [say(line[name]) for name, say in known.items() if isinstance(line.get(name), int | float)]
-    return " · ".join(found)
+    return " · ".join(filter(None, found))
