@@ -82,7 +82,7 @@ def looks_of(seed: int) -> motion.Looks:
     """Two frames of the room, of which some rows were taken for moving."""
     looks = motion.no_looks(previous_of(seed), MOTION)
     for number in (0, 1):
-        T, moving = sc.path_pose(number + seed), jnp.asarray(ROWS % 7 == number)
+        T, moving = sc.path_pose(number + seed), jnp.asarray((ROWS - number) % 7 == 0)
         looks = motion.look_again(looks, previous_of(seed + number), moving, T, sc.path_pose(seed), CAMERA)
     return looks
 

@@ -68,13 +68,12 @@ def draw_views(run: RecordedRun, rows: Sequence[int], config: RenderConfig, data
     for row in rows:
         color, depth = drawn.get(row, (None, None))
         rendered = "" if color is None else jpeg(to_bytes(color))
-        pictures.append(
-            Picture(row, _seen(dataset, run.frames[row], row), rendered, "" if depth is None else jpeg(_painted(depth, near, far)))
-        )
+        seen, painted = _seen(dataset, row, run.frames[row]), "" if depth is None else jpeg(_painted(depth, near, far))
+        pictures.append(Picture(row, seen, rendered, painted))
     return Views(pictures, near, far)
 
 
-def _seen(dataset: Dataset | None, line: Mapping[str, Any], row: int) -> str:
+def _seen(dataset: Dataset | None, row: int, line: Mapping[str, Any]) -> str:
     if dataset is None:
         return ""
     try:
