@@ -61,7 +61,7 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
         "edges the other way round",
     ),
     (
-        "mapping/submaps",
+        "mapping/atlas",
         "scale_covariance(place.covariance, 1.0 / unit)",
         "scale_covariance(place.covariance, 1.0 / scale)",
         "the unit of a place is that of the map after it has moved",
