@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.ops.linalg import safe_normalize
+from emgs_jax.ops.linalg import ROUNDED_CORRELATION, safe_normalize
 from emgs_jax.ops.neighbours import is_within_reach
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, traced, where_rows
@@ -150,13 +150,17 @@ def sample_features(grid: Float[Array, "y x f"], size: tuple[int, int], thin: in
 
 
 def sound(observation: Observation) -> Observation:
-    """The observation with every row invalid, and 0, in which a number is not finite or a point beyond any map."""
+    """The observation with every row invalid, and 0, in which a number is not finite or a point beyond any map.
+
+    Colours are clipped to [0, 1].
+    """
     o = observation
     is_sound = is_within_reach(o.points) & jnp.isfinite(o.confidence)
     for vectors in (o.colors, o.normals, o.features):
         is_sound &= jnp.all(jnp.isfinite(vectors), axis=-1)
     o = where_rows(is_sound, o, jax.tree.map(jnp.zeros_like, o))
-    return eqx.tree_at(lambda o: o.confidence, o, jnp.where(is_sound, o.confidence, 1.0))
+    confidence = jnp.where(is_sound, o.confidence, 1.0)
+    return eqx.tree_at(lambda o: (o.colors, o.confidence), o, (jnp.clip(o.colors, 0.0, 1.0), confidence))
 
 
 def sound_poses(poses: jaxlie.SE3) -> jaxlie.SE3:
@@ -165,6 +169,15 @@ def sound_poses(poses: jaxlie.SE3) -> jaxlie.SE3:
     length_sq = jnp.sum(quaternion**2, axis=-1)
     is_sound = (jnp.abs(length_sq - 1.0) < 0.1) & is_within_reach(translation)
     return jaxlie.SE3(jnp.where(is_sound[..., None], poses.wxyz_xyz, jnp.nan))
+
+
+def sound_covariances(covariances: Float[Array, "*b 6 6"]) -> Float[Array, "*b 6 6"]:
+    """The covariances, NaN where a variance is negative or a correlation impossible."""
+    variances = jnp.diagonal(covariances, axis1=-2, axis2=-1)
+    std = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
+    correlations = covariances / std[..., None] / std[..., None, :]
+    roots = jnp.linalg.cholesky(correlations + ROUNDED_CORRELATION * jnp.eye(6))
+    return jnp.where(jnp.all(jnp.isfinite(roots), axis=(-2, -1), keepdims=True), covariances, jnp.nan)
 
 
 @full_precision

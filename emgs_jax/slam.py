@@ -24,7 +24,15 @@ from emgs_jax.gaussian_map import (
 from emgs_jax.gaussians import FitConfig, GaussianIndex, Gaussians, cluster, index_of, spacing
 from emgs_jax.initialization import initialize
 from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
-from emgs_jax.observation import Observation, ObservationConfig, Prediction, sound, sound_poses, transform
+from emgs_jax.observation import (
+    Observation,
+    ObservationConfig,
+    Prediction,
+    sound,
+    sound_covariances,
+    sound_poses,
+    transform,
+)
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.ops.clustering import morton_order
 from emgs_jax.ops.executable import executable
@@ -263,7 +271,12 @@ def _localize_coarse(
     current, before = sound(prediction.current), sound(prediction.previous)
     num_left_out = jnp.sum(prediction.current.valid & ~current.valid)
     prediction = replace(
-        prediction, current=current, previous=before, T_world_views=sound_poses(prediction.T_world_views)
+        prediction,
+        current=current,
+        previous=before,
+        T_world_views=sound_poses(prediction.T_world_views),
+        T_world_anchor=sound_poses(prediction.T_world_anchor),
+        pose_covariance=sound_covariances(prediction.pose_covariance),
     )
     coarse = localize_coarse(prediction, previous, T_world_previous, view, config, estimate)
     return coarse, current, transform(coarse.T_world_camera, current, coarse.scale), num_left_out

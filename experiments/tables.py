@@ -18,20 +18,17 @@ from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.overrides import quoted
 from emgs_jax.io.files import check_writable, write_file
-from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, Line, markdown, metric_table
+from emgs_jax.report.columns import Column, Line, markdown, metric_table
 from emgs_jax.report.provenance import git_now
 from emgs_jax.report.results import METRICS_FILE, Estimate, estimates_of, read_metrics
+from emgs_jax.report.tables import COLUMNS as ALL
 from emgs_jax.report.tables import average
 
 from .command import command
 from .evaluate import Job, evaluate, plan
 
 Settings = Mapping[str, Any]  # a resolved conf/evaluate.yaml
-COLUMNS = (
-    MAIN[0]._replace(title="ATE Sim(3) [cm]", digits=1),
-    Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 1, True),
-    *(column._replace(digits=1) for column in (*MAIN[1:], *PLACED, *RENDERED)),
-)
+COLUMNS = tuple(column._replace(digits=1) for column in ALL if not column.key.startswith(("time/", "trajectory/scale")))
 _SHORT = {  # of the first page: lengths and shares by the points
     "trajectory/ate_sim3_m": "ATE [cm]",
     "reconstruction_icp/accuracy_m": "accuracy [cm]",

@@ -57,6 +57,7 @@ SLOW = {
     "mapping/test_relocalized_start.py",
     *(f"scripts/{name}.py" for name in ("test_command_line", "test_evaluate", "test_score", "test_sweep_script")),
     "scripts/test_tune.py",
+    "test_advice.py",
     "test_existence.py",
     "test_front_door.py",
     "test_mutants.py",

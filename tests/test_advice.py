@@ -41,8 +41,10 @@ from emgs_jax.report.provenance import RESULT_FORMAT
 from emgs_jax.report.results import METRICS_FILE, is_finished
 from experiments.evaluate import plan
 from experiments.export import export_run
+from experiments.grid import read_axes, variants
 from experiments.query import query
 from experiments.score import score
+from experiments.search import read_objectives, read_space
 from tests.data.test_calibration_files import CORNER, KALIBR, MAST3R, ORB, ROS, TRANSFORMS
 from tests.data.test_calibration_files import PLAIN as OF_VIPE
 from tests.data.written_benchmarks import CAMERAS, EUROC_SIZE, write_colmap, write_euroc, write_kitti, write_nerfstudio
@@ -572,13 +574,16 @@ def in_unit(lengths: float, poses: float) -> Step:
     return own(depth=lambda frame: lengths * frame.depth, T_world_camera=lambda frame: moves * frame.T_world_camera)
 
 
+def matrix(frame) -> np.ndarray:
+    fx, fy, cx, cy = tiny_run.dataset().intrinsics
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
 def unseen(frame) -> np.ndarray:
     """Where the right half was cropped away."""
     return np.where(np.arange(frame.depth.shape[1]) < 48, frame.depth, 0)
 
 
-FX, FY, CX, CY = tiny_run.dataset().intrinsics
-K = [[FX, 0, CX], [0, FY, CY], [0, 0, 1]]
 INVERSE, FLIP = np.linalg.inv, [1, -1, -1, 1]
 OF_PREDICTIONS = [
     ({"folder": "{root}"}, r"has no file \*.npz, .* and no known layout \(docs", {"folder": "{root}/own"}),
@@ -625,9 +630,9 @@ OF_PREDICTIONS = [
     (own(confidence=lambda frame: np.ones((4, 5))), r"confidence must be numbers \(48, 64\), as what it is of", own()),
     (own(intrinsics=lambda frame: [999, 999, 320, 240]), r"give those of the file's own size \(64x48\)", own()),
     (
-        own(intrinsics=lambda frame: np.array(K).T),
+        own(intrinsics=lambda frame: matrix(frame).T),
         "must be fx 0 cx, 0 fy cy, 0 0 1, row by row, .*: transpose it",
-        own(intrinsics=lambda frame: K),
+        own(intrinsics=matrix),
     ),
     (own(intrinsics=lambda frame: [1, 2, 3]), r"must be \[fx, fy, cx, cy\] or a camera matrix", own()),
     (own(depth=lambda frame: frame.depth * np.nan), "none of its 6 files has a depth above 0", own()),
@@ -970,6 +975,59 @@ OF_CONFIG = [
         {"words": "['{1}', prior/dense=itermvs]"},
     ),
 ]
+
+
+def read_sweep(root: Path, words: list[str]) -> list:
+    config = compose(*words, name="sweep")
+    return variants(config, read_axes(config))
+
+
+def read_search(root: Path, words: list[str]) -> tuple:
+    config = compose(*words, name="tune")
+    return read_space(config), read_objectives(config)
+
+
+OF_SWEEP = [
+    (
+        {"words": []},
+        r"choose one with (sweep=gates) or '(axes=\S+)'$",
+        *({"words": "['{1}']"}, {"words": '["{2}"]'}),
+    ),
+    ({"words": ["axes={em.noise:[0]}"]}, r"near names: (slam\.em\.noise)", {"words": '["axes={{{1}:[0]}}"]'}),
+    ({"words": ["axes={slam.em.noise:2}"]}, r"write (\S+): \[(\d), …\]", {"words": '["axes={{{1}:[{2},3]}}"]'}),
+    (
+        {"words": ["axes={slam.em.noise:[0]}", "grid=all"]},
+        "grid must be one of product, (one_at_a_time)",
+        {"words": '["axes={{slam.em.noise:[0]}}", "grid={1}"]'},
+    ),
+    (
+        {"words": ["axes={slam.em.noise:[-9]}"]},
+        r"from (\d) to \S+, got -9",
+        {"words": '["axes={{slam.em.noise:[{1}]}}"]'},
+    ),
+]
+
+
+def space(key: str, given: str) -> dict[str, str]:
+    return {"words": f'["space={{{{{key}:{given}}}}}"]'}
+
+
+OF_SEARCH = [
+    ({"words": []}, r"with (tune=gates), or '(space=\S+)'$", {"words": "['{1}']"}, {"words": '["{2}"]'}),
+    (space("em.noise", "[0,1]"), r"near names: (slam\.em\.noise)", space("{1}", "[0,1]")),
+    (space("slam.em.noise", "[1]"), "two or more different numbers", space("slam.em.noise", "[1,2]")),
+    (space("slam.em.noise", "3"), "must be a range {low: …, high: …", space("slam.em.noise", "{{low:0.1,high:1}}")),
+    (
+        space("slam.em.noise", "{{low:1,high:0.1}}"),
+        "needs low < high, and low above 0 with log: true",
+        space("slam.em.noise", "{{low:0.1,high:1,log:true}}"),
+    ),
+    (
+        {"words": ["tune=gates", "objectives=[best]"]},
+        r"must be minimize METRIC or maximize METRIC",
+        {"words": '["tune=gates", "objectives=[minimize trajectory/ate_sim3_m]"]'},
+    ),
+]
 TABLES = {
     "tum": (write_tum, frames(Tum, sequence=TUM), OF_TUM),
     "seven_scenes": (write_seven_scenes, frames(SevenScenes, sequence=SEVEN), OF_SEVEN),
@@ -987,6 +1045,8 @@ TABLES = {
     "evaluate": (write_finished, read_plan, OF_EVALUATION),
     "export": (written_with_points, read_export, OF_EXPORT),
     "query": (written_with_points, read_answer, OF_QUERY),
+    "sweep": (lambda root: None, read_sweep, OF_SWEEP),
+    "tune": (lambda root: None, read_search, OF_SEARCH),
     "config": (lambda root: None, lambda root, words: compose(*words), OF_CONFIG),
 }
 CASES = [(name, *row[:2], remedy) for name, (_, _, rows) in TABLES.items() for row in rows for remedy in row[2:]]

@@ -7,7 +7,7 @@ import jaxlie
 import numpy as np
 import pytest
 import reference
-from scene import assert_same, at, moved_points, observe_room, on_host, path_pose, pose
+from scene import assert_same, at, moved_points, observe_room, on_host, path_pose, pose, random_observation, replace
 
 from emgs_jax import observation
 from emgs_jax.config.values import check_value, declared
@@ -319,3 +319,19 @@ def test_a_pose_whose_quaternion_is_none_is_unknown():
     found = on_host(observation.sound_poses)(jaxlie.SE3(values)).wxyz_xyz
     np.testing.assert_array_equal(np.isfinite(found).all(axis=1), [True, False, False, False])
     np.testing.assert_array_equal(found[0], values[0])
+
+
+def test_a_covariance_that_is_none_is_unknown_and_one_of_a_single_error_is_known():
+    errors = np.ones((6, 6)), 1e6 * np.eye(6), np.zeros((6, 6)), np.diag([1, 1, 1, 1, 1, -1e-3]), np.eye(6) + 2
+    values = np.float32([*errors, 2 * np.ones((6, 6)) - np.eye(6) * 1.1, np.full((6, 6), np.nan)])
+    found = on_host(observation.sound_covariances)(values)
+    assert np.isfinite(found).all((1, 2)).tolist() == [True, True, True, False, True, False, False]
+    np.testing.assert_array_equal(found[:3], values[:3])
+
+
+def test_a_colour_is_one_of_an_image():
+    given = random_observation(4)
+    colors = np.float32([[0, 0.5, 1], [1e30, 0.5, 0.5], [-3, 0, 0.25], [np.nan, 0, 0]])
+    found = on_host(observation.sound)(replace(given, colors=colors))
+    np.testing.assert_array_equal(found.colors, [[0, 0.5, 1], [1, 0.5, 0.5], [0, 0, 0.25], [0, 0, 0]])
+    assert found.valid.tolist() == [True, True, True, False]

@@ -12,6 +12,7 @@ from scene import FULL, ROOM, WHOLE, exact, noisy, noisy_prediction
 
 from emgs_jax import slam
 from emgs_jax.device.executables import call
+from emgs_jax.localization import COARSE
 from emgs_jax.mapping.capacity import advance, grow_capacities, start
 from emgs_jax.mapping.convert import opening
 from emgs_jax.observation import Prediction
@@ -191,6 +192,38 @@ def test_a_frame_that_is_not_tracked_leaves_the_map_bit_for_bit(state, settings,
     seen = np.asarray(new.previous.valid)
     assert seen.all() if loss == "rejected" else not seen.any()
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((new, info.T_world_camera, info.T_world_newest)))
+
+
+def odd(name: str) -> Prediction:
+    """With a number that no prior should say."""
+    given = exact(FRAME)
+    if name == "colour":
+        colors = np.array(given.current.colors)
+        colors[5] = 1e30
+        return eqx.tree_at(lambda p: p.current.colors, given, sc.device(colors))
+    if name in COVARIANCES:
+        return eqx.tree_at(lambda p: p.pose_covariance, given, sc.device(np.stack([COVARIANCES[name]] * 2)))
+    anchor = {"no rotation": np.zeros(7), "anchor beyond any map": np.array([1.0, 0, 0, 0, 1e30, 0, 0])}[name]
+    return eqx.tree_at(lambda p: p.T_world_anchor, given, jaxlie.SE3(sc.device(anchor)))
+
+
+COVARIANCES = {
+    "negative variance": np.diag([1.0, 1.0, 1.0, -1e-3, 1e-4, 1e-4]),
+    "errors that are one and the same": np.ones((6, 6)),
+    "the same, a hundred times as large": 1e4 * np.ones((6, 6)),
+    "beyond float32's square": 1e30 * np.eye(6),
+}
+
+
+@pytest.mark.parametrize("coarse", ["fused", "anchored"])
+@pytest.mark.parametrize("name", ["colour", "no rotation", "anchor beyond any map", *COVARIANCES])
+def test_whatever_a_prior_says_the_state_is_sound_and_the_next_frame_tracked(state, settings, name, coarse):
+    config = sc.at(settings, "localization.coarse", COARSE.index(coarse))
+    state, info = step(state, odd(name), FULL, config)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((state, info.T_world_camera)))
+    np.testing.assert_allclose(np.linalg.norm(state.T_world_previous.rotation().wxyz), 1.0, atol=1e-5)
+    _, info = step(state, exact(FRAME + 1), FULL, config)
+    assert info.localization.is_tracked
 
 
 def test_a_step_after_a_lost_frame_is_tracked_again(state, settings):

@@ -265,7 +265,7 @@ def read_color(path: Path, raw_size: Size | None = None, flags: int = 0) -> UInt
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def read_depth(path: Path, depth_scale: float, raw_size: Size) -> Float32[np.ndarray, "_ _"]:
+def read_depth(path: Path, depth_scale: float, raw_size: Size | None = None) -> Float32[np.ndarray, "_ _"]:
     """Depth in metres from a 16-bit image, 0 where it has no value (raw 0 and 65535, the sensors' two marks)."""
     raw = decode(path, cv2.IMREAD_UNCHANGED)
     if raw.dtype != np.uint16 or raw.ndim != 2:

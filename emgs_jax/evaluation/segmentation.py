@@ -20,6 +20,7 @@ from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.geometry import rotated
 from emgs_jax.io.ply_reader import read_vertices
 
+_VOTED_ROWS = 200_000  # points that are given a class together: bounds the memory, does not change the result
 _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
 
 
@@ -176,10 +177,13 @@ def transfer_labels(points: np.ndarray, labels: np.ndarray, targets: np.ndarray,
     points, labels = points[known], labels[known].astype(np.int64)
     if not len(points):
         return np.full(len(targets), -1)
-    votes = labels[NearestPoints(points).query(targets, num_neighbours)[1]]
-    counts = (votes[:, :, None] == votes[:, None, :]).sum(-1)
-    candidates = np.where(counts == counts.max(1, keepdims=True), votes, np.iinfo(np.int64).max)
-    return candidates.min(1)
+    search, found = NearestPoints(points), np.empty(len(targets), np.int64)
+    for begin in range(0, len(targets), _VOTED_ROWS):
+        part = slice(begin, begin + _VOTED_ROWS)
+        votes = labels[search.query(targets[part], num_neighbours)[1]]
+        counts = (votes[:, :, None] == votes[:, None, :]).sum(-1)
+        found[part] = np.where(counts == counts.max(1, keepdims=True), votes, np.iinfo(np.int64).max).min(1)
+    return found
 
 
 def confusion_matrix(truth: np.ndarray, predicted: np.ndarray, num_classes: int) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Features from the class images of any segmentation network: each class has a direction of its own."""
 
+from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -72,6 +73,12 @@ class LabelFeatures:
             raise ValueError(
                 f"{self._file_of(missing[0])} does not exist, nor do those of {len(missing)} of {len(dataset)} images: "
                 "features.folder must hold a class image (PNG) or scores (.npy) of the name of every image in use"
+            )
+        twice = [name for name, count in Counter(Path(name).stem for name in {*images}).items() if count > 1]
+        if twice:
+            raise ValueError(
+                f"images of several folders have the name {twice[0]}, and classes have one folder: map the images of "
+                "one folder, or give each a name of its own"
             )
         if any(dataset.calibration.get("distortion") or ()):
             raise ValueError(

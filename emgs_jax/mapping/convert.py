@@ -72,8 +72,10 @@ def _check_covariance(prediction: PriorPrediction) -> None:
     known = covariance[np.isfinite(covariance).all((-2, -1))] if covariance.ndim == 3 else covariance
     is_sound = covariance.shape == (len(window.views), 6, 6)
     if is_sound and len(known):
-        rounding = 1e-6 * np.abs(known).max()
-        is_sound = np.abs(known - known.mT).max() <= rounding and np.linalg.eigvalsh(known).min() >= -rounding
+        variances = np.diagonal(known, axis1=1, axis2=2)
+        std = np.sqrt(np.where(variances > 0, variances, 1.0))
+        known = known / std[:, None] / std[:, :, None]  # metres and radians have roundings of their own
+        is_sound = np.abs(known - known.mT).max() <= 1e-6 and np.linalg.eigvalsh(known).min() >= -1e-6
     if not is_sound:
         raise ValueError(
             f"the prior's pose_covariance at frame {window.current}, of shape {covariance.shape}, must be "

@@ -17,6 +17,7 @@ Whitening: TypeAlias = tuple[Float[Array, "n 6"], Float[Array, "n"]]  # what `wh
 SMALLEST_LENGTH = 1e-12
 # Of a covariance's trace: what float32 loses of its entries, and the least variance that can be told from none.
 ROUNDED, FLATTEST = 2.0**-22, 2.0**-28
+ROUNDED_CORRELATION = 2.0**-18  # added to a diagonal of ones: what float32 loses of so few rows may make it indefinite
 
 
 def safe_normalize(vectors: Float[Array, "*b d"]) -> Float[Array, "*b d"]:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
+from emgs_jax.ops.linalg import ROUNDED_CORRELATION
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.icp import IcpInfo
 from emgs_jax.registration.pose_noise import Repeats, no_repeats, rescale_repeats
@@ -70,8 +71,11 @@ def kalman_update(
         difference: d, the innovation: the measurement relative to the estimate.
         information: W of the measurement; zero where nothing is measured.
     """
-    posterior = jnp.linalg.solve(jnp.eye(DEGREES) + covariance @ information, covariance)
-    posterior = 0.5 * (posterior + posterior.T)
+    root = _root(covariance)
+    # As a square, which stays a covariance however well P and W are known in different directions.
+    inner = jnp.linalg.cholesky(jnp.eye(DEGREES) + root.T @ information @ root)
+    half = jax.scipy.linalg.solve_triangular(inner, root.T, lower=True)
+    posterior = half.T @ half
     return posterior @ information @ difference, posterior
 
 
@@ -105,10 +109,16 @@ def correct(
 
 @full_precision
 def root_information(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """L⁻¹ of P = L L': |L⁻¹ x|² is the squared Mahalanobis distance of x. P must be positive definite."""
-    std = jnp.sqrt(jnp.diagonal(covariance))
-    correlation = covariance / std / std[:, None]
-    return jnp.linalg.inv(jnp.linalg.cholesky(correlation)) / std
+    """L⁻¹ of P = L L': |L⁻¹ x|² is the squared Mahalanobis distance of x. No variance of P may be 0."""
+    return jax.scipy.linalg.solve_triangular(_root(covariance), jnp.eye(covariance.shape[0]), lower=True)
+
+
+def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """L of P = L L', by correlations, so that no unit rounds another one."""
+    variances = jnp.diagonal(covariance)
+    std = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
+    correlation = covariance / std / std[:, None] + ROUNDED_CORRELATION * jnp.eye(std.shape[0])
+    return jnp.where(variances > 0, std, 0.0)[:, None] * jnp.linalg.cholesky(correlation)
 
 
 @full_precision

@@ -1,5 +1,6 @@
 """The command that repeats a run: the words that make its config of conf/."""
 
+import math
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.configure import CONF, compose
 from emgs_jax.config.overrides import written
+from emgs_jax.config.values import field_of
 from emgs_jax.io.files import flat, jsonable
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # of C where it is there: seventy files a report
@@ -46,9 +48,25 @@ def repeat(settings: Mapping[str, Any]) -> Repeated:
             default = composed.get(key, ...)
             if default != value and (follows_another or not str(own.get(key, "${")).startswith("${")):
                 is_known = OmegaConf.select(config, key, default=...) is not ...
+                value = _infinity(config, key) if is_known and value is None else value
                 words.append(f"{'' if is_known else '+'}{key}={written(value)}")
                 differences.append((key, value, default))
     return Repeated(words, differences)
+
+
+def _infinity(config: DictConfig, key: str) -> float | None:
+    """The value for which null stands, as JSON has no infinity: that of an option of conf/, else an end of the range.
+
+    None where the key takes null.
+    """
+    group, _, name = key.rpartition(".")
+    node = OmegaConf.select(config, group) if group else None
+    field = field_of(config, key) if isinstance(node, DictConfig) and "_target_" in node else None
+    if field is None or field.range is None or type(None) in field.kinds:
+        return None
+    options = (_content(path).get(name) for path in (CONF / group.replace(".", "/")).glob("*.yaml"))
+    given = [value for value in options if isinstance(value, float) and math.isinf(value)]
+    return next((end for end in (*given, field.range.high, field.range.low) if math.isinf(end)), None)
 
 
 def _values(config: DictConfig) -> dict[str, Any]:

@@ -64,7 +64,8 @@ def test_true_points_of_an_ignored_class_do_not_count_but_points_lost_to_it_do()
     assert segmentation_metrics(np.zeros((3, 4), int))["segmentation/miou_percent"] is None
 
 
-def test_a_target_takes_the_most_frequent_label_of_its_neighbours():
+def test_a_target_takes_the_most_frequent_label_of_its_neighbours(monkeypatch):
+    monkeypatch.setattr(segmentation, "_VOTED_ROWS", 7)
     rng = np.random.default_rng(1)
     points, targets = rng.uniform(size=(200, 3)), rng.uniform(size=(50, 3))
     labels = rng.integers(-1, 4, 200)

@@ -111,6 +111,8 @@ def test_labels_that_do_not_fit_the_images_or_classes_are_named(folder):
     model.check(Dataset([["x/a.png"], []]))
     with pytest.raises(ValueError, match=r"b\.png does not exist, nor do those of 1 of 2 images"):
         model.check(Dataset([["x/a.png"], ["x/b.jpg"]]))
+    with pytest.raises(ValueError, match="images of several folders have the name a, and classes have one folder"):
+        model.check(Dataset([["x/a.png"], ["y/a.png"]]))  # those of the second had the classes of the first
     bent.calibration = {"distortion": [0.1, 0.0]}
     with pytest.raises(ValueError, match="straightens its images"):
         model.check(bent)

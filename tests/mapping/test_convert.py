@@ -131,11 +131,16 @@ def test_the_steps_of_the_first_window_know_their_poses_as_well():
         assert np.trace(step.pose_covariance[0]) > np.trace(step.pose_covariance[1])
 
 
-@pytest.mark.parametrize("fault", ["shape", "asymmetric", "negative"])
+@pytest.mark.parametrize("fault", ["shape", "asymmetric", "negative", "negative beside millimetres"])
 def test_a_covariance_that_is_none_is_refused(fault):
     prediction, frames = predicted(FIRST)
     wrong = np.tile(np.eye(6), (len(FIRST.views), 1, 1))
-    wrong = {"shape": wrong[1:], "asymmetric": wrong + np.eye(6, k=1), "negative": wrong - 2 * np.eye(6)}[fault]
+    wrong = {
+        "shape": wrong[1:],
+        "asymmetric": wrong + np.eye(6, k=1),
+        "negative": wrong - 2 * np.eye(6),
+        "negative beside millimetres": wrong * np.repeat([1e6, -1e-3], 3),
+    }[fault]
     with pytest.raises(ValueError, match="pose_covariance"):
         to_first_window(replace(prediction, pose_covariance=wrong), frames, ANCHOR, CONFIG)
 

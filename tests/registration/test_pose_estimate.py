@@ -79,6 +79,22 @@ def test_an_update_is_that_of_the_kalman_filter():
     np.testing.assert_allclose(after, (np.eye(7) - gain) @ P, atol=1e-5)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("rank", [1, 7])
+def test_an_update_is_a_covariance_in_every_unit_however_well_directions_are_known(unit, rank):
+    """Metres beside what is known a thousand times as well; with rank 1 all errors are one and the same."""
+    axes, known = np.linalg.qr(np.random.default_rng(0).normal(size=(7, 7)))[0], np.logspace(0, -6, 7)
+    units = np.array([unit] * 3 + [1.0] * 4)
+    P = units[:, None] * (np.ones((7, 7)) if rank == 1 else (axes * known) @ axes.T) * units
+    W = 1e6 * (axes * known[::-1]) @ axes.T / units / units[:, None]
+    _, after = update(np.float32(P), STEP, np.float32(W))
+    expected = P - P @ W @ np.linalg.inv(np.eye(7) + P @ W) @ P
+    std = np.sqrt(np.diag(P))
+    after, expected = (x / std / std[:, None] for x in (np.float64(after), expected))
+    assert np.linalg.eigvalsh(after).min() > -1e-9
+    np.testing.assert_allclose(after, expected, atol=2.0**-9)  # the root of what is added to correlations
+
+
 def test_what_is_certain_stays_and_what_is_not_measured_says_nothing():
     ones, nothing = np.ones(7, np.float32), np.zeros((7, 7), np.float32)
     step, after = update(nothing, ones, np.eye(7, dtype=np.float32))

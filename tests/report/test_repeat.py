@@ -25,8 +25,9 @@ def settings_of(*words):
         ("dataset=apartment", "dataset.walk=out_and_back", "prior.version=2", "graph=default", "graph.every=3"),
         ("dataset=images", r"dataset.root='a b/it\'s [1], $x'", "dataset.intrinsics=[1.5,2,3,4]", "prior.level=.5"),
         ("experiment=paper", "slam.em.max_log_gap=inf", "render.opacity=.7", "baseline=voxel"),
+        ("slam.em.max_log_gap=inf", "slam.existence.refuted=-inf"),  # null, which is refused
     ],
-    ids=["walk", "images", "paper"],
+    ids=["walk", "images", "paper", "infinite"],
 )
 def test_the_words_compose_the_same_config(words):
     settings = settings_of(*words)

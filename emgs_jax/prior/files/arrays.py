@@ -5,11 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from emgs_jax.data.file_names import natural_order
-from emgs_jax.data.reading import decode, is_rigid
+from emgs_jax.data.reading import is_rigid
 from emgs_jax.io.npz import npz_names, read_npz
 from emgs_jax.io.packages import extra
 from emgs_jax.prior.files.view import Intrinsics, View, usable
@@ -48,14 +47,6 @@ def load_npy(path: Path) -> np.ndarray:
         return np.load(path, allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
         raise ValueError(f"{path} is no .npy that can be read ({error}): write it again") from error
-
-
-def load_png(path: Path, units_per_metre: float) -> np.ndarray:
-    """Depths of a 16-bit image, 0 where it has none (raw 0 and 65535)."""
-    raw = decode(path, cv2.IMREAD_UNCHANGED)
-    if raw.dtype != np.uint16 or raw.ndim != 2:
-        raise ValueError(f"{path} must be a 16-bit depth image with one channel, got {raw.dtype} {raw.shape}")
-    return np.where(raw == 65535, 0, raw).astype(np.float32) / np.float32(units_per_metre)
 
 
 def load_exr(path: Path) -> np.ndarray:

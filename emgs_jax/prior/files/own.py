@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from emgs_jax.data.file_names import last_number
+from emgs_jax.data.reading import read_depth
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.prior.files.arrays import (
     as_intrinsics,
@@ -16,7 +17,6 @@ from emgs_jax.prior.files.arrays import (
     load_json,
     load_npy,
     load_npz,
-    load_png,
     names_in,
 )
 from emgs_jax.prior.files.view import Predictions, View, whole_image
@@ -56,7 +56,7 @@ def read_own(folder: Path, units_per_metre: float) -> Predictions:
         return Predictions("npz", names, poses, source, read_npz, files, True, whole_image, unread=unread)
     given = load_json(lists[0]).get("intrinsics") if lists[0].suffix == ".json" else None
     intrinsics = None if given is None else as_intrinsics(given, f"{lists[0]}: intrinsics")
-    load = {".exr": load_exr, ".npy": load_npy, ".png": partial(load_png, units_per_metre=units_per_metre)}[suffix]
+    load = {".exr": load_exr, ".npy": load_npy, ".png": partial(read_depth, depth_scale=units_per_metre)}[suffix]
 
     def read(row: int) -> View:
         return as_view(str(paths[row]), load(paths[row]), None, intrinsics)

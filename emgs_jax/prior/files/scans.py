@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.posed_images import find_model
-from emgs_jax.data.reading import resize_intrinsics
+from emgs_jax.data.reading import read_depth, resize_intrinsics
 from emgs_jax.ops.constants import FLIP
 from emgs_jax.prior.files.arrays import (
     as_intrinsics,
@@ -16,7 +16,6 @@ from emgs_jax.prior.files.arrays import (
     load_exr,
     load_json,
     load_numbers,
-    load_png,
 )
 from emgs_jax.prior.files.view import Predictions, View, by_rays, whole_image
 
@@ -73,7 +72,7 @@ def read_scannet(folder: Path) -> Predictions:
     poses = [as_poses(load_numbers(place, (1, 4, 4)), str(place)) for place in places]  # of -inf where lost
 
     def read(row: int) -> View:
-        return as_view(str(paths[row]), load_png(paths[row], SCANNET_UNITS), None, intrinsics)
+        return as_view(str(paths[row]), read_depth(paths[row], SCANNET_UNITS), None, intrinsics)
 
     names, files = [path.stem for path in paths], [*paths, *places, calibration]
     return Predictions("ScanNet", names, np.concatenate(poses), f"{folder}/pose", read, files, True, by_rays)
