@@ -35,9 +35,9 @@ def map_frames(
         spacing = run.back_end.config.prior_query.spacing
         query = make_prior_query(prior, dataset, spacing, run.config.window_size, run.clock)
         run = replace(run, prior_query=query)
-    num_known, placed = 0, ()  # inputs that are mapped already, and their records
+    resumed, num_known, placed = run, 0, ()  # inputs that are mapped already, and their records
     if keeper.found is not None:
-        run, num_known, placed = keeper.found.restored(run), keeper.found.num_inputs, keeper.found.records
+        resumed, num_known, placed = keeper.found.restored(run), keeper.found.num_inputs, keeper.found.records
     try:
         for number, window in enumerate(window_inputs(dataset, prior, run.config, run.clock), 1):
             if number > num_known:
@@ -45,6 +45,7 @@ def map_frames(
                     run, records = map_input(run, window)
             else:
                 records, placed = placed[: len(window.frames)], placed[len(window.frames) :]
+                run = resumed if number == num_known else replace(run, records=(*run.records, *records))
             keeper.keep(run, records)
             yield run, records, window.raw
         keeper.save()

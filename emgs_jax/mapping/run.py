@@ -65,8 +65,9 @@ class MappingRun:
 
     @property
     def apart(self) -> Mapping[int, SlamState]:
-        """States of submaps that are not joined with the map, by their number."""
-        return {number: one.state for number, one in self.atlas.submaps.items() if number != self.atlas.graph.active}
+        """States of submaps that are not joined with the map, by their number; none before there is a map."""
+        others = {} if self.state is None else self.atlas.submaps
+        return {number: one.state for number, one in others.items() if number != self.atlas.graph.active}
 
     @property
     def map(self) -> GaussianMap | None:
