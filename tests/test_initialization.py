@@ -1,5 +1,6 @@
 """The first map: its number of Gaussians, its weights, its place in the world, and independence of the world frame."""
 
+import jaxlie
 import numpy as np
 import pytest
 import reference
@@ -37,6 +38,15 @@ def test_the_views_are_moved_to_the_world_by_the_priors_poses(result, views):
     for i, T in enumerate(POSES):
         expected = sc.moved_points(T, sc.rows_of(views, i))
         np.testing.assert_allclose(result[2].points[i], expected.points, atol=1e-6)  # roundings
+
+
+def test_a_view_without_a_pose_has_no_point_and_the_others_make_the_map(views, camera, config):
+    poses = np.array(sc.stack_poses(POSES).wxyz_xyz)
+    poses[1] = np.nan
+    gaussians, weight, world = first_map(views, jaxlie.SE3(sc.device(poses)), camera, 1, config().fit)
+    assert world.valid.any(axis=1).tolist() == [True, False, True]
+    assert np.isfinite(gaussians.means).all()
+    np.testing.assert_allclose(weight.sum(), 2 * 768 / 8, rtol=1e-5)
 
 
 def test_the_gaussians_lie_on_the_rooms_walls_with_their_normals_and_colours(result):

@@ -247,6 +247,27 @@ def test_points_that_are_too_far_apart_are_no_pair(wide, printed):
     assert distance < 0.02 and angle < 0.01  # half a pixel, of fewer pairs
 
 
+def test_pairs_that_are_farther_apart_than_allowed_are_none(wide, printed):
+    """Without a pair the prior's own motion, which is 3 cm off, stands in."""
+    given, off = sc.predict_room(FRAME, wide), sc.pose(translation=(0.03, 0.0, 0.0))
+    views = [jaxlie.SE3(values) for values in np.asarray(given.T_world_views.wxyz_xyz)]
+    moved = sc.product(views[1], off)
+    given = eqx.tree_at(lambda p: p.T_world_views, given, sc.stack_poses([views[0], moved, views[2]]))
+    config = sc.at(printed, "coarse", COARSE["via_previous"])
+    near, none = (coarse_of(given, wide, sc.at(config, "max_pair_distance", most)) for most in (0.05, 0.0))
+    assert sc.pose_error(none.T_world_camera, moved)[0] < 1e-5
+    assert sc.pose_error(near.T_world_camera, moved)[0] > 1e-3
+
+
+def test_where_nothing_leads_from_the_frame_before_a_pose_is_as_uncertain_as_a_fine_step_may_go(wide, printed):
+    given = sc.predict_room(FRAME, wide)
+    before = sc.moved_points(sc.path_pose(FRAME - 1), given.previous)
+    before = sc.replace(before, valid=np.zeros(80 * 64, bool))
+    found = coarse_of(given, wide, sc.at(printed, "coarse", COARSE["anchored"]), before)
+    steps = [float(printed.max_step) * found.mean_depth] * 3 + [float(printed.max_step_rad)] * 3
+    np.testing.assert_allclose(np.sqrt(np.diag(found.estimate.covariance))[:6], steps, rtol=1e-3)
+
+
 @pytest.mark.parametrize("count", [15, 16])
 def test_a_frame_is_usable_from_sixteen_points_on(wide, printed, count):
     prediction = sc.predict_room(FRAME, wide)

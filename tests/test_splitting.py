@@ -72,6 +72,13 @@ def test_points_that_contradict_split_and_points_that_agree_do_not(settings, con
     assert verdict(map, contradict(points), settings)
 
 
+@pytest.mark.parametrize("share", [0.95, 1.05])
+def test_a_colour_is_contradicted_from_its_deviation_on(settings, share):
+    map, points = one_disc(), points_of(one_disc())
+    off = np.where(is_left(points), -share, share) * float(settings.color_std)
+    assert verdict(map, replace(points, colors=0.5 + off * np.ones(3)), settings) == (share > 1)
+
+
 def test_a_view_that_is_no_nearer_than_the_first_splits_nothing(settings):
     map, enough = one_disc(), int(settings.min_points) * SPACING
     for count in (enough - 1, enough):

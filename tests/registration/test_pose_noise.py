@@ -208,3 +208,16 @@ def test_the_deviations_have_a_finite_gradient_where_answers_agree_and_where_the
 
     for before in (no_repeats(), said_again(no_repeats(), exact(1))[0]):
         assert np.isfinite(slope(np.zeros(3, np.float32), before)).all()
+
+
+def test_a_covariance_that_is_given_is_brought_into_the_maps_unit_and_the_other_is_the_guess():
+    factor, unit, depth, guess = np.random.default_rng(0).normal(size=(6, 6)), 2.0, 3.0, np.linspace(0.1, 0.6, 12)
+    given = np.float32([0.01 * factor @ factor.T, np.full((6, 6), np.nan)])
+    found = on_host(pose_noise.pose_covariances)(given, np.float32(guess.reshape(2, 6)), *map(device, (depth, unit)))
+    units, least = np.repeat([unit, 1.0], 3), pose_noise.LEAST_NOISE * np.repeat([depth, 1.0], 3)
+    np.testing.assert_allclose(found[0], units[:, None] * given[0] * units + np.diag(least**2), rtol=1e-5)
+    np.testing.assert_allclose(found[1], np.diag(guess[6:] ** 2), rtol=1e-5)
+    tiny = on_host(pose_noise.pose_covariances)(
+        0 * given[[0, 0]], np.float32(np.ones((2, 6))), *map(device, (depth, unit))
+    )
+    np.testing.assert_allclose(tiny, np.tile(np.diag(least**2), (2, 1, 1)), rtol=1e-5)

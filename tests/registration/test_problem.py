@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from compiled_rows import random_problem
 from scene import at, device, matrix_of, on_host
 
@@ -13,6 +14,7 @@ from emgs_jax.registration.pose_estimate import root_information
 from emgs_jax.registration.problem import (
     COLORED,
     COLORED_RAY,
+    RESIDUALS,
     CoarseStart,
     IcpConfig,
     Problem,
@@ -21,6 +23,7 @@ from emgs_jax.registration.problem import (
 )
 
 data_information, rows_of = on_host(problems.data_information), on_host(problems.rows_of)
+pose_information = on_host(problems.information)
 jacobian_of = on_host(jax.jacfwd(problems.rows_of))
 NOWHERE = np.zeros(7, np.float32)
 DISTRIBUTION, STD, DEPTH_NOISE = 1, 0.01, 0.03
@@ -125,3 +128,18 @@ def test_what_is_known_is_the_prior_of_the_unknowns_and_worth_less_where_the_poi
         np.testing.assert_allclose(np.linalg.norm(made(worse, True).prior @ y), expected, rtol=1e-4)
     nothing = made(1.0, True, at(settings, "prior_information", 0.0)).prior
     assert not np.any(nothing[:6]) and nothing[6, 6] == 1  # as printed; a scale that no point moves stays
+
+
+@pytest.mark.parametrize("reading", range(len(RESIDUALS)))
+def test_a_point_beyond_the_gate_costs_what_it_would_at_the_gate_and_informs_nobody(config, reading):
+    """Of a point's rows those of place are the gate's edge together, and that of colour is it as well."""
+    settings = at(config("slam/localization=default").localization.icp, "residual", reading)
+    matches, problem = random_problem(np.random.default_rng(0))
+    given = NOWHERE, matches, problem, settings
+    outlier = np.asarray(problem.source.valid) & ~np.asarray(matches.is_inlier)
+    rows = rows_of(*given)[outlier] ** 2 / float(problem.weight) / float(settings.max_mahalanobis_sq)
+    np.testing.assert_allclose(rows[:, [0, 2, 3, 4]].sum(1), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(rows[:, 1], float(reading != DISTRIBUTION), rtol=1e-5)
+    far = eqx.tree_at(lambda m: m.normals, matches, device(np.where(outlier[:, None], 1e3, matches.normals)))
+    one, other = (pose_information(problem.T_world_coarse, np.float32(1), m, problem, settings) for m in (matches, far))
+    np.testing.assert_array_equal(one, other)

@@ -38,6 +38,14 @@ def test_a_ratio_is_found_however_small_or_large(true):
     assert scale[0] == pytest.approx(true, rel=1e-4) and std[0] < 1e-5
 
 
+def test_points_beside_the_axis_count_and_those_behind_the_camera_do_not():
+    left, behind = np.asarray(NOW.points)[:, 0] < 0, np.arange(NUM_PIXELS) % 2 == 0
+    before = moved_points(T, replace(NOW, points=np.where(behind[:, None], 5.0, 1.2) * np.asarray(NOW.points)))
+    now = replace(NOW, points=np.where(behind[:, None], -1.0, 1.0) * np.asarray(NOW.points), valid=left)
+    scale, _ = on_host(repeat_scale)(now, before, T, device(1.0), RATIO)
+    assert scale == pytest.approx(1.2, rel=1e-5)
+
+
 def test_the_deviation_is_that_of_the_scales_where_pixels_err_apart():
     scale, std = scales_of(np.float32(0.05 * normal(200, NUM_PIXELS)))
     assert np.mean(std) == pytest.approx(np.std(np.log(scale)), rel=0.25)
